@@ -85,7 +85,6 @@ class Tap(Endpoint):
         unchanged.
         """
         self.extra: list[bytes] = []
-        """Datagrams that are sent in addition to the endpoint's own."""
         self._reader = Codec(9, 9)
 
     def heard(self, since_ns: int = 0) -> list[tuple[int, Message]]:
@@ -259,11 +258,9 @@ class Air:
         return passed_s
 
     def fly(self, seconds: float = 60.0) -> None:
-        """Run until the client sends set-points."""
         self.until(lambda: self.client._pilot.step, seconds)
 
     def end(self, seconds: float = 120.0) -> None:
-        """Run until the client has ended."""
         self.until(lambda: self.client.finished, seconds)
 
     def lands(self, seconds: float = 30.0) -> float:
@@ -289,7 +286,6 @@ class Air:
         self.world.act("client", lambda now_ns: self._running.change(keys, now_ns=now_ns))
 
     def take_over(self) -> None:
-        """Let a pilot take over the vehicle."""
         self.flight.act(FlightMode.PILOT, "Pilot has taken over")
 
     @property
@@ -316,7 +312,6 @@ class Air:
         return [each for _, each in self.heard("COMMAND_LONG") if each.command == command]
 
     def figures(self) -> dict[str, Any]:
-        """Figures of the client about its autopilot."""
         return self.client.vehicle_figures()["autopilot"]
 
     def rmse(self, settle_s: float = 5.0) -> float:

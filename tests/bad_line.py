@@ -34,7 +34,6 @@ corrupted (an additional copy with flipped bits).
 """
 LATE_NS = 400 * MILLISECOND_NS
 OTHERS_NS = 20 * MILLISECOND_NS
-"""Time between two messages of others [ns]."""
 FLIGHT_S = 240.0
 SETTLE_S = 20.0
 """Initial time in which the vehicle catches up with the reference and its error does not count
@@ -46,7 +45,6 @@ STATION, VEHICLE, CAMERA, TWIN = (255, 190), (2, 1), (1, 100), (245, 190)
 the client's own system number.
 """
 MODES = (0, 4, 5, 6, 9, 6 << 16, 3 << 16, 4 << 16 | 6 << 24)
-"""Custom modes of both flavours."""
 ARM, SET_MODE = 400, 176
 
 
@@ -121,7 +119,6 @@ class BadLine(Endpoint):
         return min([self._others_ns, *(each[0] for each in self._held[:1])])
 
     def _talk(self, now_ms: int) -> None:
-        """Send messages of others to the client and to the autopilot."""
         for sender in (VEHICLE, CAMERA, STATION, TWIN):
             said = self._foreign(now_ms)
             self.counts["foreign"] += 1
@@ -242,7 +239,6 @@ class OverLine(Air):
 
 
 def is_in_order(part: list[Any], whole: list[Any]) -> bool:
-    """Whether `part` is a subsequence of `whole`."""
     left = iter(whole)
     return all(each in left for each in part)
 
@@ -255,15 +251,11 @@ class Figures(NamedTuple):
     over_m: float
     """Largest distance beyond the fence [m]; negative inside."""
     off_m: float
-    """Largest distance between the client's newest position and the true one [m]."""
     pilot_s: float
     """Time until the client yielded to a pilot who took over [s]."""
     arms: int
-    """Arm commands before the autopilot was first armed."""
     frames: int
-    """Frames of client and autopilot."""
     foreign: int
-    """Frames of others that reached the client."""
 
 
 def fly(

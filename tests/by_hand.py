@@ -63,7 +63,6 @@ class ByHand:
         return [decode(datagram.payload, self.terms) for datagram in said]
 
     def say(self, message: Message) -> None:
-        """Send one datagram to the client."""
         self.client.receive(Datagram(encode(message), SERVER), now_ns=self.now_ns)
 
     def welcome(

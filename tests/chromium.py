@@ -24,13 +24,10 @@ FLAGS = (
     "--use-angle=swiftshader",
     "--enable-unsafe-swiftshader",
 )
-"""Flags that make Chromium render in software."""
 SCHEMES: tuple[Literal["dark", "light"], ...] = ("dark", "light")
-"""Colour schemes that a browser may prefer."""
 SIZES = {"wide": (1400, 900), "narrow": (420, 860)}
 """Width and height of windows [pixels]."""
 PATIENCE_S = 90.0
-"""Longest time to wait for a condition [s]."""
 SHOWN_S = 25.0
 """Time of flight at which pictures are taken [s]."""
 
@@ -120,7 +117,6 @@ def put(page: "Page", label: str, value: float | str) -> None:
 
 
 def cut(page: "Page") -> None:
-    """Cut the link, and confirm it."""
     page.get_by_role("button", name="Cut the link").click()
     page.get_by_role("button", name="Yes, cut it").click()
 

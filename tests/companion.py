@@ -60,7 +60,6 @@ class Companion:
         self.position: tuple[float, float, float] | None = None
         """Position that is sent with the velocity [m]."""
         self.beats = True
-        """Whether heartbeats are sent."""
         self.kinds = [18, 6] if self.flavour.bytewise else [18]
         """Types in its heartbeats: PX4 sends its texts only to ground stations."""
         self.autopilot.wake(now_ns=self.now_ns)

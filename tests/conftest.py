@@ -112,7 +112,6 @@ class Here(Executor):
 
 @pytest.fixture(scope="module")
 def here() -> Iterator[None]:
-    """Run flights of the laboratory's commands in this process instead of workers."""
     from skytether.lab.commands import pool
 
     with pytest.MonkeyPatch.context() as patch:

@@ -99,6 +99,7 @@ def furthest_m(seed: int, *, fences: type[Fence] = Fence) -> float:
 
 
 def main() -> None:
+    """Fly the requested number of flights, and print how far the worst left the fence."""
     parser = argparse.ArgumentParser(description=main.__doc__)
     parser.add_argument("--count", type=int, default=10_000)
     parser.add_argument("--jobs", type=int, default=2)

@@ -80,7 +80,6 @@ def refused_before_writing(
 
 
 def ran(*argv: object, **keys: Any) -> "subprocess.CompletedProcess[str]":
-    """Run a program to its end, with keys of `subprocess.run`."""
     line = [str(each) for each in argv]
     done: subprocess.CompletedProcess[str] = subprocess.run(
         line, capture_output=True, text=True, check=False, **keys

@@ -28,13 +28,11 @@ class Alive(NamedTuple):
     false_per_h: float
     """False losses of the link per hour, declared by the vehicle."""
     noticed_s: list[float]
-    """Times from each cut until the vehicle detected it [s]."""
     packets_per_s: float
     """Rate of the vehicle's heartbeats."""
 
 
 def keep(network: str, sessions: int, link: LinkConfig | None = None) -> Alive:
-    """Keep an idle link alive for a number of sessions, and cut it at the end of each."""
     kept = [_session(network, link or LinkConfig(), seed) for seed in range(1, sessions + 1)]
     false, noticed_s, packets = zip(*kept, strict=True)
     length_s = sessions * SESSION_S

@@ -24,7 +24,6 @@ class Restart(NamedTuple):
     at_s: float
     """Time of the world at which it stops [s]."""
     down_s: float = 0.2
-    """Time until the next life begins [s]."""
     remembers: bool = True
     """Whether the next life finds the saved state."""
 
@@ -33,13 +32,10 @@ class Death(NamedTuple):
     """Restart of the server."""
 
     at_s: float
-    """Time of the world [s]."""
     down_s: float
-    """Time until the next life begins [s]."""
     remembers: bool = True
     """Whether the next life keeps what was set in flight."""
     zones: str = ""
-    """Zones of the next life's scenario, if different."""
 
 
 class Lives(lives.Lives):
@@ -77,7 +73,6 @@ class Lives(lives.Lives):
         self.world.at(seconds_to_ns(time_s), action)
 
     def fly(self, until_s: float | None = None) -> None:
-        """Fly the mission to its end, or to a time [s]."""
         self.run(self.scenario.duration + 10.0 if until_s is None else until_s)
 
     def inside_s(self, zones: Zones, since_s: float = 0.0) -> float:
@@ -90,6 +85,5 @@ class Lives(lives.Lives):
         return inside * LOOK_S
 
     def least_m(self) -> float:
-        """Smallest distance between two vehicles at any time [m]."""
         _, apart_m = nearest(list(self.tracks().values()), LOOK_S)
         return float(np.nanmin(apart_m))

@@ -50,13 +50,11 @@ class Decision(MissionPlanner):
         self.state, self.vehicles = state, state.vehicles
 
     def hear(self, row: int, step: int, in_force: int, x: float, speed: float = 0.0) -> None:
-        """Receive an observation of a vehicle on the x axis [m, m/s]."""
         said = observation(step, in_force, (x, 0.0))
         said.state[0, 1] = speed
         self.observe(row, said)
 
     def align(self, step: int) -> None:
-        """Set the present step of both vehicles."""
         self.state.align(np.arange(2), np.array([step, step]))
 
     def decide(self, step: int) -> None:
@@ -64,7 +62,6 @@ class Decision(MissionPlanner):
 
 
 def alone() -> Decision:
-    """Planner for two vehicles that swap places."""
     flown = scenario(2)
     goals = swap(2, 4.0, 2)
     terms, clock = flown.terms(), exact(2)
@@ -93,7 +90,6 @@ def ready() -> Decision:
 
 
 def planned(made: Decision) -> Motion:
-    """Motion that is planned for the first vehicle at step 101."""
     made.decide(101)
     motion = made.vehicles[0].next
     assert motion is not None
@@ -120,13 +116,11 @@ def with_goals(
 
 
 def each_of(flown: Record) -> list[Rows]:
-    """Rows of each vehicle."""
     numbers = np.unique(flown.client["vehicle"])
     return [flown.client[flown.client["vehicle"] == number] for number in numbers]
 
 
 def separation_m(flown: Record, height_scale: float = 1.0) -> float:
-    """Smallest distance between two vehicles [m]."""
     told = flown.figures["client"]["by_vehicle"]
     began_s = [told[str(rows["vehicle"][0])]["began_s"] for rows in each_of(flown)]
     least = least_separation(each_of(flown), began_s, DT_S, height_scale)
@@ -135,7 +129,6 @@ def separation_m(flown: Record, height_scale: float = 1.0) -> float:
 
 
 def left_m(flown: Record, scenario: Scenario) -> list[float]:
-    """Distance of each vehicle from its last goal at the end [m]."""
     goals = scenario.make_reference()
     assert isinstance(goals, Mission)
     return [

@@ -25,7 +25,6 @@ from skytether.shared.core.events import Event, address_text
 from skytether.shell.log import LogLine
 
 PATIENCE_S = 60.0
-"""Longest wait for the end of a process [s]."""
 
 FORK = multiprocessing.get_context("forkserver")
 FORK.set_forkserver_preload(
@@ -91,7 +90,6 @@ class Command:
             self.stdout.close()
 
     def send_signal(self, number: int) -> None:
-        """Send a signal, unless it has ended."""
         if self._process.is_alive():
             os.kill(self.pid, number)
 
@@ -121,7 +119,6 @@ class Process:
         self.said: list[str] = []
 
     def wait_for(self, pattern: str) -> re.Match[str]:
-        """Next line with the pattern; the test's timeout bounds the wait."""
         for line in self.popen.stdout:
             self.said.append(line.rstrip())
             found = re.search(pattern, line)
@@ -130,7 +127,6 @@ class Process:
         raise AssertionError(f"{pattern!r} was never said; this was: {self.said}")
 
     def address(self) -> str:
-        """Address that it listens on, once printed as text or JSON."""
         found = self.wait_for(r'listening on (\S+:\d+)|"Listening"')
         if found[1]:
             return found[1]
@@ -138,7 +134,6 @@ class Process:
         return address_text(event["host"], event["port"])
 
     def events(self) -> list[Event]:
-        """Events printed so far with `--log json`."""
         return [msgspec.json.decode(line, type=LogLine).event for line in self.said]
 
     def counted(self, name: str) -> int:
@@ -151,12 +146,10 @@ class Process:
         return next((int(match[1]) for match in found if match), 0)
 
     def end(self, number: int = signal.SIGTERM) -> int:
-        """End it by a signal; returns its exit code."""
         self.popen.send_signal(number)
         return self.ended()
 
     def ended(self) -> int:
-        """Wait until it has ended by itself; returns its exit code."""
         self.said += self.popen.stdout.read().splitlines()
         return self.popen.wait(PATIENCE_S)
 

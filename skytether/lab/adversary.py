@@ -54,7 +54,6 @@ class MoveKind(StrEnum):
     DELAYS = "delays"
     """Extra delay of packets, changing linearly from the first amount to the second [s]."""
     LOSSES = "losses"
-    """Loss of a share of the packets."""
     CUTS = "cuts"
     """Loss of all packets."""
     COPIES = "copies"
@@ -87,15 +86,12 @@ AMOUNTS = {
 }
 """Smallest and largest value of each amount of a kind. Places are anywhere in the mission's box."""
 SLOW = ("uplink", "downlink", "")
-"""Directions in which a vehicle may have a long delay at first."""
 RADIUS_M = (0.4, 1.5)
 """Smallest and largest radius of a zone [m]."""
 
 
 @dataclass(frozen=True)
 class Move:
-    """Move of the adversary, with a start and a length."""
-
     kind: MoveKind
     vehicle: Annotated[int, msgspec.Meta(ge=0)]
     """Number of the vehicle from 1; 0 for all vehicles."""
@@ -153,8 +149,6 @@ class Approach(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class AdversaryNetwork(Endpoint):
-    """Network between clients and server, controlled by the adversary's moves."""
-
     def __init__(self, moves: Moves, seed: int) -> None:
         super().__init__()
         self._moves = [move for move in moves if move.kind in NETWORK]
@@ -353,7 +347,6 @@ class Climb:
 class Climbed(NamedTuple):
     best: Approach
     spares_m: list[float]
-    """Distance minus the required one for each try, see `spare_m` [m]."""
 
 
 def fly(scenario: Scenario, moves: Moves) -> Approach:

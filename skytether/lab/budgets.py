@@ -57,7 +57,7 @@ EVERY = "every step"
 
 @dataclass(frozen=True, slots=True)
 class FlownContender:
-    """Contender in a case, at one threshold and with one way of reporting."""
+    """Contender in a case, at one threshold and with one reporting policy."""
 
     contender: Contender
     threshold: float | None
@@ -113,7 +113,6 @@ Chosen = Mapping[tuple[str, float], FlownContender]
 class Scouted:
     point: FlownContender
     rmse_xy_m: float
-    """RMSE xy [m]; infinite if a flight failed."""
     packets_per_s: float
     """Packets in both directions [1/s]."""
     is_valid: bool
@@ -164,7 +163,6 @@ class Plan:
         self._scouted: list[Scouted] = []
 
     def scouts(self, points: Sequence[FlownContender]) -> Sweep:
-        """Scouting flights of some points."""
         runs, scenario = self._scouting
         return self._sweep(scenario, points, runs)
 
@@ -173,7 +171,6 @@ class Plan:
         return Sweep(self.case.name, scenario, [GridAxis("contender", names, changes)], runs)
 
     def comparison(self, points: Iterable[FlownContender]) -> Sweep:
-        """Flights of some points for the comparison, without duplicates."""
         each = {point.name: point for point in points}
         return self._sweep(self._scenario, list(each.values()), self.runs)
 

@@ -154,7 +154,6 @@ class Rmse:
     """Objective of the smallest RMSE xy within limits."""
 
     scenario: Scenario
-    """Scenario to fly; the searched keys are replaced."""
     limits: SearchLimits
 
     def settings(self) -> Mapping[str, Any]:

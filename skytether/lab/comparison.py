@@ -40,7 +40,7 @@ FIGURES = (
 
 @dataclass(frozen=True, slots=True)
 class Claim:
-    """Claim that one contender's RMSE xy is at most so many times another's."""
+    """Claim that one contender's RMSE xy is at most a given multiple of another's."""
 
     ours: str
     theirs: str
@@ -100,7 +100,6 @@ class ComparedCase:
 
     @property
     def contenders(self) -> list[Contender]:
-        """Contenders with a chosen point within at least one budget."""
         names = {name for name, _ in self.bought}
         return [each for each in (*CONTENDERS, ABOARD) if each.name in names]
 
@@ -221,7 +220,6 @@ ABOUT = (
 
 
 def budgets_table(results: Sequence[ComparedCase]) -> Table:
-    """Table of the mean RMSE xy of each contender within each budget."""
     rows, lines = [], []
     for each in results:
         best = {budget: _best(each, budget) for budget in BUDGETS}
@@ -277,7 +275,6 @@ def _best(compared: ComparedCase, budget: float) -> list[ContenderRuns]:
 
 
 def leaders_table(results: Sequence[ComparedCase]) -> Table:
-    """Table of our contender's RMSE xy relative to the best other's, within each budget."""
     rows = []
     for each in results:
         for budget in BUDGETS:
@@ -404,7 +401,6 @@ SPENT = {
     BYTES: "bytes /s, both ways",
     EFFORT: "effort [m/s]",
 }
-"""Resources over which the error is drawn, and their axis labels."""
 COLOURS = ("#c1272d", "0.5", "black", "#009e73")
 MARKERS = "sovD^P<*"
 """Markers of the triggers, in order; curves can be told apart without colour."""

@@ -20,7 +20,6 @@ from skytether.shared.scenario.dotted import flat, set_keys
 from skytether.shared.scenario.schema import Scenario
 
 SEARCH_SEED = 1001
-"""First seed of a search; the seeds of the comparison begin at the scenario's own."""
 PACKETS = 0.1
 """Largest event ratio in a search, for a contender whose trigger uses the state."""
 SCOUTS = 16
@@ -39,14 +38,10 @@ PERIODS = (0.1, 0.2, 0.5, 1, 2, 4, 8)
 
 @dataclass(frozen=True, slots=True)
 class Contender:
-    """Scheme with a trigger."""
-
     name: str
     """Identifier in tables, files and scenarios."""
     scheme: str
-    """Scheme, as the report names it."""
     trigger: str
-    """Trigger, as the report names it."""
     control: Mapping[str, Any]
     """Keys of `control` that define the contender, with the initial weights of its search."""
     threshold: str = ""
@@ -158,7 +153,6 @@ ABOARD = Contender("aboard", "reference aboard", "no packets", {})
 @dataclass(frozen=True, slots=True)
 class Case:
     name: str
-    """Identifier in tables, files and scenarios."""
     title: str
     """Name in the report."""
     plant: str
@@ -170,9 +164,7 @@ class Case:
     weights: str = ""
     """Name of the case whose weights are used; empty if the case has its own."""
     contenders: Sequence[str] = ()
-    """Names of the contenders that fly the case; empty for all."""
     start: Mapping[str, float] = field(default_factory=dict)
-    """Thresholds and their initial values in searches of this case."""
 
 
 TARGET = {
@@ -273,7 +265,7 @@ def cases(names: Sequence[str]) -> Sequence[Case]:
 
 @dataclass(frozen=True, slots=True)
 class ComparisonSize:
-    """Size of a comparison; defaults are those of the reported ones."""
+    """Number and length of the flights of a comparison; defaults as in docs/compare.md."""
 
     runs: int
     """Number of flights of each chosen point; half as many in a case without its own weights."""
@@ -285,7 +277,6 @@ class ComparisonSize:
     contenders: Sequence[Contender] = CONTENDERS
     """Contenders of the comparison; a case may restrict them."""
     scouts: int = SCOUTS
-    """Number of scouting flights of each point."""
     rounds: int = ROUNDS
     """Number of rounds in which more thresholds are tried near the budgets."""
     every: int = 1
@@ -310,7 +301,6 @@ class ComparisonSize:
 
 
 QUICK = ("paper-every-step", "paper-event", "feedback-gap", "trajectory-expected")
-"""Contenders of `--quick`."""
 
 
 def quick(scale: ComparisonSize) -> ComparisonSize:

@@ -33,7 +33,6 @@ TITLES: Mapping[Scheme, str] = {
 PAPER = f"{reading.COMPARED}/paper-every-step-target"
 """Scenario with the best weights of the paper's scheme (docs/compare.md)."""
 STEP = 4.0 / 3.0
-"""Ratio of one number of vehicles to the next, until they fail."""
 EXACT = 0.05
 """Relative accuracy of the largest number of vehicles."""
 
@@ -48,7 +47,6 @@ class CrowdPoint(msgspec.Struct, frozen=True):
     vehicle did not fly so long.
     """
     rmse_worst_m: float | None
-    """Largest RMSE of a single vehicle [m]."""
     ended: int
     """Number of vehicles that did not fly to the end."""
     braked: int
@@ -142,8 +140,6 @@ def judge(
 
 @dataclass(frozen=True, slots=True)
 class FlownScheme:
-    """Results of one scheme, in order of the number of vehicles."""
-
     points: tuple[CrowdPoint, ...]
     limit_m: float
     """RMSE above which vehicles count as failed [m]."""

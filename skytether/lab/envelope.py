@@ -119,10 +119,6 @@ class Envelope:
         return table
 
     def scenario_of(self, number: int) -> Scenario:
-        """Scenario of a point.
-
-        Raises ConfigError if the point cannot be flown.
-        """
         return reading.check(self._table(number), self.name)
 
     def fly(self, number: int) -> EnvelopePoint:
@@ -140,7 +136,6 @@ class Envelope:
         return msgspec.structs.replace(verdict, line=line)
 
     def command(self, number: int) -> str:
-        """Command line that flies this point alone."""
         before = dict(flat(reading.to_table(reading.load(self.name))))
         now = flat(self._table(number))
         changed = ((key, value) for key, value in now if value != before.get(key))
@@ -148,7 +143,6 @@ class Envelope:
         return shlex.join(["skytether", "fly", self.name, "--virtual", *flags])
 
     def csv(self, points: Iterable[EnvelopePoint]) -> str:
-        """CSV table with a row for each point: number, drawn keys, and the outcome."""
         rows = [
             [number, *self.keys(number).values(), *msgspec.structs.astuple(point)]
             for number, point in enumerate(points)

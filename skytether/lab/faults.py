@@ -31,7 +31,6 @@ class FaultKind(StrEnum):
     SKEW = "skew"
     """A host's clock runs fast by the amount [ppm]."""
     RESTART = "restart"
-    """Restart of a host after a down time."""
     FREEZE = "freeze"
     """Freeze of a host, as by SIGSTOP."""
     SOLVER = "solver"
@@ -66,7 +65,6 @@ HARMLESS = frozenset(
 """Faults during which all vehicles must fly, because every packet still arrives."""
 
 NETWORK = ("uplink", "downlink", "both")
-"""Directions of the network in which packets are affected."""
 HOSTS = ("server", "client")
 
 SHARE = (0.05, 1.0)
@@ -108,7 +106,6 @@ RANGES = {
 }
 
 EVERY_NS = 5 * SECOND_NS
-"""Mean time from one fault of a schedule to the next [ns]."""
 SHORTEST_NS = MILLISECOND_NS
 """Length below which `shrink` does not shorten a fault any further [ns]."""
 

@@ -25,13 +25,11 @@ OUTCOMES: Mapping[Outcome, Mapping[str, Any]] = {
     "flyaway": {"color": "#c1272d", "marker": "X"},
     "crashed": {"color": "black", "marker": "P"},
 }
-"""Colour and marker of each outcome of a point, in drawing order."""
 RATIOS = np.geomspace(1 / 16, 16, 17)
 """Bin edges of `envelope`: length of a horizon in round trips."""
 
 
 def envelope(path: Path, title: str, plan: Envelope, points: Sequence[EnvelopePoint]) -> None:
-    """Draw the outcomes of an envelope's points, over delays, losses and the length of a plan."""
     from matplotlib.patches import Patch
 
     keys = list(map(plan.keys, range(len(points))))
@@ -91,7 +89,6 @@ def _size(outcome: Outcome, points: int) -> float:
 
 
 def _stack(plane: Any, ratios: Array, shown: Mapping[Outcome, Flags]) -> None:
-    """Draw the share of each outcome over the horizon's length in round trips."""
     bins = np.digitize(np.clip(ratios, RATIOS[0], RATIOS[-1] * (1.0 - 1e-9)), RATIOS) - 1
     total = np.maximum(1, np.bincount(bins, minlength=len(RATIOS) - 1))
     below = np.zeros(len(total))
@@ -241,7 +238,6 @@ def _most(flown: Mapping[Scheme, FlownScheme]) -> int:
 
 
 def _is_scale(axis: GridAxis) -> bool:
-    """Whether an axis has increasing numbers, not names."""
     numbers = all(type(value) in (int, float) for value in axis.values)
     return numbers and all(low < high for low, high in pairwise(axis.values))
 

@@ -182,7 +182,6 @@ class Work:
             )
             for period in PERIODS
         }
-        """Scenario for each point of the floor, by the steps between packets."""
         first, runs = scenario.seed, 0 if _is_unknown(scenario) else plan.runs
         self.aboard = {seed: replace(aboard, seed=seed) for seed in range(first, first + runs)}
         self._tables = scenario, aboard

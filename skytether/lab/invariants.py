@@ -294,7 +294,6 @@ class WatchedLife(Recorder):
         self.row_ns = now_ns
 
     def _listen(self) -> None:
-        """Count the steps of silence of the link."""
         self._silent = 0 if self._heard else self._silent + 1
         self._heard = False
         if self._silent == self._timeout + 1:
@@ -482,7 +481,6 @@ def _reach_m(age_max_s: float, terms: Terms) -> float:
 
 
 def _extent(scenario: Scenario) -> list[tuple[float, float]]:
-    """Smallest and largest coordinate of the reference on each axis [m]."""
     times = np.linspace(0.0, scenario.reference.period_s, 200)
     positions = scenario.make_reference()(times)[:, :, 0]
     return list(zip(positions.min(axis=0).tolist(), positions.max(axis=0).tolist(), strict=True))

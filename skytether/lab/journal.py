@@ -57,7 +57,6 @@ class StudyJournal(Generic[E]):
             raise
 
     def _agree(self, folder: Path, settings: Mapping[str, Any]) -> None:
-        """Write the settings, or compare them with existing ones."""
         path = folder / SETTINGS
         text = msgspec.toml.encode(settings)
         if not path.exists():
@@ -77,7 +76,6 @@ class StudyJournal(Generic[E]):
                 )
 
     def _read(self, decoder: msgspec.json.Decoder[tuple[str, E]]) -> None:
-        """Read existing results, and set the position for the next line."""
         assert self._file is not None
         whole = 0
         for number, line in enumerate(self._file, start=1):

@@ -74,7 +74,6 @@ def _sensor(scenario: Scenario, number: int, life: int) -> Sensor:
 class Life(NamedTuple):
     client: Client
     sink: io.BytesIO
-    """Record of the client's steps."""
 
 
 class Lives:

@@ -56,8 +56,6 @@ class Place(NamedTuple):
 
 
 class MapPoint(msgspec.Struct, frozen=True):
-    """Results of a point; an entry of a map's journal."""
-
     cycles: bool
     rest_m: float
     """Largest RMS distance in the last quarter of the hovering flights [m]."""
@@ -73,8 +71,6 @@ class MapPoint(msgspec.Struct, frozen=True):
 
 @dataclass(frozen=True, slots=True)
 class Box:
-    """Scenario, and the grid of differences from it."""
-
     name: str
     scenario: Scenario
     trigger: str

@@ -63,8 +63,6 @@ HALVINGS = 7
 
 
 class Differing(NamedTuple):
-    """Differences of a vehicle and its network from the model."""
-
     tau: float = 1.0
     """Time constants relative to those of the model."""
     gain: float = 1.0
@@ -123,7 +121,6 @@ LIMITS: dict[str, tuple[str, float, float]] = {
 
 class Margin(msgspec.Struct, frozen=True, kw_only=True):
     vehicle: str
-    """Name of the vehicle in a table."""
     growth: float
     growth_ci95: float | None
     """Half-width of the 95 % interval over seeds; None for a single seed."""
@@ -235,7 +232,6 @@ def _responses(scenario: Scenario, trigger: str, runs: int) -> Array:
 
 
 def _positions_and_inputs(flights: Sequence[Record]) -> tuple[Array, Array]:
-    """Positions [m] and inputs [m/s] of flights; each of shape (runs, steps, axes)."""
     steps = min(len(flight.client) for flight in flights)
     return (
         np.array([flight.client["state"][:steps, :, 0] for flight in flights]),
@@ -294,7 +290,6 @@ def margin(scenario: Scenario, vehicle: str, trigger: str, runs: int) -> Margin:
 
 
 def wind_of(scenario: Scenario) -> float:
-    """White wind of the flights of the kind "wind" [m/s per √s]."""
     noises = scenario.sensor.position_noise_m, scenario.sensor.velocity_noise_mps
     alone = not any(noises) and scenario.vehicle.wind == 0.0
     return WIND_ALONE if alone else scenario.vehicle.wind

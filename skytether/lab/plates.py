@@ -50,13 +50,10 @@ RATIO_LOG = 20.0
 """Ratio of largest to smallest value above which an axis is logarithmic."""
 
 Samples = Mapping[str, tuple[Scenario, Sequence[Record]]]
-"""Scenario and complete records of some flights, by method."""
 
 
 @dataclass(frozen=True, slots=True)
 class Plate(Picture):
-    """Figure of a report, for screen and print, with its numbers."""
-
     pdf: bytes
     csv: str
     """Numbers in the figure, as CSV."""
@@ -218,7 +215,6 @@ def maps(flown: CellSummaries, here: ControlConfig) -> Plate:
 
 
 DRAWN = ("rmse_xy", "event_ratio")
-"""Figures drawn in the maps and curves."""
 
 
 def _grid(flown: CellSummaries) -> tuple[Array, Array, Array, Array]:

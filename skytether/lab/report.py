@@ -42,8 +42,6 @@ ABOUT = (
 
 @dataclass(frozen=True, slots=True)
 class Real:
-    """Flight over UDP."""
-
     scenario: Scenario
     flight: Record
     netem: Mapping[str, Any]
@@ -68,16 +66,12 @@ class Reproduction:
 
 @dataclass(frozen=True, slots=True)
 class Drawn:
-    """Contents of a report, with figures drawn."""
-
     title: str
     about: str
     """Introduction: one or two sentences on the scenario."""
     tables: Sequence[Table]
-    """Tables, the most important first."""
     pictures: Sequence[Plate]
     verdict: str
-    """One or two sentences on the outcome."""
 
 
 def draw(measured: Reproduction) -> Drawn:
@@ -103,7 +97,6 @@ def draw(measured: Reproduction) -> Drawn:
 
 
 def paper_table(entries: Sequence[TableEntry], columns: Mapping[str, MethodFlights]) -> Table:
-    """Table 1: the paper's figures with the reproduced ones."""
     runs, steps = len(columns[EVENT].runs), columns[PERIODIC].period
     ours, theirs = (_rmse(columns[method]) for method in (EVENT, PERIODIC))
     meet = not periodic_wins(columns[EVENT], columns[PERIODIC])
@@ -127,7 +120,6 @@ def paper_table(entries: Sequence[TableEntry], columns: Mapping[str, MethodFligh
 
 
 def traffic_table(columns: Mapping[str, MethodFlights]) -> Table:
-    """Table of the packets and bytes that entered the network, by method."""
     rows = [
         {"column": method} | by_name(TRAFFIC, cell.estimate) for method, cell in columns.items()
     ]
@@ -168,7 +160,6 @@ REAL = {
 
 
 def real_table(measured: Reproduction) -> Table:
-    """Table of the flights over UDP and of those in virtual time, by method."""
     study, cells = measured.table
     length_s = study.axis.values[1]
     rows: list[dict[str, Any]] = []
@@ -212,7 +203,6 @@ def real_table(measured: Reproduction) -> Table:
 
 
 def verdict(entries: Sequence[TableEntry], columns: Mapping[str, MethodFlights]) -> str:
-    """Result of a reproduction, in two sentences."""
     off = {(e.column, e.entry): e.deviation for e in entries if e.deviation is not None}
     near = sum(within(entry, deviation) for (_, entry), deviation in off.items())
     (column, entry), worst = max(off.items(), key=lambda item: abs(item[1]))

@@ -26,7 +26,6 @@ RECORDED = 2048
 """Number of newest packets of a direction that an attacker keeps for replay."""
 HELD_MAX = 65536
 FLOOD_NS = 10 * MILLISECOND_NS
-"""Time between two bursts of forged packets [ns]."""
 OTHER_SOCKET, STRANGERS_SOCKET, STRANGERS = 100, 200, 8
 """First number of the sockets that replay vehicles' packets; first number and count of the sockets
 that send forged packets.
@@ -98,7 +97,7 @@ class Saboteur(Endpoint):
         self._swift.discard(fault)
 
     def change_ports(self) -> None:
-        """Change the socket as which netem sees each vehicle."""
+        """Give each vehicle another socket towards netem, as NAT does when it changes ports."""
         first = max(self._clients) + OTHER_PORTS
         self._clients = dict(enumerate(self._addresses, start=first))
         self._numbers = {client: number for number, client in self._clients.items()}

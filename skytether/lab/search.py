@@ -18,7 +18,6 @@ from skytether.shared.scenario.grammar import GrammarError
 from skytether.shared.scenario.schema import Scenario
 
 SIGMA = 0.1
-"""Default initial step size, as a share of each key's range."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,7 +129,6 @@ class Optimiser:
         return [self._scenario(point) for point in self._points]
 
     def tell(self, scores: Sequence[float]) -> None:
-        """Update the search with the scores of the generation from `ask`."""
         self._search.tell(self._points, scores)
 
     def _scenario(self, point: Any) -> Scenario:
@@ -179,8 +177,6 @@ FlyAll = Callable[[Mapping[Point, Scenario]], Mapping[Point, Values]]
 
 @dataclass(frozen=True, slots=True)
 class Search:
-    """Starting point, objective and effort of a search."""
-
     start: Scenario
     objective: Objective
     free: Sequence[Free]

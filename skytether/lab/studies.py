@@ -33,7 +33,7 @@ METHODS = GridAxis(
 
 @dataclass(frozen=True, slots=True)
 class ReproductionSize:
-    """Size of a reproduction."""
+    """Number and length of the flights of a reproduction."""
 
     runs: int
     """Number of flights of each column of Table 1."""
@@ -49,7 +49,6 @@ class ReproductionSize:
     duration: float
     """Length of a flight in virtual time [s]."""
     real_s: float
-    """Length of a flight over UDP [s]."""
     real_settle_s: float
     """Initial part of a flight over UDP that RMSE leaves out [s]."""
     sample_runs: int
@@ -87,7 +86,6 @@ QUICK = ReproductionSize(
     sample_runs=2,
     delay_packets=500,
 )
-"""Size of `--quick`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,7 +93,6 @@ class Study:
     """Study of all methods over the values of one parameter."""
 
     name: str
-    """Name for files."""
     label: str
     """Label of the axis, with its unit."""
     scenario: Scenario
@@ -103,9 +100,7 @@ class Study:
     axis: GridAxis
     """Values of the parameter, and the keys that each changes."""
     runs: int
-    """Number of flights of each method at each value."""
     here: float
-    """Value of the parameter in the scenario."""
 
     def first(self) -> Sweep:
         return Sweep(SCENARIO, self.scenario, [self.axis, METHODS], self.runs)
@@ -222,13 +217,11 @@ def map_sweep(scenario: Scenario, scale: ReproductionSize) -> Sweep:
 
 
 def period_sweep(scenario: Scenario, scale: ReproductionSize) -> Sweep:
-    """Sweep of periodic sending for Fig. 5, from every step to very rarely."""
     axis = GridAxis("control.trigger.periodic", scale.periods, tuple(map(periodic, scale.periods)))
     return Sweep(SCENARIO, scenario, [axis], scale.map_runs)
 
 
 CellSummaries = Mapping[tuple[Any, ...], Sequence[Summary]]
-"""Summaries of each cell of a sweep, by its values."""
 
 
 def flown(plan: Sweep, done: Results) -> CellSummaries:
@@ -237,8 +230,6 @@ def flown(plan: Sweep, done: Results) -> CellSummaries:
 
 @dataclass(frozen=True, slots=True)
 class MethodFlights:
-    """Flights of one method at one value."""
-
     runs: Sequence[Summary]
     period: int | None = None
     """Steps between packets with periodic sending; None for other methods."""
@@ -287,8 +278,6 @@ def cells(study: Study, first: Sweep, firstly: Results, second: Sweep, secondly:
 
 
 class TableEntry(msgspec.Struct, frozen=True):
-    """Entry of Table 1: the paper's figure and the reproduced one."""
-
     column: str
     entry: str
     paper: float | None

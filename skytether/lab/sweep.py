@@ -38,7 +38,6 @@ class GridAxis:
     """Key of the scenario with its values; or a label, with the keys that each value changes."""
 
     key: str
-    """Key with dots, or a label if there are `changes`."""
     values: tuple[Any, ...]
     """Values of the key, or names of the changes."""
     changes: tuple[Mapping[str, Any], ...] = ()
@@ -108,10 +107,7 @@ def _value(text: str) -> Any:
 
 
 class FlightTask(msgspec.Struct, frozen=True):
-    """Runs of a cell that are flown together."""
-
     cell: int
-    """Number of the cell in its sweep, from 0 on."""
     chunk: int
     """Number of the task in its cell, from 0 on."""
     name: str
@@ -121,9 +117,7 @@ class FlightTask(msgspec.Struct, frozen=True):
 
 
 Runs = tuple[Summary, ...]
-"""Summaries of a task's runs, in order of the seeds."""
 Results = Mapping[tuple[int, int], Runs]
-"""Results of a sweep, by cell and chunk."""
 
 
 def fly(task: FlightTask) -> Runs:
@@ -165,7 +159,6 @@ class Sweep:
         self.cells = [tuple(value for value, _ in cell) for cell in points]
         """Values of each cell, in the order of the axes."""
         self.chunks = -(-runs // CHUNK)
-        """Number of tasks of each cell."""
         self._scenarios = [
             self._scenario({key: value for _, changes in cell for key, value in changes.items()})
             for cell in points
@@ -173,7 +166,6 @@ class Sweep:
 
     @property
     def flights(self) -> int:
-        """Number of all flights."""
         return len(self.cells) * self.runs
 
     def _scenario(self, changes: Mapping[str, Any]) -> Scenario:

@@ -59,14 +59,12 @@ from skytether.sim.world import Clock, World
 CLOCK_NS = 10**7 * SECOND_NS
 """Initial time on all clocks [ns], so large that no backward step makes it negative."""
 LANDED_NS = 5 * SECOND_NS
-"""Time after which a landed vehicle is restarted [ns]."""
 QUIET_NS = SECOND_NS
 """Time for which a flight continues after the recovery deadline [ns]."""
 SHORT_S = (8.0, 25.0)
 """Range of the time within which the faults of a short trial begin and end [s]."""
 RESTARTED = (FaultKind.RESTART, "client")
 TRAJECTORIES = 0.5
-"""Share of the trials that fly the scheme "trajectory"."""
 REKEYING = 0.3
 """Share of the trials in which vehicles renew their keys every REKEY_NS."""
 REKEY_NS = 4 * SECOND_NS
@@ -77,11 +75,9 @@ FLOWS = 128
 ports.
 """
 COMPUTE_NS = MILLISECOND_NS
-"""Computing time of the server per step [ns]."""
 
 
 def make_scenario(seed: int) -> tuple[Scenario, int]:
-    """Scenario of a trial, and its number of vehicles, both drawn from the seed."""
     rng = stream(seed, "torture", "scenario")
     kind = rng.choice(3, p=(0.6, 0.2, 0.2))
     scheme = ("committed", "committed", "predictive")[kind]
@@ -125,7 +121,6 @@ def make_scenario(seed: int) -> tuple[Scenario, int]:
 
 
 def _follow_trajectories(table: dict[str, Any], rng: np.random.Generator) -> None:
-    """Change a scenario to the scheme "trajectory", with random options."""
     axes = table["model"]["axes"]
     error_m, silence_s = round(rng.uniform(0.003, 0.1), 3), round(rng.uniform(0.3, 2.0), 2)
     gap = f"{round(float(np.exp(rng.uniform(np.log(0.01), np.log(3.0)))), 3)}"
@@ -169,7 +164,6 @@ def _follow_trajectories(table: dict[str, Any], rng: np.random.Generator) -> Non
 
 
 def short_trial(seed: int) -> Trial:
-    """Trial with faults over 8 to 25 s."""
     rng = stream(seed, "torture", "faults")
     return Trial(seed, schedule(rng, seconds_to_ns(rng.uniform(*SHORT_S))))
 
@@ -192,8 +186,6 @@ class TrialOutcome(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Failing:
-    """Solver that fails for a random share of its problems."""
-
     def __init__(self, inner: Solver, share: float, rng: np.random.Generator) -> None:
         self.inner = inner
         self._share = share
@@ -208,10 +200,9 @@ class Failing:
 
 @dataclass(slots=True)
 class TorturedVehicle:
-    """Vehicle through its lives: runs of its endpoint between restarts."""
+    """Vehicle through its lives: runs of its client between restarts."""
 
     name: str
-    """Name of its host."""
     plant: FirstOrderPlant
     """Simulated vehicle, which persists through all lives."""
     life: WatchedLife
@@ -221,8 +212,6 @@ class TorturedVehicle:
 
 
 class Torture:
-    """Trial that is running."""
-
     def __init__(self, trial: Trial) -> None:
         self.trial = trial
         self.scenario, count = make_scenario(trial.seed)
@@ -272,7 +261,6 @@ class Torture:
         self.end_ns = trial.end_ns + self._recovery_ns + QUIET_NS
 
     def run(self, stopped: Callable[[], bool] = lambda: False) -> TrialOutcome:
-        """Run the trial to its end, or to the first violation."""
         failure = invariant = ""
         try:
             self.world.run(stopped, limit_ns=self.end_ns)
@@ -352,7 +340,6 @@ class Torture:
         return life, Steady(client)
 
     def _renew(self, name: str) -> None:
-        """Restart the process of a host."""
         self.counts[f"lives of {name.partition(' ')[0]}"] += 1
         if name == SERVER[0]:
             self.world.restart(name, self._new_server())

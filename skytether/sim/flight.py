@@ -240,7 +240,6 @@ class Run:
             )
             self.hosts[host] = client
         self.flying = vehicles
-        """Number of vehicles that have not finished."""
         self._ends: tuple[int | None, int | None] = None, None
         """Rows of the server and bytes of netem when the last vehicle finished."""
         self._figures: dict[str, Any] | None = None

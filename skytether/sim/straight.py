@@ -34,7 +34,6 @@ READY_S = 1.0
 not settle.
 """
 AROUND_S = 180.0
-"""Longest time of take-off and landing together [s]."""
 
 
 def fly(

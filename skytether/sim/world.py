@@ -94,7 +94,6 @@ class Host:
     turn: int
     """Rank among hosts that are woken at one instant, from 1 in the order of `World.add`."""
     compute_ns: int
-    """Computing time of each wake [ns]."""
     busy_until_ns: int
     """Time of the world until which the host computes, and cannot be woken."""
     on_finished: Callable[[], None] | None
@@ -130,7 +129,6 @@ class World:
 
     def __init__(self, on_event: Callable[[int, str, Event], None] = lambda *_: None) -> None:
         self.now_ns = 0
-        """Time of the world [ns]."""
         self._on_event = on_event
         self._hosts: dict[str, Host] = {}
         self._agenda: list[
@@ -141,7 +139,6 @@ class World:
         None for a wake; an action has no host but a function.
         """
         self._scheduled = 0
-        """Number of entries made so far."""
         self._arriving: deque[tuple[Host, Datagram]] = deque()
         """Datagrams that arrive at the present time, in the order in which they were sent."""
 

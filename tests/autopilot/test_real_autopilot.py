@@ -95,7 +95,6 @@ class Heard(asyncio.DatagramProtocol):
         self._transport = transport
 
     def datagram_received(self, data: bytes, address: object) -> None:
-        """Store a message; request position and velocity until they arrive."""
         if PLACE not in self.newest and self._transport is not None:
             asked = dialect.MAVLink_command_long_message(
                 1,
@@ -129,8 +128,6 @@ async def until(so: Callable[[], bool], seconds: float) -> None:
 
 
 class Flight:
-    """Server, netem and client beside an autopilot."""
-
     def __init__(self, folder: Path, flown: Scenario) -> None:
         self.folder, self.flown = folder, flown
         self.said: list[LogLine] = []

@@ -186,8 +186,6 @@ def test_an_autopilot_that_is_not_reached_is_not_flown(way: str) -> None:
 
 
 class Sky:
-    """Station and autopilot without a network between them."""
-
     def __init__(self, faults: Sequence[str] = ()) -> None:
         scene = scenario(duration=6.0, network={"uplink": NONE, "downlink": NONE})
         self.events: list[tuple[int, object]] = []

@@ -58,7 +58,6 @@ def apart_m(paths: list[Array]) -> float:
     ("flavour", "loss"), [("ardupilot", 0.1), pytest.param("px4", 0.4, marks=pytest.mark.long)]
 )
 def test_three_swap_places_within_a_fence(flavour: FlavourName, loss: float) -> None:
-    """From take-off to landing, by true positions."""
     world, clients, truths = World(lambda *_: None), [], []
     for number in NUMBERS:
         flown = scenario(flavour, number, loss)

@@ -458,7 +458,6 @@ def unread(request: pytest.FixtureRequest) -> Iterator[int]:
 def test_a_server_whose_output_nobody_reads_flies_a_vehicle_and_ends_in_order(
     unread: int, start: Callable[..., Process], tmp_path: Path
 ) -> None:
-    """Even while it reports many strangers."""
     figures = tmp_path / "server.json"
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
         free.bind(("127.0.0.1", 0))

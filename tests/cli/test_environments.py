@@ -49,7 +49,6 @@ ENVIRONMENTS: dict[str, tuple[dict[str, str | None], str]] = {
 
 
 def run(argv: list[str], environment: str = "", line: str = "{}") -> CompletedProcess[str]:
-    """Run a command to its end, in one of ENVIRONMENTS or within a shell line."""
     variables, line = ENVIRONMENTS.get(environment, ({}, line))
     merged = {**os.environ, **variables}
     return ran(
@@ -60,7 +59,6 @@ def run(argv: list[str], environment: str = "", line: str = "{}") -> CompletedPr
 
 
 def begun(*argv: str, **keys: Any) -> "Popen[str]":
-    """Start a command as a user does."""
     begun: Popen[str] = Popen([*SKYTETHER, *argv], stdout=PIPE, stderr=PIPE, text=True, **keys)
     return begun
 

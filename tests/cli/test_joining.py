@@ -77,7 +77,6 @@ def test_three_recordings_become_the_flight(flown: Record, tmp_path: Path) -> No
 
 
 def test_each_process_says_what_is_its_own(flown: Record, tmp_path: Path) -> None:
-    """The server was started with another trigger, and netem with another loss."""
     table = reading.to_table(SCENARIO)
     table["control"]["trigger"] = "always"
     server = reading.check(table)

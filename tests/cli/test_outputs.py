@@ -113,7 +113,6 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def inputs(tmp_path: Path, recording: Path) -> dict[str, Path]:
-    """A file of each kind that commands read."""
     folder = tmp_path / "in"
     folder.mkdir(mode=0o700)
     made = {
@@ -295,7 +294,6 @@ def test_a_flight_that_is_killed_leaves_the_older_recording(
 
 @contextmanager
 def room_for(size: int) -> Iterator[None]:
-    """Limit the size of files."""
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     writes = sys.dont_write_bytecode
     sys.dont_write_bytecode = True  # Python would leave a truncated .pyc and read it later

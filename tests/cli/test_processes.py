@@ -91,7 +91,6 @@ async def test_a_child_that_is_killed_is_said_to_be() -> None:
 async def test_a_child_whose_record_is_incomplete_has_told_so(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The child continues, and ends with 1."""
     monkeypatch.setenv("PYTHONDONTWRITEBYTECODE", "1")  # Python would leave a truncated .pyc
     heard: list[LogLine] = []
     file = str(tmp_path / "netem")

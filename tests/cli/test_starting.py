@@ -74,7 +74,6 @@ def test_a_server_with_osqp_imports_it() -> None:
 
 
 def test_a_flight_in_virtual_time_draws_encrypts_and_compiles_nothing() -> None:
-    """rich prints the summary; all other heavy modules belong to other options."""
     modules = imported("fly", "demo", "--virtual", "--duration", "1")
     assert modules & HEAVY <= {"numba", "rich", "scipy"}
     assert modules & COMPILER == set()

@@ -153,7 +153,6 @@ def test_a_lossy_link_is_no_silence_on_the_ground() -> None:
 
 
 def test_an_autopilot_that_answers_timesync_no_more_is_told_once() -> None:
-    """The flight continues with the last known rate of the clock."""
     air = Air("px4", duration=60.0)
     air.fly()
     air.run(3.0)
@@ -227,7 +226,6 @@ def test_an_autopilot_that_restarts_on_the_ground_is_taken_from_its_new_address(
 
 
 def test_in_flight_another_address_is_not_taken_and_what_comes_from_it_is_told() -> None:
-    """Nor on a line with a fixed peer."""
     air = Air(duration=60.0, vehicle={"address": "udp:0.0.0.0:14540"})
     air.fly()
     air.tap.dumb = True

@@ -102,7 +102,6 @@ def test_a_rate_that_cannot_be_followed_is_known(rate: float) -> None:
 
 
 def test_answers_that_nobody_asked_for_count_for_nothing() -> None:
-    """Nor those that are duplicated, older than the question, or late."""
     clock, now_ns = timed(drift=0.0, delays=[(MS, MS)] * KNOWN)
     before = clock.local_ns(SECOND)
     assert not clock.hear(1, 12345, now_ns=now_ns)
@@ -148,7 +147,6 @@ def messages() -> st.SearchStrategy[bytes]:
 def test_any_bytes_raise_nothing_and_arm_nothing(
     datagrams: list[tuple[bytes, int]], autopilot: int
 ) -> None:
-    """Requests do not grow without bound either."""
     flies = vehicles.make(scenario(), 1)
     assert flies.port is not None
     codec, now_ns = Codec(1, 1), 10 * SECOND

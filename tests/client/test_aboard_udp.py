@@ -39,8 +39,6 @@ def figure_eight(autopilot: Address, **table: object) -> Scenario:
 
 
 class Processes:
-    """Autopilot, server, netem and client, with files in `folder`."""
-
     def __init__(self, folder: Path, flavour: FlavourName) -> None:
         self.folder, self.flavour = folder, flavour
         self.heard: list[LogLine] = []

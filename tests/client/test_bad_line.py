@@ -53,7 +53,6 @@ def test_a_line_that_reorders_needs_what_was_overtaken_dropped(
 
 @pytest.mark.long
 def test_a_bad_line_changes_little_for_minutes(flavour: FlavourName) -> None:
-    """`python tests/bad_line.py --minutes 60` flies for an hour."""
     compare(flavour, 2, 180.0)
 
 

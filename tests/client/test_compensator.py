@@ -18,7 +18,6 @@ quick = settings(max_examples=60)
 
 H = 10
 INPUTS = np.array([np.linspace(0.1, 1.0, H), np.linspace(-0.5, 0.5, H)])
-"""Inputs that differ at every stage."""
 HERE = np.zeros((2, 2))
 """State for tests without feedback, where it has no effect."""
 
@@ -48,7 +47,6 @@ def horizon(step: int, inputs: Array = INPUTS) -> Horizon:
 
 
 def holding(step: int, inputs: Array = INPUTS, **keys: str) -> Compensator:
-    """Compensator with one horizon."""
     compensator = Compensator(terms(**keys))
     compensator.offer(horizon(step, inputs), step + 1, step)
     return compensator

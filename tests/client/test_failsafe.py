@@ -50,7 +50,6 @@ from skytether.shared.wire.protocol import (
 STEPS_PER_S = 50
 H = 100
 D = 5
-"""Committed steps of the horizons."""
 SPEED = 1.0
 """Input of all horizons, along x [m/s]."""
 
@@ -98,7 +97,6 @@ class Hand(ByHand):
 
     @property
     def step(self) -> int:
-        """Newest step."""
         return self.said[-1].step
 
     def fly(self, seconds: float, *, beats: bool = True, plans: bool = False) -> None:
@@ -126,12 +124,10 @@ class Hand(ByHand):
 
     @property
     def speed(self) -> float:
-        """Magnitude of the reported input [m/s]."""
         return float(np.linalg.norm(self.said[-1].input))
 
     @property
     def changes(self) -> list[tuple[str, str]]:
-        """Reported modes, and their reasons."""
         self.events += self.client.events()
         told = [event for event in self.events if isinstance(event, ModeChanged)]
         return [(event.after, event.reason) for event in told]
@@ -156,7 +152,6 @@ def scenario(**sections: Any) -> Scenario:
 
 
 def tracking(**keys: Any) -> Hand:
-    """Vehicle that flies horizons."""
     hand = Hand(**keys)
     hand.fly(1.2)
     assert hand.takes
@@ -205,7 +200,6 @@ def test_a_vehicle_takes_a_horizon_after_a_second_of_good_link() -> None:
 
 
 def modes_of(hand: Hand) -> tuple[list[int], list[int]]:
-    """Modes and reasons of all steps of the record."""
     rows = hand.rows()
     return rows["mode"].tolist(), rows["reason"].tolist()
 
@@ -304,7 +298,6 @@ class Challenged(PlainLink):
         """Nothing for the session."""
 
     def outbox(self) -> list[bytes]:
-        """The answer, which carries the HELLO."""
         return [b"answer"]
 
 
@@ -498,7 +491,6 @@ def test_one_horizon_in_time_among_late_ones_is_enough() -> None:
 
 
 def test_a_restarted_server_s_horizons_wait_for_a_second_of_good_link() -> None:
-    """Plans of the server's earlier run are dropped."""
     hand = tracking()
     hand.session = 8
     hand.welcome(server_boot_id=2)
@@ -768,7 +760,6 @@ def test_the_last_clamp_keeps_braking_from_speeding_up_but_for_feedback(
 def test_no_mistake_of_the_compensator_reaches_the_plant(
     monkeypatch: pytest.MonkeyPatch, *, clamps: bool
 ) -> None:
-    """The compensator asks for 100 m/s on both axes; without the clamp that is flown."""
     hand = tracking(vehicle={"slew_mps2": 5.0})
     if not clamps:
         monkeypatch.setattr(skytether.client.pilot, "clamped", lambda wanted, *_, **__: wanted)

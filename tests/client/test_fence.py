@@ -91,7 +91,6 @@ def test_a_vehicle_that_is_slowed_is_not_said_to_be_held_by_its_fence() -> None:
 
 
 def test_a_vehicle_that_lands_is_not_said_to_be_held_by_its_fence() -> None:
-    """Wind pushes it there while it hovers without a link; the event is reported until it lands."""
     blown = packaged(
         "demo",
         duration=60.0,

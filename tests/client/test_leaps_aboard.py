@@ -25,7 +25,6 @@ def leapt() -> Air:
 
 
 def place(air: Air) -> Any:
-    """True position in the plane [m]."""
     return np.array(air.flight.position()[:2])
 
 
@@ -56,7 +55,6 @@ def test_without_a_choice_it_lands(*, armed: bool) -> None:
 
 
 def test_arming_again_is_no_choice() -> None:
-    """Arming is refused with a message; nothing is flown, and the vehicle lands."""
     air = leapt()
     air.change(armed=False)
     air.run(3.0)
@@ -106,7 +104,6 @@ def test_the_next_leap_asks_again() -> None:
 
 
 def test_nothing_is_chosen_before_a_leap() -> None:
-    """Neither in flight nor in a file, because the jump is not known yet."""
     air = Air("ardupilot")
     with pytest.raises(ConfigError, match=r"vehicle.after_leap: .*before its position has leapt"):
         air.change(vehicle__after_leap="old")

@@ -24,13 +24,11 @@ def away(flavour: FlavourName, **table: object) -> Air:
 
 
 def off_m(air: Air) -> float:
-    """Horizontal distance of the vehicle from the place where it was armed [m]."""
     x, y, _ = air.flight.position()
     return dist((x, y), (NORTH_M, EAST_M))
 
 
 def farthest_m(air: Air, seconds: float) -> float:
-    """Largest distance from that place over the next seconds [m]."""
     most = 0.0
     for _ in range(round(seconds / 0.5)):
         air.run(0.5)

@@ -49,7 +49,6 @@ async def until(so: Callable[[], object]) -> None:
 async def test_killed_in_flight_and_started_again_it_arms_nothing_before_a_person_says_so(
     tmp_path: Path,
 ) -> None:
-    """As under `Restart=always`: meanwhile the autopilot's own failsafe lands the vehicle."""
     told: list[str] = []
     anywhere = ("--bind", "127.0.0.1:0")
     socket = tmp_path / "client.sock"

@@ -32,9 +32,7 @@ from skytether.sim.flight import fly, fly_batch
 
 DT_NS = 50 * MILLISECOND_NS
 NOISE = {"position_noise_m": 0.02, "velocity_noise_mps": 0.05}
-"""Sensor noise of the scenario `target`."""
 POSITIONS = {"position_noise_m": 0.02, "position_every_s": 0.2, "velocity_every_s": "never"}
-"""Positions alone, at 5 Hz."""
 
 
 def scenario(name: str = "demo-committed", **changes: Any) -> Scenario:
@@ -53,7 +51,6 @@ def matrices(flown: Scenario) -> tuple[Array, Array, Array]:
 
 
 def square(P: aboard.Spread) -> Array:
-    """P as a matrix."""
     return np.array([[P.pp, P.pv, P.pw], [P.pv, P.vv, P.vw], [P.pw, P.vw, P.ww]])
 
 
@@ -199,7 +196,6 @@ class Plane(Vehicle):
 
 
 def test_a_vehicle_of_one_s_own_is_flown_by_what_it_tells() -> None:
-    """The true state is unknown; the record has the estimate, which stays between measurements."""
     flies = Plane(3)
     server = ByHand(scenario(), flies)
     server.wake()

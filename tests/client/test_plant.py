@@ -24,14 +24,10 @@ COMMANDS = np.random.default_rng(0).uniform(-1.8, 1.8, size=(50, 2))
 
 
 def scenario(**vehicle: object) -> Scenario:
-    """Two different axes and a circle of 1.5 m; the vehicle has default values except for the given
-    ones.
-    """
     return check({**FLIGHT, "vehicle": vehicle}, "test")
 
 
 def plant(seed: int = 0, **vehicle: object) -> FirstOrderPlant:
-    """Vehicle of `scenario`, with its own random generator."""
     flown = scenario(**vehicle)
     return FirstOrderPlant(flown, Weather(flown, np.random.default_rng(seed)))
 

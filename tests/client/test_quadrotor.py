@@ -193,7 +193,6 @@ def test_a_step_of_1_mps_is_as_documented(
 
 @pytest.mark.parametrize(("frame", "gains"), FLOWN)
 def test_a_hard_turn_costs_little_height_and_yaw_comes_back(frame: Frame, gains: Gains) -> None:
-    """To and fro at 3 m/s; thrust and torques saturate on the way."""
     flown_ = quadrotor(frame, gains)
     flown_._quad.x[6:10] = np.cos(0.5), 0.0, 0.0, np.sin(0.5)  # nose 57° to the east
     lowest = 5.0
@@ -245,7 +244,6 @@ def test_turbulence_moves_it_as_documented(
 
 @pytest.mark.parametrize(("frame", "gains"), FLOWN)
 def test_no_integral_grows_without_end(frame: Frame, gains: Gains) -> None:
-    """A minute in a storm that no tilt can resist."""
     flown_ = quadrotor(frame, gains)
     flown_.blow((60.0,), 0.0)
     response(flown_, (0.0, 0.0, 0.0), 60.0)
@@ -296,7 +294,6 @@ def test_turbulence_is_dryden_s(height_m: float) -> None:
 
 @kernel
 def mixed(frame: Frame, thrust: float, torque: F1, rotor_max: float, command: F1) -> None:
-    """Thrust and torques that `mix` produces."""
     mix(frame, thrust, torque, rotor_max, command)
 
 
@@ -351,7 +348,6 @@ def test_an_endless_battery_stays_full() -> None:
 
 
 def test_it_stands_on_the_ground_and_leaves_it() -> None:
-    """It does not sink in, and does not drift in the wind."""
     flown_ = Quadrotor(
         KG15, ARDUPILOT, np.random.default_rng(0), position=np.zeros(3), ground_m=0.0, hovers=False
     )

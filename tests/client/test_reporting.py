@@ -59,14 +59,12 @@ def test_what_is_no_report_is_refused(text: str, said: str) -> None:
 
 
 def reporter(text: str = "deviation(0.05)") -> tuple[Reporter, Compensator]:
-    """Reporter, and a compensator without a horizon."""
     terms = load("demo").terms()
     compensator = Compensator(terms)
     return Reporter(terms, text, compensator), compensator
 
 
 def horizon(step: int) -> Horizon:
-    """Horizon of zero inputs."""
     return Horizon(1, 1, step, 0, 0, np.zeros((2, 90), np.float32), np.zeros((2, 5), np.float32))
 
 
@@ -144,7 +142,6 @@ def ages(flight: Record) -> np.ndarray:
 
 
 def downs(flight: Record) -> int:
-    """Number of packets from the vehicle."""
     return int((flight.netem["direction"] == DOWNLINK).sum())
 
 
@@ -159,7 +156,6 @@ QUIET = {"vehicle.report": "deviation(0.05)", "link.timeout_s": 20.0, "link.hear
 
 
 def waited_s(flight: Record) -> float:
-    """Time until the vehicle flies a horizon [s]."""
     return float(flight.client["step"][flight.client["mode"] == Mode.TRACK][0]) * 0.05
 
 

@@ -26,24 +26,20 @@ def tracking(flavour: FlavourName = "ardupilot", **table: Any) -> Air:
 
 
 def velocity(target: int = 1) -> Message:
-    """Set-point of another commander."""
     return dialect.MAVLink_set_position_target_local_ned_message(
         1, target, 1, 1, 0b110111000111, 0, 0, 0, 3.0, 0, 0, 0, 0, 0, 0, 0
     )
 
 
 def sticks(x: int) -> Message:
-    """Stick input of a ground station, with one stick moved."""
     return dialect.MAVLink_manual_control_message(1, x, 0, 500, 0, 0)
 
 
 def channels(roll_us: int) -> Message:
-    """Channel override of a ground station."""
     return dialect.MAVLink_rc_channels_override_message(1, 1, roll_us, 1500, 0, 1500, 0, 0, 0, 0)
 
 
 def goto() -> Message:
-    """Command to fly to a place."""
     return dialect.MAVLink_command_long_message(1, 1, 192, 0, -1.0, 0, 0, 0, 0, 0, 0)
 
 
@@ -99,7 +95,6 @@ def unlike(flavour: FlavourName, slower: float, stronger: float) -> dict[str, An
 def test_neither_wind_nor_a_wrong_model_is_taken_for_a_commander(
     flavour: FlavourName, weather: str, wrong: tuple[float, float]
 ) -> None:
-    """Full speed from side to side, with the link cut for a while: no commander is reported."""
     air = Air(
         flavour,
         duration=60.0,

@@ -180,7 +180,6 @@ def heedless(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_each_kind_of_move_finds_a_planted_fault(
     kinds: str, first: int, ablation: Patch, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """With the safeguard switched on, the same moves do no harm."""
     flown = replaced(FOUR, duration=80.0) if "server" in kinds else FOUR
     named = tuple(map(MoveKind, kinds.split(",")))
     with monkeypatch.context() as without:
@@ -193,7 +192,6 @@ def test_each_kind_of_move_finds_a_planted_fault(
 def test_a_server_that_begins_anew_takes_no_zone_before_it_has_heard_all(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """A vehicle rests there that the server has not heard yet."""
     moves = (
         move(MoveKind.SERVER, 0, "", 20.0, 0.5),
         move(MoveKind.ZONES, 0, "", 22.0, 4.0, -4.0, 0.0, 0.5),
@@ -210,7 +208,6 @@ IN_THE_WAY = move(MoveKind.ZONES, 0, "", 5.0, 4.0, 0.0, 0.0, 1.0)
 
 
 def test_a_flight_comes_again_to_the_last_bit() -> None:
-    """Also from its line of JSON, with moves of all kinds."""
     moves = (
         DIES,
         move(MoveKind.DELAYS, 1, "uplink", 0.0, 30.0, 0.1, 0.7),
@@ -226,7 +223,6 @@ def test_a_flight_comes_again_to_the_last_bit() -> None:
 
 
 def test_the_fewest_moves_are_those_that_matter(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A vehicle flies into a zone; a cut and a goal without effect on that are left out."""
     heedless(monkeypatch)
     found = fly(FOUR, (DIES, IN_THE_WAY, move(MoveKind.GOALS, 2, "", 20.0, 3.0, 1.0, -3.0)))
     assert found.clear.distance_m < 0.0
@@ -258,7 +254,6 @@ SHORT = ("swap", "--reference.shape", "swap(4)", "--duration", "15")
 def test_the_command_prints_what_flies_it_again(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
-    """The line with the fewest moves, and the file with the nearest flight."""
     heedless(monkeypatch)
     monkeypatch.setattr(commands, "shrunk", lambda _, found: found)
     kept = tmp_path / "found.json"

@@ -81,12 +81,10 @@ def _results() -> dict[str, Any]:
 
 @pytest.fixture(scope="module")
 def saturated() -> RecordedProblems:
-    """Problems of a flight that often meets its bounds."""
     return record(solvers.flights()["saturated"], 1000)
 
 
 def test_the_tables_of_the_document_are_written(results: Mapping[str, Any], tmp_path: Path) -> None:
-    """Figures and pictures too; a section that is not run stays as it was."""
     file, document = tmp_path / "a.json", tmp_path / "b.md"
     document.write_text(DOCUMENT.read_text())
     write(results, file, document, tmp_path)
@@ -118,7 +116,6 @@ def test_the_flights_are_what_they_are_called(
 
 
 def test_a_fleet_that_is_listened_to_flies_the_same() -> None:
-    """Recording a fleet's problems does not change its flight."""
     scenario, count = tick.mixes()["half"], BLOCK + 2
     fleet = PlannedFleet(scenario, count)
     with listening() as listeners:
@@ -170,7 +167,6 @@ def test_what_is_not_installed_does_not_compete() -> None:
 def test_the_reference_is_the_same_whoever_finds_it(
     monkeypatch: pytest.MonkeyPatch, saturated: RecordedProblems
 ) -> None:
-    """quadprog and scipy find the same optimum."""
     reference = Reference(saturated.problem.hessian[0], saturated.problem.mpc.bounds[0])
     gradients = saturated.gradient[0, ::50, 0]
     by_quadprog = [reference.solve(gradient) for gradient in gradients]
@@ -200,7 +196,6 @@ def test_a_checkout_is_compared_with_itself(
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    """Both processes do the same work, and every contest and mix has a row in the table."""
     tiny = versions.VersionsCounts(1, 1, (2,), 1, 3, 1, 1, 0.5)
     monkeypatch.setattr(versions, "QUICK", tiny)
     monkeypatch.setattr(tick, "tune", lambda *_: {})

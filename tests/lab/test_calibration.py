@@ -77,7 +77,6 @@ def test_what_cannot_be_searched_for_is_refused(free: Free, said: str) -> None:
 
 
 def off_by(share: float) -> Values:
-    """The paper's Table 1 with every entry larger by a share."""
     return {
         column: {name: value * (1.0 + share) for name, value in entries.items()}
         for column, entries in TABLE_1.items()
@@ -85,7 +84,6 @@ def off_by(share: float) -> Values:
 
 
 def test_the_score_is_the_squares_of_the_deviations_and_punishes_those_out_of_tolerance() -> None:
-    """Ten entries; the event ratio has twice the tolerance."""
     assert Table1().score(TABLE_1) == 0.0
     assert Table1().score(off_by(0.05)) == pytest.approx(10 * 0.05**2)
     assert Table1().score(off_by(0.15)) == pytest.approx((9 * 10 + 1) * 0.15**2)
@@ -125,7 +123,6 @@ def test_the_smallest_error_may_not_be_bought_with_packets() -> None:
 
 
 def test_the_smallest_error_may_not_be_bought_with_effort() -> None:
-    """Nor with inputs at their bounds; without a limit both are free."""
     limited = Rmse(weighs("always").scenario, SearchLimits(effort_mps=0.3, saturated=0.1))
     assert limited.score(flew(0.2, 1.0, 1.0, effort_mps=0.3, saturated=0.1)) == 0.2
     assert limited.score(flew(0.2, 1.0, 1.0, effort_mps=0.33)) == pytest.approx(0.2 * 1.1**3)
@@ -187,7 +184,6 @@ def test_a_point_is_its_flights_with_an_upper_end_of_what_they_send() -> None:
 
 
 def test_a_search_begins_where_it_was_told_to() -> None:
-    """The first point is the scenario itself; all keep within their bounds."""
     search = Optimiser(PAPER, [RADIUS, LAG], population=5, sigma=0.3, seed=1)
     first, *others = search.ask()
     assert search.values(first) == pytest.approx(search.values(PAPER), rel=1e-3)
@@ -197,7 +193,6 @@ def test_a_search_begins_where_it_was_told_to() -> None:
 
 
 def test_a_search_told_the_same_proposes_the_same() -> None:
-    """So a journal of the scores can replace the flights."""
     searches = [Optimiser(PAPER, [RADIUS, LAG], population=5, sigma=0.3, seed=1) for _ in range(2)]
     proposed = []
     for search in searches:
@@ -255,7 +250,6 @@ def test_a_search_goes_on_from_its_journal_though_a_line_was_cut(
 def test_the_smallest_error_is_searched_for_and_shown(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The first point is the scenario; the best is no worse."""
     argv = ["calibrate", "paper", "--objective", "rmse", "--packets", "0.3", *SHORT]
     assert main([*argv, "--generations", "2", "--out", str(tmp_path)]) == 0
     settings = tomllib.loads((tmp_path / "settings.toml").read_text())

@@ -80,13 +80,11 @@ def test_contenders_differ_in_scheme_and_trigger_alone_and_cases_in_what_is_met(
 
 
 def test_the_search_never_sees_the_seeds_that_are_compared() -> None:
-    """For any number of runs up to a thousand."""
     start = contenders.search_start(CONTENDERS[0], TARGET, SCALE)
     assert not set(range(start.seed, start.seed + SCALE.search_runs)) & set(range(1, 1001))
 
 
 def test_every_case_has_weights_that_were_searched_for_or_those_of_one_that_has() -> None:
-    """Contenders of a case exist, and those with another case's weights fly that case too."""
     for case in CASES:
         assert set(case.contenders) <= BY_NAME.keys()
         base = BY_CASE[case.weights or case.name]
@@ -122,7 +120,6 @@ def test_every_contender_in_every_case_comes_along() -> None:
 
 
 def test_the_file_of_what_was_found_is_read_as_it(tmp_path: Path) -> None:
-    """The file has the keys that differ from the plant, and how they were found."""
     contender, case = BY_NAME["committed-gap"], BY_CASE["gusts"]
     start = contenders.search_start(contender, case, SCALE)
     control = replace(start.control, state_weight=(7.1, 1e-4), trigger="cost_gap(12.5)")
@@ -142,9 +139,6 @@ def test_the_file_of_what_was_found_is_read_as_it(tmp_path: Path) -> None:
 
 
 def thresholds(contender: Contender, scenario: Scenario) -> dict[float | None, bool]:
-    """Thresholds at which a contender flies, each with every reporting policy, and whether
-    tuned.
-    """
     points = budgets.flying(contender, BY_CASE["gusts"], scenario, SCALE)
     found = {point.threshold: point.tuned for point in points}
     assert [(point.threshold, point.report) for point in points] == [
@@ -169,7 +163,6 @@ def test_a_curve_goes_through_what_was_found_and_rises() -> None:
 
 
 def test_where_nobody_has_searched_the_weights_of_another_case_meet_what_is_met_there() -> None:
-    """The network is the case's own."""
     contender, case = BY_NAME["committed-gap"], BY_CASE["loss-0.5"]
     tuned = contenders.search_start(contender, TARGET, SCALE)
     lossy = "paper(0.4, 0.02, 2.0) & loss(0.2)"
@@ -196,15 +189,12 @@ def scout(
     points: Sequence[FlownContender],
     flies: Callable[[FlownContender], dict[str, float | None]],
 ) -> None:
-    """Scouting flights whose results `flies` returns for each point."""
     runs = [(replace(SUMMARY, **{**SPENT, **flies(point)}),) for point in points]
     done = {(cell, 0): run for cell, run in enumerate(runs)}
     plan.scouted(points, plan.scouts(points), done)
 
 
 def test_within_a_budget_the_nearest_is_chosen() -> None:
-    """Within the budget of packets and the effort limit of the case."""
-
     def chosen(*flown: dict[str, float | None]) -> list[int | None]:
         """Number of the chosen point within each budget, if the first points have these results."""
         plan = planned("committed-gap", every=3)
@@ -258,7 +248,6 @@ def test_thresholds_are_tried_until_each_budget_is_almost_used_up(name: str) -> 
 
 
 def test_nothing_is_tried_where_it_cannot_be_better() -> None:
-    """Neither beyond a worse point, nor between thresholds that are close together."""
     plan = planned("committed-gap")
     scout(plan, plan.points, lambda point: {"packets_per_s": 6.0 / (point.threshold or 1.0)})
     assert not plan.halfway()
@@ -278,14 +267,12 @@ def flew(
     packets_per_s: float = 2.0,
     bytes_per_s: float = 1000.0,
 ) -> ContenderRuns:
-    """Runs of a contender with these errors, packets and bytes."""
     spent = {"packets_per_s": packets_per_s, "bytes_per_s": bytes_per_s}
     runs = [replace(SUMMARY, rmse_xy=error, **spent) for error in errors]
     return ContenderRuns(FlownContender(BY_NAME[name], packets_per_s, "every step", True, {}), runs)
 
 
 def test_what_has_not_flown_counts_in_nothing() -> None:
-    """Neither in the mean error nor in packets and bytes."""
     one = flew("paper-event", [0.1, None, 0.3])
     assert one.estimate("rmse_xy")[0] == pytest.approx(0.2)
     assert len(one.values("packets_per_s")) == 2
@@ -300,7 +287,6 @@ ERRORS = st.lists(st.tuples(st.floats(0.01, 10.0), st.floats(0.01, 10.0)), min_s
 def test_a_ratio_lies_in_its_interval_and_goes_with_what_is_compared(
     errors: list[tuple[float, float]], factor: float
 ) -> None:
-    """Ratio of the means; twice the error doubles the ratio and its interval."""
     ours, theirs = zip(*errors, strict=True)
     found = ratio(flew("paper-event", ours), flew("paper-periodic", theirs))
     more = ratio(flew("paper-event", np.multiply(ours, factor)), flew("paper-periodic", theirs))
@@ -335,7 +321,6 @@ def test_a_jackknife_is_an_interval_of_students_where_both_apply() -> None:
 
 
 def test_seeds_that_did_not_fly_in_both_are_left_out() -> None:
-    """Fewer than two common seeds give no ratio."""
     ours, theirs = flew("paper-event", [1.0, None, 3.0]), flew("paper-periodic", [2.0, 2.0, 2.0])
     found = ratio(ours, theirs)
     assert found is not None
@@ -347,7 +332,6 @@ CLAIM = Claim("committed-gap", "paper-periodic", 0.25, {"target": 0.9})
 
 
 def within(case: Case, *points: tuple[float, ContenderRuns]) -> ComparedCase:
-    """Case with these runs within these budgets."""
     bought = {(runs.what.contender.name, budget): runs for budget, runs in points}
     return ComparedCase(case, bought)
 
@@ -379,7 +363,6 @@ def test_ours_is_judged_with_the_most_that_it_may_spend() -> None:
 
 
 def test_a_claim_holds_with_all_of_its_interval_or_not_at_all() -> None:
-    """A claim without a limit neither holds nor fails."""
     wide = (2.0, flew("committed-gap", [0.1, 0.1, 1.9], packets_per_s=1.5))
     judged = judge(CLAIM, within(TARGET, *THEIRS, wide))
     assert judged is not None
@@ -439,7 +422,6 @@ def test_a_contender_that_cannot_be_told_from_the_best_is_marked_as_well() -> No
 
 
 def test_what_is_claimed_is_what_was_asked_for() -> None:
-    """Every claim is about contenders and cases that exist."""
     for claim in CLAIMS:
         assert {claim.ours, claim.theirs} <= BY_NAME.keys()
         assert set(claim.at_most) <= BY_CASE.keys()
@@ -470,7 +452,6 @@ def fewer() -> Iterator[None]:
 
 @pytest.fixture(scope="module")
 def tuned(fewer: None, tmp_path_factory: pytest.TempPathFactory) -> Path:  # noqa: ARG001
-    """Folder of quick searches, with the file of weights."""
     folder = tmp_path_factory.mktemp("tuned")
     assert main([*TUNE, "--out", str(folder)]) == 0
     return folder
@@ -478,7 +459,6 @@ def tuned(fewer: None, tmp_path_factory: pytest.TempPathFactory) -> Path:  # noq
 
 @pytest.fixture(scope="module")
 def out(tuned: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Folder of a quick comparison."""
     folder = tmp_path_factory.mktemp("compare")
     weights = str(tuned / "weights.toml")
     assert main(["compare", "--quick", "--weights", weights, "--out", str(folder)]) == 0
@@ -486,7 +466,6 @@ def out(tuned: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_every_contender_gets_the_same_search(tuned: Path) -> None:
-    """Seeds, points, flights and limits are equal."""
     weights, searches = tuned / "weights.toml", list((tuned / "searches").iterdir())
     assert len(searches) == len(reading.names(str(weights))) == len(QUICK)
     for folder in searches:
@@ -508,7 +487,6 @@ def test_every_contender_gets_the_same_search(tuned: Path) -> None:
 def test_searches_that_are_done_are_not_done_again(
     tuned: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A repeated command reads their journals, and writes the same file."""
     kept = {path: path.read_bytes() for path in tuned.rglob("*") if path.is_file()}
     monkeypatch.setattr(pool.Crew, "share", None)
     assert main([*TUNE, "--out", str(tuned)]) == 0
@@ -542,7 +520,6 @@ def test_the_tables_are_what_each_contender_flew(out: Path, tuned: Path) -> None
 
 
 def test_the_curves_are_there_as_numbers_and_pictures(out: Path) -> None:
-    """A row for each budget of each contender, with PNG and PDF."""
     assert (out / "trade-target.png").read_bytes().startswith(b"\x89PNG")
     assert (out / "trade-target.pdf").read_bytes().startswith(b"%PDF")
     points = rows(out / "trade-target.csv")
@@ -559,7 +536,6 @@ def test_the_curves_are_there_as_numbers_and_pictures(out: Path) -> None:
 def test_where_the_reference_is_known_it_is_flown_without_packets(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """At the weights of trajectories; no contender with packets has a smaller error."""
     known = [BY_NAME[name] for name in ("paper-every-step", BESIDE, REGULATED)]
     monkeypatch.setattr(contenders, "CONTENDERS", known)
     argv = ["compare", "--quick", "--cases", "wind-0.3", "--out", str(tmp_path)]
@@ -591,7 +567,6 @@ def test_the_second_time_it_only_draws(
 def test_other_weights_are_another_comparison(
     out: Path, tuned: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Flights with earlier weights are not mixed with those of new ones."""
     file = tmp_path / "mine.toml"
     weights = (tuned / "weights.toml").read_text()
     file.write_text(weights.replace("input_weight = ", "input_weight = 77", 1))
@@ -622,7 +597,6 @@ def test_weights_that_nobody_has_searched_for_are_refused(
 def test_ctrl_c_ends_a_search_in_order_and_the_same_command_goes_on(
     tuned: Path, tmp_path: Path
 ) -> None:
-    """Finished points stay in the journal."""
     argv = [*TUNE[:3], "--generations", "2", "--workers", "1", "--out", str(tmp_path)]
     journal = tmp_path / "searches" / "paper-every-step-target" / "journal.jsonl"
     with subprocess.Popen(

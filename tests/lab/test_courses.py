@@ -159,7 +159,6 @@ def demo(scheme: str, duration_s: float, seed: int) -> Scenario:
 
 @pytest.mark.parametrize("scheme", ["trajectory", "committed"])
 def test_what_is_flown_follows_from_what_the_server_keeps(scheme: str) -> None:
-    """To the last bit."""
     steps, differ = flown_mismatches(demo(scheme, 30.0, 1))
     assert steps > 400
     assert differ == 0

@@ -64,7 +64,6 @@ def test_what_is_no_flying(keys: dict[str, Any]) -> None:
 
 
 def test_a_flight_is_judged_by_its_record() -> None:
-    """The error of all vehicles, braking after settling, and early ends."""
     scenario = reading.load("crowd")
     scenario = msgspec.structs.replace(scenario, duration=6.0, settle=3.0)
     record = fly(scenario, vehicles=3)
@@ -112,7 +111,6 @@ def test_schemes_share_the_network_and_the_target() -> None:
 def test_it_writes_a_table_and_a_picture_and_goes_on(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """A second run keeps the flights of the first and adds other numbers of vehicles."""
     argv = ("crowd", "--out", str(tmp_path / "c"), "--schemes", "threshold", "budget", *FAST)
     assert main([*argv, "--limit", "5", "--vehicles", "1", "2"]) == 0
     said = capsys.readouterr().out

@@ -81,7 +81,6 @@ def test_a_point_is_the_same_whatever_else_is_flown() -> None:
 
 
 def test_the_command_line_of_a_point_flies_that_point() -> None:
-    """With all its keys, and those changed by the user, but not the scenario's own."""
     plan = Envelope(
         "demo-committed", demo_with(duration=12.0, vehicle__steady_wind_mps=[0.1, -0.2])
     )
@@ -130,7 +129,6 @@ def chase(step: int, state: Array) -> Array:
 
 
 def ramp(speed_mps: float, since_s: float, brake: float = BRAKE) -> Array:
-    """Command along x that brakes."""
     return np.array([max(0.0, speed_mps - brake * since_s), 0.0])
 
 
@@ -273,7 +271,6 @@ def test_feedback_may_lead_back_after_a_horizon_s_end(
 def test_a_vehicle_that_moves_though_its_command_is_none_is_a_flyaway(
     moves_mps: float, has_mps: float, said: str
 ) -> None:
-    """Detected by its position, or by its speed."""
     state = PATH.copy()
     state[400:, :, 0] = PATH[400, :, 0] + moves_mps * (TIME_S[400:, None] - 20.0) * [1.0, 0.0]
     state[400:, :, 1] = [has_mps, 0.0]
@@ -313,7 +310,6 @@ def test_a_growing_swing_under_plans_is_a_flyaway() -> None:
 
 
 def test_a_state_that_is_no_number_is_a_flyaway() -> None:
-    """A comparison with NaN would be false."""
     rows = record(PATH, PATH[..., 1], YES)
     rows["state"][-1, 0, 0] = np.nan
     verdict = judge(SCENARIO, rows)
@@ -322,7 +318,6 @@ def test_a_state_that_is_no_number_is_a_flyaway() -> None:
 
 
 def test_wind_may_carry_a_vehicle_that_brakes() -> None:
-    """By as much as the wind can cause, and no more."""
     windy = demo_with(duration=40.0, vehicle__steady_wind_mps=[0.1, 0.0], vehicle__wind=0.0)
     state = np.zeros((STEPS, 2, 2))
     state[:, 0, 0], state[:, 0, 1] = 0.1 * TIME_S, 0.1
@@ -412,7 +407,6 @@ def test_a_point_that_raises_has_crashed(monkeypatch: pytest.MonkeyPatch) -> Non
 
 
 def test_the_worst_come_first() -> None:
-    """Crashes, then flyaways by distance, then astray flights by error."""
     points = [
         EnvelopePoint("astray", 1.2),
         EnvelopePoint("flyaway", None, 0.0, 3.0),
@@ -433,7 +427,6 @@ SHORT = ["envelope", "demo-committed", "--duration", "4", "--settle", "0", "--wo
 def test_more_points_go_on_where_fewer_ended(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The table of all points is the same as from a single run, and the picture is drawn."""
     once, twice = tmp_path / "once", tmp_path / "twice"
     main([*SHORT, "--points", "8", "--out", str(once)])
     main([*SHORT, "--points", "3", "--out", str(twice)])
@@ -456,9 +449,6 @@ def test_more_points_go_on_where_fewer_ended(
 def test_a_flyaway_ends_the_command_with_one_and_a_command_line(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The command line flies that point again; astray points are printed too, and are no
-    failure.
-    """
     plan = Envelope("demo-committed", demo_with(duration=4.0, settle=0.0))
     lost = EnvelopePoint("flyaway", None, 0.0, 42.0, "at 1.50 s it is commanded 1.60 m/s")
     with closing(StudyJournal(tmp_path, plan.settings(), EnvelopePoint)) as journal:
@@ -497,7 +487,6 @@ def test_an_impossible_envelope_is_refused(
 
 
 def test_points_with_trajectories_are_flown_with_feedback() -> None:
-    """At points where committed inputs are drawn with and without feedback."""
     along = demo_with(
         control__scheme="trajectory", control__trigger="expected_gap(0.05) | silence(1)"
     )

@@ -42,7 +42,6 @@ COMMANDED_S = 1.6
 
 
 def flown(case: CaseName, flavour: FlavourName) -> FaultOutcome:
-    """A flight with a fault, with the checks that hold for all faults."""
     outcome = failsafe.fly(case, flavour, 1)
     names, (least_s, most_s), ending = STARTS[case]
     assert [name for name, _ in outcome.modes] == names
@@ -84,12 +83,10 @@ def test_a_client_that_is_killed_leaves_it_to_the_autopilots_time_out(
 @pytest.mark.parametrize("flavour", BOTH)
 @pytest.mark.parametrize("case", STARTS)
 def test_each_fault_ends_as_promised(case: CaseName, flavour: FlavourName) -> None:
-    """Modes, times and the end, for both flavours."""
     flown(case, flavour)
 
 
 def test_a_row_has_the_spread_of_its_flights() -> None:
-    """Times from least to most, largest distances, and both courses if flights differ."""
     common = {"autopilot": (), "moved_m": 1.0, "off_path_m": 0.1, "off_reference_m": 2.0}
     outcomes = [
         FaultOutcome(

@@ -32,7 +32,6 @@ def test_the_same_seed_draws_the_same_schedule() -> None:
 
 
 def test_every_kind_is_drawn_everywhere_within_its_range() -> None:
-    """At each place, and with each sign if signed."""
     faults = [fault for drawn in DRAWN for fault in drawn]
     assert set(RANGES) == set(FaultKind)
     places = {(kind, where) for kind in FaultKind for where in RANGES[kind].where}
@@ -102,7 +101,6 @@ def test_a_schedule_shrinks_to_the_faults_that_matter(seed: int, data: st.DataOb
 
 
 def test_what_fails_whatever_happens_shrinks_to_nothing() -> None:
-    """A flight that fails without faults needs none."""
     assert shrink(DRAWN[0], lambda _: True) == ()
 
 

@@ -146,7 +146,6 @@ def test_statistics_are_of_all_seeds() -> None:
 def test_the_command_says_what_has_moved_and_corrects_it_on_request(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The second run uses the stored flights of the first."""
     (tmp_path / "figures.toml").write_text(
         """[demo]
 page = "page.md"

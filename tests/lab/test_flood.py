@@ -27,8 +27,6 @@ linux = pytest.mark.skipif(sys.platform != "linux", reason="the filter is one of
 
 
 class Linked(NamedTuple):
-    """A vehicle's link with a server, and packets of the vehicle."""
-
     gate: SecureGate
     ends: Ends
     observation: bytes

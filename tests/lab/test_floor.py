@@ -18,7 +18,6 @@ from skytether.sim.flight import fly
 
 
 def aged(flown: Scenario, age_steps: int, plan_steps: int) -> Rows:
-    """Record of a flight, all of whose inputs have the same age."""
     rows = np.zeros(flown.steps, client_columns(flown.model.axes))
     rows["step"] = np.arange(flown.steps)
     rows["age_ns"] = age_steps * flown.dt_ns
@@ -106,6 +105,5 @@ def test_a_vehicle_with_its_reference_aboard_measures_itself_with_noise() -> Non
 
 
 def test_what_only_the_server_knows_is_not_aboard() -> None:
-    """A target cannot be flown without a network."""
     with pytest.raises(ValueError, match="'target'"):
         fly_aboard(packaged("target"))

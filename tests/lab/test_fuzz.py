@@ -38,7 +38,6 @@ COUNTS = {
     "page": 300,
     "log": 5_000,
 }
-"""Number of inputs for each target in tests; `make fuzz` uses more."""
 BY_AXES = pytest.mark.parametrize("scenario", SCENARIOS, ids=["2-D", "3-D", "splines"])
 
 
@@ -50,7 +49,6 @@ def attack(target: Target, count: int) -> None:
 
 @pytest.mark.parametrize("name", TARGETS)
 def test_hostile_inputs_break_no_promise(name: str, tmp_path: Path) -> None:
-    """Corpus, seeds of the target, and their mutations."""
     target = TARGETS[name](tmp_path)
     for payload in (*corpus().values(), *target.seeds()[:30], b""):
         target(payload)
@@ -58,7 +56,6 @@ def test_hostile_inputs_break_no_promise(name: str, tmp_path: Path) -> None:
 
 
 def test_functions_of_a_module_are_its_own_and_those_of_its_classes() -> None:
-    """Without imported functions."""
     names = {each.__qualname__ for each in functions(feed)}
     assert names == {
         "pack",
@@ -93,7 +90,6 @@ def test_a_flight_goes_on_whatever_is_said_to_both_ends(scenario: Scenario) -> N
 
 
 def test_strangers_are_kept_out_at_every_place() -> None:
-    """Strangers' packets are dropped for every possible reason, and the flight continues."""
     strangers = Strangers()
     attack(strangers, 3_000)
     at_server, at_newcomer = strangers.server.dropped, strangers.newcomer.dropped
@@ -172,13 +168,10 @@ def test_figures_without_a_value_are_those_that_were_sent(tmp_path: Path) -> Non
 
 
 class Fussy(Decoder):
-    """Target that fails for some inputs."""
-
     def __init__(self, _: Path, fussy: int = 250) -> None:
         self._fussy = fussy
 
     def __call__(self, payload: bytes) -> None:
-        """Fail if the first byte is large."""
         if payload and payload[0] > self._fussy:
             raise ZeroDivisionError
 

@@ -113,7 +113,6 @@ def test_intervals_hold_the_truth_as_often_as_they_say() -> None:
 
 
 def second_order(damping: float) -> list[StepResponse]:
-    """Steps of a second-order vehicle."""
     made = []
     for response in answered(Numbers(1.0, 0.3, 0.1), np.random.default_rng(1)):
         w, t = 3.0 * math.sqrt(1.0 - damping**2), np.maximum(response.times, 0.0)
@@ -205,7 +204,6 @@ def fits(endpoint: Identifying) -> list[Fit | None]:
 
 
 def test_a_simulated_vehicle_is_found_out() -> None:
-    """To the last digit, because the vehicle is of first order with dead time."""
     truth = {"gain": [1.1, 0.9], "tau_s": [0.5, 0.3], "dead_time_s": [0.27, 0.0]}
     endpoint, _ = flown(scenario(vehicle=CALM | truth))
     assert endpoint.why == ""
@@ -217,7 +215,6 @@ def test_a_simulated_vehicle_is_found_out() -> None:
 
 
 def test_a_vehicle_comes_back_to_where_it_began() -> None:
-    """It stays within the planned distance, and ends at home."""
     endpoint, _ = flown(scenario(vehicle=CALM | {"start_m": [3.0, -2.0]}))
     path = np.array([each.position for each in endpoint.measured]) - (3.0, -2.0)
     plan = endpoint.experiment.plan
@@ -227,7 +224,6 @@ def test_a_vehicle_comes_back_to_where_it_began() -> None:
 
 @pytest.mark.parametrize("seed", range(12))
 def test_an_experiment_stays_inside_the_fence(seed: int) -> None:
-    """For any vehicle, with steps that fit the fence or do not."""
     rng = np.random.default_rng(seed)
     low, high = -rng.uniform(2.5, 7.0, 2), rng.uniform(2.5, 7.0, 2)
     truth = {
@@ -358,7 +354,6 @@ def test_what_hinders_a_vehicle_ends_its_flight_at_once(why: Reason) -> None:
 
 
 def test_a_vehicle_whose_state_is_unknown_is_not_flown() -> None:
-    """It lands after a second."""
     cart = Cart(blind=True)
     endpoint, world = flown(scenario(), flies=cart)
     assert endpoint.why == str(Reason.NOT_FINITE)
@@ -367,7 +362,6 @@ def test_a_vehicle_whose_state_is_unknown_is_not_flown() -> None:
 
 
 def test_a_flight_that_is_broken_off_closes_the_line() -> None:
-    """Closing lets the vehicle land; the measurements are kept."""
     cart = Cart()
     asked = scenario()
     plan = ExperimentPlan((0.5, 0.5), 3.0, 1)
@@ -427,9 +421,6 @@ def test_the_documented_field_flies_at_once_with_the_model_identified(
 
 @pytest.mark.parametrize("flavour", ["ardupilot", "px4"])
 def test_an_autopilot_is_identified(flavour: Any) -> None:
-    """Over MAVLink, with different clocks of client and autopilot; the vehicle has landed at the
-    end.
-    """
     asked = scenario(
         model={"u_max": [3.0]},
         reference={"radius_m": 5.0},
@@ -451,7 +442,6 @@ def test_an_autopilot_is_identified(flavour: Any) -> None:
 def test_what_is_identified_flies_at_once(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """With a smaller error than before, and with the keys of the command line."""
     monkeypatch.chdir(tmp_path)
     changed = ["--vehicle.tau-s", "0.4", "--vehicle.dead-time-s", "0.2", "--vehicle.gain", "0.8"]
     changed += ["--duration", "20", "--vehicle.wind", "0", "--repeats", "1"]

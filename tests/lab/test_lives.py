@@ -10,7 +10,6 @@ CENTRE = zones.parse(BOX, 2)
 
 
 def swap() -> Scenario:
-    """Four vehicles that swap places across the centre."""
     table = reading.to_table(reading.load("swap"))
     table |= {"duration": 50.0, "seed": 3}
     table["link"]["timeout_s"] = 9.0  # a restarted server is detected by its silence

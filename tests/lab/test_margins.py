@@ -107,7 +107,6 @@ def test_noise_does_not_hide_how_a_push_decays() -> None:
 
 
 def test_a_vehicle_that_is_not_reached_is_not_stable() -> None:
-    """No plan arrives, so nothing brings it back."""
     silent = demo_with(network__uplink="loss(1)", link__connect_s=5.0)
     assert growth_of(silent, "always", 1) == (np.inf, None)
 
@@ -171,7 +170,6 @@ def test_along_trajectories_the_worst_corner_asks_for_a_fifth_more(
 
 
 def at(name: str, scenario: Scenario, **box: tuple[float, ...]) -> Box:
-    """Box with a single value for each quantity except the given ones."""
     axes = {"tau": (1.0,), "gain": (1.0,), "dead_time_s": (0.0,), "burst_s": (0.0,)}
     return Box(name, scenario, "periodic(12)", **axes | box)
 
@@ -196,7 +194,6 @@ def test_a_loop_that_is_not_stable_ends_in_a_limit_cycle(monkeypatch: pytest.Mon
 
 
 def test_a_swing_that_dies_away_is_no_limit_cycle() -> None:
-    """The last quarter of a flight is compared with the one before."""
     scenario = maps.at_rest(demo_with())
     rows: Rows = np.zeros(400, client_columns(2))
     rows["step"] = np.arange(400)
@@ -211,7 +208,6 @@ def test_a_swing_that_dies_away_is_no_limit_cycle() -> None:
 
 
 def test_a_place_of_the_box_differs_as_it_says() -> None:
-    """Without wind, with bursts both ways; the time constant varies fastest."""
     box = at("demo", demo_with(), tau=(0.5, 2.0), gain=(0.7,), dead_time_s=(0.1,), burst_s=(2.0,))
     assert [place.tau for place in box.places] == [0.5, 2.0]
     scenario = box.scenario_of(1)
@@ -229,7 +225,6 @@ def test_a_place_of_the_box_differs_as_it_says() -> None:
 def test_the_command_says_which_vehicles_are_stable(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """A row for each vehicle, limits, the figures as JSON, and a map on request."""
     for table, few in (
         ("VEHICLES", ("half as quick", "dead time 0.3 s more")),
         ("LIMITS", ("dead time, more [s]", "delay each way, more [s]")),
@@ -258,7 +253,6 @@ def test_the_command_says_which_vehicles_are_stable(
 def test_an_empty_box_is_refused_in_a_line(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """A value that no vehicle can have is refused as in a scenario."""
     argv = ["margins", "demo", "--maps", str(tmp_path / "maps"), "--gain", "0", "1"]
     assert main(argv) == 2
     assert "vehicle.gain[0]: got 0.0" in capsys.readouterr().err

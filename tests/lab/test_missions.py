@@ -16,7 +16,6 @@ from skytether.shared.base.errors import ConfigError
 
 
 def test_a_mission_is_drawn_from_its_seed(tmp_path: Path) -> None:
-    """Also harsh ones, with cut links."""
     drawn = missions.random_mission(RandomOptions(), 5, tmp_path)
     again = missions.random_mission(RandomOptions(harsh=True), 5, tmp_path)
     assert again.mission == drawn.mission
@@ -56,7 +55,6 @@ def test_a_vehicle_in_a_pocket_of_others_is_let_out(monkeypatch: pytest.MonkeyPa
 
 
 def test_what_is_kept_is_not_flown_again(tmp_path: Path) -> None:
-    """A repeated command continues, with more flights if asked."""
     out, one = tmp_path / "flights", Flags(1)
     assert study(math.sqrt, [4.0, 9.0], float, {"seed": 1}, out, one) == [2.0, 3.0]
     # Another function shows which cells are flown now.

@@ -60,7 +60,6 @@ TABLES = {"table1", "traffic", "real"}
 
 
 def test_the_methods_are_the_papers_scenarios() -> None:
-    """Except for their titles."""
     plan = Sweep("paper", PAPER, [studies.METHODS], 1)
     for name, method in (
         ("paper-no-compensation", NONE),
@@ -89,7 +88,6 @@ def test_periodic_sends_at_the_nearest_rate(ratio: float, steps: int) -> None:
 
 
 def test_the_baseline_has_at_each_value_the_rate_that_the_trigger_had_there() -> None:
-    """All other keys of the value are kept."""
     axis = GridAxis(
         "loss", (0.0, 0.5), ({"network.uplink.loss": 0.0}, {"network.uplink.loss": 0.5})
     )
@@ -121,7 +119,6 @@ def columns() -> Mapping[str, MethodFlights]:
 
 
 def test_a_deviation_is_what_ours_is_more_than_the_papers() -> None:
-    """Relative; None where the paper has no entry."""
     entries = {(entry.column, entry.entry): entry for entry in studies.table_1(columns())}
     assert len(entries) == 16
     entry = entries[EVENT, "rmse_xy"]
@@ -133,7 +130,6 @@ def test_a_deviation_is_what_ours_is_more_than_the_papers() -> None:
 
 
 def test_the_report_says_who_wins_from_the_numbers() -> None:
-    """The trigger has twice the error here, and half of it when swapped."""
     worse = columns()
     better = {**worse, EVENT: MethodFlights(runs(0.1, rmse=0.25))}
     said = [
@@ -171,7 +167,6 @@ def test_a_curve_is_won_only_where_intervals_are_apart() -> None:
 
 @pytest.fixture(scope="module")
 def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Folder of a quick reproduction, by the documented command."""
     folder = tmp_path_factory.mktemp("reproduce")
     command = [sys.executable, "-P", "-m", "skytether", *shlex.split(LINE)[1:]]
     run = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
@@ -181,8 +176,6 @@ def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 class Page(HTMLParser):
-    """Content of the page: ids, addresses, and the cells of each table."""
-
     def __init__(self, text: str) -> None:
         super().__init__()
         self.open: list[str] = []
@@ -227,7 +220,6 @@ def test_every_figure_is_there_three_times_and_in_a_size_to_look_at(out: Path) -
 
 
 def test_the_page_opens_offline_and_shows_all(out: Path) -> None:
-    """Tags are closed in order, and every address is a picture within the page."""
     text = (out / "report.html").read_text()
     page = Page(text)
     assert page.open == []
@@ -269,7 +261,6 @@ def test_packets_really_took_what_was_drawn(out: Path) -> None:
 def test_the_second_time_it_only_draws(
     out: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Nothing is flown, and only the times in the report differ."""
     kept = {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
     monkeypatch.chdir(out.parent)
     assert main(shlex.split(LINE)[1:]) == 0

@@ -23,7 +23,6 @@ pytestmark = pytest.mark.long
 DT_S = 0.05
 TAU_S = 0.84
 GONE = ProcessOutage("server", CLOSED, 10 * SECOND_NS, 14 * SECOND_NS)
-"""Outage from 10 s to 14 s."""
 
 
 def life(brakes_s: float = 1.0, flies_s: float = 1.5, brake_mps2: float = 2.0) -> ProcessLife:
@@ -89,7 +88,6 @@ def test_a_vehicle_that_moves_on_although_it_is_told_to_stand_is_outside() -> No
 
 
 def test_a_process_that_is_back_at_once_leaves_no_curve() -> None:
-    """The vehicle flies on with its present plan."""
     flown = replace(life(), mode=np.full(400, Mode.TRACK, np.uint8), in_force=np.arange(400))
     found = verdict(
         flown, ProcessOutage("netem", KILLED, 10 * SECOND_NS, 10 * SECOND_NS + 5 * 10**8)
@@ -121,7 +119,6 @@ def test_a_new_life_has_to_stand_until_it_flies() -> None:
 
 
 def test_processes_that_are_killed_under_way_come_back() -> None:
-    """The vehicle brakes along its curve, rests, and flies again."""
     counts = RestartsCounts(kills=1, stops=0, flight_s=0.5, subjects=("server", "client"))
     result = restarts.measure(counts)
     server, client = restarts.verdicts_of(result)

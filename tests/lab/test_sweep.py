@@ -118,12 +118,10 @@ def test_a_grid_that_is_none_is_refused(text: str, said: str) -> None:
     ],
 )
 def test_a_cell_that_cannot_be_flown_is_refused_before_any_is(grids: list[str], said: str) -> None:
-    """The message is that of a scenario with these values, and names them."""
     assert refusal(lambda: Sweep("paper", PAPER, list(map(parse_axis, grids)), 3)) == said
 
 
 def test_seeds_end_where_a_scenarios_do() -> None:
-    """2³² - 1 is the last."""
     last = replace(PAPER, seed=2**32 - 3)
     assert next(Sweep("paper", last, [], 3).tasks()).seeds[-1] == 2**32 - 1
     with pytest.raises(ConfigError, match="expected at most 4294967292 for 4 runs"):
@@ -150,7 +148,6 @@ def test_a_task_gives_the_summaries_of_its_flights_one_by_one() -> None:
 
 
 def test_a_run_that_never_flew_has_no_error_and_spoils_no_mean() -> None:
-    """Its row has empty figures."""
     deaf = "paper(0.4, 0.02, 2.0) & loss(0.85)"
     scenario = replace(
         PAPER,
@@ -183,7 +180,6 @@ def test_the_interval_is_students() -> None:
 
 
 def test_axes_of_pictures_have_units_where_these_are_known() -> None:
-    """From the name of the key, or from a list."""
     labels = {key: figures.label(key) for key in LABELS}
     assert labels == LABELS
     table = reading.to_table(PAPER)
@@ -298,7 +294,6 @@ def test_a_line_with_a_flipped_bit_is_refused(bit: int, tmp_path: Path) -> None:
 def test_a_changed_number_in_a_journal_ends_the_command_in_one_line(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """With file, line, and an exit code of its own."""
     argv = ["sweep", "paper", "--duration", "2", "--settle", "0", "--runs", "1", "--workers", "1"]
     assert main([*argv, "--out", str(tmp_path)]) == 0
     file = tmp_path / "journal.jsonl"
@@ -310,7 +305,6 @@ def test_a_changed_number_in_a_journal_ends_the_command_in_one_line(
 
 
 def along(path: Path) -> Scenario:
-    """The paper's scenario along a trajectory from a file."""
     path.write_text(LINE)
     table = reading.to_table(PAPER) | {"reference": {"shape": "csv", "file": str(path)}}
     return reading.check(table, "mine")
@@ -347,7 +341,6 @@ def test_a_task_flies_along_its_file_as_it_was_when_the_sweep_began(tmp_path: Pa
 def test_a_sweep_does_not_go_on_along_another_trajectory(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """With the original file the command continues."""
     path, out = tmp_path / "path.csv", tmp_path / "out"
     along(path)
     (tmp_path / "mine.toml").write_text(
@@ -375,13 +368,11 @@ def run(*argv: str) -> subprocess.CompletedProcess[str]:
 
 
 def lines(out: Path) -> int:
-    """Number of finished tasks in a folder."""
     file = out / "journal.jsonl"
     return file.read_bytes().count(b"\n") if file.exists() else 0
 
 
 def tables(out: Path) -> list[bytes]:
-    """Content of both tables."""
     return [(out / name).read_bytes() for name in TABLES]
 
 
@@ -404,7 +395,6 @@ def broken_off(number: signal.Signals, out: Path) -> subprocess.CompletedProcess
 
 
 def running(pid: str) -> bool:
-    """Whether a process is still active."""
     try:
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
     except OSError:
@@ -413,7 +403,6 @@ def running(pid: str) -> bool:
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Folder of the sweep, flown by two workers without interruption."""
     out = tmp_path_factory.mktemp("sweep") / "deep" / "whole"
     with redirect_stdout(io.StringIO()) as said:
         assert main([*SWEEP, "--out", str(out), "--workers", "2"]) == 0
@@ -443,7 +432,6 @@ def test_two_keys_make_maps(whole: Path) -> None:
 
 @pytest.mark.long
 def test_a_killed_sweep_goes_on_and_loses_nothing(whole: Path, tmp_path: Path) -> None:
-    """After SIGKILL its worker ends too, and the continued sweep gives the same bytes."""
     broken_off(signal.SIGKILL, tmp_path)
     kept = (tmp_path / "journal.jsonl").read_bytes()
     resumed = run(*SWEEP, "--out", str(tmp_path), "--workers", "1")
@@ -455,7 +443,6 @@ def test_a_killed_sweep_goes_on_and_loses_nothing(whole: Path, tmp_path: Path) -
 
 @pytest.mark.long
 def test_ctrl_c_ends_a_sweep_in_one_line_and_keeps_what_was_done(tmp_path: Path) -> None:
-    """Every line of the journal is complete, and the message has the number of runs."""
     ended = broken_off(signal.SIGINT, tmp_path)
     assert (ended.returncode, ended.stdout) == (130, "")
     said = re.fullmatch(
@@ -482,7 +469,6 @@ def test_ctrl_c_ends_a_sweep_in_one_line_and_keeps_what_was_done(tmp_path: Path)
 def test_an_impossible_sweep_is_refused(
     argv: list[str], line: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """In one line, before anything is written."""
     told = refused_before_writing(["sweep", "paper", *argv], tmp_path, capsys)
     assert told == f"sweep: {line}"
 
@@ -495,7 +481,6 @@ needs_dask = pytest.mark.skipif(
 
 
 def dask(stack: ExitStack, argv: list[str], folder: Path) -> subprocess.Popen[str]:
-    """Process of a cluster, ended with the stack."""
     process = stack.enter_context(
         subprocess.Popen(
             [sys.executable, "-P", "-m", f"distributed.cli.dask_{argv[0]}", *argv[1:]],
@@ -511,7 +496,6 @@ def dask(stack: ExitStack, argv: list[str], folder: Path) -> subprocess.Popen[st
 @pytest.mark.long
 @needs_dask
 def test_a_cluster_gives_the_same_though_a_worker_is_killed(whole: Path, tmp_path: Path) -> None:
-    """A scheduler and two workers, one of which is killed."""
     with ExitStack() as stack:
         argv = ["scheduler", "--host", "127.0.0.1", "--port", "0", "--no-dashboard"]
         scheduler = dask(stack, argv, tmp_path)

@@ -92,7 +92,6 @@ def test_trials_differ_in_scheme_step_axes_and_vehicles() -> None:
 
 
 def test_trajectories_are_flown_by_a_third_or_more_with_all_that_belongs_to_them() -> None:
-    """Previews, triggers, reports, heartbeats, and vehicles that differ from their models."""
     drawn = [make_scenario(seed)[0] for seed in range(200)]
     some = [each for each in drawn if each.control.scheme == "trajectory"]
     assert len(some) > len(drawn) / 3
@@ -115,7 +114,6 @@ def test_each_step_under_a_plan_is_held_against_the_equations() -> None:
 
 @pytest.mark.parametrize("line", FAILED)
 def test_what_has_failed_once_fails_no_more(line: str) -> None:
-    """Shrunk schedules of earlier failures."""
     outcome = fly(loads(line))
     assert not outcome.failure
 
@@ -153,7 +151,6 @@ def undisturbed() -> TrialOutcome:
 
 @pytest.mark.parametrize(("one", "effect"), EFFECTS)
 def test_each_fault_has_its_effect_and_is_survived(one: ScheduledFault, effect: str) -> None:
-    """The effect is a counter that stays 0 without the fault."""
     assert not undisturbed().counts.get(effect)
     outcome = fly(Trial(1, (one,)))
     assert not outcome.failure
@@ -201,14 +198,11 @@ def test_every_kind_of_fault_is_tried() -> None:
 
 
 class Unchecked:
-    """ChaCha20-Poly1305 without a check of the tag."""
-
     def __init__(self, key: bytes) -> None:
         self._key = key
         self.encrypt = ChaCha20Poly1305(key).encrypt
 
     def decrypt(self, nonce: bytes, data: bytes, _: bytes) -> bytes:
-        """Plaintext, whether or not the tag is right."""
         algorithm = algorithms.ChaCha20(self._key, (1).to_bytes(4, "little") + nonce)
         return Cipher(algorithm, mode=None).decryptor().update(data[:-16])
 
@@ -262,12 +256,10 @@ def no_stall(patch: pytest.MonkeyPatch) -> None:
 
 
 def no_lock(patch: pytest.MonkeyPatch) -> None:
-    """No waiting for a good link after a loss."""
     patch.setattr(skytether.client.failsafe, "LOCKING", frozenset())
 
 
 def no_good_link(patch: pytest.MonkeyPatch) -> None:
-    """No waiting for a good link at all."""
     patch.setattr(skytether.client.failsafe, "GOOD_NS", 0)
 
 
@@ -279,7 +271,6 @@ def no_steady(patch: pytest.MonkeyPatch) -> None:
 
 
 def no_latch(patch: pytest.MonkeyPatch) -> None:
-    """No latch in LAND."""
     patch.setattr(
         skytether.client.endpoint, "TABLE", {**TABLE, (Mode.LAND, Reason.HORIZON): Mode.TRACK}
     )
@@ -385,7 +376,6 @@ def test_a_guard_of_trajectories_that_is_switched_off_is_caught(
 
 
 def no_disturbance(patch: pytest.MonkeyPatch) -> None:
-    """The estimated disturbance is not compensated."""
     follow = spline.follow
     patch.setattr(spline, "follow", lambda *given: follow(*given[:-1], 0.0))
 
@@ -424,14 +414,12 @@ def test_a_solver_that_fails_is_nothing_to_trajectories() -> None:
 def test_schedules_that_are_drawn_catch_each_guard(
     switch_off: Patch, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Within the first 400 trials."""
     switch_off(monkeypatch)
     assert any(fly(short_trial(seed)).failure for seed in range(1, 401))
 
 
 @LONG
 def test_two_hours_go_well() -> None:
-    """With faults throughout, and renewed keys."""
     outcome = fly(long_trial(1, 2.0))
     assert not outcome.failure
 
@@ -468,7 +456,6 @@ def test_an_endpoint_that_raises_has_failed(monkeypatch: pytest.MonkeyPatch) -> 
 
 
 def test_a_container_without_a_bound_is_found() -> None:
-    """At any depth within an endpoint."""
     scenario, _ = make_scenario(1)
     netem = Proxy(scenario, server=("server", 0), flows=10**6)
     for port in range(2100):

@@ -39,8 +39,6 @@ SHORT: dict[str, Any] = {"duration": 10, "settle": 4}
 
 
 class Constant(skytether.Endpoint):
-    """Server that commands 0.1 m/s along each axis."""
-
     def __init__(self, scenario: skytether.Scenario) -> None:
         super().__init__()
         self.terms = scenario.terms()
@@ -64,8 +62,6 @@ class Constant(skytether.Endpoint):
 
 
 class Silent(Constant):
-    """Server that never answers."""
-
     def receive(self, datagram: skytether.Datagram, *, now_ns: int) -> None:
         """Nothing."""
 
@@ -138,7 +134,6 @@ def test_a_scenario_made_by_hand_is_checked() -> None:
 
 
 def test_a_reference_that_nothing_can_follow_is_told() -> None:
-    """By an event of the server at its start, and in the summary."""
     keys = {"reference.radius_m": 8.0, "reference.period_s": 10.0, "model.gain": 0.5}
     flight = fly("demo", **SHORT, **keys)
     (told,) = (each for each in flight.events if isinstance(each.event, ReferenceTooFast))
@@ -169,7 +164,6 @@ def test_a_flight_is_that_of_the_simulation(flown: skytether.Flight) -> None:
 
 
 def test_arrays_have_names_shapes_and_units(flown: skytether.Flight) -> None:
-    """All arrays in the order of the parts, with their public names."""
     columns = {column.name: column for column in flown.columns()}
     assert columns["position_m"] == ("position_m", (200, 2), "m")
     assert columns["input_mps"] == ("input_mps", (200, 2), "m/s")
@@ -340,7 +334,6 @@ async def test_a_process_that_fails_is_an_error(monkeypatch: pytest.MonkeyPatch)
 
 
 def test_ctrl_c_ends_the_processes_first(monkeypatch: pytest.MonkeyPatch) -> None:
-    """They end in order first, also where Python was started with SIGINT ignored."""
     ended = threading.Event()
 
     def run(*_: object, interrupted: Callable[[], bool], **__: object) -> None:

@@ -295,7 +295,6 @@ def test_half_planes_keep_a_vehicle_out_from_under_one_that_may_land() -> None:
 def test_what_is_kept_from_are_all_motions_that_may_be_flown(
     loss: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """At every plan, although only changed motions are gathered again."""
     real, looked_at = MissionState.update_possible, list[int]()
 
     def update_possible(self: MissionState) -> None:
@@ -946,7 +945,6 @@ def test_one_that_is_too_near_already_yields_away_from_the_other() -> None:
 
 
 def test_goals_go_to_those_that_are_nearest(tmp_path: Path) -> None:
-    """With `mission.allocate`; starts stay as they are."""
     goals = "1,0,0,0\n1,5,9,1\n2,0,9,0\n2,5,0,1\n"
     found = reading.check(with_goals(tmp_path, goals, allocate=True), "mission")
     ends = [found.make_reference(number)(np.array(9.0))[:, 0].tolist() for number in (1, 2)]
@@ -1054,7 +1052,6 @@ def test_nobody_may_rest_above_what_it_must_not_land_on(
 
 
 def test_a_zone_below_a_vehicle_that_may_land_is_refused_in_flight(tmp_path: Path) -> None:
-    """Accepted below a vehicle that never lands."""
     table = with_goals(tmp_path, "1,0,0,0,4\n") | {"duration": 12.0}
     changes = [(9.0, {"mission.zones": "box(-1, 1, -1, 1, 0, 2)"})]
 
@@ -1248,7 +1245,6 @@ def test_places_of_published_tasks_are_as_their_authors_have_them(tmp_path: Path
 
 
 def test_four_cross_as_published() -> None:
-    """Within the 20 s of the authors' simulation; the planning is timed."""
     cell = (1, ("Luis 2020: four cross", "20 ms"))
     done = missions.fly_published(PublishedOptions(duration=25.0), cell)
     assert done.least_m > 0.2

@@ -16,7 +16,6 @@ from skytether.shared.wire.protocol import NO_HORIZON
 from two_vehicles import DT_S, alone, planned, ready, scenario
 
 FAR = 100.0
-"""Coordinate of a vehicle far from all others, on each axis [m]."""
 
 
 def along(start: list[float], velocity: list[float], *, first: int = 0) -> Motion:
@@ -99,7 +98,6 @@ def test_a_motion_that_takes_the_place_of_another_keeps_its_own_landing() -> Non
 
 
 def test_a_plan_that_still_comes_too_near_is_not_sent() -> None:
-    """Last check before a motion is sent."""
     made = ready()
     vehicle = made.vehicles[0]
     vehicle.turned_rad = 0.5
@@ -174,7 +172,6 @@ def test_nothing_is_planned_for_a_vehicle_whose_client_has_begun_anew() -> None:
 
 
 def test_others_keep_away_from_all_of_its_motions() -> None:
-    """It may be as late as any vehicle."""
     made = ready()
     made.align(101)
     made.state.restart(0)
@@ -183,7 +180,6 @@ def test_others_keep_away_from_all_of_its_motions() -> None:
 
 
 def test_an_observation_of_its_earlier_life_does_not_end_that() -> None:
-    """The observation was under way when the client restarted."""
     made = ready()
     made.align(101)
     assert made.state.restart(0)

@@ -82,7 +82,6 @@ def test_a_motion_is_compared_with_all_that_another_may_be_at_each_time(
 def test_errors_of_one_vehicle_count_as_much_as_those_of_the_other(
     seed: int, error: StepError
 ) -> None:
-    """A motion at rest stays where it is, for any error."""
     rng, keep_m = np.random.default_rng(seed), 1.5
     one, other, far = (
         drawn(rng),
@@ -168,7 +167,6 @@ def test_two_that_keep_the_distance_come_no_nearer_by_what_pieces_are_off() -> N
 
 
 def above_ground(motion: Motion) -> Motion:
-    """The motion, raised so that it does not touch the ground."""
     return motion._replace(position=motion.position + np.array([0.0, 0.0, 20.0]))
 
 
@@ -226,7 +224,6 @@ def test_who_keeps_the_distance_goes_on_to_keep_it() -> None:
 def test_no_delay_makes_the_bounds_of_an_offset_false(
     seed: int, offset_ns: int, drift: float, packets: list[tuple[float, float, float]]
 ) -> None:
-    """Also with drifting clocks, old echoes, and restarted sessions."""
     rng, known = np.random.default_rng(seed), ClockMap(1, DT_NS)
     now_ns, rows = 1000 * S, np.array([0])
     known.forget(0, 7)
@@ -296,7 +293,6 @@ def test_a_clock_that_was_set_is_noticed_and_known_anew() -> None:
 
 
 def width_s(known: ClockMap, now_ns: int) -> float:
-    """Width of the bounds of the clock offset in row 0 [s]."""
     early, late = np.zeros((2, 1))
     known.step_errors(ROWS, known.steps(ROWS, now_ns), early, late)
     return float(early[0] + late[0]) * DT_S
@@ -392,8 +388,6 @@ def odd(up_s: float, down_s: float) -> Delays:
 
 
 def delay(monkeypatch: pytest.MonkeyPatch, delays: Delays) -> None:
-    """Give each vehicle its own constant delays."""
-
     def fates(_: Proxy, name: Literal["uplink", "downlink"], flow: int) -> Fates:
         delay_s = delays(flow)[name == "downlink"]
         return Fates(path(f"constant({delay_s})"), 1, name, flow)
@@ -422,7 +416,6 @@ def test_delays_that_differ_do_not_bring_vehicles_together(monkeypatch: pytest.M
 def test_with_steps_taken_for_exact_delays_bring_vehicles_together(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Ablation of the bounds of the clocks, in the same flight."""
     delay(monkeypatch, turns(0.05, 0.85))
 
     monkeypatch.setattr(ClockMap, "step_errors", lambda *_: None)  # errors stay 0

@@ -40,7 +40,6 @@ def make(
     u_max: tuple[float, ...] = (1.8, 1.0),
     **control: Any,
 ) -> Problem:
-    """The paper's problem, with some keys of `control` changed."""
     replace = msgspec.structs.replace
     model = replace(PAPER.model, tau_s=tau_s, u_max=u_max)
     scenario = replace(PAPER, model=model, control=replace(PAPER.control, **control))
@@ -54,7 +53,6 @@ ROUGH = {"dt": 0.1, "horizon": 30, "input_weight": 1e-3, "state_weight": (10.0, 
 
 @cache
 def active_sets_with(**constants: float) -> Callable[..., int]:
-    """`active_sets` compiled with other constants than those of its module."""
     names = {**vars(exact), **constants}
     first = exact.lanes(FunctionType(exact._first_set.py_func.__code__, names))
     return part(FunctionType(exact.active_sets.py_func.__code__, {**names, "_first_set": first}))
@@ -68,7 +66,6 @@ def no_pivots(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def problems(problem: Problem, count: int, scale: float, seed: int) -> tuple[Array, Array]:
-    """Random gradients, of moving targets and states up to `scale` away, and random guesses."""
     rng = np.random.default_rng(seed)
     axes, H = problem.hessian.shape[:2]
     x = rng.normal(0.0, scale, (count, axes, 2))
@@ -78,7 +75,6 @@ def problems(problem: Problem, count: int, scale: float, seed: int) -> tuple[Arr
 
 
 def residual(problem: Problem, inputs: Array, gradient: Array) -> float:
-    """Violation of the optimality conditions, relative to the gradient."""
     slope = np.einsum("akl,nal->nak", problem.hessian, inputs) + gradient
     at_bound = np.abs(inputs) >= U_MAX[:, None]
     wrong = np.where(at_bound, np.maximum(np.sign(inputs) * slope, 0.0), slope)

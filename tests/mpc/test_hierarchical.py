@@ -48,7 +48,6 @@ SCENARIO = check(
 TERMS = SCENARIO.terms()
 MODEL = TERMS.model
 START = np.array([[1.2, 0.3], [-0.4, 0.8]])
-"""Initial state beside the circle, with a velocity."""
 CALM = np.zeros((1, 2))
 
 
@@ -57,7 +56,6 @@ def problem(which: int) -> Problem:
 
 
 def make(capacity: int = 1, scenario: Scenario = SCENARIO) -> Planner:
-    """Planner without an earlier plan."""
     terms = scenario.terms()
     desired = Desired(scenario, terms, capacity, capacity)
     return Planner(scenario.control, terms, desired, capacity, capacity, Stopwatch())
@@ -75,7 +73,6 @@ class Plan(NamedTuple):
     planned: Array
     """Planned state x_p(k|k-1) [m, m/s]; shape (n, axes, 2)."""
     figures: Figures
-    """Figures of the plans; shape (n,)."""
     horizons: Array
     """Horizons that may be sent [m/s]; shape (n, axes, 2 H)."""
 
@@ -108,24 +105,20 @@ def plan(planner: Planner, rows: Indices, step: Indices, found: Foresight) -> Pl
 
 
 def seen(estimates: Array) -> Foresight:
-    """Foresight of vehicles with exactly known states of shape (n, axes, 2)."""
     found = empty_foresight(len(estimates), 2, H, H)
     found.start[:] = estimates
     return found
 
 
 def run(planner: Planner, step: int, estimate: Array) -> Plan:
-    """Plan of one vehicle at one step."""
     return plan(planner, np.array([0]), np.array([step]), seen(estimate[None]))
 
 
 def elsewhere(step: int) -> Array:
-    """An estimate that differs at every step."""
     return START + np.random.default_rng(step).normal(scale=0.2, size=(2, 2))
 
 
 def same(one: Plan, other: Plan) -> None:
-    """Assert that two plans have the same bits."""
     for mine, yours in zip(one, other, strict=True):
         for name in FIGURES.names if mine.dtype == FIGURES else (...,):
             np.testing.assert_array_equal(mine[name], yours[name])

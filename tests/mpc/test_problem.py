@@ -34,7 +34,6 @@ quick = settings(max_examples=40)
 
 TAU_S = (0.81, 0.3)
 TWO_TAUS = discretise(TAU_S, 0.05)
-"""Model with different axes."""
 U_MAX = np.array([1.8, 1.0])
 
 
@@ -49,7 +48,6 @@ WEIGHTS = {
 
 
 def control(H: int, **keys: object) -> ControlConfig:
-    """Weights of the paper's scenario over H steps, some of them changed."""
     return ControlConfig(horizon=H, **(WEIGHTS | keys))
 
 
@@ -86,7 +84,6 @@ def optimum(problem: Problem, gradient: Array) -> Array:
 
 
 def situation(seed: int, H: int, axes: int = 2, size: float = 1.0) -> tuple[Array, Array, Array]:
-    """Random state, target and previous horizon of one vehicle."""
     rng = np.random.default_rng(seed)
     x, target = rng.normal(size=(axes, 2)), rng.normal(size=(axes, H + 1, 2))
     return size * x, size * target, size * rng.normal(size=(axes, H))

@@ -77,7 +77,6 @@ def test_bad_gradient_fails_its_own_vehicle_alone(
 
 
 def test_osqp_refuses_a_bad_guess() -> None:
-    """Nor does it enter the solver's memory."""
     gradient, guess = problems(2, 2)
     guess[0, 0, 0] = np.nan
     _, solved = OsqpSolver(PROBLEM).solve(gradient, guess)

@@ -26,7 +26,6 @@ P_MIN = 0.001
 
 
 def fates(text: str, seed: int = 1, count: int = SAMPLES, every: int = 7) -> list[Fate]:
-    """Fates of packets that enter every so many slots."""
     made = Fates(path(text), seed, "uplink", 0)
     return [made.at(every * number) for number in range(count)]
 
@@ -245,7 +244,6 @@ def test_files_are_found_beside_the_scenario(tmp_path: Any) -> None:
 
 
 def test_a_text_replaces_that_below_and_an_argument_changes_it(tmp_path: Any) -> None:
-    """Also if the base scenario has only arguments, applied to the default's text."""
     (tmp_path / "lossy.toml").write_text("extends = 'demo'\nnetwork.uplink.loss = 0.3\n")
     assert reading.load(str(tmp_path / "lossy.toml")).network.uplink == (
         "paper(0.4, 0.02, 2.0) & loss(0.3)"

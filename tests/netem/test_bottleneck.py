@@ -22,7 +22,6 @@ Packet = tuple[int, int, int]
 
 
 def linked(text: str) -> tuple[Link, Lane]:
-    """Link with these impairments, and a flow through it."""
     direction = path(text)
     return Link(UPLINK, 1472, None, direction), Lane(0, Fates(direction, 1, "uplink", 0), 0)
 
@@ -51,7 +50,6 @@ def test_a_packet_takes_its_size_over_the_rate() -> None:
 
 @pytest.mark.parametrize("serve", ["first", "fair"])
 def test_too_much_passes_at_the_rate(serve: str) -> None:
-    """Fluid limit: half of twice the rate passes, and the queue is full."""
     every_ns = SECOND_NS * 100 // 20_000  # 100 B at 20 kB/s
     packets = [(number * every_ns, 100, number % 2) for number in range(4000)]
     out, dropped = passed(f"rate(10000, queue=5000, serve={serve})", packets)

@@ -29,7 +29,6 @@ def first_fates(
     flow: int = 0,
     count: int = COUNT,
 ) -> list[Fate]:
-    """Fates of the first packets of a flow's first slots."""
     fates = Fates(path(direction), seed, name, flow)
     return [fates.at(slot) for slot in range(count)]
 

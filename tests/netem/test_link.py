@@ -28,7 +28,6 @@ PEER = ("192.0.2.1", 5000)
 
 
 def make_link(mtu: int = 1472) -> Link:
-    """Link without a record."""
     return Link(UPLINK, mtu, None)
 
 

@@ -41,7 +41,6 @@ PATIENCE_S = 60.0
 
 
 def block(word: str) -> list[str]:
-    """Commands of the document's block that contains a word, with free ports."""
     (found,) = [lines for lines in BLOCKS if any(word in line for line in lines)]
     ports: dict[str, str] = {}
     for port in re.findall(r"(?<=127\.0\.0\.1:)\d+|(?<=-port )\d+", "\n".join(found)):
@@ -57,7 +56,6 @@ def _with_ports(text: str, ports: dict[str, str]) -> str:
 
 
 def argv(line: str) -> list[str]:
-    """Documented command for this environment."""
     name, *rest = shlex.split(line)
     if name == "skytether":
         return [sys.executable, "-P", "-m", "skytether", *rest]
@@ -92,7 +90,6 @@ def counted(said: str, name: str) -> tuple[int, int]:
 
 
 def ended(process: "subprocess.Popen[str]") -> str:
-    """Output of a process until its end."""
     process.terminate()
     return process.communicate(timeout=PATIENCE_S)[0]
 

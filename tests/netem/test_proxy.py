@@ -234,7 +234,6 @@ class Siege:
 
 
 def spread(count: int) -> list[str]:
-    """Addresses of a number of hosts."""
     return [f"198.51.{number // 256}.{number % 256}" for number in range(count)]
 
 
@@ -300,7 +299,6 @@ def test_who_opens_flows_fast_enough_shuts_newcomers_out(hosts: list[str]) -> No
 
 
 def old_rule(patch: pytest.MonkeyPatch) -> None:
-    """Old rule: one answer earns a flow for a minute."""
     patch.setattr(places_module, "EXCHANGES", 1)
     patch.setattr(places_module, "EARNED_NS", 60 * SECOND_NS)
     patch.setattr(places_module, "HOST_FLOWS", FLOWS_MAX)
@@ -332,7 +330,6 @@ def test_what_one_host_holds_against_others_is_bounded() -> None:
 
 
 def test_a_fleet_of_one_host_keeps_its_places_from_strangers() -> None:
-    """As many as one host may have; the strangers exchange packets."""
     fleet = [("192.0.2.1", port) for port in range(HOST_FLOWS)]
     siege = Siege(make_proxy(flows=HOST_FLOWS), spread(5), 5, rate_hz=0)
     siege.run(2, *fleet)

@@ -34,7 +34,6 @@ TIMED = """PING example (192.0.2.1) 56(84) bytes of data.
 
 
 def trip(sent_ns: int, rtt_ns: int | None, send_ns: int = 0) -> dict[str, object]:
-    """Round trip as irtt writes it."""
     if rtt_ns is None:
         return {"lost": "true", "timestamps": {"client": {"send": {"monotonic": sent_ns}}}}
     delay = {"rtt": rtt_ns, "send": send_ns, "receive": rtt_ns - send_ns}

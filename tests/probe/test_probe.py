@@ -182,7 +182,6 @@ def test_an_open_session_is_answered_at_its_own_address_alone(train: int) -> Non
 
 
 def begin(far: Listener, prober: tuple[str, int], now_ns: int) -> bool:
-    """Whether a prober is admitted, and gets an answer to a probe."""
     far.receive(Datagram(encode(ProbeHello(b"12345678"), 64), prober), now_ns=now_ns)
     (packet,) = far.outbox()
     welcome = decode(packet.payload)
@@ -259,12 +258,10 @@ def measure(
 
 
 def models(text: str) -> set[str]:
-    """Names of the delays and losses in a text."""
     return {name for name, _ in path(text).impairments} - {"rate", "ordered"}
 
 
 def in_order(packets: Rows, direction: int) -> Rows:
-    """Packets of a direction in the order in which they were sent."""
     mine = packets[packets["direction"] == direction]
     return mine[np.lexsort((mine["number"], mine["arrived_ns"]))]
 
@@ -347,7 +344,6 @@ def test_the_models_are_those_of_the_network_and_fly() -> None:
 
 @pytest.mark.parametrize("law", ["uniform", "normal", "gamma", "lognormal"])
 def test_the_law_of_delays_is_recognised(law: str) -> None:
-    """In each of five samples of a thousand."""
     made = {
         "uniform": stats.uniform(0.02, 0.08),
         "normal": stats.norm(0.1, 0.01),

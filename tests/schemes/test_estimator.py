@@ -37,7 +37,6 @@ def seen(step: int, state: Array) -> Observation:
 
 
 def make(capacity: int = 1, *, compensate: bool = True) -> Estimator:
-    """Estimator over twelve steps."""
     flown = scenario("predictive" if compensate else "none")
     return Estimator(flown.terms(), flown.control, feedback_gain(flown), capacity)
 
@@ -84,12 +83,10 @@ def estimates(estimator: Estimator, rows: Indices, step: Indices) -> Array:
 
 
 def estimate(estimator: Estimator, step: int) -> Array:
-    """Estimate x̂(step) of the only vehicle."""
     return estimates(estimator, ROW, np.array([step]))[0]
 
 
 def flown(x: Array, inputs: Array) -> Array:
-    """State predicted by the model from x, input by input."""
     for u in inputs:
         x = MODEL.step(x, u)
     return x
@@ -121,7 +118,6 @@ def test_input_of_the_present_step_does_not_count_yet() -> None:
 
 
 def test_vehicle_hovers_before_anything_was_computed() -> None:
-    """With û = 0 the observed velocity decays with τ."""
     estimator = make()
     x = np.array([[1.0, 2.0], [3.0, -4.0]])
     estimator.observe(0, seen(0, x))
@@ -130,7 +126,6 @@ def test_vehicle_hovers_before_anything_was_computed() -> None:
 
 
 def test_newest_observation_wins_after_reordering() -> None:
-    """E11: a late observation or a duplicate is refused."""
     estimator = make()
     states = {step: np.full((2, 2), float(step)) for step in (3, 5, 7)}
     kept = [estimator.observe(0, seen(step, states[step])) for step in (5, 3, 7, 7, 5)]
@@ -214,7 +209,6 @@ def test_observation_from_ahead_is_taken_as_it_is() -> None:
 
 
 def test_without_compensation_the_observation_is_the_estimate() -> None:
-    """For any age, and any inputs flown since."""
     estimator = make(compensate=False)
     x = np.array([[1.0, 2.0], [3.0, 4.0]])
     estimator.observe(0, seen(0, x))
@@ -266,7 +260,6 @@ def test_batch_is_estimated_as_its_singles(seed: int, vehicles: int, compensate:
 
 
 def told(step: int, state: Array, u: Array) -> Observation:
-    """Observation of the only vehicle, with the input in force."""
     return seen(step, state)._replace(input=u)
 
 
@@ -312,7 +305,6 @@ def test_where_there_is_none_none_is_learned(every: int) -> None:
 
 
 def test_observations_far_apart_teach_nothing() -> None:
-    """The inputs over 0.3 s are unknown."""
     assert not watch(learning(), WIND, 6).any()
 
 
@@ -380,7 +372,6 @@ def test_the_paper_s_scheme_flies_better_with_observer_and_with_feedback() -> No
 
 @pytest.fixture(scope="module", params=["none", "predictive", "committed"])
 def controller(request: pytest.FixtureRequest) -> Controller:
-    """Controller of a vehicle under each scheme, in steps of 0.05 s."""
     table = reading.to_table(reading.load("paper"))
     table["control"] = {**table["control"], "scheme": request.param, "dt": 0.05}
     flown = reading.check(table, "test")
@@ -388,7 +379,6 @@ def controller(request: pytest.FixtureRequest) -> Controller:
 
 
 def is_able(controller: Controller, step: int) -> bool:
-    """Whether the controller decides on the only vehicle at a step."""
     rows, steps = controller.able(ROW, np.array([step]))
     assert rows.tolist() in ([], ROW.tolist())
     assert steps.tolist() == [step] * len(rows)

@@ -24,7 +24,6 @@ pytestmark = pytest.mark.usefixtures("plugin_tables")
 
 PAGE = (Path(__file__).parents[2] / "docs" / "schemes.md").read_text()
 (CHASE,) = re.findall(r"```python\n(import numpy.*?plugin_scheme.*?)```", PAGE, re.DOTALL)
-"""The page's scheme."""
 OURS = """
     import numpy as np
     from skytether.plugin_scheme import *
@@ -65,7 +64,6 @@ def plug(folder: Path, code: str) -> None:
 
 
 def scenario(scheme: str, trigger: str = "periodic(5)", **control: Any) -> Scenario:
-    """The scenario demo for eight seconds, with a scheme."""
     keys = {"scheme": scheme, "trigger": trigger} | control
     return packaged("demo", {"duration": 8.0, "settle": 2.0}, {"control": keys})
 
@@ -135,7 +133,6 @@ def test_the_documented_scheme_follows_the_reference(tmp_path: Path) -> None:
     [("paper", "predictive"), ("demo-committed", "committed"), ("demo", "trajectory")],
 )
 def test_our_schemes_fly_the_same_as_plugins(base: str, scheme: str, tmp_path: Path) -> None:
-    """To the last bit of flights and records."""
     plug(tmp_path, OURS)
     short = {"duration": 8.0, "settle": 2.0}
     ours = packaged(base, short, {"control": {"scheme": scheme}})

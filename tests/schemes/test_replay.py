@@ -28,7 +28,6 @@ HORIZON_BYTES = 300
 
 
 def scenario(name: str = "paper", **changes: Any) -> Scenario:
-    """Packaged scenario under the committed scheme, with some keys changed."""
     return packaged(name, {"control": {"scheme": "committed"}}, changes)
 
 
@@ -37,7 +36,6 @@ TOLD_M = 2e-7
 
 
 def lossy(loss: float, down: float = 0.1) -> dict[str, Any]:
-    """The paper's network, with other losses."""
     return {"uplink": {"loss": loss}, "downlink": {"loss": down}}
 
 
@@ -56,7 +54,6 @@ def small(exhausted: str = "brake", age_max_s: float = 5.0, **control: Any) -> S
 
 
 def make(flown: Scenario) -> Replay:
-    """Memory for one vehicle."""
     clock, gain = ClockMap(1, flown.dt_ns), feedback_gain(flown)
     return Replay(flown.terms(), flown.control, gain, 1, clock)
 
@@ -97,7 +94,6 @@ def by_rule(replay: Replay, step: int, in_force: int) -> Array:
 
 
 def foresee(replay: Replay, step: int) -> Foresight:
-    """Predicted state of the only vehicle at a step."""
     found = empty_foresight(1, 2, H, MOST)
     replay.foresee(ROW, np.array([step]), found)
     return found
@@ -207,7 +203,6 @@ def test_a_horizon_of_an_earlier_life_is_taken_for_flying_on() -> None:
 
 
 def test_the_newest_observation_counts() -> None:
-    """E11: late observations and duplicates are refused; a forgotten vehicle starts anew."""
     replay, x = make(small()), np.zeros((2, 2))
     kept = [see(replay, step, x + step, NO_HORIZON) for step in (5, 3, 7, 7)]
     assert kept == [True, False, True, False]
@@ -356,7 +351,6 @@ def test_the_estimate_is_exact_once_every_horizon_has_arrived_or_is_known_lost(
         remember(self, rows, step, found, event)
 
     def believe(self: Replay, row: int, observation: Observation) -> bool:
-        """Assume that all sent horizons have arrived."""
         arrived = [step for step in sent if step + 9 <= observation.step]
         newest = max([observation.in_force, *arrived])
         return observe(self, row, observation._replace(in_force=newest))
@@ -378,7 +372,6 @@ def test_a_packet_at_every_step_hides_what_is_lost() -> None:
 
 
 def test_every_lost_horizon_is_counted(sparse: tuple[Scenario, Record]) -> None:
-    """The count equals netem's, except for horizons that are too new."""
     _, flight = sparse
     netem = flight.netem[flight.netem["direction"] == UPLINK]
     horizons = netem[netem["bytes"] > HORIZON_BYTES]
@@ -412,7 +405,6 @@ def rmse(flown: Scenario, flight: Record) -> float:
 
 
 def test_it_is_stable_without_the_s_term_where_the_papers_scheme_is_not() -> None:
-    """Both schemes fly with equal weights, network and seed."""
     errors = {}
     for scheme in ("predictive", "committed"):
         flown = scenario(control={"scheme": scheme, "trigger": "always", **TIGHT}, duration=40.0)
@@ -430,7 +422,6 @@ def test_every_step_is_planned_whatever_the_trigger(
     plan = Planner.plan
 
     def count(self: Planner, rows: Indices, step: Indices, found: Foresight) -> None:
-        """Count the planned steps."""
         nonlocal planned
         planned += len(rows)
         plan(self, rows, step, found)
@@ -542,7 +533,6 @@ def test_the_vehicle_says_which_horizon_it_flies_and_since_when() -> None:
 
 
 def test_a_budget_is_kept_in_any_window_of_a_flight() -> None:
-    """Even if every step would be worth a packet."""
     control = {"trigger": "cost_gap(0) & budget(5, 2)", **FIRM}
     flight = fly(scenario(control=control, vehicle={"wind": 0.3}, duration=30.0))
     sent_s = flight.server["step"][flight.server["event"]] * 0.05

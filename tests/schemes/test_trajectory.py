@@ -80,7 +80,6 @@ def sent_steps(flight: Record) -> list[int]:
 
 
 def rmse_m(flown: Scenario, flight: Record) -> float:
-    """RMS distance from the reference, from `settle` on [m]."""
     late = flight.client["step"] * flown.control.dt >= flown.settle
     squares = (position_error(flown, flight.client)[late] ** 2).sum(axis=1)
     return float(np.sqrt(squares.mean()))
@@ -133,7 +132,6 @@ def test_pieces_join_with_the_velocity_of_the_knot(
 def test_one_knot_is_a_state_that_goes_on_by_itself(
     p: float, v: float, stage: int, spacing: int
 ) -> None:
-    """p + t v, for any spacing."""
     assert spline_at((p, v), spacing, 0.1, stage) == pytest.approx((p + stage * 0.1 * v, v))
 
 
@@ -222,7 +220,6 @@ def test_behind_its_last_stage_it_is_braked_along_and_comes_to_rest() -> None:
 
 
 def test_what_is_held_goes_on_for_ever() -> None:
-    """Without a brake the spline has no end."""
     held = guide(scenario(), (0.0, 1.0), length=20, brake=0.0)
     assert guided_to(held, 0, 500, 0.0, 0.0) == pytest.approx((50.0, 1.0))
 
@@ -266,7 +263,6 @@ class Server:
     def observe(
         self, step: int, *, in_force: int = NO_HORIZON, since: int = 0, takes: int = 1
     ) -> None:
-        """Receive an observation of a vehicle at rest at the origin."""
         at = (step, in_force, since, 0, 0, Mode.TRACK, takes)
         self.scheme.observe(0, Observation(1, 1, *at, np.zeros((2, 2)), np.zeros(2)))
 
@@ -295,7 +291,6 @@ def known(flown: Scenario, server: Server, off_m: float, off_mps: float) -> floa
 
 
 def test_target_is_sent_as_one_knot() -> None:
-    """With position and velocity."""
     server = Server(scenario())
     server.observe(7)
     server.at(8, (1.0, 0.5), (-2.0, -0.25), send=True)
@@ -491,10 +486,6 @@ FAST = {
 
 
 def test_bounds_shape_what_is_told() -> None:
-    """The error is that of plans of inputs with bounds, with fewer packets.
-
-    A trajectory that ignored the bounds would have twice the error.
-    """
     plans, told = (
         [
             flight.summary
@@ -520,7 +511,6 @@ def test_a_horizon_too_short_for_a_plan_still_leads_along_the_trajectory(horizon
 
 
 def message(step: int, knots: Floats, *, age: int = 9, spacing: int = 5) -> Trajectory:
-    """Message that the server sends at a step."""
     return Trajectory(65535, 2**32 - 1, step, 2**32 - 1, age, spacing, knots)
 
 
@@ -599,7 +589,6 @@ huge = st.floats(-(2.0**99), 2.0**99, width=32)
 def test_whatever_finite_knots_say_what_is_flown_is_within_the_bound(
     knots: list[tuple[float, float]], spacing: int, stage: int
 ) -> None:
-    """Also for absurd knots."""
     flown = scenario()
     terms = flown.terms()
     compensator = Compensator(terms, regulator(flown))
@@ -616,7 +605,6 @@ def test_whatever_finite_knots_say_what_is_flown_is_within_the_bound(
 
 
 def test_a_target_of_constant_velocity_takes_one_packet() -> None:
-    """The first packet suffices, and the vehicle reaches the target."""
     flown = scenario(control={"trigger": "cost_gap(0.01)"})
     flight = fly(flown)
     assert len(sent_steps(flight)) == 1
@@ -704,7 +692,6 @@ def test_inputs_flown_are_those_of_the_spline_that_the_server_keeps() -> None:
 
 
 def test_silence_is_as_long_as_is_said() -> None:
-    """For any length of the horizon."""
     flown = scenario(control={"trigger": "cost_gap(0.01) | silence(3)", "horizon": 4})
     assert set(np.diff(sent_steps(fly(flown)))) == {30}
 

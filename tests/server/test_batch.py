@@ -28,7 +28,6 @@ def scenario(**changes: Any) -> Scenario:
 
 
 def assert_as_alone(flown: Scenario, seeds: Sequence[int]) -> list[Record]:
-    """Compare every part of every run's record; returns the runs."""
     flights = fly_batch(flown, seeds)
     assert len(flights) == len(seeds)
     for seed, together in zip(seeds, flights, strict=True):
@@ -97,7 +96,6 @@ committing = st.builds(
         }
     ),
 )
-"""With triggers that need committed inputs."""
 guided = st.builds(
     lambda changes, control, shape: (
         changes | {"control": changes["control"] | control, "reference": {"shape": shape}}
@@ -219,7 +217,6 @@ def test_a_flight_whose_trajectory_is_looked_up_anew_is_as_alone(
     init = Desired.__init__
 
     def crowded(self: Desired, *given: Any) -> None:
-        """Store with two pages."""
         init(self, *given)
         self._keys[3:] = 2**62
         made.append(self)

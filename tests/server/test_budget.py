@@ -234,7 +234,6 @@ def test_a_rate_that_nobody_uses_does_not_rise() -> None:
 # -- flights ---------------------------------------------------------------------------------
 
 AIR = "paper(0.4, 0.02, 2) & rate(3000, queue=5000)"
-"""A quarter of the rate of the scenario `crowd`."""
 
 
 def crowd(keys: Mapping[str, Any], network: str = AIR) -> Scenario:

@@ -35,7 +35,6 @@ def listen(
     down_ns: int = 400 * MS,
     up_ns: int = 400 * MS,
 ) -> list[int]:
-    """Error of the adopted offset at each time, with constant delays."""
     return [
         observe(clock, now, offset_ns(now), down_ns=down_ns, up_ns=up_ns) - offset_ns(now)
         for now in times_ns

@@ -26,12 +26,10 @@ MOST = 39
 
 
 def estimated(capacity: int = 1, most: int = MOST) -> DelayBound:
-    """Estimated bounds."""
     return delay_bound(capacity, 0.05, most, None)
 
 
 def known(delays: list[int], first: int = 1, most: int = MOST) -> list[int]:
-    """Delay d after each sample of one vehicle."""
     bound, steps = estimated(most=most), []
     set_first(bound, 0, first)
     for sample in delays:
@@ -81,7 +79,6 @@ def test_before_any_sample_it_is_the_guess() -> None:
 
 
 def test_what_every_packet_takes_raises_it_at_once_and_never_lowers_it() -> None:
-    """Acknowledged or not, up to the maximum; an unknown delay has no effect."""
     bound, steps = estimated(), []
     set_first(bound, 0, 11)
     for delay_now in (-(2**40), 0, 10, 11, 12, 30, 12, 90):

@@ -30,7 +30,6 @@ H = 15
 
 
 def scenario(**reference: Any) -> Scenario:
-    """Circle, with some keys of the reference changed."""
     table = {"shape": "circle", "radius_m": 1.5, "period_s": 7.0} | reference
     return check({"control": {"horizon": H}, "reference": table}, "test")
 
@@ -42,7 +41,6 @@ DT_S = SCENARIO.control.dt
 def make(
     flown: Scenario = SCENARIO, references: Callable[[int], Reference] | None = None
 ) -> Desired:
-    """References of a full block of vehicles."""
     return Desired(flown, flown.terms(), BLOCK, BLOCK, references)
 
 
@@ -76,14 +74,12 @@ LATE_S = (0.27, 0.1)
 
 
 def late(**reference: Any) -> Scenario:
-    """The circle, for a vehicle with a dead time."""
     table = to_table(scenario(**reference))
     table["model"]["dead_time_s"] = LATE_S
     return check(table, "test")
 
 
 def test_a_vehicle_with_dead_time_is_planned_along_the_reference_that_much_later() -> None:
-    """Each axis by its own dead time, from any step; the present reference stays the same."""
     flown, steps, ahead = late(), np.array([3, 900]), np.array([2, 0])
     desired, sample = make(flown), flown.make_reference()
     found = window(desired, steps, ahead)
@@ -204,7 +200,6 @@ def test_a_preview_longer_than_any_window_is_a_full_one() -> None:
 
 
 def test_a_table_is_previewed_too(tmp_path: Any) -> None:
-    """Path from a CSV file that turns after a second, which is not visible before."""
     path = tmp_path / "path.csv"
     path.write_text("t,x,y\n0,0,0\n1,1,0\n2,1,1\n")
     flown = scenario(shape="csv", file=str(path), preview=0.2)
@@ -220,8 +215,6 @@ TURN = 60
 
 
 def turning(scale: float) -> Reference:
-    """Target that changes its motion at TURN."""
-
     def sample(t: Array) -> Array:
         t = np.asarray(t, dtype=np.float64)
         after = np.maximum(t - TURN * DT_S, 0.0)
@@ -243,12 +236,10 @@ def flights_that_turn(preview: float | str, monkeypatch: pytest.MonkeyPatch) -> 
 
 
 def replaced(name: str, changes: dict[str, Any], **reference: Any) -> Scenario:
-    """Packaged scenario with some keys changed."""
     return packaged(name, changes, reference=reference)
 
 
 def first_difference(flights: list[Record]) -> int:
-    """First step at which the servers' plans or decisions differ."""
     one, other = (flight.server for flight in flights)
     n = min(len(one), len(other))
     unlike = [
@@ -316,7 +307,6 @@ def test_a_prediction_goes_to_and_fro_between_walls(
 
 
 def straight(vehicle: int) -> Reference:
-    """A different line for each vehicle."""
     return shapes.timed_path(np.array([0.0, 1e4]), np.array([[0.0, 0.0], [1e2 * vehicle, -1e3]]))
 
 
@@ -347,7 +337,6 @@ def test_a_row_that_another_vehicle_takes_has_its_trajectory() -> None:
 
 
 def live(**reference: Any) -> Scenario:
-    """Live point that starts at (1, 2)."""
     return scenario(**{"shape": "live", "points_m": [[1.0, 2.0]]} | reference)
 
 

@@ -37,7 +37,6 @@ DT_NS, H = TERMS.dt_ns, TERMS.horizon
 HOUR = 3600 * S
 DELAY_NS = 440 * MS
 BEGAN_NS = 3 * HOUR
-"""Start of step 0 on the server's clock."""
 BACKWARD_NS = DELAY_NS - BEGAN_NS
 """Field G of a packet that reaches the vehicle after its delay."""
 
@@ -64,7 +63,6 @@ def seen(step: int, changed: dict[str, Any] | None = None) -> Observation:
 
 
 def judge(plausibility: Plausibility, told: Observation, *, row: int = 0, step: int = -1) -> Belief:
-    """Verdict on an observation that arrives after its delay, or when that of `step` would."""
     now_ns = BEGAN_NS + (told.step if step < 0 else step) * DT_NS + DELAY_NS
     forward_ns = now_ns - told.step * DT_NS
     backward_ns = stamped_ns(told.backward_us, near_ns=-forward_ns)
@@ -72,7 +70,6 @@ def judge(plausibility: Plausibility, told: Observation, *, row: int = 0, step: 
 
 
 def after(count: int = 5) -> Plausibility:
-    """Plausibility filter that has accepted the steps from 100 on."""
     plausibility = Plausibility(TERMS, 2)
     for step in range(100, 100 + count):
         assert judge(plausibility, seen(step)) == Belief.BELIEVED
@@ -80,7 +77,6 @@ def after(count: int = 5) -> Plausibility:
 
 
 def moved(metres: float, speed: float = 0.0) -> np.ndarray:
-    """State of step 105, displaced along the first axis."""
     return seen(105).state + np.array([[metres, speed], [0.0, 0.0]])
 
 
@@ -134,7 +130,6 @@ def test_a_vehicle_is_known_by_its_own_observations(row: int) -> None:
 
 
 def elsewhere(step: int, metres: float = 100.0) -> Observation:
-    """Observation of the vehicle after a displacement."""
     told = seen(step)
     return told._replace(state=told.state + np.array([[metres, 0.0], [0.0, 0.0]]))
 
@@ -264,7 +259,6 @@ def test_a_flipped_bit_of_a_state_is_a_jump_or_as_good_as_none(number: int, bit:
 
 
 def scenario(**changes: Any) -> Scenario:
-    """The demo with a report at every step, with some keys changed."""
     reports = {"vehicle": {"report": "always"}, "link": {"heartbeat_s": 0.1, "timeout_s": 1.0}}
     return packaged("demo-committed", reports, changes)
 
@@ -273,8 +267,6 @@ def flipped(share: float) -> list[Record]:
     """Flights with one bit flipped in a share of the packets to the server."""
 
     class Flipping(Proxy):
-        """Netem that flips bits."""
-
         def __init__(self, scenario: Scenario, **more: Any) -> None:
             super().__init__(scenario, **more)
             self._rng = random.Random(scenario.seed)
@@ -348,7 +340,6 @@ def oddly(
 def test_one_odd_observation_costs_a_few_steps_at_most(
     number: int, field: str, value: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Also if it is the first of its session."""
     flight = oddly(monkeypatch, number, field, value)
     assert flight.failure is None
     steps = flight.server["step"]
@@ -400,7 +391,6 @@ def test_a_server_whose_clock_steps_goes_on_planning(
     ours = iter([False, True])
 
     def clock(*numbers: int) -> Clock | Stepped:
-        """The client's, then the server's."""
         made = Clock(*numbers)
         return Stepped(made, 15 * S, by_ns) if next(ours) else made
 

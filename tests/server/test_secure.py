@@ -48,24 +48,20 @@ OBSERVATION, HORIZON = b"\x9b\x04\x03observation", b"\x99\x04\x04horizon"
 
 
 def gate(seed: int = 1) -> Gate:
-    """Server with the keys of two vehicles; each seed is another life."""
     return Gate(Keyring("keys", KEYS), entropy=random.Random(seed).randbytes)
 
 
 def link(seed: int = 2, key: VehicleKey = KEYS[1, 5]) -> SecureLink:
-    """Vehicle; each seed is another life."""
     return SecureLink(key, entropy=random.Random(seed).randbytes)
 
 
 def called(server: Gate, datagram: bytes, now_ns: int = 0, peer: Address = HERE) -> GateCall:
-    """Content of a datagram that the server accepts."""
     call = server.open(Datagram(datagram, peer), now_ns=now_ns)
     assert call is not None
     return call
 
 
 def refusal(end: Gate | SecureLink, datagram: bytes, now_ns: int = 0, peer: Address = HERE) -> str:
-    """Reason for which an end drops a datagram."""
     given = Datagram(datagram, peer) if isinstance(end, Gate) else datagram
     with pytest.raises(ProtocolError) as error:
         end.open(given, now_ns=now_ns)  # type: ignore[arg-type]
@@ -73,7 +69,6 @@ def refusal(end: Gate | SecureLink, datagram: bytes, now_ns: int = 0, peer: Addr
 
 
 def challenged(client: SecureLink, server: Gate, now_ns: int = 0, *, hello: bytes = HELLO) -> None:
-    """Give the client a cookie."""
     asked = Datagram(client.hello(hello, now_ns=now_ns), HERE)
     assert server.open(asked, now_ns=now_ns) is None
     (challenge,) = server.outbox()
@@ -81,14 +76,12 @@ def challenged(client: SecureLink, server: Gate, now_ns: int = 0, *, hello: byte
 
 
 def apart() -> tuple[SecureLink, Gate]:
-    """Both ends; the client has only a cookie."""
     client, server = link(), gate()
     challenged(client, server)
     return client, server
 
 
 def welcomed(client: SecureLink, server: Gate, now_ns: int = 0) -> bytes:
-    """RESPONSE to a client with a cookie, admitted and opened."""
     call = called(server, client.hello(HELLO, now_ns=now_ns), now_ns)
     assert (call.payload, call.vehicle, call.moves) == (HELLO, 1, False)
     response = call.line.seal(WELCOME)
@@ -98,7 +91,6 @@ def welcomed(client: SecureLink, server: Gate, now_ns: int = 0) -> bytes:
 
 
 def keyed(client: SecureLink, server: Gate, now_ns: int = 0) -> None:
-    """Handshake, up to the adoption of keys."""
     challenged(client, server, now_ns)
     welcomed(client, server, now_ns)
     client.adopt(now_ns=now_ns)
@@ -112,7 +104,6 @@ def joined() -> tuple[SecureLink, Gate]:
 
 
 def live(server: Gate, vehicle: int = 1) -> int | None:
-    """Number of a vehicle's live channel."""
     channel = server._vehicles[vehicle].live
     return None if channel is None else channel.number
 
@@ -260,7 +251,6 @@ def test_where_adopting_leaves_the_attempt_open_a_command_is_flown_twice(
 
 
 def test_who_has_no_key_is_met_with_silence() -> None:
-    """Plaintext, another key, an unknown vehicle or key number: nothing is sent or kept."""
     server = gate()
     strangers = {
         "forged": VehicleKey.of(1, 5, b"x" * 32),
@@ -301,7 +291,6 @@ def changed(datagram: bytes, at: int) -> bytes:
 
 
 def exchanges(monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    """List with an entry for each operation on the elliptic curve."""
     exchange, found = noise_nnpsk0._exchange, []
 
     def counted(private: X25519PrivateKey, public: bytes) -> bytes:
@@ -373,7 +362,6 @@ def test_a_challenge_answers_one_attempt_once() -> None:
 
 
 OBSERVER = [("observer", port) for port in range(50)]
-"""Addresses of an observer who copies a vehicle's packets."""
 
 
 def asked(client: SecureLink, server: Gate, now_ns: int, *, foreign_first: bool) -> list[bytes]:
@@ -463,7 +451,6 @@ def test_who_repeats_an_attempt_uses_up_no_answers() -> None:
 
 
 def test_attempts_that_brought_a_channel_are_answered_no_more() -> None:
-    """Nor are earlier, recorded attempts: the newest 16."""
     server, recorded = gate(), []
     for seed in range(10, 27):
         client, now_ns = link(seed=seed), seed * SECOND_NS
@@ -533,7 +520,6 @@ def test_without_the_order_of_counters_a_late_packet_moves_the_address(
 
 
 def test_keys_are_exchanged_under_way_without_a_lost_packet() -> None:
-    """Packets under way in the old channel are opened at both ends, for 10 s."""
     client, server = joined()
     line = called(server, client.seal(OBSERVATION)).line
     assert not client.wants_hello(FRESH_NS - 1)
@@ -583,7 +569,6 @@ def test_a_hello_that_is_repeated_ends_no_flight() -> None:
 
 
 def test_a_closed_attempt_is_not_answered() -> None:
-    """Its INITIATION, recorded and repeated, gives nobody a HELLO, cookie or not."""
     client, server = apart()
     hello = client.hello(HELLO, now_ns=0)
     welcomed(client, server)
@@ -621,7 +606,6 @@ class Flight:
         self.now_ns = 0
 
     def send(self, to_server: bool, datagram: bytes) -> None:
-        """Send a datagram: lost, once or twice, with a delay for each copy."""
         self.sent.append((to_server, datagram))
         for _ in range(1 + (self.rng.random() < 0.2)):
             if self.rng.random() >= self.loss:
@@ -632,7 +616,6 @@ class Flight:
         self.send(True, self.client.hello(HELLO, now_ns=self.now_ns))
 
     def deliver(self, to_server: bool, datagram: bytes) -> None:
-        """Deliver a datagram, and send the answers."""
         try:
             if to_server:
                 self.at_server(datagram)
@@ -642,7 +625,6 @@ class Flight:
             self.dropped[error.reason] += 1
 
     def at_server(self, datagram: bytes) -> None:
-        """Let the server handle a datagram."""
         call = self.server.open(Datagram(datagram, HERE), now_ns=self.now_ns)
         for challenge in self.server.outbox():
             self.send(False, challenge.payload)
@@ -656,7 +638,6 @@ class Flight:
             self.send(False, call.line.seal(HORIZON))
 
     def at_client(self, datagram: bytes) -> None:
-        """Let the client handle a datagram."""
         payload = self.client.open(datagram, now_ns=self.now_ns)
         if payload is None:
             self.hello()
@@ -668,7 +649,6 @@ class Flight:
             self.flies = True
 
     def tick(self) -> None:
-        """Advance by a tenth of a second."""
         self.now_ns += TICK_NS
         while self.under_way and self.under_way[0][0] <= self.now_ns:
             _, _, to_server, datagram = heappop(self.under_way)
@@ -682,7 +662,6 @@ class Flight:
             self.send(True, self.client.seal(OBSERVATION))
 
     def until(self, horizons: int) -> None:
-        """Run until so many horizons have arrived, for at most three minutes."""
         for _ in range(1800):
             if self.heard[HORIZON] >= horizons:
                 return
@@ -788,7 +767,6 @@ def test_nothing_is_accepted_after_a_restart(restarted: str) -> None:
     "message", [OBSERVATION, WELCOME[:2] + b"\xcc\x01", b"\xdc\x00\x05\x04\x01", b"", b"\x95"]
 )
 def test_only_a_hello_travels_in_an_initiation(message: bytes) -> None:
-    """Anything else, whose packet others could repeat, is dropped."""
     server, client = gate(), link()
     challenged(client, server, hello=message)
     assert refusal(server, client.hello(message, now_ns=0)) == "out of place"
@@ -798,7 +776,6 @@ def test_only_a_hello_travels_in_an_initiation(message: bytes) -> None:
     "message", [HELLO, WELCOME, b"\x95\xcc\x04\x01", b"\xdc\x00\x05\x04\x01", b""]
 )
 def test_no_greeting_travels_in_a_channel(message: bytes) -> None:
-    """Neither in its shortest encoding, nor in a longer form of msgpack."""
     client, server = joined()
     line = called(server, client.seal(OBSERVATION)).line
     assert refusal(server, client.seal(message)) == "out of place"
@@ -916,7 +893,6 @@ def test_no_secret_is_shown_by_an_end() -> None:
 
 
 def test_a_hello_whose_ephemeral_key_is_none_is_dropped() -> None:
-    """Only the owner of the key can make one."""
     key, server = KEYS[1, 5], gate()
     public = bytes(32)
     state = noise_nnpsk0._begin(key.psk, handshake.prologue(key)).mix_ephemeral(public)

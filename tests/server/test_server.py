@@ -64,14 +64,11 @@ DAY_NS = 86_400 * SECOND_NS
 
 
 def scenario(**control: Any) -> Scenario:
-    """The paper's scenario with keys of `control` changed, and a short timeout of vehicles."""
     soon = {"timeout_s": SILENCE_NS / SECOND_NS}
     return packaged("paper-every-step", control=control, link=soon)
 
 
 class Vehicles:
-    """Server, and vehicles played by the test."""
-
     def __init__(self, flown: Scenario, boot_id: int = 77, room: int = VEHICLES_MAX) -> None:
         self.terms = flown.terms()
         self.dt_ns = flown.dt_ns
@@ -87,19 +84,15 @@ class Vehicles:
         # Ticks lie on multiples of 50 ms: the first is 30 ms after the first message.
         self.now_ns = 10 * SECOND_NS + 20 * MILLISECOND_NS
         self.epochs_ns: dict[int, int] = {}
-        """Start of step 0 of each session."""
 
     def say(self, message: Message, sender: Address = HERE) -> list[tuple[Message, Address]]:
-        """Send one datagram; returns the answers."""
         self.server.receive(Datagram(encode(message), sender), now_ns=self.now_ns)
         return self.answers()
 
     def answers(self) -> list[tuple[Message, Address]]:
-        """Messages in the outbox, decoded."""
         return [(decode(out.payload, self.terms), out.peer) for out in self.server.outbox()]
 
     def ask(self, vehicle: int = 1, boot_id: int = 5, sender: Address = HERE) -> Welcome:
-        """Answer to a HELLO."""
         ((welcome, peer),) = self.say(Hello(vehicle, boot_id, self.terms), sender)
         assert isinstance(welcome, Welcome)
         assert peer == sender
@@ -118,7 +111,6 @@ class Vehicles:
         state: object = ((1.0, 0.0), (0.0, 0.0)),
         sender: Address = HERE,
     ) -> None:
-        """Send an observation, without delay unless it is an old one."""
         epoch_ns = self.epochs_ns.setdefault(welcome.session, self.now_ns - step * self.dt_ns)
         self.now_ns = max(self.now_ns, epoch_ns + step * self.dt_ns)
         assert self.say(self.told(welcome, step, state), sender) == []
@@ -126,7 +118,6 @@ class Vehicles:
     def told(
         self, welcome: Welcome, step: int, state: object = ((1.0, 0.0), (0.0, 0.0))
     ) -> Observation:
-        """Observation of a step of a session with an epoch."""
         epoch_ns = self.epochs_ns[welcome.session]
         return Observation(
             welcome.vehicle,
@@ -151,13 +142,11 @@ class Vehicles:
         return due_ns
 
     def tick(self) -> list[tuple[Message, Address]]:
-        """Advance to the next tick; returns the messages sent at it."""
         self.now_ns = max(self.now_ns, self.due_ns)
         self.server.wake(now_ns=self.now_ns)
         return self.answers()
 
     def planned(self) -> tuple[Horizon, Address]:
-        """The only message of the next tick, a horizon, and its receiver."""
         ((horizon, peer),) = self.tick()
         assert isinstance(horizon, Horizon)
         return horizon, peer

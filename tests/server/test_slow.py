@@ -47,7 +47,6 @@ OUTSIDE_M = 3.2
 def scenario(
     uplink_s: float = 0.05, downlink_s: float = 0.05, *, duration: float = 40.0, **sections: Any
 ) -> Scenario:
-    """Figure eight in calm air at TIGHT weights over constant delays, with sections changed."""
     table = reading.to_table(reading.load("demo-committed")) | {"duration": duration}
     table["control"] |= TIGHT
     table["vehicle"] |= {"wind": 0.0, "report": "always"}
@@ -77,7 +76,6 @@ def fly_over(flown: Scenario, delays: Sequence[tuple[Delay, Delay]]) -> list[Rec
 
 
 def far_m(flight: Record) -> float:
-    """Largest distance from the centre of the figure eight [m]."""
     return float(np.linalg.norm(flight.client["state"][:, :, 0], axis=1).max())
 
 
@@ -105,7 +103,6 @@ def test_a_round_trip_much_longer_than_the_horizon_is_flown(
 
 
 def short(_: float) -> float:
-    """Constant delay."""
     return 0.05
 
 
@@ -126,12 +123,10 @@ def ways(side: str, delay: Delay) -> tuple[Delay, Delay]:
 
 SIDES = ("uplink", "downlink", "both")
 FIRM = {"feedback": True, "input_weight": 1.0, "input_reference": True}
-"""Keys of a vehicle with feedback aboard."""
 
 
 @cache
 def growing_flights(dt: float, horizon: int, *, feedback: bool) -> dict[tuple[str, str], Record]:
-    """Flight over each growing delay, on each side, by the names of both."""
     flown = scenario(control={**(FIRM if feedback else TIGHT), "dt": dt, "horizon": horizon})
     names = list(product(GROWING, SIDES))
     flights = fly_over(flown, [ways(side, GROWING[growing]) for growing, side in names])
@@ -210,7 +205,6 @@ def far_without_m(*growing: tuple[str, str]) -> list[float]:
 
 
 def test_without_a_bound_on_lateness_it_flies_away(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Horizons that arrive after other inputs were flown make the plans oscillate."""
     forget_late(monkeypatch)
     assert min(far_without_m(("slowly", "uplink"), ("slowly", "both"))) > 2 * OUTSIDE_M
 

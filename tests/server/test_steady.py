@@ -52,12 +52,10 @@ class Probe(Endpoint):
         self.times_ns.append(now_ns)
 
     def next_wake_ns(self) -> int | None:
-        """Wake time that the test set [ns]."""
         return self.due_ns
 
 
 def hear(endpoint: Endpoint, times_ns: Sequence[int]) -> None:
-    """Let a datagram arrive at each of these times."""
     for now_ns in times_ns:
         endpoint.receive(Datagram(b"?", ("peer", 1)), now_ns=now_ns)
 
@@ -194,7 +192,6 @@ SEEDS = range(1, 7)
 
 @cache
 def usual_rmse() -> list[float]:
-    """Error of each seed with equal clocks [m]."""
     return rmse(*SEEDS)
 
 
@@ -203,7 +200,6 @@ STEPS = {
     for host in ("client", "server")
     for step_ns in (HOUR_NS, -HOUR_NS)
 }
-"""Clock steps in flight, by name."""
 
 CLOCKS: dict[str, dict[str, Any]] = {
     "an hour apart": {"client_clock": Clock(MIDNIGHT_NS + HOUR_NS)},

@@ -64,27 +64,22 @@ KNOWN = SituationArrays(
     heartbeat_due=np.array([False, True]),
     desired=lambda rows, *_: np.zeros((len(rows), 2, 4, 2)),
 )
-"""Given state of at most two vehicles."""
 
 
 def facing(rows: Indices, figures: Figures) -> Situation:
-    """Situation of vehicles exactly on their plans."""
     states = np.zeros((len(rows), 2, 2))
     return Situation(rows, figures, states, states, KNOWN)
 
 
 def ask(trigger: Trigger, step: int, error: float, *, fresh: bool = False) -> Verdict:
-    """Verdict on one vehicle with V = error."""
     return trigger.test(facing(ROW, figures_of(step=step, error=error, fresh=fresh)))
 
 
 def tell(trigger: Trigger, step: int, error: float = 0.0) -> None:
-    """A horizon is sent to one vehicle at this step, with V = error."""
     trigger.sent(ROW, figures_of(step=step, error=error))
 
 
 def trigger_of(text: str, *, dt: float = 0.1, capacity: int = 1) -> Trigger:
-    """Trigger of a scenario with this text and CONTROL's weights."""
     return make_trigger(msgspec.structs.replace(CONTROL, trigger=text, dt=dt), capacity)
 
 
@@ -109,7 +104,6 @@ def test_first_step_is_an_event_however_small_the_error() -> None:
 
 
 def test_nothing_happens_without_an_event() -> None:
-    """A verdict without a packet leaves the threshold unchanged."""
     trigger = after_event(0, 10.0)
     for step in (1, 2, 3):
         ask(trigger, step, 100.0)
@@ -170,7 +164,6 @@ def test_some_send_at_every_step_whatever_the_error(text: str, error: float) -> 
 
 
 def events(trigger: Trigger, first: int, last: int, *, unsent: tuple[int, ...] = ()) -> list[int]:
-    """Steps at which the trigger fires; a packet is sent at each, except those in `unsent`."""
     wanted = []
     for step in range(first, last + 1):
         verdict = ask(trigger, step, 100.0, fresh=step == first)
@@ -208,7 +201,6 @@ WANTED: dict[str, tuple[str, list[Life]]] = {
 
 @pytest.mark.parametrize(("text", "lives"), WANTED.values(), ids=WANTED)
 def test_steps_at_which_a_policy_wants_to_send(text: str, lives: list[Life]) -> None:
-    """In steps of 0.05 s."""
     trigger = trigger_of(text, dt=0.05)
     for first, last, unsent, wanted in lives:
         assert events(trigger, first, last, unsent=unsent) == wanted
@@ -393,7 +385,6 @@ class Listener(Trigger):
         self.told.append(-row)
 
     def test(self, situation: Situation) -> Verdict:
-        """Fire if the figure is positive."""
         figure = np.full(len(situation.rows), self._figure)
         return Verdict(figure > 0.0, figure, figure, self._compared)
 
@@ -437,11 +428,9 @@ trees = st.recursive(
     lambda tree: st.tuples(tree, st.sampled_from("&|"), tree),
     max_leaves=6,
 )
-"""Expressions as nested triples."""
 
 
 def written(tree: Any) -> str:
-    """Trigger as text of a scenario."""
     return tree if isinstance(tree, str) else f"({written(tree[0])} {tree[1]} {written(tree[2])})"
 
 
@@ -501,7 +490,6 @@ def test_batch_is_judged_as_its_singles(tree: Any, seed: int) -> None:
 
 
 def test_columns_of_a_plugin_reach_kernels_as_kernels_read_them() -> None:
-    """Numbers of another type or layout are copied, because kernels do not check them."""
     for values in (np.arange(3), np.arange(6.0)[::2], np.ones(3, dtype=np.float32), [1, 2, 3]):
         column = _column(values, np.float64, 3)
         assert (column.dtype, column.flags.c_contiguous) == (np.dtype(np.float64), True)

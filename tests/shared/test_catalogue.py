@@ -21,14 +21,10 @@ DOCS = Path(__file__).parents[2] / "docs"
 
 
 class Free(Section, frozen=True):
-    """A key without an owner."""
-
     wind: Strength = 0.0
 
 
 class Shared(Section, frozen=True):
-    """A key with two owners."""
-
     wind: OfServer[Annotated[float, Key(Owner.VEHICLE)]] = 0.0
 
 

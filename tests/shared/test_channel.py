@@ -40,7 +40,6 @@ OTHER_FORTH, OTHER_BACK = bytes([3]) * 32, bytes([4]) * 32
 def ends(
     vehicle: int = 1, number: int = 7, forth: bytes = FORTH, back: bytes = BACK
 ) -> tuple[Channel, Channel]:
-    """Both ends of a channel: the vehicle's and the server's."""
     return (
         Channel(vehicle, number, seal=forth, open_=back, born_ns=0),
         Channel(vehicle, number, seal=back, open_=forth, born_ns=0),
@@ -48,7 +47,6 @@ def ends(
 
 
 def refusal(channel: Channel, packet: bytes, now_ns: int = 0) -> str:
-    """Reason for which a packet is not opened."""
     with pytest.raises(ProtocolError) as error:
         channel.open(packet, now_ns=now_ns)
     return error.value.reason
@@ -177,7 +175,6 @@ def test_a_channel_is_replaced_and_ends_by_age() -> None:
 
 
 def test_a_channel_is_replaced_and_ends_by_packets() -> None:
-    """A new one is requested after 2^22 packets either way; nothing is opened after 2^32."""
     vehicle, server = ends()
     vehicle._sent = FRESH_PACKETS - 1
     assert not vehicle.wants_successor(0)
@@ -234,7 +231,6 @@ def change_bytes(rng: random.Random, packet: bytes, _: bytes) -> bytes:
 
 
 def change_header(rng: random.Random, packet: bytes, _: bytes) -> bytes:
-    """Change the counter, by little or much, without the seal."""
     at = HEADER.size - 8
     counter = rng.choice([rng.randrange(64), rng.randrange(2**32), rng.randrange(2**64)])
     return packet[:at] + struct.pack("<Q", counter) + packet[at + 8 :]
@@ -249,13 +245,11 @@ def extend(rng: random.Random, packet: bytes, _: bytes) -> bytes:
 
 
 def splice(rng: random.Random, packet: bytes, other: bytes) -> bytes:
-    """Beginning of one packet, and end of another."""
     at = rng.randrange(1, min(len(packet), len(other)))
     return packet[:at] + other[at:]
 
 
 def invent(rng: random.Random, packet: bytes, _: bytes) -> bytes:
-    """Valid header with random content."""
     return packet[: HEADER.size] + rng.randbytes(rng.randrange(80))
 
 

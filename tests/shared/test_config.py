@@ -323,7 +323,6 @@ WRONG = {
 
 
 def refusal(path: Path | str) -> str:
-    """Message about a scenario that cannot be flown."""
     return helpers.refusal(lambda: reading.load(str(path)))
 
 
@@ -357,7 +356,6 @@ def test_what_is_wrong_is_said_with_file_key_given_and_expected(
     ],
 )
 def test_a_number_that_is_not_finite_is_refused(key: str, value: str, tmp_path: Path) -> None:
-    """TOML has inf and nan; no key accepts them."""
     path = write(tmp_path, "mine.toml", f"{key} = {value}")
     assert refusal(path).startswith(
         f"{path}: {key.removesuffix('.slots_mean').removesuffix('.paper')}"
@@ -413,7 +411,6 @@ def test_an_unknown_scenario_is_refused_with_the_nearest_name() -> None:
 
 
 def test_a_file_of_scenarios_holds_one_in_each_table(tmp_path: Path) -> None:
-    """Each is named by the file's path and its own name, and may extend another scenario."""
     path = write(tmp_path, "many.toml", '[one]\nextends = "paper"\nseed = 9\n["two.5"]\nseed = 8')
     mine = write(tmp_path, "mine.toml", 'extends = "many.toml/one"\nduration = 7.0')
     assert reading.names(str(path)) == [f"{path}/one", f"{path}/two.5"]
@@ -426,7 +423,6 @@ def test_a_file_of_scenarios_holds_one_in_each_table(tmp_path: Path) -> None:
 
 
 def test_the_compared_scenarios_are_no_scenario_themselves() -> None:
-    """But each of its tables is; unknown ones are refused."""
     assert refusal("compare").startswith("compare: no such scenario; there are 5g-")
     assert reading.load("compare/paper-event-gusts").vehicle.gust_mps2 == 1.0
     said = "compare/paper-evnt-gusts: no such scenario; did you mean paper-event-gusts?"
@@ -473,7 +469,6 @@ def test_a_long_chain_of_scenarios_is_refused(tmp_path: Path) -> None:
 
 
 def test_extends_needs_the_name_of_a_scenario(tmp_path: Path) -> None:
-    """A number is refused, and so is an unknown name."""
     number = write(tmp_path, "number.toml", "extends = 3")
     assert refusal(number) == f"{number}: extends: got 3, expected the name of a scenario"
     unknown = write(tmp_path, "unknown.toml", 'extends = "papr"')
@@ -496,7 +491,6 @@ def test_a_path_with_a_zero_byte_is_refused(tmp_path: Path) -> None:
 
 
 def test_extends_lays_a_scenario_over_another_key_by_key(tmp_path: Path) -> None:
-    """Over two levels, and down to the keys of inner tables."""
     write(
         tmp_path,
         "base.toml",
@@ -598,7 +592,6 @@ def test_a_trajectory_is_looked_for_beside_the_scenario_that_names_it(tmp_path: 
 def test_a_trajectory_that_cannot_be_flown_is_refused(
     table: str | None, said: str, tmp_path: Path
 ) -> None:
-    """With the number of the wrong line, if any."""
     path = write(tmp_path, "mine.toml", '[reference]\nshape = "csv"\nfile = "path.csv"')
     trajectory = tmp_path / "path.csv"
     if table is not None:
@@ -635,7 +628,6 @@ def test_a_trajectory_out_of_this_world_is_refused(table: str, tmp_path: Path) -
 
 
 def test_one_value_is_for_all_axes() -> None:
-    """A list has one value for each axis."""
     scenario = reading.check(
         {"model": {"axes": 3, "tau_s": [0.5], "u_max": [1.0, 2.0, 3.0]}}, "mine.toml"
     )
@@ -644,7 +636,6 @@ def test_one_value_is_for_all_axes() -> None:
 
 
 def test_the_vehicle_is_what_the_model_says_unless_it_is_told_otherwise() -> None:
-    """The vehicle's time constants are the model's by default."""
     model = {"tau_s": [0.5, 0.6]}
     same = reading.check({"model": model}, "mine.toml")
     other = reading.check({"model": model, "vehicle": {"tau_s": [0.9]}}, "mine.toml")
@@ -653,7 +644,6 @@ def test_the_vehicle_is_what_the_model_says_unless_it_is_told_otherwise() -> Non
 
 
 def test_the_terms_hold_what_both_ends_must_agree_on() -> None:
-    """With a number for each axis, and the step in nanoseconds."""
     terms = Scenario().terms()
     assert terms[:5] == (50_000_000, 80, 2, (0.84, 0.84), (1.0, 1.0))
     assert terms[5:7] == ((0.0, 0.0), (1.6, 1.6))
@@ -664,5 +654,4 @@ def test_the_terms_hold_what_both_ends_must_agree_on() -> None:
 
 @pytest.mark.parametrize(("duration", "steps"), [(60.0, 1200), (0.12, 2), (0.001, 1)])
 def test_a_flight_has_as_many_steps_as_fit_its_duration(duration: float, steps: int) -> None:
-    """Rounded, and at least one."""
     assert reading.check({"duration": duration}, "mine.toml").steps == steps

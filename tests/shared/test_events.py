@@ -94,7 +94,6 @@ FIGURES = {
 
 
 def test_figures_are_names_and_numbers_in_two_columns() -> None:
-    """Groups are indented, and an empty one is marked."""
     assert rendered(FIGURES) == [
         "missed       3",
         "tick_ms_p50  0.25",
@@ -124,7 +123,6 @@ def test_two_groups_of_a_kind_share_the_lines() -> None:
 
 
 AT = re.compile(r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d\.\d{3} server\.1: ")
-"""Beginning of a line of text."""
 
 
 @contextmanager
@@ -192,7 +190,6 @@ def test_lines_that_nobody_reads_are_counted_for_whoever_reads_later(
 
 
 def test_a_log_of_text_names_its_process_in_every_line(capfd: pytest.CaptureFixture[str]) -> None:
-    """Also in the lines of figures and of a traceback."""
     log = Log("client", "text")
     log.say(Flying(vehicle=1))
     log.say(Counted(figures={"missed": 3}))
@@ -253,7 +250,6 @@ class Talker(Endpoint):
 
 
 def test_events_that_nobody_takes_give_way_and_are_counted() -> None:
-    """The oldest are dropped; once read, there is capacity again."""
     talker = Talker()
     talker.wake(now_ns=EVENTS_MAX + 7)
     omitted, *events = talker.events()

@@ -53,7 +53,6 @@ def bounded(base: type, meta: msgspec.Meta) -> st.SearchStrategy[Any]:
 
 
 def keys(section: type[msgspec.Struct], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Every key of a scenario with dots, and its type."""
     for key, kind in typing.get_type_hints(section, include_extras=True).items():
         if isinstance(kind, type) and issubclass(kind, msgspec.Struct):
             yield from keys(kind, f"{prefix}{key}.")
@@ -101,7 +100,6 @@ def fly(scenario: Scenario) -> str:
 )
 @given(drawn())
 def test_extreme_values_are_flown_or_refused_in_one_line(flat: dict[str, Any]) -> None:
-    """Without overflow, division by zero, or warnings."""
     try:
         said = fly(made(flat))
     except ConfigError as error:

@@ -40,12 +40,10 @@ CALLS: list[tuple[Any, tuple[str, ...], str]] = [
 
 
 def link(path: Path) -> None:
-    """Link to another file."""
     path.symlink_to("precious")
 
 
 def dangling(path: Path) -> None:
-    """Link without a target."""
     path.symlink_to("nothing")
 
 
@@ -77,7 +75,6 @@ def test_no_command_writes_through_a_link_or_to_a_device(
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    """Refused in one line before anything is flown; the target stays unchanged."""
     precious, at = tmp_path / "precious", tmp_path / f"it{suffix}"
     precious.write_text("precious")
     made(at)

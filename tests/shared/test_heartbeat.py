@@ -45,7 +45,6 @@ def test_the_server_waits_longer_than_the_vehicle(link: LinkConfig, patience_s: 
 
 
 def hear(hearing: Hearing, number: int) -> None:
-    """Receive a packet by its number in the session; one is sent per millisecond."""
     hearing.hear(number % NUMBERS, number * MILLISECOND_NS)
 
 
@@ -83,7 +82,6 @@ def test_what_is_asked_for_meets_the_goal_or_is_the_shortest(
     ("loss", "period_s"), [(0.0, 0.6), (0.05, 0.45), (0.1, 0.35), (0.2, 0.2), (0.3, 0.15)]
 )
 def test_a_lossier_link_is_asked_for_more(loss: float, period_s: float) -> None:
-    """With a timeout of 2 s and steps of 50 ms, after many packets."""
     table = silences(2 * SECOND_NS, DT_NS)
     found = next(ns for up_to, ns in table if loss + 0.005 * (loss == 0.0) <= up_to)
     assert found == round(period_s * SECOND_NS)

@@ -5,7 +5,6 @@ from skytether.shared.telemetry.histogram import BINS, Histogram
 
 
 def filled(*values_ns: int) -> Histogram:
-    """Histogram with bins of 10 ns."""
     histogram = Histogram(10)
     for value_ns in values_ns:
         histogram.add(value_ns)

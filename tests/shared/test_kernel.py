@@ -112,7 +112,6 @@ print([each.name for each in kernels], len(done), kernel.missing())
 
 
 def put(folder: Path, helper: str = HELPER, caller: str = CALLER) -> Path:
-    """Folder with both modules."""
     (folder / "helper.py").write_text(helper)
     (folder / "caller.py").write_text(caller)
     return folder
@@ -171,7 +170,6 @@ def test_a_help_and_a_refusal_compile_nothing(tmp_path: Path) -> None:
 
 
 def test_what_is_compiled_is_said_once(tmp_path: Path) -> None:
-    """One line without a terminal; nothing if machine code is on disk."""
     put(tmp_path, caller=MODULE)
     said = "compiling control loops, which this machine then keeps: it takes up to a minute\n"
     assert quiet(tmp_path, PREPARED) == said
@@ -278,7 +276,6 @@ def test_a_server_loads_no_kernel_of_another_scheme(scenario: str) -> None:
 
 
 def test_a_kernel_refuses_other_types_than_its_own(tmp_path: Path) -> None:
-    """At its first call; at each call where requested, as in all tests."""
     put(tmp_path, caller=MODULE)
     assert quiet(tmp_path, REFUSING) == ""
     assert quiet(tmp_path, REFUSING, "checked") == ""

@@ -21,15 +21,12 @@ A, B, C = (bytes([i]) * 32 for i in (0xA1, 0xB2, 0xC3))
 
 
 class Run(NamedTuple):
-    """Result of a command."""
-
     returncode: int
     stdout: str
     stderr: str
 
 
 def keygen(*argv: str, cwd: Path) -> Run:
-    """Run `skytether keygen` in a folder."""
     with chdir(cwd), redirect_stdout(StringIO()) as out, redirect_stderr(StringIO()) as err:
         code = command.main(keygen_, argv, "keygen")
     return Run(code, out.getvalue(), err.getvalue())
@@ -40,7 +37,6 @@ def keyring(*lines: str) -> Keyring:
 
 
 def put(path: Path, content: bytes, mode: int = 0o600) -> Path:
-    """Write a file with a mode."""
     path.write_bytes(content)
     path.chmod(mode)
     return path
@@ -92,7 +88,6 @@ GOOD = f"1 1 {A.hex()}"
     ],
 )
 def test_a_line_that_is_none_is_refused_and_not_repeated(content: str, message: str) -> None:
-    """The message says where and what was expected, and shows nothing of a secret."""
     with pytest.raises(ConfigError, match=f"^keys: {message}") as error:
         parse("keys", content.encode())
     assert "\n" not in str(error.value)

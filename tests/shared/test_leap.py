@@ -5,7 +5,6 @@ import pytest
 from skytether.shared.law.leap import position_leaps, velocity_leaps
 
 LEAST = 1e-9
-"""Smallest excess over a bound that counts [m, m/s]."""
 
 
 @pytest.mark.parametrize(

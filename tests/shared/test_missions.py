@@ -53,7 +53,6 @@ def test_vehicles_that_take_turns_at_a_place_are_not_too_near() -> None:
 
 
 def grid(vehicles: int) -> Array:
-    """Places on a square grid of 1 m."""
     return np.stack(np.divmod(np.arange(vehicles), round(vehicles**0.5)), axis=1).astype(float)
 
 

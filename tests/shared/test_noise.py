@@ -28,11 +28,8 @@ class Vector(NamedTuple):
     first: str
     second: str
     forth_0: str
-    """First packet of the initiator, "forth"."""
     forth_1: str
-    """Second packet of the initiator, "forth"."""
     back_0: str
-    """First packet of the responder, "back"."""
 
 
 # fmt: off
@@ -72,18 +69,15 @@ VECTORS = [
 
 
 def fixed(name: str) -> bytes:
-    """Key of the vectors by name."""
     return hashlib.blake2s(name.encode()).digest()
 
 
 def shake(psk: bytes, prologue: bytes = b"") -> tuple[Initiator, Responder]:
-    """Both ends, after the first message."""
     initiator = Initiator(psk, prologue, fixed("a"), b"hello")
     return initiator, Responder(psk, prologue, initiator.message)
 
 
 def packet(key: bytes, counter: int, payload: bytes) -> bytes:
-    """Transport message of Noise."""
     nonce = bytes(4) + counter.to_bytes(8, "little")
     return ChaCha20Poly1305(key).encrypt(nonce, payload, b"")
 

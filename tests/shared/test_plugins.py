@@ -62,7 +62,6 @@ class bad(Impairment):
 
 
 def plug(folder: Path, code: str, name: str = "mine.py") -> str:
-    """Path of an imported plug-in."""
     path = folder / name
     path.write_text(HEAD + dedent(code))
     plugins.load([str(path)])
@@ -70,12 +69,10 @@ def plug(folder: Path, code: str, name: str = "mine.py") -> str:
 
 
 def scenario(**sections: Any) -> Scenario:
-    """The scenario demo-committed for ten seconds, with sections changed."""
     return packaged("demo-committed", {"duration": 10.0}, sections)
 
 
 def flown(trigger: str, **control: Any) -> Record:
-    """Flight of the scenario with a trigger."""
     return fly(scenario(control={"trigger": trigger} | control))
 
 
@@ -83,7 +80,6 @@ def flown(trigger: str, **control: Any) -> Record:
 
 
 def example(document: Path) -> str:
-    """The only plug-in in a document."""
     blocks: list[str] = re.findall(r"```python\n(.*?)```", document.read_text(), re.DOTALL)
     (code,) = (block for block in blocks if "skytether.plugin import" in block)
     return code
@@ -102,7 +98,6 @@ def example(document: Path) -> str:
 def test_the_documented_plugin_flies_with_the_documented_command(
     document: Path, file: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The page's example, saved under the name it gives, flies with the page's command."""
     (line,) = re.findall(rf"^skytether .*--plugin {file}.*$", document.read_text(), re.MULTILINE)
     (tmp_path / file).write_text(example(document))
     with chdir(tmp_path):
@@ -119,7 +114,6 @@ def test_the_documented_trigger_sends_where_the_velocity_is_off(tmp_path: Path) 
 
 
 def test_the_documented_reference_moves_as_fast_as_it_says(tmp_path: Path) -> None:
-    """Its velocity is the slope of its positions; at the end it rests at `radius_m`."""
     plug(tmp_path, example(SCHEMES_MD))
     wanted = {"shape": "spiral(2)", "period_s": 40.0, "radius_m": 3.0}
     at = scenario(reference=wanted).make_reference()
@@ -182,7 +176,6 @@ def test_a_policy_is_given_what_it_may_know(tmp_path: Path) -> None:
 
 
 def test_plan_horizon_and_desired_states_are_those_that_are_flown(tmp_path: Path) -> None:
-    """The plan is the one that is sent; without loss, the horizon aboard is the last sent one."""
     code = """
         @trigger
         def look(now):
@@ -247,7 +240,6 @@ def test_a_vehicle_that_was_sent_nothing_is_sent_to_whatever_a_function_says(
 
 
 def test_a_class_remembers_what_was_sent(tmp_path: Path) -> None:
-    """A rewritten `periodic` flies like the built-in one, to the last bit."""
     code = """
         @trigger(name="every")
         class Every(Trigger):
@@ -272,7 +264,6 @@ def test_a_class_remembers_what_was_sent(tmp_path: Path) -> None:
 
 
 def test_figures_of_a_plugin_are_recorded_and_a_batch_is_its_singles(tmp_path: Path) -> None:
-    """With `above`, the record has figure and threshold."""
     code = """
         @trigger
         def far(now, m: float = 0.2):
@@ -331,7 +322,6 @@ def test_arguments_of_a_plugin_are_checked_like_ours(
 def test_every_bound_of_msgspec_holds(
     bound: str, right: str, wrong: str, form: str, tmp_path: Path
 ) -> None:
-    """As for keys of a scenario: `jolt(-0.2)` is refused if the argument must be above 0."""
     code = f"""
         from typing import Annotated
         from msgspec import Meta
@@ -358,7 +348,6 @@ def test_every_bound_of_msgspec_holds(
 def test_every_bound_of_a_text_holds(
     bound: str, right: str, wrong: str, form: str, tmp_path: Path
 ) -> None:
-    """Impairments take words and names of files."""
     code = f"""
         from typing import Annotated, Literal
         from msgspec import Meta
@@ -399,7 +388,6 @@ def test_a_plugin_may_take_negative_numbers_and_have_defaults(tmp_path: Path) ->
 
 
 def test_a_plugin_that_needs_a_scheme_is_refused_with_another(tmp_path: Path) -> None:
-    """The refusal is worded as for a built-in trigger."""
     code = """
         @trigger(needs="held")
         def mine(now):
@@ -534,7 +522,6 @@ MISTAKES = {
 
 @pytest.mark.parametrize(("body", "said"), MISTAKES.values(), ids=MISTAKES)
 def test_a_trigger_that_fails_sends_and_is_told_once(body: str, said: str, tmp_path: Path) -> None:
-    """An unnecessary packet costs bytes, a missing one the flight."""
     plug(tmp_path, f"@trigger\ndef bad(now):\n    {body}\n")
     flight, always = flown("bad"), flown("always")
     assert faults(flight) == [f"the trigger bad: {said}; when it fails, a horizon is sent"]
@@ -544,13 +531,11 @@ def test_a_trigger_that_fails_sends_and_is_told_once(body: str, said: str, tmp_p
 
 
 def test_a_budget_caps_a_trigger_that_fails(tmp_path: Path) -> None:
-    """Two packets at once, and one a second."""
     plug(tmp_path, "@trigger\ndef bad(now):\n    raise RuntimeError\n")
     assert 0 < flown("bad & budget(1, 2)").server["event"].sum() <= 12
 
 
 def test_a_class_may_fail_anywhere(tmp_path: Path) -> None:
-    """The mistake is logged once, and the flight continues."""
     code = """
         @trigger(name="bad")
         class Bad(Trigger):
@@ -573,7 +558,6 @@ def test_a_class_may_fail_anywhere(tmp_path: Path) -> None:
 
 
 def test_a_batch_with_a_trigger_that_fails_is_no_measurement(tmp_path: Path) -> None:
-    """The batch ends with the trigger's error."""
     plug(tmp_path, "@trigger\ndef bad(now):\n    raise RuntimeError('no')\n")
     said = refusal(lambda: fly_batch(scenario(control={"trigger": "bad"}), [1, 2]))
     assert said == "the trigger bad: RuntimeError: no; when it fails, a horizon is sent"
@@ -632,7 +616,6 @@ def test_a_shape_is_written_in_one_way(shape: str, tmp_path: Path) -> None:
 
 
 def test_ends_whose_references_differ_have_other_terms(tmp_path: Path) -> None:
-    """In name, numbers or the function's result, but not in its code."""
     terms = []
     for states in ("mps * t", "t * mps + 1e-9", "0.999 * mps * t"):
         plug(tmp_path, SLOPE.replace("mps * t", states))
@@ -648,7 +631,6 @@ def test_ends_whose_references_differ_have_other_terms(tmp_path: Path) -> None:
 
 
 def test_a_long_shape_fits_the_wire(tmp_path: Path) -> None:
-    """Its beginning and a digest, 32 characters at most."""
     name = "a_name_that_is_a_good_deal_longer_than_others"
     plug(tmp_path, SLOPE.replace("slope", name))
     shapes = [scenario(reference={"shape": f"{name}({mps})"}).terms().shape for mps in (0.1, 0.2)]
@@ -657,7 +639,6 @@ def test_a_long_shape_fits_the_wire(tmp_path: Path) -> None:
 
 
 def test_the_terms_of_our_shapes_are_their_names() -> None:
-    """Their other properties follow from other terms."""
     for shape in ("circle", "figure-eight", "square", "target", "live"):
         assert scenario(reference={"shape": shape}).terms().shape == shape
     assert all(entry.is_ours for entry in REFERENCES.values())
@@ -667,7 +648,6 @@ def test_the_terms_of_our_shapes_are_their_names() -> None:
 
 
 def test_a_worker_is_given_the_plugin_with_its_content(tmp_path: Path) -> None:
-    """Also if the file is gone, or has changed."""
     path = plug(tmp_path, NEVER)
     job = partial(_equipped, lambda name: name in TRIGGERS, plugins.loaded())
     Path(path).unlink()
@@ -703,7 +683,6 @@ def test_a_journal_knows_the_plugins_that_its_results_follow_from(tmp_path: Path
 def test_commands_of_the_laboratory_take_the_flag_several_times(
     argv: list[str], said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Each file is imported, in order, before the command refuses another option."""
     files = [tmp_path / "one.py", tmp_path / "two.py"]
     for path, code in zip(files, (NEVER, SLOPE), strict=True):
         path.write_text(HEAD + code)
@@ -735,7 +714,6 @@ SHORT = "--settle 0 --duration 4 --reference.shape slope(0.4)"
 
 
 def run(line: str, *more: str, folder: Path, path: str = "") -> str:
-    """Output of a command that must succeed, run as a process of its own."""
     argv = [sys.executable, "-P", "-m", "skytether", *line.split(), *more]
     env = os.environ | {"PYTHONPATH": path}
     done = subprocess.run(argv, cwd=folder, env=env, capture_output=True, text=True, check=False)
@@ -745,7 +723,6 @@ def run(line: str, *more: str, folder: Path, path: str = "") -> str:
 
 @pytest.fixture(scope="session")
 def installed(tmp_path_factory: pytest.TempPathFactory) -> str:
-    """Folder into which tests/plugin_package is installed."""
     folder = tmp_path_factory.mktemp("installed")
     with chdir(ROOT / "tests" / "plugin_package"):
         wheel = build_wheel(str(folder))
@@ -756,7 +733,6 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> str:
 def test_an_installed_package_adds_a_trigger_a_reference_and_a_vehicle(
     installed: str, tmp_path: Path
 ) -> None:
-    """Without a flag, and without a change of Skytether."""
     about = "Sends where the velocity is off its plan by more than so many m/s. (from my_package)"
     listed = run("triggers", folder=tmp_path, path=installed)
     assert f"slip(mps=0.3) with 0 <= mps\n    {about}\n" in listed
@@ -770,7 +746,6 @@ def test_an_installed_package_adds_a_trigger_a_reference_and_a_vehicle(
 
 
 def test_an_installed_package_adds_a_scheme(installed: str, tmp_path: Path) -> None:
-    """It is listed, and flown with the trigger whose figure it computes."""
     listed = run("schemes", folder=tmp_path, path=installed)
     assert "beacon\n    Sends where the vehicle should be now and how fast" in listed
     control = "--control.scheme beacon --control.trigger deviation(0.1)"
@@ -815,7 +790,6 @@ def test_an_installed_package_adds_an_impairment(installed: str, tmp_path: Path)
     ],
 )
 def test_a_mistake_of_an_impairment_ends_no_flight(mistake: str, tmp_path: Path) -> None:
-    """The impairment has no effect, and the mistake is logged once per flow and direction."""
     plug(tmp_path, IMPAIRING.format(mistake=mistake))
     network = {"uplink": "constant(0.2) & bad", "downlink": "constant(0.2)"}
     flight = fly(scenario(network=network))
@@ -840,7 +814,6 @@ def test_every_process_of_a_flight_knows_the_plugin(tmp_path: Path) -> None:
 @pytest.mark.long
 @pytest.mark.timeout(400)
 def test_workers_of_every_kind_know_the_plugin(tmp_path: Path) -> None:
-    """Processes of sweep and calibrate, and of a fleet's server."""
     (tmp_path / "mine.py").write_text(HEAD + SLOPE + NEVER)
     here = f"--workers 2 --plugin mine.py {SHORT}"
     grid = 'control.trigger="never | silence(1)","always"'
@@ -854,7 +827,6 @@ def test_workers_of_every_kind_know_the_plugin(tmp_path: Path) -> None:
 @pytest.mark.timeout(400)
 @pytest.mark.skipif(importlib.util.find_spec("distributed") is None, reason="needs `distributed`")
 def test_a_dask_worker_knows_the_plugin(tmp_path: Path) -> None:
-    """A worker started before, in a folder without the file."""
     (tmp_path / "mine.py").write_text(HEAD + NEVER)
     elsewhere = tmp_path / "elsewhere"
     elsewhere.mkdir()

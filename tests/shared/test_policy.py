@@ -103,13 +103,11 @@ REFUSED = {
 
 
 def refusal(text: str) -> str:
-    """Refusal of a scenario with this trigger."""
     return helpers.refusal(lambda: reading.check({"control": {"trigger": text}}, "mine"))
 
 
 @pytest.mark.parametrize(("text", "read"), READ.items(), ids=READ)
 def test_what_is_written_is_read(text: str, read: Expression) -> None:
-    """Names, numbers, &, | and parentheses, as Python reads them."""
     assert TRIGGERS.parse(text) == read
     control = {"scheme": "committed", "trigger": text}
     assert reading.check({"control": control}, "mine").control.trigger == text
@@ -180,7 +178,6 @@ words = st.sampled_from(
 @example("\ud800")
 @example("[" * 100 + "]" * 100)
 def test_whatever_is_written_is_a_trigger_or_refused(text: str) -> None:
-    """Without other errors, warnings of Python, or side effects."""
     said, found = "", []
     try:
         found = list(leaves(TRIGGERS.parse(text)))
@@ -194,7 +191,6 @@ def test_whatever_is_written_is_a_trigger_or_refused(text: str) -> None:
 
 
 def test_nothing_written_is_ever_run() -> None:
-    """A call that would end the process is an unknown name."""
     assert "there are always" in refusal("exit(1)")
     assert refusal("__import__('os')._exit(1)").endswith(FORM)
 
@@ -207,7 +203,6 @@ trees = st.recursive(
 
 
 def written(tree: Expression) -> str:
-    """Text with every parenthesis."""
     if isinstance(tree, Call):
         values = ", ".join(map(repr, tree.values))
         return f"{tree.name}({values})"

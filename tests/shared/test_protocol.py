@@ -87,12 +87,10 @@ terms = st.builds(
     join_s=positive,
     land_after_s=positive,
 )
-"""Any terms that another end may have."""
 
 
 @st.composite
 def observed(draw: st.DrawFn, *, splines: bool = False) -> Observation:
-    """Any observation that a vehicle can make."""
     step = draw(u32)
     since = step - draw(st.integers(0, step))
     ahead = st.integers(max(0, since - 2**32 + 1), since + 2**15)
@@ -158,7 +156,6 @@ along_splines = TERMS._replace(scheme="trajectory")
 
 
 def same(one: Message, other: Message) -> bool:
-    """Equal type and equal fields, arrays to the bit."""
     return type(one) is type(other) and all(
         np.array_equal(a, b) if isinstance(a, np.ndarray) else a == b
         for a, b in zip(one, other, strict=True)
@@ -247,7 +244,6 @@ def test_what_was_held_back_for_long_makes_a_round_trip_of_less_than_nothing(min
 
 @pytest.mark.parametrize("axes", [2, 3])
 def test_the_longest_horizon_fits_one_datagram(axes: int) -> None:
-    """All numbers at their largest, and as many inputs as the limit allows."""
     longest = INPUTS_MAX // axes
     horizon = Horizon(
         2**16 - 1,
@@ -288,7 +284,6 @@ def told_by(step: int, flown: int, *, splines: bool, silence: int = 25) -> Obser
 
 
 def test_documented_sizes_are_the_real_ones() -> None:
-    """The examples of docs/protocol.md: 40 inputs on two axes."""
     inputs = np.zeros((2, 40), np.float32)
     none = NO_FEEDBACK
     assert len(encode(Horizon(1, SESSION, 500, 2**31, 9, inputs, none, **USUAL))) == 345
@@ -319,7 +314,6 @@ def test_an_observation_is_small_for_an_hour(step: int, flown: int) -> None:
 
 
 def test_the_longest_silence_is_told_as_far_as_the_wire_has_numbers() -> None:
-    """An hour in steps of a millisecond would be 7.2 million half steps."""
     asked = Hearing(SECOND_NS, MILLISECOND_NS, 3600 * SECOND_NS)
     beat = Heartbeat(1, 1, 0, 0, 0, 0, asked.silence)
     assert decode(encode(beat), TERMS) == beat
@@ -337,7 +331,6 @@ def test_the_longest_observation() -> None:
 
 
 def test_a_horizon_made_of_bytes_is_the_message() -> None:
-    """Encoding a horizon from raw bytes or from arrays is equal, with and without feedback."""
     inputs = np.arange(84, dtype=np.float32).reshape(2, 42) / 84
     for count in (0, FEEDBACK):
         feedback = np.ones((2, count), np.float32)
@@ -348,7 +341,6 @@ def test_a_horizon_made_of_bytes_is_the_message() -> None:
 
 
 def body(message: Message) -> list[object]:
-    """The message as the list that is packed."""
     fields: list[object] = msgpack.unpackb(encode(message))
     return fields
 
@@ -362,7 +354,6 @@ WELCOME = Welcome(1, 7, 99, 98, 10, 0, TERMS)
 
 
 def terms_with(**wrong: object) -> list[object]:
-    """Terms as they are packed, with an invalid field."""
     return list(TERMS._replace(**wrong))
 
 
@@ -485,7 +476,6 @@ def test_what_is_no_message_is_refused(payload: bytes, reason: str) -> None:
 
 
 def test_no_field_of_any_message_goes_unchecked() -> None:
-    """Each field in turn made a string: never accepted."""
     for message in (HELLO, WELCOME, OBSERVATION, HORIZON, HEARTBEAT):
         for field in range(len(body(message))):
             fields = body(message)
@@ -515,7 +505,6 @@ def test_the_table_of_messages_is_complete() -> None:
 
 @given(terms, terms)
 def test_terms_differ_in_keys_exactly_where_they_are_not_equal(one: Terms, other: Terms) -> None:
-    """Both ends name the same keys, with the values swapped."""
     assert bool(differences(one, other)) == (one != other)
     assert differences(one, other) == tuple(
         Difference(difference.key, here=difference.there, there=difference.here)
@@ -535,7 +524,6 @@ anything = st.one_of(
 
 
 def verdict(payload: bytes) -> Message | Drop:
-    """Message of a datagram, or the reason of its refusal."""
     try:
         return decode(payload, TERMS)
     except ProtocolError as error:
@@ -560,5 +548,4 @@ def test_an_observation_is_read_at_once_as_it_is_field_by_field(
 
 
 def replaced(fields: list[object], field: int, value: object) -> bytes:
-    """Datagram with one field replaced."""
     return msgpack.packb([*fields[:field], value, *fields[field + 1 :]])

@@ -28,7 +28,6 @@ COLUMN_SETS = {
 
 
 def some_rows(columns: Columns, count: int) -> dict[str, np.ndarray]:
-    """Different values for every column."""
     rng = np.random.default_rng(len(columns))
     return {
         name: rng.integers(0, 2 if kind.base.kind == "b" else 250, (count, *kind.shape))
@@ -42,7 +41,6 @@ def columns(request: pytest.FixtureRequest) -> Columns:
 
 
 def written(columns: Columns, count: int = 3) -> bytes:
-    """Part with some rows."""
     sink = io.BytesIO()
     Recorder(columns, sink).append(count, **some_rows(columns, count))
     return sink.getvalue()
@@ -70,7 +68,6 @@ def test_a_row_with_too_few_or_too_many_numbers_is_our_own_mistake(count: int) -
 
 
 def test_a_row_cut_short_is_left_out(columns: Columns) -> None:
-    """A killed writer loses no more than its last row, wherever the cut is."""
     part = written(columns)
     for cut in (1, columns.itemsize // 2, columns.itemsize):
         np.testing.assert_array_equal(parse(part[:-cut]), parse(part)[:2])

@@ -22,7 +22,6 @@ ROUTE = np.array([[0.0, 0.0], [3.0, 4.0], [3.0, 6.0], [-1.0, 6.0]])
 
 
 def sample(desired: reference.Reference, t: float) -> tuple[list[float], list[float]]:
-    """Position and velocity at one time."""
     state = desired(np.array(t))
     return state[:, 0].tolist(), state[:, 1].tolist()
 

@@ -177,7 +177,6 @@ def test_compiled_it_says_the_same(
 H, BOUND, MOST = 6, 4, 70
 ROW = np.array([0])
 FIRST = 100
-"""Step of the horizon in force."""
 
 
 def scenario(exhausted: str, age_max: int, *, feedback: bool) -> Scenario:
@@ -215,7 +214,6 @@ def make_horizon(rng: np.random.Generator, step: int, d: int, near: Array, gain:
 
 
 def send(replay: Replay, horizon: Horizon) -> None:
-    """Store a sent horizon at the server."""
     found, length = empty_foresight(1, 2, H, MOST), horizon.inputs.shape[1]
     found.ahead[:], found.horizons[0, :, :length] = length - H, horizon.inputs
     if horizon.feedback.size:
@@ -224,7 +222,6 @@ def send(replay: Replay, horizon: Horizon) -> None:
 
 
 def foresee(replay: Replay, step: int) -> Foresight:
-    """Foresight of the server at a step."""
     found = empty_foresight(1, 2, H, MOST)
     replay.foresee(ROW, np.array([step]), found)
     return found

@@ -79,7 +79,6 @@ OTHER: dict[str, Any] = {
 
 
 ON_MISSION = reading.load("swap")
-"""Scenario in which vehicles keep apart."""
 MISSION: dict[str, Any] = {
     "mission.separation_m": 0.6,
     "mission.height_m": 1.0,
@@ -94,7 +93,6 @@ MISSION: dict[str, Any] = {
 
 
 ALL = dict(flat(reading.to_table(HERE)))
-"""Every key of a scenario with dots, and its value."""
 
 
 def with_(key: str, value: Any) -> Scenario:
@@ -106,7 +104,6 @@ def with_(key: str, value: Any) -> Scenario:
 
 
 def differing(key: str, folder: Path) -> tuple[Scenario, Scenario]:
-    """Two scenarios that differ in this key."""
     if key == "reference.file":
         made = []
         for name, end in (("one", 1.0), ("other", 2.0)):
@@ -134,7 +131,6 @@ def differing(key: str, folder: Path) -> tuple[Scenario, Scenario]:
 
 
 def shake_hands(ours: Scenario, theirs: Scenario) -> tuple[Server, Client]:
-    """Server of one scenario and client of another, after HELLO and WELCOME."""
     server = Server(ours, boot_id=7, entropy=stream(1, "entropy").bytes)
     client = Client(theirs, simulated(theirs, 1), server=("server", 0), vehicle=1, boot_id=9)
     client.wake(now_ns=0)
@@ -155,7 +151,6 @@ def test_every_key_is_a_term_or_free_to_differ() -> None:
 
 @pytest.mark.parametrize("key", list(TERMS.values()))
 def test_ends_that_differ_in_a_term_are_refused_and_told(key: str, tmp_path: Path) -> None:
-    """Both operators see the key and both values; no session is opened."""
     ours, theirs = differing(key, tmp_path)
     server, client = shake_hands(ours, theirs)
     (difference,) = differences(ours.terms(), theirs.terms())[:1]
@@ -191,7 +186,6 @@ def test_a_trajectory_is_compared_by_what_stands_in_its_file(tmp_path: Path) -> 
 
 
 def test_a_difference_is_told_as_the_scenario_writes_it() -> None:
-    """Seconds for the step, lists for axes, true and false."""
     here = HERE.terms()
     there = here._replace(dt_ns=20_000_000, tau_s=(0.5, 0.6), loop=True)
     assert differences(here, there) == (
@@ -202,7 +196,6 @@ def test_a_difference_is_told_as_the_scenario_writes_it() -> None:
 
 
 def test_the_longest_terms_fit_one_datagram() -> None:
-    """Three axes, and texts of the largest length."""
     terms = HERE.terms()._replace(tau_s=(math.pi,) * 3, u_max=(math.pi,) * 3, points="x" * 32)
     terms = terms._replace(scheme="x" * 32, exhausted="x" * 32, shape="x" * 32, table="x" * 32)
     assert len(encode(Hello(2**16 - 1, 2**64 - 1, terms))) <= PAYLOAD_BYTES_MAX

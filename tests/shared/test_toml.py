@@ -26,7 +26,6 @@ PARTS = 30_000
 
 
 def limited(*argv: str) -> tuple[int, str]:
-    """Exit code of a command with little memory, and its last line."""
     run = subprocess.run(
         [sys.executable, "-P", "-c", LIMITED, *argv],
         capture_output=True,

@@ -27,7 +27,6 @@ place = st.floats(-6.0, 6.0)
 
 
 def away_m(text: str, *points: tuple[float, ...]) -> list[float]:
-    """Distances of points from the zones [m]."""
     given = np.array(points)
     kept = zones.parse(text, given.shape[1])
     found: list[float] = kept.clearance(given).min(axis=1).tolist()
@@ -160,7 +159,6 @@ def test_what_is_no_zone_is_told(text: str, said: str) -> None:
 
 
 def parsed(text: str, axes: int = 2) -> zones.Zones:
-    """Zones of a text and its files."""
     return zones.parse(text, axes, reading.files_of("mission.zones", text))
 
 
@@ -171,7 +169,6 @@ def geojson(features: Any, **more: Any) -> str:
 
 
 def polygon(points: Any, **properties: Any) -> dict[str, Any]:
-    """GeoJSON feature."""
     shape = {"type": "Polygon", "coordinates": [points]}
     return {"type": "Feature", "properties": properties, "geometry": shape}
 
@@ -204,7 +201,6 @@ MEMBER = {"type": "Feature", "properties": None}
 
 
 def shape(geometry_type: str, coordinates: Any, **properties: Any) -> str:
-    """File with one feature of a geometry."""
     geometry = {"type": geometry_type, "coordinates": coordinates}
     return geojson([MEMBER | {"properties": properties, "geometry": geometry}])
 

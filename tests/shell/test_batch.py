@@ -55,7 +55,6 @@ def received(sock: socket.socket) -> list[bytes]:
 
 
 def raw_of(sock: socket.socket) -> bytes:
-    """Address of a socket in the kernel's form."""
     return pack_address(sock.getsockname())
 
 
@@ -113,7 +112,6 @@ def test_the_kernel_tells_when_each_came(
 def test_a_batch_is_bounded_and_the_rest_comes_with_the_next(
     host: str, ends: tuple[socket.socket, socket.socket]
 ) -> None:
-    """Timers and other sockets are served in between."""
     here, there = ends
     batch, numbered = DatagramBatch(FAMILIES[host]), [b"%d" % i for i in range(BATCH_MAX + 3)]
     assert batch.send(there, numbered[:BATCH_MAX], [raw_of(here)] * BATCH_MAX) == BATCH_MAX
@@ -123,7 +121,6 @@ def test_a_batch_is_bounded_and_the_rest_comes_with_the_next(
 
 
 def test_each_datagram_goes_to_its_own_peer(host: str) -> None:
-    """Also after a batch of other sizes and peers, of which nothing is left in the arrays."""
     with ExitStack() as stack:
         socks = [stack.enter_context(open_socket((host, 0))) for _ in range(5)]
         batch, payloads = DatagramBatch(FAMILIES[host]), [b"%d" % i * (i + 1) for i in range(4)]
@@ -281,7 +278,6 @@ def batches(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> 
 def drive(
     endpoint: Endpoint, talk: Callable[[Shell], Awaitable[None]]
 ) -> tuple[Shell, list[Event]]:
-    """Drive an endpoint while a coroutine talks to it, until it has finished."""
     events: list[Event] = []
 
     async def fly() -> Shell:
@@ -391,8 +387,6 @@ def test_a_fault_in_the_middle_of_a_batch_costs_no_other_datagram() -> None:
 
 
 class Crowd:
-    """Datagrams sent to a driven endpoint, and how its sockets are read."""
-
     def __init__(self, endpoint: Answering, monkeypatch: pytest.MonkeyPatch) -> None:
         self.endpoint = endpoint
         self.read: list[int] = []
@@ -506,7 +500,6 @@ def test_a_clock_that_is_set_moves_no_stamp_out_of_order(
 def test_who_loses_the_core_between_two_clocks_reads_them_again(
     ends: tuple[socket.socket, socket.socket], host: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Otherwise a datagram of 30 ms ago would seem to come from the future."""
     here, there = ends
     batch, real, slept = DatagramBatch(FAMILIES[host]), time.time_ns, iter([0.03])
 

@@ -29,8 +29,6 @@ DEMO = reading.load("demo")
 
 
 class Closing(Proxy):
-    """Netem that ends once a key has a certain value."""
-
     finished = False
 
     def change(self, scenario: schema.Scenario, keys: frozenset[str], *, now_ns: int) -> None:
@@ -119,7 +117,6 @@ def test_a_socket_that_is_closed_while_it_rests_reads_no_more(tmp_path: Path) ->
 
 
 def test_whoever_sends_garbage_and_does_not_read_costs_others_nothing(tmp_path: Path) -> None:
-    """Also a sender without an address, and one that is gone; errors are logged by the loop."""
     rng = random.Random(1)
     path = tmp_path / "netem"
     with closing(Control(path, running())) as control:

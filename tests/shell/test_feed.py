@@ -65,7 +65,6 @@ PATIENCE_S = 30.0
 
 
 def rows(number: int, part: str = "netem", size: int = 28) -> Rows:
-    """Frame with a number."""
     return Rows(part=part, time_ns=number, rows=bytes([number % 256]) * size)
 
 
@@ -105,7 +104,6 @@ def test_garbage_is_a_feed_error_or_waits_for_more(garbage: bytes, framed: bool)
 @given(st.sampled_from(FRAMES), st.data())
 @settings(max_examples=300)
 def test_a_damaged_frame_is_another_one_or_a_feed_error(frame: Frame, data: st.DataObject) -> None:
-    """With one byte changed; if the length grows, a reader waits for the rest."""
     whole = encode(frame)
     at = data.draw(st.integers(0, len(whole) - 1))
     damaged = bytearray(whole)
@@ -172,8 +170,6 @@ def test_columns_that_are_none_are_a_feed_error(text: str) -> None:
 
 
 class Driven:
-    """Feed in a loop, and its readers."""
-
     def __init__(self, path: Path) -> None:
         self.path = path
         self.loop = HandLoop()
@@ -184,14 +180,12 @@ class Driven:
         self.opened: list[Looker] = []
 
     def turn(self) -> None:
-        """Advance the time, and run the loop once."""
         self.loop.pass_time()
         self.loop.look()
         for write in tuple(self.loop.writes.values()):
             write()
 
     def look(self) -> "Looker":
-        """Connect a new reader."""
         self.opened.append(Looker(self.path))
         self.turn()
         return self.opened[-1]
@@ -229,7 +223,6 @@ class Looker:
 
 
 def numbers(frames: list[Frame]) -> list[int]:
-    """First byte of the rows of each frame that has rows."""
     return [frame.rows[0] for frame in frames if isinstance(frame, Rows)]
 
 
@@ -243,7 +236,6 @@ def driven(tmp_path: Path) -> Iterator[Driven]:
 
 
 def test_a_reader_gets_the_scenario_then_what_was_then_what_comes(driven: Driven) -> None:
-    """In order, none missing and none twice, whenever a reader connects."""
     driven.tell(1, 2, 3)
     first = driven.look()
     driven.tell(4)
@@ -332,7 +324,6 @@ def test_who_does_not_read_is_dropped_and_all_else_goes_on(driven: Driven) -> No
 def test_without_the_bound_memory_grows_for_who_does_not_read(
     driven: Driven, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """No reader is dropped, and everything is queued."""
     monkeypatch.setattr(skytether.shell.feed, "WAITING_BYTES_MAX", 1 << 60)
     dropped, waiting = flooded(driven)
     assert dropped == 0
@@ -646,7 +637,6 @@ def test_the_plans_told_are_those_that_are_sent(
 
 
 def test_flights_of_a_batch_keep_no_plans() -> None:
-    """Thousands of them would fill the memory."""
     flown = msgspec.structs.replace(DEMO, duration=6.0)
     (one,) = flight.fly_batch(flown, [1])
     assert len(one.plan) == 0

@@ -60,7 +60,6 @@ LOSSY = "paper(0.4, 0.02, 2.0) & loss({})".format
 
 
 def write(folder: Path, scenario: Scenario, values: dict[str, object]) -> None:
-    """Store the values set in a flight of a scenario."""
     kept_by = begun(folder, scenario).journal
     assert kept_by
     kept_by.write(values)
@@ -68,7 +67,6 @@ def write(folder: Path, scenario: Scenario, values: dict[str, object]) -> None:
 
 @pytest.fixture(autouse=True)
 def _ends(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let a netem end on request."""
     monkeypatch.setattr(Proxy, "finished", False)
 
 
@@ -122,7 +120,6 @@ def test_a_zone_that_was_set_in_flight_is_in_force_in_the_next_life_of_a_server(
 
 
 def test_a_journal_that_is_cut_or_flipped_anywhere_is_refused_or_exact(tmp_path: Path) -> None:
-    """A process never starts with wrong values."""
     write(tmp_path, SWAP, {"mission.zones": BOX})
     whole = kept(tmp_path).read_bytes()
     wrong = [whole[:size] for size in range(len(whole))]

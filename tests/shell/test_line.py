@@ -59,13 +59,11 @@ class Echo(Idle):
 
 
 def drive(coroutine: Any) -> Any:
-    """Run on uvloop's loop, as processes do."""
     with asyncio.Runner(loop_factory=new_event_loop) as runner:
         return runner.run(asyncio.wait_for(coroutine, 30))
 
 
 def shell(endpoint: Endpoint, line: str) -> Shell:
-    """Shell whose socket 1 is a line."""
     return Shell(endpoint, ("127.0.0.1", 0), line=parse_line("line", line))
 
 

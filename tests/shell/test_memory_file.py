@@ -19,12 +19,10 @@ WRITTEN_NS = 12_345_678_901
 
 @pytest.fixture
 def path(tmp_path: Path) -> Path:
-    """Path in a folder that does not exist yet."""
     return tmp_path / "state" / "client-1"
 
 
 def put(path: Path, held: bytes) -> None:
-    """Write a file readable only by its owner."""
     path.parent.mkdir(mode=0o700, exist_ok=True)
     path.write_bytes(held)
     path.chmod(0o600)
@@ -45,8 +43,6 @@ def read(
 
 
 class Keeps(Idle):
-    """Endpoint with state to save."""
-
     keeps = True
 
     def __init__(self) -> None:

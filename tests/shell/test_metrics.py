@@ -109,7 +109,6 @@ def test_every_figure_is_told_or_left_out(process: str, figures: dict[str, dict[
 
 
 def test_a_figure_that_is_not_known_is_found(figures: dict[str, dict[str, Any]]) -> None:
-    """It is counted in the metrics, so that it cannot go missing unnoticed."""
     told = figures["server"] | {"brand": {"new": 1}}
     assert families("server", told)[1] == ["brand/new"]
     assert numbers("server", told)["skytether_unmapped_figures", ()] == 1.0
@@ -265,7 +264,6 @@ def said(sock: socket.socket) -> bytes:
 
 
 def asked(served: Metrics, request: bytes) -> tuple[bytes, bytes]:
-    """Status line and body of the answer to a request."""
     with calling(served) as sock:
         sock.sendall(request)
         head, _, body = said(sock).partition(b"\r\n\r\n")

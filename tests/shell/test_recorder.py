@@ -33,7 +33,6 @@ def test_rows_are_in_the_file_at_the_end(tmp_path: Path) -> None:
 
 
 def test_rows_reach_the_file_while_the_flight_goes_on(tmp_path: Path) -> None:
-    """They survive a kill of the process."""
     path = tmp_path / "netem"
     with recorded(path, PACKET_COLUMNS) as part:
         append(part, 10)
@@ -43,8 +42,6 @@ def test_rows_reach_the_file_while_the_flight_goes_on(tmp_path: Path) -> None:
 
 
 class OnAFullDisk(files.Growing):
-    """File on a full disk."""
-
     def __init__(self, path: Path, buffering: int = -1) -> None:
         self._path = self.at = path
         self.file = Path("/dev/full").open("r+b", buffering)  # noqa: SIM115 - closed by `end`
@@ -126,8 +123,6 @@ def test_a_file_of_any_name_can_be_told_of() -> None:
 
 
 def test_a_command_that_fails_otherwise_says_only_that(full: Path) -> None:
-    """A refused vehicle is the reason, whatever is in the record."""
-
     def fly() -> None:
         with recorded(full, PACKET_COLUMNS) as part:
             append(part, 3)

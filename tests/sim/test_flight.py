@@ -33,7 +33,6 @@ def summary(flown: Scenario, flight: Record) -> Summary:
 
 
 def flew(name: str = "paper-every-step", **changes: Any) -> Summary:
-    """Summary of a flight of a packaged scenario with other keys."""
     flown = packaged(name, **changes)
     return summary(flown, fly(flown))
 
@@ -89,9 +88,6 @@ def test_without_network_the_estimate_is_the_state() -> None:
 
 
 def test_a_flight_that_is_over_before_it_has_settled_has_an_error() -> None:
-    """The error is that of its second half; `demo` leaves out 8 s of a flight that is long
-    enough.
-    """
     flown = packaged("demo", duration=5.0)
     flight = fly(flown)
     error = position_error(flown, flight.client, flight.server)[50:]
@@ -177,7 +173,6 @@ def test_unsynchronised_clocks_change_nothing(offset_s: float) -> None:
 
 
 def test_a_drifting_clock_is_followed() -> None:
-    """200 ppm for a minute are 12 ms; the error stays the same."""
     plain, drifted = flew(seed=3), flew(seed=3, simulation={"clock_drift_ppm": 200.0})
     assert drifted.rmse_xy == pytest.approx(plain.rmse_xy, rel=0.05)
 
@@ -291,7 +286,6 @@ def test_a_flight_is_the_same_whenever_stamps_begin_anew(
 def test_a_server_that_takes_stamps_as_they_are_plans_for_nobody(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Ablation: a day after the start no round trip is valid."""
     monkeypatch.setattr(reception, "stamped_ns", lambda stamp, near_ns: stamp * 1000)  # noqa: ARG005
     flight = fly(packaged("demo", duration=10.0))
     assert not flight.client["covered"].any()

@@ -29,7 +29,6 @@ def scenario(**sections: Any) -> Scenario:
 
 
 def said(flight: Record, host: str = "client") -> list[Any]:
-    """Events of a host of the flight."""
     return [event for _, name, event in flight.events if name.split()[0] == host]
 
 
@@ -56,7 +55,6 @@ class Interrupted(Server):
         return begin <= now_ns < end
 
     def muted(self, payload: bytes) -> bytes:
-        """A heartbeat in place of a horizon."""
         message = decode(payload, self._terms)
         if not isinstance(message, Horizon):
             return payload

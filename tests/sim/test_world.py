@@ -43,20 +43,16 @@ class Probe(Endpoint):
 
 
 class Finite(Probe):
-    """Probe that finishes with its last wake."""
-
     @property
     def finished(self) -> bool:
         return not self.wakes_ns
 
 
 def run(world: World, limit_ns: int = SECOND_NS) -> None:
-    """Run up to a time."""
     world.run(lambda: False, limit_ns=limit_ns)
 
 
 def hosted(*wakes_ns: int, **keys: Any) -> tuple[World, Probe]:
-    """World with one host, and its probe."""
     world, probe = World(), Probe(list(wakes_ns))
     world.add("host", probe, **keys)
     return world, probe
@@ -177,7 +173,6 @@ def test_the_end_of_an_endpoint_is_told_once_and_at_once() -> None:
 def test_every_event_is_told_with_its_time_and_host_before_the_end_of_its_endpoint() -> None:
     class Talker(Finite):
         def wake(self, *, now_ns: int) -> None:
-            """Send a datagram."""
             super().wake(now_ns=now_ns)
             self._events.append(Flying(vehicle=len(self.log)))
 
@@ -208,7 +203,6 @@ def test_time_stops_at_its_limit(limit_ns: int) -> None:
 
 
 def at(world: World, time_ns: int, action: Callable[..., None], *args: Any, **named: Any) -> None:
-    """Schedule an action on the world."""
     world.at(time_ns, partial(action, *args, **named))
 
 

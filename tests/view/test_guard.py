@@ -29,7 +29,6 @@ from skytether.view.frames import of_flight
 PATIENCE_S = 30.0
 PROTOCOL = Subprotocol(f"viser-v{viser.__version__}")
 BINARY, PING = 2, 9
-"""Opcodes of websocket frames."""
 CAMERA = {
     "type": "ViewerCameraMessage",
     "wxyz": [1.0, 0.0, 0.0, 0.0],
@@ -103,17 +102,14 @@ def arriving(browser: ClientConnection) -> Iterator[dict[str, Any]]:
 
 
 def told(browser: ClientConnection, kind: str) -> dict[str, Any]:
-    """Next message of a kind."""
     return next(message for message in arriving(browser) if message["type"] == kind)
 
 
 def element(browser: ClientConnection) -> str:
-    """Id of an element of the page that the browser could change."""
     return str(told(browser, "GuiDropdownMessage")["uuid"])
 
 
 def labelled(browser: ClientConnection, label: str) -> str:
-    """Id of the next element with a label."""
     shown = (each for each in arriving(browser) if each.get("props", {}).get("label") == label)
     return str(next(shown)["uuid"])
 
@@ -228,8 +224,6 @@ def test_no_answer_may_be_shown_in_a_frame(
 
 
 class Asked:
-    """Operator that records the requested changes."""
-
     def __init__(self) -> None:
         self.asked: list[tuple[str, dict[str, Any]]] = []
 

@@ -185,7 +185,6 @@ def test_healing_brings_back_what_was_before_the_link_was_cut(tmp_path: Path) ->
 
 
 def test_a_page_that_came_later_heals_as_well() -> None:
-    """Also a link that a slider has cut."""
     cuts = {"network.uplink": "rate(5000) & loss(1)", "network.downlink": "loss(1.0)"}
     assert is_cut(cuts)
     assert cut({"network.uplink": "rate(5000)"}) == {"network.uplink": "rate(5000) & loss(1)"}
@@ -326,7 +325,6 @@ def test_a_fence_is_drawn_as_far_as_it_has_bounds() -> None:
 
 
 def heard(at: str, folder: Path) -> list[str]:
-    """Output of a page's process about its address, and the page itself if it is served."""
     said: list[str] = []
     with pytest.MonkeyPatch.context() as patch, page_process.beside([folder], at):
         patch.setattr(page_process, "say", said.append)

@@ -33,8 +33,6 @@ from skytether.view.state import SAID_MAX, SLOTS_MAX, VEHICLES_MAX, State
 
 @dataclass(frozen=True)
 class Shown:
-    """Flight, and the state of its page at the end."""
-
     scenario: Scenario
     flown: Record
     frames: tuple[tuple[int, str, Frame], ...]

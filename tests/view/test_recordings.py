@@ -119,7 +119,6 @@ def refusal(argv: list[str], of: Any, capsys: pytest.CaptureFixture[str]) -> tup
 
 
 def refused(path: Path, folder: Path, capsys: pytest.CaptureFixture[str]) -> list[str]:
-    """Output of the two commands that refuse a recording."""
     tables, page = str(folder / "tables"), str(folder / "page.html")
     told = [
         refusal([str(path), "--csv", tables], export, capsys),
@@ -150,7 +149,6 @@ def test_a_network_that_nobody_could_fly_over_is_recorded(tmp_path: Path) -> Non
 
 
 def test_frames_of_a_flight_are_in_the_order_of_their_times() -> None:
-    """From 0 on; a step's row has the time at which the step began."""
     frames = list(of_flight(SCENARIO, "demo", flown()))
     times_ns = [time_ns for time_ns, _, _ in frames]
     assert times_ns == sorted(times_ns)
@@ -601,7 +599,6 @@ def test_a_feed_that_begins_anew_would_be_recorded_twice(
 
 
 def test_a_gap_in_a_feed_is_told_once(live: tuple[Live, Feeds, list[str]], tmp_path: Path) -> None:
-    """The recorder was dropped as a reader, and missed frames are lost."""
     made, feeds, told = live
     for begin in (1, 3, 5):
         for frame in (opened(client_columns(2)), row_at(begin)):
@@ -691,7 +688,6 @@ def exported(recording: Path, folder: Path, part: str) -> list[dict[str, str]]:
 
 
 def test_what_is_not_known_is_empty_and_times_are_in_ms(recording: Path, tmp_path: Path) -> None:
-    """Times are in ms; before the first horizon its step and age are empty."""
     client = flown().client
     rows = exported(recording, tmp_path, "client")
     assert client["in_force"][0] == client["age_ns"][0] == -1

@@ -34,8 +34,6 @@ FORGOTTEN = {"vehicle.wind": 2.5}
 
 
 class Probe(Idle):
-    """Endpoint that records the changes."""
-
     changeable = frozenset({"vehicle.wind", "network.uplink", "vehicle.steady_wind_mps"})
 
     def __init__(self) -> None:
@@ -205,7 +203,6 @@ def scenario(**changes: Any) -> Scenario:
 
 
 def told(flight: Record, *kinds: type[Event]) -> list[tuple[float, str, Event]]:
-    """Events of these kinds: time [s], host, event."""
     return [(at / 1e9, host, event) for at, host, event in flight.events if type(event) in kinds]
 
 
@@ -287,7 +284,6 @@ def test_a_gust_that_blows_goes_on_with_its_new_strength() -> None:
 
 
 def test_a_live_point_is_led() -> None:
-    """The server extrapolates the newest point, and the vehicle follows."""
     flown = scenario(reference={"shape": "live"}, duration=14.0)
     place, way = "reference.points_m", "reference.velocity_mps"
     flight = fly(

@@ -26,7 +26,6 @@ DOCKERFILE = (ROOT / "Dockerfile").read_text()
 
 
 def argv(service: str, scenario: str) -> list[str]:
-    """Command line of a service, with the defaults of its variables except for SCENARIO."""
     told = SERVICES[service]["command"]
     named = [re.sub(r"\$\{SCENARIO:-demo\}", scenario, each) for each in told]
     return [re.sub(r"\$\{\w+:-(.*?)\}", r"\1", each) for each in named]

@@ -19,7 +19,6 @@ BINARY = "/opt/skytether/bin/skytether"
 
 
 def settings(unit: Path) -> dict[str, str]:
-    """Settings of a unit by name; the last one counts."""
     text = re.sub(r"\\\n\s*", "", unit.read_text())
     return dict(re.findall(r"^(\w+)=(.*)$", text, re.MULTILINE))
 

@@ -43,7 +43,6 @@ FAULTY_FLIGHT_S = 110
 FAULT_S = 3.0
 """Duration of a fault [s]: more than the demo's `link.timeout_s`, so that the client detects it."""
 HORIZONS = 6
-"""Number of new horizons that shows that plans arrive."""
 HOVER_M = 1.58
 """Error `rmse_xy` of the demo for a vehicle that stays at its start [m]."""
 
@@ -169,7 +168,6 @@ def test_a_flight_goes_on_after_every_fault(compose: list[str], tmp_path: Path) 
 class Containers:
     command: list[str]
     seconds: int
-    """Length of the flight [s]."""
     project: str = field(default_factory=lambda: f"skytether-test-{secrets.token_hex(4)}")
     ids: dict[str, str] = field(default_factory=dict)
     """Identifiers of the containers, by service; they stay the same from `up` to `down`."""
@@ -192,7 +190,6 @@ class Containers:
         return run("docker", *arguments)
 
     def id(self, service: str) -> str:
-        """Container of a service, running or not."""
         if service not in self.ids:
             self.ids[service] = self.compose("ps", "--all", "--quiet", service).strip()
         return self.ids[service]
@@ -232,7 +229,6 @@ class Containers:
         return str(new[-1])
 
     def flies(self) -> None:
-        """Wait until new plans reach the vehicle."""
         until("the session", lambda: self.has_said("server", "vehicle 1 flies"))
         first = self.figures("client")
         # A second later all packets that netem holds now have been delivered.
@@ -369,7 +365,6 @@ class Containers:
         assert (code, f"no answer from {address}" in output) == (1, True), output
 
     def ask_for_the_server(self, host: str) -> tuple[int, str]:
-        """Exit code and output of another client, in the client's network."""
         argv = ["docker", "run", "--rm", "--network", f"container:{self.id('client')}"]
         argv += ["skytether-client", "client", "demo", "--id=2", "--link.connect-s=2"]
         return attempt(*argv, f"--server={host}:47001", "--insecure")

@@ -66,7 +66,6 @@ def skytether(line: str) -> list[str]:
 def test_a_documented_flight_flies(
     line: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Each documented command succeeds, with shorter flights, fewer runs and smaller fleets."""
     if "sweep" in line:
         line += " --settle 0 --duration 1 --runs 2"
     if "envelope" in line:
@@ -98,7 +97,6 @@ def test_a_documented_flight_flies(
 
 @pytest.mark.usefixtures("documented_ports")
 def test_the_three_documented_terminals_fly_together(tmp_path: Path) -> None:
-    """Block of docs/running.md with server, netem and client, each line in a process of its own."""
     on_one, _ = terminals()
     said = fly_together(on_one, tmp_path)
     assert "PLAINTEXT" in said
@@ -107,7 +105,6 @@ def test_the_three_documented_terminals_fly_together(tmp_path: Path) -> None:
 
 @pytest.mark.usefixtures("documented_ports")
 def test_the_three_documented_machines_fly_together(tmp_path: Path) -> None:
-    """Block of docs/running.md with keys, with all hosts on this machine."""
     _, on_three = terminals()
     keygen, *processes = on_three
     assert ran(*skytether(keygen), cwd=tmp_path).returncode == 0
@@ -145,7 +142,6 @@ def fly_together(lines: list[str], folder: Path) -> str:
 def test_the_documented_changes_are_made_in_flight(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The block of docs/operating.md, and the flight that it needs."""
     monkeypatch.chdir(tmp_path)
     (flies,), changes, *_ = blocks(ROOT / "docs" / "operating.md")
     with subprocess.Popen(

@@ -71,7 +71,6 @@ def test_a_server_with_keys_answers_nothing_in_plaintext(
 
 
 def test_plaintext_is_said_loudly(start: Callable[..., Process]) -> None:
-    """Also if only this machine can be reached."""
     server = start(*SERVER)
     server.address()
     assert server.end() == 0

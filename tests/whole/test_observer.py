@@ -70,14 +70,12 @@ class Observer(Idle):
 class Outcome:
     rmse_m: float
     changes: list[tuple[str, str]] = field(default_factory=list)
-    """Changes of mode, and their reasons."""
     keys: int = 0
     """Number of channels in which the vehicle has sent."""
     copied: int = 0
 
 
 async def fly(flown: Scenario, *, attacked: bool, restart_s: float) -> Outcome:
-    """Encrypted flight whose server is killed once and restarted at the same address."""
     keyring, sink, changes = make_keys(flown.seed, 1), io.BytesIO(), []
     entropy = stream(flown.seed, "entropy", int(attacked)).bytes
 

@@ -65,7 +65,6 @@ def test_the_wheel_is_our_package_and_nothing_else(wheel: Path) -> None:
 def test_a_checkout_and_its_source_distribution_make_the_same_wheel(
     wheel: Path, tmp_path: Path
 ) -> None:
-    """To the byte, although rooms are links in one and folders in the other."""
     assert contents(hatchling(ROOT, "wheel", tmp_path / "built")) == contents(wheel)
 
 
@@ -148,7 +147,6 @@ def names(folder: Path) -> set[str]:
 
 
 def strangers(folder: Path, *packages: str) -> None:
-    """Packages in a folder, none of which may be imported or run."""
     for package in packages:
         (folder / package).mkdir(parents=True)
         for name in ("__init__.py", "__main__.py"):

@@ -25,7 +25,6 @@ IN_MEMORY = {"png", "pdf", "content", "file", "figure"}
 
 
 def modules() -> dict[str, ast.Module]:
-    """Every module of the package, by its path in the repository."""
     paths = [path for room in ROOMS for path in sorted((HOUSE / room).rglob("*.py"))]
     own = [path for path in paths if path.resolve() == path]  # not through a room's link
     return {str(path.relative_to(HOUSE)): ast.parse(path.read_text()) for path in own}

@@ -44,7 +44,6 @@ class Kept(msgspec.Struct, frozen=True):
     """Content of the file that `--json` writes."""
 
     nearest: Approach
-    """Flight with the least spare distance."""
     spares_m: Sequence[float]
     """Distance minus the required one for each flight [m]."""
 

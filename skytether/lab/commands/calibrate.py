@@ -125,9 +125,6 @@ def _print_rmse(points: Sequence[SearchPoint]) -> None:
 
 
 def _print_table_1(points: Sequence[SearchPoint]) -> None:
-    """Print the best point beside Table 1, and the range of each key over the points within
-    tolerance.
-    """
     found, rows = best(points), []
     _print_entries(found.values)
     near = [point for point in points if calibration.is_admissible(point.values)]

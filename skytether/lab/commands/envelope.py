@@ -18,7 +18,6 @@ from skytether.shell import command
 from skytether.shell.command import CommandError, ScenarioFlags, ScenarioName
 
 TOLD_MAX = 10
-"""Largest number of flyaways and crashes that are printed with their command lines."""
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ def processor() -> str:
 def commit() -> str | None:
     """Commit of the checkout that this code runs from; None without a checkout.
 
-    It is asked once: a benchmark that writes down its figures changes the checkout.
+    Cached, because a benchmark that writes its results into the checkout makes it dirty.
     """
     command = ["git", "describe", "--always", "--abbrev=12", "--dirty", "--exclude=*"]
     here = Path(__file__).parent

@@ -46,9 +46,7 @@ from skytether.shell.workers import die_with_parent
 UNDER_WAY_MAX = 256
 """Largest number of tasks submitted at once; more than the cores of any machine."""
 POLL_S = 0.2
-"""Interval at which Ctrl-C is checked [s]."""
 CONNECT_S = 10.0
-"""Timeout for the connection to a Dask scheduler [s]."""
 
 K = TypeVar("K", bound=Hashable)
 T = TypeVar("T")
@@ -98,7 +96,6 @@ class Crew:
     executor: Executor
     bar: Bar
     total: float
-    """Total amount of work, measured in `unit`."""
     unit: str
     interrupted: Callable[[], bool]
     done: float = 0.0
@@ -332,7 +329,6 @@ def _start(parent: int) -> None:
 
 @contextmanager
 def _cluster(address: str) -> Iterator[Executor]:
-    """Workers of a Dask scheduler."""
     from distributed import Client
 
     try:

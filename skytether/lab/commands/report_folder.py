@@ -27,11 +27,8 @@ PACKAGES = ("skytether", "numpy", "scipy", "numba", "daqp", "msgpack", "matplotl
 
 @dataclass(frozen=True, slots=True)
 class CommandCall:
-    """Command that is running."""
-
     command: str
     began: datetime
-    """Time of day at which the command began."""
     began_s: float
     """Time at which the command began, on a monotonic clock [s]."""
 

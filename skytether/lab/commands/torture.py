@@ -26,7 +26,6 @@ SEEDS = 2**32
 HOURS_MAX = 10_000
 SCHEDULES_BYTES_MAX = 64_000_000
 TOLD_MAX = 10
-"""Largest number of failures that are shrunk and printed."""
 
 
 @dataclass(frozen=True)

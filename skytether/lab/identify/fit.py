@@ -21,11 +21,8 @@ from skytether.lab.intervals import students
 from skytether.shared.law.model import Array
 
 STEPS_MIN = 2
-"""Smallest number of steps for a fit with intervals."""
 DEAD_MAX_S = 2.0
-"""Longest dead time that a scenario allows [s]."""
 TAU_MIN_S = 1e-3
-"""Shortest time constant that a scenario allows [s]."""
 GAIN_MIN = 1e-3
 """Smallest gain that a scenario allows."""
 GRID_S = 0.08
@@ -41,9 +38,7 @@ SURE = 4.0
 
 class StepResponse(NamedTuple):
     before: float
-    """Input before the step [m/s]."""
     after: float
-    """Input after the step [m/s]."""
     changes: Array
     """Earlier changes of the input that still have an effect: time relative to the step [s], and
     amount [m/s]; shape (n, 2)."""
@@ -54,7 +49,6 @@ class StepResponse(NamedTuple):
 
     @property
     def height(self) -> float:
-        """Signed height of the step [m/s]."""
         return self.after - self.before
 
     @property
@@ -84,8 +78,6 @@ class Misfit(NamedTuple):
 
 
 class Fit(NamedTuple):
-    """First-order model with dead time, fitted to steps."""
-
     numbers: Numbers
     within: Numbers
     """Half-widths of their 95 % intervals; infinite if the steps do not determine them."""
@@ -200,7 +192,6 @@ def _projection(responses: Sequence[StepResponse]) -> Callable[[float, float], t
 
 
 def _within(responses: Sequence[StepResponse], numbers: Numbers) -> Numbers:
-    """Half-widths of the intervals of the best parameters."""
     slopes = [_slopes(each, numbers) for each in responses]
     left = [remainder(each, numbers) for each in responses]
     count, samples = len(responses), sum(map(len, left))

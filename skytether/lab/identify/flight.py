@@ -141,7 +141,6 @@ class Identifying(Endpoint):
             self._events += self._port.events()
 
     def close(self, *, now_ns: int) -> None:
-        """Let the vehicle land before the process ends."""
         if self._port is not None:
             self._port.close(now_ns=now_ns)
             self._attend()

@@ -22,7 +22,6 @@ BEYOND = 1.5
 FASTER = 1.25
 """Required speed relative to the desired trajectory's, to catch up, and to the fence's wind."""
 DIGITS = 4
-"""Significant digits of written numbers."""
 
 
 class AxisOutcome(NamedTuple):
@@ -30,7 +29,6 @@ class AxisOutcome(NamedTuple):
     cut: int
     """Number of steps that the fence cut short, or for which the fence left no room."""
     responses: Sequence[StepResponse]
-    """Responses to the usable steps."""
     fit: Fit | None
     """Fitted model; None with too few steps."""
 

@@ -13,7 +13,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 COLOURS = {True: "tab:blue", False: "tab:orange"}
-"""Colours of steps that start a motion, and of steps that end a motion."""
 WORDS = {True: "sets out", False: "stops"}
 
 

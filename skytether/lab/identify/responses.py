@@ -16,7 +16,6 @@ LEAD = 0.25
 they are the only data that separate gain from wind.
 """
 SAMPLES_MIN = 10
-"""Smallest number of measurements of a usable step."""
 
 
 def responses(

@@ -27,11 +27,9 @@ NEAR_M, SLOW_MPS = 0.3, 0.2
 HOMEWARD_S = 15.0
 """Longest time for the way home [s]; steady wind may keep a vehicle away."""
 HOLD_MIN_S, HOLD_MAX_S = 3.0, 6.0
-"""Shortest and longest default time after a step [s]."""
 STEP_MPS = 0.5
 """Size of step if the desired trajectory stands still [m/s]."""
 STEP_MIN_MPS = 0.05
-"""Smallest size of step [m/s]."""
 FAST = 1.3
 """Safety factor on the distance that the input of a step predicts."""
 
@@ -135,7 +133,6 @@ class Experiment:
         return self._input
 
     def _flown(self) -> Iterator[list[float]]:
-        """Desired input of each axis at each control step [m/s]."""
         for axis, speed in enumerate(self.plan.speeds):
             for _ in range(self.plan.repeats):
                 yield from self._go_home()
