@@ -70,13 +70,7 @@ class CrowdPoint(msgspec.Struct, frozen=True):
 
 @dataclass(frozen=True, slots=True)
 class Crowd:
-    """Scenario flown by crowds.
-
-    Args:
-        name: its name.
-        scenario: scenario of every vehicle, with the shared network.
-        udp: whether they fly over real UDP.
-    """
+    """Scenario that different numbers of vehicles fly, in virtual time or over real UDP."""
 
     name: str
     scenario: Scenario

@@ -304,8 +304,8 @@ def curve(study: Study, cells: Cells) -> Plate:
     failed = sum(not run.steps for cell in cells.values() for run in cell.runs)
     says = (
         f"The vertical line is the paper's network and vehicle; {study.runs} runs a point. "
-        f"Periodic sending at the event trigger's own rate flies better than it at {better} of {n} "
-        f"values and worse at {worse} (95 % intervals apart)."
+        f"Periodic sending at the event trigger's own rate has a smaller RMSE than the trigger at "
+        f"{better} of {n} values, and a larger one at {worse} (95 % intervals do not overlap)."
     )
     if failed:
         says += f" {failed} runs without a session are left out of the means."

@@ -99,13 +99,13 @@ def draw(measured: Reproduction) -> Drawn:
 def paper_table(entries: Sequence[TableEntry], columns: Mapping[str, MethodFlights]) -> Table:
     runs, steps = len(columns[EVENT].runs), columns[PERIODIC].period
     ours, theirs = (_rmse(columns[method]) for method in (EVENT, PERIODIC))
-    meet = not periodic_wins(columns[EVENT], columns[PERIODIC])
+    overlap = not periodic_wins(columns[EVENT], columns[PERIODIC])
     loss = f"{abs(ours / theirs - 1.0):.0%} {'more' if ours > theirs else 'less'}"
     says = (
         f"Means of {runs} flights a column with 95 % intervals, in metres; the paper's event ratio "
-        f"is its “10 times smaller”. The last column is no scheme of the paper's but a packet "
-        f"every {steps} steps, the rate nearest to the trigger's: against it the event trigger has "
-        f"{loss} RMSE xy{', though the intervals meet' if meet else ''}."
+        f"is its “10 times smaller”. The last column is not in the paper: a packet every {steps} "
+        f"steps, the rate nearest to the trigger's. Compared with it, the event trigger has {loss} "
+        f"RMSE xy{', although the intervals overlap' if overlap else ''}."
     )
     shown = {
         "column": ("column", ""),
@@ -194,9 +194,9 @@ def real_table(measured: Reproduction) -> Table:
     says = (
         f"{length_s:g} s over real UDP on loopback, three processes and netem, beside virtual "
         f"time: the run of the same seed, and mean, least and most of {len(runs)} seeds. "
-        f"{within_range} of {len(rows)} flights over UDP lie within what virtual time says. Where "
-        f"a server's tick falls within a vehicle's step is chance in both, so equal seeds do not "
-        f"give equal flights."
+        f"{within_range} of {len(rows)} flights over UDP lie within the range of virtual time. The "
+        f"phase between the server's ticks and the vehicle's steps is random in both, so equal "
+        f"seeds do not give equal flights."
     )
     title = "RMSE xy [m] over real UDP and in virtual time"
     return table_of("real", title, says, rows, REAL)
@@ -208,7 +208,7 @@ def verdict(entries: Sequence[TableEntry], columns: Mapping[str, MethodFlights])
     (column, entry), worst = max(off.items(), key=lambda item: abs(item[1]))
     ours, theirs = (_rmse(columns[method]) for method in (EVENT, PERIODIC))
     wins = periodic_wins(columns[EVENT], columns[PERIODIC])
-    what = {1: "loses to", -1: "beats", 0: "cannot be told from"}[wins]
+    what = {1: "loses to", -1: "beats", 0: "does not differ significantly from"}[wins]
     return (
         f"{near} of {len(off)} entries of Table 1 are within tolerance; the farthest is {entry} of "
         f"“{column}”, {worst:+.1%}. At its own rate the event trigger {what} a packet every "

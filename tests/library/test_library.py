@@ -442,7 +442,7 @@ REFUSALS: list[tuple[Callable[[], object], type[Exception], str]] = [
     (
         lambda: fly("demo", secure=True, server=mine()),
         ConfigError,
-        "secure: got True with a server of your own, which could not open what is sealed",
+        "secure: got True with a server of your own, which cannot open encrypted packets",
     ),
     (
         lambda: fly_batch("demo", 8),  # type: ignore[arg-type]

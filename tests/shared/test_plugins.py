@@ -733,7 +733,9 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> str:
 def test_an_installed_package_adds_a_trigger_a_reference_and_a_vehicle(
     installed: str, tmp_path: Path
 ) -> None:
-    about = "Sends where the velocity is off its plan by more than so many m/s. (from my_package)"
+    about = (
+        "Sends if the velocity differs from its plan by more than so many m/s. (from my_package)"
+    )
     listed = run("triggers", folder=tmp_path, path=installed)
     assert f"slip(mps=0.3) with 0 <= mps\n    {about}\n" in listed
     trigger = ("--control.trigger", "slip & budget(5, 2) | silence(1)")
@@ -747,7 +749,7 @@ def test_an_installed_package_adds_a_trigger_a_reference_and_a_vehicle(
 
 def test_an_installed_package_adds_a_scheme(installed: str, tmp_path: Path) -> None:
     listed = run("schemes", folder=tmp_path, path=installed)
-    assert "beacon\n    Sends where the vehicle should be now and how fast" in listed
+    assert "beacon\n    Sends the present state of the reference" in listed
     control = "--control.scheme beacon --control.trigger deviation(0.1)"
     line = f"fly demo --virtual --settle 0 --duration 8 {control}"
     assert "RMSE" in run(line, folder=tmp_path, path=installed)

@@ -207,7 +207,7 @@ def _fly(scenario: Scenario, plan: ExperimentPlan, *, sets: bool) -> SizeFlown:
 
 def _doing(flight: Identifying) -> str:
     if not flight.flown_s:
-        return "on its way into the air"
+        return "taking off"
     return f"{len(flight.experiment.steps)} steps" if not flight.is_over else "landing"
 
 

@@ -99,7 +99,7 @@ def _finish(options: SweepOptions, plan: Sweep, done: Results, flyers: Crew) -> 
     tables.show(title, headings, rows)
     failed = sum(not run.steps for runs in cells for run in runs)
     if failed:
-        print(f"{failed} runs found no server and count in no mean of the error")
+        print(f"{failed} runs found no server, and are left out of the mean errors")
     if flyers.cpu_s:
         steps = sum(run.steps for runs in flyers.fresh for run in runs)
         print(f"{steps} vehicle-steps, {steps / flyers.cpu_s:.0f} per core-second")

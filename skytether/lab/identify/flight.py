@@ -122,9 +122,9 @@ class Identifying(Endpoint):
         self._flies.fly(self._input)
         self.inputs.append((now_ns, chosen))
         if self.experiment.is_over:
-            self._end("everything is flown")
+            self._end("the experiment is complete")
         elif now_ns - (self._epoch_ns or 0) > FLOWN_MAX_NS:
-            self._end("it takes too long")
+            self._end("it has reached the longest flight time")
 
     def _end(self, why: Reason | str) -> None:
         """End the flight. The vehicle lands, unless a pilot has taken over."""

@@ -54,7 +54,7 @@ def describe(axis: AxisOutcome) -> str:
 
 def _remedy(axis: AxisOutcome) -> str:
     if axis.cut < STEPS:
-        return "fly it to its end, and measure velocities"
+        return "let the flight finish, and measure velocities"
     return "the fence leaves no room: expected a wider one, a smaller --speed, or a shorter --hold"
 
 
@@ -96,13 +96,12 @@ def scenario_text(
         "gain": [_rounded(each.gain) for each in numbers],
         "dead_time_s": [round(each.dead_time_s, 3) for each in numbers],
     }
-    made = f"Made by `skytether identify {flown.vehicle.kind}`: steps of velocity, and the model of"
     lines = [
-        f"{made} first order with dead time",
-        "that answers them alike; with 95 % intervals.",
+        f"Made by `skytether identify {flown.vehicle.kind}`: first-order model with dead time,",
+        "fitted to steps of velocity; with 95 % intervals.",
         *(f"{name}: {describe(axis)}" for name, axis in zip(AXES, axes, strict=False)),
-        f"u_max: {BEYOND:g} times the size of the steps, for nobody has seen larger ones, or what",
-        f"{FASTER:g} times the desired trajectory's speed and the fence's wind need.",
+        f"u_max: {BEYOND:g} times the size of the steps, because larger inputs were not measured;",
+        f"more if {FASTER:g} times the desired trajectory's speed or the fence's wind needs more.",
     ]
     return "".join(f"# {line}\n" for line in lines).encode() + tomli_w.dumps(told).encode()
 
