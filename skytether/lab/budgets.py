@@ -146,10 +146,10 @@ class Plan:
     def __init__(self, case: Case, weights: str, scale: ComparisonSize) -> None:
         self.case = case
         self.points: list[FlownContender] = []
-        known = reading.names(weights)
+        tables = reading.names(weights)
         for contender in scale.who(case):
             name = entry(contender, case)
-            if f"{weights}/{name}" not in known:
+            if f"{weights}/{name}" not in tables:
                 there_is = "expected every contender in every case, as --tune writes them"
                 raise ConfigError(f"{weights}: got no table {name!r}, {there_is}")
             self.points += flying(contender, case, reading.load(f"{weights}/{name}"), scale)

@@ -242,8 +242,8 @@ def budgets_table(results: Sequence[ComparedCase]) -> Table:
         "Mean RMSE xy [m] with its 95 % interval, and median, @ packets a second. Within a budget "
         "each contender flies at the threshold and with the reporting policy that had the smallest "
         "error on other seeds. * marks the smallest mean, and means that do not differ from it "
-        "significantly: the interval of their ratio on the same seeds contains 1. The CSV has bytes "
-        "and all other figures."
+        "significantly: the interval of their ratio on the same seeds contains 1. The CSV has "
+        "bytes and all other figures."
     )
     flown = {id(runs): runs for each in results for runs in each.bought.values()}.values()
     failed = sum(run.rmse_xy is None for each in flown for run in each.runs)

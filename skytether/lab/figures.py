@@ -45,10 +45,10 @@ def envelope(path: Path, title: str, plan: Envelope, points: Sequence[EnvelopePo
     figure = blank(10.0, 9.0)
     (cover, bars), (delays, losses) = figure.subplots(2, 2)
     shown = {outcome: outcomes == outcome for outcome in OUTCOMES if outcome in outcomes}
-    for outcome, here in shown.items():
+    for outcome, has_outcome in shown.items():
         style: Any = {**OUTCOMES[outcome], "s": _size(outcome, len(points)), "linewidths": 0.0}
-        cover.scatter(trip_s[here], covers_s[here], **style)
-        long = here & (covers_s >= trip_s)
+        cover.scatter(trip_s[has_outcome], covers_s[has_outcome], **style)
+        long = has_outcome & (covers_s >= trip_s)
         delays.scatter(up_s[long], down_s[long], **style)
         losses.scatter(trip_s[long], loss[long], **style)
     line_s = np.geomspace(0.01, float(trip_s.max()), 100)
@@ -68,8 +68,8 @@ def envelope(path: Path, title: str, plan: Envelope, points: Sequence[EnvelopePo
     for plane in (cover, delays, losses):
         plane.grid(alpha=0.3)
     patches = [
-        Patch(color=OUTCOMES[outcome]["color"], label=f"{outcome} {here.sum()}")
-        for outcome, here in shown.items()
+        Patch(color=OUTCOMES[outcome]["color"], label=f"{outcome} {has_outcome.sum()}")
+        for outcome, has_outcome in shown.items()
     ]
     figure.suptitle(title, fontsize=11)
     figure.legend(
@@ -92,8 +92,8 @@ def _stack(plane: Any, ratios: Array, shown: Mapping[Outcome, Flags]) -> None:
     bins = np.digitize(np.clip(ratios, RATIOS[0], RATIOS[-1] * (1.0 - 1e-9)), RATIOS) - 1
     total = np.maximum(1, np.bincount(bins, minlength=len(RATIOS) - 1))
     below = np.zeros(len(total))
-    for outcome, here in shown.items():
-        share = np.bincount(bins[here], minlength=len(total)) / total
+    for outcome, has_outcome in shown.items():
+        share = np.bincount(bins[has_outcome], minlength=len(total)) / total
         style = {"color": OUTCOMES[outcome]["color"], "edgecolor": "white", "linewidth": 0.5}
         plane.bar(RATIOS[:-1], share, np.diff(RATIOS), bottom=below, align="edge", **style)
         below += share

@@ -182,9 +182,9 @@ def draw(path: Path, title: str, box: Box, points: Sequence[MapPoint]) -> None:
     across, up = (np.arange(len(values)) for values in (box.tau, box.gain))
     for row, burst_s in enumerate(box.burst_s):
         for column, dead_time_s in enumerate(box.dead_time_s):
-            plane, here = planes[row, column], (row, column)
-            mesh = plane.pcolormesh(across, up, rmse[here], norm=norm, shading="nearest")
-            for marks, style in ((grows[here], GROWS), (cycles[here], CYCLES)):
+            plane, cell = planes[row, column], (row, column)
+            mesh = plane.pcolormesh(across, up, rmse[cell], norm=norm, shading="nearest")
+            for marks, style in ((grows[cell], GROWS), (cycles[cell], CYCLES)):
                 y, x = np.nonzero(marks)
                 plane.plot(x, y, **style)
             bursts = f"bursts of {burst_s:g} s" if burst_s else "no bursts"

@@ -59,13 +59,13 @@ def parse_axis(text: str) -> GridAxis:
 
     Raises ConfigError if the text has another form, or a value twice.
     """
-    key, equals, given = (part.strip() for part in text.partition("="))
+    key, equals, values_text = (part.strip() for part in text.partition("="))
     wrong = ConfigError(f"--grid: got {text!r}, expected {FORM}")
-    if not (key and equals and given):
+    if not (key and equals and values_text):
         raise wrong
-    ends = given.split(":")
+    ends = values_text.split(":")
     try:
-        values = _linear(*ends) if len(ends) == 3 else _listed(given)
+        values = _linear(*ends) if len(ends) == 3 else _listed(values_text)
     except ValueError:
         raise wrong from None
     if key == "seed":

@@ -270,8 +270,8 @@ class Torture:
             failure, invariant = str(violation), violation.invariant
         except Exception as error:
             where = traceback.extract_tb(error.__traceback__)[-1]
-            said = f"{type(error).__name__} {error} ({where.filename}:{where.lineno})"
-            failure, invariant = f"raises: {said}", "raises"
+            message = f"{type(error).__name__} {error} ({where.filename}:{where.lineno})"
+            failure, invariant = f"raises: {message}", "raises"
         for vehicle in self.vehicles:
             self._count(vehicle.life)
         self.counts += self.saboteur.counts

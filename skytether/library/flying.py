@@ -183,8 +183,8 @@ def _check_server(server: Endpoint, *, udp: bool, secure: bool) -> None:
     if udp:
         raise ConfigError("udp: got True with a server of your own, which flies in virtual time")
     if secure:
-        said = "got True with a server of your own, which cannot open encrypted packets"
-        raise ConfigError(f"secure: {said}")
+        message = "got True with a server of your own, which cannot open encrypted packets"
+        raise ConfigError(f"secure: {message}")
 
 
 def _over_udp(scenario: Scenario, *, secure: bool) -> Record:

@@ -94,8 +94,8 @@ def adversary(argv: Sequence[str]) -> None:
     """
     options = command.parse(AdversaryOptions(), argv, "skytether adversary", adversary.__doc__)
     if not isinstance(options.config.unallocated_reference(), Mission):
-        said = f"{options.scenario}: expected a mission, such as swap"
-        raise CommandError(said, command.CONFIGURATION)
+        message = f"{options.scenario}: expected a mission, such as swap"
+        raise CommandError(message, command.CONFIGURATION)
     title = f"{options.scenario}, seed {options.config.seed}"
     if options.attack is not None:
         found, spares_m = fly(options.config, _moves(options.attack)), list[float]()
@@ -103,8 +103,8 @@ def adversary(argv: Sequence[str]) -> None:
         found, spares_m = _search(options, title)
     _finish(options, argv, title, found, spares_m)
     if spares_m and len(spares_m) < options.tries:
-        said = f"interrupted with {len(spares_m)} of {options.tries} flights done"
-        raise CommandError(said, command.INTERRUPTED)
+        message = f"interrupted with {len(spares_m)} of {options.tries} flights done"
+        raise CommandError(message, command.INTERRUPTED)
 
 
 def _search(options: AdversaryOptions, title: str) -> tuple[Approach, list[float]]:

@@ -139,7 +139,7 @@ def _print_table_1(points: Sequence[SearchPoint]) -> None:
 def _print_entries(values: Values) -> None:
     rows = []
     for (column, name), off in calibration.deviations(values).items():
-        paper, here = calibration.TABLE_1[column][name], values[column][name]
+        paper, reproduced = calibration.TABLE_1[column][name], values[column][name]
         mark = "" if calibration.within(name, off) else " !"
-        rows.append((column, name, f"{paper:.4f}", as_text(here, ".4f"), f"{off:+.1%}{mark}"))
+        rows.append((column, name, f"{paper:.4f}", as_text(reproduced, ".4f"), f"{off:+.1%}{mark}"))
     tables.show("Table 1", ("", "entry", "paper", "here", "off"), rows)

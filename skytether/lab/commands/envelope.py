@@ -72,8 +72,10 @@ def _finish(options: EnvelopeOptions, plan: Envelope, points: Sequence[EnvelopeP
     rows = [(each, counts[each], f"{counts[each] / len(points):.1%}") for each in get_args(Outcome)]
     tables.show(title, ("outcome", "points", "share"), rows)
     for number, point in worst_first(points)[:TOLD_MAX]:
-        said = f": {point.line}" if point.line else f": {point.error_max:.2f} m from the reference"
-        print(f"{point.outcome}{said}\n    {plan.command(number)}")
+        detail = (
+            f": {point.line}" if point.line else f": {point.error_max:.2f} m from the reference"
+        )
+        print(f"{point.outcome}{detail}\n    {plan.command(number)}")
     print(f"{options.out}: points.csv, envelope.png")
     if bad := sum(counts[outcome] for outcome in BAD):
         raise CommandError(f"{bad} of {len(points)} points flew away or crashed")

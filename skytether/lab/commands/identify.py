@@ -245,7 +245,7 @@ def _say(line: Event | str) -> None:
 def _tell(options: IdentifyOptions, scenario: Scenario, flown: Sequence[SizeFlown]) -> None:
     first, out = flown[0], options.out
     costs = _costs(flown) if len(flown) > 1 else []
-    told = IdentificationTold(
+    results = IdentificationTold(
         scenario=options.scenario,
         kind=scenario.vehicle.kind,
         ended=first.flight.why,
@@ -256,7 +256,9 @@ def _tell(options: IdentifyOptions, scenario: Scenario, flown: Sequence[SizeFlow
         costs=costs,
     )
     with writing(out):
-        files.write(out / OUTCOME, msgspec.json.format(msgspec.json.encode(told), indent=2) + b"\n")
+        files.write(
+            out / OUTCOME, msgspec.json.format(msgspec.json.encode(results), indent=2) + b"\n"
+        )
         files.write(out / MEASURED, _measured(first.flight, scenario.model.axes).encode())
         figures.save(picture.drawn(first.axes), out / PICTURE, dpi=130)
     _show_models(first)

@@ -85,8 +85,8 @@ class Interrupted(CommandError):
     """Error: interrupted by Ctrl-C; the same command continues the work."""
 
     def __init__(self, done: float, total: float, unit: str) -> None:
-        said = f"interrupted with {done:.0f} of {total:.0f} {unit} done"
-        super().__init__(f"{said}; the same command goes on from here", command.INTERRUPTED)
+        message = f"interrupted with {done:.0f} of {total:.0f} {unit} done"
+        super().__init__(f"{message}; the same command goes on from here", command.INTERRUPTED)
         self.results: Mapping[Any, Any] = {}
         """Results that the study had when it was interrupted."""
 

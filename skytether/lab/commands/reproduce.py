@@ -147,8 +147,8 @@ def _really(out: Path, table: Study, method: str, scale: ReproductionSize) -> re
             raise CommandError("; ".join(map(str, shortfalls)))
         steps = record.read(part / "client")["step"]
         if not len(steps) or steps[-1] < scenario.steps - 2:
-            said = "interrupted; the same command goes on from here"
-            raise CommandError(said, command.INTERRUPTED)
+            message = "interrupted; the same command goes on from here"
+            raise CommandError(message, command.INTERRUPTED)
         part.rename(folder)
     client, server, netem = (record.read(folder / part) for part in processes.NAMES)
     figures = json.loads((folder / "netem.json").read_bytes())

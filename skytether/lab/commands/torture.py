@@ -77,8 +77,8 @@ def torture(argv: Sequence[str]) -> None:
         failed = [each for each in done if each.failure]
     _finish(options, title, done, failed)
     if failed:
-        said = f"{len(failed)} of {len(done)} flights failed"
-        raise CommandError(f"{interrupted}, and {said}" if interrupted else said)
+        message = f"{len(failed)} of {len(done)} flights failed"
+        raise CommandError(f"{interrupted}, and {message}" if interrupted else message)
     if interrupted:
         raise CommandError(interrupted, command.INTERRUPTED)
 
@@ -96,9 +96,9 @@ def _trials(options: TortureOptions) -> tuple[list[Trial], str]:
         ConfigError: a text is no schedule.
     """
     asked = ("seed", "hours", "replay", "schedule")
-    given = [name for name in asked if getattr(options, name) is not None]
-    if len(given) > 1 and given != ["seed", "hours"]:
-        together = " and ".join(f"--{name}" for name in given)
+    given_options = [name for name in asked if getattr(options, name) is not None]
+    if len(given_options) > 1 and given_options != ["seed", "hours"]:
+        together = " and ".join(f"--{name}" for name in given_options)
         raise CommandError(f"got {together}, expected one of them", command.CONFIGURATION)
     if options.schedule is not None:
         return [loads(options.schedule)], "torture by a schedule"

@@ -271,5 +271,5 @@ def verdict(found: Fit) -> str:
         return f"first order with dead time will do: it is off by at most {where}"
     if off.certain > GOOD:
         return f"first order with dead time will not do: it is off by {where}"
-    said = "because the steps differ too much: fly in calm air, or with more --repeats"
-    return f"it cannot be told whether first order with dead time will do ({where}), {said}"
+    advice = "because the steps differ too much: fly in calm air, or with more --repeats"
+    return f"it cannot be told whether first order with dead time will do ({where}), {advice}"
