@@ -255,7 +255,7 @@ class Raid:
             lives.set({key: text})
         self._zones.append((CLOCK.local(now_ns) / SECOND_NS, lives.running.scenario.zones))
 
-    # -- what is flown -----------------------------------------------------------------------------
+    # -- flight ------------------------------------------------------------------------------------
 
     def run(self) -> Approach:
         """Fly to the end, or until all vehicles have arrived and no other moves are left."""

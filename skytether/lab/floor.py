@@ -143,7 +143,7 @@ def summarise_aboard(scenario: Scenario) -> Summary:
     return replace(summary, event_ratio=0.0)
 
 
-# -- beside the contenders of a case ---------------------------------------------------------------
+# -- baselines of a case ---------------------------------------------------------------------------
 
 PERIODS = (1, 3, 10, 30)
 """Steps between two packets at which the floor is computed."""

@@ -429,7 +429,7 @@ def test_a_log_of_json_has_an_event_a_line(start: Callable[..., Process]) -> Non
     assert server.end() == 0
 
 
-# -- nobody reads, nothing can be written --------------------------------------------------------
+# -- blocked output and full disks ---------------------------------------------------------------
 
 
 @pytest.fixture(params=["a pipe that is full", "a disk that is full", "a pipe without a reader"])

@@ -128,7 +128,7 @@ def test_a_terminal_that_cannot_move_its_cursor_is_not_told_to(term: str) -> Non
     assert (b"\x1b" in shown) == (term == "xterm")
 
 
-# -- a machine that gives nothing more -----------------------------------------------------------
+# -- exhausted resources -------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(

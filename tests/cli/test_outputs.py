@@ -209,7 +209,7 @@ def test_two_options_do_not_name_one_file(
     assert not Path(at).exists()
 
 
-# -- two commands at once ------------------------------------------------------------------------
+# -- concurrent commands -------------------------------------------------------------------------
 
 
 @contextmanager

@@ -531,7 +531,7 @@ def test_a_silent_autopilot_makes_it_brake_and_hover(flavour: FlavourName) -> No
     assert air.mode is Mode.TRACK
 
 
-# When we are gone
+# End of the client
 
 
 @pytest.mark.parametrize(("flavour", "stands"), [("ardupilot", True), ("px4", False)])

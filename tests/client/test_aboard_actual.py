@@ -31,7 +31,7 @@ from skytether.shared.core.events import (
 )
 from skytether.shared.telemetry.record import Reason
 
-# The clock
+# Clock
 
 
 @pytest.mark.parametrize("ppm", [-20_000.0, -8600.0, 20_000.0])
@@ -68,7 +68,7 @@ def test_positions_that_cannot_be_used_are_not_called_silence() -> None:
     assert modes(air)[-1][0] == "track"
 
 
-# Flights after another
+# Consecutive flights
 
 
 def test_it_is_flown_again_and_again_in_one_power_up(flavour: FlavourName) -> None:
@@ -121,7 +121,7 @@ def test_an_autopilot_that_has_taken_the_vehicle_from_a_client_that_stalled_keep
     assert modes(air)[-1] == ("manual", str(Reason.TAKEN))
 
 
-# What a bench check says
+# Messages of a bench check
 
 
 def test_the_session_of_a_vehicle_that_is_not_armed_is_told() -> None:
@@ -251,7 +251,7 @@ def heartbeats(air: Air, from_port: int) -> Callable[[], None]:
     return beat
 
 
-# What it says
+# Messages
 
 
 def test_a_stream_that_is_being_set_is_not_refused() -> None:

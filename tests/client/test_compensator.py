@@ -209,7 +209,7 @@ def test_chosen_input_is_the_caller_s_own() -> None:
         np.testing.assert_allclose(chosen(compensator, 0, HERE), INPUTS[:, 0], rtol=1e-7)
 
 
-# -- too old, too late ---------------------------------------------------------------------------
+# -- age bound and late horizons -----------------------------------------------------------------
 
 
 @pytest.mark.parametrize("scheme", ["none", "predictive", "committed"])

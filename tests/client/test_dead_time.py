@@ -46,7 +46,7 @@ def flown(**sections: Any) -> tuple[Summary, Record]:
     return summarise(flight, "test", record.client, record.server, record.netem), record
 
 
-# -- the state that the next input meets -----------------------------------------------------------
+# -- predicted state -------------------------------------------------------------------------------
 
 
 @given(

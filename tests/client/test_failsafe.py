@@ -177,7 +177,7 @@ def comes_to_hover_and_takes_no_horizon(hand: Hand, *, for_s: float = 0.8) -> No
     assert (hand.mode, hand.speed) == (Mode.TRACK, SPEED)
 
 
-# -- the way to the first horizon ------------------------------------------------------------------
+# -- before the first horizon ----------------------------------------------------------------------
 
 
 def test_a_vehicle_takes_a_horizon_after_a_second_of_good_link() -> None:
@@ -349,7 +349,7 @@ def test_a_vehicle_that_is_not_armed_flies_nothing() -> None:
     assert hand.changes[-1] == ("ready", str(Reason.UNARMED))
 
 
-# -- what fails in flight --------------------------------------------------------------------------
+# -- failures in flight ----------------------------------------------------------------------------
 
 
 def test_without_a_newer_horizon_it_coasts_and_says_nothing() -> None:
@@ -695,7 +695,7 @@ def test_a_sleep_that_looks_like_a_clock_that_was_set_is_told_by_the_server(
     assert hand.mode is mode
 
 
-# -- the paper's own rule --------------------------------------------------------------------------
+# -- the paper's rule ------------------------------------------------------------------------------
 
 
 def test_a_vehicle_that_holds_has_no_failsafe() -> None:
@@ -809,9 +809,9 @@ def test_whatever_happens_a_locked_vehicle_takes_no_horizon() -> None:
         assert not (locked and failing.takes)
 
 
-# -- without its guards ----------------------------------------------------------------------------
+# -- ablations of guards ---------------------------------------------------------------------------
 
-# -- what the vehicle's own side says ---------------------------------------------------------
+# -- hindrances of the vehicle ----------------------------------------------------------------
 
 
 def hindered(hand: Hand, cause: Reason | None) -> None:
@@ -889,7 +889,7 @@ def test_a_link_that_comes_back_just_before_the_landing_has_its_second() -> None
     assert (hand.mode, hand.takes) == (Mode.HOVER, True)
 
 
-# -- no mode is held for ever by what pushes, or by what never comes ---------------------------
+# -- time limits of modes ----------------------------------------------------------------------
 
 
 def beyond_its_fence() -> Hand:

@@ -428,7 +428,7 @@ def test_the_filter_goes_on_through_a_sleep() -> None:
     assert np.abs(asleep["estimate"] - asleep["state"]).max() < 0.15
 
 
-# -- stamps of the vehicle's own -------------------------------------------------------------------
+# -- time stamps of the vehicle --------------------------------------------------------------------
 
 
 def test_a_measurement_between_two_steps_is_carried_to_the_step() -> None:

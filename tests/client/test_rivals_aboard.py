@@ -50,7 +50,7 @@ def say(air: Air, message: Message, seconds: float, every_s: float = 0.1) -> Non
         air.run(every_s)
 
 
-# By what the vehicle does
+# Detected by the motion of the vehicle
 
 
 def test_a_commander_that_nobody_sees_is_noticed_and_the_vehicle_lands(
@@ -111,7 +111,7 @@ def test_neither_wind_nor_a_wrong_model_is_taken_for_a_commander(
     assert str(Reason.STRAYED) not in [why for _, why in modes(air)]
 
 
-# On the line
+# Detected on the line
 
 
 @pytest.mark.parametrize("message", [velocity(), sticks(400), channels(1700)])

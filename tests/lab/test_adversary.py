@@ -66,7 +66,7 @@ def move(
 FOUR = scenario("swap(4)")
 
 
-# -- what the adversary does ---------------------------------------------------------------------
+# -- moves ---------------------------------------------------------------------------------------
 
 
 def arrivals(*moves: Move, at_s: float, way: str = "downlink", count: int = 1) -> list[float]:
@@ -122,7 +122,7 @@ def test_a_vehicle_without_a_client_flies_on_and_is_seen() -> None:
     assert abs(x[99] - x[60]) < 0.3  # stopped, except for wind
 
 
-# -- what it finds -------------------------------------------------------------------------------
+# -- planted faults ------------------------------------------------------------------------------
 
 
 def newest(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -201,7 +201,7 @@ def test_a_server_that_begins_anew_takes_no_zone_before_it_has_heard_all(
     assert spare_m(FOUR, fly(FOUR, moves)) < 0.0
 
 
-# -- what is found comes again -------------------------------------------------------------------
+# -- reproducibility -----------------------------------------------------------------------------
 
 DIES = move(MoveKind.CUTS, 0, "", 3.0, 2.0)
 IN_THE_WAY = move(MoveKind.ZONES, 0, "", 5.0, 4.0, 0.0, 0.0, 1.0)

@@ -65,7 +65,7 @@ SCALE = contenders.ComparisonSize(100, 20)
 TARGET = CASES[0]
 
 
-# -- what is flown -------------------------------------------------------------------------------
+# -- contenders and choice of thresholds ---------------------------------------------------------
 
 
 def test_contenders_differ_in_scheme_and_trigger_alone_and_cases_in_what_is_met() -> None:
@@ -255,7 +255,7 @@ def test_nothing_is_tried_where_it_cannot_be_better() -> None:
     assert not plan.halfway()
 
 
-# -- what is said of it --------------------------------------------------------------------------
+# -- tables and claims ---------------------------------------------------------------------------
 
 SUMMARY = summarise(PAPER, "paper", flight.fly(replace(PAPER, duration=6.0)).client)
 

@@ -91,7 +91,7 @@ def test_the_command_line_of_a_point_flies_that_point() -> None:
     assert "--reference.radius-m" not in line
 
 
-# -- the verdict, on flights by hand -------------------------------------------------------------
+# -- verdicts on artificial records --------------------------------------------------------------
 
 SCENARIO = demo_with(
     duration=40.0, control__dt=0.05, vehicle__wind=0.0, network__uplink__loss=0.0, seed=1

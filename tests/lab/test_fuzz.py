@@ -113,7 +113,7 @@ def test_the_holder_of_a_key_reaches_past_the_handshake() -> None:
     assert dropped >= {Drop.FORGED, Drop.OUT_OF_PLACE, Drop.FIELD}
 
 
-# -- what would be found out -----------------------------------------------------------------------
+# -- planted faults --------------------------------------------------------------------------------
 
 
 def test_a_decoder_that_does_not_look_at_shapes_is_found_out(

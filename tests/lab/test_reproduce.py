@@ -56,7 +56,7 @@ FIGURES = {
 TABLES = {"table1", "traffic", "real"}
 
 
-# -- what is flown -------------------------------------------------------------------------------
+# -- methods -------------------------------------------------------------------------------------
 
 
 def test_the_methods_are_the_papers_scenarios() -> None:
@@ -109,7 +109,7 @@ def test_jitter_grows_while_the_mean_delay_stays() -> None:
             assert slot_s * math.sqrt(slots_mean) == pytest.approx(std_ms / 1e3)
 
 
-# -- what is said of it --------------------------------------------------------------------------
+# -- verdicts ------------------------------------------------------------------------------------
 
 
 def columns() -> Mapping[str, MethodFlights]:

@@ -41,7 +41,7 @@ TABLES = ("runs.csv", "cells.csv")
 PAPER = replace(reading.load("paper"), duration=5.0, settle=1.0)
 
 
-# -- what is flown -------------------------------------------------------------------------------
+# -- grids and tasks -----------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -198,7 +198,7 @@ LABELS = {
 }
 
 
-# -- what is kept --------------------------------------------------------------------------------
+# -- journals ------------------------------------------------------------------------------------
 
 ONE = Sweep("paper", PAPER, [parse_axis("control.input_weight=1,2")], 3)
 OTHERS = {

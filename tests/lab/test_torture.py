@@ -64,7 +64,7 @@ def fault(
     )
 
 
-# -- what is flown ---------------------------------------------------------------------------
+# -- trials ----------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -194,7 +194,7 @@ def test_every_kind_of_fault_is_tried() -> None:
     assert {one.kind for one, _ in EFFECTS} | {FaultKind.STEP, FaultKind.SKEW} == set(RANGES)
 
 
-# -- what is found ---------------------------------------------------------------------------
+# -- ablations of guards ---------------------------------------------------------------------
 
 
 class Unchecked:

@@ -315,7 +315,7 @@ def test_what_is_kept_from_are_all_motions_that_may_be_flown(
     assert max(looked_at) > 6
 
 
-# -- what may be flown -----------------------------------------------------------------------------
+# -- possible motions ------------------------------------------------------------------------------
 
 
 def test_a_motion_may_be_flown_until_an_observation_says_otherwise() -> None:

@@ -94,7 +94,7 @@ def test_a_motion_that_takes_the_place_of_another_keeps_its_own_landing() -> Non
     assert too_near(PossibleMotion(below), far, 0, 0, possible, 0.9)[0]
 
 
-# -- what is sent --------------------------------------------------------------------------------
+# -- sending motions -----------------------------------------------------------------------------
 
 
 def test_a_plan_that_still_comes_too_near_is_not_sent() -> None:
@@ -158,7 +158,7 @@ def test_a_motion_is_sent_again_before_it_ends_aboard() -> None:
     assert 2 * ready()._resend_after + terms.join < terms.age_max
 
 
-# -- clients that begin anew ---------------------------------------------------------------------
+# -- restarted clients ---------------------------------------------------------------------------
 
 
 def test_nothing_is_planned_for_a_vehicle_whose_client_has_begun_anew() -> None:

@@ -211,7 +211,7 @@ def test_who_keeps_the_distance_goes_on_to_keep_it() -> None:
     assert accepted > 300
 
 
-# -- what is known of a clock ----------------------------------------------------------------------
+# -- bounds of clock offsets -----------------------------------------------------------------------
 
 
 @settings(max_examples=100)
@@ -371,7 +371,7 @@ def test_the_figures_tell_what_a_clock_costs(monkeypatch: pytest.MonkeyPatch) ->
     assert "clock_steps" not in flown.figures["server"]["counts"]
 
 
-# -- flights over delays that differ ---------------------------------------------------------------
+# -- flights with asymmetric delays ----------------------------------------------------------------
 
 Delays = Callable[[int], tuple[float, float]]
 """Delay of a vehicle up and down [s], by the number of its flow."""

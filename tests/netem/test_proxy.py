@@ -185,7 +185,7 @@ def test_strangers_give_way_at_once_the_one_that_is_silent_longest_first() -> No
     assert (proxy.refused, proxy.figures()["flows"]) == (0, 3)
 
 
-# -- attacks on the places -------------------------------------------------------------------
+# -- attacks on the capacity of flows --------------------------------------------------------
 
 ATTACKER = "192.0.2.66"
 
@@ -363,7 +363,7 @@ def test_a_network_of_ipv6_counts_as_one_host(one: str, other: str, *, same: boo
     assert (host_of((one, 1)) == host_of((other, 2))) is same
 
 
-# -- packets that come back ------------------------------------------------------------------
+# -- forwarding loops ------------------------------------------------------------------------
 
 
 def circulate(*netems: Proxy, packets: int, limit: int = 5000) -> int:
@@ -415,7 +415,7 @@ def test_clients_that_send_the_same_are_served_once_the_server_answers() -> None
         pass_on(proxy, b"hello", ("192.0.2.2", port))
 
 
-# -- all else --------------------------------------------------------------------------------
+# -- other properties ------------------------------------------------------------------------
 
 
 def test_a_packet_under_way_still_reaches_a_client_whose_place_was_given_away() -> None:

@@ -88,7 +88,7 @@ def test_formats_are_told_apart_by_their_content(
     assert found.lost.astype(int).tolist() == lost
 
 
-# -- logs of ping, as each program prints them -----------------------------------------------------
+# -- logs of ping ----------------------------------------------------------------------------------
 
 IPUTILS = """$ ping -O -i 0.2 192.0.2.1
 PING 192.0.2.1 (192.0.2.1) 56(84) bytes of data.

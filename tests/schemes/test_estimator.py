@@ -256,7 +256,7 @@ def test_batch_is_estimated_as_its_singles(seed: int, vehicles: int, compensate:
     np.testing.assert_array_equal(estimates(together, rows, step + 1), expected)
 
 
-# -- with observer and feedback ------------------------------------------------------------------
+# -- observer and feedback -----------------------------------------------------------------------
 
 
 def told(step: int, state: Array, u: Array) -> Observation:
@@ -367,7 +367,7 @@ def test_the_paper_s_scheme_flies_better_with_observer_and_with_feedback() -> No
     assert rmse(white, feedback=True) < 0.12
 
 
-# -- how long an observation counts --------------------------------------------------------------
+# -- age of observations -------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module", params=["none", "predictive", "committed"])

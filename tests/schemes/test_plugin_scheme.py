@@ -102,7 +102,7 @@ RIGHT = re.sub(r'@scheme.*\n|    """Sends.*\n', "", CHASE[CHASE.index("@scheme")
 """The page's scheme without its registration."""
 
 
-# -- flown as ours ---------------------------------------------------------------------------------
+# -- same flights as built-in schemes --------------------------------------------------------------
 
 
 def test_the_documented_scheme_flies_with_the_documented_command(

@@ -39,7 +39,7 @@ def lossy(loss: float, down: float = 0.1) -> dict[str, Any]:
     return {"uplink": {"loss": loss}, "downlink": {"loss": down}}
 
 
-# -- by hand -------------------------------------------------------------------------------------
+# -- artificial observations ---------------------------------------------------------------------
 
 
 def small(exhausted: str = "brake", age_max_s: float = 5.0, **control: Any) -> Scenario:
@@ -275,7 +275,7 @@ def test_a_vehicle_that_takes_no_horizon_brakes_and_stands_still() -> None:
     np.testing.assert_array_equal(seen.committed[0, :, 2], np.float32(new[:, 4]))
 
 
-# -- feedback aboard, by hand --------------------------------------------------------------------
+# -- feedback aboard, artificial observations ----------------------------------------------------
 
 
 def test_it_makes_no_difference_when_a_horizon_with_feedback_arrives() -> None:

@@ -224,7 +224,7 @@ def test_what_is_held_goes_on_for_ever() -> None:
     assert guided_to(held, 0, 500, 0.0, 0.0) == pytest.approx((50.0, 1.0))
 
 
-# -- what is sent, and when ------------------------------------------------------------------
+# -- decision to send ------------------------------------------------------------------------
 
 
 class Moved(Desired):
@@ -445,7 +445,7 @@ def test_what_no_spline_follows_has_as_many_knots_as_there_may_be() -> None:
     assert (count, spacing) == (KNOTS_MAX, 4)
 
 
-# -- what is seen ahead --------------------------------------------------------------------------
+# -- preview -------------------------------------------------------------------------------------
 
 
 @given(

@@ -38,7 +38,7 @@ def known(delays: list[int], first: int = 1, most: int = MOST) -> list[int]:
     return steps
 
 
-# -- a bound that is given ------------------------------------------------------------------------
+# -- given bound ----------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -68,7 +68,7 @@ def test_a_given_bound_is_rounded_up_to_steps(fixed_s: float, dt_s: float, steps
     assert bound.steps.tolist() == [steps] * 3
 
 
-# -- a bound that is estimated --------------------------------------------------------------------
+# -- estimated bound ------------------------------------------------------------------------------
 
 
 def test_before_any_sample_it_is_the_guess() -> None:
@@ -188,7 +188,7 @@ def test_a_vehicle_that_is_forgotten_begins_anew() -> None:
     assert bound.steps.tolist() == [9, 30]
 
 
-# -- on a network ---------------------------------------------------------------------------------
+# -- simulated network ----------------------------------------------------------------------------
 
 SECONDS = 60.0
 

@@ -303,7 +303,7 @@ def test_a_prediction_goes_to_and_fro_between_walls(
     assert plain(_extrapolated)(p, v, after_s, np.inf) == (p + v * after_s, v)
 
 
-# -- a trajectory for each vehicle -------------------------------------------------------------
+# -- references of several vehicles ------------------------------------------------------------
 
 
 def straight(vehicle: int) -> Reference:

@@ -247,7 +247,7 @@ def test_where_adopting_leaves_the_attempt_open_a_command_is_flown_twice(
     assert client.open(sent, now_ns=0) == HORIZON
 
 
-# -- who is let in -----------------------------------------------------------------------------
+# -- authentication ----------------------------------------------------------------------------
 
 
 def test_who_has_no_key_is_met_with_silence() -> None:
@@ -488,7 +488,7 @@ def test_a_vehicle_gets_five_handshakes_a_second() -> None:
     called(server, other.hello(HELLO, now_ns=0))
 
 
-# -- a channel and its successor ---------------------------------------------------------------
+# -- change of keys ----------------------------------------------------------------------------
 
 
 def test_an_address_moves_with_the_highest_counter_only() -> None:
@@ -578,7 +578,7 @@ def test_a_closed_attempt_is_not_answered() -> None:
     assert refusal(server, hello) == "replayed"
 
 
-# -- terrible networks -------------------------------------------------------------------------
+# -- bad networks ------------------------------------------------------------------------------
 
 TICK_NS = SECOND_NS // 10
 HELLO_TICKS, SILENCE_TICKS = 10, 80
@@ -692,7 +692,7 @@ def test_with_fewer_pending_channels_it_does_not(monkeypatch: pytest.MonkeyPatch
         flight.until(horizons=30)
 
 
-# -- what was recorded, and is sent again ------------------------------------------------------
+# -- replays -----------------------------------------------------------------------------------
 
 
 def replayed(flight: Flight, peer: Address) -> tuple[Counter[bytes], list[int]]:
@@ -760,7 +760,7 @@ def test_nothing_is_accepted_after_a_restart(restarted: str) -> None:
     assert all(each < 0 for each in excess)
 
 
-# -- who has a key, and abuses it --------------------------------------------------------------
+# -- attackers with a key ----------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(

@@ -79,7 +79,7 @@ def far_m(flight: Record) -> float:
     return float(np.linalg.norm(flight.client["state"][:, :, 0], axis=1).max())
 
 
-# -- delays that are known before ------------------------------------------------------------------
+# -- constant delays -------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -99,7 +99,7 @@ def test_a_round_trip_much_longer_than_the_horizon_is_flown(
     assert error < error_m
 
 
-# -- delays that grow in flight --------------------------------------------------------------------
+# -- growing delays --------------------------------------------------------------------------------
 
 
 def short(_: float) -> float:
@@ -180,7 +180,7 @@ def test_a_delay_that_comes_and_goes_is_flown_again() -> None:
     assert flight.client["covered"][-500:].all()
 
 
-# -- without its safeguards ------------------------------------------------------------------------
+# -- ablations of safeguards -----------------------------------------------------------------------
 
 
 def forget_late(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -76,7 +76,7 @@ def flown(trigger: str, **control: Any) -> Record:
     return fly(scenario(control={"trigger": trigger} | control))
 
 
-# -- what the documents say ------------------------------------------------------------------------
+# -- documented plug-ins ---------------------------------------------------------------------------
 
 
 def example(document: Path) -> str:
@@ -128,7 +128,7 @@ def test_the_documented_policies_are_those_that_there_are() -> None:
     assert set(TRIGGERS) <= set(rows)
 
 
-# -- how they are listed ---------------------------------------------------------------------------
+# -- lists -----------------------------------------------------------------------------------------
 
 
 def test_triggers_are_listed_with_a_sentence_each(
@@ -149,7 +149,7 @@ def test_references_are_listed_with_a_sentence_each(capsys: pytest.CaptureFixtur
     assert "figure-eight\n    Lemniscate, 2 `radius_m` wide" in said
 
 
-# -- what a policy is given ------------------------------------------------------------------------
+# -- situation of a policy -------------------------------------------------------------------------
 
 
 def test_a_policy_is_given_what_it_may_know(tmp_path: Path) -> None:

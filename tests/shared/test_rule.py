@@ -34,7 +34,7 @@ from skytether.shared.wire.protocol import NO_HORIZON, Horizon, Mode, Observatio
 
 quick = settings(max_examples=200)
 
-# -- in plain numbers ----------------------------------------------------------------------------
+# -- scalar functions ----------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -172,7 +172,7 @@ def test_compiled_it_says_the_same(
         assert COMPILED["step"](horizon, stage, *states) == rule.step(horizon, stage, *states)
 
 
-# -- at both ends --------------------------------------------------------------------------------
+# -- client and server ---------------------------------------------------------------------------
 
 H, BOUND, MOST = 6, 4, 70
 ROW = np.array([0])

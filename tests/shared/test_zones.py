@@ -132,7 +132,7 @@ def test_nobody_is_above_a_zone_that_reaches_to_the_sky() -> None:
     assert raised.clearance(points)[:, 1].tolist() == kept.clearance(points)[:, 1].tolist()
 
 
-# -- what is written -------------------------------------------------------------------------------
+# -- texts and files -------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -341,7 +341,7 @@ def test_a_file_lies_beside_the_scenario(tmp_path: Path) -> None:
     assert len(reading.load(str(file)).zones.zones) == 1
 
 
-# -- ways around -----------------------------------------------------------------------------------
+# -- routes ----------------------------------------------------------------------------------------
 
 
 def length_m(way: Array) -> float:

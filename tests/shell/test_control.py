@@ -162,7 +162,7 @@ def test_an_answer_of_something_else_is_a_control_error(said: bytes, tmp_path: P
                 caller.ask({})
 
 
-# -- its place -------------------------------------------------------------------------------------
+# -- path of the socket ----------------------------------------------------------------------------
 
 
 def test_a_socket_that_a_killed_process_left_behind_gives_way(tmp_path: Path) -> None:

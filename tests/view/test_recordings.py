@@ -128,7 +128,7 @@ def refused(path: Path, folder: Path, capsys: pytest.CaptureFixture[str]) -> lis
     return [line for _, line in told]
 
 
-# --- What is written comes back.
+# --- Round trips.
 
 
 def test_a_flight_comes_back_to_the_last_bit(recording: Path) -> None:
@@ -659,7 +659,7 @@ def test_a_flight_over_udp_is_recorded_from_its_first_step_on(tmp_path: Path) ->
     assert counted == {"server", "netem", "client"}
 
 
-# --- What is made of one.
+# --- Exports.
 
 
 def test_tables_have_plain_columns_with_units(recording: Path, tmp_path: Path) -> None:
@@ -754,7 +754,7 @@ def test_a_report_is_one_page_that_needs_nothing_else(recording: Path, tmp_path:
     assert f"uplink lost {lost}" in page[page.index("dropped by netem") :]
 
 
-# --- What is refused.
+# --- Refusals.
 
 
 def other_mcap(path: Path) -> None:
@@ -786,7 +786,7 @@ def test_what_is_no_recording_is_refused_in_a_line(
     assert set(tmp_path.iterdir()) == before
 
 
-# --- What somebody has changed with care.
+# --- Manipulated recordings.
 
 
 def changed(path: Path, out: Path, change: Callable[[list[Any]], object]) -> Path:

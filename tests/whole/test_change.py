@@ -62,7 +62,7 @@ def answer(running: Running, request: bytes) -> Answer:
     return msgspec.json.decode(running.answer(request, now_ns=7), type=Answer)
 
 
-# -- what is checked -------------------------------------------------------------------------------
+# -- checks of changes -----------------------------------------------------------------------------
 
 
 def test_a_change_is_laid_over_all_changes_before_it() -> None:

@@ -284,7 +284,7 @@ class Containers:
         say(f"landed: {summary.steps} steps, rmse_xy {summary.rmse_xy:.3f} m")
         return summary
 
-    # -- the locks ---------------------------------------------------------------------------
+    # -- isolation ---------------------------------------------------------------------------
 
     @contextlib.contextmanager
     def capture(self) -> Iterator[Path]:
