@@ -66,7 +66,7 @@ class MoveKind(StrEnum):
     GOALS = "goals"
     """The vehicle's goal is the place in the amounts [m]; after the move, its own goal again."""
     ZONES = "zones"
-    """An additional cylinder to keep out of: x, y and radius in the amounts [m]."""
+    """Additional zone, a cylinder with x, y and radius in the amounts [m]."""
 
 
 NETWORK = (MoveKind.DELAYS, MoveKind.LOSSES, MoveKind.CUTS, MoveKind.COPIES)

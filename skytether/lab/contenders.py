@@ -195,7 +195,7 @@ def _circle(name: str, title: str, keys: Mapping[str, Any], effort_mps: float) -
 
 
 def _network(argument: str, value: Any) -> Mapping[str, Any]:
-    """Keys of both directions of the network; without an argument, of their whole text."""
+    """Keys that set an argument, or with "" the whole text, of both directions of the network."""
     at = f".{argument}" if argument else ""
     return {f"network.{way}{at}": value for way in ("uplink", "downlink")}
 

@@ -42,7 +42,7 @@ PUSH = 1e-4
 above the rounding errors of messages with a noise of some centimetres.
 """
 FLOOR = 1e-9
-"""Ratio of a mean square to its largest value, below which it is rounding."""
+"""Share of its largest value below which a mean square counts as rounding error."""
 SETTLE_S, ROUND_TRIPS = 5.0, 4.0
 """Time before a push: seconds, plus a number of mean round trips. By then sessions are open and the
 delay bound is stationary.
@@ -193,7 +193,7 @@ def growth_of(scenario: Scenario, trigger: str, runs: int) -> tuple[float, float
 
     The growth is infinite if SMALL is reached within STEPS_MIN, or if there is no session.
 
-    `trigger` is that of `clocked_trigger`.
+    `trigger` comes from `clocked_trigger`.
     """
     h = _responses(scenario, trigger, runs)
     if h.shape[1] < STEPS_MIN:
@@ -258,7 +258,7 @@ def _growth(h: Array) -> float:
 def margin(scenario: Scenario, vehicle: str, trigger: str, runs: int) -> Margin:
     """Margin of a scenario, flown for a number of seeds.
 
-    `trigger` is that of `clocked_trigger`.
+    `trigger` comes from `clocked_trigger`.
     """
     growth, half = growth_of(scenario, trigger, runs)
     if growth + (half or 0.0) >= 1.0:
@@ -300,7 +300,7 @@ def limit(scenario: Scenario, quantity: str, trigger: str, runs: int) -> MarginL
 
     Args:
         quantity: one of LIMITS.
-        trigger: that of `clocked_trigger`.
+        trigger: from `clocked_trigger`.
         runs: number of seeds for each value.
     """
     name, near, far = LIMITS[quantity]

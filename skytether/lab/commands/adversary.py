@@ -68,7 +68,7 @@ class AdversaryOptions:
     random: bool = False
     """Draw the moves of each flight at random, without a search."""
     first: Annotated[int, Argument(metavar="N")] = 0
-    """Number of the first climb: another number begins elsewhere."""
+    """Number of the first climb, which seeds its random moves."""
     workers: Annotated[int | None, Argument(metavar="N")] = None
     """Number of worker processes; one per core unless given."""
     out: Path | None = None

@@ -35,7 +35,7 @@ class CalibrateOptions:
     """Goal of the search: table1, to reproduce the paper's Table 1, or rmse, the smallest mean RMSE
     xy."""
     packets: float = 0.1
-    """Largest event ratio; with the objective rmse, and a trigger that uses the state."""
+    """Largest event ratio, for the objective rmse with a trigger that uses the state."""
     effort: Annotated[float, tyro.conf.arg(metavar="MPS")] = math.inf
     """Largest effort with the objective rmse, the RMS change of the command from step to step
     [m/s]; no limit unless given."""

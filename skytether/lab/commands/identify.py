@@ -302,7 +302,7 @@ def _show_models(flown: SizeFlown) -> None:
 
 
 def _costs(flown: Sequence[SizeFlown]) -> list[dict[str, float]]:
-    """Largest errors that models identified at each size make for the requested size."""
+    """Largest errors, for the requested size of step, of models identified at each size."""
     measured = [axis.responses for axis in flown[0].axes]
 
     def off(model: Fit | None, axis: int) -> float:
