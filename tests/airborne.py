@@ -69,7 +69,7 @@ def scenario(**table: Any) -> Scenario:
 
 
 class Tap(Endpoint):
-    """Wrapper around an endpoint: records incoming datagrams, and can drop, alter or add outgoing
+    """Wrapper around an endpoint: records incoming datagrams; can drop, alter or add outgoing
     ones.
     """
 
@@ -81,7 +81,7 @@ class Tap(Endpoint):
         self.deaf = self.dumb = False
         """Whether all incoming, and all outgoing, datagrams are dropped."""
         self.alter: Callable[[Message], bytes | None] | None = None
-        """Function that returns the bytes sent in place of a message; None sends messages
+        """Function that returns the bytes sent in place of a message, or None to send it
         unchanged.
         """
         self.extra: list[bytes] = []
@@ -250,9 +250,7 @@ class Air:
         return (self.world.now_ns - began_ns) / 1e9
 
     def until(self, so: Callable[[], object], seconds: float) -> float:
-        """Run until a condition holds, which must happen in time; returns the time that passed
-        [s].
-        """
+        """Run until a condition holds, which must happen in time; returns the time passed [s]."""
         passed_s = self.run(seconds, lambda: bool(so()))
         assert so(), self.said("client")[-5:]
         return passed_s

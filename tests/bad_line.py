@@ -36,9 +36,7 @@ LATE_NS = 400 * MILLISECOND_NS
 OTHERS_NS = 20 * MILLISECOND_NS
 FLIGHT_S = 240.0
 SETTLE_S = 20.0
-"""Initial time in which the vehicle catches up with the reference and its error does not count
-[s].
-"""
+"""Initial time without an error limit, in which the vehicle reaches the reference [s]."""
 FENCE = {"low_m": [-7.0, -7.0, 2.0], "high_m": [7.0, 7.0, 8.0]}
 STATION, VEHICLE, CAMERA, TWIN = (255, 190), (2, 1), (1, 100), (245, 190)
 """System and component of a ground station, another vehicle, a camera aboard, and a station with
@@ -132,9 +130,7 @@ class BadLine(Endpoint):
             self.send(start + noise, receiver)
 
     def _foreign(self, now_ms: int) -> Message:
-        """Message of another system that would be dangerous if the client took it for its
-        autopilot's.
-        """
+        """Message of another system, dangerous if the client took it for its autopilot's."""
         rng, mode = self._rng, MODES[self._draw(len(MODES))]
         armed, client = 128 * self._draw(2), (245, 191)
         x, y, z, *v = rng.uniform(30.0, 99.0, 6).tolist()

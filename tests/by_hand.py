@@ -78,8 +78,8 @@ class ByHand:
         self.say(Welcome(4, session, boot_id, server_boot_id, 1234, refusal, terms))
 
     def horizon(self, step: int, value: float, *, observed: int | None = None) -> None:
-        """Send a horizon of one constant input, planned from the observation of `step` unless
-        given.
+        """Send a horizon of one constant input, planned from the observation of `step` by
+        default.
         """
         age = 0 if observed is None else step - observed
         inputs = np.full((self.terms.axes, self.terms.planned), value, np.float32)

@@ -68,9 +68,7 @@ terminal.prepare(kernel.missing())
 
 
 def pytest_sessionstart(session: pytest.Session) -> None:
-    """Compile the kernels of flights before the first test, so that flights over UDP need not
-    wait.
-    """
+    """Compile the kernels of flights before the first test, for the sake of flights over UDP."""
     if not hasattr(session.config, "workerinput"):
         subprocess.run([sys.executable, "-P", "-c", COMPILE], check=True)
 

@@ -29,9 +29,7 @@ def scenario(**sections: Any) -> Scenario:
 
 
 class Gusts(Weather):
-    """Wind that reverses at the worst times: it blows towards the nearest bound, or away from
-    it.
-    """
+    """Wind that reverses at the worst times: towards the nearest bound, or away from it."""
 
     def __init__(self, flown: Scenario, rng: np.random.Generator, plant_x: Array) -> None:
         super().__init__(flown, rng)

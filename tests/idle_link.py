@@ -40,9 +40,7 @@ def keep(network: str, sessions: int, link: LinkConfig | None = None) -> Alive:
 
 
 def _session(network: str, link: LinkConfig, seed: int) -> tuple[int, float, int]:
-    """False losses of a session, time until its end was detected [s], and packets of the
-    vehicle.
-    """
+    """False losses of a session, time to detect its end [s], and packets of the vehicle."""
     timeout_ns, end_ns = seconds_to_ns(link.timeout_s), SESSION_S * SECOND_NS
     up, down = (Fates(path(network), seed, name, 0) for name in ("uplink", "downlink"))
     ear = Hearing(timeout_ns, STEP_NS, link.fixed_ns)

@@ -66,8 +66,11 @@ class Flight:
         self, scenario: Scenario, record: Record, *, name: str, secure: bool = False
     ) -> None:
         self.scenario = scenario
+        """Scenario that was flown."""
         self.name = name
+        """Name of the scenario."""
         self.secure = secure
+        """Whether the link was encrypted."""
         # A part without rows gets this scenario's columns, so that its arrays exist.
         parts: dict[str, Any] = {**_no_rows(scenario)}
         parts |= {part: rows for part in PARTS if len(rows := getattr(record, part))}
@@ -78,7 +81,8 @@ class Flight:
     def __getitem__(self, name: str) -> NDArray[Any]:
         """Array of this name.
 
-        Raises KeyError if there is none.
+        Raises:
+            KeyError: there is no array of this name.
         """
         try:
             return self._arrays[name]

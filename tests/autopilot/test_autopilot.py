@@ -113,7 +113,7 @@ def test_a_vertical_step_is_as_measured(ardupilot: Companion) -> None:
 
 
 def test_px4_stays_below_what_it_is_told() -> None:
-    """Measured: gain 0.79 to 0.89 within 3 s, time constant 0.25 to 0.78 s, dead time 0.03 to 0.20
+    """Measured: gain 0.79 to 0.89 in 3 s, time constant 0.25 to 0.78 s, dead time 0.03 to 0.20
     s.
     """
     companion = climbed("px4")

@@ -89,8 +89,8 @@ def test_a_frame_with_a_right_checksum_may_say_anything(payload: bytes, number: 
 
 @given(st.integers(-(2**31), 2**31 - 1).filter(lambda n: (n >> 22) & 0x1FF != 0x1FE))
 def test_an_integer_goes_bit_by_bit(value: int) -> None:
-    """Integers are sent bit by bit, as by PX4, except for signalling NaNs, which no float can
-    carry.
+    """Integers are sent bit by bit, as by PX4; signalling NaNs are excluded, as no float has
+    them.
     """
     kind = parameters.type_of(value)
     sent = parameters.to_wire(value, bytewise=True)

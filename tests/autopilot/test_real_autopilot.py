@@ -185,9 +185,7 @@ async def test_arducopter_flies_a_figure_eight_over_the_papers_network(tmp_path:
 
 @needs_arducopter
 async def test_arducopter_stands_where_its_client_is_killed(tmp_path: Path) -> None:
-    """After SIGKILL nobody repeats velocities, and ArduCopter's own timeout stops the vehicle in
-    the air.
-    """
+    """After SIGKILL no velocities are sent, and ArduCopter's own timeout stops the vehicle."""
     heard = Heard()
     loop = asyncio.get_running_loop()
     listening, _ = await loop.create_datagram_endpoint(

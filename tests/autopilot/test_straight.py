@@ -245,9 +245,7 @@ def test_a_flight_that_begins_on_the_ground_is_refused() -> None:
 
 
 def test_the_true_state_is_taken_at_the_time_of_each_step() -> None:
-    """Interpolated between two ticks of the autopilot; undefined where the autopilot reported
-    nothing.
-    """
+    """Interpolated between two ticks of the autopilot; undefined where it reported nothing."""
     scene = scenario()
     station = np.zeros(3, station_columns(3))
     station["time_ns"], station["step"] = [0, 50_000_000, 100_000_000], [0, 1, 2]

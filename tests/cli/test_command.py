@@ -1,6 +1,4 @@
-"""Commands as a user runs them: real processes and sockets, and a one-line message for each
-mistake.
-"""
+"""Commands as a user runs them: real processes and sockets, and one line for each mistake."""
 
 import json
 import os

@@ -75,9 +75,7 @@ def test_every_command_has_its_needs_told_here() -> None:
 
 
 def test_every_package_that_is_imported_is_asked_for() -> None:
-    """Requirements name every imported package, and do not rely on another package's
-    requirements.
-    """
+    """Requirements name every imported package, independently of other packages' requirements."""
     asked = {re.split("[^a-z0-9_-]", one)[0] for one in metadata.requires("skytether") or ()}
     ours = {"skytether", *(MODULES.get(name, name.replace("-", "_")) for name in asked)}
     imported = set()

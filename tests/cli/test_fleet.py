@@ -231,9 +231,7 @@ def supervise(work: object) -> int:
 
 
 def test_the_end_of_one_worker_is_the_end_of_all() -> None:
-    """A dead worker's vehicles have lost their sessions, so all workers end and are started
-    anew.
-    """
+    """A dead worker's vehicles have lost their sessions, so all workers end and restart."""
 
     def work(number: int, _: socket) -> None:
         if number == 2:

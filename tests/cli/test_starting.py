@@ -35,9 +35,7 @@ HEAVY = {
     "websockets",
 }
 EXTRAS = {"importlib.metadata", "mcap", "prometheus_client", "skytether.server"}
-"""Modules that cost memory and time before the first packet and are needed only for some
-options.
-"""
+"""Modules that cost memory and time before the first packet, and that only some options need."""
 COMPILER = {"scipy.linalg", "numba.np.linalg"}
 """Modules that numba imports to compile, but not to load compiled code."""
 

@@ -487,9 +487,7 @@ def test_a_low_battery_is_not_taken_off_with() -> None:
 
 
 def test_the_autopilots_own_failsafe_is_left_alone(flavour: FlavourName) -> None:
-    """The autopilot has lost its estimate and lands; the client reports that and commands
-    nothing.
-    """
+    """The autopilot has lost its estimate and lands; the client only reports that."""
     air = flying(flavour)
     air.flight.estimates = False
     lost_ns = air.world.now_ns
@@ -511,9 +509,7 @@ def test_a_lost_estimate_lands_where_the_autopilot_does_not(flavour: FlavourName
 
 
 def test_a_silent_autopilot_makes_it_brake_and_hover(flavour: FlavourName) -> None:
-    """After mavlink.silence_s the set-points fall to zero; when the autopilot answers, the flight
-    continues.
-    """
+    """After mavlink.silence_s set-points fall to zero, until the autopilot answers again."""
     air = flying(flavour)
     air.tap.dumb = True
     silent_ns = air.world.now_ns
@@ -630,9 +626,7 @@ def late_heartbeat(air: Air, until: Callable[[], bool] = lambda: False) -> None:
 
 
 def test_a_late_heartbeat_does_not_take_the_vehicle_back_from_a_pilot() -> None:
-    """The heartbeat was sent before the pilot took over, and one with a newer number has
-    arrived.
-    """
+    """It was sent before the pilot took over; one with a newer number has already arrived."""
     air = flying("ardupilot")
     end_ns = air.world.now_ns + SECOND
     air.world.at(end_ns - 1, air.take_over)
@@ -663,9 +657,7 @@ def test_an_autopilot_that_counts_anew_is_heard_after_a_pause() -> None:
 
 
 def test_stamps_that_cannot_be_are_dropped_and_counted() -> None:
-    """Duplicate, out of order, ahead, old, far and non-finite stamps; the state in use stays
-    right.
-    """
+    """Duplicate, out of order, ahead, old, far and non-finite stamps; the state stays right."""
     air = flying("ardupilot")
     codec = Codec(1, 1)
     now_ms = air.flight.now_ns // 1_000_000

@@ -1,6 +1,4 @@
-"""Behaviour that real autopilots showed, repeated by the scripted ones, and the client's
-messages.
-"""
+"""Behaviour of real autopilots, repeated by the scripted ones, and the client's messages."""
 
 from collections.abc import Callable
 

@@ -176,9 +176,7 @@ async def test_unsafe_parameters_end_with_a_line_each(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("end", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
 async def test_who_ends_in_flight_leaves_it_to_the_autopilot(end: int, tmp_path: Path) -> None:
-    """By the client's command or the autopilot's timeouts it is on the ground half a minute
-    later.
-    """
+    """By the client's command or the autopilot's timeouts it has landed half a minute later."""
     processes = Processes(tmp_path, "px4")
     await processes.run("--set-parameters", end=end)
     assert any(said.startswith("Disarm") for said in processes.autopilot)

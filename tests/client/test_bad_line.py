@@ -31,9 +31,7 @@ def compare(flavour: FlavourName, seed: int, duration: float) -> None:
     ("flavour", "seed"), [("ardupilot", 1), pytest.param("px4", 5, marks=pytest.mark.long)]
 )
 def test_a_bad_line_changes_little(flavour: FlavourName, seed: int) -> None:
-    """The client believes no mode and no position of others, flies as usual, and yields to a
-    pilot.
-    """
+    """The client ignores modes and positions of others, flies as usual, and yields to a pilot."""
     compare(flavour, seed, SETTLE_S + 10.0)
 
 

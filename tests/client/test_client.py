@@ -96,9 +96,7 @@ def test_another_scenario_at_the_server_ends_the_client_with_the_difference() ->
 def test_a_vehicle_that_is_refused_says_why_asks_on_and_gives_up_with_the_reason(
     refusal: int, reason: Literal["full", "taken"]
 ) -> None:
-    """Logged at the first refusal; the client gives up after `link.connect_s`, as without an
-    answer.
-    """
+    """Logged at the first refusal; gives up after `link.connect_s`, as without an answer."""
     server, hellos = ByHand(scenario(link={"connect_s": 15.0})), 0
     while not server.client.finished:
         hellos += len(server.wake())
@@ -166,9 +164,7 @@ def test_nothing_of_a_closed_session_is_heard() -> None:
 
 
 def test_a_restarted_server_whose_clock_is_ahead_is_no_sleep_of_the_vehicle() -> None:
-    """Clocks of two runs of the server cannot be compared; the vehicle brakes only for the
-    restart.
-    """
+    """Clocks of two runs of the server cannot be compared; only the restart causes braking."""
     server = flying(vehicle={"exhausted": "brake"})
     for step in range(45):
         server.wake()
@@ -204,7 +200,7 @@ def test_the_epoch_is_the_moment_the_session_opens() -> None:
 
 
 def test_every_observation_tells_when_the_newest_word_of_the_server_came() -> None:
-    """Arrival time minus the message's time stamp, from which the server estimates the clock
+    """Arrival time minus time stamp of the message, for the server's estimate of the clock
     offset.
     """
     server = flying()

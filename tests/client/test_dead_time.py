@@ -26,9 +26,7 @@ AUTOPILOT = {
     "dead_time_s": [0.27, 0.24],
     "u_max": [3.0],
 }
-"""Model like an autopilot's horizontal and vertical axis; neither dead time is a multiple of the
-step.
-"""
+"""Model like an autopilot's horizontal and vertical axis, with dead times between steps."""
 PERFECT = dict.fromkeys(("uplink", "downlink"), "")
 BRISK = {"shape": "figure-eight", "radius_m": 3.0, "period_s": 15.0}
 
@@ -115,9 +113,7 @@ def test_a_filter_that_knows_of_the_dead_time_is_right_with_noise_and_late_measu
 
 
 def test_the_error_of_an_estimate_is_taken_when_the_next_input_meets_the_vehicle() -> None:
-    """With a dead time the error is hardly larger, because it is evaluated when the input takes
-    effect.
-    """
+    """It is hardly larger with a dead time, because it is evaluated when the input takes effect."""
     noise = {"position_noise_m": 0.02, "velocity_noise_mps": 0.05}
     late = {"dead_time_s": 0.27}
     with_it, _ = flown(model=late, vehicle=late, sensor=noise)

@@ -161,9 +161,7 @@ def tracking(**keys: Any) -> Hand:
 
 
 def comes_to_hover_and_takes_no_horizon(hand: Hand, *, for_s: float = 0.8) -> None:
-    """Braked at 2 m/s² from 1 m/s, although the link is good and a horizon arrives at every
-    step.
-    """
+    """Braked at 2 m/s² from 1 m/s, although the link is good and horizons arrive."""
     hand.fly(0.02, plans=True)
     assert (hand.mode, hand.takes, hand.said[-1].in_force) == (Mode.BRAKE, False, NO_HORIZON)
     hand.fly(0.5, plans=True)
@@ -353,9 +351,7 @@ def test_a_vehicle_that_is_not_armed_flies_nothing() -> None:
 
 
 def test_without_a_newer_horizon_it_coasts_and_says_nothing() -> None:
-    """Coasting begins after a second; heartbeats continue, and the next horizon is flown at
-    once.
-    """
+    """Coasting begins after a second; the next horizon is flown at once."""
     hand = tracking()
     told = hand.changes
     hand.fly(1.1)
@@ -513,9 +509,7 @@ def test_malformed_messages_of_the_server_itself_end_in_brake() -> None:
 
 
 def test_what_has_been_counted_towards_a_new_session_counts_no_more() -> None:
-    """Ten horizons for impossible times end a session; the count starts again for the next
-    session.
-    """
+    """Ten horizons for impossible times end a session; the next session counts from 0."""
     met: list[Reason] = []
     guard = aboard()
 
@@ -683,9 +677,7 @@ def test_a_link_that_is_lost_meanwhile_changes_nothing_in_that() -> None:
 def test_a_sleep_that_looks_like_a_clock_that_was_set_is_told_by_the_server(
     slept_s: int, mode: Mode
 ) -> None:
-    """For the client, behind `Steady`, no time has passed; the server's clock has advanced by half
-    a minute.
-    """
+    """Behind `Steady` no time has passed; the server's clock has advanced by half a minute."""
     hand = tracking()
     hand.say(Heartbeat(4, hand.session, stamp_us(SECOND_NS), Idle.PLANS, 0))
     hand.fly(0.1, beats=False)
@@ -730,9 +722,7 @@ def test_a_vehicle_that_holds_has_no_failsafe() -> None:
 def test_the_last_clamp_bounds_value_and_change(
     wanted: list[float], flown: list[float] | None
 ) -> None:
-    """From 0.8 and 0.2 m/s, with bounds of 1.6 m/s and 1 m/s per step; non-finite inputs are
-    refused.
-    """
+    """From 0.8 and 0.2 m/s; bounds are 1.6 m/s and 1 m/s per step; NaN is refused."""
     assert clamped(wanted, [0.8, 0.2], [1.6, 1.6], 1.0, without_feedback=wanted) == flown
 
 
@@ -790,9 +780,7 @@ def test_nothing_leads_out_of_fault_and_only_fault_out_of_land(table: failsafe.T
 
 
 def test_whatever_happens_a_locked_vehicle_takes_no_horizon() -> None:
-    """Ten thousand random causes: after a forced brake a horizon is accepted only with a good
-    link.
-    """
+    """Ten thousand random causes: after a forced brake only a good link allows a horizon."""
     rng = stream(1, "causes")
     told: list[Reason] = []
     failing = aboard(lambda _, __, cause, ___: told.append(cause))
@@ -904,9 +892,7 @@ def beyond_its_fence() -> Hand:
 
 
 def test_a_fence_that_pushes_for_ever_keeps_no_vehicle_from_landing() -> None:
-    """After loss of the link it brakes, hovers and lands in the usual time, while the fence pushes
-    it back.
-    """
+    """After loss of the link it brakes, hovers and lands in the usual time."""
     hand = beyond_its_fence()
     began_s = hand.now_ns / SECOND_NS
     while hand.mode is not Mode.LAND and hand.now_ns / SECOND_NS < began_s + 20.0:

@@ -163,9 +163,7 @@ def test_measurements_come_when_they_are_due(
 
 
 def test_a_vehicle_tells_what_it_has_measured_when_it_is_asked() -> None:
-    """Measurements are stamped by the client's clock; those of missed steps are delivered once
-    each.
-    """
+    """Measurements are stamped by the client's clock; those of missed steps come once each."""
     flown = scenario(sensor=POSITIONS | {"delay_s": 0.1})
     flies, began_ns = simulated(flown, 1), 10**12
     first = flies.measurements(now_ns=began_ns)
@@ -399,9 +397,7 @@ def test_the_same_seed_has_the_same_noise_and_vehicles_have_their_own() -> None:
 
 
 def steps_of(flown: Scenario, awake: Iterable[int]) -> tuple[Rows, list[Message]]:
-    """Record of a vehicle that is awake at some steps with an input of 0.5 m/s, and its
-    messages.
-    """
+    """Record of a vehicle awake at some steps with an input of 0.5 m/s, and its messages."""
     server, said = ByHand(flown), []
     server.wake()
     server.welcome()

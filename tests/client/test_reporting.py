@@ -69,9 +69,7 @@ def horizon(step: int) -> Horizon:
 
 
 def test_what_is_news_is_told_at_once() -> None:
-    """The first step of a session, another horizon in force, another mode, and a step after
-    sleep.
-    """
+    """The first step of a session, another horizon in force or mode, and a step after sleep."""
     told, compensator = reporter()
 
     def due(step: int, session: int = 7, mode: Mode = Mode.READY, silence: int = 0) -> bool:
@@ -234,9 +232,7 @@ def test_nobody_calls_a_quiet_vehicle_lost() -> None:
 def test_the_demo_takes_a_fifth_of_the_paper_s_packets(
     name: str, error_m: float, share: float
 ) -> None:
-    """The paper sends 39 packets a second, both ways; the error is that of a report at every
-    step.
-    """
+    """The paper sends 39 packets a second; the error is that of a report at every step."""
     flights = skytether.fly_batch(name, range(1, 25))
     packets = [flight.summary.packets_per_s or 0.0 for flight in flights]
     errors = [flight.summary.rmse_xy or 1.0 for flight in flights]

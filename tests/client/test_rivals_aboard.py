@@ -154,9 +154,7 @@ def test_one_stray_set_point_is_none() -> None:
 
 
 def test_a_vehicle_may_yield_to_a_second_commander_as_to_a_pilot() -> None:
-    """Nothing is sent meanwhile; three seconds after the last foreign set-point it hovers, and
-    flies on.
-    """
+    """Nothing is sent meanwhile; three seconds after the last foreign set-point it hovers."""
     air = tracking(mavlink={"second_commander": "yield"})
     say(air, velocity(), 0.5)
     assert modes(air)[-1] == ("manual", str(Reason.TAKEN))
@@ -170,9 +168,7 @@ def test_a_vehicle_may_yield_to_a_second_commander_as_to_a_pilot() -> None:
 
 
 def test_a_vehicle_that_yields_sends_nothing_while_it_is_led_away(flavour: FlavourName) -> None:
-    """No foreign message is on the line, but the vehicle moves although it was commanded to
-    stand.
-    """
+    """No foreign message is on the line, but the vehicle moves despite a command to stand."""
     air = tracking(flavour, mavlink={"second_commander": "yield"})
     air.autopilot.script._commands = True
     air.run(3.0, lambda: bool(air.of(Strays)))

@@ -133,7 +133,7 @@ def test_the_smallest_error_may_not_be_bought_with_effort() -> None:
 
 
 def test_what_is_searched_for_follows_from_the_trigger_and_from_what_is_on() -> None:
-    """The position's weight is fixed, because only ratios matter; so is every key that is 0 for
+    """Fixed are the position's weight, because only ratios matter, and keys that are 0 for
     "off".
     """
     weights = {

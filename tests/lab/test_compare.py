@@ -148,9 +148,7 @@ def thresholds(contender: Contender, scenario: Scenario) -> dict[float | None, b
 
 
 def test_a_curve_goes_through_what_was_found_and_rises() -> None:
-    """Thresholds around the found one; whole steps of a period without duplicates; one point of
-    `always`.
-    """
+    """Thresholds around the found one; whole steps without duplicates; one point of `always`."""
     gap = replace(PAPER, control=replace(PAPER.control, trigger="cost_gap(0.8)"))
     found = thresholds(BY_NAME["committed-gap"], gap)
     assert list(found) == pytest.approx([0.08, 0.24, 0.8, 2.4, 8.0, 24.0, 80.0])

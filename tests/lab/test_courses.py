@@ -1,6 +1,4 @@
-"""Inputs prescribed by a message: by independent equations, and by the server's copy of the
-message.
-"""
+"""Inputs prescribed by a message: by independent equations, and by the server's copy."""
 
 from itertools import pairwise
 from typing import Any

@@ -241,9 +241,7 @@ def test_a_command_that_does_not_brake_without_a_plan_is_a_flyaway(rows: Rows, s
 def test_feedback_may_lead_back_after_a_horizon_s_end(
     *, feedback: bool, is_held: bool, behind_m: float, away_m: float, outcome: str
 ) -> None:
-    """Feedback of a finished horizon may move the vehicle by a metre plus its lag; at the end it
-    rests.
-    """
+    """Feedback of a finished horizon may move the vehicle by a metre plus its lag."""
     state = PATH.copy()
     state[:, 0, 0] -= behind_m
     rest = state[400, :, 0].copy()
@@ -297,9 +295,7 @@ def swinging(step: int) -> Array:
 
 
 def test_a_growing_swing_under_plans_is_a_flyaway() -> None:
-    """Further from the reference than a vehicle at rest in the middle, under plans based on newer
-    observations.
-    """
+    """Further away than a vehicle at rest in the middle, under plans based on new observations."""
     state = np.array([swinging(step) for step in range(STEPS)])
     verdict = judge(SCENARIO, record(state, PATH[..., 1], YES))
     assert verdict.outcome == "flyaway"

@@ -10,9 +10,7 @@ from skytether.autopilot.flavours import FlavourName
 
 BOTH: tuple[FlavourName, ...] = ("ardupilot", "px4")
 SILENCE_S = (1.4, 2.1)
-"""Range of times within which a lost server is detected: `link.timeout_s` after the last packet
-[s].
-"""
+"""Time within which a lost server is detected: `link.timeout_s` after the last packet [s]."""
 STARTS: dict[CaseName, tuple[list[str], tuple[float, float], Ending]] = {
     "link cut": (["BRAKE", "HOVER", "LAND"], SILENCE_S, "has landed"),
     "link cut for 5 s": (["BRAKE", "HOVER", "TRACK"], SILENCE_S, "flies on"),

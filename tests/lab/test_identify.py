@@ -1,6 +1,4 @@
-"""Identification: true parameters are found, steps stay inside the fence, and the written scenario
-flies.
-"""
+"""Identification: parameters are found, steps stay inside the fence, the result can be flown."""
 
 import csv
 import json
@@ -134,9 +132,7 @@ def test_what_noise_hides_is_said_to_be_unknown() -> None:
 
 
 def test_a_model_of_another_vehicle_is_off_by_as_much_as_the_vehicles_differ() -> None:
-    """0.1 s more of dead time gives an error of the rise within that time, relative to a step's
-    height.
-    """
+    """0.1 s more of dead time gives an error of the rise within that time."""
     truth = Numbers(1.0, 0.5, 0.1)
     made = answered(truth, np.random.default_rng(0))
     off = misfit(made, truth._replace(dead_time_s=0.2))
@@ -163,9 +159,7 @@ def test_inputs_before_a_step_are_answered_as_well() -> None:
 
 
 def test_measurements_belong_to_a_step_by_their_stamps() -> None:
-    """In any order of arrival; measurements without a velocity, and steps with few, are left
-    out.
-    """
+    """In any order of arrival; without measurements that have no velocity, and steps with few."""
     second = 1_000_000_000
     inputs = [(0, [0.0]), (second, [1.0]), (2 * second, [0.0])]
     measured = [Measurement(n * second // 20, [0.0], [float(n)]) for n in reversed(range(45))]
@@ -267,9 +261,7 @@ def test_steps_without_room_are_not_flown() -> None:
 
 
 def test_a_step_down_needs_a_floor() -> None:
-    """Without a lower bound the altitude goes up and back, however little room the ceiling
-    leaves.
-    """
+    """Without a lower bound the altitude goes up and back, even below a low ceiling."""
     space = {"model": {"axes": 3}, "reference": {"altitude_m": 5.0}}
     plan = ExperimentPlan((0.4, 0.4, 0.4), 3.0, 1)
     ceiling = {"high_m": [30.0, 30.0, 7.5]}
@@ -301,9 +293,7 @@ class Told(Endpoint):
 
 
 class Cart(Vehicle):
-    """Vehicle that reaches any velocity at once, is ready after 2 s, and may be hindered after 10
-    s.
-    """
+    """Vehicle that reaches any velocity at once, ready after 2 s, maybe hindered after 10 s."""
 
     def __init__(self, hindrance: Reason | None = None, *, blind: bool = False) -> None:
         self.port = Told()

@@ -56,9 +56,7 @@ def regulated(scenario: Scenario, gain: float = 1.0) -> tuple[Array, Array]:
 
 @pytest.mark.parametrize("change_weight", [0.0, 0.05])
 def test_a_regulator_aboard_has_the_margin_of_its_lyapunov_equation(change_weight: float) -> None:
-    """Along a trajectory x and u(k-1) are regulated aboard: P = F P Fᵀ + W, and ρ(F)² is the
-    growth.
-    """
+    """Along a trajectory x and u(k-1) are regulated aboard: P = F P Fᵀ + W; growth is ρ(F)²."""
     scenario = demo_with(
         **TRAJECTORY,
         control__input_weight=0.01,
@@ -144,9 +142,7 @@ def test_a_later_network_is_the_scenarios_with_a_delay_more() -> None:
 
 
 def test_the_worst_corners_of_the_box_are_stable_at_weights_that_bear_them() -> None:
-    """Fast, strong and late; slow, weak and late: stable at the demo's weights, not at tighter
-    ones.
-    """
+    """Fast, strong and late; slow, weak and late: stable at the demo's weights, not at tighter."""
     corners = (Differing(0.5, 1.3, 0.3), Differing(2.0, 0.7, 0.3))
     for corner in corners:
         assert growth_of(corner.of(demo_with()), "periodic(12)", 2)[0] < 0.995
@@ -158,9 +154,7 @@ def test_the_worst_corners_of_the_box_are_stable_at_weights_that_bear_them() -> 
 def test_along_trajectories_the_worst_corner_asks_for_a_fifth_more(
     input_weight: float, stable: bool
 ) -> None:
-    """Compensation of the estimated disturbance makes the loop tighter, so it needs larger
-    weights.
-    """
+    """Compensation of the estimated disturbance tightens the loop, so it needs larger weights."""
     scenario = demo_with(**TRAJECTORY, control__input_weight=input_weight)
     corner = Differing(0.5, 1.3, 0.3).of(scenario)
     assert (growth_of(corner, clocked_trigger(scenario), 2)[0] < 0.995) == stable

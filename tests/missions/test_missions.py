@@ -183,9 +183,7 @@ def test_far_from_others_axes_are_planned_one_by_one_to_the_last_bit(
 
 @given(st.integers(0, 2**31), st.integers(0, 60))
 def test_motions_come_too_near_where_any_of_their_pieces_does(seed: int, begin: int) -> None:
-    """Also if bounding boxes exclude them; vehicles that are already too near must only not come
-    nearer.
-    """
+    """Also if bounding boxes exclude them; vehicles already too near must not come nearer."""
     rng = np.random.default_rng(seed)
     scale, keep_m, off_m = np.array([1.0, 0.7]), 1.5, 0.02
     motion, base, *others = (drawn(rng) for _ in range(12))
@@ -272,9 +270,7 @@ def test_vehicles_that_may_land_come_too_near_below_their_motions(
 
 
 def test_half_planes_keep_a_vehicle_out_from_under_one_that_may_land() -> None:
-    """The direct way passes 3 m below; the vehicle comes to rest beside it, also if neither lands
-    yet.
-    """
+    """The direct way passes 3 m below; the vehicle comes to rest beside the other one."""
     above, times = resting(0, np.array([0.0, 0.0, 4.0])), np.arange(0.0, 121.0, 5.0)
     held = np.tile([1.5, 0.0, 1.0], (len(times), 1))
     flown, reach_m = PossibleMotions(np.ones(3), DT_S), np.full(len(times), 9.0)
@@ -338,9 +334,7 @@ def test_a_motion_may_be_flown_until_an_observation_says_otherwise() -> None:
 
 
 def test_another_life_does_not_wait_for_what_was_sent_to_the_one_before() -> None:
-    """Its steps are smaller, so the step count would never tell; a life with saved state reports
-    its motion.
-    """
+    """Its steps are smaller, so the step count would never tell."""
     made, place = alone().state, np.array([4.0, 0.0])
     for in_force, left in ((NO_HORIZON, 0), (900, 1)):
         vehicle = made.vehicles[0] = VehicleMotions()
@@ -372,8 +366,8 @@ def test_a_motion_is_too_near_below_the_distance(beyond_m: float, is_hit: bool) 
 
 @pytest.mark.parametrize("turned", [0.0, 0.5])
 def test_a_vehicle_that_has_turned_goes_on_to_the_right_of_its_goal(turned: float) -> None:
-    """Although the direct way is free, because it still passes somebody; it turns back
-    gradually.
+    """Although the direct way is free, because it still passes another one; it turns back
+    slowly.
     """
     made = ready()
     made.vehicles[0].turned_rad = turned
@@ -488,9 +482,7 @@ def test_a_vehicle_that_creeps_is_stuck_after_its_patience() -> None:
 
 
 def test_a_foreign_motion_is_over_after_the_last_step_it_may_have() -> None:
-    """Until then the vehicle may be anywhere on it; from the first later observation on, it
-    rests.
-    """
+    """Until then the vehicle may be anywhere on it; from the next observation on, it rests."""
     until = 70 + LONGEST
     for steps in ((100, until, until + 1, until + 2), (100, until + 100, until + 101)):
         made, x = alone(), -4.0
@@ -526,9 +518,7 @@ def test_a_vehicle_rests_once_all_its_motions_are_over() -> None:
 
 
 def test_who_gets_a_motion_again_says_so_again() -> None:
-    """The second copy changes nothing aboard, but its acknowledgement is due: the first may be
-    lost.
-    """
+    """The second copy changes nothing aboard, but the first acknowledgement may be lost."""
     terms = scenario(2).terms()
     compensator = Compensator(terms)
     reporter = Reporter(terms, "deviation(9)", compensator)
@@ -923,9 +913,7 @@ def test_nobody_is_asked_who_is_far_ahead_on_the_way() -> None:
 
 
 def test_one_that_is_too_near_already_yields_away_from_the_other() -> None:
-    """Vehicles at rest may be nearer than plans keep; without the rule no place is found for
-    one.
-    """
+    """Vehicles at rest may be nearer than plans keep; otherwise no place is found for one."""
     free = zones.Zones([])
     home, way = np.array([0.91, 0.0]), np.array([[0.0, 0.0], [5.0, 0.0]])
 

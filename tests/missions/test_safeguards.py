@@ -151,9 +151,7 @@ def test_a_new_motion_is_the_old_one_as_long_as_it_may_be_taken() -> None:
 
 
 def test_a_motion_is_sent_again_before_it_ends_aboard() -> None:
-    """Otherwise a vehicle at rest would drift; twice within `link.age_max_s`, because one may be
-    lost.
-    """
+    """Otherwise a vehicle at rest drifts; twice within `link.age_max_s`, as one may be lost."""
     terms = scenario(2).terms()
     assert 2 * ready()._resend_after + terms.join < terms.age_max
 
@@ -275,9 +273,7 @@ def test_zones_are_checked_whatever_is_known_of_a_clock(late: float) -> None:
 
 @pytest.mark.parametrize("late", [0.0, 1e11])
 def test_a_vehicle_moves_away_from_one_of_whose_clock_nothing_is_known(late: float) -> None:
-    """They are already too near; the computation must not grow with the uncertainty of the
-    clock.
-    """
+    """Already too near; the computation must not grow with the uncertainty of the clock."""
     made = ready()
     for row, x in ((0, 0.3), (1, 0.0)):
         made.vehicles[row].in_force = SentMotion(90, resting(100, np.array([x, 0.0])))

@@ -144,9 +144,7 @@ def test_what_is_on_its_way_when_it_lands_is_so_at_its_own_time() -> None:
 
 
 def test_two_that_keep_the_distance_come_no_nearer_by_what_pieces_are_off() -> None:
-    """The tolerance of the motion in force differs at another step, which must not count as too
-    near.
-    """
+    """The tolerance of the motion in force differs at another step; that is not too near."""
     rng, far = np.random.default_rng(5), resting(0, np.array([100.0, 0.0]))
     for _ in range(200):
         base, other = drawn(rng), drawn(rng)
@@ -173,9 +171,7 @@ def above_ground(motion: Motion) -> Motion:
 def landing_m(
     one: Motion, other: Motion, begin: int, mine: StepError, its: StepError, lands: list[int]
 ) -> float:
-    """Least distance as in `least_m`, between vehicles of which each may land from a step of its
-    own on [m].
-    """
+    """Least distance as in `least_m`, where each vehicle may land from its own step on [m]."""
     steps = np.append(np.arange(begin, max(one.last, other.last) + 80.0, 0.5), 1e3)
     here, nearest = one.at(steps, DT_S)[0], np.inf
     for shift in np.arange(-its.late - mine.early, its.early + mine.late + 0.5, 0.5):
@@ -301,9 +297,7 @@ def width_s(known: ClockMap, now_ns: int) -> float:
 def listen(
     known: ClockMap, begin_s: int, end_s: int, up_s: float, down_s: float
 ) -> set[Contradiction]:
-    """Contradictions found by observations, one a second over these delays, between equal
-    clocks.
-    """
+    """Contradictions found by observations, one a second over these delays, with equal clocks."""
     found = set()
     for at_s in range(begin_s, end_s):
         sample = round(down_s * S), round(up_s * S)
@@ -340,9 +334,7 @@ def test_the_time_of_day_bounds_the_clock_and_the_step() -> None:
 
 
 def test_a_time_of_day_that_cannot_be_is_told_and_all_counts_that_may_be() -> None:
-    """Neither the smaller nor the other bound is used alone, even after the time of day is right
-    again.
-    """
+    """Neither bound is used alone, even after the time of day is right again."""
     known = ClockMap(1, DT_NS)
     listen(known, 0, 5, 0.1, 0.1)
     assert known.tell(0, 400 * MS, 5 * MS, now_ns=5 * S) is Contradiction.TIME_OF_DAY

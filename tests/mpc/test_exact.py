@@ -1,6 +1,4 @@
-"""The exact solver: accurate to rounding, independent of earlier problems, and never a wrong
-answer.
-"""
+"""Exact solver: accurate to rounding, independent of earlier problems, never a wrong answer."""
 
 from collections.abc import Callable
 from functools import cache

@@ -203,9 +203,7 @@ def test_first_plan_has_no_change_term() -> None:
 
 @pytest.mark.parametrize("gap", [1, 3, H])
 def test_generator_goes_on_from_its_own_prediction(gap: int) -> None:
-    """Initial state x_p(k|k-1) ∈ X_p(k-1): the state after the previous inputs of the steps
-    passed.
-    """
+    """Initial state x_p(k|k-1) ∈ X_p(k-1): the state after the inputs of the steps passed."""
     planner = make()
     before = run(planner, 10, START)
     made = run(planner, 10 + gap, elsewhere(gap))
@@ -301,9 +299,7 @@ def cost_of(found: Foresight, target: Array, told: Array, inputs: Array) -> floa
 @settings(max_examples=20)
 @given(st.integers(0, 2**32 - 1), st.integers(1, H), st.integers(0, H))
 def test_figures_are_what_they_are_called(seed: int, gap: int, d: int) -> None:
-    """V of (16), the additional cost of keeping the old plan, and its deviation from the new
-    one.
-    """
+    """V of (16), the additional cost of keeping the old plan, and its deviation."""
     rng, rows, planner = np.random.default_rng(seed), np.array([2]), make(3)
     before = plan(planner, rows, np.array([40 - d]), crowd(rng, np.array([d])))
     found = crowd(rng, np.array([d]))
@@ -376,9 +372,7 @@ def test_inputs_that_are_never_flown_are_not_compared(flown: int) -> None:
 
 @pytest.mark.parametrize("first", [True, False])
 def test_figures_that_compare_with_nothing_are_zero(first: bool) -> None:
-    """V and deviation at a first step; with "predictive", those that compare with the sent
-    horizon.
-    """
+    """V and deviation at a first step; with "predictive", those compared with the sent horizon."""
     control = msgspec.structs.replace(SCENARIO.control, scheme="predictive")
     scenario = SCENARIO if first else msgspec.structs.replace(SCENARIO, control=control)
     planner, rng, rows = make(scenario=scenario), np.random.default_rng(1), np.array([0])
@@ -500,9 +494,7 @@ def test_vehicle_without_any_plan_hovers() -> None:
 
 
 def test_first_plan_is_tried_again_until_it_is_solved() -> None:
-    """Nothing was sent, so the next step counts as the first: an event (E18), without an S-term
-    (E8).
-    """
+    """Nothing was sent, so the next step is the first: an event (E18), no S-term (E8)."""
     fails = {GENERATOR}
     planner = make_faulty(fails)
     run(planner, 0, START)

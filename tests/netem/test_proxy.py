@@ -272,9 +272,7 @@ def test_who_repeats_a_packet_from_many_ports_shuts_nobody_out(
 def test_who_exchanges_packets_in_all_places_shuts_newcomers_out(
     hosts: list[str], rate_hz: int, expected: float
 ) -> None:
-    """With at least eight packets in ten seconds for each flow; vehicles in flight are not
-    affected.
-    """
+    """With at least eight packets in ten seconds per flow; vehicles in flight are not affected."""
     assert 90 < 128 * EXCHANGES * SECOND_NS / EARNED_NS < 150
     siege = Siege(make_proxy(flows=128), hosts, 128 // len(hosts), 0, stays=EXCHANGES)
     siege.run(2, ALICE)

@@ -1,6 +1,4 @@
-"""Downlink delay compensator, eq. (12)-(13): x̂(k) is the old state predicted with the known
-inputs.
-"""
+"""Downlink delay compensator, eq. (12)-(13): x̂(k) predicted from an old state and inputs."""
 
 from typing import Any
 
@@ -266,9 +264,7 @@ def told(step: int, state: Array, u: Array) -> Observation:
 def watch(
     estimator: Estimator, wind: Array, every: int = 1, *, steps: int = 200, row: int = 0
 ) -> Array:
-    """Disturbance estimated for a vehicle with changing inputs in steady wind, observed every
-    `every` steps.
-    """
+    """Disturbance estimated in steady wind with changing inputs, observed at some steps."""
     x, found = np.zeros((2, 2)), empty_foresight(1, 2, H, 1)
     for step in range(steps):
         u = 0.2 * np.array([np.sin(0.1 * step), np.cos(0.1 * step)])
@@ -391,9 +387,7 @@ def is_able(controller: Controller, step: int) -> bool:
 def test_old_observations_are_out_of_reach(
     controller: Controller, observed: int, now: int, *, able: bool
 ) -> None:
-    """Five seconds are allowed, a step more is not; an observation from the future counts as
-    new.
-    """
+    """Five seconds are allowed, a step more is not; an observation from the future is new."""
     controller.forget(0)
     controller.observe(0, seen(observed, np.zeros((2, 2))))
     assert is_able(controller, now) == able

@@ -268,9 +268,7 @@ BAD_PLAN = "super().plan(*given)\nfound.horizons[rows == 1, :, :80] = {}"
 def test_a_mistake_costs_its_vehicle_the_plan_and_nobody_else(
     method: str, wrong: str, said: str, tmp_path: Path
 ) -> None:
-    """The mistake is logged once; the vehicle flies its present plan and hovers, the other one
-    flies on.
-    """
+    """Logged once; the vehicle flies its plan to the end and hovers, the other one flies on."""
     plug(tmp_path, failing(method, wrong))
     flight = fly(scenario("chase"), vehicles=2)
     (told,) = faults(flight)

@@ -135,9 +135,7 @@ def test_a_horizon_in_flight_is_in_force_when_it_had_its_time() -> None:
 
 @pytest.mark.parametrize("under_way", [0, 1, 2, 3, 6])
 def test_each_doubt_is_what_is_flown_without_the_newest_horizons(under_way: int) -> None:
-    """Weighted with the probability that exactly these are lost; the last case covers all
-    others.
-    """
+    """Weighted with the probability that exactly these are lost; the last covers all others."""
     loss, given = 0.2, plans(3, *[BOUND + H] * (under_way + 1))
 
     def foreseen(count: int) -> Foresight:
@@ -362,9 +360,7 @@ def test_the_estimate_is_exact_once_every_horizon_has_arrived_or_is_known_lost(
 
 
 def test_a_packet_at_every_step_hides_what_is_lost() -> None:
-    """All horizons begin with the same committed inputs, so the state is known whichever
-    arrives.
-    """
+    """All horizons begin with the same committed inputs, so the state is always known."""
     flown = scenario(control={"trigger": "always", "delay_bound": 0.8}, duration=20.0)
     flight = fly(flown)
     assert flight.netem["lost"].sum() > 50
@@ -438,9 +434,7 @@ def test_every_step_is_planned_whatever_the_trigger(
     ids=["steady wind", "and a wrong gain"],
 )
 def test_the_disturbance_observer_leaves_no_offset(vehicle: dict[str, Any]) -> None:
-    """Hovering in constant wind, in the last twenty seconds; without the observer there is an
-    offset.
-    """
+    """Hovering in constant wind, in the last twenty seconds; an offset without the observer."""
     offsets = {}
     for observer_s in (0.0, 4.0):
         control = {"trigger": "cost_gap(0.01)", "observer_s": observer_s}
@@ -482,9 +476,7 @@ def test_feedback_aboard_flies_in_wind_with_a_packet_a_second() -> None:
 
 
 def test_with_feedback_aboard_the_estimate_is_as_exact() -> None:
-    """Exact to the resolution of reports without noise, once each horizon has arrived or is
-    lost.
-    """
+    """Exact to the resolution of reports, once each horizon has arrived or is lost."""
     control = {
         "scheme": "committed",
         "feedback": True,
@@ -499,9 +491,7 @@ def test_with_feedback_aboard_the_estimate_is_as_exact() -> None:
 
 
 def test_the_observer_sees_past_feedback_aboard() -> None:
-    """Feedback against steady wind is not learned as a disturbance, and the wind's estimate
-    stays.
-    """
+    """Feedback against steady wind is no disturbance, and the wind's estimate stays."""
     reference = {"shape": "hover", "points_m": [[0.0, 0.0]]}
     control = {
         "scheme": "committed",

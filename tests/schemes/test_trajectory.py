@@ -310,9 +310,7 @@ def test_a_target_faster_than_the_bound_is_sent_at_the_bound() -> None:
 
 
 def test_gap_is_the_mean_over_what_may_be_followed() -> None:
-    """A trajectory under way counts with the probability of arrival; otherwise the vehicle
-    hovers.
-    """
+    """A trajectory under way counts with its probability of arrival; otherwise hovering does."""
     flown = scenario()
     server = Server(flown)
     server.observe(0)
@@ -798,9 +796,7 @@ def test_steady_wind_is_taken_off_by_the_vehicle_itself(
 def test_a_vehicle_along_a_spline_reports_where_it_leaves_it(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """In still air the server predicts the vehicle, so reports are few; ablation: it predicts a
-    vehicle at rest.
-    """
+    """In still air the server predicts the vehicle, so reports are few."""
     silent = {"wind": 0.0, "report": "deviation(0.01) | silence(1)"}
     table = reading.to_table(reading.load("demo")) | {"duration": 20.0}
     table["control"]["scheme"] = "trajectory"

@@ -63,9 +63,7 @@ class Crowd:
     st.integers(0, 2**32 - 1),
 )
 def test_no_more_goes_than_the_rate(sizes: list[int], rate: float, blocks: int, seed: int) -> None:
-    """In any window of T at most r (T + BURST_S), and the excess of a packet over the previous
-    one.
-    """
+    """In any window of T at most r (T + BURST_S), plus the excess of a packet's size."""
     crowd, rng = Crowd(rate, sizes), np.random.default_rng(seed)
     spent = [
         sum(sizes[row] for row in crowd.tick(rng.random(len(sizes)), blocks=blocks))

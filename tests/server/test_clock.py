@@ -178,9 +178,7 @@ def test_step_is_a_change_by_more_than_40_ms(jump_ms: int, bound_ms: int) -> Non
 
 
 def test_change_that_differs_between_directions_is_no_stepped_clock() -> None:
-    """A step changes both directions equally, to within 40 ms or a fifth: by 10 and 50 of 300
-    ms.
-    """
+    """A step changes both directions equally, to within 40 ms or a fifth."""
     before = times(0, 10)
     assert after_change(300 * MS, 700 * MS, before=before, since=20) == 350 * MS
     assert after_change(300 * MS, 510 * MS, before=before, since=20) == 405 * MS
@@ -212,9 +210,7 @@ FEW = ((4, 300), (5, 400))
 def test_four_packets_are_too_few_to_tell_a_stepped_clock(
     before: range, since: int, bound_ms: int
 ) -> None:
-    """Before or after the step, because the minimum of four is unreliable; also where the ring
-    wraps.
-    """
+    """Before or after the step: the minimum of four is unreliable; also where the ring wraps."""
     assert after_change(200 * MS, 600 * MS, before=before, since=since) == bound_ms * MS
 
 

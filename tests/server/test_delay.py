@@ -231,9 +231,7 @@ FLIGHTS = {
     (0.02, 1): (22, 25, 30, 0.012),
     (0.02, 10): (24, 29, 12, 0.03),
 }
-"""By Δt [s] and period: smallest and largest d of the last half, changes, share of late
-horizons.
-"""
+"""By Δt [s] and period: smallest and largest d at the end, changes, share of late horizons."""
 
 
 @pytest.mark.parametrize("seed", range(3))

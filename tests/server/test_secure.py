@@ -345,9 +345,7 @@ def test_a_cookie_is_good_for_its_address_and_up_to_two_minutes() -> None:
 
 
 def test_a_challenge_answers_one_attempt_once() -> None:
-    """Repeated, changed or of another attempt it draws no HELLO, so nobody can make the client
-    flood.
-    """
+    """Repeated, changed or of another attempt it draws no HELLO, which prevents floods."""
     client, server = link(), gate()
     server.open(Datagram(client.hello(HELLO, now_ns=0), HERE), now_ns=0)
     challenge = server.outbox()[0].payload
@@ -492,9 +490,7 @@ def test_a_vehicle_gets_five_handshakes_a_second() -> None:
 
 
 def test_an_address_moves_with_the_highest_counter_only() -> None:
-    """A late packet, or one of the previous channel, does not show the vehicle's present
-    address.
-    """
+    """A late packet, or one of the previous channel, does not show the present address."""
     client, server = joined()
     packets = [client.seal(OBSERVATION) for _ in range(4)]
     assert [called(server, packets[i]).moves for i in (0, 2, 1, 3)] == [True, True, False, True]
@@ -509,9 +505,7 @@ def test_an_address_moves_with_the_highest_counter_only() -> None:
 def test_without_the_order_of_counters_a_late_packet_moves_the_address(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Otherwise an attacker who delays a packet and sends it from elsewhere gets the next
-    answers.
-    """
+    """Otherwise an attacker who delays a packet and resends it gets the next answers."""
     client, server = joined()
     held, newer = client.seal(OBSERVATION), client.seal(OBSERVATION)
     called(server, newer)
@@ -586,9 +580,7 @@ HELLO_TICKS, SILENCE_TICKS = 10, 80
 
 
 class Flight:
-    """Vehicle that sends HELLO until it is welcomed, and then a packet at every tick, over a bad
-    network.
-    """
+    """Vehicle that sends HELLO until welcomed, then a packet at every tick, over a bad network."""
 
     def __init__(self, seed: int, loss: float, delay_s: Callable[[random.Random], float]) -> None:
         self.rng = random.Random(seed)
@@ -696,9 +688,7 @@ def test_with_fewer_pending_channels_it_does_not(monkeypatch: pytest.MonkeyPatch
 
 
 def replayed(flight: Flight, peer: Address) -> tuple[Counter[bytes], list[int]]:
-    """Accepted packets among all that were ever sent, and how much longer answers are than
-    requests.
-    """
+    """Accepted packets among all ever sent, and how much longer answers are than requests."""
     accepted = Counter[bytes]()
     excess = []
     for to_server, datagram in flight.sent:

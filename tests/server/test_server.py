@@ -354,9 +354,7 @@ def test_of_two_new_clients_under_one_number_the_first_flies() -> None:
 
 
 def test_a_vehicle_that_was_silent_for_a_while_is_not_taken_over_once_it_is_heard_again() -> None:
-    """The network was interrupted, not the vehicle; a life welcomed meanwhile is refused when it
-    asks.
-    """
+    """The network was interrupted, not the vehicle; a life welcomed meanwhile is refused."""
     vehicles, first = live()
     vehicles.now_ns += SILENCE_NS + 1
     second = vehicles.open(boot_id=6, sender=("other", 2))

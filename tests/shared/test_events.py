@@ -212,9 +212,7 @@ def test_a_log_of_text_names_its_process_in_every_line(capfd: pytest.CaptureFixt
 def test_an_endpoints_events_are_told_as_far_as_they_can_be_read(
     capfd: pytest.CaptureFixture[str],
 ) -> None:
-    """A process's own events are never omitted; the number of omitted ones is logged before the
-    end.
-    """
+    """A process's own events are never omitted; the number of omitted ones is logged."""
     log = Log("client", "text")
     for vehicle in range(4318):
         log.hear(Flying(vehicle=vehicle))

@@ -149,9 +149,7 @@ def test_a_link_at_rest_is_rarely_taken_for_lost(loss: float, packets_per_s: flo
 
 @pytest.mark.parametrize("loss", [0.0, 0.1])
 def test_a_hover_in_still_air_costs_the_heartbeats_and_no_more(loss: float) -> None:
-    """Both ends settle at the rate that the loss requires, the vehicle's at that of the longer
-    timeout.
-    """
+    """Both ends settle at the rate that the loss requires."""
     calm = {"vehicle.wind": 0.0, "reference.shape": "hover", "reference.points_m": [[0.0, 0.0]]}
     way = {"network.uplink.loss": loss, "network.downlink.loss": loss}
     scenario = skytether.load("demo", duration=60, settle=5, **calm, **way)

@@ -178,9 +178,7 @@ def test_what_is_compiled_is_said_once(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("helpers", ["helped", "alone"])
 def test_kernels_are_compiled_by_other_processes(tmp_path: Path, helpers: str) -> None:
-    """Their machine code is read from the disk; if no helper can be started, this process
-    compiles.
-    """
+    """Their machine code is read from the disk; without helpers this process compiles."""
     (tmp_path / "helper.py").write_text(HELPER)
     for name in ("caller", "second"):
         (tmp_path / f"{name}.py").write_text(MODULE)

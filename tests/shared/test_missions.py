@@ -12,9 +12,7 @@ from skytether.shared.scenario.mission import Mission, mission
 Goals = dict[int, tuple[Array, Array]]
 MANY = 20_000
 CPU_S = 30.0
-"""Longest time for MANY vehicles [s]. The check takes half a second; comparing all pairs takes
-minutes.
-"""
+"""Time limit for MANY vehicles [s]: the check takes half a second, comparing all pairs minutes."""
 
 
 def each_with_each(goals: Goals, apart_m: float, height: float) -> tuple[float, float] | None:

@@ -149,9 +149,7 @@ def test_an_answer_to_another_attempt_is_refused() -> None:
 
 
 def test_an_ephemeral_key_without_secret_is_refused() -> None:
-    """The point 0 gives the same secret with every private key; only the owner of the psk can
-    try.
-    """
+    """The point 0 gives the same secret with every key; only the owner of the psk can try."""
     initiator, _ = shake(PSK)
     with pytest.raises(NoiseError):
         initiator.open(bytes(KEY_BYTES) + bytes(16))

@@ -1,6 +1,4 @@
-"""Plug-ins: triggers and references from files and packages, in every process, and their
-mistakes.
-"""
+"""Plug-ins: triggers and references from files and packages in all processes; mistakes."""
 
 import csv
 import importlib.util
@@ -742,7 +740,7 @@ def test_an_installed_package_adds_a_trigger_a_reference_and_a_vehicle(
     flies = ("--vehicle.kind", "rail")
     argv = (*trigger, *flies)
     assert "RMSE" in run(f"fly demo --virtual {SHORT}", *argv, folder=tmp_path, path=installed)
-    assert "rail\n    Vehicle that has any velocity" in run(
+    assert "rail\n    Vehicle that reaches any velocity" in run(
         "vehicles", folder=tmp_path, path=installed
     )
 

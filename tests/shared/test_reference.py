@@ -166,9 +166,7 @@ def test_array_of_times_is_its_single_times(table: dict[str, object], axes: int)
 
 
 def test_a_target_stays_within_its_bounds_and_comes_back_the_way_it_went() -> None:
-    """At any time in the future; only an hour of its motion is random, then it repeats
-    backwards.
-    """
+    """At any time in the future; an hour of its motion is random, then it repeats backwards."""
     rng = np.random.default_rng(1)
     desired = reference.target(rng, 2, agility=0.5, speed_mps=0.8, radius_m=2.0)
     times = np.arange(0.0, 200.0, 0.01)

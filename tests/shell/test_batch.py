@@ -302,9 +302,7 @@ async def has_heard(endpoint: "Answering", count: int) -> None:
 def converse(
     endpoint: Endpoint, pieces: Sequence[tuple[socket.socket, Sequence[bytes]]]
 ) -> tuple[Shell, list[Event]]:
-    """Send bursts to a driven endpoint, each after the previous one was received, until it
-    finishes.
-    """
+    """Send bursts to a driven endpoint, each after receipt of the previous one."""
 
     async def talk(shell: Shell) -> None:
         for sock, payloads in pieces:
@@ -440,9 +438,7 @@ class TwoSockets(Answering):
 
 
 def send_to_both(pieces: Sequence[Sequence[int]]) -> TwoSockets:
-    """Send numbered datagrams to two sockets of an endpoint; `pieces` has the sockets of each
-    burst.
-    """
+    """Send numbered datagrams to an endpoint; `pieces` has the sockets of each burst."""
     endpoint = TwoSockets(1 + sum(map(len, pieces)), lambda _: [])
 
     async def talk(shell: Shell) -> None:
@@ -472,9 +468,7 @@ def test_two_crowded_sockets_are_heard_in_the_order_of_arrival() -> None:
 
 
 def test_a_quiet_socket_beside_a_crowded_one_shows_no_earlier_time() -> None:
-    """A datagram that arrived earlier at the crowded socket, but is read later, gets the present
-    time.
-    """
+    """A datagram that arrived at the crowded socket before, but is read later, counts as new."""
     endpoint = send_to_both([[0] * 20, [0, 0, 0, 0, 1, 0, 0, 0, 0], [0] * 5 + [1, 1] + [0] * 5])
     assert {each.socket for each in endpoint.heard} == {0, 1}
     assert sorted(endpoint.stamps_ns) == endpoint.stamps_ns

@@ -125,9 +125,7 @@ def test_what_arrives_is_heard_before_anybody_acts_on_that_instant() -> None:
 
 
 def test_a_computing_host_sends_late_and_hears_at_once() -> None:
-    """A host woken at 50 computes for 30 ns: its datagram leaves at 80, but it receives one at
-    60.
-    """
+    """Woken at 50 for 30 ns of computing: sends at 80, but receives a datagram at 60."""
     world, busy, other = World(), Probe([50]), Probe([60])
     busy_address = world.add("busy", busy, compute_ns=30)
     other_address = world.add("other", other)

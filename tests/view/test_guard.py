@@ -313,9 +313,7 @@ def test_a_message_of_countless_frames_ends_the_connection(page: Page, sent: byt
 
 
 def test_who_never_reads_is_cut_off_once_he_pings(page: Page) -> None:
-    """The answers would fill the memory; a client that does not ping is cut off by the page's
-    pings.
-    """
+    """The answers would fill the memory; other clients are cut off by the page's pings."""
     with closing(opened(page.port)) as sock:
         sock.sendall(frame(BINARY, msgspec.msgpack.encode(CAMERA)))
         with suppress(OSError):  # reset, or a broken pipe

@@ -84,9 +84,7 @@ def test_the_curves_of_a_vehicle_are_its_record() -> None:
 
 
 def test_a_cut_link_is_a_gap_in_all_that_nobody_knows_meanwhile() -> None:
-    """In age and reference, from the moment the texts show a dash; the vehicle itself is still
-    shown.
-    """
+    """In age and reference, from the moment the texts show a dash; the vehicle is still shown."""
     shown = demo(cut_s=6.0)
     track, client, server = shown.state.vehicles[1], shown.flown.client, shown.flown.server
     curves, dt = track.curves(1201), shown.scenario.control.dt  # a grid of the steps themselves
@@ -414,9 +412,7 @@ def test_what_is_said_cannot_become_part_of_the_page() -> None:
 
 
 def test_it_says_how_old_what_the_server_knows_is() -> None:
-    """A vehicle that reports rarely is still shown at every step, while plans use older
-    observations.
-    """
+    """A vehicle that reports rarely is shown at every step; plans use older observations."""
     shown = demo()
     track, newest = shown.state.vehicles[1], shown.flown.server[-1]
     behind = int(newest["step"] - newest["observed_step"])

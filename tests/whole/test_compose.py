@@ -32,9 +32,7 @@ def argv(service: str, scenario: str) -> list[str]:
 
 
 def test_a_profile_adds_services_and_changes_none() -> None:
-    """Without a profile there are the five services of a flight; none waits for one of a
-    profile.
-    """
+    """Without a profile there are the five services of a flight, independent of profiles."""
     assert {name for name, each in SERVICES.items() if "profiles" not in each} == ALWAYS
     for profile, added in PROFILES.items():
         assert {n for n, each in SERVICES.items() if each.get("profiles") == [profile]} == added

@@ -97,9 +97,7 @@ def test_ten_thousand_hostile_datagrams_are_counted_and_change_nothing(
 
 
 def test_a_flood_of_hellos_stays_within_the_servers_bounds() -> None:
-    """Many vehicles with many lives each: one answer each, memory within the capacity, and each
-    refusal logged.
-    """
+    """Many vehicles with many lives: one answer each, bounded memory, each refusal logged."""
     server = Server(SCENARIO, boot_id=1, entropy=stream(1, "entropy").bytes)
     answers = 0
     for boot_id in range(3):

@@ -163,9 +163,7 @@ def test_rooms_of_a_checkout_run_as_processes(name: str) -> None:
 
 @pytest.mark.long
 def test_folders_with_our_names_are_not_taken_for_ours(tmp_path: Path) -> None:
-    """Folders in the user's directory are ignored by the command, its processes, and `python
-    -P`.
-    """
+    """Folders in the user's directory are ignored by commands, processes, and `python -P`."""
     strangers(tmp_path, *OLD_NAMES, "skytether")
     skytether = str(Path(sys.executable).with_name("skytether"))
     flags = ["--duration", "3", "--settle", "0"]
