@@ -230,8 +230,8 @@ class Torture:
         restarts = any((each.kind, each.where) == RESTARTED for each in trial.faults)
         steps = any(each.kind is FaultKind.STEP and is_small(each.amount) for each in trial.faults)
         self._step_ns = STEP_FOUND_NS if steps else 0
-        """Additional recovery time after a small forward step of a clock [ns]; such a step looks like
-        a freeze until the server has newer measurements.
+        """Additional recovery time after a small forward step of a clock [ns], which looks like a
+        freeze until the server has newer measurements.
         """
         self._recovery_ns = recovery_ns(self.scenario, restarts=restarts) + self._step_ns
         """Time within which a vehicle must fly again after the last fault [ns]."""
