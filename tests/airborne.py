@@ -1,4 +1,4 @@
-"""A flight with a scripted autopilot in virtual time: server, netem, client and autopilot."""
+"""Flights with a scripted autopilot in virtual time: server, netem, client and autopilot."""
 
 import io
 import re
@@ -31,10 +31,10 @@ SAFE: dict[FlavourName, dict[str, float]] = {
     "ardupilot": {"GUID_TIMEOUT": 1.0, "FS_GCS_ENABLE": 5, "SYSID_MYGCS": 245},
     "px4": {"COM_OBL_RC_ACT": 4},
 }
-"""Parameters with which a vehicle is flown."""
+"""Autopilot parameters with which the client accepts the vehicle."""
 BOTH: tuple[FlavourName, ...] = ("ardupilot", "px4")
 ARM, TAKE_OFF, SET_MODE = 400, 22, 176
-"""Numbers of commands."""
+"""MAVLink numbers of commands."""
 SECOND = 1_000_000_000
 OFFSET_NS = 86_400_000_000_000
 FIGURE = {
@@ -47,14 +47,14 @@ NONE = ""
 
 
 def documented() -> str:
-    """The scenario `field.toml` of docs/fly-a-real-one.md."""
+    """Scenario `field.toml` of docs/fly-a-real-one.md."""
     document = (Path(__file__).parents[1] / "docs" / "fly-a-real-one.md").read_text()
     (table,) = re.findall(r"```toml\n(.*?)```", document, re.DOTALL)
     return str(table)
 
 
 def scenario(**table: Any) -> Scenario:
-    """A figure eight in space over a network without delay, with some keys changed."""
+    """Figure eight in space over a network without delay, with some keys changed."""
     default: dict[str, Any] = {
         "duration": 10.0,
         "control": {"dt": 0.05},
@@ -69,24 +69,22 @@ def scenario(**table: Any) -> Scenario:
 
 
 class Tap(Endpoint):
-    """An endpoint that is overheard, and whose datagrams can be lost or made.
-
-    Args:
-        inner: the endpoint.
+    """Wrapper around an endpoint: records incoming datagrams; can drop, alter or add outgoing
+    ones.
     """
 
     def __init__(self, inner: Endpoint) -> None:
         super().__init__()
         self.inner = inner
         self._heard: list[tuple[int, bytes]] = []
-        """Datagrams that came, and when [ns]."""
+        """Datagrams that arrived, and when [ns]."""
         self.deaf = self.dumb = False
-        """Whether nothing comes to it, or nothing of it leaves."""
+        """Whether all incoming, and all outgoing, datagrams are dropped."""
         self.alter: Callable[[Message], bytes | None] | None = None
-        """Function that returns the bytes sent in place of a message; None sends messages
-        unchanged."""
+        """Function that returns the bytes sent in place of a message, or None to send it
+        unchanged.
+        """
         self.extra: list[bytes] = []
-        """Datagrams that are sent beside its own."""
         self._reader = Codec(9, 9)
 
     def heard(self, since_ns: int = 0) -> list[tuple[int, Message]]:
@@ -131,7 +129,7 @@ class Tap(Endpoint):
 
 
 def altered(kind: str, **fields: Callable[[Any], Any]) -> Callable[[Message], bytes | None]:
-    """A `Tap.alter` that makes other values of fields of a kind of message."""
+    """Function for `Tap.alter` that replaces fields in messages of one kind."""
 
     def alter(message: Message) -> bytes | None:
         if message.get_type() != kind:
@@ -144,17 +142,17 @@ def altered(kind: str, **fields: Callable[[Any], Any]) -> Callable[[Message], by
 
 
 class Air:
-    """A flight.
+    """Flight of a vehicle with an autopilot.
 
     Args:
-        flavour: which autopilot.
-        faults: what goes wrong, as on the command line.
-        parameters: the autopilot's, in place of safe ones.
-        sets: whether the client may set them.
-        host: name of the autopilot's host; "line" is that of a line of bytes.
+        flavour: flavour of the autopilot.
+        faults: faults of the autopilot, as on the command line.
+        parameters: parameters of the autopilot that replace SAFE.
+        sets: whether the client may set parameters.
+        host: name of the autopilot's host; "line" is the host of a serial line.
         ready_s: time until the autopilot can be armed [s].
         drift_ppm: drift of the client's clock.
-        autopilot_ppm: drift of the autopilot's clock, which its whole simulation follows.
+        autopilot_ppm: drift of the autopilot's clock, including its simulation.
         table: keys of the scenario.
     """
 
@@ -216,12 +214,11 @@ class Air:
         return client
 
     def restart(self, down_s: float = 1.0, *, remembers: bool = True, **table: Any) -> None:
-        """Let the client's process die, and start again after a while.
+        """Kill the client's process, and start a new one after `down_s` [s].
 
         Args:
-            down_s: time until then [s].
-            remembers: whether it finds what the life before has kept.
-            table: keys of the scenario that are others then.
+            remembers: whether the new process finds the state that the old one saved.
+            table: keys of the scenario that change for the new process.
         """
         self.world.stop("client")
         self.run(down_s)
@@ -244,41 +241,39 @@ class Air:
         return self.world.now_ns / 1e9
 
     def run(self, seconds: float, until: Callable[[], bool] = lambda: False) -> float:
-        """Let time pass, until something is so; returns how much has passed [s]."""
+        """Run until a condition holds, for at most `seconds`; returns the time that passed [s]."""
         began_ns, over = self.world.now_ns, []
         until_ns = began_ns + round(1e9 * seconds)
-        # An action ends it: what lies behind a world's own limit is lost for the next run.
+        # End by an action: `World.run` drops the event that lies beyond its limit.
         self.world.at(until_ns, lambda: over.append(True))
         self.world.run(lambda: bool(over) or until(), limit_ns=until_ns)
         return (self.world.now_ns - began_ns) / 1e9
 
     def until(self, so: Callable[[], object], seconds: float) -> float:
-        """Let time pass until something is so, which it must be by then; returns how much [s]."""
+        """Run until a condition holds, which must happen in time; returns the time passed [s]."""
         passed_s = self.run(seconds, lambda: bool(so()))
         assert so(), self.said("client")[-5:]
         return passed_s
 
     def fly(self, seconds: float = 60.0) -> None:
-        """Let time pass until the pilot flies."""
         self.until(lambda: self.client._pilot.step, seconds)
 
     def end(self, seconds: float = 120.0) -> None:
-        """Let time pass until the client has ended."""
         self.until(lambda: self.client.finished, seconds)
 
     def lands(self, seconds: float = 30.0) -> float:
-        """Let time pass until its motors are disarmed; returns how much [s]."""
+        """Run until the motors are disarmed; returns the time that passed [s]."""
         return self.until(lambda: not self.flight.armed, seconds)
 
     def close(self, seconds: float = 0.5) -> int:
-        """End the client as a signal does; returns how often it asks for a mode from then on."""
+        """End the client as a signal does; returns how often it requests a mode afterwards."""
         before = len(self.commands(SET_MODE))
         self.world.act("client", self.client.close)
         self.run(seconds)
         return len(self.commands(SET_MODE)) - before
 
     def quiet(self, seconds: float) -> None:
-        """Let time pass, in which the client must send no setpoint."""
+        """Run for a time in which the client must send no set-point."""
         since_ns = self.world.now_ns
         self.run(seconds)
         assert not self.setpoints(since_ns)
@@ -289,12 +284,10 @@ class Air:
         self.world.act("client", lambda now_ns: self._running.change(keys, now_ns=now_ns))
 
     def take_over(self) -> None:
-        """Let a pilot have the vehicle."""
         self.flight.act(FlightMode.PILOT, "Pilot has taken over")
 
     @property
     def mode(self) -> Mode:
-        """Mode of the failsafe."""
         return self.client._failsafe.mode
 
     def rows(self) -> Rows:
@@ -317,11 +310,10 @@ class Air:
         return [each for _, each in self.heard("COMMAND_LONG") if each.command == command]
 
     def figures(self) -> dict[str, Any]:
-        """Figures of the client about its autopilot."""
         return self.client.vehicle_figures()["autopilot"]
 
     def rmse(self, settle_s: float = 5.0) -> float:
-        """Error in the plane between the truth and what was desired, rms [m]."""
+        """RMS distance between true and desired position in the plane [m]."""
         rows = self.rows()
         dt = self.scenario.control.dt
         times = rows["step"] * dt
@@ -335,7 +327,7 @@ class Air:
 
 
 def flying(flavour: FlavourName, *faults: str, seconds: float = 1.0, **table: Any) -> Air:
-    """A vehicle in the air that has followed a plan for some seconds."""
+    """Vehicle in the air that has followed a plan for some seconds."""
     air = Air(flavour, faults=faults, **{"duration": 60.0} | table)
     air.fly()
     air.until(lambda: air.mode is Mode.TRACK, 5.0)

@@ -1,6 +1,6 @@
-"""A bad line between client and autopilot, with others on it, and flights over it.
+"""Flights over a bad line between client and autopilot, on which others send too.
 
-`python tests/bad_line.py --minutes 60` flies for as long, and prints what came of each flight.
+`python tests/bad_line.py --minutes 60` flies for an hour, and prints the result of each flight.
 """
 
 import argparse
@@ -29,30 +29,27 @@ from skytether.station.joined import state_at
 
 CLIENT, AUTOPILOT = ("client", 1), ("autopilot", 0)
 LOST, DOUBLED, LATE, CUT, FLIPPED = 0.1, 0.05, 0.05, 0.1, 0.1
-"""Shares of frames that are lost, that come twice, that come late, and of which a part, or a copy
-with other bits, comes as well."""
+"""Shares of frames that are lost, duplicated, delayed, truncated (an additional part), and
+corrupted (an additional copy with flipped bits).
+"""
 LATE_NS = 400 * MILLISECOND_NS
-"""Most by which a frame comes late [ns]."""
 OTHERS_NS = 20 * MILLISECOND_NS
-"""Time between two words of others [ns]."""
 FLIGHT_S = 240.0
-"""Length of a flight [s]."""
 SETTLE_S = 20.0
-"""Time of a flight before which its error does not count [s]: it catches up with the reference."""
+"""Initial time without an error limit, in which the vehicle reaches the reference [s]."""
 FENCE = {"low_m": [-7.0, -7.0, 2.0], "high_m": [7.0, 7.0, 8.0]}
 STATION, VEHICLE, CAMERA, TWIN = (255, 190), (2, 1), (1, 100), (245, 190)
-"""Numbers of a ground station, another vehicle, a camera aboard, and one with our own number."""
+"""System and component of a ground station, another vehicle, a camera aboard, and a station with
+the client's own system number.
+"""
 MODES = (0, 4, 5, 6, 9, 6 << 16, 3 << 16, 4 << 16 | 6 << 24)
-"""Modes of either flavour."""
 ARM, SET_MODE = 400, 176
 
 
 class BadLine(Endpoint):
-    """A line that loses, doubles, delays and spoils frames, and on which others talk.
+    """Line that loses, duplicates, delays and corrupts frames, and on which others send.
 
-    Args:
-        seed: of all that is drawn.
-        is_bad: whether it is; a good one hands on what it gets.
+    With `is_bad` false it passes everything on unchanged.
     """
 
     def __init__(self, seed: int, *, is_bad: bool = True) -> None:
@@ -62,12 +59,11 @@ class BadLine(Endpoint):
         self._codecs = {each: Codec(*each) for each in (STATION, VEHICLE, CAMERA, TWIN)}
         self._reader = Codec(9, 9)
         self._held: list[tuple[int, int, bytes, Address]] = []
-        """Heap of what comes late: time [ns], number, frame and receiver."""
+        """Heap of delayed frames: time [ns], number, frame and receiver."""
         self._others_ns = 0
         self.counts: Counter[str] = Counter()
-        """Number of each thing that was done."""
         self.sent: list[tuple[int, Message]] = []
-        """Messages of the client's, but heartbeats and questions, and when [ns]."""
+        """Messages of the client with their times [ns], without heartbeats and requests."""
 
     def receive(self, datagram: Datagram, *, now_ns: int) -> None:
         from_client = datagram.peer == CLIENT
@@ -121,7 +117,6 @@ class BadLine(Endpoint):
         return min([self._others_ns, *(each[0] for each in self._held[:1])])
 
     def _talk(self, now_ms: int) -> None:
-        """Let somebody say something to the client, and to the autopilot."""
         for sender in (VEHICLE, CAMERA, STATION, TWIN):
             said = self._foreign(now_ms)
             self.counts["foreign"] += 1
@@ -135,7 +130,7 @@ class BadLine(Endpoint):
             self.send(start + noise, receiver)
 
     def _foreign(self, now_ms: int) -> Message:
-        """Something that is another's, and would be dangerous if it were our autopilot's."""
+        """Message of another system, dangerous if the client took it for its autopilot's."""
         rng, mode = self._rng, MODES[self._draw(len(MODES))]
         armed, client = 128 * self._draw(2), (245, 191)
         x, y, z, *v = rng.uniform(30.0, 99.0, 6).tolist()
@@ -171,9 +166,9 @@ class BadLine(Endpoint):
         return makers[self._draw(len(makers))]()
 
     def _asked(self, now_ms: int) -> Message:
-        """Something that a ground station asks of our autopilot, or commands another vehicle.
+        """Request of a ground station to the autopilot, or a command to another vehicle.
 
-        What the autopilot answers is heard by the client as well.
+        The client receives the autopilot's answers as well.
         """
         mode = MODES[self._draw(len(MODES))]
         long = dialect.MAVLink_command_long_message
@@ -183,7 +178,7 @@ class BadLine(Endpoint):
             lambda: dialect.MAVLink_param_request_read_message(1, 1, b"GUID_TIMEOUT", -1),
             lambda: dialect.MAVLink_param_request_list_message(1, 1),
             lambda: long(1, 1, 512, 0, 32.0, 0, 0, 0, 0, 0, 0),  # a position, once
-            lambda: long(1, 1, 31000, 0, 0, 0, 0, 0, 0, 0, 0),  # what it does not know
+            lambda: long(1, 1, 31000, 0, 0, 0, 0, 0, 0, 0, 0),  # an unknown command
             lambda: long(2, 1, ARM, 0, float(self._draw(2)), 21196.0, 0, 0, 0, 0, 0),
             lambda: long(2, 1, SET_MODE, 0, 1.0, float(mode % 256), 0, 0, 0, 0, 0),
             lambda: dialect.MAVLink_set_mode_message(2, 1, mode),
@@ -195,13 +190,11 @@ class BadLine(Endpoint):
 
 
 class OverLine(Air):
-    """A flight of the scenario `autopilot` over a line.
+    """Flight of the scenario `autopilot` over a line.
 
     Args:
-        flavour: which autopilot.
-        seed: of network and line.
-        is_bad: whether the line is.
-        table: keys of the scenario.
+        seed: seed of network and line.
+        is_bad: whether the line is bad.
     """
 
     def __init__(
@@ -216,10 +209,10 @@ class OverLine(Air):
         self.line = BadLine(seed, is_bad=is_bad)
         self.world.add("line", self.line)
         self.had: list[tuple[str, bool]] = []
-        """Modes that the autopilot was in, and whether it was armed, in order."""
+        """True modes of the autopilot, and whether it was armed, in order."""
 
     def run(self, seconds: float, until: Callable[[], bool] = lambda: False) -> float:
-        """See `Air`; what the autopilot does meanwhile is written down."""
+        """Run as `Air` does, and record the modes of the autopilot."""
 
         def watched() -> bool:
             now = self.flight.mode_name, self.flight.armed
@@ -231,7 +224,7 @@ class OverLine(Air):
 
     @property
     def believed(self) -> list[tuple[str, bool]]:
-        """Modes and arming that the client has heard, in order."""
+        """Modes and arming that the client believed, in order."""
         return [(each.mode, each.armed) for each in self.of(AutopilotMode)]
 
     def sent(self, command: int) -> list[int]:
@@ -242,7 +235,6 @@ class OverLine(Air):
 
 
 def is_in_order(part: list[Any], whole: list[Any]) -> bool:
-    """Whether a list is another one with some left out."""
     left = iter(whole)
     return all(each in left for each in part)
 
@@ -251,25 +243,21 @@ class Figures(NamedTuple):
     flavour: FlavourName
     seed: int
     rmse_m: float
-    """Error in the plane between the truth and the reference, rms [m]."""
+    """RMS error between true position and reference in the plane [m]."""
     over_m: float
-    """Furthest over the fence [m], below 0 inside."""
+    """Largest distance beyond the fence [m]; negative inside."""
     off_m: float
-    """Largest distance of the newest position that the client believed from the truth [m]."""
     pilot_s: float
-    """Time until the client left it to a pilot who took over [s]."""
+    """Time until the client yielded to a pilot who took over [s]."""
     arms: int
-    """Commands to arm before the autopilot was armed first."""
     frames: int
-    """Frames of client and autopilot."""
     foreign: int
-    """Frames of others that came to the client."""
 
 
 def fly(
     flavour: FlavourName, seed: int, *, is_bad: bool = True, duration: float = FLIGHT_S
 ) -> Figures:
-    """Fly to shortly before the end, have a pilot take over, and check what must be so."""
+    """Fly until shortly before the end, let a pilot take over, and check the invariants."""
     air = OverLine(flavour, seed, is_bad=is_bad, duration=duration)
     air.run(90.0, lambda: air.flight.armed)
     armed_ns = air.world.now_ns
@@ -316,7 +304,7 @@ def _figures(air: OverLine, flavour: FlavourName, seed: int, pilot_s: float, arm
 
 
 def main() -> None:
-    """Fly as long as is asked for, with both flavours in turn, and tell what came of it."""
+    """Fly both flavours in turn for the requested time, and print the results."""
     parser = argparse.ArgumentParser(description=main.__doc__)
     parser.add_argument("--minutes", type=int, default=60)
     parser.add_argument("--jobs", type=int, default=1)

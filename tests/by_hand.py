@@ -1,4 +1,4 @@
-"""A client whose server a test plays by hand: it says exactly what the test wants it to."""
+"""Client whose server is played by the test, message by message."""
 
 import io
 
@@ -26,12 +26,12 @@ SERVER: Address = ("server", 0)
 
 
 class ByHand:
-    """A client of vehicle 4, and the time that its clock shows.
+    """Client of vehicle 4, and the time on its clock.
 
     Args:
-        flown: its scenario.
-        flies: its vehicle; that of the scenario unless given.
-        link: its link; one in plaintext unless given.
+        flown: scenario of the client.
+        flies: vehicle; the scenario's unless given.
+        link: link; plaintext unless given.
     """
 
     def __init__(
@@ -53,7 +53,7 @@ class ByHand:
         self.session = 7
 
     def wake(self) -> list[Message]:
-        """Time passes until the client wants to be woken; what it then says."""
+        """Advance to the client's next wake; returns the messages that it sends."""
         due_ns = self.client.next_wake_ns()
         assert due_ns is not None
         self.now_ns = max(self.now_ns, due_ns)
@@ -63,7 +63,6 @@ class ByHand:
         return [decode(datagram.payload, self.terms) for datagram in said]
 
     def say(self, message: Message) -> None:
-        """One datagram to the client."""
         self.client.receive(Datagram(encode(message), SERVER), now_ns=self.now_ns)
 
     def welcome(
@@ -79,11 +78,12 @@ class ByHand:
         self.say(Welcome(4, session, boot_id, server_boot_id, 1234, refusal, terms))
 
     def horizon(self, step: int, value: float, *, observed: int | None = None) -> None:
-        """A horizon of one constant input, planned from a step that is its own unless told."""
+        """Send a horizon of one constant input, planned from the observation of `step` by
+        default.
+        """
         age = 0 if observed is None else step - observed
         inputs = np.full((self.terms.axes, self.terms.planned), value, np.float32)
         self.say(Horizon(4, self.session, step, 5678, age, inputs))
 
     def rows(self) -> Rows:
-        """The record so far."""
         return parse(self.sink.getvalue())

@@ -18,20 +18,16 @@ if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page
 
 CHROMIUM = os.environ.get("CHROMIUM") or shutil.which("chromium") or ""
-"""Chromium's executable; empty if there is none."""
 FLAGS = (
     "--no-sandbox",
     "--use-gl=angle",
     "--use-angle=swiftshader",
     "--enable-unsafe-swiftshader",
 )
-"""Flags that make Chromium render in software."""
 SCHEMES: tuple[Literal["dark", "light"], ...] = ("dark", "light")
-"""What a browser may prefer."""
 SIZES = {"wide": (1400, 900), "narrow": (420, 860)}
 """Width and height of windows [pixels]."""
 PATIENCE_S = 90.0
-"""Longest time to wait for a condition [s]."""
 SHOWN_S = 25.0
 """Time of flight at which pictures are taken [s]."""
 
@@ -50,8 +46,7 @@ def chromium() -> "Iterator[Browser]":
 def served(*arguments: str) -> Iterator[str]:
     """Run a command that serves a page; yields the page's address.
 
-    Raises:
-        RuntimeError: the command serves none.
+    Raises RuntimeError if the command serves none.
     """
     command = [sys.executable, "-P", "-m", "skytether", *arguments]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
@@ -98,13 +93,13 @@ def status(page: "Page", place: int = 0) -> str:
 
 
 def flown_s(page: "Page", place: int = 0) -> float:
-    """Time of flight on the page [s]; 0 before any."""
+    """Time of flight on the page [s]; 0 before the flight."""
     words = page.locator(".skytether-status")
     return float(words.nth(place).get_attribute(FLOWN_S) or 0) if words.count() > place else 0.0
 
 
 def plotted_s(page: "Page") -> float:
-    """Newest time in the first plot [s]; 0 before any."""
+    """Newest time in the first plot [s]; 0 before the flight."""
     newest = """() => {
         const plots = Object.values((window.__viserTestpoints || {}).uplots || {});
         return plots.length ? plots[0].chart.data[0].at(-1) : 0;
@@ -117,12 +112,11 @@ def put(page: "Page", label: str, value: float | str) -> None:
     nearest = f"xpath=//*[text()='{label}']/ancestor::*[.//input][1]//input"
     field = page.locator(nearest).last
     field.fill(value if isinstance(value, str) else f"{value:g}")
-    # Not on the field: the page takes it away as soon as the token in it is right.
+    # Not on the field: the page removes it as soon as its token is right.
     page.keyboard.press("Enter")
 
 
 def cut(page: "Page") -> None:
-    """Cut the link, and say that it is meant."""
     page.get_by_role("button", name="Cut the link").click()
     page.get_by_role("button", name="Yes, cut it").click()
 

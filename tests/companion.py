@@ -1,4 +1,4 @@
-"""A companion computer for tests: it speaks MAVLink with a scripted autopilot in virtual time."""
+"""Companion computer for tests: speaks MAVLink with a scripted autopilot in virtual time."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -17,7 +17,7 @@ from skytether.shared.core.endpoint import Datagram
 from skytether.shared.scenario.reading import check
 
 VELOCITY_ONLY = 0b110111000111
-"""Type mask of a setpoint of velocities alone."""
+"""Type mask of a set-point with velocities only."""
 POSITION_AND_VELOCITY = 0b110111000000
 ADDRESS = ("127.0.0.1", 40000)
 STEP_NS = 20_000_000
@@ -25,13 +25,12 @@ LOCAL = dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED
 
 
 class Companion:
-    """A companion computer, the autopilot that it flies, and the time between them.
+    """Companion computer, the autopilot that it flies, and their time.
 
     Args:
-        flavour: which autopilot.
-        ready_s: time until it may be armed [s].
-        faults: what goes wrong, as on the command line.
-        errs: whether it estimates its velocity with the errors of its flavour.
+        ready_s: time until the autopilot may be armed [s].
+        faults: faults of the autopilot, as on the command line.
+        errs: whether the autopilot's velocity estimate has the errors of its flavour.
         vehicle: keys of the scenario's vehicle.
     """
 
@@ -55,15 +54,14 @@ class Companion:
         self.codec = Codec(255, 190)
         self.now_ns = 1_000_000_000
         self.heard: list[tuple[int, Message]] = []
-        """All that came, and when [ns]."""
+        """Messages that arrived, and when [ns]."""
         self.velocity: tuple[float, float, float] | None = None
-        """Setpoint that is sent at every step [m/s]; None: none is."""
+        """Set-point that is sent at every step [m/s]; None sends none."""
         self.position: tuple[float, float, float] | None = None
-        """Position that is sent with it [m]."""
+        """Position that is sent with the velocity [m]."""
         self.beats = True
-        """Whether it sends heartbeats."""
         self.kinds = [18, 6] if self.flavour.bytewise else [18]
-        """Kinds of its heartbeats: PX4 sends its texts to ground stations alone."""
+        """Types in its heartbeats: PX4 sends its texts only to ground stations."""
         self.autopilot.wake(now_ns=self.now_ns)
 
     @property
@@ -83,7 +81,7 @@ class Companion:
                 self.heard += [(self.now_ns, each) for each in self.codec.decode(payload)]
 
     def run(self, seconds: float, watch: Callable[[], bool] = lambda: False) -> float:
-        """Let time pass, until something is so; returns how much has passed [s]."""
+        """Run until a condition holds, for at most `seconds`; returns the time that passed [s]."""
         began_ns = self.now_ns
         until_ns = began_ns + round(1e9 * seconds)
         beat_ns = 0
@@ -129,7 +127,7 @@ class Companion:
         return self.command(400, 1.0)
 
     def climb(self, altitude: float = 5.0) -> float:
-        """Arm, take off and get into the mode that is guided; returns the time of the climb [s]."""
+        """Arm, take off and enter guided mode; returns the time of the climb [s]."""
         above_sea = self.flavour.home[2] if self.flavour.bytewise else 0.0
         self.run(1.0)
         if not self.flavour.bytewise:
@@ -159,7 +157,7 @@ class Companion:
         return [text for text in said if text is not None]
 
     def track(self, since: int = 0) -> np.ndarray:
-        """Times [s], positions and velocities in our axes of all that it told; shape (n, 7)."""
+        """Times [s], positions and velocities in our axes of all received states; shape (n, 7)."""
         rows = [
             (m.time_boot_ms / 1e3, *turned((m.x, m.y, m.z)), *turned((m.vx, m.vy, m.vz)))
             for m in self.all("LOCAL_POSITION_NED")[since:]

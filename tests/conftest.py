@@ -1,4 +1,4 @@
-"""Requirements of the tests on the machine."""
+"""Settings of the tests, and requirements on the machine."""
 
 import atexit
 import fcntl
@@ -24,11 +24,11 @@ from skytether.shared.scenario.registry import TABLES
 from skytether.shell import plugins
 
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
-    # A shell's job in the background ignores Ctrl-C, and so would every command that a test starts.
+    # A shell's background job ignores SIGINT, and so would every command that a test starts.
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
-# What is tested is the same each time; `--hypothesis-profile=fresh` draws other examples. No test
-# looks at the time, for the machine may be busy.
+# Examples are the same each time; `--hypothesis-profile=fresh` draws others. No deadlines, because
+# the machine may be busy.
 UNTIMED: dict[str, Any] = {
     "deadline": None,
     "suppress_health_check": [hypothesis.HealthCheck.too_slow],
@@ -36,15 +36,15 @@ UNTIMED: dict[str, Any] = {
 hypothesis.settings.register_profile("same", derandomize=True, **UNTIMED)
 hypothesis.settings.register_profile("fresh", derandomize=False, **UNTIMED)
 hypothesis.settings.load_profile("same")
-# A kernel reads whatever it is handed as the types that it names: here every call is checked.
+# Kernels do not check the types of their arguments; in tests every call is checked.
 kernel.check_types()
-# No flight of a test serves a page, unless the test asks for one.
+# No flight of a test serves a page unless the test asks for one.
 os.environ.setdefault("SKYTETHER_PAGE", "none")
-# Tests share the cores among themselves; threads for matrices of a hundred rows wait in loops.
+# Tests share the cores; threads for matrices of a hundred rows would only spin.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-# Tests start hundreds of processes; none shall compile anew what another has.
+# Tests start hundreds of processes, which share compiled code.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
-# What a client keeps for its next life is not found by that of another test.
+# A test must not find the saved state of another test's client.
 _STATES = tempfile.mkdtemp(prefix="skytether-states-")
 atexit.register(shutil.rmtree, _STATES, ignore_errors=True)
 os.environ["XDG_STATE_HOME"] = _STATES
@@ -56,7 +56,7 @@ FIRST = (
     *("test_command.py", "test_straight.py", "test_margins.py", "test_compare.py", "test_fleet.py"),
     *("test_trajectory.py", "test_kernel.py", "test_slow.py", "test_loopback.py"),
 )
-"""Files that take longest: they begin first, so that no other worker waits for them at the end."""
+"""Slowest files: they start first, so that no worker waits for them at the end."""
 
 
 COMPILE = """
@@ -68,13 +68,12 @@ terminal.prepare(kernel.missing())
 
 
 def pytest_sessionstart(session: pytest.Session) -> None:
-    """Compile what flies before the first test: flights over UDP wait for no compiler."""
+    """Compile the kernels of flights before the first test, for the sake of flights over UDP."""
     if not hasattr(session.config, "workerinput"):
         subprocess.run([sys.executable, "-P", "-c", COMPILE], check=True)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Put the files that take longest first."""
     place = {name: number for number, name in enumerate(FIRST)}
     items.sort(key=lambda item: place.get(item.path.name, len(FIRST)))
 
@@ -90,7 +89,7 @@ def has_ipv6() -> bool:
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:
-    """Give each test a state folder of its own, and skip those that this machine cannot run."""
+    """Give each test its own state folder, and skip tests that this machine cannot run."""
     os.environ["XDG_STATE_HOME"] = str(Path(_STATES) / f"{abs(hash(item.nodeid))}")
     _skip_without_ipv6(item)
 
@@ -101,7 +100,7 @@ def _skip_without_ipv6(item: pytest.Item) -> None:
 
 
 class Here(Executor):
-    """Does everything in this process, which takes no time to begin."""
+    """Executor that runs everything at once in this process."""
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
         future: Future[Any] = Future()
@@ -111,7 +110,6 @@ class Here(Executor):
 
 @pytest.fixture(scope="module")
 def here() -> Iterator[None]:
-    """Flights of the laboratory's commands are flown in this process, not in workers."""
     from skytether.lab.commands import pool
 
     with pytest.MonkeyPatch.context() as patch:
@@ -121,7 +119,7 @@ def here() -> Iterator[None]:
 
 @pytest.fixture
 def start() -> Iterator[Callable[..., Any]]:
-    """Starts processes; what is still running at the end of the test is killed."""
+    """Start processes; those still running at the end of the test are killed."""
     from warm import Process
 
     with ExitStack() as stack:
@@ -130,17 +128,17 @@ def start() -> Iterator[Callable[..., Any]]:
 
 @pytest.fixture
 def documented_ports() -> Iterator[None]:
-    """Wait until no other test uses the fixed ports of commands in the documents, and use them."""
+    """Exclusive use of the fixed ports of commands in the documents."""
     with (Path(tempfile.gettempdir()) / f"skytether-documented-ports-{os.getuid()}").open(
         "a"
     ) as file:
-        fcntl.flock(file, fcntl.LOCK_EX)  # ends with the file, whatever becomes of the process
+        fcntl.flock(file, fcntl.LOCK_EX)  # released with the file, even if the process dies
         yield
 
 
 @pytest.fixture
 def plugin_tables() -> Iterator[None]:
-    """Leave the tables that plug-ins extend as they were."""
+    """Restore the tables that plug-ins extend."""
     before = [dict(table) for table in TABLES]
     yield
     plugins._loaded.clear()

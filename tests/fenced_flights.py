@@ -1,7 +1,7 @@
-"""Flights with a fence, of vehicles unlike their models, in wind and with hostile inputs.
+"""Flights inside a fence of vehicles that differ from their models, in wind and with hostile
+inputs.
 
-`python tests/fenced_flights.py --count 10000` flies as many, and tells how far over the fence the
-worst of them came.
+`python tests/fenced_flights.py --count 10000` prints the largest distance beyond the fence.
 """
 
 import argparse
@@ -21,18 +21,15 @@ from skytether.shared.law.model import Array
 from skytether.shared.scenario.schema import Scenario
 
 FLIGHT_S = 20.0
-"""Length of a flight [s]."""
 BOX_M = 6.0
-"""Half the width of the box [m]."""
 
 
 def scenario(**sections: Any) -> Scenario:
-    """The scenario demo, with other keys in its sections."""
     return packaged("demo", {"duration": 30.0}, sections)
 
 
 class Gusts(Weather):
-    """Wind that turns round at the worst of times: it blows towards the nearest bound, or away."""
+    """Wind that reverses at the worst times: towards the nearest bound, or away from it."""
 
     def __init__(self, flown: Scenario, rng: np.random.Generator, plant_x: Array) -> None:
         super().__init__(flown, rng)
@@ -41,14 +38,14 @@ class Gusts(Weather):
         self._towards = 1.0
 
     def push(self) -> Array:
-        """Disturbance that acts like an input, of each axis [m/s]."""
+        """Disturbance that acts like an input, for each axis [m/s]."""
         if self._rng.random() < 0.05:
             self._towards = self._rng.choice([-1.0, 1.0, 1.0])
         return np.sign(self.x[:, 0]) * self._wind * self._towards / 2**0.5
 
 
 def random_scenario(rng: np.random.Generator) -> Scenario:
-    """A vehicle that is not quite like its model, in a box or a circle."""
+    """Vehicle that differs from its model, in a box or a circle."""
     tau, late, u_max = rng.uniform(0.3, 1.0), rng.uniform(0.0, 0.4), rng.uniform(1.0, 5.0)
     truth = {
         "tau_s": [tau * rng.uniform(0.7, 1.3)],
@@ -71,9 +68,7 @@ def random_scenario(rng: np.random.Generator) -> Scenario:
 
 
 def furthest_m(seed: int, *, fences: type[Fence] = Fence) -> float:
-    """Largest distance beyond the fence that hostile inputs reach [m]; negative if they stay
-    inside.
-    """
+    """Largest distance beyond the fence that hostile inputs reach [m]; negative inside."""
     flown = random_scenario(np.random.default_rng(seed))
     rng = np.random.default_rng(seed)
     plant = FirstOrderPlant(flown, Weather(flown, stream(1, "wind")))
@@ -102,7 +97,7 @@ def furthest_m(seed: int, *, fences: type[Fence] = Fence) -> float:
 
 
 def main() -> None:
-    """Fly as many as are asked for, and tell how the worst of them ended."""
+    """Fly the requested number of flights, and print how far the worst left the fence."""
     parser = argparse.ArgumentParser(description=main.__doc__)
     parser.add_argument("--count", type=int, default=10_000)
     parser.add_argument("--jobs", type=int, default=2)

@@ -1,4 +1,4 @@
-"""Scenarios and shells that tests of several rooms need."""
+"""Scenarios, commands and shells for several rooms of tests."""
 
 import asyncio
 import socket
@@ -25,16 +25,15 @@ from skytether.shell.driver import Shell
 
 LOOPBACK: Address = ("127.0.0.1", 0)
 SKYTETHER = (sys.executable, "-P", "-m", "skytether")
-"""Command line of a command that is started as a user starts it."""
+"""Command line prefix, as a user starts a command."""
 
 
 def packaged(name: str, *layers: Mapping[str, Any], **changes: Any) -> Scenario:
     """Packaged scenario with other keys.
 
     Args:
-        name: the scenario's name.
-        layers: tables laid over it, one after the other; a section keeps the keys that its layer
-            does not name.
+        layers: tables laid over the scenario in order; a section keeps the keys that its layer does
+            not name.
         changes: the last layer.
 
     Raises:
@@ -48,7 +47,7 @@ def packaged(name: str, *layers: Mapping[str, Any], **changes: Any) -> Scenario:
 
 
 def demo_with(**keys: Any) -> Scenario:
-    """The scenario `demo-committed` with some keys changed: `control__dt=0.1` is `control.dt`."""
+    """Scenario `demo-committed` with some keys changed: `control__dt=0.1` is `control.dt`."""
     table = reading.to_table(reading.load("demo-committed"))
     set_keys({key.replace("__", "."): value for key, value in keys.items()}, table)
     return reading.check(table, "test")
@@ -62,7 +61,7 @@ def refusal(run: Callable[[], object]) -> str:
 
 
 def refused(argv: Sequence[str], capfd: pytest.CaptureFixture[str]) -> str:
-    """The one line in which a command is refused."""
+    """Line with which a command is refused."""
     assert main([*argv]) == 2
     (line,) = capfd.readouterr().err.splitlines()
     return line
@@ -71,7 +70,7 @@ def refused(argv: Sequence[str], capfd: pytest.CaptureFixture[str]) -> str:
 def refused_before_writing(
     argv: list[str], folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> str:
-    """Message of a command that is refused in one line, before it writes into `folder`."""
+    """Line with which a command is refused before it writes into `folder`."""
     out = folder / "out"
     assert main([*argv, "--out", str(out)]) == 2
     assert not out.exists()
@@ -81,7 +80,6 @@ def refused_before_writing(
 
 
 def ran(*argv: object, **keys: Any) -> "subprocess.CompletedProcess[str]":
-    """Run a program to its end, with keys of `subprocess.run`."""
     line = [str(each) for each in argv]
     done: subprocess.CompletedProcess[str] = subprocess.run(
         line, capture_output=True, text=True, check=False, **keys
@@ -90,7 +88,7 @@ def ran(*argv: object, **keys: Any) -> "subprocess.CompletedProcess[str]":
 
 
 def until(holds: Callable[[], object], within_s: float = 60.0) -> None:
-    """Wait until a condition holds; it fails after `within_s` [s]."""
+    """Wait until a condition holds; fail after `within_s` [s]."""
     deadline_s = time.monotonic() + within_s
     while not holds():
         assert time.monotonic() < deadline_s
@@ -99,7 +97,7 @@ def until(holds: Callable[[], object], within_s: float = 60.0) -> None:
 
 @contextmanager
 def interpreted() -> Iterator[None]:
-    """Vehicles that fly by plain Python, as they do aboard, until the end of the block."""
+    """Clients run as plain Python, as aboard, until the end of the block."""
     kernel.interpret_all()
     try:
         yield
@@ -108,7 +106,7 @@ def interpreted() -> Iterator[None]:
 
 
 class Idle(Endpoint):
-    """An endpoint that hears nothing and is never woken, unless a subclass says so."""
+    """Endpoint that ignores datagrams and is never woken; subclasses may override that."""
 
     def receive(self, datagram: Datagram, *, now_ns: int) -> None:
         """See `Endpoint`."""
@@ -117,12 +115,11 @@ class Idle(Endpoint):
         """See `Endpoint`."""
 
     def next_wake_ns(self) -> int | None:
-        """See `Endpoint`."""
         return None
 
 
 class HandLoop:
-    """Stands in for an event loop: time passes, and sockets are looked at, when a test says so."""
+    """Stand-in for an event loop: time passes and sockets are read only when a test says so."""
 
     def __init__(self) -> None:
         self.reads: Callable[[], None] | None = None
@@ -146,16 +143,16 @@ class HandLoop:
         return self
 
     def cancel(self) -> None:
-        """See asyncio's `TimerHandle`."""
+        """Like asyncio's `TimerHandle`."""
 
     def pass_time(self) -> None:
-        """Do what is due later."""
+        """Run the callbacks that are due later."""
         later, self.later = self.later, []
         for _, then in later:
             then()
 
     def look(self) -> bool:
-        """Read if somebody wants to; returns whether anybody does."""
+        """Read the sockets with a reader; returns whether there is one."""
         if self.reads is None:
             return False
         self.reads()

@@ -1,8 +1,7 @@
 """Idle link, kept alive by the real code of both ends, and cut at the end of each session.
 
 The vehicle's `Failsafe` and `Hearing`, the server's `Session` and `Hearing`, each on its own grid
-of steps, and netem's fates of packets. There is no vehicle and no plan, so only heartbeats are
-sent.
+of steps, and netem's loss and delay. There is no vehicle and no plan, so only heartbeats are sent.
 """
 
 from heapq import heappop, heappush
@@ -20,22 +19,20 @@ from skytether.shared.scenario.schema import LinkConfig
 STEP_NS = 50 * MILLISECOND_NS
 """Length of a step of both ends [ns]; the server's steps begin half a step later."""
 SESSION_S = 600
-"""Length of a session, which begins without knowledge of the loss [s]."""
+"""Length of a session, which starts without an estimate of the loss [s]."""
 
 
 class Alive(NamedTuple):
-    """Results of a link."""
+    """Results of an idle link."""
 
     false_per_h: float
-    """Times an hour that the vehicle took the working link for lost."""
+    """False losses of the link per hour, declared by the vehicle."""
     noticed_s: list[float]
-    """Times from each cut until the vehicle took the link for lost [s]."""
     packets_per_s: float
-    """Heartbeats of the vehicle."""
+    """Rate of the vehicle's heartbeats."""
 
 
 def keep(network: str, sessions: int, link: LinkConfig | None = None) -> Alive:
-    """Keep an idle link alive for a number of sessions, and cut it at the end of each."""
     kept = [_session(network, link or LinkConfig(), seed) for seed in range(1, sessions + 1)]
     false, noticed_s, packets = zip(*kept, strict=True)
     length_s = sessions * SESSION_S
@@ -43,7 +40,7 @@ def keep(network: str, sessions: int, link: LinkConfig | None = None) -> Alive:
 
 
 def _session(network: str, link: LinkConfig, seed: int) -> tuple[int, float, int]:
-    """False losses of one session, how soon its end was noticed [s], and packets of the vehicle."""
+    """False losses of a session, time to detect its end [s], and packets of the vehicle."""
     timeout_ns, end_ns = seconds_to_ns(link.timeout_s), SESSION_S * SECOND_NS
     up, down = (Fates(path(network), seed, name, 0) for name in ("uplink", "downlink"))
     ear = Hearing(timeout_ns, STEP_NS, link.fixed_ns)
@@ -99,15 +96,14 @@ def _session(network: str, link: LinkConfig, seed: int) -> tuple[int, float, int
 
 
 class _Unsealed:
-    """Way back of a session without encryption."""
+    """Reply path of a session without encryption."""
 
     def seal(self, payload: bytes) -> bytes:
-        """See `ReplyPath`."""
         return payload
 
 
 def _grid(time_ns: int, phase_ns: int) -> int:
-    """First beginning of a step at a time or later [ns]."""
+    """First start of a step at a time or later [ns]."""
     return -(-(time_ns - phase_ns) // STEP_NS) * STEP_NS + phase_ns
 
 

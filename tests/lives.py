@@ -1,4 +1,4 @@
-"""Flights of a mission with deaths that are known ahead, and what is asked of them afterwards."""
+"""Flights of a mission with scheduled restarts of processes, and figures of the flown paths."""
 
 from collections.abc import Mapping, Sequence
 from functools import partial
@@ -14,42 +14,37 @@ from skytether.shared.scenario.zones import Zones
 from skytether.shared.telemetry.summary import nearest
 
 LOOK_S = 10 * MILLISECOND_NS / SECOND_NS
-"""Time between two looks at where vehicles are [s]."""
+"""Sampling time of the vehicles' positions [s]."""
 
 
 class Restart(NamedTuple):
-    """A process of a vehicle that dies and starts again."""
+    """Restart of a vehicle's client."""
 
     vehicle: int
     at_s: float
-    """Time of the world at which it dies [s]."""
+    """Time of the world at which it stops [s]."""
     down_s: float = 0.2
-    """Time until the next life begins [s]."""
     remembers: bool = True
-    """Whether that finds what the life before has kept."""
+    """Whether the next life finds the saved state."""
 
 
 class Death(NamedTuple):
-    """A server that dies, and begins anew without its memory."""
+    """Restart of the server."""
 
     at_s: float
-    """Time of the world [s]."""
     down_s: float
-    """Time until the next life begins [s]."""
     remembers: bool = True
-    """Whether that takes up what was set in flight before."""
+    """Whether the next life keeps what was set in flight."""
     zones: str = ""
-    """Zones of the scenario that it begins with, where these are others."""
 
 
 class Lives(lives.Lives):
-    """A mission, and the lives of the processes that fly it.
+    """Mission with scheduled restarts.
 
     Args:
-        scenario: what is flown; a mission.
-        restarts: which processes of vehicles die, and when.
-        deaths: when the server dies.
-        settings: what an operator sets at the server: times [s], and values by key.
+        restarts: restarts of clients.
+        deaths: restarts of the server.
+        settings: keys that an operator sets at the server: times [s], and values by key.
     """
 
     def __init__(
@@ -78,16 +73,10 @@ class Lives(lives.Lives):
         self.world.at(seconds_to_ns(time_s), action)
 
     def fly(self, until_s: float | None = None) -> None:
-        """Fly the mission to its end, or to a time [s]."""
         self.run(self.scenario.duration + 10.0 if until_s is None else until_s)
 
     def inside_s(self, zones: Zones, since_s: float = 0.0) -> float:
-        """Time that vehicles were within zones, all together [s].
-
-        Args:
-            zones: where nobody is to be.
-            since_s: time of the world from which on it counts [s].
-        """
+        """Time that vehicles spent within zones from `since_s` on, summed over vehicles [s]."""
         at_s = np.arange(since_s, self.world.now_ns / SECOND_NS, LOOK_S)
         inside = 0
         for times, at in self.tracks().values():
@@ -96,6 +85,5 @@ class Lives(lives.Lives):
         return inside * LOOK_S
 
     def least_m(self) -> float:
-        """Smallest distance between two vehicles at any time [m]."""
         _, apart_m = nearest(list(self.tracks().values()), LOOK_S)
         return float(np.nanmin(apart_m))

@@ -1,6 +1,6 @@
-"""Writes every UDP packet that is heard or sent here to standard output, as a pcap file does.
+"""Write every UDP packet received or sent here to standard output, as a pcap file.
 
-It runs as root in the network of a container: `python -c "$(cat sniff.py)" > capture.pcap`.
+Runs as root in the network of a container: `python -c "$(cat sniff.py)" > capture.pcap`.
 """
 
 import signal
@@ -14,7 +14,6 @@ HEAD = struct.pack("=IHHiIII", 0xA1B2C3D4, 2, 4, 0, 0, 65535, ETHERNET)
 
 
 def main() -> None:
-    """Capture until SIGTERM."""
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
     out = sys.stdout.buffer
     out.write(HEAD)

@@ -1,4 +1,4 @@
-"""Missions of a few vehicles, what came of them, and two that swap places and are planned for."""
+"""Missions of few vehicles: their figures, and a planner for two vehicles that swap places."""
 
 from pathlib import Path
 from typing import Any
@@ -43,29 +43,25 @@ def observation(step: int, in_force: int, place: tuple[float, float]) -> Observa
 
 
 class Decision(MissionPlanner):
-    """Decision for two vehicles, and what it is made by."""
+    """Mission planner for two vehicles, with its inputs."""
 
     def __init__(self, fleet: Fleet, state: MissionState) -> None:
         super().__init__(fleet, state)
         self.state, self.vehicles = state, state.vehicles
 
     def hear(self, row: int, step: int, in_force: int, x: float, speed: float = 0.0) -> None:
-        """An observation of a vehicle on the x axis [m, m/s]."""
         said = observation(step, in_force, (x, 0.0))
         said.state[0, 1] = speed
         self.observe(row, said)
 
     def align(self, step: int) -> None:
-        """Let it be this step of both."""
         self.state.align(np.arange(2), np.array([step, step]))
 
     def decide(self, step: int) -> None:
-        """Plan for both at this step."""
         self.plan(np.arange(2), np.array([step, step]), None)  # type: ignore[arg-type]
 
 
 def alone() -> Decision:
-    """Decision for two vehicles that swap places."""
     flown = scenario(2)
     goals = swap(2, 4.0, 2)
     terms, clock = flown.terms(), exact(2)
@@ -76,7 +72,7 @@ def alone() -> Decision:
 
 
 def exact(vehicles: int) -> ClockMap:
-    """Clocks that show what the server's does, for certain."""
+    """Clock maps with zero offset and no uncertainty."""
     clock = ClockMap(vehicles, round(DT_S * SECOND_NS))
     for row in range(vehicles):
         clock.observe(row, 0, 0, heard=1, now_ns=0)
@@ -84,7 +80,7 @@ def exact(vehicles: int) -> ClockMap:
 
 
 def ready() -> Decision:
-    """Decision for two vehicles that rest where they begin, each on a motion of step 90."""
+    """Planner for two vehicles that rest at their starts, each on a motion of step 90."""
     made = alone()
     for row, x in ((0, 4.0), (1, -4.0)):
         made.hear(row, 100, NO_HORIZON, x)
@@ -94,7 +90,6 @@ def ready() -> Decision:
 
 
 def planned(made: Decision) -> Motion:
-    """Motion that is decided for the first vehicle at step 101."""
     made.decide(101)
     motion = made.vehicles[0].next
     assert motion is not None
@@ -104,13 +99,12 @@ def planned(made: Decision) -> Motion:
 def with_goals(
     folder: Path, rows: str, scenario: Scenario | str = "swap", **mission: Any
 ) -> dict[str, Any]:
-    """Table of a scenario with other goals, which are put into a folder.
+    """Table of a scenario with other goals, whose file is written to a folder.
 
     Args:
-        folder: where their file comes to lie.
-        rows: its lines: vehicle, time [s], and place [m]; of three numbers in space.
-        scenario: all else, or the name of a scenario that comes with Skytether.
-        mission: keys of the section that are others.
+        rows: lines of the file: vehicle, time [s], and place [m]; of three numbers in space.
+        scenario: base scenario, or the name of a packaged one.
+        mission: keys of the section `mission` to change.
     """
     table = reading.to_table(reading.load(scenario) if isinstance(scenario, str) else scenario)
     table["model"]["axes"] = rows.partition("\n")[0].count(",") - 1
@@ -122,13 +116,11 @@ def with_goals(
 
 
 def each_of(flown: Record) -> list[Rows]:
-    """Rows of each vehicle."""
     numbers = np.unique(flown.client["vehicle"])
     return [flown.client[flown.client["vehicle"] == number] for number in numbers]
 
 
 def separation_m(flown: Record, height_scale: float = 1.0) -> float:
-    """Smallest distance between two vehicles [m]."""
     told = flown.figures["client"]["by_vehicle"]
     began_s = [told[str(rows["vehicle"][0])]["began_s"] for rows in each_of(flown)]
     least = least_separation(each_of(flown), began_s, DT_S, height_scale)
@@ -137,7 +129,6 @@ def separation_m(flown: Record, height_scale: float = 1.0) -> float:
 
 
 def left_m(flown: Record, scenario: Scenario) -> list[float]:
-    """Distance of each vehicle from its last goal at the end [m]."""
     goals = scenario.make_reference()
     assert isinstance(goals, Mission)
     return [
@@ -157,7 +148,7 @@ def clear_m(flown: Record, kept: Zones) -> float:
 
 
 def drawn(rng: np.random.Generator, axes: int = 2, knots: int = 0) -> Motion:
-    """A motion from a place within 4 m, of accelerations up to 0.6 m/s² on an axis."""
+    """Random motion from a place within 4 m, with accelerations up to 0.6 m/s² on an axis."""
     T, knots = SPACING * DT_S, knots or int(rng.integers(1, 17))
     velocity = np.cumsum(rng.uniform(-0.6 * T, 0.6 * T, (knots, axes)), axis=0)
     velocity[-1] = 0.0

@@ -1,8 +1,7 @@
-"""Commands in processes of their own, forked from one that has imported what they need.
+"""Commands in processes forked from one that has imported everything they need.
 
-A server's imports and kernels take three seconds of CPU, and most tests are about what comes after
-them. Where a process comes from `python -m`, or what it does before it has imported everything, is
-tested with `subprocess`.
+A server's imports and kernels take three seconds of CPU, and most tests concern what comes after.
+Tests of the start itself use `subprocess`.
 """
 
 import multiprocessing
@@ -26,12 +25,11 @@ from skytether.shared.core.events import Event, address_text
 from skytether.shell.log import LogLine
 
 PATIENCE_S = 60.0
-"""Longest wait for the end of a process [s]."""
 
 FORK = multiprocessing.get_context("forkserver")
 FORK.set_forkserver_preload(
     [
-        "pytest",  # each child imports the main module of this process: a script of pytest's
+        "pytest",  # each child imports the main module of this process, a script of pytest's
         "skytether.autopilot.__main__",
         "skytether.cli.fleet",
         "skytether.cli.fly",
@@ -45,7 +43,7 @@ FORK.set_forkserver_preload(
 
 
 class Command:
-    """A `skytether` command that goes on, as `subprocess.Popen` has it."""
+    """Running `skytether` command, with the interface of `subprocess.Popen`."""
 
     def __init__(
         self,
@@ -55,14 +53,14 @@ class Command:
         env: Mapping[str, str] | None = None,
         file_bytes: int | None = None,
     ) -> None:
-        """Start it.
+        """Start the command.
 
         Args:
             argv: the subcommand and its arguments.
-            stdout: file that it prints to; a pipe, read at `self.stdout`, unless given.
-            stderr: file for its mistakes; its standard output unless given.
+            stdout: file for its output; a pipe, read at `self.stdout`, unless given.
+            stderr: file for its errors; its standard output unless given.
             env: its environment; that of this process unless given.
-            file_bytes: size at which the disk is full for it.
+            file_bytes: size at which the disk is full for the command.
         """
         pipe = None
         if stdout is None:
@@ -84,7 +82,7 @@ class Command:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        """Wait until it has ended; where the test has failed, end it."""
+        """Wait for its end; if the test has failed, kill it."""
         if kind is not None:
             self.kill()
         self._process.join()
@@ -92,16 +90,14 @@ class Command:
             self.stdout.close()
 
     def send_signal(self, number: int) -> None:
-        """Send it a signal, unless it has ended."""
         if self._process.is_alive():
             os.kill(self.pid, number)
 
     def kill(self) -> None:
-        """End it at once."""
         self.send_signal(signal.SIGKILL)
 
     def wait(self, timeout: float) -> int:
-        """Wait until it has ended; returns its exit code, or the signal that ended it as -N."""
+        """Wait for its end; returns its exit code, or the signal that ended it as -N."""
         self._process.join(timeout)
         if self._process.exitcode is None:
             raise subprocess.TimeoutExpired("skytether", timeout)
@@ -109,10 +105,10 @@ class Command:
 
 
 class Process:
-    """A command that goes on, and what it has said.
+    """Running command, and its output.
 
     Args:
-        stack: at whose end it is killed.
+        stack: kills the command at its end.
         argv: see `Command`.
         file_bytes: see `Command`.
     """
@@ -123,7 +119,6 @@ class Process:
         self.said: list[str] = []
 
     def wait_for(self, pattern: str) -> re.Match[str]:
-        """The first line from here on that has the pattern; the test's time limit bounds it."""
         for line in self.popen.stdout:
             self.said.append(line.rstrip())
             found = re.search(pattern, line)
@@ -132,7 +127,6 @@ class Process:
         raise AssertionError(f"{pattern!r} was never said; this was: {self.said}")
 
     def address(self) -> str:
-        """Address that it listens on, once it says so in words or in JSON."""
         found = self.wait_for(r'listening on (\S+:\d+)|"Listening"')
         if found[1]:
             return found[1]
@@ -140,11 +134,10 @@ class Process:
         return address_text(event["host"], event["port"])
 
     def events(self) -> list[Event]:
-        """All that it has said so far with `--log json`."""
         return [msgspec.json.decode(line, type=LogLine).event for line in self.said]
 
     def counted(self, name: str) -> int:
-        """A number that it has counted, asked for by SIGUSR1; 0 where there is none of it."""
+        """One of its counters, requested by SIGUSR1; 0 if absent."""
         self.popen.send_signal(signal.SIGUSR1)
         self.wait_for("counted so far:")
         first = len(self.said)
@@ -153,18 +146,15 @@ class Process:
         return next((int(match[1]) for match in found if match), 0)
 
     def end(self, number: int = signal.SIGTERM) -> int:
-        """End it by a signal; returns its exit code."""
         self.popen.send_signal(number)
         return self.ended()
 
     def ended(self) -> int:
-        """Wait until it has ended by itself; returns its exit code."""
         self.said += self.popen.stdout.read().splitlines()
         return self.popen.wait(PATIENCE_S)
 
 
 def skytether(*argv: str, timeout_s: float = 60.0) -> subprocess.CompletedProcess[str]:
-    """Run a command to its end."""
     with TemporaryFile() as out, TemporaryFile() as err:
         with Command(*argv, stdout=out.fileno(), stderr=err.fileno()) as command:
             try:
@@ -194,7 +184,7 @@ def _become(
     sys.stdout = os.fdopen(1, "w", buffering=1, encoding="utf-8", closefd=False)
     sys.stderr = os.fdopen(2, "w", buffering=1, encoding="utf-8", closefd=False)
     if file_bytes is not None:
-        sys.dont_write_bytecode = True  # Python keeps half of a .pyc, and reads it ever after
+        sys.dont_write_bytecode = True  # Python would leave a truncated .pyc and read it later
         _, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
         resource.setrlimit(resource.RLIMIT_FSIZE, (file_bytes, hard))
     sys.argv = ["skytether", *argv]

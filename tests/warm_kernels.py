@@ -1,4 +1,4 @@
-"""Has all that flies in memory once imported, for all processes that are forked from it."""
+"""Imports all kernels of flights once, for all processes that are forked afterwards."""
 
 import skytether.quadrotor.loops
 import skytether.server.endpoint  # noqa: F401 - they are its kernels

@@ -38,26 +38,22 @@ BASE_NS = 50 * MILLISECOND_NS
 ARRIVED_M, RESTS_MPS = 0.3, 0.1
 """Distance from its goal, and speed, below which a vehicle has arrived [m, m/s]."""
 AIMED_NS = 10 * SECOND_NS
-"""Length of the time before the nearest approach that targeted changes are in [ns]."""
+"""Targeted changes begin within this time before the nearest approach [ns]."""
 ONE_NS = MILLISECOND_NS
-"""Length of a move against a single packet [ns]."""
+"""Length of a targeted move, which hits a single packet [ns]."""
 MOVES_MAX = 64
-"""Default of the largest number of moves."""
 DRAWN = 10
-"""Number of random tries; the climb starts from the best."""
+"""Number of random attacks before a climb, which starts from the best of them."""
 PATIENCE = 40
-"""Number of tries without improvement after which the search restarts."""
+"""Number of tries without improvement after which the climb starts anew from random attacks."""
 CLIMB = 100
 """Largest number of tries of one climb."""
 
 
 class MoveKind(StrEnum):
-    """Kind of a move."""
-
     DELAYS = "delays"
     """Extra delay of packets, changing linearly from the first amount to the second [s]."""
     LOSSES = "losses"
-    """Loss of a share of the packets."""
     CUTS = "cuts"
     """Loss of all packets."""
     COPIES = "copies"
@@ -70,7 +66,7 @@ class MoveKind(StrEnum):
     GOALS = "goals"
     """The vehicle's goal is the place in the amounts [m]; after the move, its own goal again."""
     ZONES = "zones"
-    """An additional cylinder to keep out of: x, y and radius in the amounts [m]."""
+    """Additional zone, a cylinder with x, y and radius in the amounts [m]."""
 
 
 NETWORK = (MoveKind.DELAYS, MoveKind.LOSSES, MoveKind.CUTS, MoveKind.COPIES)
@@ -90,34 +86,28 @@ AMOUNTS = {
 }
 """Smallest and largest value of each amount of a kind. Places are anywhere in the mission's box."""
 SLOW = ("uplink", "downlink", "")
-"""Directions in which a vehicle may have a long delay at first."""
 RADIUS_M = (0.4, 1.5)
 """Smallest and largest radius of a zone [m]."""
 
 
 @dataclass(frozen=True)
 class Move:
-    """Move of the adversary, with a start and a length."""
-
     kind: MoveKind
     vehicle: Annotated[int, msgspec.Meta(ge=0)]
-    """Number of the vehicle; 0 for all of them."""
+    """Number of the vehicle from 1; 0 for all vehicles."""
     way: str
-    """`uplink` or `downlink` for packets; empty for both directions, and for other kinds."""
+    """`uplink` or `downlink`; empty for both directions, and for moves that concern no packets."""
     start_ns: Annotated[int, msgspec.Meta(ge=0)]
-    """Time of the world at which it begins [ns]."""
+    """Time in the virtual world [ns]."""
     length_ns: Annotated[int, msgspec.Meta(ge=1)]
-    """Duration [ns]."""
     amounts: tuple[float, ...] = ()
-    """Amounts, see `MoveKind`."""
+    """Amounts; `MoveKind` gives their meaning and units."""
 
     @property
     def end_ns(self) -> int:
-        """Time of the world at which it ends [ns]."""
         return self.start_ns + self.length_ns
 
     def is_on(self, now_ns: int) -> bool:
-        """Whether the move is active at a time of the world."""
         return self.start_ns <= now_ns < self.end_ns
 
 
@@ -125,26 +115,23 @@ Moves = tuple[Move, ...]
 
 
 class Packet(NamedTuple):
-    """A packet that entered the adversary's network."""
-
     time_ns: int
     way: str
     vehicle: int
 
 
 class Near(msgspec.Struct, frozen=True):
-    """Smallest distance in a flight."""
+    """Smallest distance in a flight, and when and where it occurred."""
 
     distance_m: float | None = None
     """Distance [m]; None if there was nothing to measure."""
     at_s: float = 0.0
-    """Time of the world [s]."""
+    """Time in the virtual world [s]."""
     vehicles: tuple[int, ...] = ()
-    """Numbers of the nearest vehicles."""
 
     @property
     def away_m(self) -> float:
-        """Distance, infinite if there was nothing to measure [m]."""
+        """Distance [m]; infinite if there was nothing to measure."""
         return math.inf if self.distance_m is None else self.distance_m
 
 
@@ -152,8 +139,6 @@ NOWHERE = Near()
 
 
 class Approach(msgspec.Struct, frozen=True, kw_only=True):
-    """Result of a flight."""
-
     moves: Moves
     apart: Near
     """Smallest distance between two vehicles."""
@@ -164,13 +149,6 @@ class Approach(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class AdversaryNetwork(Endpoint):
-    """Network between clients and server, controlled by the adversary's moves.
-
-    Args:
-        moves: moves of the adversary.
-        seed: seed of the losses.
-    """
-
     def __init__(self, moves: Moves, seed: int) -> None:
         super().__init__()
         self._moves = [move for move in moves if move.kind in NETWORK]
@@ -178,15 +156,16 @@ class AdversaryNetwork(Endpoint):
         self._in_flight: list[tuple[int, int, Datagram]] = []
         """Heap of the packets in flight: time of arrival, order, and packet."""
         self.packets: list[Packet] = []
-        """All packets that have entered."""
 
     def receive(self, datagram: Datagram, *, now_ns: int) -> None:
-        """Delay, lose or copy a packet; vehicle n uses socket n towards the server."""
+        """Delay, lose or copy a packet. Towards the server, vehicle n uses socket n; socket 0 is
+        the server's.
+        """
         payload, (host, _), socket = datagram
         way, vehicle = ("uplink", socket) if socket else ("downlink", int(host.split()[1]))
         onward = Datagram(payload, (f"client {vehicle}", 0) if socket else SERVER, vehicle - socket)
         self.packets.append(Packet(now_ns, way, vehicle))
-        # Drawn for every packet, so that the number does not depend on other moves.
+        # Drawn for every packet: a packet's number does not depend on the other moves.
         drawn = self._draw(way, vehicle)
         late_s, copies_s = 0.0, []
         for move in self._moves:
@@ -209,28 +188,20 @@ class AdversaryNetwork(Endpoint):
             heappush(self._in_flight, (due_ns, len(self.packets), onward))
 
     def _draw(self, way: str, vehicle: int) -> float:
-        """Random number below 1 for the next packet of a vehicle."""
         if (way, vehicle) not in self._chance:
             self._chance[way, vehicle] = stream(self._seed, "adversary", way, vehicle)
         return float(self._chance[way, vehicle].random())
 
     def wake(self, *, now_ns: int) -> None:
-        """Send the packets that are due."""
         while self._in_flight and self._in_flight[0][0] <= now_ns:
             self._out.append(heappop(self._in_flight)[2])
 
     def next_wake_ns(self) -> int | None:
-        """Time at which the next packet is due."""
         return self._in_flight[0][0] if self._in_flight else None
 
 
 class Raid:
-    """Flight of a mission with the adversary's moves.
-
-    Args:
-        scenario: the mission; its network is not used.
-        moves: moves of the adversary.
-    """
+    """Flight of a mission with the adversary's moves; the scenario's network is not used."""
 
     def __init__(self, scenario: Scenario, moves: Moves) -> None:
         self._scenario, self._moves, self._air = (
@@ -242,13 +213,12 @@ class Raid:
         self._lives = Lives(scenario, self._air, None if 0 in mortal else mortal)
         self._world, self._vehicles = self._lives.world, self._lives.mission.vehicles
         self._zones: list[tuple[float, Zones]] = [(0.0, scenario.zones)]
-        """Zones set by the operator, and the time of each change [s; the hosts' clocks]."""
+        """Zones set by the operator, and the time of each change on the hosts' clocks [s]."""
         for move in moves:
             if move.kind not in NETWORK:
                 self._plan(move)
 
     def _plan(self, move: Move) -> None:
-        """Schedule a move that does not concern the network."""
         lives = self._lives
         hit = [number for number in self._vehicles if move.vehicle in (0, number)]
         begin: list[Callable[[], None]] = [self._set]
@@ -285,7 +255,7 @@ class Raid:
             lives.set({key: text})
         self._zones.append((CLOCK.local(now_ns) / SECOND_NS, lives.running.scenario.zones))
 
-    # -- what is flown -----------------------------------------------------------------------------
+    # -- flight ------------------------------------------------------------------------------------
 
     def run(self) -> Approach:
         """Fly to the end, or until all vehicles have arrived and no other moves are left."""
@@ -307,11 +277,9 @@ class Raid:
 
     @property
     def packets(self) -> Sequence[Packet]:
-        """Packets that have entered the air."""
         return self._air.packets
 
     def _has_arrived(self) -> bool:
-        """Whether all vehicles are at rest at their last goals."""
         for number, body in self._lives.bodies.items():
             goal = self._lives.mission.of(number)(np.array(self._scenario.duration))[:, 0]
             p, v = body.plant.state().T
@@ -320,7 +288,6 @@ class Raid:
         return True
 
     def _apart(self, tracks: Mapping[int, Track]) -> Near:
-        """Smallest distance between two vehicles."""
         flown = {number: each for number, each in tracks.items() if len(each[0])}
         times, apart_m = nearest(list(flown.values()), self._scenario.control.dt)
         if not np.isfinite(apart_m).any():
@@ -335,18 +302,20 @@ class Raid:
         return Near(float(apart_m[least]), world_s(times[least]), pair)
 
     def _clear(self, tracks: Mapping[int, Track]) -> Near:
-        """Smallest distance of a vehicle from a zone, while the zone existed."""
+        """Smallest distance of a vehicle from a zone, over the times at which the zone was in
+        force.
+        """
         scale, found = self._scenario.mission.height_scale, NOWHERE
         ends = [since for since, _ in self._zones[1:]] + [math.inf]
         for (since, zones), end in zip(self._zones, ends, strict=True):
             for number, (times, at) in tracks.items():
-                here = np.flatnonzero((times >= since) & (times < end))
-                if zones and len(here):
-                    points = at[here] / np.array([1.0, 1.0, scale])[: at.shape[1]]
+                in_force = np.flatnonzero((times >= since) & (times < end))
+                if zones and len(in_force):
+                    points = at[in_force] / np.array([1.0, 1.0, scale])[: at.shape[1]]
                     clear_m = zones.clearance(points).min(axis=1)
                     i = int(clear_m.argmin())
                     if clear_m[i] < found.away_m:
-                        found = Near(float(clear_m[i]), world_s(times[here[i]]), (number,))
+                        found = Near(float(clear_m[i]), world_s(times[in_force[i]]), (number,))
         return found
 
 
@@ -355,95 +324,80 @@ class Raid:
 
 @dataclass(frozen=True)
 class Climb:
-    """A climb of the search."""
+    """One task of the search: a hill climb with restarts."""
 
     scenario: Scenario
     kinds: tuple[MoveKind, ...]
-    """Kinds of moves that the adversary may make."""
     number: int
-    """Number of the climb, the seed of its random numbers."""
+    """Number of the climb; seeds its random numbers."""
     tries: int
-    """Number of flights."""
     moves: int = MOVES_MAX
-    """Largest number of moves."""
     patience: int = PATIENCE
-    """Tries without improvement after which the search restarts; 0: all moves are random."""
+    """Tries without improvement after which the climb restarts; 0: all moves are random."""
 
     @property
     def seeks_zones(self) -> bool:
-        """Whether the climb minimises the distance from zones: every second one, if there are
-        any.
+        """Whether the climb minimises the distance from zones: every second climb does, if there
+        are zones.
         """
         has_zones = bool(self.scenario.zones) or MoveKind.ZONES in self.kinds
         return has_zones and bool(self.number % 2)
 
 
 class Climbed(NamedTuple):
-    """Result of a climb."""
-
     best: Approach
     spares_m: list[float]
-    """Spare distance of each try, see `spare_m` [m]."""
 
 
 def fly(scenario: Scenario, moves: Moves) -> Approach:
-    """Fly a mission with the adversary's moves."""
     return Raid(scenario, moves).run()
 
 
 def spare_m(scenario: Scenario, found: Approach) -> float:
-    """Smallest distance minus the required one, between vehicles or from zones [m]."""
+    """Smallest distance minus the required distance, between vehicles or from zones [m]."""
     return min(found.apart.away_m - scenario.mission.separation_m, found.clear.away_m)
 
 
 def climb(task: Climb) -> Climbed:
-    """Search for the moves that bring two vehicles, or a vehicle and a zone, nearest."""
+    """Search for the moves that bring two vehicles, or a vehicle and a zone, nearest together."""
     scenario, rng = task.scenario, stream(task.scenario.seed, "climb", task.number)
     draws, spares_m = MoveSampler(task, rng), list[float]()
     best: Approach | None = None
-    here: Approach | None = None
+    current: Approach | None = None
     drawn, since, packets = 0, 0, list[Packet]()
 
-    def value(found: Approach) -> float:
-        return (found.clear if task.seeks_zones else found.apart).away_m
+    def value(tried: Approach) -> float:
+        return (tried.clear if task.seeks_zones else tried.apart).away_m
 
     for _ in range(task.tries):
         if since >= task.patience:
-            here, drawn, since = None, 0, 0
-        if here is None or drawn < DRAWN:
+            current, drawn, since = None, 0, 0
+        if current is None or drawn < DRAWN:
             moves, drawn = draws.some(), drawn + 1
         else:
-            near, since = here.clear if task.seeks_zones else here.apart, since + 1
-            moves = draws.changed(here.moves, near, packets)
+            near, since = current.clear if task.seeks_zones else current.apart, since + 1
+            moves = draws.changed(current.moves, near, packets)
         raid = Raid(scenario, moves)
-        found = raid.run()
-        if here is None or value(found) < value(here):
-            here, packets, since = found, list(raid.packets), 0
-        if best is None or spare_m(scenario, found) < spare_m(scenario, best):
-            best = found
-        spares_m.append(spare_m(scenario, found))
+        tried = raid.run()
+        if current is None or value(tried) < value(current):
+            current, packets, since = tried, list(raid.packets), 0
+        if best is None or spare_m(scenario, tried) < spare_m(scenario, best):
+            best = tried
+        spares_m.append(spare_m(scenario, tried))
     assert best is not None
     return Climbed(best, spares_m)
 
 
 class MoveSampler:
-    """Random moves, and random changes of moves.
-
-    Args:
-        task: the climb.
-        rng: random generator.
-    """
-
     def __init__(self, task: Climb, rng: np.random.Generator) -> None:
-        made = task.scenario.make_reference()
-        assert isinstance(made, Mission)
+        reference = task.scenario.make_reference()
+        assert isinstance(reference, Mission)
         self._rng, self._most = rng, task.moves
-        self._kinds, self._vehicles = task.kinds, made.vehicles
-        self._low, self._high = made.places.min(axis=0), made.places.max(axis=0)
+        self._kinds, self._vehicles = task.kinds, reference.vehicles
+        self._low, self._high = reference.places.min(axis=0), reference.places.max(axis=0)
         self._last_ns = seconds_to_ns(task.scenario.duration)
 
     def some(self) -> Moves:
-        """Random moves to start from."""
         rng, moves = self._rng, list[Move]()
         kinds = [kind for kind in self._kinds if kind is not MoveKind.DELAYS]
         if MoveKind.DELAYS in self._kinds:
@@ -460,7 +414,6 @@ class MoveSampler:
         return tuple(moves[-self._most :])
 
     def _one(self, kinds: Sequence[MoveKind]) -> Move:
-        """Random move of one of these kinds."""
         rng, kind = self._rng, kinds[int(self._rng.integers(len(kinds)))]
         low_s, high_s = LENGTHS_S.get(kind, LENGTH_S)
         length_ns = seconds_to_ns(low_s * (high_s / low_s) ** rng.random())
@@ -473,7 +426,6 @@ class MoveSampler:
         return Move(kind, vehicle, way, start_ns, length_ns, self._amounts(kind))
 
     def _amounts(self, kind: MoveKind) -> tuple[float, ...]:
-        """Random amounts of a move."""
         rng = self._rng
         if kind in OPERATOR:
             place = rng.uniform(self._low, self._high)
@@ -487,8 +439,8 @@ class MoveSampler:
 
         Args:
             moves: moves of the best flight so far.
-            near: its nearest approach.
-            packets: its packets.
+            near: the nearest approach in this flight.
+            packets: the packets of this flight.
         """
         rng, now = self._rng, list(moves)
         for _ in range(1 + rng.poisson(0.5)):
@@ -504,11 +456,10 @@ class MoveSampler:
                     now.append(self._aimed(near, packets))
                 case _:
                     now.append(self._one(self._kinds))
-        # Keep the newest moves, so that the change has an effect.
+        # Keep the newest moves: otherwise an added move could be cut off at once.
         return tuple(now[-self._most :])
 
     def _tuned(self, move: Move) -> Move:
-        """Move with a small random change of its start, length or amounts."""
         rng = self._rng
         low_s, high_s = LENGTHS_S.get(move.kind, LENGTH_S)
         match rng.integers(3):
@@ -526,7 +477,7 @@ class MoveSampler:
                 return replace(move, amounts=tuple(a + share * (b - a) for a, b in pairs))
 
     def _aimed(self, near: Near, packets: Sequence[Packet]) -> Move:
-        """Random move shortly before the nearest approach, for one of the nearest vehicles."""
+        """Random move shortly before the nearest approach, against one of the nearest vehicles."""
         rng, at_ns = self._rng, seconds_to_ns(near.at_s)
         move, candidates = self._one(self._kinds), near.vehicles or self._vehicles
         start_ns = max(at_ns - int(rng.integers(AIMED_NS)), 0)
@@ -543,21 +494,19 @@ class MoveSampler:
 
 
 def shrunk(scenario: Scenario, found: Approach) -> Approach:
-    """Flight with fewer and shorter moves that still violates a required distance."""
+    """Flight of fewer and shorter moves that still violates a required distance."""
     moves = shrink(found.moves, lambda moves: spare_m(scenario, fly(scenario, moves)) < 0.0)
     return fly(scenario, moves)
 
 
 def dumps(moves: Moves) -> str:
-    """Line of JSON for moves."""
     return msgspec.json.encode(moves).decode()
 
 
 def loads(line: str) -> Moves:
-    """Moves in a line of JSON.
+    """Decode moves from JSON.
 
-    Raises:
-        ConfigError: the line has no moves.
+    Raises ConfigError if the line is not a list of moves.
     """
     try:
         return msgspec.json.decode(line, type=Moves)

@@ -1,9 +1,9 @@
-"""Choice of thresholds and ways of reporting, for contenders within budgets of packets.
+"""Choice of thresholds and reporting policies for contenders, within budgets of packets.
 
-Each contender, with its weights (`lab.contenders`), first flies at several thresholds and with
-several ways of reporting, on the seeds of the search (scouting flights). Near each budget of
-packets more thresholds are tried, until the budget is almost used up. The best choice within each
-budget then flies in the comparison.
+Each contender first flies scouting flights at several thresholds and reporting policies, with its
+weights (`lab.contenders`), on the seeds of the search. Near each budget of packets more thresholds
+are tried, until the budget is almost used up. The choice with the smallest error within each budget
+then flies in the comparison.
 """
 
 import math
@@ -30,12 +30,13 @@ from skytether.shared.scenario.dotted import set_keys, value
 from skytether.shared.scenario.schema import Scenario
 
 BUDGETS = (1.0, 2.0, 5.0, 10.0, 20.0, 40.0)
-"""Budgets: largest numbers of packets per second, of both directions and with heartbeats."""
+"""Budgets: largest numbers of packets per second, both directions together, with heartbeats."""
 SOUGHT = tuple(sorted((*BUDGETS, 4.5)))
-"""Budgets for which points are chosen and flown: BUDGETS, and slightly less than 0.12 of the
-packets of the paper's scheme at every step, for the claimed ratios (`comparison.CLAIMS`)."""
+"""Budgets for which points are chosen: BUDGETS, and 4.5 per second, slightly less than 0.12 of the
+packets of the paper's scheme at every step, for the claimed ratios (`comparison.CLAIMS`).
+"""
 CLOSE = 1.05
-"""Ratio of two neighbouring thresholds below which none between them is tried."""
+"""Ratio of neighbouring thresholds below which no threshold between them is tried."""
 EFFORT_RATIO_MAX = 1.05
 """Largest ratio of a chosen point's effort to the effort limit of its case."""
 REPORTS: Mapping[str, Mapping[str, Any]] = {
@@ -49,32 +50,30 @@ REPORTS: Mapping[str, Mapping[str, Any]] = {
         "link.age_max_s": 10.0,
     },
 }
-"""Ways of reporting to the server, and the keys that each changes."""
+"""Policies by which the vehicle reports its state, and the keys that each changes."""
 EVERY = "every step"
-"""Way of reporting with which weights are searched for."""
+"""Reporting policy with which weights are searched for."""
 
 
 @dataclass(frozen=True, slots=True)
 class FlownContender:
-    """Contender in a case, at one threshold and with one way of reporting."""
+    """Contender in a case, at one threshold and with one reporting policy."""
 
     contender: Contender
     threshold: float | None
-    """Value of the contender's threshold; None without one."""
+    """Threshold of the trigger; None if the contender has none."""
     report: str
-    """Way of reporting, a key of REPORTS."""
+    """Reporting policy, a key of REPORTS."""
     tuned: bool
-    """Whether the threshold is the one that the search found."""
+    """Whether the threshold is the result of the search for weights."""
     keys: Mapping[str, Any]
-    """Keys that differ from the plant, with dots, and their values."""
+    """Keys that differ from the plant's scenario, with dots, and their values."""
 
     @property
     def name(self) -> tuple[str, float | None, str]:
-        """Contender, threshold and way of reporting."""
         return self.contender.name, self.threshold, self.report
 
     def at(self, threshold: float) -> "FlownContender":
-        """Same contender and way of reporting, at another threshold."""
         keys = {**self.keys, f"control.{self.contender.threshold}": threshold}
         return FlownContender(self.contender, threshold, self.report, False, keys)
 
@@ -82,15 +81,15 @@ class FlownContender:
 def flying(
     contender: Contender, case: Case, tuned: Scenario, scale: ComparisonSize
 ) -> list[FlownContender]:
-    """Contender with every way of reporting at all its thresholds, in rising order."""
+    """Contender with every reporting policy at all its thresholds, in rising order."""
     keys, key = differences(tuned, case.plant), contender.threshold
     keys = {path: value for path, value in keys.items() if path not in case.keys}
     values: list[float | None] = [None]
-    here = value(reading.to_table(tuned), f"control.{key}") if key else None
-    if here is not None:
+    tuned_threshold = value(reading.to_table(tuned), f"control.{key}") if key else None
+    if tuned_threshold is not None:
         first = contender.factors.index(1) % scale.every
-        scaled = [here * factor for factor in contender.factors[first :: scale.every]]
-        if isinstance(here, int):  # steps
+        scaled = [tuned_threshold * factor for factor in contender.factors[first :: scale.every]]
+        if isinstance(tuned_threshold, int):  # steps
             scaled = [max(1, round(value)) for value in scaled]
         values = sorted({*scaled})
     return [
@@ -98,7 +97,7 @@ def flying(
             contender,
             value,
             report,
-            value == here,
+            value == tuned_threshold,
             {**keys, **({f"control.{key}": value} if key else {}), **changes},
         )
         for value in values
@@ -107,28 +106,25 @@ def flying(
 
 
 Chosen = Mapping[tuple[str, float], FlownContender]
-"""Choice of each contender within each budget, by its name and the budget [1/s]."""
+"""Point of each contender within each budget, by the contender's name and the budget [1/s]."""
 
 
 @dataclass(frozen=True, slots=True)
 class Scouted:
-    """Means of a point's scouting flights."""
-
     point: FlownContender
     rmse_xy_m: float
-    """RMSE xy [m]; infinite if a flight failed."""
     packets_per_s: float
-    """Packets both ways [1/s]."""
+    """Packets in both directions [1/s]."""
     is_valid: bool
-    """Whether its effort is within the limit of the case."""
+    """Whether the effort is within the limit of the case."""
 
     def is_within(self, budget: float) -> bool:
-        """Whether the point may be chosen for a budget of packets [1/s]."""
+        """Whether the point may be chosen for a budget [1/s]."""
         return self.is_valid and self.packets_per_s <= budget and math.isfinite(self.rmse_xy_m)
 
 
 def _between(lower: float | None, upper: float | None) -> float | None:
-    """Geometric mean of two thresholds; None if they are too close together for another."""
+    """Geometric mean of two thresholds; None if they differ by less than CLOSE."""
     if lower is None or upper is None:
         return None
     mean = math.sqrt(lower * upper)
@@ -150,16 +146,15 @@ class Plan:
     def __init__(self, case: Case, weights: str, scale: ComparisonSize) -> None:
         self.case = case
         self.points: list[FlownContender] = []
-        """All contenders at all thresholds with all ways of reporting."""
-        known = reading.names(weights)
+        tables = reading.names(weights)
         for contender in scale.who(case):
             name = entry(contender, case)
-            if f"{weights}/{name}" not in known:
+            if f"{weights}/{name}" not in tables:
                 there_is = "expected every contender in every case, as --tune writes them"
                 raise ConfigError(f"{weights}: got no table {name!r}, {there_is}")
             self.points += flying(contender, case, reading.load(f"{weights}/{name}"), scale)
         self.runs = -(-scale.runs // 2) if case.weights else scale.runs
-        """Number of flights of each chosen point."""
+        """Number of flights of each chosen point; half in a case with its own weights."""
         plant = reading.to_table(reading.load(case.plant))
         set_keys(case.keys, plant)
         plant["duration"] = min(plant["duration"], scale.duration)
@@ -168,7 +163,6 @@ class Plan:
         self._scouted: list[Scouted] = []
 
     def scouts(self, points: Sequence[FlownContender]) -> Sweep:
-        """Flights by which points are chosen."""
         runs, scenario = self._scouting
         return self._sweep(scenario, points, runs)
 
@@ -177,18 +171,11 @@ class Plan:
         return Sweep(self.case.name, scenario, [GridAxis("contender", names, changes)], runs)
 
     def comparison(self, points: Iterable[FlownContender]) -> Sweep:
-        """Flights of some points, without duplicates."""
         each = {point.name: point for point in points}
         return self._sweep(self._scenario, list(each.values()), self.runs)
 
     def scouted(self, points: Sequence[FlownContender], sweep: Sweep, done: Results) -> None:
-        """Store the results of scouting flights.
-
-        Args:
-            points: the points that were flown.
-            sweep: their flights, see `scouts`.
-            done: results of these flights.
-        """
+        """Store the results of scouting flights, which `scouts` made of the same points."""
         for cell, point in enumerate(points):
             runs = sweep.of_cell(done, cell)
             packets, effort = (
@@ -200,7 +187,6 @@ class Plan:
             self._scouted.append(Scouted(point, float(np.mean(errors)), packets, is_valid))
 
     def _best(self) -> dict[tuple[str, float], Scouted]:
-        """Point with the least RMSE xy within each budget, by contender and budget."""
         best: dict[tuple[str, float], Scouted] = {}
         for each in self._scouted:
             for budget in SOUGHT:
@@ -212,9 +198,10 @@ class Plan:
         return best
 
     def halfway(self) -> list[FlownContender]:
-        """Points to scout next: between a threshold that exceeds a budget and the next within it.
+        """Points to scout next: thresholds between one that exceeds a budget and the next one
+        within.
 
-        A pair is skipped if the point that exceeds the budget is no better than the best within it.
+        A pair is skipped if the point over the budget has no smaller error than the best within.
         """
         best, points_between = self._best(), {}
         ways: dict[tuple[str, str], list[Scouted]] = {}
@@ -237,13 +224,13 @@ class Plan:
     def chosen(self) -> Chosen:
         """Point with the least RMSE xy within each budget, by contender and budget.
 
-        A contender has no entry for a budget if no point is within the budget and the case's effort
-        limit without a failed flight.
+        A contender has no entry for a budget in which every point failed or exceeded the effort
+        limit.
         """
         return {name: each.point for name, each in self._best().items()}
 
     def tuned(self, name: str) -> Scenario:
-        """Scenario of a contender at the threshold found by the search, reporting at every step."""
+        """Scenario of a contender that reports at every step, at the threshold of the search."""
         (point,) = (
             each
             for each in self.points

@@ -1,7 +1,7 @@
-"""Objectives of searches: the paper's Table 1, or the smallest error within some limits.
+"""Objectives of searches: reproduction of the paper's Table 1, or the smallest error within limits.
 
-An objective (see `lab.search.Objective`) flies every point of a search, a scenario, with the same
-seeds, and scores the flights: the smaller the score, the better.
+An objective (`lab.search.Objective`) flies every point of a search, which is a scenario, with the
+same seeds, and scores the flights. A smaller score is better.
 """
 
 import math
@@ -36,12 +36,12 @@ TABLE_1: Mapping[str, Mapping[str, float]] = {
         "event_ratio": 0.1,
     },
 }
-"""Paper's Table 1 [m], and the event ratio that its "10 times smaller" means."""
+"""Entries of the paper's Table 1 [m], and the event ratio for the paper's "10 times smaller"."""
 
 TOLERANCE = 0.1
 """Largest relative deviation of an entry that counts as reproduced; twice this for event ratios."""
 UNFLYABLE = 1e9
-"""Score of a point with a failed flight."""
+"""Score of a point of which a flight failed."""
 
 
 FREE = (
@@ -60,18 +60,13 @@ FREE = (
 
 @dataclass(frozen=True, slots=True)
 class Table1:
-    """Objective to reproduce every entry of Table 1."""
-
     def settings(self) -> Mapping[str, Any]:
-        """Name of the objective, as plain values."""
         return {"objective": "table1"}
 
     def free(self) -> Sequence[Free]:
-        """Default keys of the search."""
         return FREE
 
     def fly(self, scenario: Scenario, seeds: Sequence[int]) -> Values:
-        """Means over seeds, for each column of the table."""
         values: dict[str, dict[str, float | None]] = {}
         for column, changes in COLUMNS.items():
             table = plain(scenario)
@@ -90,7 +85,7 @@ class Table1:
 
 
 def deviations(values: Values) -> dict[tuple[str, str], float]:
-    """Relative deviation of each entry from Table 1, by column and name; NaN for no figure."""
+    """Relative deviation of each entry from Table 1, by column and name; NaN if a flight failed."""
     found = {
         (column, name): (values[column][name], target)
         for column, targets in TABLE_1.items()
@@ -103,12 +98,10 @@ def deviations(values: Values) -> dict[tuple[str, str], float]:
 
 
 def within(name: str, deviation: float) -> bool:
-    """Whether a deviation of an entry is within tolerance."""
     return abs(deviation) <= TOLERANCE * (2.0 if name == "event_ratio" else 1.0)
 
 
 def is_admissible(values: Values) -> bool:
-    """Whether every entry of Table 1 is within tolerance."""
     return all(within(name, value) for (_, name), value in deviations(values).items())
 
 
@@ -121,9 +114,9 @@ WEIGHTS = (
 )
 """Weights that are searched for; only their ratios matter, so the position's is fixed."""
 REGULATOR = (WEIGHTS[0], *WEIGHTS[3:])
-"""Weights that determine the regulator along a trajectory, and the nominal motion."""
+"""Weights that determine the regulator along a trajectory, and the trajectory itself."""
 SPLINE_KEYS = (Free("control.spline_error_m", 1e-3, 1e-1),)
-"""Key of a trajectory that the server knows ahead."""
+"""Key of a trajectory scheme whose server knows the reference in advance."""
 TRIGGER_KEYS: Mapping[str, Sequence[Free]] = {
     "state_gap": (
         Free("control.trigger.state_gap.epsilon", 1e-4, 1e8),
@@ -133,17 +126,14 @@ TRIGGER_KEYS: Mapping[str, Sequence[Free]] = {
     "expected_gap": (Free("control.trigger.expected_gap", 1e-6, 1e6),),
     "deviation": (Free("control.trigger.deviation", 1e-4, 1e1),),
 }
-"""Keys of each policy that uses the state; they are searched for together with the weights."""
+"""Parameters of triggers that use the state; searched for together with the weights."""
 OBSERVER_KEYS = (Free("control.observer_s", 0.05, 50.0),)
-"""Keys of the schemes that have a disturbance observer."""
 MEANS = ("rmse_xy", "event_ratio", "effort_mps", "saturated")
-"""Figures of a point that are averaged over the seeds."""
 ONLY = "here"
-"""Name of the single column of an objective without columns."""
+"""Name of the only column of an objective without columns."""
 
 
 def trigger_keys(trigger: str) -> Sequence[Free]:
-    """Keys of the policies in a trigger."""
     names = (each.name for each in leaves(TRIGGERS.parse(trigger)))
     keys = (key for name in names for key in TRIGGER_KEYS.get(name, ()))
     return list(dict.fromkeys(keys))
@@ -151,10 +141,8 @@ def trigger_keys(trigger: str) -> Sequence[Free]:
 
 @dataclass(frozen=True, slots=True)
 class SearchLimits:
-    """Limits within which the error is minimised."""
-
     packets: float = 1.0
-    """Largest event ratio; only applied to triggers that use the state."""
+    """Largest event ratio; only for triggers that use the state."""
     effort_mps: float = math.inf
     """Largest effort, the RMS change of the command from step to step [m/s]."""
     saturated: float = 1.0
@@ -166,15 +154,15 @@ class Rmse:
     """Objective of the smallest RMSE xy within limits."""
 
     scenario: Scenario
-    """Scenario that is flown, except for the keys that are searched for."""
     limits: SearchLimits
 
     def settings(self) -> Mapping[str, Any]:
-        """Name of the objective and its limits, as plain values."""
         return {"objective": "rmse", **asdict(self.limits)}
 
     def free(self) -> Sequence[Free]:
-        """Weights, and the keys of scheme and trigger; keys that are 0, for "off", are left out."""
+        """Weights, and the keys of scheme and trigger. A key whose value is 0, for "off", is left
+        out.
+        """
         control, table = self.scenario.control, plain(self.scenario)
         observer = OBSERVER_KEYS if control.properties.observes else ()
         weights: Sequence[Free] = WEIGHTS
@@ -185,7 +173,7 @@ class Rmse:
         return [key for key in keys if key.of(table) > 0.0]
 
     def fly(self, scenario: Scenario, seeds: Sequence[int]) -> Values:
-        """Means over seeds, and the upper end of the event ratio's 95 % interval."""
+        """Means over seeds, and the upper end of the 95 % interval of the event ratio."""
         runs = sweep.summaries(ONLY, scenario, seeds)
         means = {name: _mean(runs, name) for name in MEANS}
         _, half = sweep.estimate(runs, "event_ratio")
@@ -206,12 +194,12 @@ class Rmse:
         return rmse * math.prod(max(1.0, each) ** 3 for each in over)
 
     def _binds(self) -> bool:
-        """Whether the share of packets depends on the flight."""
+        """Whether the trigger uses the state, so that the event ratio depends on the flight."""
         named = leaves(TRIGGERS.parse(self.scenario.control.trigger))
         return any(each.name in TRIGGER_KEYS for each in named)
 
 
 def _mean(runs: Sequence[Summary], name: str) -> float | None:
-    """Mean of a figure; None if it is missing in a run that failed."""
+    """Mean of a figure; None if a flight failed."""
     values = [getattr(run, name) for run in runs]
     return None if None in values else float(np.mean(values))

@@ -36,25 +36,22 @@ FIGURES = (
     "aoi_s_peak",
     "plan_age_s_mean",
 )
-"""Figures of a summary that are compared."""
 
 
 @dataclass(frozen=True, slots=True)
 class Claim:
-    """Claim that one contender's RMSE xy is at most so many times another's."""
+    """Claim that one contender's RMSE xy is at most a given multiple of another's."""
 
     ours: str
-    """Name of the contender that the claim favours."""
     theirs: str
-    """Name of the contender it is compared with."""
     share: float = 1.0
-    """Largest share of the other's packets that ours may send, both ways."""
+    """Largest share of the other contender's packets in both directions that ours may send."""
     at_most: Mapping[str, float] = field(default_factory=dict)
-    """Largest ratio, by case; in other cases the ratio is only reported."""
+    """Largest ratio by case; in other cases the ratio is only reported."""
 
 
 OURS = "trajectory-expected"
-"""Contender for which most is claimed."""
+"""Contender for which most ratios are claimed."""
 CLAIMS = (
     Claim(OURS, "paper-every-step", 0.12, {"target": 0.95, "turns": 0.8}),
     Claim(OURS, "feedback-gap", 0.5),
@@ -64,19 +61,17 @@ CLAIMS = (
 
 @dataclass(frozen=True, slots=True)
 class ContenderRuns:
-    """Runs of a contender in a case, at one threshold and with one way of reporting."""
+    """Runs of a contender in a case, at one threshold and with one reporting policy."""
 
     what: FlownContender
-    """Contender, threshold and way of reporting."""
     runs: Sequence[Summary]
-    """Summary of each flight, by seed."""
 
     def estimate(self, figure: str) -> Estimate:
         """Mean of one of FIGURES, and half the width of its 95 % interval."""
         return interval(self.values(figure))
 
     def values(self, figure: str) -> list[float]:
-        """Values of one of FIGURES in every run that has it."""
+        """Values of one of FIGURES, without runs that failed or have no value."""
         flew = (run for run in self.runs if run.rmse_xy is not None)
         values = (getattr(run, figure) for run in flew)
         return [value for value in values if value is not None]
@@ -94,24 +89,22 @@ class ContenderRuns:
 
 @dataclass(frozen=True, slots=True)
 class ComparedCase:
-    """Results of a case."""
-
     case: Case
     bought: Mapping[tuple[str, float], ContenderRuns]
-    """Runs of each contender's choice within each budget, by its name and the budget [1/s]."""
+    """Runs of each contender's chosen point within each budget, by the contender's name and the
+    budget [1/s].
+    """
     tuned: Sequence[FlownContender] = ()
     """Each contender at the threshold that the search found."""
     floor: Sequence[Floor] = ()
-    """Points of a floor."""
 
     @property
     def contenders(self) -> list[Contender]:
-        """Contenders that fly within at least one budget."""
         names = {name for name, _ in self.bought}
         return [each for each in (*CONTENDERS, ABOARD) if each.name in names]
 
     def curve(self, contender: str) -> list[ContenderRuns]:
-        """Choices of a contender with rising budget; each point once."""
+        """Chosen points of a contender with rising budget; each point once."""
         points = (self.bought.get((contender, budget)) for budget in SOUGHT)
         return list({id(each): each for each in points if each is not None}.values())
 
@@ -123,13 +116,7 @@ def compared(
     done: Results,
     beside: Baselines,
 ) -> ComparedCase:
-    """Results of a plan, and of its baselines.
-
-    Args:
-        chosen: choice of each contender within each budget.
-        sweep: flights of these points.
-        done: results of the sweep.
-    """
+    """Results of a case: flights of the chosen points, and the baselines."""
     cells = {name: cell for cell, (name,) in enumerate(sweep.cells)}
     flown = {
         point.name: ContenderRuns(point, sweep.of_cell(done, cells[point.name]))
@@ -146,7 +133,7 @@ def compared(
 def ratio(ours: ContenderRuns, theirs: ContenderRuns) -> tuple[float, float, float] | None:
     """Ratio of the mean RMSE xy of ours to theirs, and its 95 % interval, see `jackknife`.
 
-    The result is None if fewer than two seeds have flown in both.
+    None if fewer than two seeds have flown in both.
     """
     errors = [
         (one.rmse_xy, other.rmse_xy)
@@ -161,43 +148,37 @@ def ratio(ours: ContenderRuns, theirs: ContenderRuns) -> tuple[float, float, flo
 
 @dataclass(frozen=True, slots=True)
 class Judged:
-    """Result of a claim in a case."""
-
     claim: Claim
-    """Claim that is judged."""
     case: Case
-    """Case in which it is judged."""
     ours: ContenderRuns
-    """Runs of our contender, within the largest budget in which it sends no more than the claim
-    allows."""
+    """Runs within the largest budget in which our contender sends no more than the claim allows."""
     theirs: ContenderRuns
-    """Runs of the other contender, within the largest budget."""
+    """Runs of the other contender within the largest budget."""
     ratio: tuple[float, float, float] | None
-    """Ratio of both mean RMSE xy, with its interval; None if too few flights succeeded."""
+    """Ratio of the two mean RMSE xy, with its interval; None if too few flights succeeded."""
     sparse: bool
     """Whether our contender sends no more than the claim allows."""
 
     @property
     def medians(self) -> float | None:
-        """Ratio of both median RMSE xy; None if either has not flown."""
+        """Ratio of the two median RMSE xy; None if one has no runs."""
         ours, theirs = self.ours.median(), self.theirs.median()
         return ours / theirs if ours and theirs else None
 
     @property
     def at_most(self) -> float | None:
-        """Largest claimed ratio; None if none is claimed in the case."""
+        """Largest claimed ratio; None if the claim says nothing about the case."""
         return self.claim.at_most.get(self.case.name)
 
     @property
     def holds(self) -> bool | None:
-        """Whether the whole interval is below the claimed ratio; None if none is claimed."""
+        """Whether the whole interval is below the claimed ratio; None without a claimed ratio."""
         if self.at_most is None:
             return None
         return self.sparse and self.ratio is not None and self.ratio[2] <= self.at_most
 
 
 def judge(claim: Claim, compared: ComparedCase) -> Judged | None:
-    """Judge a claim; None if either contender has not flown."""
     ours, theirs = compared.curve(claim.ours), compared.curve(claim.theirs)
     if not (ours and theirs):
         return None
@@ -210,11 +191,6 @@ def judge(claim: Claim, compared: ComparedCase) -> Judged | None:
 
 
 def draw(results: Sequence[ComparedCase]) -> Drawn:
-    """Report of a comparison.
-
-    Args:
-        results: results, case by case.
-    """
     own = [each for each in results if not each.case.weights]
     judged = [found for claim in CLAIMS for each in results if (found := judge(claim, each))]
     asked = [each.holds for each in judged if each.holds is not None]
@@ -244,7 +220,6 @@ ABOUT = (
 
 
 def budgets_table(results: Sequence[ComparedCase]) -> Table:
-    """Table of the choice of each contender within each budget."""
     rows, lines = [], []
     for each in results:
         best = {budget: _best(each, budget) for budget in BUDGETS}
@@ -265,10 +240,10 @@ def budgets_table(results: Sequence[ComparedCase]) -> Table:
             lines.append((each.case.title, contender.title, *cells))
     says = (
         "Mean RMSE xy [m] with its 95 % interval, and median, @ packets a second. Within a budget "
-        "each contender flies at the threshold and with the way of reporting that had the smallest "
-        "error on other seeds; * marks the smallest mean, and those that cannot be told from it: "
-        "the interval of their ratio on the same seeds contains 1. The CSV has bytes and all other "
-        "figures."
+        "each contender flies at the threshold and with the reporting policy that had the smallest "
+        "error on other seeds. * marks the smallest mean, and means that do not differ from it "
+        "significantly: the interval of their ratio on the same seeds contains 1. The CSV has "
+        "bytes and all other figures."
     )
     flown = {id(runs): runs for each in results for runs in each.bought.values()}.values()
     failed = sum(run.rmse_xy is None for each in flown for run in each.runs)
@@ -287,7 +262,9 @@ def _ranked(compared: ComparedCase, budget: float) -> list[ContenderRuns]:
 
 
 def _best(compared: ComparedCase, budget: float) -> list[ContenderRuns]:
-    """Runs within a budget with the least mean RMSE xy, and those that cannot be told from it."""
+    """Runs within a budget with the least mean RMSE xy, and those without a significant difference
+    from it.
+    """
     ranked = _ranked(compared, budget)
     return [
         each
@@ -298,7 +275,6 @@ def _best(compared: ComparedCase, budget: float) -> list[ContenderRuns]:
 
 
 def leaders_table(results: Sequence[ComparedCase]) -> Table:
-    """Table of the ratio of our contender to the best of the others within each budget."""
     rows = []
     for each in results:
         for budget in BUDGETS:
@@ -332,7 +308,7 @@ def leaders_table(results: Sequence[ComparedCase]) -> Table:
 
 
 def _ratio_row(found: tuple[float, float, float] | None) -> dict[str, float | None]:
-    """CSV cells of a ratio and its interval's ends, empty without one; see `ratio`."""
+    """CSV cells of a ratio and the ends of its interval, empty if there is none; see `ratio`."""
     return dict(zip(("ratio", "ratio_low", "ratio_high"), found or (None,) * 3, strict=True))
 
 
@@ -341,7 +317,6 @@ def _ratio_span(row: Row) -> str:
 
 
 def _row(each: ContenderRuns) -> dict[str, Any]:
-    """Point, number of runs and of successful ones, and every figure."""
     flew = sum(run.rmse_xy is not None for run in each.runs)
     counts = {
         "threshold": each.what.threshold,
@@ -353,7 +328,6 @@ def _row(each: ContenderRuns) -> dict[str, Any]:
 
 
 def ratios_table(judged: Sequence[Judged]) -> Table:
-    """Table of the claimed ratios."""
     rows = []
     for each in judged:
         packets, octets = (each.ours.mean(of) / each.theirs.mean(of) for of in (PACKETS, BYTES))
@@ -394,7 +368,6 @@ def ratios_table(judged: Sequence[Judged]) -> Table:
 
 
 def weights_table(results: Sequence[ComparedCase]) -> Table:
-    """Table of each contender's weights and threshold in each case."""
     flown = [(each.case, point) for each in results for point in each.tuned]
     keys = list(
         dict.fromkeys(
@@ -418,7 +391,7 @@ def weights_table(results: Sequence[ComparedCase]) -> Table:
 
 
 def _weights(value: Any) -> str:
-    """Number as text, or several between commas; empty for None."""
+    """Number as text, or several with commas between; empty for None."""
     parts = () if value is None else np.atleast_1d(value)
     return ", ".join(f"{part:.4g}" for part in parts)
 
@@ -428,15 +401,13 @@ SPENT = {
     BYTES: "bytes /s, both ways",
     EFFORT: "effort [m/s]",
 }
-"""Resources, and their axis labels."""
 COLOURS = ("#c1272d", "0.5", "black", "#009e73")
-"""Colours of the schemes, in order."""
 MARKERS = "sovD^P<*"
 """Markers of the triggers, in order; curves can be told apart without colour."""
 
 
 def _style(contender: Contender) -> tuple[str, str]:
-    """Colour and marker of a contender, used in every figure."""
+    """Colour and marker of a contender, the same in every figure."""
     if contender is ABOARD:
         return "0.3", ""
     schemes = list(dict.fromkeys(each.scheme for each in CONTENDERS))
@@ -446,7 +417,6 @@ def _style(contender: Contender) -> tuple[str, str]:
 
 
 def curves(compared: ComparedCase) -> Plate:
-    """Figure of a case: RMSE xy over the packets that each contender sends."""
     case = compared.case
     rows = [
         {"contender": name, "budget": budget} | _row(runs)
@@ -495,7 +465,7 @@ def _draw_curve(
     rmse, half = np.array([each.estimate(RMSE) for each in flown], np.float64).reshape(-1, 2).T
     half = np.nan_to_num(half)
     median = np.array([each.median() for each in flown], np.float64)
-    low = np.maximum(rmse - half, 0.5 * rmse)  # a logarithmic axis has no 0
+    low = np.maximum(rmse - half, 0.5 * rmse)  # a logarithmic axis cannot show 0
     colour, marker = _style(contender)
     if flown and not flown[0].mean(PACKETS):
         for plane in panes:

@@ -1,9 +1,9 @@
 """Contenders and cases of `skytether compare`, and the file of each contender's weights.
 
-The best weights of a contender in a case are a table of that file, found by a search
-(`search_start`, and `lab.calibration.Rmse`) on seeds that the comparison does not fly.
-`lab.budgets` then chooses a threshold for each budget of packets. Some cases are flown with the
-weights of another case, to show how well the weights transfer.
+The best weights of each contender in each case stand in that file. A search finds them
+(`search_start`, `lab.calibration.Rmse`), on seeds that the comparison does not fly. `lab.budgets`
+then chooses a threshold for each budget of packets. Some cases are flown with the weights of
+another case, to show how well weights transfer.
 """
 
 import json
@@ -20,45 +20,40 @@ from skytether.shared.scenario.dotted import flat, set_keys
 from skytether.shared.scenario.schema import Scenario
 
 SEARCH_SEED = 1001
-"""First seed of a search; the seeds of the comparison begin at the scenario's own."""
 PACKETS = 0.1
 """Largest event ratio in a search, for a contender whose trigger uses the state."""
 SCOUTS = 16
-"""Number of flights, on seeds of the search, by which points are chosen for the budgets."""
+"""Number of scouting flights of a point, on seeds of the search."""
 ROUNDS = 4
-"""Number of times that thresholds are tried halfway between those within and beyond a budget.
+"""Number of rounds in which thresholds are bisected near each budget.
 
-Measured in the case `target` at 1 packet/s, 5 % more packets reduce the error by a fifth. So with
-thresholds far apart, contenders that left more of the budget unused looked worse than they are."""
+In the case `target`, at 1 packet/s, 5 % more packets reduce the error by a fifth. With coarse
+thresholds, contenders that left much of a budget unused would look too bad.
+"""
 NEAR = (0.1, 0.3, 1, 3, 10, 30, 100)
-"""Factors on the threshold of a figure; each gives one point."""
+"""Factors on a threshold; each gives a point."""
 PERIODS = (0.1, 0.2, 0.5, 1, 2, 4, 8)
-"""Factors on a period of ten steps; each gives one point."""
+"""Factors on a period of ten steps; each gives a point."""
 
 
 @dataclass(frozen=True, slots=True)
 class Contender:
-    """Scheme with a trigger."""
-
     name: str
-    """Short name, in tables, files and scenarios."""
+    """Identifier in tables, files and scenarios."""
     scheme: str
-    """Name of the scheme as a reader of the report sees it."""
     trigger: str
-    """Name of the trigger as a reader of the report sees it."""
     control: Mapping[str, Any]
     """Keys of `control` that define the contender, with the initial weights of its search."""
     threshold: str = ""
-    """Key of `control` that determines how many packets are sent; empty if there is none."""
+    """Key of `control` that determines the number of packets; empty if there is none."""
 
     @property
     def title(self) -> str:
-        """Name as a reader of the report sees it."""
         return f"{self.scheme}, {self.trigger}"
 
     @property
     def factors(self) -> Sequence[float]:
-        """Multiples of the found threshold, each one point of the curve."""
+        """Factors on the threshold that the search found; each gives a point of the curve."""
         if not self.threshold:
             return ()
         return PERIODS if self.threshold == "trigger.periodic" else NEAR
@@ -70,8 +65,7 @@ LOOSE = {
     "input_weight": 5.0,
     "change_weight": 200.0,
 }
-"""Initial weights of a search with the paper's scheme, whose plans should change little from step
-to step."""
+"""Initial weights of a search with the paper's scheme: successive plans should differ little."""
 TIGHT = {
     "state_weight": [7.1, 1.0],
     "terminal_weight": [50.0, 20.0],
@@ -81,15 +75,16 @@ TIGHT = {
 """Initial weights of a search with committed inputs, which need no S-term."""
 
 PAPER = {"scheme": "predictive", "feedback": False, "observer_s": 0.0, "horizon": 40} | LOOSE
-"""The paper's scheme, with the horizon that reproduces its table."""
+"""The paper's scheme, with the horizon that reproduces its Table 1."""
 COMMITTED = {
     "scheme": "committed",
     "feedback": False,
     "observer_s": 4.0,
     "horizon": 60,
 } | TIGHT
-"""Scheme with committed inputs; the observer's time constant is searched for and may come out very
-long."""
+"""Scheme with committed inputs. The time constant of its observer is searched for, and may come out
+so long that the observer has no effect.
+"""
 FEEDBACK = COMMITTED | {"feedback": True}
 TRAJECTORY = {
     "scheme": "trajectory",
@@ -109,11 +104,12 @@ COST_GAP = {"trigger": "cost_gap(300.0)"}
 EXPECTED_GAP = {"trigger": "expected_gap(300.0)"}
 SILENT = {"trigger": "cost_gap(3.0) | silence(1)"}
 ACKNOWLEDGED = {"trigger": "expected_gap(3.0) | heartbeat"}
-"""Triggers for trajectories. Their gap is smaller: the cost of one step, not of a horizon."""
+"""Triggers for trajectories. Their threshold is smaller: it is the cost of one step, not of a
+horizon.
+"""
 
 
 def _contenders() -> tuple[Contender, ...]:
-    """All contenders, family by family."""
     every, periodic, gap, expected = "every step", "periodic", "cost gap", "expected gap"
     steps, cost, doubted = "trigger.periodic", "trigger.cost_gap", "trigger.expected_gap"
     committed, aboard, spline = "committed", "committed with feedback", "trajectory"
@@ -156,14 +152,11 @@ ABOARD = Contender("aboard", "reference aboard", "no packets", {})
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """Case: a scenario in which all contenders fly."""
-
     name: str
-    """Short name, in tables, files and scenarios."""
     title: str
-    """Name as a reader of the report sees it."""
+    """Name in the report."""
     plant: str
-    """Name of the scenario with the vehicle, trajectory and network of all contenders."""
+    """Name of the scenario with the vehicle, reference and network of all contenders."""
     keys: Mapping[str, Any]
     """Keys of the scenario, with dots, that differ from the plant."""
     effort_mps: float = math.inf
@@ -171,9 +164,7 @@ class Case:
     weights: str = ""
     """Name of the case whose weights are used; empty if the case has its own."""
     contenders: Sequence[str] = ()
-    """Names of the contenders that fly the case; empty for all."""
     start: Mapping[str, float] = field(default_factory=dict)
-    """Thresholds and their initial values in searches of this case."""
 
 
 TARGET = {
@@ -184,25 +175,27 @@ TARGET = {
     "duration": 35.0,
 }
 """Keys of every case with a target: as few heartbeats as in the paper's scenario, and plans
-weighted around the target's velocity (`control.input_reference`)."""
+weighted around the target's velocity (`control.input_reference`).
+"""
 CIRCLE = ("paper-every-step", "paper-event", "committed-gap", "feedback-gap", "trajectory-expected")
-"""Contenders on a trajectory that is known in advance, for which no network is needed."""
+"""Contenders on the circle. The reference is known in advance, so a vehicle could fly it without a
+network.
+"""
 
 
 def _unsearched(name: str, title: str, keys: Mapping[str, Any]) -> Case:
-    """Case that is flown with the weights of the case `target`."""
     return Case(name, title, "target", {**TARGET, **keys}, weights="target")
 
 
 def _circle(name: str, title: str, keys: Mapping[str, Any], effort_mps: float) -> Case:
-    """Case that flies the paper's circle, where costs are hundreds of times smaller."""
+    """Case on the paper's circle, with costs and hence thresholds hundreds of times smaller."""
     small = {"trigger.cost_gap": 1.0, "trigger.expected_gap": 1.0, "trigger.state_gap": 300.0}
     round_ = {**keys, "duration": 32.5}  # one full circle after the time that RMSE leaves out
     return Case(name, title, "paper", round_, effort_mps, contenders=CIRCLE, start=small)
 
 
 def _network(argument: str, value: Any) -> Mapping[str, Any]:
-    """Keys of both directions of the network: their whole text, or an argument in it."""
+    """Keys that set an argument, or with "" the whole text, of both directions of the network."""
     at = f".{argument}" if argument else ""
     return {f"network.{way}{at}": value for way in ("uplink", "downlink")}
 
@@ -261,46 +254,37 @@ CASES = (
 def cases(names: Sequence[str]) -> Sequence[Case]:
     """Cases by name; all if no name is given.
 
-    Raises:
-        ConfigError: there is no such case.
+    Raises ConfigError if a name is unknown.
     """
-    known = {case.name: case for case in CASES}
+    by_name = {case.name: case for case in CASES}
     for name in names:
-        if name not in known:
-            raise ConfigError(f"--cases: got {name!r}, expected others; {hint(name, known)}")
-    return [known[name] for name in names] or CASES
+        if name not in by_name:
+            raise ConfigError(f"--cases: got {name!r}, expected others; {hint(name, by_name)}")
+    return [by_name[name] for name in names] or CASES
 
 
 @dataclass(frozen=True, slots=True)
 class ComparisonSize:
-    """Size of a comparison; defaults are those of the reported ones."""
+    """Number and length of the flights of a comparison; defaults as in docs/compare.md."""
 
     runs: int
-    """Number of flights of each chosen point; half as many if the case has no weights of its
-    own."""
+    """Number of flights of each chosen point; half as many in a case without its own weights."""
     generations: int
-    """Number of generations of a search."""
     population: int = 8
-    """Number of points in a generation."""
     search_runs: int = 6
-    """Number of flights of each point of a search."""
     search_duration: float = 30.0
-    """Length of a flight of a search [s]."""
     cases: Sequence[Case] = CASES
-    """Cases that are flown."""
     contenders: Sequence[Contender] = CONTENDERS
-    """Contenders that fly, in those cases that they are in."""
+    """Contenders of the comparison; a case may restrict them."""
     scouts: int = SCOUTS
-    """Number of flights of each point by which points are chosen."""
     rounds: int = ROUNDS
-    """Number of times that more thresholds are tried near the budgets."""
+    """Number of rounds in which more thresholds are tried near the budgets."""
     every: int = 1
-    """Stride over a contender's factors, which always includes the factor 1."""
+    """Stride over a contender's factors; the factor 1 is always among them."""
     duration: float = math.inf
     """Largest length of a flight [s]."""
 
     def who(self, case: Case) -> list[Contender]:
-        """Contenders that fly in a case."""
         return [
             each for each in self.contenders if not case.contenders or each.name in case.contenders
         ]
@@ -317,11 +301,10 @@ class ComparisonSize:
 
 
 QUICK = ("paper-every-step", "paper-event", "feedback-gap", "trajectory-expected")
-"""Contenders of a first look."""
 
 
 def quick(scale: ComparisonSize) -> ComparisonSize:
-    """Reduced size for a quick trial run, at most as large as requested."""
+    """Reduced size for `--quick`, at most as large as requested."""
     few = [case for case in scale.cases if case.name in ("target", "loss-0.5")]
     return ComparisonSize(
         runs=min(scale.runs, 3),
@@ -342,7 +325,6 @@ def quick(scale: ComparisonSize) -> ComparisonSize:
 
 
 def search_start(contender: Contender, case: Case, scale: ComparisonSize) -> Scenario:
-    """Scenario from which the search for a contender's weights in a case begins."""
     table = reading.to_table(reading.load(case.plant))
     set_keys({f"control.{key}": value for key, value in contender.control.items()}, table)
     if contender.threshold in case.start:
@@ -353,27 +335,24 @@ def search_start(contender: Contender, case: Case, scale: ComparisonSize) -> Sce
 
 
 def entry(contender: Contender, case: Case) -> str:
-    """Name of a contender in a case, as a table in the file of weights."""
+    """Name of a contender's table for a case in the file of weights."""
     return f"{contender.name}-{case.weights or case.name}"
 
 
 @dataclass(frozen=True, slots=True)
 class TunedWeights:
-    """Result of the search for a contender's weights in a case."""
-
     contender: Contender
     case: Case
     scenario: Scenario
-    """Scenario with the weights."""
     says: str
-    """Summary of the result on the seeds of the search, in a line."""
+    """Line that summarises the result on the seeds of the search."""
 
 
 def to_file(found: Sequence[TunedWeights], scale: ComparisonSize) -> str:
-    """File of weights: one table per contender and case, with keys that differ from the plant.
+    """Text of the file of weights: a table per contender and case, with the keys that differ from
+    the plant.
 
-    Args:
-        scale: size of the searches, noted in the file.
+    A comment in the file states the size of the searches, `scale`.
     """
     says = (
         "Scenarios of each contender of `skytether compare` in each case, with the weights and "
@@ -401,20 +380,22 @@ def to_file(found: Sequence[TunedWeights], scale: ComparisonSize) -> str:
 
 
 def _keys_of(found: TunedWeights) -> dict[str, Any]:
-    """Keys of a result for the file: the contender's, and those that differ from the plant."""
-    here = dict(flat(reading.to_table(found.scenario)))
-    own = {f"control.{key}": here[f"control.{key}"] for key in found.contender.control}
+    """Keys of a result for the file: the contender's own, and those that differ from the plant."""
+    values = dict(flat(reading.to_table(found.scenario)))
+    own = {f"control.{key}": values[f"control.{key}"] for key in found.contender.control}
     return own | differences(found.scenario, found.case.plant)
 
 
 def _inline(value: Any) -> str:
-    """Value as TOML on one line; JSON's form of numbers, texts and lists is valid TOML."""
+    """Value as TOML on one line; JSON's numbers, texts and lists are valid TOML."""
     if isinstance(value, dict):
         return f"{{ {', '.join(f'{key} = {_inline(each)}' for key, each in value.items())} }}"
     return json.dumps(value, ensure_ascii=False)
 
 
 def differences(scenario: Scenario, plant: str) -> dict[str, Any]:
-    """Keys in the sections of a scenario that differ from its plant, with dots, and values."""
-    here, there = (dict(flat(reading.to_table(each))) for each in (scenario, reading.load(plant)))
-    return {key: value for key, value in here.items() if "." in key and value != there[key]}
+    """Keys of a scenario's sections that differ from the plant, with dots, and their values."""
+    own, plant_values = (
+        dict(flat(reading.to_table(each))) for each in (scenario, reading.load(plant))
+    )
+    return {key: value for key, value in own.items() if "." in key and value != plant_values[key]}

@@ -1,8 +1,7 @@
-"""Inputs that a vehicle should fly by a horizon or trajectory, computed independently for checks.
+"""Inputs that a horizon or trajectory prescribes, computed independently for checks.
 
-A course is the motion that one message prescribes. The equations of `shared.law.rule` and
-`shared.law.spline` are written here a second time, in plain numpy, so that these checks do not
-share an error with the compiled functions that both ends use.
+The equations of `shared.law.rule` and `shared.law.spline` are written a second time here, in plain
+numpy, so that checks do not share an error with the compiled functions that both ends use.
 """
 
 from collections.abc import Sequence
@@ -23,12 +22,10 @@ from skytether.shared.wire.protocol import (
 
 
 class PlannedCourse:
-    """Course by a horizon of inputs.
+    """Inputs prescribed by a horizon.
 
     Args:
-        horizon: the horizon.
         length: number of usable inputs.
-        terms: the rule of flight.
     """
 
     def __init__(self, horizon: Horizon, length: int, terms: Terms) -> None:
@@ -38,7 +35,6 @@ class PlannedCourse:
         self._model, self._brake = terms.model, terms.brake
         feedback = horizon.feedback.astype(float)
         self.feeds_back = feedback.size > 0
-        """Whether the horizon contains feedback gains."""
         if not self.feeds_back:
             feedback = np.zeros((terms.axes, FEEDBACK))
         self.lag = np.zeros(terms.axes)
@@ -46,7 +42,7 @@ class PlannedCourse:
         self._reference, self._stage = feedback[:, REFERENCE], 0
 
     def prescribed(self, stage: int) -> Array:
-        """Prescribed input at a stage, and after the last stage the braking curve [m/s]."""
+        """Prescribed input [m/s]; after the last stage it falls along the braking curve."""
         length = self._inputs.shape[1]
         u: Array = self._inputs[:, min(max(stage, 0), length - 1)]
         left = self._speed - max(stage - length + 1, 0) * self._brake
@@ -58,10 +54,9 @@ class PlannedCourse:
         state: Array,
         disturbance: Sequence[float],  # noqa: ARG002
     ) -> Array:
-        """Feedback at a stage for a state of shape (axes, 2) [m/s]; stages must not decrease.
+        """Feedback at a stage for a state [m, m/s] of shape (axes, 2); stages must not decrease.
 
-        Args:
-            disturbance: estimate of the vehicle's filter, unused here [m/s].
+        `disturbance`, the estimate of the vehicle's filter [m/s], is unused here.
         """
         if stage < 0 or not self.feeds_back:
             return np.zeros(len(self._inputs))
@@ -76,12 +71,10 @@ class PlannedCourse:
 
 
 class FollowedCourse:
-    """Course along a trajectory.
+    """Inputs prescribed by a trajectory.
 
     Args:
-        trajectory: the trajectory.
         length: number of usable stages.
-        terms: the rule of flight.
         regulator: K and λ of the vehicle's regulator; shape (axes, 3).
     """
 
@@ -91,13 +84,13 @@ class FollowedCourse:
         self._knots, self._spacing = trajectory.knots.astype(float), trajectory.spacing
         self._length, self._terms = length, terms
         self._gain, self.lag = regulator[:, :2], regulator[:, 2]
-        """K; and λ, the weight of the previous input; shape (axes,)."""
+        """Weight λ of the previous input; shape (axes,)."""
         self._model, self._bound = terms.model, np.array(terms.u_max)
         self._last = self._along(length - 1)
         self._reference, self._stage = self._state(length), length
 
     def _state(self, stage: int) -> Array:
-        """State of the spline at a stage, position [m] and velocity [m/s]; shape (axes, 2)."""
+        """State of the spline at a stage [m, m/s]; shape (axes, 2)."""
         knots, dt_s = self._knots, self._terms.dt_s
         last = knots.shape[1] - 1
         knot = min(max(stage // self._spacing, 0), last)
@@ -118,7 +111,7 @@ class FollowedCourse:
         return np.clip(u, -self._bound, self._bound)
 
     def prescribed(self, stage: int) -> Array:
-        """Prescribed input ū at a stage, and after the last stage the braking curve [m/s]."""
+        """Prescribed input ū [m/s]; after the last stage it falls along the braking curve."""
         if stage < self._length or not self._terms.brake:
             return self._along(stage)
         speed = float(np.linalg.norm(self._last))

@@ -1,7 +1,7 @@
 """Largest number of vehicles on one shared network, for each scheme.
 
-All vehicles of a flight share one network with the scenario's finite rate. A number of vehicles
-"flies" if all of them fly to the end, none brakes after `settle`, and the root mean square of all
+The vehicles of a flight share one network with the scenario's finite rate. They fly, in the sense
+of this module, if all reach the end, none brakes after `settle`, and the root mean square of all
 distances from the targets is within a limit.
 """
 
@@ -29,39 +29,38 @@ TITLES: Mapping[Scheme, str] = {
     "threshold": "trajectories, a threshold for each vehicle",
     "budget": "trajectories, one budget for all vehicles",
 }
-"""Schemes that are compared, and their display names."""
+"""Schemes that are compared, and their titles."""
 PAPER = f"{reading.COMPARED}/paper-every-step-target"
 """Scenario with the best weights of the paper's scheme (docs/compare.md)."""
 STEP = 4.0 / 3.0
-"""Ratio of one number of vehicles to the next, until they fail."""
 EXACT = 0.05
-"""Largest relative error of the number of vehicles that is found."""
+"""Relative accuracy of the largest number of vehicles."""
 
 
 class CrowdPoint(msgspec.Struct, frozen=True):
-    """Results of a flight; an entry of the journal. Figures of a direction cover all packets."""
+    """Results of a flight, stored in the journal. `up` and `down` are directions of the network."""
 
     scheme: Scheme
     vehicles: int
     rmse_m: float | None
-    """Root mean square distance of all vehicles from their targets [m], from `settle` on; None if a
-    vehicle did not fly so long."""
+    """Root mean square distance of all vehicles from their targets from `settle` on [m]; None if a
+    vehicle did not fly so long.
+    """
     rmse_worst_m: float | None
-    """Largest RMSE of a single vehicle [m]."""
     ended: int
     """Number of vehicles that did not fly to the end."""
     braked: int
     """Number of vehicles that braked, from `settle` on."""
     up_queueing_ms_p50: float
-    """Median queueing delay of a packet up at the finite rate [ms]."""
+    """Median queueing delay of an uplink packet at the finite rate [ms]."""
     up_queueing_ms_p99: float
     down_queueing_ms_p50: float
     down_queueing_ms_p99: float
     up_lost: float
-    """Share of packets up lost at random, or dropped by a full queue."""
+    """Share of uplink packets lost at random, or dropped by a full queue."""
     down_lost: float
     up_bytes_per_s: float
-    """Bytes per second up, with headers [B/s]."""
+    """Uplink rate, with headers [B/s]."""
     down_bytes_per_s: float
 
     def flies(self, limit_m: float) -> bool:
@@ -71,28 +70,20 @@ class CrowdPoint(msgspec.Struct, frozen=True):
 
 @dataclass(frozen=True, slots=True)
 class Crowd:
-    """Scenario flown by crowds.
-
-    Args:
-        name: its name.
-        scenario: scenario of every vehicle, with the shared network.
-        udp: whether they fly over real UDP.
-    """
+    """Scenario that different numbers of vehicles fly, in virtual time or over real UDP."""
 
     name: str
     scenario: Scenario
     udp: bool
 
     def settings(self) -> dict[str, Any]:
-        """Settings that determine all points, as plain values."""
         files, table = digests([self.scenario]), reading.to_table(self.scenario)
         return {"name": self.name, "udp": self.udp, "files": files, "scenario": table}
 
     def of(self, scheme: Scheme) -> Scenario:
         """Scenario of a scheme.
 
-        Raises:
-            ConfigError: the scenario cannot be flown with it.
+        Raises ConfigError if the scenario cannot be flown with the scheme.
         """
         table = reading.to_table(self.scenario)
         if scheme == "paper":
@@ -109,12 +100,7 @@ class Crowd:
 def judge(
     scenario: Scenario, scheme: Scheme, vehicles: int, client: Rows, netem: Mapping[str, Any]
 ) -> CrowdPoint:
-    """Figures of a flight.
-
-    Args:
-        client: rows of all vehicles.
-        netem: figures of netem.
-    """
+    """Figures of a flight, from the rows of all vehicles and the figures of netem."""
     squares, ended, braked = [], vehicles, 0
     for vehicle in np.unique(client["vehicle"]):
         rows = client[client["vehicle"] == vehicle]
@@ -148,15 +134,12 @@ def judge(
 
 @dataclass(frozen=True, slots=True)
 class FlownScheme:
-    """Points of one scheme, in order of the number of vehicles."""
-
     points: tuple[CrowdPoint, ...]
     limit_m: float
-    """Largest error of vehicles that count as flying [m]."""
+    """RMSE above which vehicles count as failed [m]."""
 
     @classmethod
     def of(cls, points: Sequence[CrowdPoint], scheme: Scheme, limit_m: float) -> Self:
-        """Points of a scheme among all points."""
         own = sorted((each for each in points if each.scheme == scheme), key=lambda p: p.vehicles)
         return cls(tuple(own), limit_m)
 
@@ -172,7 +155,7 @@ class FlownScheme:
         return max((p.vehicles for p in self.points if p.vehicles < below), default=0)
 
     def next(self, most: int) -> int | None:
-        """Number of vehicles to fly next, at most `most`; None once the largest number is known."""
+        """Number of vehicles to fly next, at most `most`; None once the largest number is found."""
         low, high = self.flying, self.too_many
         if high is None:
             return None if low >= most else min(ceil(low * STEP) or 1, most)
@@ -180,5 +163,4 @@ class FlownScheme:
 
 
 def points_csv(points: Sequence[CrowdPoint]) -> str:
-    """CSV table with a row for each point."""
     return to_csv(CrowdPoint.__struct_fields__, map(msgspec.structs.astuple, points))

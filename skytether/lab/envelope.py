@@ -1,20 +1,20 @@
 """Envelope of a scenario: networks and settings under which it flies, tested at random points.
 
-A point is the scenario with other delays, losses, step, horizon and scheme, which follow from the
-seed and the point's number alone. The outcome is judged from the scenario and the client's record
-alone. A vehicle without a planned input since time s, when its command was u and its velocity v,
-must follow the braking curve (a: brake_mps2, g: gain):
+A point is the scenario with other delays, losses, step, horizon and scheme, drawn from the seed and
+the point's number. The outcome is judged from the scenario and the client's record alone. A vehicle
+without a planned input since time s, with command u and velocity v at that time, must follow the
+braking curve (a: brake_mps2, g: gain):
+    |u(t)| ≤ |u| - a (t - s)                                            command
+    |p(t) - p(s)| ≤ τ |v| + g (|u|²/2a + |u| Δt)                        distance flown
+    |v(t)| ≤ |v| e^(-(t - s)/τ) + g |u| e^(-(t - s - |u|/a - Δt)/τ)     speed
 
-    |u(t)| ≤ |u| - a (t - s)                                                   what is commanded
-    |p(t) - p(s)| ≤ τ |v| + g (|u|²/2a + |u| Δt)                               how far that takes it
-    |v(t)| ≤ |v| e^(-(t - s)/τ) + g |u| e^(-(t - s - |u|/a - Δt)/τ)            how fast it still is
-
-With feedback aboard, a finished horizon still leads the vehicle to the point where the plan itself
-would stop, which is further ahead by as much as the vehicle lags behind the plan. Until the horizon
-is dropped, only the second line applies, with the distance from the reference at s and 1 m added.
+With feedback aboard, the vehicle of a finished horizon is still guided to the point where the plan
+itself would stop. That point is further ahead by the vehicle's lag behind the plan. Until the
+horizon is dropped, only the second line applies, with the distance from the reference at s and 1 m
+added.
 
 The vehicle must always stay within a disc around the reference, enlarged by 1 m and the stopping
-distance. And it must be near the reference once it flies a plan based on an observation made under
+distance. It must be near the reference once it flies a plan based on an observation made under
 earlier plans.
 """
 
@@ -41,24 +41,24 @@ from skytether.shared.telemetry.summary import position_error
 from skytether.sim import flight
 
 DELAY_MAX_S = 3.0
-"""Largest minimum delay of a direction that is drawn [s]."""
+"""Largest minimum delay of a direction [s]."""
 LOSSES_MAX = (0.5, 0.99)
-"""Largest loss of a direction, in each half of the points."""
+"""Largest loss of a direction; each value applies to half of the points."""
 DT_MIN_S, DT_MAX_S = 0.005, 0.5
-"""Shortest and longest step that is drawn [s]."""
+"""Shortest and longest control step [s]."""
 HORIZON_MAX = 120
-"""Longest horizon that is drawn; the shortest is 1."""
+"""Longest horizon [steps]; the shortest is 1."""
 NEAR_M = 1.0
-"""Distance from the reference up to which a vehicle counts as on it [m]."""
+"""Distance up to which a vehicle counts as on the reference [m]."""
 SIGMAS = 6.0
-"""Number of standard deviations of white wind that are attributed to wind."""
+"""White wind is assumed to stay within this number of standard deviations."""
 ROUNDING = 1e-6
 """Rounding tolerance of a distance [m] or a speed [m/s]."""
 
 Outcome = Literal[
     "flown", "interrupted", "hovering", "unanswered", "refused", "astray", "flyaway", "crashed"
 ]
-"""Outcome of a point, as explained in docs/studies.md."""
+"""Outcome of a point; docs/studies.md explains each."""
 BAD: tuple[Outcome, ...] = ("crashed", "flyaway")
 """Forbidden outcomes, the worst first."""
 WRONG: tuple[Outcome, ...] = (*BAD, "astray")
@@ -66,7 +66,6 @@ WRONG: tuple[Outcome, ...] = (*BAD, "astray")
 
 
 def draw(seed: int, number: int) -> dict[str, Any]:
-    """Keys and values of a point, drawn from the seed and the point's number."""
     rng = stream(seed, "envelope", number)
     loss_max = float(rng.choice(LOSSES_MAX))
     keys: dict[str, Any] = {}
@@ -84,39 +83,31 @@ def draw(seed: int, number: int) -> dict[str, Any]:
 
 
 def _short(value: float) -> float:
-    """Number rounded to four digits, for a short command line."""
     return float(f"{value:.4g}")
 
 
 class EnvelopePoint(msgspec.Struct, frozen=True):
-    """Outcome of a point, or of any flight."""
-
     outcome: Outcome
     error_max: float | None = None
-    """Largest distance from the reference after settling [m]; None if it never settled."""
+    """Largest distance from the reference after settling [m]; None if the flight ended before."""
     covered: float | None = None
     """Share of the steps with a planned input; None if no step was flown."""
     outside_m: float | None = None
     """Largest distance from the disc around the reference [m]; 0 within it."""
     line: str = ""
-    """Reason why it was refused, judged unsafe, or ended early."""
+    """Reason why the point was refused, judged unsafe, or ended early."""
 
 
 @dataclass(frozen=True, slots=True)
 class Envelope:
-    """Scenario whose points are flown."""
-
     name: str
-    """Name of the scenario, for command lines and messages."""
     scenario: Scenario
 
     def settings(self) -> dict[str, Any]:
-        """Settings that determine all points, as plain values."""
         files, table = digests([self.scenario]), reading.to_table(self.scenario)
         return {"name": self.name, "files": files, "scenario": table}
 
     def keys(self, number: int) -> dict[str, Any]:
-        """Keys and values of a point; see `draw`."""
         keys = draw(self.scenario.seed, number)
         if self.scenario.terms().splines:  # a trajectory requires feedback aboard
             keys["control.feedback"] = True
@@ -128,11 +119,6 @@ class Envelope:
         return table
 
     def scenario_of(self, number: int) -> Scenario:
-        """Scenario of a point.
-
-        Raises:
-            ConfigError: it cannot be flown.
-        """
         return reading.check(self._table(number), self.name)
 
     def fly(self, number: int) -> EnvelopePoint:
@@ -144,13 +130,12 @@ class Envelope:
         try:
             flown = flight.fly(scenario)
             verdict = judge(scenario, flown.client)
-        except Exception as error:  # any exception is the outcome of the point
+        except Exception as error:  # an exception of any kind is the outcome of the point
             return EnvelopePoint("crashed", line=f"{type(error).__name__}: {error}")
         line = verdict.line or (str(flown.failure) if flown.failure else "")
         return msgspec.structs.replace(verdict, line=line)
 
     def command(self, number: int) -> str:
-        """Command line that flies just one point again."""
         before = dict(flat(reading.to_table(reading.load(self.name))))
         now = flat(self._table(number))
         changed = ((key, value) for key, value in now if value != before.get(key))
@@ -158,7 +143,6 @@ class Envelope:
         return shlex.join(["skytether", "fly", self.name, "--virtual", *flags])
 
     def csv(self, points: Iterable[EnvelopePoint]) -> str:
-        """CSV table with a row for each point: number, drawn keys, and the outcome."""
         rows = [
             [number, *self.keys(number).values(), *msgspec.structs.astuple(point)]
             for number, point in enumerate(points)
@@ -167,7 +151,6 @@ class Envelope:
 
 
 def _flag(key: str, value: Any) -> Iterator[str]:
-    """Words of a command line that set a key."""
     section, _, name = key.replace("_", "-").rpartition(".")
     path = f"{section}." if section else ""
     if isinstance(value, bool):
@@ -178,7 +161,9 @@ def _flag(key: str, value: Any) -> Iterator[str]:
 
 
 def worst_first(points: Iterable[EnvelopePoint]) -> list[tuple[int, EnvelopePoint]]:
-    """Points that went wrong, with their numbers: crashes, flyaways by distance, those astray."""
+    """Points with a WRONG outcome, with their numbers: crashes, flyaways by distance, then astray
+    ones.
+    """
     wrong = [(number, point) for number, point in enumerate(points) if point.outcome in WRONG]
 
     def rank(numbered: tuple[int, EnvelopePoint]) -> tuple[int, float, float]:
@@ -211,12 +196,7 @@ def disc(scenario: Scenario) -> tuple[Array, float]:
 
 
 def judge(scenario: Scenario, client: Rows) -> EnvelopePoint:
-    """Outcome of a flight.
-
-    Args:
-        scenario: scenario that was flown.
-        client: rows of its one vehicle, a row for every step.
-    """
+    """Outcome of a flight, from the rows of its only vehicle, one for every step."""
     if not len(client):
         return EnvelopePoint("unanswered")
     covered = client["covered"]
@@ -251,7 +231,7 @@ def _faults(
     time_s = client["step"] * dt
     position, velocity = client["state"][..., 0], client["state"][..., 1]
     speed, command = np.linalg.norm(velocity, axis=1), np.linalg.norm(client["input"], axis=1)
-    # A finished horizon is still in force: feedback leads the vehicle to where the plan stops.
+    # A finished horizon is still in force: feedback guides the vehicle to where the plan stops.
     guided = ~covered & (client["age_ns"] >= 0) & scenario.control.feedback
     blind = ~covered & ~guided
     begun = _begun(covered, guided)
@@ -259,7 +239,7 @@ def _faults(
     age_s = client["age_ns"] / SECOND_NS
     # Wind cannot be compensated before it has been observed.
     pushed_m, pushed_mps = _wind(scenario, np.where(covered, np.maximum(0.0, age_s), since_s))
-    # A command sent earlier acts only after the dead time.
+    # With dead time, commands from before `begun` act later: the largest possible one is assumed.
     on_its_way = np.where(late_s > 0.0, top_mps, command[begun])
     stopping_s = on_its_way / brake + dt + late_s
 
@@ -271,10 +251,11 @@ def _faults(
         return np.exp(-np.maximum(0.0, passed_s) / tau_s)
 
     travelled_m = np.linalg.norm(position - position[begun], axis=1)
-    behind_m = guided * (NEAR_M + error_m[begun])  # behind the plan, which leads to the reference
+    # Lag behind the plan, which ends on the reference.
+    behind_m = guided * (NEAR_M + error_m[begun])
     curve_mps = speed[begun] * left(since_s)
     curve_mps += gain * on_its_way * left(since_s - stopping_s)
-    # Time under plans at the newest observation that the plan in force was made from.
+    # Time for which the vehicle had flown plans, at the observation behind the plan in force.
     seen_s = np.where(age_s >= 0.0, since_s - age_s, -1.0)
     rules: tuple[tuple[str, Flags, Array, Any], ...] = (
         (
@@ -322,7 +303,7 @@ def _faults(
 def _begun(covered: Flags, guided: Flags) -> Any:
     """Row at which the present stretch of one kind began; shape (steps,).
 
-    Kinds are: covered by planned inputs, following the feedback alone, and neither.
+    A stretch is covered by planned inputs, or follows the feedback alone, or neither.
     """
     rows, kind = np.arange(len(covered)), covered + 2 * guided
     changed = np.concatenate([[True], kind[1:] != kind[:-1]])
@@ -330,10 +311,8 @@ def _begun(covered: Flags, guided: Flags) -> Any:
 
 
 def _wind(scenario: Scenario, blind_s: Array) -> tuple[Array, float]:
-    """Distance [m] and speed [m/s] that wind may cause without a correction.
-
-    Args:
-        blind_s: time without a correction [s]; shape (steps,).
+    """Distance [m] and speed [m/s] that wind may cause within `blind_s`, the time without a
+    correction [s].
     """
     vehicle, tau_s = scenario.vehicle, float(scenario.true_tau_s.max())
     blown_mps = float(np.linalg.norm(vehicle.steady_wind_mps)) + tau_s * vehicle.gust_mps2

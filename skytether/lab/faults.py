@@ -1,8 +1,8 @@
 """Faults of a flight under torture, as a schedule drawn from a seed.
 
 A schedule is data: each fault has a kind, a host or direction, a time, a length and an amount.
-Equal seeds draw equal schedules. A schedule with which a flight fails is shrunk to the shortest
-that still fails, and kept as a line of JSON with the seed of the flight.
+Equal seeds draw equal schedules. A failing schedule is shrunk to the shortest one that still fails,
+and kept as a line of JSON with the seed of the flight.
 """
 
 from collections.abc import Callable, Sequence
@@ -18,30 +18,25 @@ from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS, seconds_to_ns
 
 
 class FaultKind(StrEnum):
-    """Kind of a fault."""
-
     LOSS = "loss"
-    """Loss of a share of the packets."""
     BURST = "burst"
-    """Loss of several packets in a row, again and again."""
+    """Loss of several packets in a row, repeatedly."""
     DUPLICATES = "duplicates"
-    """Duplication of a share of the packets."""
     REORDERING = "reordering"
     """Extra delay of each packet, random up to the amount [s]."""
     PARTITION = "partition"
-    """Partition: no packet passes either way."""
+    """Loss of all packets in both directions."""
     STEP = "step"
-    """Step of a host's clock by the amount [s], permanent."""
+    """Permanent step of a host's clock by the amount [s]."""
     SKEW = "skew"
-    """Skew: a host's clock runs faster by the amount [ppm]."""
+    """A host's clock runs fast by the amount [ppm]."""
     RESTART = "restart"
-    """Restart of a host after a down time."""
     FREEZE = "freeze"
     """Freeze of a host, as by SIGSTOP."""
     SOLVER = "solver"
     """Failure of the solver in a share of its solves."""
     OVERLOAD = "overload"
-    """Overload: the server computes for the amount [steps] at each wake."""
+    """The server computes for the amount [steps] at each wake."""
     REPLAY = "replay"
     """Attacker that replays packets after a delay of the amount [s]."""
     DELAY = "delay"
@@ -49,17 +44,19 @@ class FaultKind(StrEnum):
     CORRUPTION = "corruption"
     """Attacker that flips a bit in a share of the packets."""
     FLOOD = "flood"
-    """Attacker without keys that sends forged packets, as many per second as the amount."""
+    """Attacker without keys that sends forged packets; the amount is their rate [1/s]."""
     COPY = "copy"
     """Attacker that copies a share of the packets, sends the copies from other addresses to either
-    end, before or after the originals, and forwards the answers."""
+    end, before or after the originals, and forwards the answers.
+    """
     KEYS = "keys"
     """Restart of the server with other keys, then with the right ones again."""
     CROWD = "crowd"
-    """Attacker that sends copies of vehicles' packets to netem from another host and many ports, as
-    many per second as the amount, and forwards the answers."""
+    """Attacker that sends copies of vehicles' packets to netem from another host and many ports,
+    and forwards the answers; the amount is their rate [1/s].
+    """
     PORT = "port"
-    """NAT that permanently gives every vehicle another port; packets to the old one are lost."""
+    """NAT that permanently maps every vehicle to another port; packets to the old port are lost."""
 
 
 HARMLESS = frozenset(
@@ -68,7 +65,6 @@ HARMLESS = frozenset(
 """Faults during which all vehicles must fly, because every packet still arrives."""
 
 NETWORK = ("uplink", "downlink", "both")
-"""Directions in which packets are affected."""
 HOSTS = ("server", "client")
 
 SHARE = (0.05, 1.0)
@@ -76,14 +72,13 @@ SHARE = (0.05, 1.0)
 
 @dataclass(frozen=True)
 class Range:
-    """Range from which a kind of fault is drawn."""
+    """Range from which the faults of a kind are drawn."""
 
     where: tuple[str, ...]
-    """Hosts or directions that may be affected."""
     length_s: tuple[float, float]
     """Shortest and longest duration [s]; drawn log-uniformly."""
     amount: tuple[float, float] = (1.0, 1.0)
-    """Smallest and largest amount, drawn log-uniformly; the unit is that of the kind."""
+    """Smallest and largest amount; drawn log-uniformly."""
     signed: bool = False
     """Whether the amount may also be negative."""
 
@@ -109,59 +104,51 @@ RANGES = {
     FaultKind.CROWD: Range(("netem",), (5.0, 30.0), (20.0, 1_000.0)),
     FaultKind.PORT: Range(("client",), (0.0, 0.0)),
 }
-"""Range of every kind."""
 
 EVERY_NS = 5 * SECOND_NS
-"""Mean time from one fault of a schedule to the next [ns]."""
 SHORTEST_NS = MILLISECOND_NS
 """Length below which `shrink` does not shorten a fault any further [ns]."""
 
 
 @dataclass(frozen=True)
 class ScheduledFault:
-    """Scheduled fault."""
-
     kind: FaultKind
     where: str
-    """Host or direction that is affected, one of those in its range."""
+    """Host or direction, one of those in the kind's range."""
     start_ns: Annotated[int, msgspec.Meta(ge=0)]
-    """Time of the world at which it begins [ns]."""
+    """Time in the virtual world [ns]."""
     length_ns: Annotated[int, msgspec.Meta(ge=0)]
     """Duration [ns]; 0 for a permanent fault."""
     amount: float
-    """Amount, in the unit of its kind."""
+    """Amount; `FaultKind` gives its meaning and unit."""
 
     @property
     def end_ns(self) -> int:
-        """Time of the world at which the fault ends [ns]."""
         return self.start_ns + self.length_ns
 
     @property
     def over_ns(self) -> int:
-        """Time of the world at which the last packet delayed by the fault arrives [ns]."""
+        """Time at which the last packet delayed by the fault arrives [ns]."""
         delays = self.kind in (FaultKind.REORDERING, FaultKind.DELAY)
         return self.end_ns + (seconds_to_ns(self.amount) if delays else 0)
 
 
 def schedule(rng: np.random.Generator, duration_ns: int) -> tuple[ScheduledFault, ...]:
-    """Draw the faults of a flight, at least one, in order of time.
-
-    Args:
-        rng: random generator.
-        duration_ns: time within which all faults begin and end [ns].
+    """Draw the faults of a flight, at least one, in order of time. All begin and end within
+    `duration_ns`.
     """
     count = 1 + rng.poisson(duration_ns / EVERY_NS)
     kinds = list(FaultKind)
     drawn = [_draw(rng, kinds[rng.integers(len(kinds))], duration_ns) for _ in range(count)]
-    kept = [fault for fault in drawn if not _hides(fault, drawn)]
-    return tuple(sorted(kept or drawn[:1], key=lambda fault: fault.start_ns))
+    possible = [fault for fault in drawn if not _hides(fault, drawn)]
+    return tuple(sorted(possible or drawn[:1], key=lambda fault: fault.start_ns))
 
 
 def _hides(step: ScheduledFault, drawn: Sequence[ScheduledFault]) -> bool:
-    """Whether a step of a clock happens while its host is frozen, or shortly after another step.
+    """Whether a clock step falls into a freeze of its host, or shortly after another step.
 
-    Then the host cannot know how long it was frozen. Real hosts use CLOCK_MONOTONIC, which cannot
-    be set.
+    Then the host could not tell how long it was frozen. Real hosts use CLOCK_MONOTONIC, which
+    cannot be set.
     """
     if step.kind is not FaultKind.STEP:
         return False
@@ -188,14 +175,11 @@ def _draw(rng: np.random.Generator, kind: FaultKind, duration_ns: int) -> Schedu
 
 
 def _between(rng: np.random.Generator, bounds: tuple[float, float]) -> float:
-    """Random number between two, log-uniform."""
     low, high = bounds
     return low if low == high else float(low * (high / low) ** rng.random())
 
 
 class Timed(Protocol):
-    """Data class with a length."""
-
     @property
     def length_ns(self) -> int:
         """Duration [ns]."""
@@ -211,53 +195,48 @@ def shrink(faults: Sequence[T], fails: Callable[[tuple[T, ...]], bool]) -> tuple
     halved in length while the schedule still fails.
 
     Args:
-        faults: schedule that fails.
         fails: whether a schedule fails; called often, also with the empty one.
     """
-    kept = tuple(faults)
-    size, dropped = len(kept), True
+    shortest = tuple(faults)
+    size, dropped = len(shortest), True
     while size > 1 or dropped:
         size, first, dropped = max(1, size // 2), 0, False
-        while first < len(kept):
-            rest = kept[:first] + kept[first + size :]
+        while first < len(shortest):
+            rest = shortest[:first] + shortest[first + size :]
             if fails(rest):
-                kept, dropped = rest, True
+                shortest, dropped = rest, True
             else:
                 first += size
-    for n in range(len(kept)):
-        while kept[n].length_ns >= 2 * SHORTEST_NS:
-            shorter = cast(T, replace(cast(Any, kept[n]), length_ns=kept[n].length_ns // 2))
-            if not fails((*kept[:n], shorter, *kept[n + 1 :])):
+    for n in range(len(shortest)):
+        while shortest[n].length_ns >= 2 * SHORTEST_NS:
+            shorter = cast(T, replace(cast(Any, shortest[n]), length_ns=shortest[n].length_ns // 2))
+            if not fails((*shortest[:n], shorter, *shortest[n + 1 :])):
                 break
-            kept = (*kept[:n], shorter, *kept[n + 1 :])
-    return kept
+            shortest = (*shortest[:n], shorter, *shortest[n + 1 :])
+    return shortest
 
 
 @dataclass(frozen=True)
 class Trial:
-    """Flight under torture."""
+    """Flight under torture: its faults, and the seed of all other random numbers."""
 
     seed: Annotated[int, msgspec.Meta(ge=0, le=2**32 - 1)]
-    """Seed of all other random numbers."""
     faults: tuple[ScheduledFault, ...]
-    """Faults of the flight."""
 
     @property
     def end_ns(self) -> int:
-        """Time of the world after which no effect of a fault remains."""
+        """Time after which no fault has an effect [ns]."""
         return max((fault.over_ns for fault in self.faults), default=0)
 
 
 def dumps(trial: Trial) -> str:
-    """Line of JSON for a trial."""
     return msgspec.json.encode(trial).decode()
 
 
 def loads(line: str) -> Trial:
-    """Trial in a line of JSON.
+    """Decode a trial from JSON.
 
-    Raises:
-        ConfigError: the line is no trial.
+    Raises ConfigError if the line is no trial.
     """
     try:
         trial = msgspec.json.decode(line, type=Trial)

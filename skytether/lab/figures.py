@@ -25,17 +25,11 @@ OUTCOMES: Mapping[Outcome, Mapping[str, Any]] = {
     "flyaway": {"color": "#c1272d", "marker": "X"},
     "crashed": {"color": "black", "marker": "P"},
 }
-"""Colour and marker of each outcome of a point, in the order in which they are drawn."""
 RATIOS = np.geomspace(1 / 16, 16, 17)
 """Bin edges of `envelope`: length of a horizon in round trips."""
 
 
 def envelope(path: Path, title: str, plan: Envelope, points: Sequence[EnvelopePoint]) -> None:
-    """Draw the outcomes of an envelope's points, over delays, losses and the length of a plan.
-
-    Args:
-        path: file to write, in one of FORMATS.
-    """
     from matplotlib.patches import Patch
 
     keys = list(map(plan.keys, range(len(points))))
@@ -51,10 +45,10 @@ def envelope(path: Path, title: str, plan: Envelope, points: Sequence[EnvelopePo
     figure = blank(10.0, 9.0)
     (cover, bars), (delays, losses) = figure.subplots(2, 2)
     shown = {outcome: outcomes == outcome for outcome in OUTCOMES if outcome in outcomes}
-    for outcome, here in shown.items():
+    for outcome, has_outcome in shown.items():
         style: Any = {**OUTCOMES[outcome], "s": _size(outcome, len(points)), "linewidths": 0.0}
-        cover.scatter(trip_s[here], covers_s[here], **style)
-        long = here & (covers_s >= trip_s)
+        cover.scatter(trip_s[has_outcome], covers_s[has_outcome], **style)
+        long = has_outcome & (covers_s >= trip_s)
         delays.scatter(up_s[long], down_s[long], **style)
         losses.scatter(trip_s[long], loss[long], **style)
     line_s = np.geomspace(0.01, float(trip_s.max()), 100)
@@ -74,8 +68,8 @@ def envelope(path: Path, title: str, plan: Envelope, points: Sequence[EnvelopePo
     for plane in (cover, delays, losses):
         plane.grid(alpha=0.3)
     patches = [
-        Patch(color=OUTCOMES[outcome]["color"], label=f"{outcome} {here.sum()}")
-        for outcome, here in shown.items()
+        Patch(color=OUTCOMES[outcome]["color"], label=f"{outcome} {has_outcome.sum()}")
+        for outcome, has_outcome in shown.items()
     ]
     figure.suptitle(title, fontsize=11)
     figure.legend(
@@ -89,18 +83,17 @@ def envelope(path: Path, title: str, plan: Envelope, points: Sequence[EnvelopePo
 
 
 def _size(outcome: Outcome, points: int) -> float:
-    """Marker area of an outcome with so many points [points²]; failures stay visible."""
+    """Marker area of an outcome in a picture with `points` points [pt²]; failures stay visible."""
     area = float(np.clip(20_000.0 / points, 5.0, 30.0))
     return max(25.0, area) if outcome in WRONG else area
 
 
 def _stack(plane: Any, ratios: Array, shown: Mapping[Outcome, Flags]) -> None:
-    """Draw the share of each outcome over the horizon's length in round trips."""
     bins = np.digitize(np.clip(ratios, RATIOS[0], RATIOS[-1] * (1.0 - 1e-9)), RATIOS) - 1
     total = np.maximum(1, np.bincount(bins, minlength=len(RATIOS) - 1))
     below = np.zeros(len(total))
-    for outcome, here in shown.items():
-        share = np.bincount(bins[here], minlength=len(total)) / total
+    for outcome, has_outcome in shown.items():
+        share = np.bincount(bins[has_outcome], minlength=len(total)) / total
         style = {"color": OUTCOMES[outcome]["color"], "edgecolor": "white", "linewidth": 0.5}
         plane.bar(RATIOS[:-1], share, np.diff(RATIOS), bottom=below, align="edge", **style)
         below += share
@@ -117,7 +110,6 @@ def _stack(plane: Any, ratios: Array, shown: Mapping[Outcome, Flags]) -> None:
 
 
 UNITS = {"s": "s", "m": "m", "mps": "m/s", "mps2": "m/s²", "ppm": "ppm"}
-"""Unit of a key, by the last part of its name."""
 OTHER_UNITS = {
     "duration": "s",
     "settle": "s",
@@ -129,11 +121,10 @@ OTHER_UNITS = {
     "model.u_max": "m/s",
     "vehicle.wind": "m/s per √s",
 }
-"""Units of the keys whose names do not end in one."""
+"""Units of the keys whose names do not end in a unit."""
 
 
 def label(key: str) -> str:
-    """Label of a key of the scenario, with its unit, if any."""
     unit = OTHER_UNITS.get(key) or ("_" in key and UNITS.get(key.rsplit("_", 1)[1]))
     return f"{key} [{unit}]" if unit else key
 
@@ -144,8 +135,7 @@ def curve(
     """Draw the means of a sweep over one key, with their intervals.
 
     Args:
-        path: file to write, in one of FORMATS.
-        name: label of the figure that was measured, with its unit.
+        name: label of the measured figure, with its unit.
         means: mean at each value, NaN for none; shape (values,).
         halves: half the width of each mean's interval; shape (values,).
     """
@@ -173,9 +163,8 @@ def heat_map(
     """Draw the means of a sweep over two keys.
 
     Args:
-        path: file to write, in one of FORMATS.
         axes: horizontal axis, and vertical axis.
-        name: label of the figure that was measured, with its unit.
+        name: label of the measured figure, with its unit.
         means: mean in each cell, NaN for none; shape (values across, values up).
     """
     figure = blank(6.4, 5.0)
@@ -202,10 +191,7 @@ SCHEME_COLOURS: Mapping[Scheme, str] = {
 def crowd(path: Path, title: str, flown: Mapping[Scheme, FlownScheme], limit_m: float) -> None:
     """Draw error, queueing delay and loss over the number of vehicles, for each scheme.
 
-    Args:
-        path: file to write, in one of FORMATS.
-        flown: points of each scheme.
-        limit_m: largest error of vehicles that count as flying [m].
+    `limit_m` is the RMSE above which vehicles count as failed [m].
     """
     figure = blank(7.0, 8.0)
     panes = figure.subplots(3, 1, sharex=True)
@@ -223,8 +209,10 @@ def crowd(path: Path, title: str, flown: Mapping[Scheme, FlownScheme], limit_m: 
             if numbers:
                 pane.plot(numbers, drawn, color=colour, linewidth=1.0, label=TITLES[scheme])
             for flies, marker in ((True, "o"), (False, "X")):
-                here = [point.flies(limit_m) == flies for point in points]
-                pane.scatter(np.array(numbers)[here], drawn[here], color=colour, marker=marker)
+                has_outcome = [point.flies(limit_m) == flies for point in points]
+                pane.scatter(
+                    np.array(numbers)[has_outcome], drawn[has_outcome], color=colour, marker=marker
+                )
             if pane is panes[1]:
                 rare = [point.up_queueing_ms_p99 for point in points]
                 pane.plot(numbers, rare, color=colour, linewidth=0.8, linestyle=":")
@@ -246,16 +234,13 @@ def crowd(path: Path, title: str, flown: Mapping[Scheme, FlownScheme], limit_m: 
 
 
 def _most(flown: Mapping[Scheme, FlownScheme]) -> int:
-    """Largest number of vehicles that was flown."""
     return max(point.vehicles for each in flown.values() for point in each.points)
 
 
 def _is_scale(axis: GridAxis) -> bool:
-    """Whether an axis has increasing numbers, and not names."""
     numbers = all(type(value) in (int, float) for value in axis.values)
     return numbers and all(low < high for low, high in pairwise(axis.values))
 
 
 def _places(axis: GridAxis) -> Array:
-    """Coordinates of an axis' values in a picture; shape (values,)."""
     return np.array(axis.values if _is_scale(axis) else range(len(axis.values)), dtype=np.float64)

@@ -1,16 +1,16 @@
 """Floors: lower bounds of the tracking error over a network, and flights without any packets.
 
-An input depends on an observation and on a plan, and both have some age when the input takes
-effect. Disturbances since then are uncompensated. For white accelerations their variance is known
-in closed form, and the record contains the ages: so each flight has a floor, below which no other
-planner, solver or weight could have flown with the same packet timing.
+An input depends on an observation and on a plan, and both have an age when the input takes effect.
+Disturbances since then are uncompensated. For white accelerations their variance is known in closed
+form, and the record contains the ages. So each flight has a floor: no planner, solver or weight can
+have a smaller error with the same packet timing.
 
-The floor does not hold for event triggers: they send when the error is large, so age and error are
-correlated, and some flights come below the floor. It holds for packets sent at every step,
-periodically, or at fixed times.
+The floor holds for packets sent at every step, periodically, or at fixed times. It does not hold
+for event triggers: they send when the error is large, so age and error are correlated, and some
+flights come below the floor.
 
-The opposite baseline is a flight without a network: the reference and a regulator are aboard. This
-is possible if the trajectory is known before the flight.
+The opposite baseline is a flight without a network, with reference and regulator aboard. It is
+possible if the reference is known before the flight.
 """
 
 import math
@@ -43,15 +43,14 @@ UNKNOWN = ("target", "live")
 
 
 def wind_floor_m(scenario: Scenario, client: Rows) -> float:
-    """Floor of RMSE xy [m], from `settle` on, for plans flown without feedback aboard, in white
-    wind.
+    """Floor of RMSE xy [m], from `settle` on, in white wind for plans flown without feedback
+    aboard.
 
-    An input cannot compensate wind after the observation that it was planned from. Steps flown
-    without a plan are counted as without wind. Gusts are not included. With feedback aboard the
-    vehicle compensates wind itself, so this floor does not apply.
+    An input cannot compensate wind after the observation that it was planned from. With feedback
+    aboard the vehicle compensates wind itself, so this floor does not apply. Steps without a plan
+    count as if there were no wind; gusts are not included.
 
-    Args:
-        client: rows of one vehicle, with the ages.
+    `client` has the rows of one vehicle.
     """
     before = _inputs(scenario, client)
     ages_s = (before["age_ns"] * 1e-9 + scenario.control.dt)[before["age_ns"] >= 0]
@@ -64,12 +63,11 @@ def wind_floor_m(scenario: Scenario, client: Rows) -> float:
 def target_floor_m(scenario: Scenario, client: Rows) -> float:
     """Floor of RMSE xy [m], from `settle` on, for a target that only the server knows.
 
-    A vehicle cannot know the target's motion after its plan was made: white acceleration of the
+    The vehicle cannot know the target's motion after its plan was made: white acceleration of the
     strength `reference.agility`, except within `reference.preview`. The target's bounds are
-    ignored. Steps flown without a plan are counted as if the target had been at rest.
+    ignored. Steps without a plan count as if the target had been at rest.
 
-    Args:
-        client: rows of one vehicle, with the ages of its plans.
+    `client` has the rows of one vehicle.
     """
     before, preview = _inputs(scenario, client), scenario.reference.preview
     if preview == "all":
@@ -91,14 +89,12 @@ def _root(total: float, count: int) -> float:
 
 
 def fly_aboard(scenario: Scenario) -> Rows:
-    """Fly with the reference aboard, and without a network; the client's part of the record.
+    """Fly with the reference aboard, without a network; returns the client's part of the record.
 
-    At each step the vehicle follows a spline of the reference (`shared.law.spline.follow`), and
-    inputs pass the same clamp as in a networked flight. Winds and noise equal those of one with
-    this seed.
+    At each step the vehicle follows a spline of the reference (`shared.law.spline.follow`). Clamp,
+    wind and noise are those of a networked flight with this seed.
 
-    Raises:
-        ValueError: only the server knows the reference.
+    Raises ValueError if only the server knows the reference.
     """
     if scenario.reference.shape in UNKNOWN:
         shape = scenario.reference.shape
@@ -147,41 +143,36 @@ def summarise_aboard(scenario: Scenario) -> Summary:
     return replace(summary, event_ratio=0.0)
 
 
-# -- beside the contenders of a case ---------------------------------------------------------------
+# -- baselines of a case ---------------------------------------------------------------------------
 
 PERIODS = (1, 3, 10, 30)
 """Steps between two packets at which the floor is computed."""
 RUNS = 4
-"""Number of flights for one point of the floor."""
 
 
 class Floor(msgspec.Struct, frozen=True):
     """Point of a floor, for packets that are sent at fixed times."""
 
     packets_per_s: float
-    """Packets up per second."""
     rmse_m: float
-    """Floor of RMSE xy [m]."""
 
 
 @dataclass(frozen=True, slots=True)
 class Baselines:
-    """Baselines beside the contenders of a case."""
+    """Lower bounds that a comparison shows with the contenders of a case."""
 
     floor: Sequence[Floor] = ()
     """Lower bound of the RMSE at several packet rates: for all contenders if only the server sees
-    the target; in wind, for those without feedback aboard."""
+    the target; in wind, for those without feedback aboard.
+    """
     aboard: Sequence[Summary] = ()
-    """Flights with the reference aboard, and no packets; none if only the server knows the
-    reference."""
+    """Flights with the reference aboard and no packets; none if only the server knows the
+    reference.
+    """
 
 
 class Work:
-    """Flights for the baselines of a case.
-
-    Args:
-        plan: plan of the contenders.
-    """
+    """Flights for the baselines of a case."""
 
     def __init__(self, plan: Plan) -> None:
         scenario, aboard = plan.tuned(BESIDE), plan.tuned(REGULATED)
@@ -191,14 +182,11 @@ class Work:
             )
             for period in PERIODS
         }
-        """Scenario for each point of the floor, by the steps between packets."""
         first, runs = scenario.seed, 0 if _is_unknown(scenario) else plan.runs
         self.aboard = {seed: replace(aboard, seed=seed) for seed in range(first, first + runs)}
-        """Scenarios with the reference aboard, by seed."""
         self._tables = scenario, aboard
 
     def settings(self) -> dict[str, Any]:
-        """Settings that determine the results, as plain values."""
         return {
             "files": digests(self._tables),
             "runs": RUNS,

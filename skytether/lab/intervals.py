@@ -1,7 +1,7 @@
 """Confidence intervals of the laboratory's figures, at 95 %.
 
 A mean over independent flights has Student's interval. Any other statistic of a sample of flights
-(a ratio of means, a rate of growth) has the jackknife's, which follows from the change of the
+(a ratio of means, a rate of growth) has the jackknife's interval, computed from the changes of the
 statistic when one flight is left out. The fit of `identify` has the robust interval of least
 squares, see `lab.identify.fit`.
 """
@@ -19,11 +19,7 @@ Estimate = tuple[float | None, float | None]
 
 
 def students(freedom: int) -> float:
-    """Half-width of a 95 % interval in standard errors.
-
-    Args:
-        freedom: degrees of freedom.
-    """
+    """Half-width of a 95 % interval in standard errors, for a number of degrees of freedom."""
     return float(stats.t.ppf(0.975, freedom))
 
 
@@ -43,9 +39,7 @@ def interval(values: Sequence[float]) -> Estimate:
 def jackknife(statistic: Callable[[Array], float], sample: Array) -> tuple[float, float]:
     """Statistic of a sample, and half-width of its 95 % interval (jackknife, Student's t).
 
-    Args:
-        statistic: function of a sample.
-        sample: an independent row for each flight, at least two; shape (n, …).
+    `sample` has an independent row for each flight, at least two.
     """
     n = len(sample)
     others = np.array([statistic(np.delete(sample, row, axis=0)) for row in range(n)])

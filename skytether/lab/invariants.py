@@ -1,10 +1,10 @@
-"""Checks of the invariants of every step of every vehicle in `skytether torture`.
+"""Checks of the safety invariants at every step of every vehicle in `skytether torture`.
 
-A `WatchedLife` wraps the link of one run of a client and receives its record: it sees every message
-that the vehicle accepts, and every input that it flies. A `Gatekeeper` wraps the gate of one run of
-the server. A `Ledger` has all messages that were really sent, to check that no others are accepted.
-Deadlines of the vehicle are counted in its own steps (a frozen vehicle cannot act), all others in
-the world's time. A "life" is one run of an endpoint, from start to restart.
+A `WatchedLife` wraps the link of one run of a client and receives the client's record, so it sees
+every message that the vehicle accepts and every input that it flies. A `Gatekeeper` wraps the gate
+of one run of the server. A `Ledger` lists all messages that were sent, to check that no others are
+accepted. Deadlines of the vehicle are counted in its own steps, because a frozen vehicle cannot
+act; all others in virtual time. A "life" is one run of an endpoint, from start to restart.
 """
 
 import io
@@ -38,54 +38,45 @@ from skytether.shared.wire.protocol import (
 )
 
 WELCOME, OBSERVATION, HORIZON, HEARTBEAT, TRAJECTORY = 2, 3, 4, 5, 7
-"""Numbers of types of messages on the wire, see `shared.wire.protocol`."""
+"""Message types on the wire, see `shared.wire.protocol`."""
 ONCE = frozenset({OBSERVATION, HORIZON, HEARTBEAT, TRAJECTORY})
-"""Message types of which each message is unique, and so may be accepted once at most."""
+"""Message types of which each message is unique, so it may be accepted at most once."""
 REMEMBERED = 8192
-"""Number of newest messages of a direction that are stored, more than can be in flight."""
+"""Number of newest messages of a direction that are stored; more than can be in flight."""
 STEPS_REMEMBERED = 4096
 """Number of newest steps of a life whose time is stored."""
 HORIZONS_MAX = 1024
-"""Number of newest horizons of a life that are stored."""
 ROUNDING = 1e-6
-"""Rounding tolerance of a speed [m/s], as horizons travel as float32."""
+"""Rounding tolerance of a speed [m/s], because horizons are sent as float32."""
 MARGIN_M = 2.0
 """Margin of the position's bound for wind and the vehicle's dynamics [m]."""
 FLYING = (Mode.TRACK, Mode.COAST)
-"""Modes in which a horizon is flown."""
 
 
 class Violation(Exception):
-    """Error: an invariant is violated."""
-
     def __init__(self, invariant: str, what: str) -> None:
         super().__init__(f"{invariant}: {what}")
         self.invariant = invariant
-        """Name of the invariant."""
 
 
 class Ledger:
-    """Ledger of the messages of one direction: their senders, and how often each was sent."""
+    """Messages of one direction: the sender's life, and how often each was sent and accepted."""
 
     def __init__(self) -> None:
         self._sealed: OrderedDict[tuple[int, bytes], list[int]] = OrderedDict()
         """Sender's life, times sent and times accepted, by vehicle and message."""
 
     def seal(self, vehicle: int, payload: bytes, life: int) -> None:
-        """Note a message that is sent."""
         entry = self._sealed.setdefault((vehicle, payload), [life, 0, 0])
-        # The same bytes may be sent more than once, as CLOSE is.
+        # A sender may send the same bytes more than once, for example CLOSE.
         entry[1] += 1
-        # A message that arrives after its removal would be reported as forged, so REMEMBERED is far
-        # more than can be in flight.
+        # A message that arrives after its removal here would count as forged.
         if len(self._sealed) > REMEMBERED:
             self._sealed.popitem(last=False)
 
     def believe(self, vehicle: int, payload: bytes, kind: int | None) -> None:
-        """Note a message that is accepted.
-
-        Raises:
-            Violation: the message was not sent, or not as often.
+        """Count an accepted message; raises Violation if it was not sent, or was accepted too
+        often.
         """
         entry = self._sealed.get((vehicle, payload))
         if entry is None:
@@ -102,10 +93,7 @@ class Ledger:
 class Gatekeeper:
     """Wrapper around the real gate of one life of the server.
 
-    Args:
-        gate: the real gate.
-        life: number of the server's life.
-        up, down: ledgers of the server's and of the vehicles' messages.
+    `up` and `down` are the ledgers of the server's and of the vehicles' messages.
     """
 
     def __init__(self, gate: Gate, life: int, up: Ledger, down: Ledger) -> None:
@@ -115,7 +103,7 @@ class Gatekeeper:
         self._up, self._down = up, down
 
     def open(self, datagram: Datagram, *, now_ns: int) -> GateCall | None:
-        """See `Gate`; the message must be one that a vehicle has sent."""
+        """Open a message as `Gate` does; raises Violation if no vehicle has sent the message."""
         call = self.gate.open(datagram, now_ns=now_ns)
         if call is None:
             return None
@@ -124,17 +112,15 @@ class Gatekeeper:
         return call._replace(line=_Noted(call.line, call.vehicle, self._life, self._up))
 
     def admit(self, call: GateCall, *, now_ns: int) -> None:
-        """See `Gate`."""
         assert isinstance(call.line, _Noted)
         self.gate.admit(call._replace(line=call.line.inner), now_ns=now_ns)
 
     def outbox(self) -> list[Datagram]:
-        """See `Gate`."""
         return self.gate.outbox()
 
 
 class _Noted:
-    """Wrapper around a reply path that notes all messages."""
+    """Wrapper around a reply path that enters all messages into the ledger."""
 
     __slots__ = ("_life", "_up", "_vehicle", "inner")
 
@@ -143,7 +129,6 @@ class _Noted:
         self._vehicle, self._life, self._up = vehicle, life, up
 
     def seal(self, payload: bytes) -> bytes:
-        """See `ReplyPath`."""
         self._up.seal(self._vehicle, payload, self._life)
         return self.inner.seal(payload)
 
@@ -152,15 +137,11 @@ class WatchedLife(Recorder):
     """Wrapper around the real link of one life of a vehicle, which also checks its record.
 
     Args:
-        link: the real link.
-        scenario: scenario that is flown.
-        vehicle: number of the vehicle.
         number: number of this life.
         up, down: ledgers of the server's and of the vehicles' messages.
-        clock: returns the world's time [ns].
+        clock: returns the time of the virtual world [ns].
         overdue: returns whether all faults ended so long ago that the vehicle must fly.
-        rekey_ns: time after which the vehicle asks for new keys, if earlier than the link does
-            [ns].
+        rekey_ns: time after which the vehicle asks for new keys, if the link does not ask earlier.
         drifted_m: distance that the vehicle may have flown while frozen, in earlier lives [m].
     """
 
@@ -185,7 +166,7 @@ class WatchedLife(Recorder):
         self._clock, self._overdue, self._rekey_ns = clock, overdue, rekey_ns
         self._terms, self._dt_ns = scenario.terms(), scenario.dt_ns
         self._timeout = seconds_to_ns(scenario.link.timeout_s) // self._dt_ns
-        """Time-out [steps]."""
+        """Link timeout [steps]."""
         self._change_max = scenario.vehicle.slew_mps2 * self._terms.dt_s
         """Largest change of the input from step to step [m/s]."""
         self._regulator = regulator(scenario)
@@ -204,53 +185,49 @@ class WatchedLife(Recorder):
         self._silent = 0
         """Steps since the newest packet of the session."""
         self._good_ns: int | None = None
-        """Time since which the link has been good; None while it is lost."""
+        """Time since which the link has been good [ns]; None while it is lost."""
         self._speed_lost = 0.0
         """Speed at the last step before the link was lost [m/s]."""
         self._times_ns: OrderedDict[int, int] = OrderedDict()
-        """Time of the world of each step that was flown [ns]."""
+        """Virtual time of each step that was flown [ns]."""
         self._horizons: deque[tuple[int, int, bytes]] = deque(maxlen=HORIZONS_MAX)
-        """Session, server's life and message of each horizon that was opened."""
+        """Session, server's life and message of each horizon that was received."""
         self._in_force: tuple[int, int, Horizon | Trajectory] | None = None
-        """Horizon or trajectory in force, decoded."""
+        """Session, server's life, and the horizon or trajectory in force."""
         self._observed = -1
-        """Step of the observation that the plan in force was made from."""
+        """Step of the observation that the plan in force is based on."""
         self._course: Course | None = None
-        """Course of the plan in force."""
+        """Inputs that the plan in force prescribes."""
         self._covered = False
         """Whether the plan in force had an input for the last step."""
         self._speed = 0.0
         """Magnitude of the last input without feedback [m/s]."""
         self.drifted_m = drifted_m
-        """Distance that the vehicle may have flown while frozen, in this life and earlier ones
-        [m]."""
+        """Distance that the vehicle may have flown while frozen, over all lives so far [m]."""
         self.disturbance: Callable[[], Sequence[float]] = tuple
         """Function that returns the filter's disturbance estimate, of each axis [m/s]."""
         self.input = [0.0] * self._terms.axes
         """Input in force, of each axis [m/s]."""
         self.mode = Mode.INIT
-        """Mode of the vehicle."""
         self.step, self.steps, self.missed = -1, 0, 0
         """Newest step, number of steps flown, and number of steps missed."""
         self.planned, self.followed = 0, 0
-        """Number of steps flown by a horizon of inputs, and along a trajectory."""
+        """Number of steps flown by a horizon, and along a trajectory."""
         self.row_ns = -1
-        """Time of the world of the newest step [ns], or -1."""
+        """Virtual time of the newest step [ns], or -1."""
 
     # -- the link ----------------------------------------------------------------------------
 
     def hello(self, payload: bytes, *, now_ns: int) -> bytes:
-        """See `ClientLink`."""
         self._down.seal(self.vehicle, payload, self._number)
         return self._link.hello(payload, now_ns=now_ns)
 
     def seal(self, payload: bytes) -> bytes:
-        """See `ClientLink`."""
         self._down.seal(self.vehicle, payload, self._number)
         return self._link.seal(payload)
 
     def open(self, datagram: bytes, *, now_ns: int) -> bytes | None:
-        """See `ClientLink`; the message must be one that the server has sent to this vehicle."""
+        """Open a message as `ClientLink` does; raises Violation if the server has not sent it."""
         payload = self._link.open(datagram, now_ns=now_ns)
         if payload is None:
             return None
@@ -266,22 +243,19 @@ class WatchedLife(Recorder):
         return payload
 
     def outbox(self) -> list[bytes]:
-        """See `ClientLink`."""
         return self._link.outbox()
 
     def adopt(self, *, now_ns: int) -> None:
-        """See `ClientLink`."""
         self._link.adopt(now_ns=now_ns)
         self._adopted_ns = now_ns
         assert self._welcome is not None
-        # Another life of the server: the link must again be good for a second.
+        # After a restart of the server, the link must be good for a second again.
         if self._session is None or self._welcome[1] != self._session[1]:
             self._good_ns = None
         self._session = self._welcome
         self._hear()
 
     def wants_hello(self, now_ns: int) -> bool:
-        """See `ClientLink`."""
         is_old = self._session is not None and now_ns - self._adopted_ns >= self._rekey_ns
         return is_old or self._link.wants_hello(now_ns)
 
@@ -293,11 +267,7 @@ class WatchedLife(Recorder):
     # -- the record --------------------------------------------------------------------------
 
     def append_row(self, *values: float) -> None:
-        """Check one row of the record.
-
-        Raises:
-            Violation: the row violates an invariant.
-        """
+        """Check a row of the record; raises Violation if it violates an invariant."""
         axes = self._terms.axes
         step, now_ns = int(values[1]), self._clock()
         state, estimate = values[2 : 2 + 2 * axes], values[2 + 4 * axes : 2 + 6 * axes]
@@ -312,8 +282,8 @@ class WatchedLife(Recorder):
         self._check_input(flown)
         self._check_mode(mode, covered=bool(covered), now_ns=now_ns)
         self._check_horizon(step, int(in_force), int(age_ns), now_ns)
-        known = np.reshape(estimate, (axes, 2))
-        self._check_follows(step, known, flown, covered=bool(covered))
+        estimated = np.reshape(estimate, (axes, 2))
+        self._check_follows(step, estimated, flown, covered=bool(covered))
         self._check_silence(mode, flown)
         self._check_place(state[::2], asleep)
         # Without this rule a vehicle that never flies again would pass.
@@ -324,7 +294,6 @@ class WatchedLife(Recorder):
         self.row_ns = now_ns
 
     def _listen(self) -> None:
-        """Count the silence of the link."""
         self._silent = 0 if self._heard else self._silent + 1
         self._heard = False
         if self._silent == self._timeout + 1:
@@ -332,7 +301,6 @@ class WatchedLife(Recorder):
             self._speed_lost = math.hypot(*self.input)
 
     def _check_input(self, flown: list[float]) -> None:
-        """Check that the input is finite, within its bound, and changes no faster than allowed."""
         for u, before, most in zip(flown, self.input, self._terms.u_max, strict=True):
             if not math.isfinite(u):
                 raise Violation("finite", f"an input of {u}")
@@ -342,29 +310,27 @@ class WatchedLife(Recorder):
                 raise Violation("slew", f"from {before:.4f} to {u:.4f} m/s in a step")
 
     def _check_mode(self, mode: Mode, *, covered: bool, now_ns: int) -> None:
-        """Check that the table allows the mode, and that no horizon is flown after a freeze."""
+        """Check that the table of modes allows the mode, and that no horizon is flown after a
+        freeze.
+        """
         if mode not in REACHED[self.mode]:
             raise Violation("table", f"from {self.mode} to {mode}")
         if mode is Mode.FAULT:
             raise Violation("table", "in fault, with a state and an input that are finite")
         if covered != (mode in FLYING):
             raise Violation("table", f"{mode}, and a horizon is {'' if covered else 'not '}flown")
-        # By the world's clock: the vehicle's own may have been set or have stood still.
+        # By virtual time: the vehicle's own clock may have been set, or have stood still.
         late_ns = now_ns - self.row_ns - self._dt_ns
         if self.row_ns >= 0 and late_ns > STALL_NS + MILLISECOND_NS and mode in FLYING:
             raise Violation("asleep", f"{mode} on waking {late_ns / SECOND_NS:.2f} s late")
 
     def check_change(self, before: str, after: str) -> None:
-        """Check a reported change of mode.
-
-        Raises:
-            Violation: the table has no such transition.
-        """
+        """Check a reported change of mode; raises Violation if the table has no such transition."""
         if (before, after) not in MOVES:
             raise Violation("table", f"from {before} to {after} at once")
 
     def _check_horizon(self, step: int, in_force: int, age_ns: int, now_ns: int) -> None:
-        """Check that the horizon was sent by the server's present life for this session, and is not
+        """Check that the horizon in force is from the server's present life and session, and is not
         too old.
         """
         if in_force == NO_HORIZON:
@@ -375,7 +341,7 @@ class WatchedLife(Recorder):
             self._in_force = self._find(in_force)
             self._course = None
             good_ns = self._good_ns
-            # Two steps of tolerance: a packet is noticed at the beginning of the next step.
+            # Two steps of tolerance: the client notices a packet at the beginning of the next step.
             if good_ns is None or now_ns - good_ns < GOOD_NS - 2 * self._dt_ns:
                 since = "never" if good_ns is None else f"{(now_ns - good_ns) / SECOND_NS:.3f} s"
                 raise Violation("good link", f"a horizon is flown, the link is good since {since}")
@@ -393,7 +359,7 @@ class WatchedLife(Recorder):
                 self._course = PlannedCourse(horizon, min(horizon.inputs.shape[1], last), terms)
 
     def _find(self, made_for: int) -> tuple[int, int, Horizon | Trajectory]:
-        """Find the horizon in force, by the step that it was made for and its observation."""
+        """Horizon in force, identified by its step and its observation."""
         # The step alone is ambiguous: two lives of the server may have planned for the same step.
         for session, life, payload in reversed(self._horizons):
             horizon = decode(payload, self._terms)
@@ -403,10 +369,11 @@ class WatchedLife(Recorder):
         raise Violation("foreign", f"a horizon for step {made_for} that was never received")
 
     def _check_follows(self, step: int, state: Array, flown: list[float], *, covered: bool) -> None:
-        """Check that the input follows the horizon within the rate limit, and that none is too old.
+        """Check that the input follows the horizon within the rate limit, and that its plan is not
+        too old.
 
-        After the horizon's last input the vehicle must follow the braking curve: without feedback,
-        its speed must not exceed the prescribed one.
+        After the horizon's last input the vehicle must brake: without feedback, its speed must not
+        exceed the braking curve.
         """
         course, before = self._course, np.array(self.input)
         if course is None:
@@ -419,7 +386,7 @@ class WatchedLife(Recorder):
         prescribed = course.prescribed(stage)
         if not covered:
             most = max(0.0, self._speed - (0.0 if self._covered else self._terms.brake))
-        # After the last input, the part without feedback must not accelerate.
+        # After the last input, the input without feedback must not grow.
         speed = max(float(np.linalg.norm(prescribed)), ROUNDING)
         left_out = prescribed * (1.0 - min(1.0, most / speed))
         bound = np.array(self._terms.u_max)
@@ -441,7 +408,7 @@ class WatchedLife(Recorder):
     def _check_age(self, step: int, observed: int) -> None:
         """Check that the observation behind the input is not older than allowed."""
         limit_ns = self._terms.age_max * self._dt_ns
-        # By both clocks: a vehicle whose clock is slow must not fly old inputs either.
+        # By both clocks: a vehicle with a slow clock must not fly old inputs either.
         old_ns = max(self._clock() - self._times_ns[observed], (step - observed) * self._dt_ns)
         if old_ns > limit_ns + 2 * self._dt_ns or step - observed > self._terms.age_max:
             raise Violation(
@@ -449,7 +416,7 @@ class WatchedLife(Recorder):
             )
 
     def _check_silence(self, mode: Mode, flown: list[float]) -> None:
-        """Check that the vehicle brakes while the link is lost; a landing one may also descend."""
+        """Check that the vehicle brakes while the link is lost; during landing it may descend."""
         lost = self._silent - self._timeout - 1
         if lost < 0:
             return
@@ -464,11 +431,13 @@ class WatchedLife(Recorder):
             raise Violation("brakes", f"{speed:.3f} m/s after {silent_s:.2f} s of silence")
 
     def _check_place(self, position: tuple[float, ...], asleep: int) -> None:
-        """Check that the vehicle is near the reference, or within reach of unplanned flight."""
+        """Check that the vehicle is near the reference, or within the distance that a flight
+        without plans allows.
+        """
         away = max(
             max(low - p, p - high) for p, (low, high) in zip(position, self._extent, strict=True)
         )
-        if away <= MARGIN_M:  # the vehicle is back at the reference
+        if away <= MARGIN_M:  # back at the reference
             self.drifted_m = 0.0
         # A frozen vehicle flies on with its last input.
         self.drifted_m += _speed_max(self._terms) * asleep * self._terms.dt_s
@@ -480,7 +449,7 @@ MOVES = frozenset(
     {(str(mode), str(after)) for (mode, _), after in TABLE.items()}
     | {(str(mode), str(mode)) for mode in Mode}
 )
-"""Pairs of a mode and a mode that the table reaches from it in one transition, by name."""
+"""Pairs of mode names that the table connects by one transition, or that are equal."""
 
 
 def _reached(mode: Mode) -> frozenset[Mode]:
@@ -497,24 +466,21 @@ REACHED = {mode: _reached(mode) for mode in Mode}
 
 
 def _session(payload: bytes) -> int:
-    """Session number in a message of the server."""
     session: int = msgpack.unpackb(payload)[3]
     return session
 
 
 def _speed_max(terms: Terms) -> float:
-    """Largest steady speed on an axis [m/s]."""
     return max(gain * u_max for gain, u_max in zip(terms.gain, terms.u_max, strict=True))
 
 
 def _reach_m(age_max_s: float, terms: Terms) -> float:
     """Largest distance of a vehicle from the region of the reference [m]."""
-    # At full speed for as long as an input may be old, a second to brake, and the dead time.
+    # At full speed for the largest age of an input, one second of braking, and the dead time.
     return _speed_max(terms) * (age_max_s + 1.0 + max(terms.dead_time_s)) + MARGIN_M
 
 
 def _extent(scenario: Scenario) -> list[tuple[float, float]]:
-    """Smallest and largest coordinate of the reference on each axis [m]."""
     times = np.linspace(0.0, scenario.reference.period_s, 200)
     positions = scenario.make_reference()(times)[:, :, 0]
     return list(zip(positions.min(axis=0).tolist(), positions.max(axis=0).tolist(), strict=True))
@@ -529,17 +495,12 @@ LARGE = {
 }
 """Bounds of containers by attribute name, where they differ from BOUND."""
 BOUND = max(EVENTS_MAX, 2048)
-"""Largest number of items in a container of an endpoint."""
 OURS = tuple(f"skytether.{room}." for room in ("server", "client", "netem", "shared"))
 """Packages whose objects are searched for containers."""
 
 
 def check_bounds(name: str, endpoint: object) -> None:
-    """Check that no container within an endpoint exceeds its bound.
-
-    Raises:
-        Violation: a container does.
-    """
+    """Check that no container within an endpoint exceeds its bound; otherwise raise Violation."""
     for attribute, size in _sizes(endpoint, name, set()):
         bound = LARGE.get(attribute.rpartition(".")[2], BOUND)
         if size > bound:
@@ -547,14 +508,13 @@ def check_bounds(name: str, endpoint: object) -> None:
 
 
 def _sizes(thing: Any, name: str, seen: set[int]) -> Iterator[tuple[str, int]]:
-    """Names and sizes of all containers within an object."""
     # Parts of an endpoint refer to each other in circles.
     if id(thing) in seen:
         return
     seen.add(id(thing))
     if isinstance(thing, dict | list | deque | set):
         yield name, len(thing)
-        # More items than the bound are a violation already, so the others are not searched.
+        # A container above its bound is a violation anyway, so the items beyond need no search.
         for each in list(thing.values() if isinstance(thing, dict) else thing)[:BOUND]:
             yield from _sizes(each, name, seen)
     elif type(thing).__module__.startswith(OURS):

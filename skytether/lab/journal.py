@@ -57,7 +57,6 @@ class StudyJournal(Generic[E]):
             raise
 
     def _agree(self, folder: Path, settings: Mapping[str, Any]) -> None:
-        """Write the settings, or compare them with existing ones."""
         path = folder / SETTINGS
         text = msgspec.toml.encode(settings)
         if not path.exists():
@@ -77,7 +76,6 @@ class StudyJournal(Generic[E]):
                 )
 
     def _read(self, decoder: msgspec.json.Decoder[tuple[str, E]]) -> None:
-        """Read existing results, and set the position for the next line."""
         assert self._file is not None
         whole = 0
         for number, line in enumerate(self._file, start=1):
@@ -97,7 +95,6 @@ class StudyJournal(Generic[E]):
         self._file.truncate()
 
     def add(self, name: str, result: E) -> None:
-        """Store the result of a cell on disk."""
         self.results[name] = result
         if self._file is not None:
             self._file.write(sealed(msgspec.json.encode((name, result))))
@@ -105,13 +102,11 @@ class StudyJournal(Generic[E]):
             os.fsync(self._file.fileno())
 
     def close(self) -> None:
-        """Release the folder for other commands."""
         if self._file is not None:
             self._file.close()
 
 
 def name_of(key: Any) -> str:
-    """Name of a cell, from its key."""
     return msgspec.json.encode(key).decode()
 
 
@@ -121,7 +116,7 @@ def sealed(content: bytes) -> bytes:
 
 
 def digests(scenarios: Sequence[Scenario]) -> dict[str, str]:
-    """Digests of all files and plug-ins that some scenarios name, as a part of the settings."""
+    """Digests of all files and plug-ins that some scenarios name, for the settings."""
     files = {file.name: digest(file.content) for each in scenarios for file in each.files}
     entries = (entry for each in scenarios for entry in each.entries())
     plugged = {entry.source: entry.version for entry in entries if not entry.is_ours}
@@ -129,5 +124,4 @@ def digests(scenarios: Sequence[Scenario]) -> dict[str, str]:
 
 
 def digest(content: bytes) -> str:
-    """Digest of the content of a file."""
     return hashlib.blake2b(content, digest_size=8).hexdigest()

@@ -1,7 +1,6 @@
 """Text of docs/keys.md, made from `shared/scenario/schema.py`; `make keys` writes it.
 
-The text of each key is its docstring in the source, as in `--help`; the unit is taken from the
-docstring's brackets.
+A key's meaning is its docstring there, as in `--help`; its unit stands in the docstring's brackets.
 """
 
 import inspect
@@ -33,12 +32,10 @@ page is for looking up; `make keys` makes it from `shared/scenario/schema.py`.
 
 
 def document() -> str:
-    """Complete text of the document."""
     return "\n".join([HEAD, *_tables(Scenario, "", inspect.getdoc(Scenario) or "")])
 
 
 def _tables(section: type[Section], prefix: str, about: str) -> Iterator[str]:
-    """Tables of a section's keys, and of its nested sections."""
     descriptions = meanings(section)
     rows: list[str] = []
     within: list[str] = []
@@ -71,7 +68,6 @@ def _row(name: str, field: msgspec.structs.FieldInfo, sentence: str) -> str:
 
 
 def values(kind: Any) -> str:
-    """Allowed values of a key's type, in words."""
     origin, parts = get_origin(kind), get_args(kind)
     if origin is Annotated:
         metas = [each for each in parts if isinstance(each, msgspec.Meta)]
@@ -96,7 +92,6 @@ def _either(kinds: list[str]) -> str:
 
 
 def _bounded(kind: type, meta: msgspec.Meta) -> str:
-    """Allowed range of a number, in words; "text" for a text of any allowed length."""
     if kind is str:
         return "text"
     low = _number(meta.ge) if meta.gt is None else f"more than {_number(meta.gt)}"
@@ -104,13 +99,12 @@ def _bounded(kind: type, meta: msgspec.Meta) -> str:
 
 
 def _number(value: float | None) -> str:
-    """Bound of a number, in its shortest form."""
     assert value is not None  # every number of a scenario has bounds
     return str(value) if isinstance(value, int) else f"{value:g}".replace("e+0", "e")
 
 
 def _toml(value: object) -> str:
-    """Value in the form that TOML and JSON share."""
+    """Value in a notation that is valid in TOML and in JSON."""
     return msgspec.json.encode(value).decode()
 
 

@@ -1,7 +1,7 @@
 """Missions in virtual time in which server and clients stop and restart.
 
-A life is one run of a process. A vehicle flies on without its client, as with an autopilot: it
-keeps its last velocity for HOLD_NS and then rests. Keys set by the operator survive the server.
+A life is one run of a process. Without its client a vehicle keeps its last velocity for HOLD_NS and
+then rests, as with an autopilot. Keys set by the operator survive a restart of the server.
 """
 
 import io
@@ -37,18 +37,13 @@ from skytether.sim.world import Clock, World
 
 NETWORK: Address = ("netem", 0)
 CLOCK = Clock(10**6 * SECOND_NS)
-"""Clock of all hosts; its offset has no effect, as the server estimates clock offsets."""
+"""Clock of all hosts. Its offset has no effect, because the server estimates clock offsets."""
 HOLD_NS = SECOND_NS
-"""Time for which a vehicle keeps its last velocity while its client is down; then it stops [ns]."""
+"""Time for which a vehicle without a client keeps its last velocity before it stops [ns]."""
 
 
 class Body(SimulatedVehicle):
-    """Simulated vehicle that flies on without its client.
-
-    Args:
-        scenario: scenario of the flight.
-        number: number of the vehicle.
-    """
+    """Simulated vehicle that flies on without its client."""
 
     def __init__(self, scenario: Scenario, number: int) -> None:
         weather = Weather(scenario, stream(scenario.seed, "wind", number))
@@ -58,7 +53,6 @@ class Body(SimulatedVehicle):
         """Times [s; client's clock] and positions [m] of steps without a client."""
 
     def fly_alone(self, now_ns: int) -> None:
-        """Fly without a client up to the present step."""
         measurements, lost, velocity = list[Measurement](), self._step, self._velocity
         while lost >= 0 and self._began_ns + (self._step + 1) * self._dt_ns <= now_ns:
             is_held = (self._step - lost) * self._dt_ns < HOLD_NS
@@ -78,18 +72,14 @@ def _sensor(scenario: Scenario, number: int, life: int) -> Sensor:
 
 
 class Life(NamedTuple):
-    """Run of a vehicle's client."""
-
     client: Client
     sink: io.BytesIO
-    """Record of its steps."""
 
 
 class Lives:
     """Mission whose server and clients can be stopped and restarted.
 
     Args:
-        scenario: scenario of the mission.
         network: endpoint between clients and server; the scenario's network unless given.
         mortal: numbers of vehicles whose clients may stop; only these save their state.
     """
@@ -104,21 +94,20 @@ class Lives:
         assert isinstance(mission, Mission)
         self.scenario, self.mission = scenario, mission
         self.events: list[tuple[float, str, Event]] = []
-        """Time of the world [s], host and event."""
+        """Virtual time [s], host and event."""
         self.world = World(self._on_event)
         flows = 2 * len(mission.vehicles)
         self.world.add(NETWORK[0], network or Proxy(scenario, server=SERVER, flows=flows))
         self._mortal = mission.vehicles if mortal is None else mortal
         self._lives: dict[int, list[Life]] = {number: [] for number in mission.vehicles}
         self.bodies = {number: Body(scenario, number) for number in mission.vehicles}
-        """Vehicles by number."""
         for number in mission.vehicles:
             start_ns = int(stream(scenario.seed, "phase", number).integers(scenario.dt_ns))
             client = self._client(number, remembers=False)
             self.world.add(f"client {number}", client, clock=CLOCK, start_ns=start_ns)
         self._servers = 0
         self.running: Running | None = None
-        """Server and its scenario, while the server runs."""
+        """Server and its scenario; None while the server is down."""
         self._settings: Mapping[str, Any] = {}
         """Keys set in flight, as the server's journal stores them."""
         self.world.add(SERVER[0], self._server(scenario), clock=CLOCK)
@@ -127,7 +116,6 @@ class Lives:
         self.events.append((time_ns / SECOND_NS, host, event))
 
     def _server(self, scenario: Scenario) -> Server:
-        """Make the next life of the server."""
         self._servers += 1
         entropy = stream(scenario.seed, "entropy", self._servers).bytes
         count = len(self.mission.vehicles)
@@ -136,7 +124,6 @@ class Lives:
         return self.server
 
     def _client(self, number: int, *, remembers: bool) -> Client:
-        """Make the next life of a vehicle's client."""
         lives, before, sink = self._lives[number], None, io.BytesIO()
         if remembers and (kept := self.world.memory(f"client {number}")):
             before = recall(*kept, CLOCK.local(self.world.now_ns), self.scenario.terms())
@@ -154,21 +141,16 @@ class Lives:
         return client
 
     def _keeps(self, number: int) -> bool:
-        """Whether a vehicle's client saves its state."""
         return number in self._mortal and self.scenario.vehicle.memory != "none"
 
     # -- stops and restarts ------------------------------------------------------------------------
 
     def stop_client(self, number: int) -> None:
-        """Stop a vehicle's client."""
         self.world.stop(f"client {number}")
 
     def start_client(self, number: int, *, remembers: bool = True) -> None:
-        """Start the next life of a vehicle's client.
-
-        Args:
-            number: number of the vehicle.
-            remembers: whether it finds the saved state of the previous life.
+        """Start the next life of a vehicle's client; `remembers` tells whether it finds the saved
+        state.
         """
         body, remembers = self.bodies[number], remembers and self._keeps(number)
         body.fly_alone(CLOCK.local(self.world.now_ns))
@@ -177,7 +159,6 @@ class Lives:
         self.world.restart(f"client {number}", self._client(number, remembers=remembers))
 
     def stop_server(self) -> None:
-        """Stop the server."""
         if self.running is not None:
             self._settings, self.running = self.running.settings, None
         self.world.stop(SERVER[0])
@@ -195,15 +176,15 @@ class Lives:
         self.world.restart(SERVER[0], self._server(scenario))
 
     def set(self, values: Mapping[str, Any]) -> None:
-        """Set keys at the server, as an operator; it may refuse them."""
+        """Set keys at the server, as an operator; the server may refuse them."""
         if self.running is not None:
-            with suppress(ConfigError):  # the refusal is an event
+            with suppress(ConfigError):  # a refusal is logged as an event
                 self.world.act(SERVER[0], partial(self.running.change, values))
 
     # -- the flight --------------------------------------------------------------------------------
 
     def track(self, number: int) -> Track:
-        """Track of a vehicle through all its lives, from its first step on the mission."""
+        """Flown path of a vehicle through all its lives, from its first step on the mission."""
         dt_s, scale = self.scenario.control.dt, self.scenario.mission.height_scale
         tracks: list[Track] = []
         for client, sink in self._lives[number]:
@@ -214,7 +195,7 @@ class Lives:
         if not tracks:
             return np.zeros(0), np.zeros((0, self.scenario.model.axes))
         body = self.bodies[number]
-        # A vehicle without a client, or with one that is refused, stays at its last position.
+        # A vehicle without a client, or with a refused one, stays at its last position.
         now = CLOCK.local(self.world.now_ns) / SECOND_NS, body.plant.state()[:, 0].tolist()
         times, at = (np.array(each) for each in zip(*body.unflown, now, strict=True))
         at[:, 2:] *= scale
@@ -225,14 +206,12 @@ class Lives:
         return times[order], at[order]
 
     def tracks(self) -> dict[int, Track]:
-        """Track of every vehicle, by number."""
         return {number: self.track(number) for number in self._lives}
 
     def run(self, until_s: float) -> None:
-        """Fly until a time of the world [s]."""
         self.world.run(lambda: False, limit_ns=seconds_to_ns(until_s))
 
 
 def world_s(time_s: float) -> float:
-    """Time of the world for a time on the hosts' clock [s]."""
+    """Virtual time for a time on the hosts' clock [s]."""
     return float(time_s) - CLOCK.offset_ns / SECOND_NS

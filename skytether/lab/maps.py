@@ -1,11 +1,10 @@
 """Margin maps: flights of vehicles that differ from the model, over a grid of differences.
 
 Each point of the grid is flown without wind in two ways: hovering, from a start START_M beside the
-hover point; and along the scenario's reference. Hovering without disturbance, a vehicle whose loop
-is stable comes to rest. If its RMS distance from the hover point is above REST_M in the last
-quarter of the flight, and above SUSTAINED of that in the quarter before, it is in a limit cycle: it
-oscillates between the bounds of its input. The table also has the growth after a push
-(`lab.margins`).
+hover point, and along the scenario's reference. In a stable loop the hovering vehicle comes to
+rest. It is in a limit cycle, an oscillation between the bounds of its input, if its RMS distance
+from the hover point is above REST_M in the last quarter of the flight, and above SUSTAINED times
+that of the quarter before. The table also has the growth after a push (`lab.margins`).
 """
 
 from collections.abc import Iterable, Sequence
@@ -34,21 +33,18 @@ from skytether.sim.flight import fly_batch
 START_M = 1.0
 """Initial distance from the hover point, along the first axis [m]."""
 REST_S = 60.0
-"""Length of the hovering flights [s]."""
 REST_M = 0.05
-"""RMS distance from the hover point above which a vehicle has not come to rest [m]."""
+"""RMS distance from the hover point below which a vehicle counts as at rest [m]."""
 SUSTAINED = 0.7
 """Ratio of the last quarter's RMS distance to that of the quarter before, above which the
-oscillation does not decay."""
+oscillation does not decay.
+"""
 RUNS = 2
 """Number of flights of each kind at a point, with seeds that count up from the scenario's."""
 PUSHES = 4
-"""Number of seeds for the growth after a push."""
 
 
 class Place(NamedTuple):
-    """Coordinates of a point in the box."""
-
     burst_s: float
     """Mean burst length of loss, both ways [s]; 0 for independent losses."""
     dead_time_s: float
@@ -60,10 +56,7 @@ class Place(NamedTuple):
 
 
 class MapPoint(msgspec.Struct, frozen=True):
-    """Results of a point; an entry of a map's journal."""
-
     cycles: bool
-    """Whether a hovering flight ended in a limit cycle."""
     rest_m: float
     """Largest RMS distance in the last quarter of the hovering flights [m]."""
     rmse_m: float | None
@@ -71,17 +64,14 @@ class MapPoint(msgspec.Struct, frozen=True):
     saturated: float | None
     """Share of the steps along the reference with an input at its bound."""
     event_ratio: float | None
-    """Share of the server's steps along the reference that sent a horizon."""
+    """Share of the server's steps along the reference that sent a plan."""
     growth: float
     """Growth of the mean square per step after a push."""
 
 
 @dataclass(frozen=True, slots=True)
 class Box:
-    """Scenario, and the grid of differences from it."""
-
     name: str
-    """Name of the scenario."""
     scenario: Scenario
     trigger: str
     """Trigger of the pushes, see `lab.margins.clocked_trigger`."""
@@ -92,11 +82,9 @@ class Box:
 
     @property
     def places(self) -> list[Place]:
-        """All points, by their number."""
         return [Place(*at) for at in product(self.burst_s, self.dead_time_s, self.gain, self.tau)]
 
     def settings(self) -> dict[str, Any]:
-        """Settings that determine all points, as plain values."""
         files, table = digests([self.scenario]), reading.to_table(self.scenario)
         box = {
             "tau": self.tau,
@@ -108,7 +96,6 @@ class Box:
         return {"name": self.name, "box": box, "files": files, "scenario": table}
 
     def scenario_of(self, number: int) -> Scenario:
-        """Scenario of a point, without wind."""
         burst_s, dead_time_s, gain, tau = self.places[number]
         network = self.scenario.network
         if burst_s:
@@ -140,7 +127,6 @@ class Box:
         )
 
     def csv(self, points: Iterable[MapPoint]) -> str:
-        """CSV table with a row for each point: coordinates and results."""
         each = enumerate(zip(self.places, points, strict=True))
         rows = [
             [number, *place, *msgspec.structs.astuple(point)] for number, (place, point) in each
@@ -149,7 +135,7 @@ class Box:
 
 
 def _in_bursts(direction: str, burst_s: float) -> str:
-    """Impairments of a direction with its losses in bursts of a mean length [s]."""
+    """Impairments of a direction, with its losses in bursts of a mean length [s]."""
     calls = IMPAIRMENTS.calls(direction)
     share = next((call.values[0] for call in calls if call.name == "loss"), 0.0)
     others = [call.text for call in calls if call.name != "loss"]
@@ -157,13 +143,12 @@ def _in_bursts(direction: str, burst_s: float) -> str:
 
 
 def at_rest(scenario: Scenario) -> Scenario:
-    """Scenario of a hovering flight that starts START_M beside the hover point."""
     beside, still = (START_M,) + (0.0,) * (scenario.model.axes - 1), hovering(scenario, REST_S)
     return replace(still, vehicle=replace(still.vehicle, start_m=beside))
 
 
 def resting(scenario: Scenario, client: Rows) -> tuple[float, float]:
-    """Root mean square distance from the point, in the last two quarters [m]."""
+    """RMS distance from the hover point in each of the last two quarters [m]."""
     squares: Array = (position_error(scenario, client) ** 2).sum(axis=1)
     if not len(squares):
         return 0.0, 0.0
@@ -173,16 +158,14 @@ def resting(scenario: Scenario, client: Rows) -> tuple[float, float]:
 
 
 def _mean(values: Iterable[float | None]) -> float | None:
-    known = [value for value in values if value is not None]
-    return float(np.mean(known)) if known else None
+    present = [value for value in values if value is not None]
+    return float(np.mean(present)) if present else None
 
 
 def draw(path: Path, title: str, box: Box, points: Sequence[MapPoint]) -> None:
     """Draw the RMSE over time constant and gain, a map for each dead time and length of bursts.
 
-    Args:
-        path: file to write.
-        points: all points of the box, by number.
+    `points` are all points of the box, by number.
     """
     from matplotlib.colors import LogNorm
     from matplotlib.lines import Line2D
@@ -193,15 +176,15 @@ def draw(path: Path, title: str, box: Box, points: Sequence[MapPoint]) -> None:
     grows = np.array([point.growth >= 1.0 for point in points]).reshape(shape)
     figure = blank(1.2 + 2.5 * shape[1], 1.4 + 2.3 * shape[0])
     planes = figure.subplots(shape[0], shape[1], squeeze=False, sharex=True, sharey=True)
-    known = rmse[np.isfinite(rmse)]
-    low, high = (float(known.min()), float(known.max())) if known.size else (0.01, 0.1)
+    finite = rmse[np.isfinite(rmse)]
+    low, high = (float(finite.min()), float(finite.max())) if finite.size else (0.01, 0.1)
     norm = LogNorm(low, max(high, 1.01 * low))
     across, up = (np.arange(len(values)) for values in (box.tau, box.gain))
     for row, burst_s in enumerate(box.burst_s):
         for column, dead_time_s in enumerate(box.dead_time_s):
-            plane, here = planes[row, column], (row, column)
-            mesh = plane.pcolormesh(across, up, rmse[here], norm=norm, shading="nearest")
-            for marks, style in ((grows[here], GROWS), (cycles[here], CYCLES)):
+            plane, cell = planes[row, column], (row, column)
+            mesh = plane.pcolormesh(across, up, rmse[cell], norm=norm, shading="nearest")
+            for marks, style in ((grows[cell], GROWS), (cycles[cell], CYCLES)):
                 y, x = np.nonzero(marks)
                 plane.plot(x, y, **style)
             bursts = f"bursts of {burst_s:g} s" if burst_s else "no bursts"

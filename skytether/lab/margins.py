@@ -3,17 +3,17 @@ from the model.
 
 The loop is flown in virtual time: vehicle, server and network of a scenario, hovering. There are
 three kinds of flights.
-
     push   only a weak wind for PUSH_S; h(n): mean over seeds and axes of p² n steps after it
            growth = lim h(n+1) / h(n), of the mean square; below 1 the loop is stable
     wind   only the scenario's white wind and noise: root mean square of p and u
     rest   no wind, START_M beside the hover point: a vehicle that does not come to rest is in a
            limit cycle, an oscillation between the bounds of its input (`lab.maps`)
 
-The growth is that of the linear loop. Bounds: only steps before an input reaches SMALL of its bound
-are used. Noise: the flight is repeated without the push, and p is the difference. Thresholds: a
-weak push stays below all of them, so a trigger that uses the state would never send; it is replaced
-by a periodic one with its measured rate. Wind and rest are flown with the scenario's own trigger.
+The growth is that of the linear loop, so nonlinear effects are removed. Bounds: only steps before
+an input reaches SMALL of its bound are used. Noise: the flight is repeated without the push, and p
+is the difference. Thresholds: a weak push stays below all of them, so a trigger that uses the state
+would never send; it is replaced by a periodic one with its measured rate. Wind and rest are flown
+with the scenario's own trigger.
 """
 
 import math
@@ -34,38 +34,35 @@ from skytether.shared.telemetry.summary import AT_BOUND
 from skytether.sim.flight import fly_batch
 
 PUSH_S, FOLLOWED_S = 0.25, 24.0
-"""Length of a push, and time for which its response is evaluated [s]: six time constants of a
-typical disturbance observer."""
+"""Length of a push, and time for which its response is evaluated, six time constants of a typical
+disturbance observer [s].
+"""
 PUSH = 1e-4
-"""Strength of the push, a white acceleration [m/s per √s]: too weak to reach any bound or
-threshold, and well above the rounding errors of messages with noise of some centimetres."""
+"""White acceleration of the push [m/s per √s]: too weak to reach a bound or threshold, and well
+above the rounding errors of messages with a noise of some centimetres.
+"""
 FLOOR = 1e-9
-"""Share of its largest value below which a mean square is rounding."""
+"""Share of its largest value below which a mean square counts as rounding error."""
 SETTLE_S, ROUND_TRIPS = 5.0, 4.0
-"""Time [s], plus a number of mean round trips, before a push: by then sessions are open and the
-delay bound is stationary."""
+"""Time before a push: seconds, plus a number of mean round trips. By then sessions are open and the
+delay bound is stationary.
+"""
 WIND_S, WIND_BUILDS_S = 60.0, 10.0
-"""Time for which the response to wind is evaluated, and time before that in which it builds up
-[s]."""
+"""Time for which the response to wind is evaluated, and the time before for its build-up [s]."""
 SMALL = 0.05
-"""Share of an input's bound up to which the response to a push is evaluated, so that no bound
-acts."""
+"""Share of an input's bound up to which a response is evaluated, so that no bound acts."""
 STEPS_MIN = 10
-"""Smallest number of steps from which a rate of growth can be estimated."""
+"""Smallest number of steps from which a growth can be estimated."""
 WIND_ALONE = 0.1
 """Wind if the scenario has neither wind nor noise [m/s per √s]."""
 CLOCK_ONLY = ("always", "periodic", "silence", "budget")
-"""Policies that do not use the state."""
+"""Triggers that do not use the state."""
 RATE_RUNS, LIMIT_RUNS = 4, 4
-"""Number of seeds for the rate of a trigger, and largest number for each step of a limit's
-bisection."""
+"""Number of seeds for the rate of a trigger, and largest number for each bisection of a limit."""
 HALVINGS = 7
-"""Number of bisections for a limit."""
 
 
 class Differing(NamedTuple):
-    """Differences of a vehicle and its network from the model."""
-
     tau: float = 1.0
     """Time constants relative to those of the model."""
     gain: float = 1.0
@@ -80,7 +77,6 @@ class Differing(NamedTuple):
         return min(scenario.terms().dead_time_s) + self.dead_time_s >= 0.0
 
     def of(self, scenario: Scenario) -> Scenario:
-        """Scenario with this vehicle and network."""
         terms, network = scenario.terms(), scenario.network
         vehicle = replace(
             scenario.vehicle,
@@ -124,35 +120,30 @@ LIMITS: dict[str, tuple[str, float, float]] = {
 
 
 class Margin(msgspec.Struct, frozen=True, kw_only=True):
-    """Results for one vehicle."""
-
     vehicle: str
-    """Name of the vehicle in a table."""
     growth: float
-    """Growth of the mean square per step."""
     growth_ci95: float | None
-    """Half-width of the growth's 95 % interval over seeds; None for a single seed."""
+    """Half-width of the 95 % interval over seeds; None for a single seed."""
     stable: bool
     """Whether the upper end of the growth's interval is below 1."""
     rms_m: tuple[float, ...] | None
-    """Root mean square of the position's deviation, of each axis [m]; None if unstable."""
+    """RMS deviation of the position on each axis [m]; None if unstable."""
     rms_ci95_m: tuple[float, ...] | None
     """Half-width of the 95 % interval of `rms_m`; None if unstable, or for a single seed."""
     rms_input_mps: tuple[float, ...] | None
-    """Root mean square of the input, of each axis [m/s]; None if unstable."""
+    """RMS input on each axis [m/s]; None if unstable."""
     saturated: float | None
     """Share of the steps with an input at its bound on some axis; None if unstable."""
 
 
 class MarginLimit(msgspec.Struct, frozen=True, kw_only=True):
-    """Limit of one quantity, up to which the loop is stable, with all others equal."""
+    """Limit of one quantity up to which the loop is stable, with all other quantities unchanged."""
 
     quantity: str
     """Name of the quantity in a table."""
     searched: float
-    """Last value of the search."""
     value: float | None
-    """The limit; None if the loop is stable at `searched`."""
+    """The limit; None if the loop is stable at `searched`, the last value of the search."""
 
 
 def uses_state(scenario: Scenario) -> bool:
@@ -171,11 +162,7 @@ def clocked_trigger(scenario: Scenario) -> str:
 
 
 def hovering(scenario: Scenario, duration: float) -> Scenario:
-    """Scenario of a simulated vehicle that hovers at the origin without wind.
-
-    Args:
-        duration: length of the flight [s].
-    """
+    """Scenario of a simulated vehicle that hovers at the origin without wind for `duration` [s]."""
     origin = (0.0,) * scenario.model.axes
     flown = windless(scenario)
     return replace(
@@ -193,13 +180,11 @@ def settled_s(scenario: Scenario) -> float:
 
 
 def windless(scenario: Scenario) -> Scenario:
-    """Scenario without any wind."""
     calm = replace(scenario.vehicle, wind=0.0, steady_wind_mps=(), gust_mps2=0.0)
     return replace(scenario, vehicle=calm)
 
 
 def _flown(scenario: Scenario, runs: int, **keys: Any) -> list[Record]:
-    """Flights with seeds that count up from the scenario's."""
     return fly_batch(scenario, range(scenario.seed, scenario.seed + runs), **keys)
 
 
@@ -208,10 +193,7 @@ def growth_of(scenario: Scenario, trigger: str, runs: int) -> tuple[float, float
 
     The growth is infinite if SMALL is reached within STEPS_MIN, or if there is no session.
 
-    Args:
-        scenario: scenario of the loop.
-        trigger: see `clocked_trigger`.
-        runs: number of seeds.
+    `trigger` comes from `clocked_trigger`.
     """
     h = _responses(scenario, trigger, runs)
     if h.shape[1] < STEPS_MIN:
@@ -237,7 +219,7 @@ def _responses(scenario: Scenario, trigger: str, runs: int) -> Array:
     if flown.sensor != SensorConfig():
         calm_p, calm_u = _positions_and_inputs(_flown(flown, runs))
         p, u = p - calm_p, u - calm_u
-    if not p.any(axis=(1, 2)).all():  # a vehicle had no session by then
+    if not p.any(axis=(1, 2)).all():  # a vehicle had no session when the push came
         return np.zeros((runs, 0))
     begins = np.argmax(p.any(axis=2), axis=1) + round(PUSH_S / dt)
     steps = min(round((FOLLOWED_S - 2.0) / dt), p.shape[1] - int(begins.max()))
@@ -250,7 +232,6 @@ def _responses(scenario: Scenario, trigger: str, runs: int) -> Array:
 
 
 def _positions_and_inputs(flights: Sequence[Record]) -> tuple[Array, Array]:
-    """Positions [m] and inputs [m/s] of flights; each of shape (runs, steps, axes)."""
     steps = min(len(flight.client) for flight in flights)
     return (
         np.array([flight.client["state"][:steps, :, 0] for flight in flights]),
@@ -261,7 +242,7 @@ def _positions_and_inputs(flights: Sequence[Record]) -> tuple[Array, Array]:
 def _growth(h: Array) -> float:
     """Growth per step in the later part of a response, by least squares of its logarithm.
 
-    Averaging over quarters of the response removes most of slow oscillations.
+    Means over a quarter of the response remove most of slow oscillations.
     """
     (rounded,) = np.nonzero(h < FLOOR * h[:1])
     h = h[: int(rounded[0])] if len(rounded) else h
@@ -277,9 +258,7 @@ def _growth(h: Array) -> float:
 def margin(scenario: Scenario, vehicle: str, trigger: str, runs: int) -> Margin:
     """Margin of a scenario, flown for a number of seeds.
 
-    Args:
-        vehicle: name of the scenario's vehicle.
-        trigger: see `clocked_trigger`.
+    `trigger` comes from `clocked_trigger`.
     """
     growth, half = growth_of(scenario, trigger, runs)
     if growth + (half or 0.0) >= 1.0:
@@ -311,7 +290,6 @@ def margin(scenario: Scenario, vehicle: str, trigger: str, runs: int) -> Margin:
 
 
 def wind_of(scenario: Scenario) -> float:
-    """White wind of the flights of the kind "wind" [m/s per √s]."""
     noises = scenario.sensor.position_noise_m, scenario.sensor.velocity_noise_mps
     alone = not any(noises) and scenario.vehicle.wind == 0.0
     return WIND_ALONE if alone else scenario.vehicle.wind
@@ -322,7 +300,7 @@ def limit(scenario: Scenario, quantity: str, trigger: str, runs: int) -> MarginL
 
     Args:
         quantity: one of LIMITS.
-        trigger: see `clocked_trigger`.
+        trigger: from `clocked_trigger`.
         runs: number of seeds for each value.
     """
     name, near, far = LIMITS[quantity]

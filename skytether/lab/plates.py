@@ -39,7 +39,6 @@ if TYPE_CHECKING:
 COLUMN, PAGE = 3.5, 7.16
 """Width of a figure over one column and over the page [inch]."""
 LETTERS = 8
-"""Size of letters in every figure [points]."""
 STYLES: Mapping[str, Mapping[str, Any]] = {
     NONE: {"color": "0.5", "linestyle": ":", "marker": "s"},
     EVERY: {"color": "black", "linestyle": "-", "marker": "o"},
@@ -48,28 +47,22 @@ STYLES: Mapping[str, Mapping[str, Any]] = {
 }
 """Line style of each method; methods can be told apart without colour."""
 RATIO_LOG = 20.0
-"""Ratio of largest to smallest value above which a scale is logarithmic."""
+"""Ratio of largest to smallest value above which an axis is logarithmic."""
 
 Samples = Mapping[str, tuple[Scenario, Sequence[Record]]]
-"""Scenario and some complete records of flights, by method."""
 
 
 @dataclass(frozen=True, slots=True)
 class Plate(Picture):
-    """Figure of a report, for screen and print, with its numbers."""
-
     pdf: bytes
-    """Drawing for print."""
     csv: str
-    """Numbers in the drawing, as CSV."""
+    """Numbers in the figure, as CSV."""
 
     def files(self) -> dict[str, bytes]:
-        """Content of each of the figure's files, by suffix."""
         return {".png": self.png, ".pdf": self.pdf, ".csv": self.csv.encode()}
 
 
 def picture(figure: "Figure", name: str, title: str, says: str, csv: str) -> Plate:
-    """Figure in all written formats."""
     png, pdf = as_png(figure, 220), io.BytesIO()
     figure.set_layout_engine("none")  # keep the figure's exact size
     figure.savefig(pdf, format="pdf", metadata={"CreationDate": None})
@@ -77,10 +70,10 @@ def picture(figure: "Figure", name: str, title: str, says: str, csv: str) -> Pla
 
 
 def delay(direction: str, delay_ms: Array) -> Plate:
-    """Fig. 2: the delay (17), and the delay that netem added.
+    """Fig. 2: distribution of the delay (17), drawn and measured.
 
-    Args:
-        delay_ms: measured delay of each packet over UDP, and drawn delay [ms]; shape (packets, 2).
+    `delay_ms` has the measured delay of each packet over UDP, and the delay that netem drew [ms];
+    shape (packets, 2).
     """
     took_ms, late_ms = delay_ms[:, 0], delay_ms[:, 0] - delay_ms[:, 1]
     least_s, slot_s, slots_mean, *_ = map(float, IMPAIRMENTS.calls(direction)[0].values)
@@ -88,7 +81,7 @@ def delay(direction: str, delay_ms: Array) -> Plate:
     count = int(stats.poisson.ppf(0.9999, slots_mean)) + 2
     slots = np.arange(count)
     lattice_ms, pdf = first_ms + slot_ms * slots, stats.poisson.pmf(slots, slots_mean)
-    # A packet can be late, never early: any excess of up to a slot is assigned to the drawn slot.
+    # A packet is never early: an excess of up to a slot belongs to the drawn slot.
     nearest = np.floor((took_ms - first_ms) / slot_ms + 0.1)
     share = np.array([np.mean(nearest == slot) for slot in slots])
     fine_ms = np.arange(first_ms - slot_ms, lattice_ms[-1] + 1.0)
@@ -122,7 +115,6 @@ def delay(direction: str, delay_ms: Array) -> Plate:
 
 
 def paths(samples: Samples) -> Plate:
-    """Fig. 3: path without and with compensation, with a packet at every step."""
     rmse, positions = [], []
     with lettered(PAGE, 3.9, LETTERS) as figure:
         planes = figure.subplots(1, 2, sharex=True, sharey=True)
@@ -145,7 +137,6 @@ def paths(samples: Samples) -> Plate:
 
 
 def events(samples: Samples) -> Plate:
-    """Fig. 4: path with the event trigger, and its events below."""
     scenario, flights = samples[EVENT]
     flight, dt = flights[0], scenario.control.dt
     step, wanted, position = _path(scenario, flight)
@@ -178,7 +169,6 @@ def _path(scenario: Scenario, flight: Record) -> tuple[Indices, Array, Array]:
 
 
 def _draw_path(plane: Any, scenario: Scenario, flight: Record) -> None:
-    """Draw the path of a flight over its reference."""
     draw_reference(plane, scenario, flight.client, flight.server)
     position = flight.client["state"][:, :2, 0]
     plane.plot(position[:, 0], position[:, 1], "k-", linewidth=0.8, label="UAV")
@@ -194,8 +184,7 @@ DECAY, EPSILON = "decay rate λ [1/s]", "tolerance ε"
 def maps(flown: CellSummaries, here: ControlConfig) -> Plate:
     """Fig. 5: RMSE and event ratio over the decay rate λ and the tolerance ε.
 
-    Args:
-        here: the paper's own λ and ε, which a cross marks.
+    A cross marks the λ and ε of `here`, the paper's own.
     """
     decay, epsilon, rmse, ratio = _grid(flown)
     here_epsilon, here_decay = TRIGGERS.one(here.trigger).values
@@ -226,11 +215,12 @@ def maps(flown: CellSummaries, here: ControlConfig) -> Plate:
 
 
 DRAWN = ("rmse_xy", "event_ratio")
-"""Figures in the maps, and in the curves beside them."""
 
 
 def _grid(flown: CellSummaries) -> tuple[Array, Array, Array, Array]:
-    """Values of λ and ε; over both, mean RMSE xy [m] and event ratio; shapes (λ,), (ε,), (λ, ε)."""
+    """Values of λ and of ε, and mean RMSE xy [m] and event ratio over both; shapes (λ,), (ε,), (λ,
+    ε).
+    """
     decay, epsilon = (np.unique([values[axis] for values in flown]) for axis in (0, 1))
     shape = (len(decay), len(epsilon))
     rmse, ratio = (
@@ -241,7 +231,7 @@ def _grid(flown: CellSummaries) -> tuple[Array, Array, Array, Array]:
 
 
 def pareto(flown: CellSummaries, periodic: CellSummaries) -> Plate:
-    """Fig. 5 as curves: RMSE against event ratio, with periodic sending for comparison."""
+    """Fig. 5 as curves: RMSE over event ratio, with periodic sending for comparison."""
     decay, _, rmse, ratio = _grid(flown)
     rates, errors = (
         np.array([estimate(runs, name)[0] for runs in periodic.values()], dtype=np.float64)
@@ -284,7 +274,7 @@ def pareto(flown: CellSummaries, periodic: CellSummaries) -> Plate:
 
 
 def curve(study: Study, cells: Cells) -> Plate:
-    """RMSE of all methods against the parameter of a study, with 95 % bands."""
+    """RMSE of all methods over the parameter of a study, with 95 % bands."""
     methods = list(STYLES)
     table = {
         method: np.array(
@@ -300,7 +290,7 @@ def curve(study: Study, cells: Cells) -> Plate:
             halves = np.nan_to_num(halves)
             plane.plot(places, means, **STYLES[method], linewidth=1.0, markersize=3.5, label=method)
             colour = STYLES[method]["color"]
-            low = np.maximum(means - halves, 0.5 * means)  # a logarithmic axis has no 0
+            low = np.maximum(means - halves, 0.5 * means)  # a logarithmic axis cannot show 0
             plane.fill_between(places, low, means + halves, color=colour, alpha=0.2, linewidth=0)
         plane.axvline(study.here, color="0.6", linewidth=0.8)
         means = np.concatenate([table[method][:, 0] for method in methods])
@@ -314,8 +304,8 @@ def curve(study: Study, cells: Cells) -> Plate:
     failed = sum(not run.steps for cell in cells.values() for run in cell.runs)
     says = (
         f"The vertical line is the paper's network and vehicle; {study.runs} runs a point. "
-        f"Periodic sending at the event trigger's own rate flies better than it at {better} of {n} "
-        f"values and worse at {worse} (95 % intervals apart)."
+        f"Periodic sending at the event trigger's own rate has a smaller RMSE than the trigger at "
+        f"{better} of {n} values, and a larger one at {worse} (95 % intervals do not overlap)."
     )
     if failed:
         says += f" {failed} runs without a session are left out of the means."
@@ -335,7 +325,9 @@ def curve(study: Study, cells: Cells) -> Plate:
 
 
 def against_periodic(study: Study, cells: Cells) -> tuple[int, int]:
-    """Number of values at which periodic sending is better than the trigger, and worse."""
+    """Number of values at which periodic sending is better than the event trigger, and at which it
+    is worse.
+    """
     signs = [
         periodic_wins(cells[value, EVENT], cells[value, PERIODIC]) for value in study.axis.values
     ]
@@ -343,7 +335,7 @@ def against_periodic(study: Study, cells: Cells) -> tuple[int, int]:
 
 
 def estimates(samples: Samples) -> Plate:
-    """Distribution of the error of the server's estimate (13)."""
+    """Distribution of the error of the server's state estimate (13)."""
     shares = np.linspace(0.0, 1.0, 201)
     errors = {
         method: np.concatenate([_estimate_error(flight) for flight in flights])
@@ -371,8 +363,8 @@ def estimates(samples: Samples) -> Plate:
 
 
 def _estimate_error(flight: Record) -> Array:
-    """‖x̂ − x‖ of position [m] and velocity [m/s], at steps where both are known; shape (steps,
-    2).
+    """‖x̂ − x‖ of position [m] and velocity [m/s] at steps for which both are recorded; shape
+    (steps, 2).
     """
     _, ours, theirs = np.intersect1d(
         flight.server["step"], flight.client["step"], return_indices=True
@@ -383,7 +375,6 @@ def _estimate_error(flight: Record) -> Array:
 
 
 def intervals(samples: Samples) -> Plate:
-    """Distribution of the time between two packets of the event trigger."""
     scenario, flights = samples[EVENT]
     gaps = np.concatenate(
         [np.diff(flight.server["step"][flight.server["event"]]) for flight in flights]
@@ -412,11 +403,9 @@ def intervals(samples: Samples) -> Plate:
 
 
 def solve_times(servers: Mapping[str, Rows], dt: float) -> Plate:
-    """Distribution of the computing time of both MPCs per step in the flights over UDP.
+    """Distribution of the time per step of both MPCs in the flights over UDP.
 
-    Args:
-        servers: rows of the server's records, by method.
-        dt: length of a step [s].
+    `servers` are the rows of the server's records by method, `dt` the length of a step [s].
     """
     solve_ms = {
         name: rows["solve_ns"][rows["solve_ns"] >= 0] / 1e6 for name, rows in servers.items()

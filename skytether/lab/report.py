@@ -1,4 +1,6 @@
-"""Report: a page of tables and figures that opens offline; and the report of `reproduce`."""
+"""Report: a page of tables and figures that opens offline; and the contents of `reproduce`'s
+report.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -40,28 +42,20 @@ ABOUT = (
 
 @dataclass(frozen=True, slots=True)
 class Real:
-    """Flight over UDP."""
-
     scenario: Scenario
-    """Scenario that was flown."""
     flight: Record
-    """Records of the flight."""
     netem: Mapping[str, Any]
-    """Figures of netem: its counters, and its lateness."""
+    """Counters of netem, and its lateness."""
 
 
 @dataclass(frozen=True, slots=True)
 class Reproduction:
-    """Results of all flights of a reproduction."""
-
     table: tuple[Study, Cells]
-    """Study of Table 1, and its cells."""
     curves: Sequence[tuple[Study, Cells]]
-    """Study of each curve, and its cells."""
     maps: CellSummaries
     """Summaries of Fig. 5, by λ and ε."""
     periods: CellSummaries
-    """Summaries of periodic sending beside Fig. 5, by period."""
+    """Summaries of periodic sending, for Fig. 5 as curves, by period."""
     delay_ms: Array
     """Measured delay of each packet over UDP, and drawn delay [ms]; shape (packets, 2)."""
     real: Mapping[str, Real]
@@ -72,22 +66,15 @@ class Reproduction:
 
 @dataclass(frozen=True, slots=True)
 class Drawn:
-    """Report with its figures drawn."""
-
     title: str
-    """Heading of the page."""
     about: str
     """Introduction: one or two sentences on the scenario."""
     tables: Sequence[Table]
-    """Tables, the most important first."""
     pictures: Sequence[Plate]
-    """Figures."""
     verdict: str
-    """Result: one or two sentences on the outcome."""
 
 
 def draw(measured: Reproduction) -> Drawn:
-    """Report of a reproduction."""
     study, cells = measured.table
     columns = {method: cell for (value, method), cell in cells.items() if value == study.here}
     entries = table_1(columns)
@@ -110,16 +97,15 @@ def draw(measured: Reproduction) -> Drawn:
 
 
 def paper_table(entries: Sequence[TableEntry], columns: Mapping[str, MethodFlights]) -> Table:
-    """Table 1, the paper's figures beside the reproduced ones."""
     runs, steps = len(columns[EVENT].runs), columns[PERIODIC].period
     ours, theirs = (_rmse(columns[method]) for method in (EVENT, PERIODIC))
-    meet = not periodic_wins(columns[EVENT], columns[PERIODIC])
+    overlap = not periodic_wins(columns[EVENT], columns[PERIODIC])
     loss = f"{abs(ours / theirs - 1.0):.0%} {'more' if ours > theirs else 'less'}"
     says = (
         f"Means of {runs} flights a column with 95 % intervals, in metres; the paper's event ratio "
-        f"is its “10 times smaller”. The last column is no scheme of the paper's but a packet "
-        f"every {steps} steps, the rate nearest to the trigger's: against it the event trigger has "
-        f"{loss} RMSE xy{', though the intervals meet' if meet else ''}."
+        f"is its “10 times smaller”. The last column is not in the paper: a packet every {steps} "
+        f"steps, the rate nearest to the trigger's. Compared with it, the event trigger has {loss} "
+        f"RMSE xy{', although the intervals overlap' if overlap else ''}."
     )
     shown = {
         "column": ("column", ""),
@@ -134,7 +120,6 @@ def paper_table(entries: Sequence[TableEntry], columns: Mapping[str, MethodFligh
 
 
 def traffic_table(columns: Mapping[str, MethodFlights]) -> Table:
-    """Table of the packets and bytes that entered the network, by method."""
     rows = [
         {"column": method} | by_name(TRAFFIC, cell.estimate) for method, cell in columns.items()
     ]
@@ -175,7 +160,6 @@ REAL = {
 
 
 def real_table(measured: Reproduction) -> Table:
-    """Table of the flights over real UDP beside those in virtual time, by method."""
     study, cells = measured.table
     length_s = study.axis.values[1]
     rows: list[dict[str, Any]] = []
@@ -210,22 +194,21 @@ def real_table(measured: Reproduction) -> Table:
     says = (
         f"{length_s:g} s over real UDP on loopback, three processes and netem, beside virtual "
         f"time: the run of the same seed, and mean, least and most of {len(runs)} seeds. "
-        f"{within_range} of {len(rows)} flights over UDP lie within what virtual time says. Where "
-        f"a server's tick falls within a vehicle's step is chance in both, so equal seeds do not "
-        f"give equal flights."
+        f"{within_range} of {len(rows)} flights over UDP lie within the range of virtual time. The "
+        f"phase between the server's ticks and the vehicle's steps is random in both, so equal "
+        f"seeds do not give equal flights."
     )
     title = "RMSE xy [m] over real UDP and in virtual time"
     return table_of("real", title, says, rows, REAL)
 
 
 def verdict(entries: Sequence[TableEntry], columns: Mapping[str, MethodFlights]) -> str:
-    """Result of a reproduction, in two sentences."""
     off = {(e.column, e.entry): e.deviation for e in entries if e.deviation is not None}
     near = sum(within(entry, deviation) for (_, entry), deviation in off.items())
     (column, entry), worst = max(off.items(), key=lambda item: abs(item[1]))
     ours, theirs = (_rmse(columns[method]) for method in (EVENT, PERIODIC))
     wins = periodic_wins(columns[EVENT], columns[PERIODIC])
-    what = {1: "loses to", -1: "beats", 0: "cannot be told from"}[wins]
+    what = {1: "loses to", -1: "beats", 0: "does not differ significantly from"}[wins]
     return (
         f"{near} of {len(off)} entries of Table 1 are within tolerance; the farthest is {entry} of "
         f"“{column}”, {worst:+.1%}. At its own rate the event trigger {what} a packet every "
@@ -234,21 +217,18 @@ def verdict(entries: Sequence[TableEntry], columns: Mapping[str, MethodFlights])
 
 
 def _rmse(cell: MethodFlights) -> float:
-    """Mean RMSE xy [m]; NaN if nothing was flown."""
+    """Mean RMSE xy [m]; NaN if every flight failed."""
     mean = cell.estimate("rmse_xy")[0]
     return float("nan") if mean is None else mean
 
 
 def as_interval(estimate: Estimate, spec: str) -> str:
-    """Mean with its interval, as shown in a table."""
     return " ± ".join(as_text(part, spec) for part in estimate)
 
 
 def html(drawn: Drawn, scenario: Scenario, calls: Sequence[Mapping[str, Any]]) -> str:
     """Page of a report.
 
-    Args:
-        scenario: scenario of the report.
-        calls: facts about each call of the command that made it, in order.
+    `calls` are facts about each call of the command that made the report, in order.
     """
     return rendered("figures/report.html.jinja", drawn=drawn, scenario=scenario, calls=calls)

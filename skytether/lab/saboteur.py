@@ -1,7 +1,8 @@
 """Attackers: a man in the middle between vehicles and netem, and an observer on another host.
 
-Neither can read packets. Without an active fault (`lab.faults`) packets pass unchanged. During one
-they are lost, duplicated, delayed, altered or replayed, or an attacker sends additional packets.
+Neither can read packets. Without an active fault (`lab.faults`) packets pass unchanged. During a
+fault they are lost, duplicated, delayed, altered or replayed, or an attacker sends additional
+packets.
 """
 
 from collections import Counter, deque
@@ -19,43 +20,38 @@ from skytether.shared.wire.handshake import INITIATION
 SERVER: Address = ("server", 0)
 NETEM: Address = ("netem", 0)
 OBSERVER = "observer"
-"""Name of the observer's host."""
 SABOTEUR: Address = ("saboteur", 0)
 
 RECORDED = 2048
 """Number of newest packets of a direction that an attacker keeps for replay."""
 HELD_MAX = 65536
-"""Largest number of packets that an attacker holds back."""
 FLOOD_NS = 10 * MILLISECOND_NS
-"""Time between two bursts of forged packets [ns]."""
 OTHER_SOCKET, STRANGERS_SOCKET, STRANGERS = 100, 200, 8
-"""First number of the sockets that replay vehicles' packets, first number of those that send forged
-ones, and the latter's count."""
+"""First number of the sockets that replay vehicles' packets; first number and count of the sockets
+that send forged packets.
+"""
 COPIER_SOCKET, COPIERS = 300, 16
 """First number and count of the sockets that send copies and receive the answers."""
 OTHER_PORTS = 1000
-"""Offset from a vehicle's socket to the one after NAT has given it another port."""
+"""Offset from a vehicle's socket to its socket after NAT has changed the port."""
 CROWD_PORTS = (100, 600)
 """Fewest and most ports from which an observer sends."""
 HELLOS = 0.8
-"""Share of handshake packets among an observer's copies; the server answers each of them."""
+"""Share of handshake packets among an observer's copies; the server answers every one."""
 COPY_S = 0.3
-"""Longest delay of a copy, or of an answer to one [s]."""
+"""Longest delay of a copy, or of the answer to a copy [s]."""
 SWIFT = 0.5
 """Share of attackers whose copies are faster than the network."""
 ASTRAY = 0.2
-"""Share of copies and answers that are sent to a wrong destination."""
+"""Share of copies and answers that go to a wrong destination."""
 
 
 class Saboteur(Endpoint):
-    """Man in the middle that replays and alters packets, but cannot read them.
+    """Man in the middle between vehicles and netem: replays and alters packets, but cannot read
+    them.
 
-    Vehicle n is represented to netem by socket n, and by others once NAT has given it another port.
-    Packets pass unless a fault is active.
-
-    Args:
-        rng: random generator.
-        clients: addresses of vehicles 1, 2, ….
+    Netem sees vehicle n as socket n, and as another socket once NAT has changed the port. `clients`
+    are the addresses of vehicles 1, 2, ….
     """
 
     def __init__(self, rng: np.random.Generator, clients: Sequence[Address]) -> None:
@@ -65,7 +61,6 @@ class Saboteur(Endpoint):
         self._clients = dict(enumerate(clients, start=1))
         self._numbers = {client: number for number, client in self._clients.items()}
         self._on: list[ScheduledFault] = []
-        """Active faults."""
         self._left: dict[ScheduledFault, int] = {}
         """Number of packets that a burst still drops."""
         self._recorded: dict[str, deque[tuple[int, Datagram]]] = {
@@ -75,20 +70,17 @@ class Saboteur(Endpoint):
         self.initiations: deque[bytes] = deque(maxlen=RECORDED)
         """Newest INITIATIONs of the vehicles."""
         self._held: list[tuple[int, int, Datagram]] = []
-        """Heap of delayed packets: time at which a packet goes on, order, and packet."""
+        """Heap of delayed packets: time of release, order, and packet."""
         self._order = 0
         self._swift: set[ScheduledFault] = set()
-        """Attackers that copy all packets; copies of vehicles' packets reach the server before the
-        originals."""
+        """Attackers whose copies of vehicles' packets reach the server before the originals."""
         self._copied: dict[int, Address] = {}
         """Vehicle whose packet each socket copied last, by the socket's number."""
         self._volley_ns: int | None = None
         """Time of the next burst of forged packets."""
         self.counts: Counter[str] = Counter()
-        """Number of packets affected by each kind of fault."""
 
     def begin(self, fault: ScheduledFault, now_ns: int) -> None:
-        """Apply a fault to packets from now on."""
         self._on.append(fault)
         if fault.kind is FaultKind.FLOOD:
             self._volley_ns = now_ns
@@ -100,26 +92,24 @@ class Saboteur(Endpoint):
                     self._replay(fault, datagram, passed_ns, now_ns)
 
     def end(self, fault: ScheduledFault) -> None:
-        """End a fault."""
         self._on.remove(fault)
         self._left.pop(fault, None)
         self._swift.discard(fault)
 
     def change_ports(self) -> None:
-        """Represent each vehicle to netem by another socket from now on."""
+        """Give each vehicle another socket towards netem, as NAT does when it changes ports."""
         first = max(self._clients) + OTHER_PORTS
         self._clients = dict(enumerate(self._addresses, start=first))
         self._numbers = {client: number for number, client in self._clients.items()}
 
     def copy(self) -> bytes | None:
-        """Packet of a vehicle that an observer repeats, or None before there is any."""
+        """Recorded packet of a vehicle for an observer to repeat; None before the first packet."""
         rng, sent = self._rng, self._recorded["downlink"]
         if self.initiations and rng.random() < HELLOS:
             return self.initiations[-1]
         return sent[int(rng.integers(len(sent)))][1].payload if sent else None
 
     def receive(self, datagram: Datagram, *, now_ns: int) -> None:
-        """Pass a packet on, or apply the active faults."""
         payload, peer, socket = datagram
         if socket == 0:
             number = self._numbers.get(peer)
@@ -137,7 +127,6 @@ class Saboteur(Endpoint):
         self._release(now_ns)
 
     def wake(self, *, now_ns: int) -> None:
-        """Pass delayed packets on, and send forged ones."""
         if self._volley_ns is not None and now_ns >= self._volley_ns:
             floods = [fault for fault in self._on if fault.kind is FaultKind.FLOOD]
             for fault in floods:
@@ -147,7 +136,6 @@ class Saboteur(Endpoint):
         self._release(now_ns)
 
     def next_wake_ns(self) -> int | None:
-        """Time at which the next delayed packet goes on."""
         due_ns = self._held[0][0] if self._held else None
         if due_ns is None or (self._volley_ns is not None and self._volley_ns < due_ns):
             return self._volley_ns
@@ -200,7 +188,7 @@ class Saboteur(Endpoint):
     def _replay(
         self, fault: ScheduledFault, datagram: Datagram, passed_ns: int, now_ns: int
     ) -> None:
-        """Replay a packet if the time falls within the fault, sometimes from another address."""
+        """Replay a packet if the replay falls within the fault, sometimes from another address."""
         again_ns = passed_ns + seconds_to_ns(fault.amount)
         if not now_ns <= again_ns < fault.end_ns:
             return
@@ -211,7 +199,6 @@ class Saboteur(Endpoint):
         self._hold(again_ns, datagram)
 
     def _copy(self, fault: ScheduledFault, direction: str, datagram: Datagram, now_ns: int) -> None:
-        """Send a copy of a packet from the attacker's address."""
         swift = fault in self._swift
         if not swift and self._rng.random() >= fault.amount:
             return
@@ -232,8 +219,8 @@ class Saboteur(Endpoint):
             self._send_copy(payload, self._copied[socket], socket, now_ns)
 
     def _send_copy(self, payload: bytes, client: Address, socket: int, now_ns: int) -> None:
-        """Send a packet to a vehicle, sometimes the wrong one, from the server's address or
-        another.
+        """Send a packet to its vehicle or sometimes to a wrong one, as the server or from another
+        address.
         """
         rng = self._rng
         if rng.random() < ASTRAY:
@@ -246,7 +233,6 @@ class Saboteur(Endpoint):
         return seconds_to_ns(COPY_S * max(0.0, self._rng.uniform(-1.0, 1.0)))
 
     def _flipped(self, payload: bytes) -> bytes:
-        """Payload with one flipped bit."""
         bit = int(self._rng.integers(8 * len(payload)))
         flipped = bytearray(payload)
         flipped[bit // 8] ^= 1 << bit % 8
@@ -292,37 +278,28 @@ class Saboteur(Endpoint):
 class Observer(Endpoint):
     """Attacker on another host that sends copies of vehicles' packets to netem from many ports.
 
-    The answers go to the vehicles under their server's address.
-
-    Args:
-        rng: random generator.
-        saboteur: man in the middle, which gives access to packets and forges addresses.
+    The answers go to the vehicles through `saboteur`, under the server's address.
     """
 
     def __init__(self, rng: np.random.Generator, saboteur: Saboteur) -> None:
         super().__init__()
         self._rng, self._saboteur = rng, saboteur
         self._on: dict[ScheduledFault, int] = {}
-        """Active faults, and the number of ports that each sends from."""
+        """Number of ports that each active fault sends from."""
         self._sent = 0
         self._volley_ns: int | None = None
-        """Time of the next burst of copies."""
 
     def begin(self, fault: ScheduledFault, now_ns: int) -> None:
-        """Send copies from now on."""
         self._on[fault] = int(self._rng.integers(*CROWD_PORTS))
         self._volley_ns = now_ns
 
     def end(self, fault: ScheduledFault) -> None:
-        """Send no more."""
         del self._on[fault]
 
     def receive(self, datagram: Datagram, *, now_ns: int) -> None:  # noqa: ARG002
-        """Forward an answer."""
         self.send(datagram.payload, SABOTEUR)
 
     def wake(self, *, now_ns: int) -> None:
-        """Send a burst of copies."""
         if self._volley_ns is None or now_ns < self._volley_ns:
             return
         for fault, ports in self._on.items():
@@ -335,5 +312,4 @@ class Observer(Endpoint):
         self._volley_ns = now_ns + FLOOD_NS if self._on else None
 
     def next_wake_ns(self) -> int | None:
-        """Time of the next burst of copies."""
         return self._volley_ns

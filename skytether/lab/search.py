@@ -2,7 +2,7 @@
 
 Free keys are searched on logarithmic scales between bounds. Each generation of points is proposed,
 flown by a function passed in, and scored by an objective. The proposals depend only on the settings
-and the earlier scores: given these again, from a journal, an interrupted search continues.
+and the earlier scores, so an interrupted search continues from its journal.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -18,7 +18,6 @@ from skytether.shared.scenario.grammar import GrammarError
 from skytether.shared.scenario.schema import Scenario
 
 SIGMA = 0.1
-"""Default initial step size, as a share of each key's range."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,15 +29,13 @@ class Free:
     high: float
 
     def __str__(self) -> str:
-        """KEY=LOW:HIGH, as accepted by `parse`."""
         return f"{self.key}={self.low:g}:{self.high:g}"
 
     @classmethod
     def parse(cls, text: str) -> "Free":
         """Free key from the text KEY=LOW:HIGH.
 
-        Raises:
-            ConfigError: the text has another form, or the bounds are impossible.
+        Raises ConfigError if the text has another form, or the bounds are impossible.
         """
         key, _, bounds = text.partition("=")
         try:
@@ -50,14 +47,12 @@ class Free:
         return cls(key, low, high)
 
     def of(self, table: Any) -> float:
-        """Value of the key in a scenario's table."""
         *sections, last = self.key.split(".")
         if last.isdigit():
             return float(dotted.value(table, ".".join(sections))[int(last)])
         return float(dotted.value(table, self.key))
 
     def put(self, table: Any, value: float) -> None:
-        """Set the key in a scenario's table."""
         *sections, last = self.key.split(".")
         if last.isdigit():
             dotted.value(table, ".".join(sections))[int(last)] = value
@@ -66,11 +61,7 @@ class Free:
 
 
 def check_free(free: Sequence[Free], start: Scenario) -> None:
-    """Refuse keys that cannot be searched for.
-
-    Raises:
-        ConfigError: a key is no number of the scenario, or its value is out of its bounds.
-    """
+    """Raise ConfigError if a key is no number of the scenario, or its value is out of bounds."""
     for key in free:
         try:
             value = key.of(plain(start))
@@ -86,7 +77,6 @@ def check_free(free: Sequence[Free], start: Scenario) -> None:
 
 
 def put(scenario: Scenario, values: Mapping[Free, float]) -> Scenario:
-    """Scenario with other values of some keys."""
     table = plain(scenario)
     for key, value in values.items():
         key.put(table, value)
@@ -105,8 +95,7 @@ def plain(table: Any) -> Any:
 class Optimiser:
     """CMA-ES over free keys, from the values of a scenario.
 
-    Args:
-        sigma: initial step size, as a share of the (logarithmic) range of each key.
+    `sigma` is the initial step size, as a share of the logarithmic range of each key.
     """
 
     def __init__(
@@ -118,8 +107,9 @@ class Optimiser:
         self._free = free
         low, high = np.log([key.low for key in free]), np.log([key.high for key in free])
         self._low, self._range = low, high - low
-        here = (np.log([key.of(plain(start)) for key in free]) - low) / self._range
-        rng = np.random.default_rng(seed)  # a generator of its own: numpy's global one is shared
+        start_point = (np.log([key.of(plain(start)) for key in free]) - low) / self._range
+        # numpy's global generator would be shared with other code
+        rng = np.random.default_rng(seed)
         options = {
             "bounds": [0, 1],
             "popsize": population,
@@ -127,7 +117,7 @@ class Optimiser:
             "seed": np.nan,
             "randn": lambda *shape: rng.standard_normal(shape),
         }
-        self._search = cma.CMAEvolutionStrategy(np.clip(here, 0.01, 0.99), sigma, options)
+        self._search = cma.CMAEvolutionStrategy(np.clip(start_point, 0.01, 0.99), sigma, options)
         self._points: list[Any] = []
 
     def ask(self) -> list[Scenario]:
@@ -139,7 +129,6 @@ class Optimiser:
         return [self._scenario(point) for point in self._points]
 
     def tell(self, scores: Sequence[float]) -> None:
-        """Take the scores of the generation that was proposed."""
         self._search.tell(self._points, scores)
 
     def _scenario(self, point: Any) -> Scenario:
@@ -151,7 +140,6 @@ class Optimiser:
         )
 
     def values(self, scenario: Scenario) -> dict[str, float]:
-        """Values of the free keys in a scenario."""
         table = plain(scenario)
         return {key.key: key.of(table) for key in self._free}
 
@@ -161,8 +149,6 @@ Values = Mapping[str, Mapping[str, float | None]]
 
 
 class Objective(Protocol):
-    """Objective of a search."""
-
     def settings(self) -> Mapping[str, Any]:
         """Name and settings of the objective, as plain values."""
 
@@ -178,39 +164,29 @@ class Objective(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class SearchPoint:
-    """Point that was flown."""
-
     keys: Mapping[str, float]
-    """Values of the free keys."""
     values: Values
-    """Figures, by column and name; None if a flight failed."""
     score: float
-    """Score; smaller is better."""
 
 
 Point = tuple[float, ...]
 """Values of the free keys, in order: the name of a point in the journal."""
 FlyAll = Callable[[Mapping[Point, Scenario]], Mapping[Point, Values]]
-"""Function that returns the figures of scenarios, after flying those that were not flown."""
+"""Function that returns the figures of scenarios, after flying those without stored figures."""
 
 
 @dataclass(frozen=True, slots=True)
 class Search:
-    """Starting point, objective and effort of a search."""
-
     start: Scenario
     objective: Objective
     free: Sequence[Free]
-    """Keys that change."""
     runs: int
     """Number of flights of each point, with seeds that count up from the start's."""
     population: int
-    """Number of points in a generation."""
     sigma: float = SIGMA
-    """Initial step size, as a share of each key's (logarithmic) range."""
+    """Initial step size, as a share of each key's logarithmic range."""
 
     def settings(self) -> dict[str, Any]:
-        """Settings that determine all points of the search, as plain values."""
         return {
             **self.objective.settings(),
             "free": list(map(str, self.free)),
@@ -240,22 +216,20 @@ class Search:
         for _ in range(generations):
             proposed = optimiser.ask()
             keys = [optimiser.values(each) for each in proposed]
-            here = [tuple(each.values()) for each in keys]
-            cells.update(zip(here, proposed, strict=True))
+            names = [tuple(each.values()) for each in keys]
+            cells.update(zip(names, proposed, strict=True))
             flown = fly_all(cells)
             generation = [
                 SearchPoint(own, flown[point], self.objective.score(flown[point]))
-                for own, point in zip(keys, here, strict=True)
+                for own, point in zip(keys, names, strict=True)
             ]
             optimiser.tell([point.score for point in generation])
             points += generation
             yield points
 
     def scenario(self, point: SearchPoint) -> Scenario:
-        """Scenario of a point."""
         return put(self.start, {key: point.keys[key.key] for key in self.free})
 
 
 def best(points: Sequence[SearchPoint]) -> SearchPoint:
-    """Point with the smallest score."""
     return min(points, key=lambda point: point.score)

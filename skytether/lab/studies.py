@@ -1,8 +1,8 @@
 """Studies of `skytether reproduce`: the paper's Table 1 and Fig. 5, and usual further studies.
 
-A study flies all methods over the values of one parameter. Its second sweep is a fair baseline: at
-each value, periodic sending with the period nearest to the event trigger's rate at that value,
-known from the first sweep.
+A study flies all methods over the values of one parameter. For a fair comparison, a second sweep
+flies periodic sending at each value, with the period nearest to the event trigger's rate in the
+first sweep.
 """
 
 import math
@@ -21,7 +21,6 @@ from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.summary import Summary
 
 SCENARIO = "paper"
-"""Name of the scenario that all studies start from."""
 NONE, EVERY, EVENT = COLUMNS
 PERIODIC = "periodic at equal rate"
 METHODS = GridAxis(
@@ -29,12 +28,12 @@ METHODS = GridAxis(
     tuple(COLUMNS),
     tuple({f"control.{key}": value for key, value in keys.items()} for keys in COLUMNS.values()),
 )
-"""Methods of Table 1, each a column of it; PERIODIC is flown for comparison."""
+"""Methods of Table 1, one per column; PERIODIC is flown for comparison."""
 
 
 @dataclass(frozen=True, slots=True)
 class ReproductionSize:
-    """Size of a reproduction."""
+    """Number and length of the flights of a reproduction."""
 
     runs: int
     """Number of flights of each column of Table 1."""
@@ -43,25 +42,22 @@ class ReproductionSize:
     map_runs: int
     """Number of flights of each cell of Fig. 5."""
     points: int
-    """Number of points of each curve."""
     cells: int
     """Number of cells along each side of Fig. 5."""
     periods: tuple[int, ...]
-    """Periods of the periodic curve beside Fig. 5 [steps]."""
+    """Periods of periodic sending in Fig. 5 as curves [steps]."""
     duration: float
     """Length of a flight in virtual time [s]."""
     real_s: float
-    """Length of a flight over UDP [s]."""
     real_settle_s: float
-    """Beginning of a flight over UDP that RMSE leaves out [s]."""
+    """Initial part of a flight over UDP that RMSE leaves out [s]."""
     sample_runs: int
     """Number of flights of each method whose complete records are drawn."""
     delay_packets: int
-    """Number of packets sent through netem, each way, to measure their delay."""
+    """Number of packets sent through netem in each direction, to measure their delay."""
 
 
 def full(runs: int) -> ReproductionSize:
-    """Size of a complete reproduction."""
     return ReproductionSize(
         runs=runs,
         curve_runs=-(-runs // 2),
@@ -90,7 +86,6 @@ QUICK = ReproductionSize(
     sample_runs=2,
     delay_packets=500,
 )
-"""Size of a first look."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,20 +93,16 @@ class Study:
     """Study of all methods over the values of one parameter."""
 
     name: str
-    """Short name, for files."""
     label: str
     """Label of the axis, with its unit."""
     scenario: Scenario
-    """Scenario that is flown, except for the parameter."""
+    """Scenario to fly; the parameter is replaced."""
     axis: GridAxis
     """Values of the parameter, and the keys that each changes."""
     runs: int
-    """Number of flights of each method at each value."""
     here: float
-    """Value of the parameter in the scenario itself."""
 
     def first(self) -> Sweep:
-        """Sweep of the methods of Table 1."""
         return Sweep(SCENARIO, self.scenario, [self.axis, METHODS], self.runs)
 
     def second(self, flown: "CellSummaries") -> Sweep:
@@ -125,7 +116,7 @@ class Study:
 
 
 def periodic(steps: int) -> Mapping[str, Any]:
-    """Keys and values of periodic sending with so many steps between packets."""
+    """Keys of periodic sending with this number of steps between packets."""
     return {"control.trigger": f"periodic({steps})"}
 
 
@@ -147,8 +138,8 @@ def table_study(scenario: Scenario, scale: ReproductionSize) -> Study:
 
 
 def curve_studies(scenario: Scenario, scale: ReproductionSize) -> list[Study]:
-    """Studies that are usual in the literature: loss, delay, jitter, a wrong model, other
-    clocks.
+    """Studies of loss, delay, jitter, a wrong model and clock offset, which are usual in the
+    literature.
     """
     up, n = scenario.uplink, scale.points
     (paper, _) = IMPAIRMENTS.calls(scenario.network.uplink)
@@ -171,7 +162,7 @@ def curve_studies(scenario: Scenario, scale: ReproductionSize) -> list[Study]:
         return {f"network.{way}.{key}": keys[key] for way in directions for key in keys}
 
     def jitter(std_ms: float) -> Mapping[str, Any]:
-        # A Poisson number of slots has variance = mean; the mean delay is kept.
+        # The variance of a Poisson number equals its mean; the mean delay is kept.
         slots = (std_ms / 1e3 / slot_s) ** 2
         least_s = round(up.mean_s - slot_s * slots, 9)
         return both_ways({"paper.slots_mean": slots, "paper.minimum_s": least_s})
@@ -216,7 +207,6 @@ def curve_studies(scenario: Scenario, scale: ReproductionSize) -> list[Study]:
 
 
 def map_sweep(scenario: Scenario, scale: ReproductionSize) -> Sweep:
-    """Sweep of Fig. 5, over the decay rate λ and the tolerance ε."""
     decay = np.linspace(0.5, 5.0, scale.cells).tolist()
     epsilon = np.linspace(0.9, 9.0, scale.cells).tolist()
     axes = [
@@ -227,26 +217,20 @@ def map_sweep(scenario: Scenario, scale: ReproductionSize) -> Sweep:
 
 
 def period_sweep(scenario: Scenario, scale: ReproductionSize) -> Sweep:
-    """Sweep of periodic sending for Fig. 5, from every step to very rarely."""
     axis = GridAxis("control.trigger.periodic", scale.periods, tuple(map(periodic, scale.periods)))
     return Sweep(SCENARIO, scenario, [axis], scale.map_runs)
 
 
 CellSummaries = Mapping[tuple[Any, ...], Sequence[Summary]]
-"""Summaries of each cell of a sweep, by its values."""
 
 
 def flown(plan: Sweep, done: Results) -> CellSummaries:
-    """Summaries of each cell of a sweep, by its values."""
     return {values: plan.of_cell(done, cell) for cell, values in enumerate(plan.cells)}
 
 
 @dataclass(frozen=True, slots=True)
 class MethodFlights:
-    """Flights of one method at one value."""
-
     runs: Sequence[Summary]
-    """Summary of each flight."""
     period: int | None = None
     """Steps between packets with periodic sending; None for other methods."""
 
@@ -263,7 +247,7 @@ class MethodFlights:
 def periodic_wins(event: MethodFlights, periodic: MethodFlights) -> int:
     """Comparison of RMSE xy: 1 if periodic sending is better, -1 if it is worse.
 
-    The result is 0 if the 95 % intervals overlap, or nothing was flown.
+    0 if the 95 % intervals overlap, or a method has no successful flight.
     """
     (ours, ours_half), (theirs, theirs_half) = (
         cell.estimate("rmse_xy") for cell in (event, periodic)
@@ -279,12 +263,7 @@ Cells = Mapping[tuple[float, str], MethodFlights]
 
 
 def cells(study: Study, first: Sweep, firstly: Results, second: Sweep, secondly: Results) -> Cells:
-    """Cells of a study, from both of its sweeps.
-
-    Args:
-        firstly: finished tasks of the first sweep.
-        secondly: finished tasks of the second sweep.
-    """
+    """Cells of a study, from the results of both of its sweeps."""
     found = {key: MethodFlights(runs) for key, runs in flown(first, firstly).items()}
     periods = [
         int(TRIGGERS.one(keys["control.trigger"]).values[0]) for _, keys in second.axes[0].points()
@@ -299,18 +278,13 @@ def cells(study: Study, first: Sweep, firstly: Results, second: Sweep, secondly:
 
 
 class TableEntry(msgspec.Struct, frozen=True):
-    """Entry of Table 1, the paper's figure beside the reproduced one."""
-
     column: str
-    """Method."""
     entry: str
-    """Name of the figure."""
     paper: float | None
-    """Paper's figure; None if it has none."""
+    """Paper's figure; None if the paper has none."""
     here: float | None
-    """Reproduced figure: mean of the flights; None if no flight succeeded."""
+    """Mean of the reproduced flights; None if all failed."""
     ci95: float | None
-    """Half-width of the 95 % interval of `here`."""
     deviation: float | None
     """Relative deviation of `here` from `paper`; None without a paper's figure."""
 

@@ -27,11 +27,10 @@ from skytether.shared.telemetry.summary import Summary, summarise
 from skytether.sim.flight import fly_batch
 
 CHUNK = 25
-"""Number of runs in a task; the last of a cell may have fewer."""
+"""Number of runs in a task; the last task of a cell may have fewer."""
 FORM = "KEY=START:STOP:COUNT or KEY=VALUE,VALUE,..."
 """Form of a grid on the command line."""
 SEED_MAX = 2**32 - 1
-"""Largest seed of a scenario."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,16 +38,13 @@ class GridAxis:
     """Key of the scenario with its values; or a label, with the keys that each value changes."""
 
     key: str
-    """Key with dots, or a label if there are `changes`."""
     values: tuple[Any, ...]
     """Values of the key, or names of the changes."""
     changes: tuple[Mapping[str, Any], ...] = ()
-    """Keys that each value changes, and their values; empty if it changes only `key`."""
+    """Keys that each value changes, and their values; empty if each changes only `key`."""
 
     def __str__(self) -> str:
-        """KEY=VALUE,VALUE,... as accepted by `parse_axis`, or with the changes in place of
-        values.
-        """
+        """KEY=VALUE,VALUE,... as in `parse_axis`, or with the changes in place of values."""
         values = self.changes or self.values
         return f"{self.key}={','.join(msgspec.json.encode(value).decode() for value in values)}"
 
@@ -61,16 +57,15 @@ class GridAxis:
 def parse_axis(text: str) -> GridAxis:
     """Grid from a user's text: `vehicle.wind=0:0.5:6` or `control.scheme=committed,none`.
 
-    Raises:
-        ConfigError: the text has another form, or a value twice.
+    Raises ConfigError if the text has another form, or a value twice.
     """
-    key, equals, given = (part.strip() for part in text.partition("="))
+    key, equals, values_text = (part.strip() for part in text.partition("="))
     wrong = ConfigError(f"--grid: got {text!r}, expected {FORM}")
-    if not (key and equals and given):
+    if not (key and equals and values_text):
         raise wrong
-    ends = given.split(":")
+    ends = values_text.split(":")
     try:
-        values = _linear(*ends) if len(ends) == 3 else _listed(given)
+        values = _linear(*ends) if len(ends) == 3 else _listed(values_text)
     except ValueError:
         raise wrong from None
     if key == "seed":
@@ -112,28 +107,20 @@ def _value(text: str) -> Any:
 
 
 class FlightTask(msgspec.Struct, frozen=True):
-    """Some runs of a cell, which are flown together."""
-
     cell: int
-    """Number of the cell in its sweep, from 0 on."""
     chunk: int
     """Number of the task in its cell, from 0 on."""
     name: str
-    """Name of the scenario, for the summaries."""
     scenario: Scenario
-    """Scenario that is flown, except for the seed."""
+    """Scenario to fly; the seed is replaced."""
     seeds: tuple[int, ...]
-    """Seed of each run."""
 
 
 Runs = tuple[Summary, ...]
-"""Results of a task: summary of each run, in order of the seeds."""
 Results = Mapping[tuple[int, int], Runs]
-"""Results of a sweep, by cell and chunk."""
 
 
 def fly(task: FlightTask) -> Runs:
-    """Fly all runs of a task in virtual time."""
     return summaries(task.name, task.scenario, task.seeds)
 
 
@@ -172,7 +159,6 @@ class Sweep:
         self.cells = [tuple(value for value, _ in cell) for cell in points]
         """Values of each cell, in the order of the axes."""
         self.chunks = -(-runs // CHUNK)
-        """Number of tasks of each cell."""
         self._scenarios = [
             self._scenario({key: value for _, changes in cell for key, value in changes.items()})
             for cell in points
@@ -180,7 +166,6 @@ class Sweep:
 
     @property
     def flights(self) -> int:
-        """Number of all flights."""
         return len(self.cells) * self.runs
 
     def _scenario(self, changes: Mapping[str, Any]) -> Scenario:
@@ -190,7 +175,6 @@ class Sweep:
         return reading.check(table, f"{self.name} with {where}" if where else self.name)
 
     def tasks(self) -> Iterator[FlightTask]:
-        """All tasks, cell by cell."""
         first = self.scenario.seed
         for cell, scenario in enumerate(self._scenarios):
             for chunk in range(self.chunks):
@@ -209,7 +193,6 @@ class Sweep:
         }
 
     def runs_csv(self, done: Results) -> str:
-        """CSV table with a row for each run, cell by cell and by seed."""
         keys = [axis.key for axis in self.axes]
         rows = (
             [*values, *astuple(run)]
@@ -230,11 +213,9 @@ class Sweep:
         return rows_csv(rows)
 
     def scenario_of(self, *values: Any) -> Scenario:
-        """Scenario of the cell with these values."""
         return self._scenarios[self.cells.index(values)]
 
     def of_cell(self, done: Results, cell: int) -> list[Summary]:
-        """Summaries of a cell's runs, by seed."""
         return [run for chunk in range(self.chunks) for run in done[cell, chunk]]
 
 

@@ -59,28 +59,25 @@ from skytether.sim.world import Clock, World
 CLOCK_NS = 10**7 * SECOND_NS
 """Initial time on all clocks [ns], so large that no backward step makes it negative."""
 LANDED_NS = 5 * SECOND_NS
-"""Time after which a landed vehicle is restarted [ns]."""
 QUIET_NS = SECOND_NS
-"""Time for which a flight goes on after the recovery deadline [ns]."""
+"""Time for which a flight continues after the recovery deadline [ns]."""
 SHORT_S = (8.0, 25.0)
 """Range of the time within which the faults of a short trial begin and end [s]."""
 RESTARTED = (FaultKind.RESTART, "client")
 TRAJECTORIES = 0.5
-"""Share of the trials that fly the scheme "trajectory"."""
 REKEYING = 0.3
 """Share of the trials in which vehicles renew their keys every REKEY_NS."""
 REKEY_NS = 4 * SECOND_NS
 STEP_FOUND_NS = (BUCKETS + RECENT) * BUCKET_NS
-"""Time after which the server has forgotten clock measurements from before a step [ns]."""
+"""Time after a clock step by which the server holds no older clock measurements [ns]."""
 FLOWS = 128
-"""Number of netem's places for flows: more than one host can occupy alone, and fewer than an
-observer has ports."""
+"""Capacity of netem in flows: more than a single host may occupy, and fewer than an observer's
+ports.
+"""
 COMPUTE_NS = MILLISECOND_NS
-"""Computing time of the server per step [ns]."""
 
 
 def make_scenario(seed: int) -> tuple[Scenario, int]:
-    """Scenario of a trial, and its number of vehicles, both drawn from the seed."""
     rng = stream(seed, "torture", "scenario")
     kind = rng.choice(3, p=(0.6, 0.2, 0.2))
     scheme = ("committed", "committed", "predictive")[kind]
@@ -124,7 +121,6 @@ def make_scenario(seed: int) -> tuple[Scenario, int]:
 
 
 def _follow_trajectories(table: dict[str, Any], rng: np.random.Generator) -> None:
-    """Change a scenario to the scheme "trajectory", with its options drawn at random."""
     axes = table["model"]["axes"]
     error_m, silence_s = round(rng.uniform(0.003, 0.1), 3), round(rng.uniform(0.3, 2.0), 2)
     gap = f"{round(float(np.exp(rng.uniform(np.log(0.01), np.log(3.0)))), 3)}"
@@ -159,16 +155,15 @@ def _follow_trajectories(table: dict[str, Any], rng: np.random.Generator) -> Non
     )
     table["link"]["heartbeat_s"] = (0.1, "auto")[rng.integers(2)]
     if rng.random() < 0.3:
-        known = np.broadcast_to(table["model"].get("gain", 1.0), axes)
+        gain = np.broadcast_to(table["model"].get("gain", 1.0), axes)
         table["vehicle"] |= {
-            "gain": (known * rng.uniform(0.8, 1.2, axes)).tolist(),
+            "gain": (gain * rng.uniform(0.8, 1.2, axes)).tolist(),
             "steady_wind_mps": rng.uniform(-0.2, 0.2, axes).tolist(),
         }
     table["control"]["change_weight"] = float(rng.choice((0.0, 0.05, 0.6)))
 
 
 def short_trial(seed: int) -> Trial:
-    """Trial of about 25 s."""
     rng = stream(seed, "torture", "faults")
     return Trial(seed, schedule(rng, seconds_to_ns(rng.uniform(*SHORT_S))))
 
@@ -179,35 +174,24 @@ def long_trial(seed: int, hours: float = 1.0) -> Trial:
 
 
 class TrialOutcome(msgspec.Struct, frozen=True, kw_only=True):
-    """Result of a trial."""
-
     trial: Trial
     failure: str = ""
     """Violation or exception that ended the trial; empty if there was none."""
     invariant: str = ""
     """Name of the violated invariant, or `raises` for an exception."""
     flown_s: float
-    """Time of the world [s]."""
+    """Length of the trial in virtual time [s]."""
     counts: dict[str, int]
     """Counters of steps, lives, packets and so on, by name."""
 
 
 class Failing:
-    """Solver that fails for a share of its problems.
-
-    Args:
-        inner: solver for the other problems.
-        share: share of failures.
-        rng: random generator.
-    """
-
     def __init__(self, inner: Solver, share: float, rng: np.random.Generator) -> None:
         self.inner = inner
         self._share = share
         self._rng = rng
 
     def solve(self, gradient: Array, guess: Array) -> tuple[Array, Flags]:
-        """See `Solver`."""
         inputs, solved = self.inner.solve(gradient, guess)
         failed = self._rng.random(len(solved)) < self._share
         inputs[failed] = guess[failed]
@@ -216,27 +200,18 @@ class Failing:
 
 @dataclass(slots=True)
 class TorturedVehicle:
-    """Vehicle through its lives: runs of its endpoint between restarts."""
+    """Vehicle through its lives: runs of its client between restarts."""
 
     name: str
-    """Name of its host."""
     plant: FirstOrderPlant
     """Simulated vehicle, which persists through all lives."""
     life: WatchedLife
-    """Present life."""
     lives: int = 1
-    """Number of lives so far."""
     down: int = 0
     """Number of active faults that keep its host down."""
 
 
 class Torture:
-    """Trial that is running.
-
-    Args:
-        trial: trial to run.
-    """
-
     def __init__(self, trial: Trial) -> None:
         self.trial = trial
         self.scenario, count = make_scenario(trial.seed)
@@ -249,14 +224,15 @@ class Torture:
         self.world = World(self._hear)
         self._up, self._down = Ledger(), Ledger()
         self._calm_ns = 0
-        """Time of the world since which no fault is active, while this is so."""
+        """Virtual time since which no fault is active [ns]; unused while one is."""
         self._under_way = 0
-        """Number of faults that are active, or have effects under way."""
+        """Number of faults that are active, or still have effects."""
         restarts = any((each.kind, each.where) == RESTARTED for each in trial.faults)
         steps = any(each.kind is FaultKind.STEP and is_small(each.amount) for each in trial.faults)
         self._step_ns = STEP_FOUND_NS if steps else 0
-        """Time after a clock's step until clocks are known again; such a step looks like a
-        freeze."""
+        """Additional recovery time after a small forward step of a clock [ns], which looks like a
+        freeze until the server has newer measurements.
+        """
         self._recovery_ns = recovery_ns(self.scenario, restarts=restarts) + self._step_ns
         """Time within which a vehicle must fly again after the last fault [ns]."""
         self.counts: Counter[str] = Counter()
@@ -285,7 +261,6 @@ class Torture:
         self.end_ns = trial.end_ns + self._recovery_ns + QUIET_NS
 
     def run(self, stopped: Callable[[], bool] = lambda: False) -> TrialOutcome:
-        """Run the trial to its end, or to the first violation."""
         failure = invariant = ""
         try:
             self.world.run(stopped, limit_ns=self.end_ns)
@@ -295,8 +270,8 @@ class Torture:
             failure, invariant = str(violation), violation.invariant
         except Exception as error:
             where = traceback.extract_tb(error.__traceback__)[-1]
-            said = f"{type(error).__name__} {error} ({where.filename}:{where.lineno})"
-            failure, invariant = f"raises: {said}", "raises"
+            message = f"{type(error).__name__} {error} ({where.filename}:{where.lineno})"
+            failure, invariant = f"raises: {message}", "raises"
         for vehicle in self.vehicles:
             self._count(vehicle.life)
         self.counts += self.saboteur.counts
@@ -365,7 +340,6 @@ class Torture:
         return life, Steady(client)
 
     def _renew(self, name: str) -> None:
-        """Restart the process of a host."""
         self.counts[f"lives of {name.partition(' ')[0]}"] += 1
         if name == SERVER[0]:
             self.world.restart(name, self._new_server())
@@ -394,7 +368,6 @@ class Torture:
         return not self._under_way and self.world.now_ns - self._calm_ns > self._recovery_ns
 
     def _plan(self, fault: ScheduledFault) -> None:
-        """Schedule a fault."""
         world = self.world
 
         harm = int(fault.kind not in HARMLESS)
@@ -417,7 +390,6 @@ class Torture:
         world.at(fault.start_ns, begin)
 
     def hosts(self, where: str) -> list[str]:
-        """Names of the hosts affected by a fault."""
         return [each.name for each in self.vehicles] if where == "client" else [where]
 
     def set_down(self, name: str, *, down: bool) -> None:
@@ -429,7 +401,7 @@ class Torture:
             self._renew(name)
 
     def set_keys(self, *, right: bool) -> None:
-        """Let the server's next lives have the vehicles' keys, or others."""
+        """Let the server's next lives use the vehicles' keys, or wrong ones."""
         self._wrong_keys += -1 if right else 1
 
     def set_solver(self, share: float, *, failing: bool) -> None:
@@ -466,7 +438,7 @@ class Torture:
             self.world.at(due_ns, renew)
 
     def _check_end(self) -> None:
-        """Check that every vehicle flies, and no container exceeds its bound."""
+        """Check that every vehicle flies, and that no container exceeds its bound."""
         for vehicle in self.vehicles:
             life = vehicle.life
             silent_ns = self.end_ns - life.row_ns
@@ -480,20 +452,16 @@ class Torture:
 
 
 def is_small(step_s: float) -> bool:
-    """Whether a forward step of a clock is so small that it may be taken for a freeze [s]."""
+    """Whether a forward step of a clock [s] is so small that it may be taken for a freeze."""
     return 0 < seconds_to_ns(step_s) <= JUMP_NS
 
 
 def recovery_ns(scenario: Scenario, *, restarts: bool) -> int:
     """Time within which a vehicle must fly again after the last fault [ns].
 
-    It is the sum of the stages: the end of the session is noticed; HELLO, cookie and session are
-    exchanged; the link is good for the required time; a horizon planned after that arrives.
-
-    Args:
-        scenario: scenario that is flown.
-        restarts: whether vehicles are restarted: then the server may wait for the end of the
-            earlier life.
+    The sum of the stages: the client notices the end of the session; HELLO, cookie and session are
+    exchanged; the link is good for the required time; a horizon planned after that arrives. With
+    `restarts` the server may have to wait for the end of the vehicle's earlier life.
     """
     (paper,) = IMPAIRMENTS.calls(scenario.network.uplink)
     least_s, slot_s, *_ = map(float, paper.values)
@@ -505,7 +473,6 @@ def recovery_ns(scenario: Scenario, *, restarts: bool) -> int:
 def act(  # noqa: PLR0912 - a branch for each kind of fault
     torture: Torture, fault: ScheduledFault, *, begins: bool
 ) -> None:
-    """Apply the beginning, or the end, of a fault."""
     world, dt_ns = torture.world, torture.scenario.dt_ns
     names = torture.hosts(fault.where)
     match fault.kind:
@@ -548,7 +515,6 @@ def act(  # noqa: PLR0912 - a branch for each kind of fault
 
 
 def fly(trial: Trial, stopped: Callable[[], bool] = lambda: False) -> TrialOutcome:
-    """Fly a trial to its end, or to the first violation."""
     return Torture(trial).run(stopped)
 
 

@@ -39,33 +39,27 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 PARTS = ("client", "server", "netem", "plan")
-"""Parts of a record: rows of the vehicle's steps, the server's, of packets, and of plans."""
+"""Parts of a record: rows of the vehicle's and the server's steps, of packets, and of plans."""
 UNITS = MappingProxyType({"m": "m", "mps": "m/s", "s": "s", "ns": "ns", "bytes": "B"})
-"""Unit of an array whose name ends in one of these words; other arrays have none."""
+"""Unit of an array by the last word of its name; other arrays have none."""
 
 
 class Column(NamedTuple):
-    """Description of an array of a flight, as `Flight.columns` lists it."""
+    """Name, shape and unit of an array of a flight, see `Flight.columns`."""
 
     name: str
     shape: tuple[int, ...]
     unit: str
-    """Unit; empty for counts, flags and numbers without a unit."""
+    """Unit; empty for counts, flags and ratios."""
 
 
 class Flight:
     """Flight that was flown, or loaded from a recording.
 
-    `flight["position_m"]` is an array, one row for each step of the vehicle, of shape (steps, axes)
-    where it is a vector. Names of arrays of the server, netem and the plans begin with the name of
-    that part, as in `flight["server.event"]`. `print(flight)` lists all arrays with shape and unit.
-    Arrays cannot be written to.
-
-    Args:
-        scenario: scenario that was flown.
-        record: the record of the flight.
-        name: name of the scenario.
-        secure: whether the link was encrypted.
+    `flight["position_m"]` is an array with a row for each step of the vehicle; a vector has the
+    shape (steps, axes). Names of arrays of the server, netem and the plans begin with that part, as
+    in `flight["server.event"]`. `print(flight)` lists all arrays with shape and unit. Arrays are
+    read-only.
     """
 
     def __init__(
@@ -77,7 +71,7 @@ class Flight:
         """Name of the scenario."""
         self.secure = secure
         """Whether the link was encrypted."""
-        # An empty part gets this scenario's columns, so that its arrays exist.
+        # A part without rows gets this scenario's columns, so that its arrays exist.
         parts: dict[str, Any] = {**_no_rows(scenario)}
         parts |= {part: rows for part in PARTS if len(rows := getattr(record, part))}
         events = tuple(each._replace(host=each.process) for each in record.events)
@@ -121,8 +115,10 @@ class Flight:
         client = self.record.client
         client = client[client["vehicle"] == client["vehicle"][:1]]
         rows = client, self.record.server, self.record.netem
-        known = self.record.figures
-        return summarise(self.scenario, self.name, *rows, figures=known, secure=self.secure)
+        process_figures = self.record.figures
+        return summarise(
+            self.scenario, self.name, *rows, figures=process_figures, secure=self.secure
+        )
 
     @property
     def events(self) -> tuple[FlightEvent, ...]:
@@ -139,8 +135,7 @@ class Flight:
         """Picture of the flight: the path over the reference, and the packets in each second.
 
         Args:
-            ax: axes of matplotlib on which the path alone is drawn, such as those of a figure as
-                wide as a paper's column; a figure of its own unless given.
+            ax: matplotlib axes for the path alone; without `ax`, both are drawn in a new figure.
 
         Raises:
             FlightError: no step was flown.
@@ -213,13 +208,13 @@ class Flight:
                     figures[process] = frame.figures
         parts: dict[str, Any] = {**_no_rows(recorded.scenario), **recorded.parts}
         parts["netem"]["arrived_ns"] -= recorded.begin_ns
-        told = [each.event for each in events]
+        log_events = [each.event for each in events]
         record = Record(
             **parts,
             failure=_failure(events),
             figures=figures,
             events=tuple(events),
-            incomplete=tuple(event for event in told if isinstance(event, RecordIncomplete)),
+            incomplete=tuple(event for event in log_events if isinstance(event, RecordIncomplete)),
         )
         about = recorded.about
         return cls(recorded.scenario, record, name=about.scenario, secure=about.secure)
@@ -239,7 +234,7 @@ class Flight:
 
 @extras.named()
 def table(flights: Iterable[Flight]) -> "pandas.DataFrame":
-    """Table of flights: one row each, one column for each field of `Summary` that is one value.
+    """Table of flights: one row each, one column for each single-valued field of `Summary`.
 
     Raises:
         ExtraMissing: pandas is not installed.
@@ -250,13 +245,12 @@ def table(flights: Iterable[Flight]) -> "pandas.DataFrame":
 
 
 def values(summary: Summary) -> dict[str, Any]:
-    """Fields of a summary that are one value: not `modes` and `drops`, which are tables."""
+    """Single-valued fields of a summary: all but the tables `modes` and `drops`."""
     fields = msgspec.structs.asdict(summary)
     return {name: value for name, value in fields.items() if name not in ("modes", "drops")}
 
 
 def _no_rows(scenario: Scenario) -> dict[str, Table]:
-    """Empty rows for each part of a record, by its name."""
     axes = scenario.model.axes
     return {
         "client": np.empty(0, client_columns(axes)),
@@ -267,7 +261,7 @@ def _no_rows(scenario: Scenario) -> dict[str, Table]:
 
 
 def _failure(events: list[FlightEvent]) -> Failure | None:
-    """Failure of the first vehicle that failed: its last event."""
+    """Last event of the first vehicle that failed."""
     last: dict[int, Event] = {
         each.event.vehicle: each.event
         for each in events

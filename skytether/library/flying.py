@@ -30,8 +30,8 @@ def load(scenario: Given, /, **keys: Any) -> Scenario:
 
     Args:
         scenario: name of a scenario, path of a .toml file, or a scenario.
-        keys: keys of the scenario and their values. A dot leads into a table, as in TOML; a table
-            may also be given as a mapping, which replaces only the keys that it has.
+        keys: keys of the scenario and their values. A dot leads into a table, as in TOML. A mapping
+            as a value replaces the keys that it has in that table.
 
     Raises:
         ConfigError: there is no such scenario or key, or a value that cannot be flown.
@@ -74,12 +74,12 @@ def fly(
         scenario: name of a scenario, path of a .toml file, or a scenario.
         udp: whether server, netem and client fly as three processes on loopback, in real time.
         secure: whether the link is encrypted, with keys made for this flight.
-        server: endpoint that plans in place of Skytether's server, in virtual time; make a new one
-            for each flight.
+        server: endpoint that plans in place of Skytether's server, only in virtual time; each
+            flight needs a new one.
         keys: see `load`.
 
     Returns:
-        The flight; where the vehicle could not fly, `Flight.failure` says why.
+        The flight. If the vehicle could not fly, `Flight.failure` says why.
 
     Raises:
         ConfigError: the scenario cannot be flown, or not with these arguments.
@@ -103,12 +103,12 @@ def fly(
 def fly_batch(scenario: Given, seeds: Iterable[int], /, **keys: Any) -> list[Flight]:
     """Fly a scenario once for each seed in virtual time, several times faster than one by one.
 
-    Each flight equals that of `fly` with the same seed, to the last bit, except for the plans,
-    which are not recorded.
+    Each flight equals that of `fly` with the same seed, to the last bit, but plans are not
+    recorded.
 
     Args:
         scenario: name of a scenario, path of a .toml file, or a scenario.
-        seeds: seeds in place of the scenario's, no two alike, as in `range(100)`.
+        seeds: different seeds that replace the scenario's, as in `range(100)`.
         keys: see `load`.
 
     Raises:
@@ -131,21 +131,23 @@ def fly_batch(scenario: Given, seeds: Iterable[int], /, **keys: Any) -> list[Fli
 
 
 def named(scenario: Given, keys: Mapping[str, Any]) -> tuple[str, Scenario]:
-    """Name of a scenario (of one made by hand, its title), and the scenario; see `load`."""
+    """Name of a scenario, and the scenario with keys replaced; a scenario made by hand has its
+    title as name.
+    """
     plugins.load()  # plug-ins of installed packages, once per process
     if isinstance(scenario, Scenario):
-        name, given = scenario.title, scenario
+        name, base = scenario.title, scenario
     elif isinstance(scenario, str | PathLike):
         name = fspath(scenario)
-        given = reading.load_base(name)
+        base = reading.load_base(name)
     else:
         expected = "expected the name of a scenario, a .toml file or a Scenario"
         raise TypeError(f"scenario: got {scenario!r}, {expected}")
-    return name, _checked(name, given, keys)
+    return name, _checked(name, base, keys)
 
 
 def prepare() -> None:
-    """Compile the server's kernels if this machine has not yet, with a note on stderr."""
+    """Compile the server's kernels unless this machine has them already, with a note on stderr."""
     import skytether.sim.flight  # noqa: F401 - its kernels are those of every flight
     from skytether.shared.base import kernel
     from skytether.shell import terminal
@@ -154,28 +156,26 @@ def prepare() -> None:
 
 
 def _checked(name: str, scenario: Scenario, keys: Mapping[str, Any]) -> Scenario:
-    """Scenario with keys replaced, every value checked."""
     table = _laid(keys, msgspec.to_builtins(scenario, enc_hook=_plain))
     return reading.check(table, f"{name or 'the scenario'}{' with these keys' if keys else ''}")
 
 
 def _laid(keys: Mapping[str, Any], table: dict[str, Any]) -> dict[str, Any]:
-    """Table with plain values of keys laid over it."""
     plain: dict[str, Any] = msgspec.to_builtins(dict(keys), enc_hook=_plain)
     set_keys(dict(flat(plain)), table)
     return table
 
 
 def _plain(value: Any) -> Any:
-    """Plain value of a numpy number or array, or of a path; of anything else its text."""
+    """Plain value of a numpy number or array; of anything else, such as a path, its text."""
     return value.tolist() if hasattr(value, "tolist") else str(value)
 
 
 def _check_server(server: Endpoint, *, udp: bool, secure: bool) -> None:
-    """Refuse a server of the user's that cannot be flown.
+    """Refuse an endpoint of the user that cannot be the server.
 
     Raises:
-        ConfigError: with the kinds of flight that it could fly.
+        ConfigError: the kind of flight needs Skytether's server.
         TypeError: the server is no endpoint.
     """
     if not isinstance(server, Endpoint):
@@ -183,13 +183,13 @@ def _check_server(server: Endpoint, *, udp: bool, secure: bool) -> None:
     if udp:
         raise ConfigError("udp: got True with a server of your own, which flies in virtual time")
     if secure:
-        said = "got True with a server of your own, which could not open what is sealed"
-        raise ConfigError(f"secure: {said}")
+        message = "got True with a server of your own, which cannot open encrypted packets"
+        raise ConfigError(f"secure: {message}")
 
 
 def _over_udp(scenario: Scenario, *, secure: bool) -> Record:
-    """Fly over UDP, in a thread: the caller's thread may run an event loop already, as in a
-    notebook.
+    """Fly over UDP in a thread of its own, because the caller's thread may already run an event
+    loop, as in a notebook.
     """
     from skytether.cli import processes
     from skytether.shell.command import CommandError
@@ -202,7 +202,7 @@ def _over_udp(scenario: Scenario, *, secure: bool) -> Record:
         ThreadPoolExecutor(1) as pool,
         ExitStack() as stack,
     ):
-        # Ctrl-C: the processes are ended in order before the exception goes on
+        # After Ctrl-C the processes are ended in order before the exception is raised again.
         stack.callback(stopped.set)
         flying = pool.submit(
             processes.run,

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Swept:
-    """One combination of a sweep, and its flights."""
+    """One combination of a sweep's values, and its flights."""
 
     keys: Mapping[str, Any]
     """Value of each key of the grid."""
@@ -36,10 +36,10 @@ class Swept:
     def mean(self, figure: str) -> Estimate:
         """Mean of a figure over the flights, and half the width of its 95 % confidence interval.
 
-        The mean is None where no flight has the figure, the interval where fewer than two have it.
+        The mean is None if no flight has the figure, the interval if fewer than two have it.
 
         Raises:
-            KeyError: the name is no numeric figure of a summary.
+            KeyError: `figure` is no numeric figure of a summary.
         """
         if figure not in lab.FIGURES:
             raise KeyError(f"no figure {figure!r}; {hint(str(figure), lab.FIGURES)}")
@@ -76,8 +76,9 @@ def sweep(
         scenario: name of a scenario, path of a .toml file, or a scenario.
         grid: values of each key that is swept; the last key changes fastest.
         runs: number of flights of each combination, with seeds that count up from the scenario's.
-        workers: number of processes that fly; 1 for the calling one. A script with more needs `if
-            __name__ == "__main__":`, as with `multiprocessing`. The results are the same.
+        workers: number of processes that fly; with 1, the calling process flies. With more, a
+            script needs `if __name__ == "__main__":`, as with `multiprocessing`. Results are the
+            same.
         keys: see `skytether.load`.
 
     Raises:
@@ -95,7 +96,7 @@ def sweep(
     if workers == 1:
         results = list(map(lab.fly, tasks))
     else:
-        # not fork: the child could inherit a lock that nobody releases
+        # A forked child could inherit a lock that is never released.
         spawned = multiprocessing.get_context("spawn")
         with ProcessPoolExecutor(workers, spawned) as pool:
             results = list(pool.map(lab.fly, tasks))

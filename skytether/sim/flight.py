@@ -1,13 +1,13 @@
-"""Flights in virtual time: scenario + seed → World → record and events.
+"""Flights in virtual time: a scenario and a seed give a record and events.
 
-**A run in a batch equals the same run alone, bit for bit.** Runs of a batch share one server, which
-solves for all of them at once, and nothing else: each run has its own network, winds and clocks,
-from its seed. Three things make the records equal. First, the server's ticks lie on the grid of its
-own clock, and a seed's random phase shifts the vehicles' start instead. Second, the server's
-computing time delays what it sends, not what it hears, and the server is woken after all other
-hosts (`sim.world`). Third, the numbers that differ between runs, of vehicles and sessions, always
-take the same number of bytes on the wire. Events are equal as well, once the vehicles of each run
-are numbered from 1.
+**A run in a batch equals the same run alone, bit for bit.** The runs of a batch share only a
+server, which solves for all of them at once. Each run has its own network, winds and clocks, from
+its seed. Three rules make the records equal. The server's ticks lie on the grid of its own clock,
+and a random phase from the seed shifts the start of the vehicles instead. The server's computing
+time delays the packets that it sends, not those that it receives, and at one instant the server is
+woken after all other hosts (`sim.world`). The numbers of vehicles and sessions, which differ
+between runs, always take the same number of bytes on the wire. Events are equal as well, once the
+vehicles of each run are numbered from 1.
 """
 
 import io
@@ -56,18 +56,21 @@ from skytether.shared.wire.drop import Drop
 from skytether.shared.wire.keys import Keyring
 from skytether.sim.world import Clock, World
 
-compile_all()  # what flies aboard is plain Python: here thousands may fly in one process
+# Aboard the client's code is plain Python; thousands of clients in one process need it compiled.
+compile_all()
 MIDNIGHT_NS = 86_400 * SECOND_NS
-"""Time on the server's clock at the start [ns]; far from 0, so that no timestamp is negative."""
+"""Time on the server's clock at the start [ns]; so large that no timestamp is negative."""
 BOOT_ID = 2**63 + 2**31
-"""Boot id of every endpoint: it takes as many bytes as a random one, and so do session numbers."""
+"""Boot id of every endpoint. It takes as many bytes as a random one, and so do session numbers."""
 SERVER: Address = ("server", 0)
 COMPANY_MAX = 100
-"""Most runs that share a server; more would be no faster, and vehicle numbers must fit one byte."""
+"""Largest number of runs that share a server. More would be no faster, and vehicle numbers must fit
+one byte.
+"""
 ASK_NS = 10 * MILLISECOND_NS
-"""Time of the world between two checks whether to stop the flight [ns]."""
+"""Virtual time between two calls of `stopped` [ns]."""
 EVENTS_MAX = 65_536
-"""Most events kept of a flight; newer ones replace the oldest."""
+"""Number of newest events of a flight that are kept."""
 
 
 def fly(
@@ -85,22 +88,21 @@ def fly(
 ) -> Record:
     """Fly a scenario in virtual time.
 
-    The vehicles start at a random phase of the server's grid, drawn from the seed: as in a real
-    flight, the server's ticks may fall anywhere within the vehicles' steps.
+    The vehicles start at a random phase of the server's grid, drawn from the seed, because in a
+    real flight too the server's ticks fall anywhere within the vehicles' steps.
 
     Args:
-        scenario: what to fly.
-        vehicles: number of vehicles, numbered from 1, all with the same trajectory, each with its
-            own winds.
-        secure: whether the link is sealed, with keys from the seed.
-        server: endpoint in place of `Server`; nothing of it is recorded.
+        vehicles: number of vehicles, from 1 on, all with the same reference, each with its own
+            winds.
+        secure: whether the link is encrypted, with keys from the seed.
+        server: endpoint in place of `Server`; it is not recorded.
         beside: endpoints of further hosts by name, such as an autopilot at `vehicle.address`.
-        changes: times [s, counted as in `Record.events`] and the keys and values that change then,
-            as in `shared.core.change`; a refused change is an event, and the flight goes on.
-        actions: times [s], and functions that act on the world then, such as to stop a host.
+        changes: times [s, counted as in `Record.events`], and the keys and values that change then,
+            as in `shared.core.change`; a refused change is an event, and the flight continues.
+        actions: times [s], and functions that act on the world then, for example stop a host.
         stopwatch: stopwatch for the server's stages; its times differ from flight to flight.
         on_second: called with the time flown [s], once per second of flight.
-        stopped: called often; once it returns true, the flight is ended.
+        stopped: called often; the flight ends once the result is true.
     """
     keyring = make_keys(scenario.seed, vehicles) if secure else None
     columns, sink = plan_columns(scenario.model.axes, scenario.control.horizon), io.BytesIO()
@@ -132,16 +134,14 @@ def fly_batch(
 ) -> list[Record]:
     """Fly a scenario once for each of these seeds, many times faster than one by one.
 
-    Each flight is the one that `fly` makes of the scenario with that seed, to the last bit, except
-    that of the server's `figures` only the drops are known. If the server's computing time exceeds
-    a step, so that it misses ticks, runs are flown one by one: which ticks it misses depends on
-    when it began.
+    Each flight equals that of `fly` with the same seed, to the last bit, except that the server's
+    `figures` contain only the drops. If the server's computing time exceeds a step, the runs are
+    flown one by one: which ticks the server misses depends on when it began.
 
     Args:
-        scenario: what to fly.
-        seeds: seeds in place of the scenario's, no two alike.
-        changes: see `fly`.
-        on_second, stopped: see `fly`; the time begins anew every COMPANY_MAX runs.
+        seeds: different seeds that replace the scenario's.
+        changes, stopped: as in `fly`.
+        on_second: as in `fly`; the time restarts every COMPANY_MAX runs.
 
     Raises:
         ConfigError: a plug-in raised an exception.
@@ -163,15 +163,14 @@ def fly_batch(
 
 
 class SharedServer(Server):
-    """Server of several runs, which also counts for each what it drops."""
+    """Server of several runs, which also counts dropped datagrams by run."""
 
     def __init__(self, *args: Any, **options: Any) -> None:
         super().__init__(*args, **options)
         self.dropped_by_host: defaultdict[str, Counter[Drop]] = defaultdict(Counter)
-        """Number of dropped datagrams by the host that sent them, and reason."""
+        """Number of dropped datagrams, by the sending host and the reason."""
 
     def receive(self, datagram: Datagram, *, now_ns: int) -> None:
-        """See `Endpoint`."""
         dropped = self._reception.hear(datagram, now_ns=now_ns)
         if dropped is not None:
             self.dropped_by_host[datagram.peer[0]][dropped] += 1
@@ -181,13 +180,12 @@ class Run:
     """Vehicles of one seed and their network, in a world shared with other runs.
 
     Args:
-        world: where its hosts are added.
-        scenario: what to fly, with the run's seed.
+        scenario: scenario to fly, with the run's seed.
         server_rows: returns the number of rows that the server has recorded so far.
-        server_figures: returns the server's figures so far, of what comes from a host.
-        number: number of the run, from 0; its vehicles' numbers follow those of the runs before.
-        vehicles: number of its vehicles.
-        keyring: their keys, where the link is sealed.
+        server_figures: returns the server's figures so far for the datagrams of a host.
+        number: number of the run, from 0; its vehicles are numbered after those of earlier runs.
+        vehicles: number of vehicles.
+        keyring: keys of the vehicles; None without encryption.
     """
 
     def __init__(
@@ -213,7 +211,6 @@ class Run:
         netem_at = world.add(f"netem {scenario.seed}", self.netem)
         self.netem_host = netem_at[0]
         self.hosts: dict[str, Endpoint] = {self.netem_host: self.netem}
-        """Endpoints by the names of their hosts."""
         self._events: deque[FlightEvent] = deque(maxlen=EVENTS_MAX)
         simulation = scenario.simulation
         clock = Clock(
@@ -243,15 +240,14 @@ class Run:
             )
             self.hosts[host] = client
         self.flying = vehicles
-        """Number of vehicles that have not finished."""
         self._ends: tuple[int | None, int | None] = None, None
         """Rows of the server and bytes of netem when the last vehicle finished."""
         self._figures: dict[str, Any] | None = None
-        """Figures of each process at that time."""
+        """Figures of each process when the last vehicle finished."""
 
     def hear(self, time_ns: int, host: str, event: Event) -> None:
-        """Keep an event of this run, numbered as if it flew alone, until its last vehicle has
-        finished.
+        """Keep an event until the last vehicle of the run has finished; vehicles are numbered from
+        1.
         """
         if not self.flying:
             return
@@ -274,11 +270,7 @@ class Run:
         }
 
     def flight(self, server_rows: Rows) -> Record:
-        """Record of the run, numbered as if it had flown alone.
-
-        Args:
-            server_rows: the server's rows of all runs.
-        """
+        """Record of the run, with vehicles numbered from 1, from the server's rows of all runs."""
         rows_end, bytes_end = self._ends
         client = parse(self._sinks[0].getvalue()).copy()
         netem = parse(self._sinks[1].getvalue()[:bytes_end])
@@ -306,7 +298,7 @@ def make_keys(seed: int, vehicles: int) -> Keyring:
 def _link(keyring: Keyring | None, seed: int, vehicle: int) -> ClientLink | None:
     if keyring is None:
         return None
-    from skytether.client.secure import SecureLink  # its ciphers take a while
+    from skytether.client.secure import SecureLink  # imports ciphers, which takes a while
 
     return SecureLink(keyring.of(vehicle), entropy=stream(seed, "entropy", vehicle).bytes)
 
@@ -314,7 +306,7 @@ def _link(keyring: Keyring | None, seed: int, vehicle: int) -> ClientLink | None
 def _gate(keyring: Keyring | None, entropy: Callable[[int], bytes]) -> Gate | None:
     if keyring is None:
         return None
-    from skytether.server.secure import SecureGate  # its ciphers take a while
+    from skytether.server.secure import SecureGate  # imports ciphers, which takes a while
 
     return SecureGate(keyring, entropy=entropy)
 
@@ -383,7 +375,7 @@ def _fly(
     run_of = {host: run for run in runs for host in run.hosts} | dict.fromkeys(beside, runs[0])
     for name, endpoint in beside.items():
         world.add(name, endpoint)
-    # Added last, the server is woken last at an instant: it has heard everything due by then.
+    # Added last, the server is woken last at an instant, when all datagrams due have arrived.
     compute_ns = seconds_to_ns(scenario.simulation.compute_s)
     world.add(SERVER[0], server, clock=Clock(MIDNIGHT_NS), compute_ns=compute_ns)
     hosts = {host: endpoint for run in runs for host, endpoint in run.hosts.items()}
@@ -427,17 +419,19 @@ def plan_changes(
     endpoints: Mapping[str, Endpoint],
     changes: Sequence[tuple[float, Mapping[str, Any]]],
 ) -> None:
-    """Schedule changes of keys, each at the hosts that accept it, or to be refused by the first."""
+    """Schedule changes of keys at each host that accepts the key; the first host refuses unknown
+    keys.
+    """
     running = {host: Running(endpoint, scenario) for host, endpoint in endpoints.items()}
     changeable = frozenset[str]().union(*(each.changeable for each in running.values()))
 
     def change(values: Mapping[str, Any]) -> None:
         for i, (host, each) in enumerate(running.items()):
-            here = (
+            accepted = (
                 each.changeable if i else each.changeable | ({*map(text_key, values)} - changeable)
             )
-            if own := {key: value for key, value in values.items() if text_key(key) in here}:
-                with suppress(ConfigError):  # the refusal is reported as an event
+            if own := {key: value for key, value in values.items() if text_key(key) in accepted}:
+                with suppress(ConfigError):  # a refusal is reported as an event
                     world.act(host, partial(each.change, own))
 
     for time_s, values in changes:

@@ -1,6 +1,6 @@
-"""Flights by a ground station in virtual time: station, netem and autopilot → a flight's record.
+"""Flights in virtual time by set-points that a ground station sends to an autopilot.
 
-The autopilot is to netem what a vehicle is, and the station what a server is: both meet the same
+Station, netem and autopilot take the places of server, netem and client, so both meet the same
 network as a flight of Skytether with the same seed.
 """
 
@@ -30,10 +30,10 @@ from skytether.station.joined import joined, station_columns
 from skytether.station.laws import Law
 
 READY_S = 1.0
-"""Time from the autopilot's start until it may be armed [s]; short, because a simulation need not
-wait for filters to settle."""
+"""Time from the autopilot's start until it may be armed [s]; short, because simulated filters need
+not settle.
+"""
 AROUND_S = 180.0
-"""Longest time of take-off and landing together [s]."""
 
 
 def fly(
@@ -45,10 +45,9 @@ def fly(
     on_second: Callable[[int], None] = lambda _: None,
     stopped: Callable[[], bool] = lambda: False,
 ) -> Record:
-    """Fly a scenario by set-points that a ground station sends straight to an autopilot.
+    """Fly a scenario by set-points that a ground station sends directly to an autopilot.
 
     Args:
-        scenario: what to fly.
         law: law that chooses set-points.
         flavour: flavour of the autopilot.
         changes, on_second, stopped: see `sim.flight.fly`.

@@ -1,13 +1,14 @@
-"""Virtual time: any number of endpoints on one clock that jumps from instant to instant.
+"""Virtual time: endpoints on a common clock that jumps from event to event.
 
-Between endpoints a datagram takes no time: delays come from netem, which is an endpoint here as
-well. Every host has its own clock, with offset and drift. A host may take time to compute when it
-is woken: only at the end of that time do its datagrams leave, and only then can it be woken again.
-It receives datagrams meanwhile, so computing for one peer does not delay what another sends. A host
-can be stopped and restarted, frozen for a while, and have its clock set, by actions scheduled with
-their time (`World.at`). What an endpoint keeps for its next life stays with its host. Time is
-integer nanoseconds, and events of one instant happen in a fixed order: equal inputs give equal
-outcomes on every machine, and hosts that exchange no datagrams do not affect each other.
+A datagram takes no time between endpoints; delays come from netem, which is an endpoint too. Every
+host has its own clock, with offset and drift. A host may need computing time when it is woken: its
+datagrams leave at the end of that time, and only then can it be woken again. It receives datagrams
+meanwhile, so computing for one peer does not delay the datagrams of another. Scheduled actions
+(`World.at`) can stop and restart a host, freeze it, and set its clock. The state that an endpoint
+saves survives a restart of its host.
+
+Time is integer nanoseconds, and events of one instant happen in a fixed order. So equal inputs give
+equal outcomes on every machine, and hosts that exchange no datagrams do not affect each other.
 """
 
 from collections import deque
@@ -21,7 +22,9 @@ from skytether.shared.core.events import Event
 
 BILLION = 1_000_000_000
 FROZEN_MAX = 6_500
-"""Most datagrams queued for a frozen host: the number of 600 B that fit a socket's buffer."""
+"""Largest number of datagrams queued for a frozen host: the number of 600 B that fit a socket's
+buffer.
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,12 +32,11 @@ class Clock:
     """Host's monotonic clock, as a function of the world's time."""
 
     offset_ns: int = 0
-    """Time on the clock at time 0 of the world [ns]."""
+    """Reading of the clock at time 0 of the world [ns]."""
     drift_ppb: int = 0
-    """Rate by which the clock runs faster than the world's [10⁻⁹]."""
+    """Rate by which the clock runs faster than the world's time [10⁻⁹]."""
 
     def local(self, time_ns: int) -> int:
-        """Time on the clock at a time of the world."""
         shown_ns = self.offset_ns + time_ns
         return shown_ns + time_ns * self.drift_ppb // BILLION if self.drift_ppb else shown_ns
 
@@ -46,12 +48,9 @@ class Clock:
         return passed_ns - passed_ns * self.drift_ppb // (BILLION + self.drift_ppb)
 
     def changed(self, time_ns: int, *, step_ns: int = 0, drift_ppb: int | None = None) -> "Clock":
-        """Clock that continues this one, with a step or another rate.
+        """Clock after a step of `step_ns` or a change of rate at `time_ns`, a time of the world.
 
-        Args:
-            time_ns: time of the world at which the change happens [ns].
-            step_ns: jump of the clock then [ns].
-            drift_ppb: new rate; None keeps the present one.
+        With `drift_ppb` None the rate stays the same.
         """
         drift_ppb = self.drift_ppb if drift_ppb is None else drift_ppb
         offset_ns = self.local(time_ns) + step_ns - Clock(0, drift_ppb).local(time_ns)
@@ -59,12 +58,11 @@ class Clock:
 
 
 class _Still(Endpoint):
-    """Stand-in for the endpoint of a host that is down or frozen: it does nothing.
+    """Stand-in for the endpoint of a host that is down or frozen.
 
     Args:
-        inner: the real endpoint.
-        room: most datagrams queued for it; 0 for a host that is down.
-        armed_ns: time of the world at which its timer ends, or None.
+        room: largest number of queued datagrams; 0 for a host that is down.
+        armed_ns: time of the world at which the host's timer ends, or None.
     """
 
     def __init__(self, inner: Endpoint, room: int, armed_ns: int | None = None) -> None:
@@ -73,10 +71,9 @@ class _Still(Endpoint):
         self.inner = inner
         self.room = room
         self.waiting: deque[Datagram] = deque()
-        """Queued datagrams, in order of arrival; later ones are dropped when the queue is full."""
+        """Queued datagrams in order of arrival; later ones are dropped when the queue is full."""
 
     def receive(self, datagram: Datagram, *, now_ns: int) -> None:  # noqa: ARG002
-        """Queue the datagram if there is room."""
         if len(self.waiting) < self.room:
             self.waiting.append(datagram)
 
@@ -95,24 +92,24 @@ class Host:
     endpoint: Endpoint
     clock: Clock
     turn: int
-    """Rank among hosts that are woken at one instant, from 1: the order of being added."""
+    """Rank among hosts that are woken at one instant, from 1 in the order of `World.add`."""
     compute_ns: int
-    """Computing time of each wake [ns]."""
     busy_until_ns: int
     """Time of the world until which the host computes, and cannot be woken."""
     on_finished: Callable[[], None] | None
-    """Callback for the end of the endpoint, until it has been called."""
+    """Callback for the end of the endpoint; None once called."""
     armed_ns: int | None = None
     """Time of the world at which the host is to be woken, or None."""
     due_ns: int | None = None
-    """Time on the host's clock that `armed_ns` was computed from; None to compute it again."""
+    """Time on the host's clock from which `armed_ns` was computed; None to compute it again."""
     memory: tuple[bytes, int] | None = None
-    """Content that its endpoints kept last, and when [ns; the host's clock]; None of none."""
+    """State that an endpoint of the host saved last, and when [ns; host's clock]."""
 
 
 ACTION, ARRIVAL = -1, 0
-"""Priorities at one instant: actions run before datagrams arrive, and these before any host is
-woken."""
+"""Order at one instant: actions run before datagrams arrive, and datagrams arrive before hosts are
+woken.
+"""
 
 
 class Act(Protocol):
@@ -123,16 +120,15 @@ class Act(Protocol):
 
 
 class World:
-    """Hosts, and the agenda of events that happen to them.
+    """Hosts, and the agenda of their future events.
 
     Args:
-        on_event: called with the time of the world, the host's name and the event, for each event
-            of every endpoint, before the end of that endpoint is told.
+        on_event: called for each event of an endpoint with the time of the world, the host's name
+            and the event, before `on_finished` of that host.
     """
 
     def __init__(self, on_event: Callable[[int, str, Event], None] = lambda *_: None) -> None:
         self.now_ns = 0
-        """Time of the world [ns]."""
         self._on_event = on_event
         self._hosts: dict[str, Host] = {}
         self._agenda: list[
@@ -140,9 +136,9 @@ class World:
             | tuple[int, int, int, None, Callable[[], None]]
         ] = []
         """Heap of future events: time, rank, order of entry, host, and the arriving datagram, or
-        None for a wake; an action has no host but a function."""
+        None for a wake; an action has no host but a function.
+        """
         self._scheduled = 0
-        """Number of entries made so far."""
         self._arriving: deque[tuple[Host, Datagram]] = deque()
         """Datagrams that arrive at the present time, in the order in which they were sent."""
 
@@ -156,18 +152,13 @@ class World:
         compute_ns: int = 0,
         on_finished: Callable[[], None] | None = None,
     ) -> Address:
-        """Add a host.
+        """Add a host, and return its address.
 
         Args:
-            name: name of the host, unlike any other's.
-            endpoint: endpoint that runs on it.
-            clock: its clock.
-            start_ns: time of the world before which it is not woken.
+            name: unique name of the host.
+            start_ns: time of the world before which the host is not woken.
             compute_ns: computing time of each wake [ns].
-            on_finished: called once, when the endpoint has just finished.
-
-        Returns:
-            Address of the host.
+            on_finished: called once, when the endpoint has finished.
         """
         assert name not in self._hosts
         turn = len(self._hosts) + 1
@@ -177,13 +168,13 @@ class World:
         return (name, 0)
 
     def at(self, time_ns: int, action: Callable[[], None]) -> None:
-        """Schedule an action for a time of the world that has not passed."""
+        """Schedule an action for a time of the world, which must not be in the past."""
         assert time_ns >= self.now_ns
         self._scheduled += 1
         heappush(self._agenda, (time_ns, ACTION, self._scheduled, None, action))
 
     def stop(self, name: str) -> None:
-        """Take a host down: it receives nothing, and datagrams it was about to send are lost."""
+        """Take a host down: it receives nothing, and the datagrams that it computes are lost."""
         host = self._hosts[name]
         host.endpoint, host.armed_ns = _Still(host.endpoint, 0), None
         self._agenda[:] = [
@@ -195,12 +186,9 @@ class World:
         heapify(self._agenda)
 
     def restart(self, name: str, endpoint: Endpoint) -> None:
-        """Start a new endpoint on a host, at its address and with its clock, from now on.
+        """Start a new endpoint on a host, which may be up, down or frozen; address and clock stay.
 
-        Args:
-            name: name of the host, which may be up, down or frozen.
-            endpoint: endpoint that runs on it from now on; its end is reported unless one was
-                before.
+        The end of the new endpoint is reported, unless the end of an earlier one was.
         """
         self.stop(name)
         host = self._hosts[name]
@@ -208,13 +196,13 @@ class World:
         self._arm(host)
 
     def memory(self, name: str) -> tuple[bytes, int] | None:
-        """Content that an endpoint on a host kept last, and when [ns; its clock]; None of none."""
+        """State that an endpoint of a host saved last, and when [ns; host's clock]."""
         return self._hosts[name].memory
 
     def freeze(self, name: str) -> None:
         """Freeze a host: datagrams are queued for it, up to a bound.
 
-        A host that is down or frozen already stays as it is.
+        No effect on a host that is down or already frozen.
         """
         host = self._hosts[name]
         if not isinstance(host.endpoint, _Still):
@@ -222,10 +210,10 @@ class World:
             host.armed_ns = None
 
     def thaw(self, name: str) -> None:
-        """Let a frozen host go on: it receives the queued datagrams, and is then woken if it wants
-        to be.
+        """Let a frozen host run again: it receives the queued datagrams, and is then woken if one
+        is due.
 
-        A host that is not frozen stays as it is.
+        No effect on a host that is not frozen.
         """
         host = self._hosts[name]
         still = host.endpoint
@@ -238,22 +226,21 @@ class World:
                 self._at(host.armed_ns, host.turn, host, None)
 
     def set_clock(self, name: str, *, step_ns: int = 0, drift_ppb: int | None = None) -> None:
-        """Step a host's clock now, or change its rate from now on.
+        """Step a host's clock, or change its rate from now on.
 
-        The host is not informed. Its pending wake is on a timer, which is independent of the clock,
-        and comes when it would have come.
+        The host is not informed. Its pending wake comes when it would have come, because timers are
+        independent of the clock.
 
         Args:
-            name: name of the host.
-            step_ns: jump of the clock, forward or back [ns].
-            drift_ppb: rate by which the clock runs faster than the world's [10⁻⁹]; None leaves it.
+            step_ns: step of the clock, forward or back [ns].
+            drift_ppb: rate by which the clock runs faster than the world's time [10⁻⁹]; None keeps
+                it.
         """
         host = self._hosts[name]
         host.clock = host.clock.changed(self.now_ns, step_ns=step_ns, drift_ppb=drift_ppb)
         host.due_ns = None
 
     def set_compute(self, name: str, compute_ns: int) -> None:
-        """Change the computing time of each wake of a host [ns]."""
         self._hosts[name].compute_ns = compute_ns
 
     def rearm(self, name: str) -> None:
@@ -261,11 +248,9 @@ class World:
         self._arm(self._hosts[name])
 
     def act(self, name: str, act: Act) -> None:
-        """Act on a host's endpoint now, and let its datagrams and events out.
+        """Act on a host's endpoint now, and send its datagrams and report its events.
 
-        Args:
-            name: name of the host.
-            act: called with the time on the host's clock.
+        `act` is called with the time on the host's clock.
         """
         host = self._hosts[name]
         try:

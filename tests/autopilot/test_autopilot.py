@@ -1,6 +1,7 @@
-"""The scripted autopilot answers as ArduCopter 4.5.6 and PX4 1.17 were measured to in simulation.
+"""The scripted autopilot answers as ArduCopter 4.5.6 and PX4 1.17 did in simulation.
 
-Tolerances stand beside the measured values. All of it is in virtual time.
+Measured values stand in the docstrings, tolerances beside the values in the tests. All in virtual
+time.
 """
 
 import math
@@ -30,7 +31,7 @@ BOTH: tuple[FlavourName, ...] = ("ardupilot", "px4")
 
 
 def step(companion: Companion, size: float, axis: int = 0) -> Steps:
-    """Times [s] and velocities over the size, of an isolated step on an axis."""
+    """Times [s] and velocities relative to the size, of an isolated step on an axis."""
     companion.velocity = (0.0, 0.0, 0.0)
     companion.run(5.0)
     since = len(companion.all("LOCAL_POSITION_NED"))
@@ -44,14 +45,14 @@ def step(companion: Companion, size: float, axis: int = 0) -> Steps:
 
 
 def crossing(times: np.ndarray, values: np.ndarray, level: float) -> float:
-    """Time at which values first reach a level, in between two of them [s]."""
+    """Time at which values first reach a level, interpolated [s]."""
     k = int(np.argmax(values >= level))
     share = (level - values[k - 1]) / (values[k] - values[k - 1])
     return float(times[k - 1] + share * (times[k] - times[k - 1]))
 
 
 def fitted(times: np.ndarray, values: np.ndarray) -> tuple[float, float, float]:
-    """Gain, time constant [s] and dead time [s] of a first order, by least squares."""
+    """Gain, time constant [s] and dead time [s] of a first-order model, by least squares."""
 
     def residual(p: np.ndarray) -> np.ndarray:
         return p[0] * (1.0 - np.exp(-np.maximum(times - p[2], 0.0) / p[1])) - values
@@ -61,7 +62,7 @@ def fitted(times: np.ndarray, values: np.ndarray) -> tuple[float, float, float]:
 
 
 def climbed(flavour: FlavourName = "ardupilot", **parameters: float) -> Companion:
-    """An autopilot in the air, guided, with some parameters set before."""
+    """Autopilot in the air, in guided mode, with some parameters set before."""
     companion = Companion(flavour)
     for name, value in parameters.items():
         set_parameter(companion, name, value)
@@ -71,7 +72,7 @@ def climbed(flavour: FlavourName = "ardupilot", **parameters: float) -> Companio
 
 @pytest.fixture(scope="module")
 def ardupilot() -> Companion:
-    """ArduCopter in the air, with its position at 50 Hz."""
+    """ArduCopter in the air, sending its position at 50 Hz."""
     companion = climbed()
     companion.stream(50.0)
     return companion
@@ -81,7 +82,7 @@ def ardupilot() -> Companion:
 
 
 def test_a_step_of_1_mps_is_as_measured(ardupilot: Companion) -> None:
-    """10, 50, 63 and 90 % after 0.30, 0.60, 0.72 and 1.32 s, here within 0.03 s; and a fit."""
+    """Measured: 10, 50, 63 and 90 % after 0.30, 0.60, 0.72 and 1.32 s."""
     times, values = step(ardupilot, 1.0)
     reached = [crossing(times, values, level) for level in (0.1, 0.5, 0.632, 0.9)]
     np.testing.assert_allclose(reached, [0.30, 0.60, 0.72, 1.32], rtol=0, atol=0.03)
@@ -97,14 +98,14 @@ def test_a_step_of_1_mps_is_as_measured(ardupilot: Companion) -> None:
 def test_larger_steps_are_slower_as_measured(
     ardupilot: Companion, size: float, tau_s: float, dead_s: float
 ) -> None:
-    """Within 0.15 s of time constant and 0.04 s of dead time: limits of jerk shape them."""
+    """Tolerances are wide because limits of jerk shape the response."""
     _, tau, dead = fitted(*step(ardupilot, size, axis=1))
     assert tau == pytest.approx(tau_s, abs=0.15)
     assert dead == pytest.approx(dead_s, abs=0.04)
 
 
 def test_a_vertical_step_is_as_measured(ardupilot: Companion) -> None:
-    """0.5 m/s: gain 1.01, time constant 0.21 s, dead time 0.24 s; the latter is shorter here."""
+    """Measured for 0.5 m/s: gain 1.01, time constant 0.21 s, dead time 0.24 s."""
     gain, tau_s, dead_s = fitted(*step(ardupilot, 0.5, axis=2))
     assert gain == pytest.approx(1.01, abs=0.03)
     assert tau_s == pytest.approx(0.21, abs=0.05)
@@ -112,7 +113,9 @@ def test_a_vertical_step_is_as_measured(ardupilot: Companion) -> None:
 
 
 def test_px4_stays_below_what_it_is_told() -> None:
-    """Gain 0.79 to 0.89 within 3 s, time constant 0.25 to 0.78 s, dead time 0.03 to 0.20 s."""
+    """Measured: gain 0.79 to 0.89 in 3 s, time constant 0.25 to 0.78 s, dead time 0.03 to 0.20
+    s.
+    """
     companion = climbed("px4")
     companion.stream(50.0)
     times, values = step(companion, 1.0)
@@ -124,11 +127,11 @@ def test_px4_stays_below_what_it_is_told() -> None:
 
 
 def test_px4_errs_as_measured() -> None:
-    """Three minutes of hovering by a velocity of zero, by what it tells and where it truly was.
+    """Estimation errors over three minutes of hovering with zero velocity.
 
-    Ten flights of PX4 1.17 had errors of the velocity of 0.08 to 0.34 m/s and of the position of
-    0.07 to 0.23 m (standard deviations on a horizontal axis), which went together, and came 1.1 to
-    1.6 m away within 10 s (root mean square).
+    In ten flights of PX4 1.17 the standard deviation on a horizontal axis was 0.08 to 0.34 m/s for
+    velocity and 0.07 to 0.23 m for position, correlated. The vehicle drifted 1.1 to 1.6 m within 10
+    s (RMS).
     """
     companion = Companion("px4", errs=True)
     companion.climb()
@@ -166,7 +169,9 @@ def test_10_setpoints_a_second_answer_as_50_do() -> None:
 def test_ardupilot_stands_after_its_time_out_and_goes_on_when_setpoints_do(
     ardupilot: Companion,
 ) -> None:
-    """Below 0.9, 0.5 and 0.1 m/s 3.30, 3.60 and 4.25 s after the last; moves 0.28 s after new."""
+    """Measured: below 0.9, 0.5 and 0.1 m/s 3.30, 3.60 and 4.25 s after the last set-point; moves
+    again 0.28 s after new ones.
+    """
     step(ardupilot, 1.0)
     since = len(ardupilot.all("LOCAL_POSITION_NED"))
     last_s = ardupilot.flight.now_ns / 1e9 - 0.02
@@ -184,7 +189,7 @@ def test_ardupilot_stands_after_its_time_out_and_goes_on_when_setpoints_do(
 
 
 def test_px4_flies_home_and_lands_after_its_time_out() -> None:
-    """It leaves OFFBOARD 1.2 s after the last setpoint, whether anybody is aboard or not."""
+    """Measured: PX4 leaves OFFBOARD 1.2 s after the last set-point."""
     companion = climbed("px4")
     companion.velocity = (2.0, 0.0, 0.0)
     companion.run(4.0)
@@ -247,7 +252,9 @@ def test_ardupilot_forgets_setpoints_of_before() -> None:
 
 @pytest.mark.parametrize(("flavour", "ready_s"), [("ardupilot", 41.5), ("px4", 4.6)])
 def test_it_is_armed_once_it_knows_where_it_is(flavour: FlavourName, ready_s: float) -> None:
-    """41.5 s and 4.6 s after its start, as measured; until then it says why, and has no place."""
+    """Measured: 41.5 s after its start for ArduCopter, 4.6 s for PX4. Until then the autopilot
+    reports a reason and no position.
+    """
     companion = Companion(flavour, ready_s=None)
     companion.run(ready_s - 0.1)
     assert companion.arm() == companion.flight.refusal
@@ -264,7 +271,7 @@ def test_it_is_armed_once_it_knows_where_it_is(flavour: FlavourName, ready_s: fl
 
 
 def test_ardupilot_climbs_and_lands_as_measured() -> None:
-    """7.6 s to 5 m; 12 to 13 s until it has landed and disarmed by itself."""
+    """Measured: 7.6 s to 5 m; 12 to 13 s until landed and disarmed."""
     companion = Companion()
     assert companion.climb() == pytest.approx(7.6, abs=0.3)
     assert companion.command(21) == 0
@@ -287,7 +294,6 @@ def test_a_setpoint_alone_lifts_px4_and_not_ardupilot() -> None:
 
 @pytest.mark.parametrize("flavour", BOTH)
 def test_it_disarms_by_itself_where_it_is_not_flown(flavour: FlavourName) -> None:
-    """10 s after arming."""
     companion = Companion(flavour)
     companion.run(1.0)
     assert companion.arm() == (0 if companion.flight.why_not_armed() == "" else 4)
@@ -308,7 +314,7 @@ def test_it_is_not_disarmed_in_the_air_unless_it_must(flavour: FlavourName) -> N
 
 
 def fly_with(fault: str, flavour: FlavourName, seconds: float, **keys: float) -> Companion:
-    """A flight of 1 m/s in which something goes wrong, from arming on."""
+    """Flight at 1 m/s with a fault from arming on."""
     companion = Companion(flavour, faults=(fault,))
     for name, value in keys.items():
         set_parameter(companion, name, value)
@@ -470,7 +476,7 @@ def test_a_stream_is_exact_by_its_own_stamp(rate: float) -> None:
 
 
 def test_a_stream_that_is_stopped_stops() -> None:
-    """An interval of -1; 0 is the one it has at the start; a message it has not is denied."""
+    """Interval -1 stops a stream, 0 restores its default; an unknown message is refused."""
     companion = Companion("px4")
     companion.run(1.0)
     number = dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED
@@ -522,7 +528,7 @@ def test_a_message_is_sent_on_request(flavour: FlavourName, name: str) -> None:
 
 
 def test_the_attitude_is_that_of_what_it_flies(ardupilot: Companion) -> None:
-    """Nose down to fly north, right side down to fly east, by NED's signs."""
+    """Nose down to fly north, right side down to fly east, in NED signs."""
     ardupilot.velocity = (0.0, 0.0, 0.0)
     ardupilot.run(5.0)
     ardupilot.velocity = (1.0, 1.0, 0.0)
@@ -546,7 +552,9 @@ def test_position_and_velocity_are_flown_together(ardupilot: Companion) -> None:
 
 
 def test_a_position_is_flown_to_when_nobody_is_left() -> None:
-    """Ablation of sending velocities alone: ArduCopter goes on, far beyond its time-out."""
+    """With a position in the set-points, ArduCopter continues far beyond its timeout. So the client
+    sends velocities only.
+    """
     companion = climbed()
     companion.position, companion.velocity = (60.0, 0.0, 5.0), (0.0, 0.0, 0.0)
     companion.setpoint()
@@ -568,7 +576,6 @@ def test_a_position_is_flown_to_when_nobody_is_left() -> None:
 def test_a_setpoint_that_cannot_be_flown_is_none(
     change: Callable[[Companion], None], mask: int
 ) -> None:
-    """No number, nothing in it, or accelerations, which nobody here sends."""
     companion = climbed()
     change(companion)
     before = companion.autopilot.figures()["rejected"]

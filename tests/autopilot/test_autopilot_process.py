@@ -23,7 +23,6 @@ LINES = re.findall(
 
 @contextmanager
 def companion() -> Iterator[socket.socket]:
-    """A socket of a companion computer."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as own:
         own.bind(("127.0.0.1", 0))
         own.settimeout(20.0)
@@ -31,7 +30,6 @@ def companion() -> Iterator[socket.socket]:
 
 
 def heartbeat(own: socket.socket) -> object:
-    """The next heartbeat that comes."""
     codec = Codec(255, 190)
     while True:
         for message in codec.decode(own.recv(2048)):

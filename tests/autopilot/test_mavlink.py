@@ -1,4 +1,4 @@
-"""MAVLink's bytes: what a codec writes it reads, among whatever else comes; parameters; axes."""
+"""MAVLink codec: round trips, noise between frames, parameters, axes."""
 
 import math
 
@@ -35,7 +35,9 @@ def test_what_is_written_is_read() -> None:
 @settings(max_examples=60, deadline=None)
 @given(st.lists(NOISE, min_size=4, max_size=4), st.booleans())
 def test_frames_are_found_among_noise(noise: list[bytes], stream: bool) -> None:
-    """All of them, in order, in a datagram or a stream; a longest frame's worth ends the wait."""
+    """All frames are found in order, in datagrams or a stream; an incomplete frame delays the rest
+    by one frame's length at most.
+    """
     sent = frames(3)
     mixed = b"".join(a + b for a, b in zip(noise, [*sent, bytes(FRAME_BYTES_MAX)], strict=True))
     codec = Codec(255, 190, stream=stream)
@@ -66,7 +68,7 @@ def test_a_stream_may_come_in_any_pieces(sizes: list[int]) -> None:
 @settings(max_examples=300, deadline=None)
 @given(st.integers(0, 2), st.integers(0, 400), st.integers(1, 255))
 def test_a_flipped_bit_is_no_message(which: int, at: int, flip: int) -> None:
-    """The checksum covers all but the first byte, which nothing begins with then."""
+    """The checksum covers all bytes but the first, without which no frame begins."""
     frame = bytearray(frames(3)[which])
     frame[at % len(frame)] ^= flip
     assert Codec(255, 190).decode(bytes(frame)) == []
@@ -87,8 +89,8 @@ def test_a_frame_with_a_right_checksum_may_say_anything(payload: bytes, number: 
 
 @given(st.integers(-(2**31), 2**31 - 1).filter(lambda n: (n >> 22) & 0x1FF != 0x1FE))
 def test_an_integer_goes_bit_by_bit(value: int) -> None:
-    """Integers are sent bit by bit, as by PX4, except for signalling NaNs, which no float can
-    carry.
+    """Integers are sent bit by bit, as by PX4; signalling NaNs are excluded, as no float has
+    them.
     """
     kind = parameters.type_of(value)
     sent = parameters.to_wire(value, bytewise=True)
@@ -98,7 +100,6 @@ def test_an_integer_goes_bit_by_bit(value: int) -> None:
 
 @given(st.integers(-(2**24), 2**24))
 def test_an_integer_goes_as_a_number(value: int) -> None:
-    """Integers are converted to floats, as by ArduPilot; they are exact up to 24 bits."""
     sent = parameters.to_wire(value, bytewise=False)
     assert parameters.from_wire(sent, parameters.INTEGER, bytewise=False) == value
 
@@ -114,7 +115,7 @@ def test_what_is_no_number_is_no_value(bytewise: bool) -> None:
 
 @given(st.text(st.characters(codec="ascii", exclude_characters="\0"), max_size=250))
 def test_a_long_text_is_put_together(text: str) -> None:
-    """It goes in 50 bytes a message; one whose chunk is lost is none, and leaves nothing behind."""
+    """A long text is split into messages of 50 bytes; if one is lost, the whole text is dropped."""
     codec, texts = Codec(1, 1), Texts()
     sent = b"".join(map(codec.encode, chunks(4, text, 7)))
     read = Codec(255, 190).decode(sent)

@@ -1,4 +1,4 @@
-"""Set-points sent straight to an autopilot: the laws, the ground station, and flights by both."""
+"""Set-points sent directly to an autopilot: the laws, the ground station, and flights."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -41,13 +41,12 @@ from skytether.station.joined import joined, station_columns, summary_of
 from skytether.station.laws import Heard, setpoint
 
 OTHERS = (("velocity", 1.28), ("targets", 0.64))
-"""Other laws, and the RMSE xy that was measured with them [m]."""
+"""Other laws, and the measured RMSE xy with each [m]."""
 EIGHT = figure_eight(5.0, 30.0, 3, 5.0)
 NONE = ""
 
 
 def scenario(**table: Any) -> Scenario:
-    """The scenario `autopilot`, flown for 4 s, with some keys changed."""
     return packaged("autopilot", {"duration": 4.0, "settle": 0.0}, table)
 
 
@@ -59,7 +58,7 @@ def flown(law: str = "led", flavour: FlavourName = "ardupilot", **table: Any) ->
 
 
 def test_velocity_flies_to_where_the_vehicle_should_be_now() -> None:
-    """Set-point u(t) = r'(t) + k (r(t) - y), whenever y was measured."""
+    """Set-point u(t) = r'(t) + k (r(t) - y), regardless of the age of the measurement y."""
     chosen = setpoint(laws.make("velocity"), EIGHT, 4.0, Heard(3.0, np.array([1.0, 2.0, 3.0])))
     r, v = EIGHT(np.array(4.0)).T
     np.testing.assert_allclose(chosen.velocity, v + 0.3 * (r - [1.0, 2.0, 3.0]))
@@ -76,7 +75,7 @@ def test_led_compares_what_was_measured_with_where_it_should_have_been_then() ->
 
 
 def test_targets_leave_it_to_the_autopilot_to_regulate() -> None:
-    """Set-points p(t) = r(t + T), u(t) = r'(t + T), wherever the vehicle is."""
+    """Set-points p(t) = r(t + T), u(t) = r'(t + T), regardless of the vehicle's position."""
     chosen = setpoint(laws.make("targets", 0.5), EIGHT, 4.0, Heard(3.9, np.zeros(3)))
     assert chosen.position is not None
     np.testing.assert_allclose([chosen.position, chosen.velocity], EIGHT(np.array(4.5)).T)
@@ -127,7 +126,7 @@ def test_it_flies_as_an_arducopter_was_measured_to(law: str, measured_m: float) 
 
 
 def _is_counted_as_flown(summary: Summary) -> None:
-    """A set-point a step and 20 positions a second, and little beside."""
+    """A set-point per step and 20 positions per second, and little else."""
     assert summary.uplink_packets is not None
     assert summary.downlink_packets is not None
     assert summary.steps <= summary.uplink_packets < 1.1 * summary.steps
@@ -136,7 +135,6 @@ def _is_counted_as_flown(summary: Summary) -> None:
 
 
 def test_px4_is_flown_as_well_and_the_same_seed_flies_the_same() -> None:
-    """It needs a stream before its mode, and is told the altitude of take-off above the sea."""
     one, other = flown("targets", "px4"), flown("targets", "px4")
     assert one.trace_hash() == other.trace_hash()
     assert [type(each.event) for each in one.events].count(Finished) == 1
@@ -153,7 +151,7 @@ def test_half_of_all_packets_may_be_lost() -> None:
 
 
 def test_an_age_is_known_although_clocks_differ() -> None:
-    """TIMESYNC gives the age of a position that was 0.2 s under way: 0.2 s to 0.2 s plus a step."""
+    """TIMESYNC gives a position that was 0.2 s under way an age of 0.2 s to 0.2 s plus a step."""
     late = "constant(0.2)"
     drifts = {"clock_drift_ppm": 500.0, "clock_offset_s": 1000.0}
     record = flown(network={"uplink": late, "downlink": late}, simulation=drifts)
@@ -188,12 +186,6 @@ def test_an_autopilot_that_is_not_reached_is_not_flown(way: str) -> None:
 
 
 class Sky:
-    """A station and an autopilot with no network between them.
-
-    Args:
-        faults: what goes wrong, as on the command line.
-    """
-
     def __init__(self, faults: Sequence[str] = ()) -> None:
         scene = scenario(duration=6.0, network={"uplink": NONE, "downlink": NONE})
         self.events: list[tuple[int, object]] = []
@@ -253,7 +245,7 @@ def test_a_flight_that_begins_on_the_ground_is_refused() -> None:
 
 
 def test_the_true_state_is_taken_at_the_time_of_each_step() -> None:
-    """Between two ticks of the autopilot in between; where it told nothing, nothing is known."""
+    """Interpolated between two ticks of the autopilot; undefined where it reported nothing."""
     scene = scenario()
     station = np.zeros(3, station_columns(3))
     station["time_ns"], station["step"] = [0, 50_000_000, 100_000_000], [0, 1, 2]
@@ -292,7 +284,7 @@ def test_the_autopilot_records_where_it_truly_is_at_every_tick() -> None:
 
 
 def flight(contender: str, air: autopilots.Air, seed: int, **whole: float) -> autopilots.FlownCell:
-    """Figures of flights of PX4 in which nothing was flown, but for those that are given."""
+    """Figures of flights of PX4, all zero except for the given ones."""
     nothing = [np.zeros(80, columns) for columns in (station_columns(3), TRUTH_COLUMNS)]
     record = joined(scenario(), *nothing, np.zeros(0, PACKET_COLUMNS))
     summary = summary_of(scenario(), "autopilot", record)

@@ -1,4 +1,4 @@
-"""Three autopilots on one mission: in virtual time, and over UDP as docs/together.md says."""
+"""Three autopilots on one mission: in virtual time, and over UDP as in docs/together.md."""
 
 import io
 import re
@@ -35,7 +35,7 @@ from skytether.sim.world import Clock, World
 NUMBERS = (1, 2, 3)
 DOCUMENT = Path(__file__).parents[2] / "docs" / "together.md"
 PX4 = {"tau_s": [0.5], "gain": [0.85], "dead_time_s": [0.1]}
-"""Model of PX4, as the scenario `px4` has it."""
+"""Model of PX4 in the scenario `px4`."""
 
 
 def scenario(flavour: FlavourName, number: int, loss: float) -> Scenario:
@@ -48,7 +48,7 @@ def scenario(flavour: FlavourName, number: int, loss: float) -> Scenario:
 
 
 def apart_m(paths: list[Array]) -> float:
-    """Smallest distance between two of them [m]; each of shape (n, 3)."""
+    """Smallest distance between two paths [m]; each of shape (n, 3)."""
     steps = min(map(len, paths))
     pairs = combinations((path[:steps] for path in paths), 2)
     return min(float(np.linalg.norm(one - other, axis=1).min()) for one, other in pairs)
@@ -58,7 +58,6 @@ def apart_m(paths: list[Array]) -> float:
     ("flavour", "loss"), [("ardupilot", 0.1), pytest.param("px4", 0.4, marks=pytest.mark.long)]
 )
 def test_three_swap_places_within_a_fence(flavour: FlavourName, loss: float) -> None:
-    """From the ground where each begins, and back to it; by where they truly were."""
     world, clients, truths = World(lambda *_: None), [], []
     for number in NUMBERS:
         flown = scenario(flavour, number, loss)
@@ -77,7 +76,7 @@ def test_three_swap_places_within_a_fence(flavour: FlavourName, loss: float) -> 
     assert [client.failure for client in clients] == [None, None, None]
     paths = []
     for number, truth in zip(NUMBERS, truths, strict=True):
-        stands = flown.start_m(number) * [1.0, 1.0, 0.0]  # its own frame begins there
+        stands = flown.start_m(number) * [1.0, 1.0, 0.0]  # its local frame begins at its start
         path = parse(truth.getvalue())["state"][:, :, 0] + stands
         paths.append(path)
         goal = flown.make_reference(number)(np.array(flown.duration))[:, 0]
@@ -92,10 +91,7 @@ def test_three_swap_places_within_a_fence(flavour: FlavourName, loss: float) -> 
 @pytest.mark.usefixtures("documented_ports")
 @pytest.mark.long
 def test_the_documented_autopilots_swap_places_over_udp(tmp_path: Path) -> None:
-    """Each line in a process of its own; clients for 45 s, over the emulated network.
-
-    Clients begin at different times, which the times of their steps tell.
-    """
+    """Each autopilot, server, netem and client is a process; 45 s over the emulated network."""
     found = re.findall(r"```sh\n(.*?)```", DOCUMENT.read_text(), re.DOTALL)
     (block,) = (each for each in found if "skytether autopilot" in each)
     lines = [shlex.split(line)[1:] for line in block.splitlines()]

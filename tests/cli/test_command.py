@@ -1,4 +1,4 @@
-"""The commands as a user runs them: real processes, real sockets, and one line for a mistake."""
+"""Commands as a user runs them: real processes and sockets, and one line for each mistake."""
 
 import json
 import os
@@ -42,7 +42,7 @@ QUICK = [
     *("--settle", "0"),
     *("--link.heartbeat-s", "0.1", "--link.timeout-s", "0.5"),
 ]
-"""A short link without losses, and a session that notices silence soon."""
+"""Short link without losses, and a session that detects silence soon."""
 
 
 # -- mistakes ------------------------------------------------------------------------------------
@@ -211,7 +211,6 @@ def test_a_virtual_flight_writes_the_same_summary_twice(tmp_path: Path) -> None:
 
 
 def test_a_flight_tells_what_was_dropped_and_why(tmp_path: Path) -> None:
-    """By each end, in the file and in the table; what occurred alone."""
     file = tmp_path / "flight.json"
     argv = ["fly", "demo", "--virtual", "--secure", "--duration", "8", "--json", str(file)]
     run = skytether(*argv, "--network.downlink", "constant(0.1) & duplicate(0.5) & loss(0.2)")
@@ -226,7 +225,7 @@ def test_a_flight_tells_what_was_dropped_and_why(tmp_path: Path) -> None:
 
 @pytest.fixture
 def contradictory(tmp_path: Path) -> str:
-    """File of a scenario whose loss of 40 % asks for a longer horizon than it has."""
+    """File of a scenario whose loss of 40 % needs a longer horizon than it has."""
     file = tmp_path / "mine.toml"
     file.write_text(
         'extends = "demo-committed"\ncontrol.horizon = 12\nduration = 2.0\n'
@@ -265,7 +264,6 @@ def test_a_flag_may_end_a_contradiction_of_the_file(
 def test_a_table_in_millimetres_is_flown_with_a_warning(
     tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    """First at 2 s, after a rest at the origin; the summary has the share of such steps."""
     table, told = tmp_path / "mm.csv", tmp_path / "told.json"
     table.write_text("t,x,y\n0,0,0\n2,0,0\n12,5100,0\n")
     argv = ["fly", "demo", "--virtual", "--duration", "10", "--settle", "0", "--json", str(told)]
@@ -280,7 +278,7 @@ def test_a_table_in_millimetres_is_flown_with_a_warning(
 def test_a_second_scenario_is_judged_as_it_is_flown(
     contradictory: str, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    """A longer flight of the other one leads it over its own fence."""
+    """The second scenario's longer flight leads over its own fence."""
     fenced = Path(contradictory).with_name("fenced.toml")
     fenced.write_text(
         'extends = "demo"\nduration = 2.0\nsettle = 0.0\nfence.radius_m = 6.0\n'
@@ -387,7 +385,12 @@ def test_a_client_that_is_refused_names_each_key_and_both_values(
 def test_a_client_too_many_and_one_under_a_number_in_flight_are_told_why(
     start: Callable[..., Process],
 ) -> None:
-    patient = ["--settle", "0", "--link.timeout-s", "10"]  # nobody is silent, on a busy machine
+    patient = [
+        "--settle",
+        "0",
+        "--link.timeout-s",
+        "10",
+    ]  # long timeout, so that a busy machine does not trip it
     server = start("server", "demo", "--bind", "127.0.0.1:0", "--vehicles", "1", *patient)
     address = server.address()
     argv = ["client", "demo", "--server", address, *patient]
@@ -424,12 +427,12 @@ def test_a_log_of_json_has_an_event_a_line(start: Callable[..., Process]) -> Non
     assert server.end() == 0
 
 
-# -- nobody reads, nothing can be written --------------------------------------------------------
+# -- blocked output and full disks ---------------------------------------------------------------
 
 
 @pytest.fixture(params=["a pipe that is full", "a disk that is full", "a pipe without a reader"])
 def unread(request: pytest.FixtureRequest) -> Iterator[int]:
-    """A standard output that takes nothing."""
+    """Standard output that accepts no data."""
     if request.param == "a disk that is full":
         number = os.open("/dev/full", os.O_WRONLY)
         yield number
@@ -453,7 +456,6 @@ def unread(request: pytest.FixtureRequest) -> Iterator[int]:
 def test_a_server_whose_output_nobody_reads_flies_a_vehicle_and_ends_in_order(
     unread: int, start: Callable[..., Process], tmp_path: Path
 ) -> None:
-    """However many strangers it has to tell of meanwhile."""
     figures = tmp_path / "server.json"
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
         free.bind(("127.0.0.1", 0))
@@ -471,12 +473,12 @@ def test_a_server_whose_output_nobody_reads_flies_a_vehicle_and_ends_in_order(
         finally:
             server.kill()
     counted = json.loads(figures.read_text())
-    assert counted["vehicles"] == 0  # the client has said that it ends
+    assert counted["vehicles"] == 0  # the client has announced its end
     assert counted["counts"]["steps"] > 40
 
 
 def call_as_strangers(port: int, count: int) -> None:
-    """Say HELLO with other terms to a server, by other numbers, and hear its answer to each."""
+    """Send HELLO with other terms to a server, from several vehicles, and await each answer."""
     demo = reading.load("demo")
     control = msgspec.structs.replace(demo.control, dt=0.02, horizon=100)
     terms = msgspec.structs.replace(demo, control=control).terms()
@@ -526,7 +528,6 @@ def test_a_flood_of_strangers_is_counted_in_a_line(start: Callable[..., Process]
 def test_a_full_disk_costs_the_record_and_not_the_flight(
     start: Callable[..., Process], tmp_path: Path
 ) -> None:
-    """Each process says so once, goes on, and ends with 1; what it has recorded is kept."""
     parts = {name: tmp_path / name for name in ("server", "netem", "client")}
     full = {"file_bytes": 1500}
 
@@ -560,7 +561,7 @@ def test_a_full_disk_costs_the_record_and_not_the_flight(
 def test_a_flight_whose_disk_fills_is_flown_and_shown_as_far_as_it_is_recorded(
     start: Callable[..., Process], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """One command: exit code 1, the summary of what there is, and how much of the flight it is."""
+    """Exit code 1, the summary of the recorded part, and the share of the flight that it covers."""
     monkeypatch.setenv("TMPDIR", str(tmp_path))
     file = tmp_path / "summary.json"
     argv = ["fly", "demo", *QUICK, "--duration", "4", "--json", str(file)]

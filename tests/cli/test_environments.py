@@ -1,4 +1,4 @@
-"""Commands where something is missing: streams, files, a home, a language, a terminal, patience."""
+"""Commands without something usual: streams, files, home, locale, terminal, or time to end."""
 
 import os
 import pty
@@ -21,11 +21,10 @@ pytestmark = pytest.mark.long
 
 PATIENCE_S = 60.0
 SIGUSR1_IGNORED = 1 << (signal.SIGUSR1 - 1)
-"""Bit of SIGUSR1 in the mask of ignored signals."""
 
 VIRTUAL = ["--virtual", "--vehicles", "2", "--duration", "1", "--settle", "0"]
 SHORT = ["--duration", "2", "--settle", "0"]
-for _direction in ("uplink", "downlink"):  # a plan comes at once
+for _direction in ("uplink", "downlink"):  # a plan arrives at once
     SHORT += [f"--network.{_direction}", "loss(0.1)"]
 
 POOR = {
@@ -50,7 +49,6 @@ ENVIRONMENTS: dict[str, tuple[dict[str, str | None], str]] = {
 
 
 def run(argv: list[str], environment: str = "", line: str = "{}") -> CompletedProcess[str]:
-    """One command to its end, in one of the environments or within a line of shell."""
     variables, line = ENVIRONMENTS.get(environment, ({}, line))
     merged = {**os.environ, **variables}
     return ran(
@@ -61,7 +59,6 @@ def run(argv: list[str], environment: str = "", line: str = "{}") -> CompletedPr
 
 
 def begun(*argv: str, **keys: Any) -> "Popen[str]":
-    """A command that goes on, as a user starts it."""
     begun: Popen[str] = Popen([*SKYTETHER, *argv], stdout=PIPE, stderr=PIPE, text=True, **keys)
     return begun
 
@@ -83,7 +80,7 @@ def test_a_command_does_the_same_in_any_environment(environment: str, tmp_path: 
 
 
 def test_a_flight_over_udp_needs_neither_streams_nor_home(tmp_path: Path) -> None:
-    """Nor many open files: no socket of its own is taken for a stream, in none of its processes."""
+    """A process without standard streams must not open a socket in their place."""
     file = tmp_path / "summary.json"
     flags = ["--network.uplink", "constant(0.03)", "--network.downlink", "constant(0.03)"]
     fly = run(["fly", "demo", *SHORT, *flags, "--json", str(file)], "everything at once")
@@ -122,7 +119,7 @@ def test_a_terminal_that_cannot_move_its_cursor_is_not_told_to(term: str) -> Non
     with Popen(argv, stdout=theirs, stderr=theirs, env=environment) as command:
         os.close(theirs)
         shown = b""
-        with suppress(OSError):  # its other end is closed
+        with suppress(OSError):  # the other end is closed
             while True:
                 shown += os.read(ours, 65536)
     os.close(ours)
@@ -131,7 +128,7 @@ def test_a_terminal_that_cannot_move_its_cursor_is_not_told_to(term: str) -> Non
     assert (b"\x1b" in shown) == (term == "xterm")
 
 
-# -- a machine that gives nothing more -----------------------------------------------------------
+# -- exhausted resources -------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -177,7 +174,10 @@ def test_a_file_that_cannot_be_written_is_told_before_the_flight(
         assert main([*argv, flag, str(file)]) == 2
         said = f"{command}: {flag}: {file}: cannot be written: {reason}\n"
         assert capfd.readouterr().err == said
-    for fine in (kept, tmp_path / "new.png"):  # and what is wrong is something else
+    for fine in (
+        kept,
+        tmp_path / "new.png",
+    ):  # files that can be written are not mentioned in the message
         assert main([*argv, flag, str(fine), "--link.heartbeat_s", "9"]) == 2
         assert "link.timeout_s" in capfd.readouterr().err
     assert [path.name for path in tmp_path.iterdir()] == ["kept.png"]
@@ -216,9 +216,7 @@ def test_a_mistake_is_one_line_whatever_stands_in_it() -> None:
 
 
 def about(pid: int, path: str) -> str:
-    """File `path` of a process in /proc; empty once the process has ended, which it may do while
-    it is read.
-    """
+    """File `path` of a process in /proc; empty if the process has ended, even during the read."""
     try:
         return Path(f"/proc/{pid}/{path}").read_text()
     except (FileNotFoundError, ProcessLookupError):
@@ -226,7 +224,7 @@ def about(pid: int, path: str) -> str:
 
 
 def ignores_usr1(pid: int) -> bool:
-    """Whether a process has come so far as to ignore SIGUSR1; False for one that has ended."""
+    """Whether a process already ignores SIGUSR1; False if it has ended."""
     found = re.search(r"SigIgn:\s*(\w+)", about(pid, "status"))
     return found is not None and bool(int(found[1], 16) & SIGUSR1_IGNORED)
 
@@ -247,7 +245,7 @@ def children(pid: int) -> list[int]:
     ids=lambda argv: " ".join(argv[:2]),
 )
 def test_sigusr1_ends_no_process_that_starts(argv: list[str], tmp_path: Path) -> None:
-    """It asks for figures, which there are none of yet: it is ignored from the first moment."""
+    """SIGUSR1 requests figures; before any exist, the signal must be ignored."""
     module = argv[0] if argv[0] == "skytether" else f"skytether.{argv[0]}"
     command = [sys.executable, "-P", "-m", module, *argv[1:]]
     with Popen(command, cwd=tmp_path, stdout=DEVNULL, stderr=DEVNULL) as process:
@@ -266,7 +264,7 @@ def test_a_flight_and_its_processes_outlive_sigusr1() -> None:
         while fly.poll() is None:
             for pid in (fly.pid, *children(fly.pid)):
                 if ignores_usr1(pid):
-                    # Ended between the two lines: nobody is left to be told.
+                    # It may end between the two lines.
                     with suppress(ProcessLookupError):
                         os.kill(pid, signal.SIGUSR1)
             time.sleep(0.02)
@@ -284,7 +282,7 @@ def test_a_flight_that_is_ended_while_it_starts_leaves_nothing(
 ) -> None:
     folder = tmp_path / "tmp"
     folder.mkdir()
-    # A horizon that never comes: the flight cannot begin before the signal does.
+    # No horizon arrives: the flight cannot begin before the signal.
     environment = os.environ | {"TMPDIR": str(folder)}
     with begun("fly", "--network.uplink.loss", "1", env=environment) as fly:
         until(lambda: len(children(fly.pid)) == count)
@@ -298,7 +296,7 @@ def test_a_flight_that_is_ended_while_it_starts_leaves_nothing(
 
 def test_ctrl_c_while_a_command_is_imported_is_no_traceback() -> None:
     with begun("fly") as fly:
-        until(lambda: ignores_usr1(fly.pid))  # the imports have just begun
+        until(lambda: ignores_usr1(fly.pid))  # imports have just begun
         fly.send_signal(signal.SIGINT)
         out, err = fly.communicate(timeout=PATIENCE_S)
     assert fly.returncode in (-signal.SIGINT, 130)

@@ -1,4 +1,4 @@
-"""Extras: each command runs on what it needs, and says in one line which extra it misses."""
+"""Extras: each command runs with the extras that it needs, and names a missing one in one line."""
 
 import ast
 import os
@@ -40,10 +40,10 @@ NEEDS: dict[str, tuple[str, ...]] = {
     "report": ("record",),
     **dict.fromkeys(LAB, ("lab",)),
 }
-"""Extras that the help of each command needs: all that it imports before it knows its options."""
+"""Extras that the help of each command needs: everything imported before it parses its options."""
 
 BROUGHT = {"osqp": "jinja2", "viser": "zstandard"}
-"""Packages that bring one which we ask for in another extra."""
+"""Packages that bring a package which another extra requires."""
 
 RUN = """
 import sys
@@ -56,13 +56,12 @@ sys.exit(main())
 
 
 def packages(*names: str) -> set[str]:
-    """Modules that some extras bring."""
     found = {module for name in names for module in extras._extras()[name]}
     return found | {BROUGHT[one] for one in found & BROUGHT.keys()}
 
 
 def run(argv: list[str], installed: tuple[str, ...]) -> subprocess.CompletedProcess[str]:
-    """A command where only these extras are installed."""
+    """Run a command with only these extras installed."""
     missing = packages(*ALL) - packages(*installed) or {"none"}
     return ran(sys.executable, "-P", "-c", RUN, ",".join(missing), *argv)
 
@@ -76,7 +75,7 @@ def test_every_command_has_its_needs_told_here() -> None:
 
 
 def test_every_package_that_is_imported_is_asked_for() -> None:
-    """The requirements name every imported package, and do not rely on another package's."""
+    """Requirements name every imported package, independently of other packages' requirements."""
     asked = {re.split("[^a-z0-9_-]", one)[0] for one in metadata.requires("skytether") or ()}
     ours = {"skytether", *(MODULES.get(name, name.replace("-", "_")) for name in asked)}
     imported = set()
@@ -105,9 +104,9 @@ def _imports(tree: ast.AST) -> Iterator[str]:
     ],
 )
 def test_a_command_runs_with_what_it_needs_and_names_what_it_misses(command: str) -> None:
-    """Without any extra it ends with 2 and one line; with its own it knows its help.
+    """Without extras the command ends with 2 and one line; with its own it prints its help.
 
-    One command of the laboratory stands for all: their package asks for the extra.
+    One command of the laboratory stands for all, because their package checks the extra.
     """
     shown = run([command, *(["--help"] if command not in LISTS else [])], NEEDS[command])
     assert (shown.returncode, shown.stderr) == (0, "")

@@ -1,4 +1,4 @@
-"""Many vehicles: in one process, on one server, on several workers, and what they cost."""
+"""Many vehicles: in one process, on one server, on several workers, and their traffic."""
 
 import io
 import json
@@ -36,7 +36,6 @@ GUSTY = reading.check(
     | {"duration": 4.0, "settle": 0.0, "vehicle": {"wind": 0.1, "gust_mps2": 0.5}},
     "test",
 )
-"""Four seconds at 50 Hz, every vehicle in a wind of its own."""
 
 
 def clients(scenario: Scenario, count: int, server: Address) -> tuple[list[Client], io.BytesIO]:
@@ -59,7 +58,8 @@ def clients(scenario: Scenario, count: int, server: Address) -> tuple[list[Clien
 def flown(count: int, *, together: bool) -> Rows:
     """Rows of a number of vehicles in virtual time, in one process or in one process each."""
     world = World()
-    # Ticks 7 ms into the vehicles' steps: no horizon comes at the very instant that a step begins.
+    # Ticks 7 ms into the vehicles' steps, so that no horizon arrives exactly at the start of a
+    # step.
     server = world.add(
         "server",
         Server(GUSTY, boot_id=1, entropy=stream(1, "entropy").bytes, capacity=count),
@@ -177,7 +177,7 @@ def test_a_mission_is_flown_by_its_name_and_from_a_table(tmp_path: Path) -> None
     drawn = ("--virtual", "--duration", "6", "--figure", str(film))
     shown = fleet_command(tmp_path, "--mission", str(show), *drawn)
     with Image.open(film) as frames:
-        # Four times as fast as it was flown, in 12 frames a second.
+        # Four times as fast as flown, in 12 frames a second.
         assert frames.n_frames == pytest.approx(6 / 4 * 12, abs=2)
     assert shown["vehicles"] == 2
     assert shown["least_separation_m"] == pytest.approx(3.0, abs=0.3)
@@ -255,7 +255,7 @@ def test_a_fleet_over_udp_is_summed_up(tmp_path: Path, count: int) -> None:
     assert summary["server_steps"] > 6 * 200
     assert set(summary["server_cpu_us"]) == {*STAGES, "total"}
     assert summary["dropped"] == 0
-    # 50 Hz, each way, less what the first round trip takes.
+    # 50 Hz each way, minus the first round trip.
     assert 6 * 40 < summary["downlink_packets_per_s"] <= 6 * 51
 
 
@@ -272,7 +272,7 @@ def test_a_fleet_has_a_page_where_one_is_asked_for() -> None:
 
 
 def supervise(work: object) -> int:
-    """The exit code of two workers, supervised in a process of its own; 250 where it hangs."""
+    """Exit code of two supervised workers, in a process of its own; 250 if it hangs."""
     pid = os.fork()
     if pid == 0:
         signal.alarm(20)
@@ -282,7 +282,7 @@ def supervise(work: object) -> int:
 
 
 def test_the_end_of_one_worker_is_the_end_of_all() -> None:
-    """A worker that dies takes its vehicles' sessions with it: better start anew than limp."""
+    """A dead worker's vehicles have lost their sessions, so all workers end and restart."""
 
     def work(number: int, _: socket) -> None:
         if number == 2:
@@ -293,7 +293,7 @@ def test_the_end_of_one_worker_is_the_end_of_all() -> None:
 
 
 def test_workers_share_one_address_and_every_peer_keeps_its_worker() -> None:
-    """Forty peers, each heard by one of the two and always the same; both have some to hear."""
+    """Each of forty peers is always served by the same worker, and both workers serve some."""
 
     def work(number: int, sock: socket) -> None:
         sock.setblocking(True)

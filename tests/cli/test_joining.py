@@ -1,4 +1,4 @@
-"""Recordings by hand: each process writes one of its own, and they become one flight."""
+"""Recordings of processes started by hand, joined into one flight."""
 
 import signal
 from collections.abc import Callable, Sequence
@@ -26,9 +26,9 @@ from warm import Process
 
 SCENARIO = msgspec.structs.replace(reading.load("demo"), duration=5.0, settle=3.0)
 OFFSETS_NS = {"client": 10**18, "server": 10**18 + 7 * 10**9, "netem": 10**18 - 3 * 10**9}
-"""Time of day minus the clock, of each process's computer [ns]."""
+"""Time of day minus the clock of each process's computer [ns]."""
 AT_ONCE = ("--settle", "0", "--network.uplink", "loss(0.1)", "--network.downlink", "loss(0.1)")
-"""A network without delay, over which the first plan comes in a moment."""
+"""Network without delay, over which the first plan arrives at once."""
 
 
 @pytest.fixture(scope="module")
@@ -37,7 +37,7 @@ def flown() -> Record:
 
 
 def recorded_by(process: str, folder: Path, flown: Record, scenario: Scenario = SCENARIO) -> Path:
-    """Recording of one process, by its own clock."""
+    """Recording of one process, on its own clock."""
     path, off_ns = folder / f"{process}.mcap", OFFSETS_NS[process]
     about = recorder._about(scenario, "demo", began=None, offset_ns=off_ns, secure=False)
     late_ns = OFFSETS_NS["client"] - off_ns
@@ -77,7 +77,6 @@ def test_three_recordings_become_the_flight(flown: Record, tmp_path: Path) -> No
 
 
 def test_each_process_says_what_is_its_own(flown: Record, tmp_path: Path) -> None:
-    """The server was started with another trigger, and netem with another loss."""
     table = reading.to_table(SCENARIO)
     table["control"]["trigger"] = "always"
     server = reading.check(table)
@@ -132,7 +131,7 @@ def test_a_flight_by_hand_is_recorded_and_joined(
     assert command.main(report, [str(out), "--out", str(tmp_path / "page.html")], "it") == 0
     parts, summary = read(out).parts, read(out).summary
     assert set(parts) == {"client", "server", "plan", "netem"}
-    # A busy machine makes the vehicle sleep through steps, and no row is missing beside theirs.
+    # On a busy machine the vehicle may miss steps, but no recorded row may be missing.
     last = parts["client"][-1]
     assert last["step"] + 1 == len(parts["client"]) + last["missed"]
     assert summary is not None

@@ -55,7 +55,6 @@ def test_any_other_line_is_for_tyro(line: str) -> None:
 def test_the_help_has_options_and_another_one_has_keys(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Their texts are wrapped once, whatever the width."""
     monkeypatch.setenv("COLUMNS", "1000")
     shown = []
     for flag in ("--nonsense", "--help", "--help-keys"):

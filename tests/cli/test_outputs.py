@@ -1,4 +1,6 @@
-"""What commands write: never an input, never what another command writes, never half of it."""
+"""Outputs of commands: no input, nor the output of another running command, is overwritten, and no
+file is left half-written.
+"""
 
 import dataclasses
 import fcntl
@@ -70,18 +72,18 @@ LINES = {
     "station --json": "station SCENARIO OUT",
     "station --record": "station SCENARIO OUT",
 }
-"""A line for each option that names what is written; OUT stands for the option and another name of
-the input."""
+"""Command line for each option that names an output; OUT is the option's value, and another path of
+the input.
+"""
 READ = {"plugin", "keys", "replay", "file", "files", "folders", "path"}
 """Options that name files to read, or sockets and folders of sockets."""
 SOCKETS = {"control", "feed"}
-"""Options that name sockets to make, for which no file is replaced."""
+"""Options that name sockets to create, which replace no file."""
 IN_PLACE = {("keygen", "file")}
 """Options whose file is read and written on purpose."""
 
 
 def options_of(command: str) -> type:
-    """The record of a command's options."""
     module = importlib.import_module(COMMANDS[command].partition(":")[0])
     found = [
         each
@@ -92,7 +94,7 @@ def options_of(command: str) -> type:
 
 
 def test_every_option_that_names_a_file_is_looked_at() -> None:
-    """A new one belongs in the table above, or is read alone."""
+    """A new option belongs into LINES, or is only read."""
     for command in COMMANDS:
         kind = options_of(command)
         for field in dataclasses.fields(kind):
@@ -111,7 +113,6 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def inputs(tmp_path: Path, recording: Path) -> dict[str, Path]:
-    """A file of each kind that commands read."""
     folder = tmp_path / "in"
     folder.mkdir(mode=0o700)
     made = {
@@ -145,7 +146,7 @@ def inputs(tmp_path: Path, recording: Path) -> dict[str, Path]:
 
 
 def line_of(option: str, inputs: dict[str, Path], out: Path) -> tuple[list[str], Path, Path]:
-    """Arguments of a line of the table, its input, and where that is linked to as the output."""
+    """Arguments of a line of LINES, its input, and the output path, a link to the input."""
     *words, last = LINES[option].split()
     flag = option.partition(" ")[2]
     (source,) = (inputs[word] for word in words if word in inputs and word != "OTHER")
@@ -208,7 +209,7 @@ def test_two_options_do_not_name_one_file(
     assert not Path(at).exists()
 
 
-# -- two commands at once ------------------------------------------------------------------------
+# -- concurrent commands -------------------------------------------------------------------------
 
 
 @contextmanager
@@ -272,7 +273,7 @@ def test_a_new_file_is_locked_at_once_and_gone_where_nothing_was_written(tmp_pat
 def test_a_flight_that_is_killed_leaves_the_older_recording(
     recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Meanwhile no other command may write there; what was recorded can be read."""
+    """Meanwhile no other command may write there; the recorded part is readable."""
     at, part = tmp_path / "it.mcap", tmp_path / "it.part1.mcap"
     at.write_bytes(recording.read_bytes())
     argv = ["fly", "demo", "--no-page", "--duration", "60", "--record", str(at)]
@@ -293,10 +294,9 @@ def test_a_flight_that_is_killed_leaves_the_older_recording(
 
 @contextmanager
 def room_for(size: int) -> Iterator[None]:
-    """No file may be longer."""
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     writes = sys.dont_write_bytecode
-    sys.dont_write_bytecode = True  # Python keeps half of a .pyc, and reads it ever after
+    sys.dont_write_bytecode = True  # Python would leave a truncated .pyc and read it later
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
     try:
         yield
@@ -341,7 +341,7 @@ def test_a_full_disk_leaves_the_older_file(
 def test_without_unnamed_files_a_file_is_replaced_as_well(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """As on NFS: it has a name of its own while it is written."""
+    """As on NFS: the file has a temporary name while it is written."""
     monkeypatch.setattr(files.os, "O_TMPFILE", os.O_DIRECTORY | os.O_RDWR)
     at = tmp_path / "it"
     with files.replacing(at) as file:
@@ -355,7 +355,7 @@ def test_without_unnamed_files_a_file_is_replaced_as_well(
 
 
 def test_an_older_record_stays_until_the_new_one_is_whole(tmp_path: Path) -> None:
-    """What a full disk has left of the new one is beside it."""
+    """The incomplete new record, left by a full disk, is beside the old one."""
     at, part = tmp_path / "it", tmp_path / "it.part1"
 
     def fly(rows: int) -> None:

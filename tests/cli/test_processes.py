@@ -1,4 +1,4 @@
-"""Processes as children: what is known of one is what it says, as events; and its last words."""
+"""Child processes: their events, and their last lines."""
 
 import asyncio
 import os
@@ -49,7 +49,7 @@ async def test_a_child_is_known_by_its_events() -> None:
 def test_a_scenario_without_a_failsafe_is_warned_of(
     name: str, scenario: str, start: Callable[..., Process]
 ) -> None:
-    """`paper` is one; `demo` has a failsafe, and netem flies nothing."""
+    """`paper` has no failsafe, `demo` has one, and netem flies nothing."""
     place = ("--server", "127.0.0.1:9") if name == "client" else ("--bind", "127.0.0.1:0")
     process = start(name, scenario, *place, "--log", "json")
     process.address()
@@ -91,8 +91,7 @@ async def test_a_child_that_is_killed_is_said_to_be() -> None:
 async def test_a_child_whose_record_is_incomplete_has_told_so(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It is no failure of the child, which goes on and ends with 1."""
-    monkeypatch.setenv("PYTHONDONTWRITEBYTECODE", "1")  # Python keeps half of a .pyc
+    monkeypatch.setenv("PYTHONDONTWRITEBYTECODE", "1")  # Python would leave a truncated .pyc
     heard: list[LogLine] = []
     file = str(tmp_path / "netem")
     argv = ("demo", "--bind", "127.0.0.1:0", "--record", file)
@@ -110,7 +109,7 @@ async def test_a_child_whose_record_is_incomplete_has_told_so(
 
 
 def test_events_of_a_flight_stand_in_the_order_of_their_times(tmp_path: Path) -> None:
-    """One process's line may come before an earlier one of another; the first is time 0."""
+    """A process's line may arrive before an earlier one of another; the first event is time 0."""
     said = [
         LogLine(process="server", time_ns=7, event=SessionEnded(vehicle=1)),
         LogLine(process="client", time_ns=5, event=Flying(vehicle=1)),

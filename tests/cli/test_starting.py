@@ -1,7 +1,6 @@
-"""Commands import what they need and no more: imports are most of what a start takes.
+"""Imports of commands, which take most of their start: no module that the command can do without.
 
-`python -m bench --only starting` measures the time; here no module is imported that a
-command can do without.
+`python -m bench --only starting` measures the time.
 """
 
 import sys
@@ -36,13 +35,13 @@ HEAVY = {
     "websockets",
 }
 EXTRAS = {"importlib.metadata", "mcap", "prometheus_client", "skytether.server"}
-"""Modules that cost memory and time until the first packet where nobody has asked for them."""
+"""Modules that cost memory and time before the first packet, and that only some options need."""
 COMPILER = {"scipy.linalg", "numba.np.linalg"}
-"""Modules that numba imports to compile, and not to load what was compiled."""
+"""Modules that numba imports to compile, but not to load compiled code."""
 
 
 def imported(*argv: str) -> set[str]:
-    """Modules that a command has imported at its end; a process by hand ends once it listens."""
+    """Modules that a command has imported at its end; a server or client ends once it listens."""
     done = ran(sys.executable, "-P", "-c", MODULES, *argv)
     assert done.returncode == 0, done.stderr
     return set(done.stdout.rpartition("imported: ")[2].split())
@@ -60,7 +59,7 @@ def test_what_is_light_imports_nothing_heavy(command: str) -> None:
 
 @pytest.mark.parametrize("scenario", ["demo", "paper"])
 def test_a_server_imports_its_own_solver_and_no_ciphers_without_keys(scenario: str) -> None:
-    """Numba is what it needs; scipy's own package is imported by numba, which asks its version."""
+    """The server needs numba, which imports the package scipy to ask its version."""
     modules = imported("server", scenario, "--bind", "127.0.0.1:0")
     assert "numba" in modules
     assert modules & (HEAVY | {"scipy.sparse"}) <= {"numba", "scipy"}
@@ -73,7 +72,6 @@ def test_a_server_with_osqp_imports_it() -> None:
 
 
 def test_a_flight_in_virtual_time_draws_encrypts_and_compiles_nothing() -> None:
-    """Its summary is printed by rich; all else that is heavy belongs to other options."""
     modules = imported("fly", "demo", "--virtual", "--duration", "1")
     assert modules & HEAVY <= {"numba", "rich", "scipy"}
     assert modules & COMPILER == set()

@@ -1,4 +1,4 @@
-"""What tests of several files of this folder ask for."""
+"""Fixtures for several files of this folder."""
 
 import pytest
 
@@ -8,5 +8,4 @@ from skytether.autopilot.flavours import FlavourName
 
 @pytest.fixture(params=BOTH)
 def flavour(request: pytest.FixtureRequest) -> FlavourName:
-    """Each flavour of autopilot in turn."""
     return request.param

@@ -1,7 +1,6 @@
-"""A vehicle with an autopilot: the client flies the scripted ones, in virtual time.
+"""Vehicles with scripted autopilots in virtual time, see `airborne`.
 
-`tests/airborne.py` has the world. Each row of the failsafe on the autopilot's side, each refusal,
-and each kind of traffic that is not its own is met here.
+Covers each row of the failsafe for the autopilot, each refusal, and each kind of foreign traffic.
 """
 
 from collections.abc import Callable
@@ -46,7 +45,7 @@ from skytether.shared.wire.protocol import Mode
 
 @pytest.fixture(scope="module", params=BOTH)
 def flown(request: pytest.FixtureRequest) -> Air:
-    """A flight of 12 s to its end; the client knows the dead time, and its clock drifts."""
+    """Flight of 12 s to its end; the client knows the dead time, and its clock drifts."""
     air = Air(request.param, duration=12.0, drift_ppm=50.0, model={"dead_time_s": [0.27]})
     air.fly()
     air.end()
@@ -54,7 +53,7 @@ def flown(request: pytest.FixtureRequest) -> Air:
 
 
 def why(air: Air) -> tuple[str, str]:
-    """What the client was about to do when it gave up, and why it did."""
+    """Stage in which the client gave up, and the reason."""
     failure = air.client.failure
     assert isinstance(failure, NotTakenOff)
     return failure.doing, failure.why
@@ -83,7 +82,7 @@ def test_setpoints_are_velocities_alone_at_the_rate_of_steps(flown: Air) -> None
 
 
 def test_no_setpoint_but_a_zero_comes_before_the_climb_is_over(flown: Air) -> None:
-    """PX4 needs a stream of zeros before OFFBOARD; ArduCopter is told nothing at all."""
+    """PX4 needs a stream of zeros before OFFBOARD; ArduCopter gets no set-points at all."""
     (began_ns,) = [at_ns for at_ns, _, event in flown.events if isinstance(event, Flying)]
     before = [each for time_ns, each in flown.setpoints() if time_ns < began_ns]
     assert all((each.vx, each.vy, each.vz) == (0.0, 0.0, 0.0) for each in before)
@@ -91,7 +90,7 @@ def test_no_setpoint_but_a_zero_comes_before_the_climb_is_over(flown: Air) -> No
 
 
 def test_one_heartbeat_a_second_is_that_of_an_onboard_computer(flown: Air) -> None:
-    """From the first moment to the last; to PX4 it is a ground station too, to hear its words."""
+    """To PX4 the client is a ground station as well, because PX4 sends texts only to those."""
     all_beats = flown.heard("HEARTBEAT")
     kinds = {(each.type, each.get_srcSystem(), each.get_srcComponent()) for _, each in all_beats}
     station = {(dialect.MAV_TYPE_GCS, 245, 191)} if flown.flight.flavour.title == "PX4" else set()
@@ -103,7 +102,6 @@ def test_one_heartbeat_a_second_is_that_of_an_onboard_computer(flown: Air) -> No
 
 
 def test_measurements_are_those_of_their_stamps(flown: Air) -> None:
-    """Altitude and all; what the client knows is 20 ms old at most, and nothing was dropped."""
     rows = flown.rows()
     assert np.isfinite(rows["measured"]).all()
     told = flown.figures()
@@ -121,7 +119,6 @@ def test_the_way_into_the_air_is_the_autopilots_own(flown: Air) -> None:
 
 
 def test_what_the_autopilot_is_and_does_in_silence_is_told(flown: Air) -> None:
-    """Before anything is armed; a parameter that it does not have is told as such."""
     ((found,), (read,)) = flown.of(AutopilotFound), flown.of(ParametersRead)
     assert found.name.startswith(flown.flight.flavour.title)
     said = str(read)
@@ -141,7 +138,7 @@ def test_px4_is_not_told_of_a_station_where_it_acts_on_the_loss_of_one() -> None
 
 def test_figures_have_what_a_pilot_looks_at(flown: Air) -> None:
     told = flown.figures()
-    assert told["mode"] in ("LAND", "OFFBOARD")  # PX4 goes back to the mode before its landing
+    assert told["mode"] in ("LAND", "OFFBOARD")  # PX4 returns to the mode before its landing
     assert (told["armed"], told["garbage_bytes"]) == (0, 0)
     assert 0.9 < told["battery"] <= 1.0
     assert told["home"]["altitude_m"] == pytest.approx(flown.flight.flavour.home[2])
@@ -205,7 +202,6 @@ def test_parameters_are_set_and_read_back_where_that_is_allowed(flavour: Flavour
 
 
 def test_a_parameter_that_cannot_be_set_is_refused() -> None:
-    """The autopilot answers with its old value: the vehicle is not armed."""
     air = Air("ardupilot", parameters=SAFE["ardupilot"] | {"GUID_TIMEOUT": 3.0}, sets=True)
     air.flight.set = lambda *_: None
     air.end(20.0)
@@ -261,7 +257,7 @@ def test_the_newer_name_of_a_parameter_will_do() -> None:
 
 def test_what_keeps_it_from_arming_is_told_and_tried_again() -> None:
     air = Air("ardupilot", ready_s=8.0, mavlink={"patience_s": 20.0})
-    air.flight.why_not_armed = (  # it knows its position, and does not arm for another reason
+    air.flight.why_not_armed = (  # it knows its position, and refuses to arm for another reason
         lambda: "" if air.flight.now_ns > 10 * SECOND else "PreArm: Compass not calibrated"
     )
     air.until(lambda: air.flight.armed, 30.0)
@@ -278,7 +274,7 @@ def test_who_cannot_arm_in_time_says_why_in_the_autopilots_words(flavour: Flavou
 
 
 def test_an_autopilot_that_ends_in_a_climb_is_told_to_be_silent(flavour: FlavourName) -> None:
-    """The altitude that was heard last is no reason: nobody knows whether it still holds."""
+    """The last known altitude does not count: it may be outdated."""
     air = Air(flavour, mavlink={"patience_s": 12.0})
     air.run(30.0, lambda: air.flight.position()[2] > 1.0)
     air.tap.dumb = True
@@ -329,7 +325,7 @@ def test_an_unarmed_scenario_arms_nothing_until_somebody_arms_it(flavour: Flavou
 
 
 def test_a_vehicle_that_flies_in_guided_is_not_taken_off_again() -> None:
-    """It is flown where it is, from the autopilot's own origin where the scenario says so."""
+    """It starts where it is, relative to the autopilot's origin if the scenario says so."""
     air = Air("ardupilot", duration=5.0, mavlink={"origin": "autopilot"})
     in_the_air(air, FlightMode.GUIDED)
     air.fly()
@@ -340,7 +336,7 @@ def test_a_vehicle_that_flies_in_guided_is_not_taken_off_again() -> None:
 
 
 def in_the_air(air: Air, mode: FlightMode) -> None:
-    """Have the vehicle fly at 4 m before the client comes to it."""
+    """Let the vehicle fly at 4 m before the client connects."""
     flight = air.flight
     for _ in range(300):
         flight.tick()
@@ -392,7 +388,7 @@ def test_a_take_off_that_does_not_climb_ends_in_a_landing(flavour: FlavourName) 
 
 
 def test_the_flight_must_not_begin_on_the_ground() -> None:
-    """In space the altitude of take-off is that of the reference, unless it is given."""
+    """In space the altitude of take-off is that of the reference, unless given."""
     with pytest.raises(ConfigError, match=r"mavlink.takeoff_m: got 'auto' at altitude 0 m"):
         vehicles.make(scenario(reference={"altitude_m": 0.0}), 1)
     vehicles.make(scenario(reference={"altitude_m": 0.0}, mavlink={"takeoff_m": 1.0}), 1)
@@ -402,7 +398,7 @@ def test_the_flight_must_not_begin_on_the_ground() -> None:
 
 
 def test_who_arms_it_while_we_are_about_to_has_it() -> None:
-    """The command for our mode was not heard: it is not repeated."""
+    """The lost mode command is not repeated, because a pilot has armed meanwhile."""
     air = Air("ardupilot")
     air.flight.switch = lambda _: air.flight.refusal
     air.run(10.0, lambda: bool(air.commands(SET_MODE)))
@@ -428,7 +424,7 @@ def test_a_pilot_wins_at_once_and_is_told_nothing_more(flavour: FlavourName) -> 
 
 
 def test_a_vehicle_that_is_given_back_hovers_and_flies_on() -> None:
-    """Once the link has been good for a second; PX4 needs setpoints for that, and has none."""
+    """Once the link has been good for a second. PX4 needs set-points first, and gets none."""
     air = flying("ardupilot")
     air.take_over()
     air.run(1.0)
@@ -456,7 +452,7 @@ def test_a_disarmed_vehicle_is_never_flown_again(flavour: FlavourName) -> None:
 
 
 def test_a_low_battery_lands_by_the_autopilots_own_landing() -> None:
-    """BRAKE, then LAND, though the autopilot itself only says so."""
+    """BRAKE, then LAND, although the autopilot itself only warns."""
     air = flying("ardupilot")
     air.flight.quadrotor.discharge(0.1)
     air.run(60.0, lambda: not air.flight.armed)
@@ -468,7 +464,7 @@ def test_a_low_battery_lands_by_the_autopilots_own_landing() -> None:
 
 
 def test_the_voltage_counts_as_well() -> None:
-    """The voltage counts if its key is set; a sag of one second does not."""
+    """The voltage counts if its key is set; a drop of one second does not."""
     air = flying("ardupilot", mavlink={"battery_min_v": 5.0})
     weak = altered("SYS_STATUS", voltage_battery=lambda _: 4900)
     air.tap.alter = weak
@@ -491,7 +487,7 @@ def test_a_low_battery_is_not_taken_off_with() -> None:
 
 
 def test_the_autopilots_own_failsafe_is_left_alone(flavour: FlavourName) -> None:
-    """Its estimate is lost, it lands by itself: we say what it says, and command nothing."""
+    """The autopilot has lost its estimate and lands; the client only reports that."""
     air = flying(flavour)
     air.flight.estimates = False
     lost_ns = air.world.now_ns
@@ -503,7 +499,7 @@ def test_the_autopilots_own_failsafe_is_left_alone(flavour: FlavourName) -> None
 
 
 def test_a_lost_estimate_lands_where_the_autopilot_does_not(flavour: FlavourName) -> None:
-    """BRAKE, then the autopilot's landing: flags alone say that it is lost."""
+    """BRAKE, then the autopilot's landing; only flags report the lost estimate."""
     air = flying(flavour)
     air.flight.once = lambda _: False
     air.flight.estimates = False
@@ -513,7 +509,7 @@ def test_a_lost_estimate_lands_where_the_autopilot_does_not(flavour: FlavourName
 
 
 def test_a_silent_autopilot_makes_it_brake_and_hover(flavour: FlavourName) -> None:
-    """After mavlink.silence_s; setpoints go on, of zero in the end; then it flies on."""
+    """After mavlink.silence_s set-points fall to zero, until the autopilot answers again."""
     air = flying(flavour)
     air.tap.dumb = True
     silent_ns = air.world.now_ns
@@ -531,14 +527,14 @@ def test_a_silent_autopilot_makes_it_brake_and_hover(flavour: FlavourName) -> No
     assert air.mode is Mode.TRACK
 
 
-# When we are gone
+# End of the client
 
 
 @pytest.mark.parametrize(("flavour", "stands"), [("ardupilot", True), ("px4", False)])
 def test_killed_we_repeat_nothing_and_the_autopilot_acts(
     flavour: FlavourName, stands: bool
 ) -> None:
-    """ArduCopter stands after its time-out and lands after that of its station; PX4 lands."""
+    """ArduCopter stops after its timeout and lands after its ground-station timeout; PX4 lands."""
     air = flying(flavour)
     air.world.stop("client")
     killed_ns = air.world.now_ns
@@ -550,7 +546,7 @@ def test_killed_we_repeat_nothing_and_the_autopilot_acts(
 
 
 def test_a_pilot_that_does_not_call_is_not_repeated_for_long() -> None:
-    """Though the port is driven on: after half a second nothing is sent."""
+    """If the client's loop stops calling, its port sends nothing after half a second."""
     air = flying("ardupilot")
     air.client._pilot.next_ns = None  # its loop has died
     air.client._begin = lambda _: None
@@ -562,7 +558,7 @@ def test_a_pilot_that_does_not_call_is_not_repeated_for_long() -> None:
 
 
 def test_who_ends_in_flight_says_land_three_times(flavour: FlavourName) -> None:
-    """On Ctrl-C or SIGTERM; on the ground nothing is said, and nothing begins."""
+    """On Ctrl-C or SIGTERM in flight; on the ground nothing is sent."""
     air = flying(flavour)
     before = len(air.commands(SET_MODE))
     air.world.act("client", air.client.close)
@@ -615,7 +611,7 @@ def test_others_are_not_the_autopilot() -> None:
 
 
 def late_heartbeat(air: Air, until: Callable[[], bool] = lambda: False) -> None:
-    """Let time pass until something is so; a heartbeat of before comes again 0.3 s later."""
+    """Run until a condition holds; an old heartbeat arrives again 0.3 s later."""
     heartbeats: list[bytes] = []
 
     def note(message: Message) -> None:
@@ -630,7 +626,7 @@ def late_heartbeat(air: Air, until: Callable[[], bool] = lambda: False) -> None:
 
 
 def test_a_late_heartbeat_does_not_take_the_vehicle_back_from_a_pilot() -> None:
-    """It was sent before he took over: one with a newer number has come."""
+    """It was sent before the pilot took over; one with a newer number has already arrived."""
     air = flying("ardupilot")
     end_ns = air.world.now_ns + SECOND
     air.world.at(end_ns - 1, air.take_over)
@@ -661,7 +657,7 @@ def test_an_autopilot_that_counts_anew_is_heard_after_a_pause() -> None:
 
 
 def test_stamps_that_cannot_be_are_dropped_and_counted() -> None:
-    """Doubled, out of order, ahead, old, far, not finite; what is flown by stays true."""
+    """Duplicate, out of order, ahead, old, far and non-finite stamps; the state stays right."""
     air = flying("ardupilot")
     codec = Codec(1, 1)
     now_ms = air.flight.now_ns // 1_000_000
@@ -695,7 +691,7 @@ def test_stamps_that_cannot_be_are_dropped_and_counted() -> None:
 
 
 def test_a_bad_line_brings_it_into_the_air_as_well(flavour: FlavourName) -> None:
-    """A fifth of what either says is lost, a tenth comes doubled, a tenth cut off."""
+    """A fifth of the frames of either side is lost, a tenth duplicated, a tenth truncated."""
     air = Air(flavour, duration=5.0)
     rng = np.random.default_rng(1)
     inner = air.tap.outbox
@@ -743,7 +739,7 @@ def test_a_line_of_bytes_may_come_in_any_pieces(flavour: FlavourName) -> None:
 
 @pytest.mark.parametrize(("dt", "least", "most"), [(0.1, 18, 20), (0.02, 50, 50)])
 def test_setpoints_come_at_the_rate_of_steps_or_more(dt: float, least: int, most: int) -> None:
-    """Between two steps the velocity of the last is repeated; 50 a second are never exceeded."""
+    """The last velocity is repeated between steps, at 50 per second at most."""
     control = {"dt": dt, "horizon": 40}
     air = flying("ardupilot", control=control)
     began_ns = air.world.now_ns
@@ -776,13 +772,13 @@ def test_an_autopilot_that_never_speaks_again_is_left_to_its_own_failsafe(
 
 
 def test_a_vehicle_that_drifts_over_its_fence_lands_when_its_link_is_lost() -> None:
-    """Its accelerometers have failed: the fence pushes for ever, and keeps it from nothing."""
+    """Its accelerometers have failed, so the fence's corrections have no effect."""
     fence = {"low_m": [-9.0, -9.0, 0.5], "high_m": [8.0, 9.0, 9.0], "wind_mps": 0.5}
     air = flying("ardupilot", "drift@1", fence=fence, vehicle={"land_after_s": 4.0})
     air.until(lambda: air.flight.position()[0] > 8.2, 30.0)
     air.world.stop("server")
     lost_s = air.run(30.0, lambda: air.mode is Mode.LAND)
     assert [after for after, _ in modes(air)][-3:] == ["brake", "hover", "land"]
-    # The time-out, braking from 3 m/s on all axes at 2 m/s², hovering, and landing.
+    # The timeout, braking from 3 m/s on all axes at 2 m/s², hovering, and landing.
     assert lost_s < 1.5 + 3.1 + 4.0 + 0.2
     assert air.setpoints()[-1][1].vx < -1.0

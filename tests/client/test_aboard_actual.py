@@ -1,4 +1,4 @@
-"""What actual autopilots were seen to do, shown by the scripted ones, and what the client says."""
+"""Behaviour of real autopilots, repeated by the scripted ones, and the client's messages."""
 
 from collections.abc import Callable
 
@@ -29,12 +29,12 @@ from skytether.shared.core.events import (
 )
 from skytether.shared.telemetry.record import Reason
 
-# The clock
+# Clock
 
 
 @pytest.mark.parametrize("ppm", [-20_000.0, -8600.0, 20_000.0])
 def test_a_clock_that_runs_up_to_2_percent_wrong_is_followed(ppm: float) -> None:
-    """PX4's own simulator runs 0.86 % slow: its positions are used from first to last."""
+    """PX4's own simulator runs 0.86 % slow; its positions are used throughout."""
     air = Air("px4", autopilot_ppm=ppm, duration=25.0)
     air.fly()
     air.end()
@@ -66,11 +66,11 @@ def test_positions_that_cannot_be_used_are_not_called_silence() -> None:
     assert modes(air)[-1][0] == "track"
 
 
-# Flights after another
+# Consecutive flights
 
 
 def test_it_is_flown_again_and_again_in_one_power_up(flavour: FlavourName) -> None:
-    """After a landing PX4 is in OFFBOARD, in which it is not armed without set-points."""
+    """After a landing PX4 is in OFFBOARD, and without set-points it refuses to arm there."""
     air = Air(flavour, duration=5.0)
     air.fly()
     air.end()
@@ -83,7 +83,7 @@ def test_it_is_flown_again_and_again_in_one_power_up(flavour: FlavourName) -> No
 
 
 def test_px4_says_why_it_is_not_armed(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Its own words reach the log without their tabulator, and are the reason given at the end."""
+    """Its text is logged without tabs, and is the reason given at the end."""
     air = Air("px4", mavlink={"patience_s": 4.0})
     words = "Arming denied: Resolve system health failures first"
     monkeypatch.setattr(air.flight, "why_not_armed", lambda: f"{words}\t")
@@ -93,7 +93,7 @@ def test_px4_says_why_it_is_not_armed(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_the_altitude_of_take_off_is_above_the_ground_it_stands_on() -> None:
-    """PX4's estimate of the height had drifted by 1.3 m since home was set: it climbed to 3.7 m."""
+    """PX4's height estimate had drifted by 1.3 m since home was set, and it climbed to 3.7 m."""
     air = Air("px4", duration=5.0)
     drifted = {"altitude": lambda mm: mm - 1300, "z": lambda _: 1.3}
     air.tap.alter = altered("HOME_POSITION", **drifted)
@@ -102,7 +102,7 @@ def test_the_altitude_of_take_off_is_above_the_ground_it_stands_on() -> None:
 
 
 def test_an_autopilot_that_has_taken_the_vehicle_from_a_client_that_stalled_keeps_it() -> None:
-    """The client stands still for 3 s. PX4 would be back in OFFBOARD on the first set-point."""
+    """The client stalls for 3 s. The first set-point would put PX4 back into OFFBOARD."""
     air = Air("px4", duration=60.0)
     air.fly()
     air.run(4.0)
@@ -119,7 +119,7 @@ def test_an_autopilot_that_has_taken_the_vehicle_from_a_client_that_stalled_keep
     assert modes(air)[-1] == ("manual", str(Reason.TAKEN))
 
 
-# What a bench check says
+# Messages of a bench check
 
 
 def test_the_session_of_a_vehicle_that_is_not_armed_is_told() -> None:
@@ -151,7 +151,6 @@ def test_a_lossy_link_is_no_silence_on_the_ground() -> None:
 
 
 def test_an_autopilot_that_answers_timesync_no_more_is_told_once() -> None:
-    """It goes on flying: the clock is followed as it ran."""
     air = Air("px4", duration=60.0)
     air.fly()
     air.run(3.0)
@@ -163,7 +162,7 @@ def test_an_autopilot_that_answers_timesync_no_more_is_told_once() -> None:
 
 
 def test_an_autopilot_that_does_not_answer_timesync_is_told_and_given_up() -> None:
-    """It would be waited for for ever, without a word."""
+    """Otherwise the client would wait for ever, without a message."""
     air = Air(mavlink={"patience_s": 5.0})
     air.tap.alter = lambda message: b"" if message.get_type() == "TIMESYNC" else None
     air.run(20.0, lambda: bool(air.of(NotTakenOff)))
@@ -183,7 +182,7 @@ def test_what_is_waited_for_is_the_autopilot_before_it_is_the_server() -> None:
 
 @pytest.mark.parametrize("armed", [True, False])
 def test_a_line_that_is_cut_is_told_in_the_climb_and_on_the_ground(armed: bool) -> None:
-    """Nothing comes from the autopilot for 8 s, of the 60 s that the climb may take."""
+    """Nothing arrives from the autopilot for 8 s of the 60 s that the climb may take."""
     air = Air(armed=armed)
     air.run(30.0, lambda: air.flight.armed)
     assert air.flight.armed is armed
@@ -208,7 +207,7 @@ def test_a_vehicle_found_armed_waits_for_a_person_once_it_is_disarmed() -> None:
 
 
 def test_an_autopilot_that_restarts_on_the_ground_is_taken_from_its_new_address() -> None:
-    """A `udp:` line: another source port after 4 s of silence, and all is set up again."""
+    """`udp:` line: another source port after 4 s of silence, with a complete new set-up."""
     air = Air(armed=False, vehicle={"address": "udp:0.0.0.0:14540"})
     air.run(6.0)
     assert len(air.of(ParametersRead)) == 1
@@ -225,7 +224,6 @@ def test_an_autopilot_that_restarts_on_the_ground_is_taken_from_its_new_address(
 
 
 def test_in_flight_another_address_is_not_taken_and_what_comes_from_it_is_told() -> None:
-    """Nor on a line whose other end was given."""
     air = Air(duration=60.0, vehicle={"address": "udp:0.0.0.0:14540"})
     air.fly()
     air.tap.dumb = True
@@ -239,7 +237,7 @@ def test_in_flight_another_address_is_not_taken_and_what_comes_from_it_is_told()
 
 
 def heartbeats(air: Air, from_port: int) -> Callable[[], None]:
-    """Function that has the client hear a heartbeat of the autopilot from another port."""
+    """Function that sends the client a heartbeat of the autopilot from another port."""
     codec = Codec(1, 1)
 
     def beat() -> None:
@@ -251,7 +249,7 @@ def heartbeats(air: Air, from_port: int) -> Callable[[], None]:
     return beat
 
 
-# What it says
+# Messages
 
 
 def test_a_stream_that_is_being_set_is_not_refused() -> None:

@@ -1,4 +1,4 @@
-"""Parts of a vehicle with an autopilot: its clock, what any bytes do, and what it costs to fly."""
+"""Parts of a vehicle with an autopilot: clock, robustness against any bytes, parameters, cost."""
 
 import numpy as np
 import pytest
@@ -17,7 +17,7 @@ from skytether.shared.core.endpoint import Datagram
 
 MS, SECOND = 1_000_000, 1_000_000_000
 SLOW = 2_100_000
-"""A way of an answer that is just too slow to be taken for a quick one [ns]."""
+"""Delay of an answer just above the limit for a quick one [ns]."""
 PEER = ("autopilot", 0)
 
 
@@ -38,7 +38,7 @@ def timed(
 
 
 def boot(local_ns: int, drift: float, offset_ns: int = 7 * SECOND) -> int:
-    """Time that the autopilot's clock shows."""
+    """Reading of the autopilot's clock."""
     return round((local_ns - offset_ns) * (1.0 - drift))
 
 
@@ -53,7 +53,7 @@ def boot(local_ns: int, drift: float, offset_ns: int = 7 * SECOND) -> int:
 )
 @example(0.0, [(MS, MS), *[(3 * MS, MS)] * 6, *[(MS, 3 * MS)] * 6, *[(SLOW, SLOW)] * 50])
 def test_the_clock_contradicts_no_answer(drift: float, delays: list[tuple[int, int]]) -> None:
-    """It is off by no more than an answer's round trip, and what the clocks drift since that."""
+    """The error is at most an answer's round trip plus the drift since."""
     clock, now_ns = timed(drift=drift, delays=delays)
     newest_first = enumerate(reversed(delays[-WINDOW:]))
     bound = min(sum(ways) + 2 * (DRIFT_MAX + WANDER) * age * SECOND for age, ways in newest_first)
@@ -63,7 +63,7 @@ def test_the_clock_contradicts_no_answer(drift: float, delays: list[tuple[int, i
 
 
 def test_drift_is_found() -> None:
-    """Drift of 100 ppm in 60 s of answers that take 3 to 16 ms, with the median of an autopilot."""
+    """Drift of 100 ppm over 60 s of answers that take 3 to 16 ms."""
     rng = np.random.default_rng(1)
     ways = (1.5 * MS + rng.exponential(0.5 * MS, (60, 2))).astype(int).tolist()
     clock, now_ns = timed(drift=100e-6, delays=[(there, back) for there, back in ways])
@@ -83,7 +83,7 @@ def test_a_large_drift_is_followed_from_the_fourth_answer_on(drift: float) -> No
 
 
 def test_a_clock_that_stood_still_is_right_from_the_next_answer_on() -> None:
-    """A simulator that is paused for 60 ms, within what does not count as a reboot."""
+    """A simulator paused for 60 ms, which does not count as a reboot."""
     ways, pause_ns = [(MS // 10, MS // 10)] * 40, 60 * MS
     clock, now_ns = timed(drift=0.0, delays=ways)
     for later_ns in (now_ns + SECOND, now_ns + 2 * SECOND):
@@ -102,7 +102,6 @@ def test_a_rate_that_cannot_be_followed_is_known(rate: float) -> None:
 
 
 def test_answers_that_nobody_asked_for_count_for_nothing() -> None:
-    """Nor those that come twice, from before the question, or late."""
     clock, now_ns = timed(drift=0.0, delays=[(MS, MS)] * KNOWN)
     before = clock.local_ns(SECOND)
     assert not clock.hear(1, 12345, now_ns=now_ns)
@@ -125,7 +124,7 @@ def test_a_clock_that_begins_anew_is_believed_after_three_answers() -> None:
 
 
 def messages() -> st.SearchStrategy[bytes]:
-    """Frames of the autopilot with a right checksum, whose content is anything."""
+    """Frames of the autopilot with a right checksum and random content."""
 
     def frame(number: int, payload: bytes, component: int) -> bytes:
         kind = dialect.mavlink_map[number]
@@ -148,7 +147,6 @@ def messages() -> st.SearchStrategy[bytes]:
 def test_any_bytes_raise_nothing_and_arm_nothing(
     datagrams: list[tuple[bytes, int]], autopilot: int
 ) -> None:
-    """Nor does what is asked grow without bound: nobody said that it stands safely."""
     flies = vehicles.make(scenario(), 1)
     assert flies.port is not None
     codec, now_ns = Codec(1, 1), 10 * SECOND
@@ -181,7 +179,7 @@ def test_a_line_of_bytes_is_bounded(pieces: list[bytes]) -> None:
 
 @pytest.mark.parametrize("rules", [safety.ardupilot(245), safety.px4()])
 def test_what_is_set_is_what_is_safe(rules: tuple[safety.Rule, ...]) -> None:
-    """Each rule with a wish is content with its own value; each value has words."""
+    """Each rule accepts the value that it would set, and has a text for each value."""
     for rule in rules:
         if rule.wanted:
             assert rule.is_safe(rule.value)

@@ -1,4 +1,4 @@
-"""A vehicle with an autopilot over real UDP: four processes, as its user starts them."""
+"""Vehicle with an autopilot over real UDP: four processes, started as a user does."""
 
 import asyncio
 import contextlib
@@ -29,7 +29,6 @@ PAPER = "paper(0.4, 0.02, 2.0) & loss(0.1)"
 
 
 def figure_eight(autopilot: Address, **table: object) -> Scenario:
-    """A figure eight 10 m wide in 30 s, over the paper's network."""
     return scenario(
         duration=30.0,
         reference=FIGURE | {"altitude_m": 5.0},
@@ -40,20 +39,11 @@ def figure_eight(autopilot: Address, **table: object) -> Scenario:
 
 
 class Processes:
-    """Autopilot, server, netem and client.
-
-    Args:
-        folder: where their files come to lie.
-        flavour: which autopilot.
-    """
-
     def __init__(self, folder: Path, flavour: FlavourName) -> None:
         self.folder, self.flavour = folder, flavour
         self.heard: list[LogLine] = []
         self.last_words = ""
-        """Events of the client."""
         self.autopilot: list[str] = []
-        """Sentences of the autopilot."""
         self.flies = asyncio.Event()
 
     def _hear(self, line: LogLine) -> None:
@@ -62,7 +52,7 @@ class Processes:
             self.flies.set()
 
     async def run(self, *arguments: str, end: int | None = None) -> int:
-        """Fly, to the end or until a signal is sent after 3 s of flight; returns the exit code."""
+        """Fly to the end, or until a signal is sent after 3 s of flight; returns the exit code."""
         ready = ("--bind", "127.0.0.1:0", "--ready", "2", "--flavour", self.flavour)
         anywhere = ("--bind", "127.0.0.1:0")
         async with started(
@@ -103,7 +93,6 @@ class Processes:
         return code
 
     def events(self, kind: type) -> list[object]:
-        """Events of the client of a kind."""
         return [line.event for line in self.heard if isinstance(line.event, kind)]
 
 
@@ -127,7 +116,7 @@ async def test_a_figure_eight_over_the_papers_network(flavour: FlavourName, tmp_
 
 
 def field_in(folder: Path) -> list[str]:
-    """Commands of docs/fly-a-real-one.md, whose scenario is `field.toml` in the folder now."""
+    """Commands of docs/fly-a-real-one.md, with its scenario `field.toml` written to the folder."""
     document = (Path(__file__).parents[2] / "docs" / "fly-a-real-one.md").read_text()
     (folder / "field.toml").write_text(documented())
     commands: list[str] = re.findall(r"```sh\n(.*?)```", document, re.DOTALL)
@@ -187,7 +176,7 @@ async def test_unsafe_parameters_end_with_a_line_each(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("end", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
 async def test_who_ends_in_flight_leaves_it_to_the_autopilot(end: int, tmp_path: Path) -> None:
-    """Told to land, or by its own time-outs: half a minute later it is on the ground."""
+    """By the client's command or the autopilot's timeouts it has landed half a minute later."""
     processes = Processes(tmp_path, "px4")
     await processes.run("--set-parameters", end=end)
     assert any(said.startswith("Disarm") for said in processes.autopilot)

@@ -1,4 +1,4 @@
-"""Flights over a line that loses and spoils frames, and on which others talk: see `bad_line`."""
+"""Flights over a line that loses and corrupts frames, and on which others send; see `bad_line`."""
 
 import pytest
 
@@ -8,16 +8,16 @@ from skytether.client.mavlink.condition import Condition
 from skytether.shared.wire.protocol import Mode
 
 OFF_M = 1.5
-"""Distance from the truth below which a position was our autopilot's [m]: others are 30 m away, and
-what is a second old no more than this."""
+"""Largest error of a position that came from the vehicle's own autopilot [m]. Other positions are
+30 m away; at this speed a position of one second ago is this far.
+"""
 PILOT_S = 1.0
-"""Time within which a pilot has the vehicle [s]: a few heartbeats may be lost."""
+"""Time within which a pilot has the vehicle [s]; some heartbeats may be lost."""
 WORSE = 1.5
-"""Most by which a bad line may make the error larger."""
+"""Largest ratio of the errors over the bad and the good line."""
 
 
 def compare(flavour: FlavourName, seed: int, duration: float) -> None:
-    """Fly over a bad line and a good one, and compare."""
     bad = fly(flavour, seed, duration=duration)
     good = fly(flavour, seed, is_bad=False, duration=duration)
     assert bad.rmse_m <= WORSE * good.rmse_m
@@ -31,14 +31,14 @@ def compare(flavour: FlavourName, seed: int, duration: float) -> None:
     ("flavour", "seed"), [("ardupilot", 1), pytest.param("px4", 5, marks=pytest.mark.long)]
 )
 def test_a_bad_line_changes_little(flavour: FlavourName, seed: int) -> None:
-    """No mode and no position of others is believed; it flies as it would, and a pilot wins."""
+    """The client ignores modes and positions of others, flies as usual, and yields to a pilot."""
     compare(flavour, seed, SETTLE_S + 10.0)
 
 
 def test_a_line_that_reorders_needs_what_was_overtaken_dropped(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Else a mode that the autopilot has left is believed again."""
+    """Otherwise the client believes a mode that the autopilot has left."""
     monkeypatch.setattr(Condition, "_is_overtaken", lambda *_: False)
 
     def fly_until_one_fails() -> None:
@@ -51,7 +51,6 @@ def test_a_line_that_reorders_needs_what_was_overtaken_dropped(
 
 @pytest.mark.long
 def test_a_bad_line_changes_little_for_minutes(flavour: FlavourName) -> None:
-    """`python tests/bad_line.py --minutes 60` flies for an hour."""
     compare(flavour, 2, 180.0)
 
 
@@ -68,7 +67,7 @@ def test_whatever_others_say_nothing_is_armed(flavour: FlavourName) -> None:
 
 
 def test_this_line_spoils_what_it_says() -> None:
-    """It loses a tenth, and what comes is nearly as much others' as ours."""
+    """It loses a tenth, and nearly as many foreign frames arrive as own ones."""
     air = OverLine("ardupilot", 3, armed=False)
     air.run(20.0)
     counts, figures = air.line.counts, air.figures()

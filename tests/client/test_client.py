@@ -1,4 +1,4 @@
-"""The client as an endpoint: session, steps on its own grid, and flying on alone."""
+"""The client as an endpoint: session, steps on its own grid, and flight without packets."""
 
 from typing import Any, Literal
 
@@ -39,16 +39,15 @@ from skytether.shared.wire.protocol import (
 )
 
 OPENED = ModeChanged(vehicle=4, before="init", after="ready", reason="its session is open")
-"""Event of a vehicle that holds its last input for ever: it accepts a horizon at once."""
+"""Event of a vehicle that holds its last input for ever, and so accepts a horizon at once."""
 
 
 def scenario(**changes: Any) -> Scenario:
-    """A short flight of the paper's, with some keys changed."""
     return packaged("paper-every-step", {"duration": 10.0}, changes)
 
 
 def flying(**changes: Any) -> ByHand:
-    """A server that has just welcomed its client."""
+    """Client that has just received WELCOME."""
     server = ByHand(scenario(**changes))
     assert [type(message) for message in server.wake()] == [Hello]
     server.welcome()
@@ -65,7 +64,7 @@ def test_hello_is_repeated_until_somebody_answers() -> None:
 
 
 def test_an_unreachable_server_ends_the_client_with_a_reason() -> None:
-    """After `link.connect_s`, before it has flown at all; after 5 s it says that it goes on."""
+    """After `link.connect_s`, before any flight; after 5 s it logs that it still tries."""
     server = ByHand(scenario(link={"connect_s": 15.0}))
     for _ in range(30):
         if server.client.finished:
@@ -97,7 +96,7 @@ def test_another_scenario_at_the_server_ends_the_client_with_the_difference() ->
 def test_a_vehicle_that_is_refused_says_why_asks_on_and_gives_up_with_the_reason(
     refusal: int, reason: Literal["full", "taken"]
 ) -> None:
-    """Once, at the first refusal; it gives up after `link.connect_s`, as without an answer."""
+    """Logged at the first refusal; gives up after `link.connect_s`, as without an answer."""
     server, hellos = ByHand(scenario(link={"connect_s": 15.0})), 0
     while not server.client.finished:
         hellos += len(server.wake())
@@ -131,7 +130,7 @@ def test_a_vehicle_that_was_refused_flies_once_there_is_room() -> None:
 
 
 def test_a_refusal_in_flight_is_told_and_flown_through() -> None:
-    """After its first session a vehicle never gives up; a refusal that comes late is no news."""
+    """After its first session a vehicle never gives up, and a late refusal is not logged."""
     server = flying(link={"heartbeat_s": 0.1, "timeout_s": 1.0, "connect_s": 2.0})
     server.welcome(refusal=Refusal.TAKEN)
     assert server.client.events() == (Flying(vehicle=4), OPENED)
@@ -165,7 +164,7 @@ def test_nothing_of_a_closed_session_is_heard() -> None:
 
 
 def test_a_restarted_server_whose_clock_is_ahead_is_no_sleep_of_the_vehicle() -> None:
-    """Clocks of two lives of the server cannot be compared: it brakes for the restart alone."""
+    """Clocks of two runs of the server cannot be compared; only the restart causes braking."""
     server = flying(vehicle={"exhausted": "brake"})
     for step in range(45):
         server.wake()
@@ -201,7 +200,9 @@ def test_the_epoch_is_the_moment_the_session_opens() -> None:
 
 
 def test_every_observation_tells_when_the_newest_word_of_the_server_came() -> None:
-    """The arrival time minus the message's stamp, for the server's map of the clocks."""
+    """Arrival time minus time stamp of the message, for the server's estimate of the clock
+    offset.
+    """
     server = flying()
     epoch_ns = server.now_ns
     (first,) = server.wake()
@@ -219,7 +220,7 @@ def test_every_observation_tells_when_the_newest_word_of_the_server_came() -> No
 
 
 def test_an_input_is_flown_from_the_step_after_it_came() -> None:
-    """Applied at the next step, felt in the state one step later."""
+    """Applied at the next step, visible in the state one step later."""
     server = flying()
     server.wake()
     server.horizon(0, 1.0)
@@ -235,7 +236,7 @@ def test_an_input_is_flown_from_the_step_after_it_came() -> None:
 
 
 def test_ages_are_counted_from_a_clock_that_begins_with_the_flight_as_well() -> None:
-    """The observation of step 0 is stamped 0 then; without a horizon the age is -1."""
+    """The observation of step 0 is stamped 0; without a horizon the age is -1."""
     server = ByHand(scenario())
     server.now_ns = 0
     server.wake()
@@ -263,7 +264,7 @@ def test_a_vehicle_that_does_not_know_its_true_state_records_its_estimate(
 
 
 def test_steps_slept_through_are_flown_with_the_old_input_and_counted() -> None:
-    """The actuator holds what it was told last; only the present step is observed."""
+    """The actuator holds the last input; only the present step is observed."""
     server = flying()
     server.wake()
     server.horizon(0, 1.0)
@@ -278,7 +279,7 @@ def test_steps_slept_through_are_flown_with_the_old_input_and_counted() -> None:
 
 
 def test_a_silent_server_is_called_while_the_flight_goes_on() -> None:
-    """HELLO beside the observations; a heartbeat ends the calling, the epoch stays."""
+    """HELLO accompanies the observations until a heartbeat arrives; the epoch stays."""
     server = flying(link={"heartbeat_s": 0.1, "timeout_s": 1.0})
     epoch_ns = server.now_ns
     said = [message for _ in range(65) for message in server.wake()]

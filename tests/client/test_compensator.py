@@ -1,4 +1,4 @@
-"""Uplink delay compensator, eq. (11): which horizon is flown, and the rule of flight aboard."""
+"""Uplink delay compensator, eq. (11): the horizon in force, and the input computed aboard."""
 
 import numpy as np
 import pytest
@@ -18,13 +18,12 @@ quick = settings(max_examples=60)
 
 H = 10
 INPUTS = np.array([np.linspace(0.1, 1.0, H), np.linspace(-0.5, 0.5, H)])
-"""Every stage unlike every other."""
 HERE = np.zeros((2, 2))
-"""A state; without feedback none matters."""
+"""State for tests without feedback, where it has no effect."""
 
 
 def terms(*, scheme: str = "predictive", exhausted: str = "hold", feedback: bool = False) -> Terms:
-    """Ten stages of 0.1 s, on a network of no delay; the age bound is 50 steps."""
+    """Ten stages of 0.1 s, a network without delay, an age bound of 50 steps."""
     direction = "loss(0.1)"
     return check(
         {
@@ -44,24 +43,21 @@ def terms(*, scheme: str = "predictive", exhausted: str = "hold", feedback: bool
 
 
 def horizon(step: int, inputs: Array = INPUTS) -> Horizon:
-    """Horizon that the server made for `step`."""
     return Horizon(1, 1, step, 0, 0, inputs.astype(np.float32))
 
 
 def holding(step: int, inputs: Array = INPUTS, **keys: str) -> Compensator:
-    """A compensator that has been given one horizon."""
     compensator = Compensator(terms(**keys))
     compensator.offer(horizon(step, inputs), step + 1, step)
     return compensator
 
 
 def chosen(compensator: Compensator, step: int, state: Array) -> Array:
-    """Input that is chosen for a step, as an array."""
     return np.array(compensator.choose(step, state, np.zeros(2), np.zeros(2))[0])
 
 
 def told(compensator: Compensator, step: int, state: Array) -> Array:
-    """What of that input is no feedback."""
+    """Part of the input that is not feedback."""
     return np.array(compensator.choose(step, state, np.zeros(2), np.zeros(2))[1])
 
 
@@ -75,7 +71,7 @@ def test_vehicle_hovers_before_its_first_horizon() -> None:
 @pytest.mark.parametrize("exhausted", ["hold", "brake"])
 @pytest.mark.parametrize("stage", range(-4, H))
 def test_stage_is_the_step_since_the_horizon_was_made(stage: int, exhausted: str) -> None:
-    """Input u(k|k_h); where the server's idea of the step is ahead, the first is the nearest."""
+    """Input u(k|k_h); if the server's step is ahead, the first input."""
     compensator = Compensator(terms(exhausted=exhausted))
     compensator.offer(horizon(100), 95, 94)
     flown = chosen(compensator, 100 + stage, HERE)
@@ -108,7 +104,7 @@ def test_brake_goes_straight_and_never_back(x: float, y: float, later: int) -> N
 
 
 def test_stale_horizon_is_ignored_after_reordering() -> None:
-    """E11: the newest generation wins; what comes after it is counted."""
+    """E11: the newest horizon stays in force; older ones are counted and dropped."""
     compensator = Compensator(terms())
     for made in (10, 12, 11, 12, 10):
         new = horizon(made, INPUTS + 0.01 * (made - 10))
@@ -130,7 +126,7 @@ def test_order_of_arrival_does_not_matter(order: list[int], step: int) -> None:
 @pytest.mark.parametrize("exhausted", ["hold", "brake"])
 @pytest.mark.parametrize("step", [7, 12, 58])
 def test_without_compensation_the_newest_first_input_is_flown(step: int, exhausted: str) -> None:
-    """Until the age bound, 5 s after step 8: the rest of the horizon is not looked at."""
+    """Until the age bound, 5 s after step 8; the rest of the horizon is ignored."""
     compensator = holding(5, scheme="none", exhausted=exhausted)
     compensator.offer(horizon(7, INPUTS + 0.2), 9, 8)
     compensator.offer(horizon(6, INPUTS + 0.3), 9, 8)
@@ -138,7 +134,7 @@ def test_without_compensation_the_newest_first_input_is_flown(step: int, exhaust
 
 
 def on_spline(regulator: Array | None = None) -> Compensator:
-    """Compensator with a trajectory from step 100 on, of two intervals at a steady velocity."""
+    """Compensator with a trajectory from step 100 on: two intervals at constant velocity."""
     knots = np.array([[[1.0, 0.4], [1.2, 0.4]], [[2.0, -0.2], [1.9, -0.2]]], np.float32)
     compensator = Compensator(
         terms(scheme="trajectory", feedback=True, exhausted="brake"), regulator
@@ -148,7 +144,7 @@ def on_spline(regulator: Array | None = None) -> Compensator:
 
 
 def test_the_first_knot_of_a_spline_is_where_the_vehicle_is_to_be() -> None:
-    """Position and velocity: there the regulator asks for nothing beside the desired velocity."""
+    """On the trajectory the regulator adds nothing to the desired velocity."""
     regulator = np.array([[2.0, 0.5, 0.0]] * 2)
     there = np.array([[1.0, 0.4], [2.0, -0.2]], np.float32).astype(float)
     compensator = on_spline(regulator)
@@ -160,7 +156,7 @@ def test_the_first_knot_of_a_spline_is_where_the_vehicle_is_to_be() -> None:
 
 
 def test_a_place_is_held_at_rest() -> None:
-    """Where the vehicle is, whatever its velocity; nothing else is in force."""
+    """At its present position, whatever its velocity; no plan is in force."""
     compensator = Compensator(
         terms(scheme="trajectory", feedback=True, exhausted="brake"),
         np.array([[1.0, 0.0, 0.0]] * 2),
@@ -175,7 +171,7 @@ def test_a_place_is_held_at_rest() -> None:
 
 
 def test_a_horizon_is_in_force_since_the_first_step_chosen_for() -> None:
-    """Not since it came, nor since the newest step; another one begins anew."""
+    """Not since its arrival, nor since the newest step; another horizon restarts the count."""
     compensator = holding(100)
     for step in (103, 104, 107):
         chosen(compensator, step, HERE)
@@ -183,7 +179,7 @@ def test_a_horizon_is_in_force_since_the_first_step_chosen_for() -> None:
     compensator.offer(horizon(106), 108, 106)
     compensator.drop(108, np.zeros(2))
     chosen(compensator, 109, HERE)
-    assert compensator.since == 103  # that one was dropped before it was flown
+    assert compensator.since == 103  # dropped before any input was flown
     compensator.offer(horizon(108), 110, 108)
     chosen(compensator, 110, HERE)
     chosen(compensator, 111, HERE)
@@ -201,7 +197,7 @@ def test_a_horizon_is_from_the_future_where_it_is_more_than_h_steps_ahead() -> N
 
 
 def test_inputs_are_held_within_the_bounds() -> None:
-    """The last clamp, apart from the parser's: each axis its own, on both sides."""
+    """Last clamp, independent of the parser's: both bounds of each axis."""
     compensator = holding(0, np.tile([[1.8015, -5.0], [-0.9005, 3.0]], H // 2))
     assert chosen(compensator, 0, HERE).tolist() == [1.8, -0.9]
     assert chosen(compensator, 1, HERE).tolist() == [-1.8, 0.9]
@@ -213,7 +209,7 @@ def test_chosen_input_is_the_caller_s_own() -> None:
         np.testing.assert_allclose(chosen(compensator, 0, HERE), INPUTS[:, 0], rtol=1e-7)
 
 
-# -- too old, too late ---------------------------------------------------------------------------
+# -- age bound and late horizons -----------------------------------------------------------------
 
 
 @pytest.mark.parametrize("scheme", ["none", "predictive", "committed"])
@@ -221,12 +217,12 @@ def test_chosen_input_is_the_caller_s_own() -> None:
     ("step", "observed", "reason"),
     [
         (100, 99, None),
-        (100, 50, None),  # its first input is 50 steps younger than that
+        (100, 50, None),  # its first input is 50 steps younger
         (100, 49, "too old"),
         (100, 0, "too old"),
         (100, 101, "observation"),
         (100, 102, "observation"),
-        (100, -1, "observation"),  # no stamp of its own
+        (100, -1, "observation"),  # observation before step 0
     ],
 )
 def test_a_horizon_from_an_old_or_impossible_observation_is_refused(
@@ -248,7 +244,7 @@ def test_a_horizon_from_an_old_or_impossible_observation_is_refused(
 
 @pytest.mark.parametrize(("exhausted", "after"), [("hold", 1.0), ("brake", 0.8)])
 def test_a_horizon_is_flown_no_longer_than_the_age_bound(exhausted: str, after: float) -> None:
-    """Seen at step 54, no input is flown after step 104; then it is held or braked along."""
+    """Observed at step 54, so no input is flown after step 104; then held or braked."""
     compensator = Compensator(terms(exhausted=exhausted))
     compensator.offer(horizon(100, np.tile([[0.6], [0.8]], H)), 101, 54)
     flown = []
@@ -259,7 +255,7 @@ def test_a_horizon_is_flown_no_longer_than_the_age_bound(exhausted: str, after: 
 
 
 def test_a_horizon_that_is_over_when_it_comes_is_not_braked_along() -> None:
-    """Its last input is flown for one step; a step later another one was braked along long ago."""
+    """Its last input is flown for one step; a step later the braking curve has already ended."""
     for late, is_held in ((H - 1, True), (H, False)):
         compensator = Compensator(terms(exhausted="brake"))
         if is_held:
@@ -271,10 +267,10 @@ def test_a_horizon_that_is_over_when_it_comes_is_not_braked_along() -> None:
 
 
 def test_a_horizon_that_is_cut_by_its_age_is_braked_along_its_last_flown_input() -> None:
-    """The inputs behind the age bound of 50 steps were never flown."""
+    """Inputs beyond the age bound of 50 steps were never flown."""
     rising = np.array([np.linspace(0.1, 1.0, H), np.zeros(H)])
     compensator = Compensator(terms(exhausted="brake"))
-    compensator.offer(horizon(45, rising), 46, 0)  # five stages are young enough
+    compensator.offer(horizon(45, rising), 46, 0)  # five stages are within the age bound
     flown, covered = [], []
     for step in range(46, 54):
         flown.append(chosen(compensator, step, HERE)[0])
@@ -287,7 +283,7 @@ def test_a_horizon_that_is_cut_by_its_age_is_braked_along_its_last_flown_input()
 
 @pytest.mark.parametrize("after", ["dropped", "replaced"])
 def test_a_copy_is_counted_only_while_its_horizon_is_in_force(after: str) -> None:
-    """The server repeats what it does not know to be in force; older ones are late."""
+    """The server repeats a horizon until it is acknowledged; copies of older ones count as late."""
     compensator = holding(100)
     assert not compensator.offer(horizon(100), 103, 100)
     assert (compensator.stale, compensator.repeated) == (1, 1)
@@ -305,7 +301,7 @@ def test_a_copy_is_counted_only_while_its_horizon_is_in_force(after: str) -> Non
 def test_without_compensation_the_age_bound_ends_the_first_input(
     exhausted: str, after: float
 ) -> None:
-    """It is held, or braked along at 2 m/s² from 1 m/s, whatever inputs follow it."""
+    """The first input is held, or braked at 2 m/s² from 1 m/s, whatever inputs follow."""
     inputs = np.tile([[0.6], [0.8]], H) * np.append(1.0, np.full(H - 1, after))
     compensator = holding(5, inputs, scheme="none", exhausted=exhausted)
     speeds = [float(np.linalg.norm(chosen(compensator, step, HERE))) for step in (55, 56, 57)]
@@ -317,7 +313,7 @@ def test_without_compensation_the_age_bound_ends_the_first_input(
 def test_a_horizon_that_comes_long_after_its_committed_steps_is_refused(
     scheme: str, d: int
 ) -> None:
-    """After a quarter of the horizon, two steps here; the paper's scheme commits to nothing."""
+    """After a quarter of the horizon, two steps here; the paper's scheme has no committed steps."""
     inputs = np.concatenate([np.zeros((2, d)), INPUTS], axis=1)
     in_time, late = Compensator(terms(scheme=scheme)), Compensator(terms(scheme=scheme))
     in_time.offer(horizon(100, inputs), 102 + d, 99)
@@ -337,7 +333,7 @@ GAIN = np.array([[3.0, 1.5], [2.0, 0.5]])
 
 
 def with_feedback(x: Array, disturbance: Array, gain: Array = GAIN) -> Horizon:
-    """A horizon for step 100 that leads on from a state."""
+    """Horizon for step 100 whose reference starts at a state."""
     feedback = np.concatenate([x, disturbance[:, None], gain], axis=1).astype(np.float32)
     assert feedback.shape == (2, FEEDBACK)
     return horizon(100)._replace(feedback=feedback)
@@ -376,7 +372,7 @@ def test_there_is_no_feedback_before_the_first_stage() -> None:
 @pytest.mark.parametrize("exhausted", ["hold", "brake"])
 @pytest.mark.parametrize("step", [100 + H, 120 + H])
 def test_feedback_goes_on_after_the_last_stage(step: int, exhausted: str) -> None:
-    """Onto what is told there: the last input, or what braking leaves of it."""
+    """Added to the prescribed input: the last input, or the braking curve."""
     flown = terms(exhausted=exhausted, feedback=True)
     compensator, plain = Compensator(flown), holding(100, exhausted=exhausted)
     disturbance, x = np.array([0.25, -0.5]), HERE
@@ -395,7 +391,7 @@ def test_feedback_goes_on_after_the_last_stage(step: int, exhausted: str) -> Non
 def test_with_feedback_it_brakes_and_stays_where_it_is_in_wind(
     monkeypatch: pytest.MonkeyPatch, *, goes_on: bool
 ) -> None:
-    """Half a minute after the last input; had feedback ended there, it would drift."""
+    """For half a minute after the last input; without feedback there, the vehicle would drift."""
     flown, wind = terms(exhausted="brake", feedback=True), np.array([0.3, -0.2])
     compensator, x, places = Compensator(flown), HERE, []
     compensator.offer(with_feedback(HERE, np.zeros(2)), 100, 99)
@@ -403,7 +399,7 @@ def test_with_feedback_it_brakes_and_stays_where_it_is_in_wind(
         whole = rule.flown
 
         def end(stage: int, told: float, back: float, bound: float) -> float:
-            """Feedback up to the last input, as it once was."""
+            """Rule without feedback after the last input."""
             return whole(stage, told, back if stage < H else 0.0, bound)
 
         monkeypatch.setattr(rule, "flown", end)
@@ -433,7 +429,6 @@ def test_a_horizon_that_is_dropped_leaves_no_feedback() -> None:
 
 
 def test_a_horizon_that_is_dropped_covers_nothing_from_then_on() -> None:
-    """Also before the next input is chosen, and it does not count as one that is chosen anew."""
     compensator = holding(100, exhausted="brake")
     chosen(compensator, 101, HERE)
     assert (compensator.covered, compensator.since) == (True, 101)

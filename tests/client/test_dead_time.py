@@ -1,4 +1,4 @@
-"""Dead time and gain of the model: the state that the next input meets, and what flies by it."""
+"""Dead time and gain of the model: prediction of the state when the next input takes effect."""
 
 from typing import Any
 
@@ -26,25 +26,25 @@ AUTOPILOT = {
     "dead_time_s": [0.27, 0.24],
     "u_max": [3.0],
 }
-"""A model like that of an autopilot's horizontal and vertical axis; neither dead time is whole."""
+"""Model like an autopilot's horizontal and vertical axis, with dead times between steps."""
 PERFECT = dict.fromkeys(("uplink", "downlink"), "")
 BRISK = {"shape": "figure-eight", "radius_m": 3.0, "period_s": 15.0}
 
 
 def scenario(**sections: Any) -> Scenario:
-    """The demo in calm air, some 15 s; sections are laid over."""
+    """The demo in calm air for 15 s, with sections changed."""
     calm = {"duration": 15.0, "settle": 5.0, "vehicle": {"wind": 0.0}}
     return packaged("demo-committed", calm, sections)
 
 
 def flown(**sections: Any) -> tuple[Summary, Record]:
-    """Summary and record of a flight along a brisk figure-eight."""
+    """Summary and record of a flight along a fast figure eight."""
     flight = scenario(**{"reference": BRISK} | sections)
     record = fly(flight)
     return summarise(flight, "test", record.client, record.server, record.netem), record
 
 
-# -- the state that the next input meets -----------------------------------------------------------
+# -- predicted state -------------------------------------------------------------------------------
 
 
 @given(
@@ -63,7 +63,7 @@ def test_what_the_next_input_meets_obeys_eq_4_without_dead_time(
     wind_mps: tuple[float, ...],
     seed: int,
 ) -> None:
-    """Predicted from the plant's true state, in whole and broken steps, whatever is flown."""
+    """Predicted from the plant's true state, with dead times in whole and broken steps."""
     late_s = [ns / 1e9 for ns in dead_time_ns]
     model = {"tau_s": tau_s, "gain": gain, "dead_time_s": late_s}
     steady = [g * w for g, w in zip(gain, wind_mps, strict=True)]
@@ -84,14 +84,16 @@ def test_what_the_next_input_meets_obeys_eq_4_without_dead_time(
         np.testing.assert_allclose(met, wanted, rtol=0.0, atol=1e-12 * 40)
     for axis, ns in enumerate(dead_time_ns):
         whole, rest_ns = divmod(ns, known.dt_ns)
-        if not rest_ns and whole < len(states):  # it is the plant's own state, later
+        if not rest_ns and whole < len(
+            states
+        ):  # the predicted state is the plant's own, some steps later
             later, _ = states[-1]
             _, before = states[-1 - whole]
             np.testing.assert_allclose(before[axis], later[axis], rtol=0.0, atol=1e-10)
 
 
 def test_a_filter_that_knows_of_the_dead_time_is_right_with_noise_and_late_measurements() -> None:
-    """Ablation: told of none, it is decimetres off where inputs change all the time."""
+    """Without the dead time, the filter is decimetres off while inputs change."""
     sensor = {"position_noise_m": 0.01, "velocity_noise_mps": 0.02, "delay_s": 0.12}
     off = {}
     truth = {"dead_time_s": 0.27, "gain": 0.8}
@@ -111,7 +113,7 @@ def test_a_filter_that_knows_of_the_dead_time_is_right_with_noise_and_late_measu
 
 
 def test_the_error_of_an_estimate_is_taken_when_the_next_input_meets_the_vehicle() -> None:
-    """It is hardly larger with a dead time: the vehicle flies by where it will be then."""
+    """It is hardly larger with a dead time, because it is evaluated when the input takes effect."""
     noise = {"position_noise_m": 0.02, "velocity_noise_mps": 0.05}
     late = {"dead_time_s": 0.27}
     with_it, _ = flown(model=late, vehicle=late, sensor=noise)
@@ -120,7 +122,7 @@ def test_the_error_of_an_estimate_is_taken_when_the_next_input_meets_the_vehicle
 
 
 def test_constant_wind_is_reckoned_with_while_inputs_are_on_their_way() -> None:
-    """Learned aboard even where the state is measured as it is, for nothing else tells of it."""
+    """Estimated aboard even with exact measurements, because nothing else reveals wind."""
     known = scenario(model={"dead_time_s": 0.4}, vehicle={"steady_wind_mps": [1.0, -0.5]})
     flies, aboard, states, met = simulated(known, 1), Navigation(known), [], []
     for k in range(400):
@@ -137,7 +139,7 @@ def test_constant_wind_is_reckoned_with_while_inputs_are_on_their_way() -> None:
 
 @pytest.mark.parametrize("scheme", ["committed", "predictive", "trajectory"])
 def test_a_known_dead_time_costs_hardly_anything(scheme: str) -> None:
-    """Ablation: the same vehicle with a model without dead time is off."""
+    """Without the dead time in the model, the same vehicle has a large error."""
     splines = scheme == "trajectory"
     control = {"scheme": scheme, "trigger": "cost_gap(0.01) | silence(1)" if splines else "always"}
     control |= {"input_weight": 0.05}
@@ -175,7 +177,7 @@ def test_the_reported_state_is_the_true_one_a_dead_time_later() -> None:
 
 
 def test_a_gain_that_is_known_leaves_no_error() -> None:
-    """Ablation: without the observer, a vehicle whose gain the model has wrong lags or leads."""
+    """Without the observer, a vehicle with a wrong gain in its model lags or leads."""
     control, network = {"observer_s": 0.0, "feedback": False, "trigger": "always"}, PERFECT
     right, wrong = (
         flown(model=model, vehicle={"gain": 0.8}, control=control, network=network, reference={})[0]
@@ -185,7 +187,7 @@ def test_a_gain_that_is_known_leaves_no_error() -> None:
 
 
 def test_without_a_dead_time_nothing_is_predicted() -> None:
-    """The report is the estimate itself, and exact measurements pass no filter."""
+    """The report equals the estimate, and exact measurements pass unfiltered."""
     known = Navigation(scenario())
     known.advance(simulated(scenario(), 1).measurements(now_ns=0), np.zeros(2), now_ns=0)
     assert known.predicted is known.estimate

@@ -1,6 +1,6 @@
-"""The failsafe aboard: what a vehicle does when the link, the server or itself fails.
+"""Failsafe aboard: behaviour when the link, the server or the vehicle fails.
 
-A hand makes the server's messages, at a step of 20 ms each; the vehicle is the real one.
+The test plays the server at steps of 20 ms; the client is the real one.
 """
 
 from collections.abc import Callable
@@ -50,19 +50,18 @@ from skytether.shared.wire.protocol import (
 STEPS_PER_S = 50
 H = 100
 D = 5
-"""Committed steps of the horizons."""
 SPEED = 1.0
 """Input of all horizons, along x [m/s]."""
 
 
 class Sealed(PlainLink):
-    """A link that vouches for the server."""
+    """Link that counts as authenticated."""
 
     secure = True
 
 
 class Hand(ByHand):
-    """A vehicle, and a hand that plays its server: a heartbeat each 0.1 s, horizons on request."""
+    """Client, and its server played by the test: a heartbeat each 0.1 s, horizons on request."""
 
     def __init__(self, *, secure: bool = False, armed: bool = True, **sections: Any) -> None:
         flown = msgspec.structs.replace(scenario(**sections), armed=armed)
@@ -72,7 +71,6 @@ class Hand(ByHand):
         self.welcome()
 
     def heartbeat(self) -> None:
-        """Say that the server lives."""
         self.say(Heartbeat(4, self.session, 1, Idle.PLANS, 0))
 
     def plan(
@@ -82,9 +80,10 @@ class Hand(ByHand):
         observed: int | None = None,
         gain: tuple[float, float] | None = None,
     ) -> None:
-        """A horizon, of the step that was flown last unless told, with feedback if there is a gain.
+        """Send a horizon that starts at the vehicle's reported state, for the last step unless
+        given.
 
-        It leads on from where the vehicle said that it was.
+        With `gain` the horizon has feedback.
         """
         step = self.step if made_for is None else made_for
         age = step - (self.step if observed is None else observed)
@@ -98,11 +97,10 @@ class Hand(ByHand):
 
     @property
     def step(self) -> int:
-        """The step that was flown last."""
         return self.said[-1].step
 
     def fly(self, seconds: float, *, beats: bool = True, plans: bool = False) -> None:
-        """Let time pass, with heartbeats or without, and with a horizon at each step or none."""
+        """Advance, with or without heartbeats, and with a horizon at each step or none."""
         for _ in range(round(seconds * STEPS_PER_S)):
             self.out = self.wake()
             self.said = [each for each in self.out if isinstance(each, Observation)] or self.said
@@ -117,36 +115,33 @@ class Hand(ByHand):
 
     @property
     def mode(self) -> Mode:
-        """Mode that the vehicle reports."""
         return Mode(self.said[-1].mode)
 
     @property
     def takes(self) -> bool:
-        """Whether it says that it flies horizons."""
+        """Whether the vehicle reports that it accepts horizons."""
         return bool(self.said[-1].takes)
 
     @property
     def speed(self) -> float:
-        """Magnitude of the input that it says it flies [m/s]."""
         return float(np.linalg.norm(self.said[-1].input))
 
     @property
     def changes(self) -> list[tuple[str, str]]:
-        """Modes that it has told, and why."""
         self.events += self.client.events()
         told = [event for event in self.events if isinstance(event, ModeChanged)]
         return [(event.after, event.reason) for event in told]
 
 
 def aboard(changed: Callable[..., None] = lambda *_: None, **times_s: float) -> Failsafe:
-    """A failsafe by itself; times are a second each, unless given."""
+    """Failsafe without a client; times are a second each, unless given."""
     times = {"timeout": 1.0, "brake": 1.0, "land_after": 1.0} | times_s
     times_ns = {f"{name}_ns": round(s * SECOND_NS) for name, s in times.items()}
     return Failsafe(TABLE, armed=True, changed=changed, **times_ns)
 
 
 def scenario(**sections: Any) -> Scenario:
-    """A long flight of the demo at 50 Hz in calm air; sections are laid over."""
+    """Long flight of the demo at 50 Hz in calm air, with sections changed."""
     preset = {
         "duration": 100.0,
         "control": {"dt": 0.02, "horizon": H, "feedback": False},
@@ -157,7 +152,6 @@ def scenario(**sections: Any) -> Scenario:
 
 
 def tracking(**keys: Any) -> Hand:
-    """A vehicle that flies horizons."""
     hand = Hand(**keys)
     hand.fly(1.2)
     assert hand.takes
@@ -167,7 +161,7 @@ def tracking(**keys: Any) -> Hand:
 
 
 def comes_to_hover_and_takes_no_horizon(hand: Hand, *, for_s: float = 0.8) -> None:
-    """Braked at 2 m/s² from 1 m/s, with the link good and horizons at every step meanwhile."""
+    """Braked at 2 m/s² from 1 m/s, although the link is good and horizons arrive."""
     hand.fly(0.02, plans=True)
     assert (hand.mode, hand.takes, hand.said[-1].in_force) == (Mode.BRAKE, False, NO_HORIZON)
     hand.fly(0.5, plans=True)
@@ -181,11 +175,11 @@ def comes_to_hover_and_takes_no_horizon(hand: Hand, *, for_s: float = 0.8) -> No
     assert (hand.mode, hand.speed) == (Mode.TRACK, SPEED)
 
 
-# -- the way to the first horizon ------------------------------------------------------------------
+# -- before the first horizon ----------------------------------------------------------------------
 
 
 def test_a_vehicle_takes_a_horizon_after_a_second_of_good_link() -> None:
-    """One that comes before that is dropped, and counted."""
+    """An earlier horizon is dropped, and counted."""
     hand = Hand()
     hand.fly(0.98, plans=True)
     assert (hand.mode, hand.takes, hand.speed) == (Mode.SYNC, False, 0.0)
@@ -204,7 +198,6 @@ def test_a_vehicle_takes_a_horizon_after_a_second_of_good_link() -> None:
 
 
 def modes_of(hand: Hand) -> tuple[list[int], list[int]]:
-    """Mode and reason of every step of the record."""
     rows = hand.rows()
     return rows["mode"].tolist(), rows["reason"].tolist()
 
@@ -232,7 +225,7 @@ def test_a_link_is_good_with_gaps_up_to_two_thirds_of_the_time_out(gap_ns: int, 
 
 
 def tracking_alone(now_ns: int) -> Failsafe:
-    """A failsafe by itself that has just heard its server and accepted a horizon."""
+    """Failsafe without a client that has just received a packet and accepted a horizon."""
     guard = aboard(timeout=1.0, brake=0.5)
     guard.heard(now_ns=now_ns)
     for cause in (Reason.OPENED, Reason.GOOD):
@@ -297,13 +290,12 @@ def test_rounding_of_a_speed_is_not_clamped() -> None:
 
 
 class Challenged(PlainLink):
-    """A link whose handshake answers each datagram with another."""
+    """Link whose handshake answers each datagram with another one."""
 
     def open(self, datagram: bytes, *, now_ns: int) -> None:  # type: ignore[override]
         """Nothing for the session."""
 
     def outbox(self) -> list[bytes]:
-        """The answer, which carries the HELLO."""
         return [b"answer"]
 
 
@@ -317,7 +309,7 @@ def test_no_hello_is_due_for_a_while_after_the_answer_to_a_challenge() -> None:
 
 
 def test_a_link_that_stutters_is_not_good() -> None:
-    """A heartbeat every 1.1 s for nine seconds, where silence of 1 s is a loss."""
+    """A heartbeat every 1.1 s for nine seconds; silence of 1 s is a loss."""
     hand = Hand()
     for _ in range(8):
         hand.fly(1.1, beats=False)
@@ -329,7 +321,7 @@ def test_a_link_that_stutters_is_not_good() -> None:
 def test_a_link_is_good_while_it_is_never_silent_for_more_than_two_thirds_of_the_time_out(
     steps: int, mode: Mode
 ) -> None:
-    """A heartbeat every 0.66 s, and every 0.68 s, fifteen times: silence of 1 s is a loss."""
+    """A heartbeat every 0.66 s, and every 0.68 s, fifteen times; silence of 1 s is a loss."""
     hand = Hand()
     hand.fly(1 / STEPS_PER_S, beats=False)
     for _ in range(15):
@@ -339,7 +331,7 @@ def test_a_link_is_good_while_it_is_never_silent_for_more_than_two_thirds_of_the
 
 
 def test_a_horizon_planned_before_the_vehicle_took_any_is_dropped() -> None:
-    """The server reckoned that it would stand still."""
+    """The server assumed that the vehicle would stand still."""
     hand = Hand()
     hand.fly(1.2)
     hand.plan(observed=30)
@@ -355,11 +347,11 @@ def test_a_vehicle_that_is_not_armed_flies_nothing() -> None:
     assert hand.changes[-1] == ("ready", str(Reason.UNARMED))
 
 
-# -- what fails in flight --------------------------------------------------------------------------
+# -- failures in flight ----------------------------------------------------------------------------
 
 
 def test_without_a_newer_horizon_it_coasts_and_says_nothing() -> None:
-    """After a second; the heartbeats live, and the next horizon is flown at once."""
+    """Coasting begins after a second; the next horizon is flown at once."""
     hand = tracking()
     told = hand.changes
     hand.fly(1.1)
@@ -371,7 +363,7 @@ def test_without_a_newer_horizon_it_coasts_and_says_nothing() -> None:
 
 
 def test_an_exhausted_horizon_is_braked_along_and_the_next_is_taken_at_once() -> None:
-    """The link is good: nothing is locked."""
+    """The link is good, so the next horizon is accepted without a wait."""
     hand = tracking()
     hand.fly((D + H) / STEPS_PER_S + 0.1)
     assert (hand.mode, hand.takes) == (Mode.BRAKE, True)
@@ -388,7 +380,7 @@ def test_an_exhausted_horizon_is_braked_along_and_the_next_is_taken_at_once() ->
 
 
 def test_with_feedback_it_hovers_where_it_came_to_rest_in_whatever_wind() -> None:
-    """The prescribed input is braked to zero, so the vehicle hovers; feedback balances the wind."""
+    """The prescribed input is braked to zero, so the vehicle hovers; feedback compensates wind."""
     wind = [0.4, -0.3]
     hand = Hand(control={"feedback": True}, vehicle={"steady_wind_mps": wind})
     hand.fly(1.2)
@@ -401,14 +393,14 @@ def test_with_feedback_it_hovers_where_it_came_to_rest_in_whatever_wind() -> Non
     places = hand.rows()["state"][:, :, 0]
     assert np.abs(places[-1] - places[-100]).max() < 1e-3
     np.testing.assert_allclose(hand.said[-1].input, np.negative(wind), atol=1e-3)
-    hand.fly(2.0, beats=False)  # the link is lost: nothing of a plan is flown any more
+    hand.fly(2.0, beats=False)  # the link is lost: no plan is flown any more
     assert (hand.mode, hand.speed, hand.said[-1].in_force) == (Mode.HOVER, 0.0, NO_HORIZON)
 
 
 def test_what_is_told_while_braking_never_speeds_up_whatever_feedback_adds(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """A compensator that tells full speed again after the last input is kept from it."""
+    """Even with a faulty compensator that commands full speed after the last input."""
     hand = Hand(control={"feedback": True})
     hand.fly(1.2)
     hand.plan(gain=(0.0, 0.0))
@@ -421,7 +413,7 @@ def test_what_is_told_while_braking_never_speeds_up_whatever_feedback_adds(
 
 
 def test_a_silent_server_ends_in_brake_with_horizon_left() -> None:
-    """After a second without a packet, with one more second of horizon."""
+    """After a second without a packet, although one more second of horizon is left."""
     hand = tracking()
     hand.fly(0.96, beats=False)
     assert hand.speed == SPEED
@@ -437,7 +429,7 @@ def test_a_silent_server_ends_in_brake_with_horizon_left() -> None:
 
 
 def test_ten_seconds_of_hovering_alone_end_in_landing_for_good() -> None:
-    """In space it descends to the ground; what the server says then changes nothing."""
+    """In space it descends to the ground; later messages of the server change nothing."""
     space = {"model": {"axes": 3}, "reference": {"altitude_m": 2.0}}
     hand = tracking(control={"horizon": 60}, **space)
     hand.fly(0.5, plans=True)
@@ -495,7 +487,6 @@ def test_one_horizon_in_time_among_late_ones_is_enough() -> None:
 
 
 def test_a_restarted_server_s_horizons_wait_for_a_second_of_good_link() -> None:
-    """Plans of the server's earlier run are dropped."""
     hand = tracking()
     hand.session = 8
     hand.welcome(server_boot_id=2)
@@ -504,7 +495,7 @@ def test_a_restarted_server_s_horizons_wait_for_a_second_of_good_link() -> None:
 
 
 def test_malformed_messages_of_the_server_itself_end_in_brake() -> None:
-    """Five within a second: one flipped bit is forgiven, a server gone mad is not."""
+    """Five within a second; a single one is tolerated."""
     hand = tracking(secure=True)
     for _ in range(4):
         hand.client.receive(Datagram(b"?", SERVER), now_ns=hand.now_ns)
@@ -518,7 +509,7 @@ def test_malformed_messages_of_the_server_itself_end_in_brake() -> None:
 
 
 def test_what_has_been_counted_towards_a_new_session_counts_no_more() -> None:
-    """Ten horizons for impossible times end a session; the next ten are needed to end another."""
+    """Ten horizons for impossible times end a session; the next session counts from 0."""
     met: list[Reason] = []
     guard = aboard()
 
@@ -534,7 +525,6 @@ def test_what_has_been_counted_towards_a_new_session_counts_no_more() -> None:
 
 
 def with_input_out_of_range(hand: Hand) -> Horizon:
-    """A horizon that asks for more than u_max."""
     inputs = np.full((2, H), 1.01 * hand.terms.u_max[0], np.float32)
     return Horizon(4, hand.session, hand.step, 1, hand.step, inputs)
 
@@ -548,7 +538,7 @@ def test_in_plaintext_a_stranger_cannot_make_it_brake_by_malformed_messages() ->
 
 
 def test_horizons_for_impossible_times_end_in_a_new_session() -> None:
-    """Ten within a second: braked, and HELLO said; only a WELCOME is heard from then on."""
+    """Ten within a second: the vehicle brakes and sends HELLO, and accepts only a WELCOME."""
     hand = tracking()
     for n in range(10):
         if n % 2:
@@ -564,7 +554,7 @@ def test_horizons_for_impossible_times_end_in_a_new_session() -> None:
 
 
 def test_a_server_that_closes_the_session_ends_in_brake_at_once() -> None:
-    """Later and earlier packets of the session are ignored; the vehicle asks for a new session."""
+    """Other packets of the session are ignored; the vehicle asks for a new session."""
     hand = tracking()
     for _ in range(3):
         hand.say(Close(4, hand.session))
@@ -588,7 +578,7 @@ def test_a_close_of_another_session_is_dropped() -> None:
 
 
 def test_a_vehicle_that_was_asleep_brakes_on_waking_and_takes_the_next_horizon() -> None:
-    """121 ms late: what it was flying had been planned for other places."""
+    """121 ms late: the plan in force was made for other places."""
     hand = tracking()
     hand.now_ns += 141_000_000
     hand.heartbeat()
@@ -650,7 +640,7 @@ def test_what_is_not_finite_ends_in_fault_for_good() -> None:
 
 
 def test_a_state_that_no_vehicle_can_have_ends_in_hover_until_somebody_has_chosen() -> None:
-    """A position that changes by 300 m in a step, or a velocity by 20 m/s, is not flown by."""
+    """A position that changes by 300 m in a step, or a velocity by 20 m/s."""
     for p, v in ((300.0, 0.0), (0.0, 20.0)):
         hand = tracking()
         hand.flies.plant.x += [p, v]
@@ -687,7 +677,7 @@ def test_a_link_that_is_lost_meanwhile_changes_nothing_in_that() -> None:
 def test_a_sleep_that_looks_like_a_clock_that_was_set_is_told_by_the_server(
     slept_s: int, mode: Mode
 ) -> None:
-    """Seen through `Steady` no time has passed; the server's clock has gone on by half a minute."""
+    """Behind `Steady` no time has passed; the server's clock has advanced by half a minute."""
     hand = tracking()
     hand.say(Heartbeat(4, hand.session, stamp_us(SECOND_NS), Idle.PLANS, 0))
     hand.fly(0.1, beats=False)
@@ -697,7 +687,7 @@ def test_a_sleep_that_looks_like_a_clock_that_was_set_is_told_by_the_server(
     assert hand.mode is mode
 
 
-# -- the paper's own rule --------------------------------------------------------------------------
+# -- the paper's rule ------------------------------------------------------------------------------
 
 
 def test_a_vehicle_that_holds_has_no_failsafe() -> None:
@@ -732,7 +722,7 @@ def test_a_vehicle_that_holds_has_no_failsafe() -> None:
 def test_the_last_clamp_bounds_value_and_change(
     wanted: list[float], flown: list[float] | None
 ) -> None:
-    """From 0.8 and 0.2 m/s, at most 1.6 m/s, and 1 m/s a step; nothing of what is not finite."""
+    """From 0.8 and 0.2 m/s; bounds are 1.6 m/s and 1 m/s per step; NaN is refused."""
     assert clamped(wanted, [0.8, 0.2], [1.6, 1.6], 1.0, without_feedback=wanted) == flown
 
 
@@ -760,12 +750,11 @@ def test_the_last_clamp_keeps_braking_from_speeding_up_but_for_feedback(
 def test_no_mistake_of_the_compensator_reaches_the_plant(
     monkeypatch: pytest.MonkeyPatch, *, clamps: bool
 ) -> None:
-    """100 m/s on both axes, from one step to the next; without the clamp it is flown."""
     hand = tracking(vehicle={"slew_mps2": 5.0})
     if not clamps:
         monkeypatch.setattr(skytether.client.pilot, "clamped", lambda wanted, *_, **__: wanted)
     monkeypatch.setattr(Compensator, "choose", lambda *_: ([100.0, -100.0],) * 2)
-    # What is over u_max is no message: the record tells.
+    # An observation above u_max cannot be encoded, so the record is checked instead.
     monkeypatch.setattr(skytether.client.session.ServerSession, "send", lambda *_: None)
     hand.fly(0.4, plans=True)
     flown = hand.rows()["input"]
@@ -791,7 +780,7 @@ def test_nothing_leads_out_of_fault_and_only_fault_out_of_land(table: failsafe.T
 
 
 def test_whatever_happens_a_locked_vehicle_takes_no_horizon() -> None:
-    """Ten thousand causes by chance: no horizon leads out of a forced brake without a good link."""
+    """Ten thousand random causes: after a forced brake only a good link allows a horizon."""
     rng = stream(1, "causes")
     told: list[Reason] = []
     failing = aboard(lambda _, __, cause, ___: told.append(cause))
@@ -808,20 +797,19 @@ def test_whatever_happens_a_locked_vehicle_takes_no_horizon() -> None:
         assert not (locked and failing.takes)
 
 
-# -- without its guards ----------------------------------------------------------------------------
+# -- ablations of guards ---------------------------------------------------------------------------
 
-# -- what the vehicle's own side says ---------------------------------------------------------
+# -- hindrances of the vehicle ----------------------------------------------------------------
 
 
 def hindered(hand: Hand, cause: Reason | None) -> None:
-    """Let the vehicle have this hindrance from now on."""
     hand.flies.hindrance = lambda *, now_ns: cause  # noqa: ARG005
 
 
 PILOTS = (Reason.TAKEN, Reason.DISARMED)
 GROUNDING = (Reason.BATTERY, Reason.ASTRAY, Reason.RIVAL, Reason.STRAYED)
 DEAF = (Reason.MUTE, Reason.UNUSABLE)
-"""Hindrances that leave the vehicle to a pilot, that land it, and that let it wait."""
+"""Causes while which the vehicle receives no commands."""
 
 
 @pytest.mark.parametrize("cause", PILOTS)
@@ -871,7 +859,7 @@ def test_a_vehicle_whose_autopilot_is_silent_brakes_and_waits_for_it(cause: Reas
 
 
 def test_a_vehicle_whose_autopilot_stays_silent_lands() -> None:
-    """`vehicle.land_after_s` of hovering, and the second that a link has to be good."""
+    """`vehicle.land_after_s` of hovering, and the second for which a link must be good."""
     hand = tracking()
     hindered(hand, Reason.MUTE)
     hand.fly(0.6 + 10.0, plans=True)
@@ -889,11 +877,11 @@ def test_a_link_that_comes_back_just_before_the_landing_has_its_second() -> None
     assert (hand.mode, hand.takes) == (Mode.HOVER, True)
 
 
-# -- no mode is held for ever by what pushes, or by what never comes ---------------------------
+# -- time limits of modes ----------------------------------------------------------------------
 
 
 def beyond_its_fence() -> Hand:
-    """A vehicle that wind of 1.5 m/s holds beyond its fence, whose bound is 4.5 m."""
+    """Vehicle that wind of 1.5 m/s holds beyond its fence, whose bound is 4.5 m."""
     fence = {"low_m": [-9.0, -9.0], "high_m": [4.5, 9.0], "wind_mps": 0.2}
     hand = Hand(vehicle={"steady_wind_mps": [1.5, 0.0]}, fence=fence)
     hand.fly(1.2)
@@ -904,7 +892,7 @@ def beyond_its_fence() -> Hand:
 
 
 def test_a_fence_that_pushes_for_ever_keeps_no_vehicle_from_landing() -> None:
-    """The link is cut: it brakes, hovers and lands when one inside would, and is pushed back."""
+    """After loss of the link it brakes, hovers and lands in the usual time."""
     hand = beyond_its_fence()
     began_s = hand.now_ns / SECOND_NS
     while hand.mode is not Mode.LAND and hand.now_ns / SECOND_NS < began_s + 20.0:
@@ -932,7 +920,7 @@ ADVERSITIES: dict[str, tuple[float, Reason | None]] = {
     "no estimate": (0.1, Reason.ASTRAY),
     "a leap": (0.1, Reason.LEAPT),
 }
-"""Time between packets [s], and what is met at every step."""
+"""Time between packets [s], and hindrance at every step."""
 
 
 @pytest.mark.parametrize("adversity", ADVERSITIES)
@@ -940,7 +928,7 @@ ADVERSITIES: dict[str, tuple[float, Reason | None]] = {
     "mode", [Mode.SYNC, Mode.READY, Mode.TRACK, Mode.COAST, Mode.BRAKE, Mode.HOVER]
 )
 def test_no_mode_in_the_air_lasts_for_ever(mode: Mode, adversity: str) -> None:
-    """Nothing ever tells that it stands still: something pushes it; only time passes."""
+    """The vehicle is never seen at rest, because something pushes it; only time passes."""
     every_s, hindrance = ADVERSITIES[adversity]
     failing = aboard(brake=2.0, land_after=10.0)
     failing.meet(Reason.OPENED, now_ns=0)
@@ -958,7 +946,7 @@ def test_no_mode_in_the_air_lasts_for_ever(mode: Mode, adversity: str) -> None:
         failing.step(late_ns=0, hindrance=hindrance, now_ns=now_ns)
         if failing.mode in (Mode.TRACK, Mode.COAST) and now_ns > 5 * SECOND_NS:
             failing.meet(Reason.ENDED, now_ns=now_ns)
-    # The longest plan, noticing, braking, hovering, and a second for a link to be good.
+    # The longest plan, detection, braking, hovering, and a second for a link to be good.
     assert now_ns <= (5 + 1 + 2 + 10 + 1.1) * SECOND_NS
 
 
@@ -980,7 +968,7 @@ ROWS: dict[Reason, Callable[[], None]] = {
     Reason.NOT_FINITE: test_what_is_not_finite_ends_in_fault_for_good,
     Reason.LEAPT: test_a_state_that_no_vehicle_can_have_ends_in_hover_until_somebody_has_chosen,
 }
-"""Scenario that needs the table's rows of a cause."""
+"""Test that needs the table's rows of a cause."""
 for _causes, _test in (
     (PILOTS, test_what_a_pilot_has_taken_is_his_at_once_and_until_he_gives_it_back),
     (GROUNDING, test_a_vehicle_that_can_fly_no_further_brakes_and_lands),
@@ -1030,7 +1018,7 @@ GUARDS: dict[str, tuple[object, str, object, Callable[[], None]]] = {
         test_malformed_messages_of_the_server_itself_end_in_brake,
     ),
 }
-"""Guard that is switched off, how, and the scenario that needs it."""
+"""Guard to switch off, how, and the test that needs it."""
 
 
 @pytest.mark.parametrize("guard", GUARDS)

@@ -1,4 +1,4 @@
-"""The fence: no input leads over it, whatever the model gets wrong and wherever the wind blows."""
+"""Fence: no input leads beyond it, for any error of the model and any wind."""
 
 from typing import Any
 
@@ -19,12 +19,12 @@ from skytether.sim.flight import fly
 
 
 def test_no_input_leads_over_the_fence() -> None:
-    """Time constants wrong by 30 %, gains by 20 %, dead times by 0.1 s, and wind that turns."""
+    """Time constants off by 30 %, gains by 20 %, dead times by 0.1 s, and turning wind."""
     assert max(map(furthest_m, range(30))) <= 0.0
 
 
 class WithoutMargin(Fence):
-    """A fence whose bounds are not drawn in."""
+    """Fence whose bounds are not reduced by a margin."""
 
     def __init__(self, flown: Scenario) -> None:
         super().__init__(flown)
@@ -34,7 +34,7 @@ class WithoutMargin(Fence):
 
 
 class WithoutForesight(Fence):
-    """A fence that looks at where the vehicle is, and not at where it comes to rest."""
+    """Fence that checks the present position, not where the vehicle comes to rest."""
 
     def __init__(self, flown: Scenario) -> None:
         super().__init__(flown)
@@ -52,9 +52,9 @@ def test_a_flight_that_stays_inside_is_the_same_with_a_fence() -> None:
 
 
 def held_back(scheme: str, seed: int) -> Record:
-    """A flight in wind, with a gain and a dead time that are wrong, out of a fence at x = 1 m.
+    """Flight in wind with a wrong gain and dead time, against a fence at x = 1 m.
 
-    The circle of the demo is 3.1 m wide. The scenario is made, and not read: nobody has held the
+    The demo's circle is 3.1 m wide. The scenario is built directly, without the check of the
     trajectory against the fence.
     """
     rng = np.random.default_rng(seed)
@@ -75,7 +75,7 @@ def held_back(scheme: str, seed: int) -> Record:
 def test_a_vehicle_whose_server_knows_of_no_fence_is_held_and_says_so(
     scheme: str, seed: int
 ) -> None:
-    """Of all schemes, also with a regulator aboard that would take the correction away."""
+    """In every scheme, also with a regulator aboard that counteracts the correction."""
     record = held_back(scheme, seed)
     assert record.client["state"][:, 0, 0].max() <= 1.0
     assert record.client["state"][:, 0, 0].min() < -1.0
@@ -83,7 +83,7 @@ def test_a_vehicle_whose_server_knows_of_no_fence_is_held_and_says_so(
 
 
 def test_a_vehicle_that_is_slowed_is_not_said_to_be_held_by_its_fence() -> None:
-    """In the middle of a wide fence, whose speed bounds its way onto the figure."""
+    """In the middle of a wide fence, whose speed limit slows the way onto the figure."""
     slowed = packaged(
         "demo", duration=20.0, fence={"radius_m": 40.0, "speed_mps": 0.65, "wind_mps": 0.2}
     )
@@ -91,7 +91,6 @@ def test_a_vehicle_that_is_slowed_is_not_said_to_be_held_by_its_fence() -> None:
 
 
 def test_a_vehicle_that_lands_is_not_said_to_be_held_by_its_fence() -> None:
-    """Wind blows it there while it hovers without a link; that is said until it lands."""
     blown = packaged(
         "demo",
         duration=60.0,
@@ -133,7 +132,7 @@ def test_wind_that_a_weak_vehicle_cannot_fly_against_is_refused() -> None:
 
 
 def test_near_a_bound_the_speed_towards_it_is_the_distance_over_t() -> None:
-    """T = τ + 2 Δt: without τ in it, a vehicle of a larger inertia would come too close."""
+    """T = τ + 2 Δt: without τ, a vehicle with a large time constant would come too close."""
     flown = scenario(fence={"low_m": [-9.0, -9.0], "high_m": [9.0, 9.0]})
     terms, (_, high, _) = flown.terms(), inner_bounds(flown)
     T = terms.tau_s[0] + SLOW_STEPS * flown.control.dt

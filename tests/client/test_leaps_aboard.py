@@ -1,4 +1,4 @@
-"""Leaps of an autopilot's position: told in metres, hovered through, and decided by a person."""
+"""Jumps of an autopilot's position: reported in metres, hovered through, decided by a person."""
 
 from typing import Any
 
@@ -16,7 +16,7 @@ FENCE = {"low_m": [-8.0, -8.0, 0.5], "high_m": [8.0, 8.0, 9.0], "wind_mps": 0.5}
 
 
 def leapt() -> Air:
-    """A vehicle in flight whose reported position has just leapt by 12 m."""
+    """Vehicle in flight whose reported position has just jumped by 12 m."""
     slow = {"axes": 3, "tau_s": [0.5, 0.5, 0.25], "u_max": [1.5]}
     air = flying("ardupilot", seconds=2.0, duration=90.0, fence=FENCE, model=slow)
     air.flight.displaced = LEAP
@@ -25,19 +25,18 @@ def leapt() -> Air:
 
 
 def place(air: Air) -> Any:
-    """True position in the plane [m]."""
     return np.array(air.flight.position()[:2])
 
 
 def test_a_leap_is_told_in_metres_and_pushes_nobody() -> None:
-    """The fence is 8 m wide and the leap 12 m: the vehicle brakes where it is, and hovers."""
+    """The fence is 8 m wide and the jump 12 m; the vehicle brakes where it is, and hovers."""
     air = leapt()
     began = place(air)
     (told,) = air.of(StateLeapt)
     assert told.by_m == pytest.approx(LEAP, abs=0.1)
     air.run(6.0)
     assert air.mode is Mode.HOVER
-    # Braking from 1.5 m/s at 2 m/s², and what dead time and inertia add.
+    # Braking from 1.5 m/s at 2 m/s², plus dead time and inertia.
     assert np.linalg.norm(place(air) - began) < 2.0
     hovered = place(air)
     air.run(1.0)
@@ -56,7 +55,6 @@ def test_without_a_choice_it_lands(*, armed: bool) -> None:
 
 
 def test_arming_again_is_no_choice() -> None:
-    """It is refused in words; nothing is flown, and the vehicle lands."""
     air = leapt()
     air.change(armed=False)
     air.run(3.0)
@@ -67,7 +65,7 @@ def test_arming_again_is_no_choice() -> None:
 
 @pytest.mark.parametrize("choice", ["old", "new"])
 def test_a_choice_flies_on_in_the_frame_that_was_chosen(choice: str) -> None:
-    """In the old one where it was; in the new one figure and fence have moved by the leap."""
+    """In the old frame at the old place; in the new frame figure and fence move by the jump."""
     air = leapt()
     air.change(armed=False)
     air.run(3.0)
@@ -106,7 +104,6 @@ def test_the_next_leap_asks_again() -> None:
 
 
 def test_nothing_is_chosen_before_a_leap() -> None:
-    """Neither in flight nor in a file: it would be chosen without knowing the leap."""
     air = Air("ardupilot")
     with pytest.raises(ConfigError, match=r"vehicle.after_leap: .*before its position has leapt"):
         air.change(vehicle__after_leap="old")
@@ -115,7 +112,7 @@ def test_nothing_is_chosen_before_a_leap() -> None:
 
 
 def test_the_chosen_frame_is_that_of_the_origin() -> None:
-    """Whoever keeps the origin over a restart keeps the choice with it."""
+    """The operator's origin, kept over a restart, includes the choice."""
     air = leapt()
     air.change(vehicle__after_leap="old")
     assert air.flies.port.autopilot.positions.origin == pytest.approx(LEAP, abs=0.1)

@@ -1,4 +1,4 @@
-"""A client whose process dies while its autopilot flies, and starts again, in virtual time."""
+"""Restarts of a client while its autopilot flies, in virtual time."""
 
 from math import dist
 
@@ -15,7 +15,7 @@ NORTH_M, EAST_M = 20.0, -12.0
 
 
 def away(flavour: FlavourName, **table: object) -> Air:
-    """A flight whose vehicle takes off far from the origin of its autopilot's local frame."""
+    """Flight whose vehicle takes off far from the origin of its autopilot's local frame."""
     air = Air(flavour, duration=40.0, reference={"radius_m": 2.0}, **table)
     air.flight.quadrotor._quad.x[:2] = NORTH_M, EAST_M
     air.fly()
@@ -24,13 +24,11 @@ def away(flavour: FlavourName, **table: object) -> Air:
 
 
 def off_m(air: Air) -> float:
-    """Distance of the vehicle from the place where it was armed, in the plane [m]."""
     x, y, _ = air.flight.position()
     return dist((x, y), (NORTH_M, EAST_M))
 
 
 def farthest_m(air: Air, seconds: float) -> float:
-    """Largest such distance over the next seconds [m]."""
     most = 0.0
     for _ in range(round(seconds / 0.5)):
         air.run(0.5)
@@ -39,7 +37,7 @@ def farthest_m(air: Air, seconds: float) -> float:
 
 
 def test_a_client_restarted_in_the_air_flies_on_in_the_frame_it_had(flavour: FlavourName) -> None:
-    """Figure and fence stay where they were: the origin outlives the process."""
+    """Figure and fence stay where they were: the saved origin outlives the process."""
     air = away(flavour)
     air.restart(0.3)
     assert farthest_m(air, 12.0) < 3.5
@@ -50,7 +48,7 @@ def test_a_client_restarted_in_the_air_flies_on_in_the_frame_it_had(flavour: Fla
 
 
 def test_without_its_origin_a_vehicle_in_the_air_hovers_until_somebody_says_where_it_is() -> None:
-    """It keeps its place under a stream of zeros, and then flies its figure where that belongs."""
+    """It holds its place under a stream of zeros, and flies the figure once the origin is set."""
     air = away("ardupilot")
     air.restart(1.0, remembers=False)
     air.run(5.0)
@@ -77,7 +75,7 @@ def test_where_nobody_says_where_the_origin_is_it_lands_where_it_is() -> None:
 
 
 def test_an_origin_of_before_the_autopilots_reboot_is_not_taken() -> None:
-    """Its local frame has begun anew, as its clock has."""
+    """After a reboot the autopilot's local frame and clock start anew."""
     air = away("ardupilot")
     air.world.stop("client")
     air.autopilot._began_ns += 8_000_000_000
@@ -91,7 +89,7 @@ def test_an_origin_of_before_the_autopilots_reboot_is_not_taken() -> None:
 def test_a_client_restarted_after_a_failsafe_landing_arms_nothing(
     flavour: FlavourName, down_s: float
 ) -> None:
-    """A process that starts is no person: it waits for one, and then takes off."""
+    """A new process does not replace a person: it waits for one, and then takes off."""
     air = away(flavour)
     air.world.stop("client")
     air.lands(40.0)
@@ -119,7 +117,7 @@ def test_a_client_that_finds_its_vehicle_landing_arms_nothing_even_without_a_mem
 
 
 def test_a_word_counts_on_the_ground_alone() -> None:
-    """Said in the air, it does not let the next life take off after a landing."""
+    """Given in the air, the permission does not let the next process take off after a landing."""
     air = away("ardupilot")
     air.restart(0.3)
     air.run(3.0)

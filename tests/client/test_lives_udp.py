@@ -1,4 +1,4 @@
-"""A client that is killed in flight and started again by its service, over real UDP."""
+"""Client that is killed in flight and restarted by its service, over real UDP."""
 
 import asyncio
 from collections.abc import Callable
@@ -20,31 +20,27 @@ pytestmark = pytest.mark.long
 
 
 class Service:
-    """A client that is started again and again, and what its runs say.
+    """Client that is started repeatedly, and the events of its runs.
 
     Args:
-        stack: ends it.
-        arguments: its command line.
+        stack: ends the client.
+        arguments: command line of the client.
     """
 
     def __init__(self, stack: AsyncExitStack, arguments: list[str]) -> None:
         self._stack, self._arguments = stack, arguments
         self.events: list[Any] = []
-        """Events of the present run."""
 
     async def start(self) -> Child:
-        """Start it once more."""
         self.events = events = list[Any]()
         child = started("client", *self._arguments, on_event=lambda line: events.append(line.event))
         return await self._stack.enter_async_context(child)
 
     def of(self, kind: type) -> list[Any]:
-        """Events of a kind of the present run."""
         return [event for event in self.events if isinstance(event, kind)]
 
 
 async def until(so: Callable[[], object]) -> None:
-    """Wait until something is so."""
     async with asyncio.timeout(120.0):
         while not so():
             await asyncio.sleep(0.1)
@@ -53,7 +49,6 @@ async def until(so: Callable[[], object]) -> None:
 async def test_killed_in_flight_and_started_again_it_arms_nothing_before_a_person_says_so(
     tmp_path: Path,
 ) -> None:
-    """As under `Restart=always`: the autopilot's own failsafe lands the vehicle meanwhile."""
     told: list[str] = []
     anywhere = ("--bind", "127.0.0.1:0")
     socket = tmp_path / "client.sock"

@@ -1,4 +1,4 @@
-"""What a client keeps for its next life: the motion in force, step 0, and its boot id."""
+"""State that a client saves for its next process: the motion in force, step 0, and its boot id."""
 
 import contextlib
 
@@ -34,7 +34,7 @@ KEPT = SavedState(
 
 
 def swap(seed: int) -> Scenario:
-    """Eight vehicles that swap places over the paper's network, of whose packets 10 % are lost."""
+    """Eight vehicles swap places over the paper's network with 10 % loss."""
     table = reading.to_table(SWAP)
     table |= {"duration": 20.0, "seed": seed}
     table["reference"]["shape"] = "swap(8)"
@@ -42,14 +42,14 @@ def swap(seed: int) -> Scenario:
 
 
 def flown(*restarts: Restart) -> Lives:
-    """Such a flight in which processes restart."""
+    """Flight of `swap` in which processes restart."""
     flight = Lives(swap(1), restarts)
     flight.fly()
     return flight
 
 
 def test_a_vehicle_whose_process_restarts_goes_on_along_its_motion_and_others_keep_apart() -> None:
-    """The server notices nothing but a silence: session, steps and motion are those of before."""
+    """The server sees only a silence: session, steps and motion continue."""
     flight = flown(Restart(5, 7.6))
     assert flight.least_m() > SWAP.mission.separation_m
     assert flight.server.controller.counts["left_tube"] == 0
@@ -65,7 +65,6 @@ def test_a_vehicle_whose_process_restarts_goes_on_along_its_motion_and_others_ke
 
 
 def test_without_its_memory_two_vehicles_come_nearer_than_asked_for() -> None:
-    """The ablation: what the test above shows is due to what was kept, and to nothing else."""
     flight = flown(Restart(5, 7.6, remembers=False))
     assert flight.least_m() < SWAP.mission.separation_m
 
@@ -81,7 +80,7 @@ def test_what_is_kept_comes_back_as_it_was_by_whichever_clock_it_was_written() -
 def test_what_was_kept_too_long_ago_counts_as_lost_but_for_the_vehicles_own_part(
     passed_ns: int,
 ) -> None:
-    """A motion is over by then; whether the vehicle was armed is not."""
+    """The motion is over by then; the vehicle's own part, whether it was armed, is still valid."""
     content = KEPT.encode(NOW_NS)
     assert recall(content, NOW_NS, NOW_NS, TERMS) == KEPT
     lost = recall(content, NOW_NS, NOW_NS + passed_ns, TERMS)
@@ -89,7 +88,7 @@ def test_what_was_kept_too_long_ago_counts_as_lost_but_for_the_vehicles_own_part
 
 
 def test_after_a_restart_of_the_computer_it_is_known_alone_that_the_vehicle_was_armed() -> None:
-    """Its clock has begun anew, so neither step 0 nor the age of the origin is known."""
+    """The clock has restarted, so neither step 0 nor the age of the origin is known."""
     lost = recall(KEPT.encode(NOW_NS), None, NOW_NS, TERMS)
     assert lost == SavedState(frame=VehicleMemory(armed=True))
 
@@ -114,7 +113,7 @@ def test_after_a_restart_of_the_computer_it_is_known_alone_that_the_vehicle_was_
 def test_content_that_no_client_can_have_kept_is_refused(wrong: dict[str, object]) -> None:
     wrong_kept = msgspec.structs.replace(KEPT, **wrong)
     if wrong == {"boot_id": 2**64}:
-        return  # msgpack cannot hold it
+        return  # msgpack cannot encode it
     with pytest.raises(ValueError, match=r".+"):
         SavedState.decode(wrong_kept.encode(0), 0, axes=2)
 
@@ -126,9 +125,9 @@ def test_any_bytes_are_refused_or_are_something_kept(content: bytes) -> None:
 
 
 def test_nothing_is_told_to_the_server_before_it_is_kept() -> None:
-    """Else it would forget a motion that the next life follows."""
+    """Otherwise a restart could forget a motion that the server relies on."""
     memory = ClientMemory(TERMS, 1, None)
-    assert memory.may_tell(KEPT, now_ns=NOW_NS)  # there is nothing yet that would be followed
+    assert memory.may_tell(KEPT, now_ns=NOW_NS)  # no saved motion yet
     assert memory.keep(KEPT, now_ns=NOW_NS) is not None
     memory.kept()
     assert memory.may_tell(KEPT, now_ns=NOW_NS)
@@ -165,7 +164,9 @@ def test_what_has_not_changed_is_written_again_before_it_is_too_old_and_not_at_e
 def test_others_keep_away_from_all_of_a_motion_whose_client_has_begun_anew(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """It may stand anywhere on it. Here that keeps two vehicles apart; mostly it comes too late."""
+    """The vehicle may stand anywhere on its last motion. Here that keeps two vehicles apart; mostly
+    it comes too late.
+    """
     restart = Restart(7, 6.0, remembers=False)
     flight = flown(restart)
     assert flight.least_m() > SWAP.mission.separation_m

@@ -1,4 +1,4 @@
-"""Navigation aboard: sensor, Kalman filter, and flights that use them."""
+"""Navigation aboard: sensor, Kalman filter, and flights with both."""
 
 from collections.abc import Iterable
 from copy import deepcopy
@@ -32,18 +32,15 @@ from skytether.sim.flight import fly, fly_batch
 
 DT_NS = 50 * MILLISECOND_NS
 NOISE = {"position_noise_m": 0.02, "velocity_noise_mps": 0.05}
-"""Sensor noise of the scenario `target`."""
 POSITIONS = {"position_noise_m": 0.02, "position_every_s": 0.2, "velocity_every_s": "never"}
-"""Positions alone, at 5 Hz."""
 
 
 def scenario(name: str = "demo-committed", **changes: Any) -> Scenario:
-    """A scenario that comes with Skytether, with some keys changed."""
     return packaged(name, changes)
 
 
 def matrices(flown: Scenario) -> tuple[Array, Array, Array]:
-    """F, the input's column and Q of the filter's [p, v, w], written down anew."""
+    """F, the input's column and Q of the filter's state [p, v, w], computed independently."""
     model, dt = flown.terms().model, flown.control.dt
     q = flown.sensor.process_noise
     F, B, Q = np.eye(3), np.zeros(3), np.zeros((3, 3))
@@ -54,12 +51,11 @@ def matrices(flown: Scenario) -> tuple[Array, Array, Array]:
 
 
 def square(P: aboard.Spread) -> Array:
-    """P as a matrix."""
     return np.array([[P.pp, P.pv, P.pw], [P.pv, P.vv, P.vw], [P.pw, P.vw, P.ww]])
 
 
 def wander(flown: Scenario, steps: int, seed: int) -> tuple[Array, Array]:
-    """Inputs and true states of a vehicle that is what the filter takes it for.
+    """Inputs and true states of a vehicle that obeys the filter's model exactly.
 
     Returns:
         inputs [m/s], shape (steps, axes), and [p, v, w], shape (steps + 1, axes, 3).
@@ -92,7 +88,7 @@ def follow(flown: Scenario, inputs: Array, states: Array) -> tuple[Array, Array]
 def test_what_ten_sigmas_of_noise_cannot_explain_is_a_leap(
     number: str, least: float, sign: float
 ) -> None:
-    """Within a step of 50 ms, on either axis: 1 m or 2 m/s, 50 m/s² for so long, and 10 sigmas."""
+    """Within a step of 50 ms: 1 m or 2 m/s, plus 50 m/s² over the step, plus 10 sigmas."""
     for axis in (0, 1):
         for far, leaps in ((least - 1e-9, False), (least + 1e-9, True)):
             known = Navigation(scenario(sensor=NOISE))
@@ -104,7 +100,7 @@ def test_what_ten_sigmas_of_noise_cannot_explain_is_a_leap(
                 told.append(known.leapt)
                 before = x["velocity"][axis]
                 x[number][axis] += sign * far if step == 0 else 0.0
-                # The mean of its velocity carries the vehicle along.
+                # The position moves with the mean velocity of the step.
                 x["position"][axis] += 0.025 * (before + x["velocity"][axis])
             assert told == [False, leaps, False]
 
@@ -156,7 +152,7 @@ def test_noise_and_bias_are_those_that_were_asked_for() -> None:
 def test_measurements_come_when_they_are_due(
     sensor: dict[str, Any], positions: list[int], velocities: list[int]
 ) -> None:
-    """At the first step that is late enough; of a delay ago, and of the start until then."""
+    """At the first step after the due time; a delayed sensor reports the start until then."""
     told = Sensor(scenario(sensor=sensor), np.random.default_rng(0))
     known = [told.measure(np.full((2, 2), float(step))) for step in range(13)]
     assert [step for step, each in enumerate(known) if each.position] == positions
@@ -167,7 +163,7 @@ def test_measurements_come_when_they_are_due(
 
 
 def test_a_vehicle_tells_what_it_has_measured_when_it_is_asked() -> None:
-    """Measurements carry the asker's clock; those of missed steps are handed over, each once."""
+    """Measurements are stamped by the client's clock; those of missed steps come once each."""
     flown = scenario(sensor=POSITIONS | {"delay_s": 0.1})
     flies, began_ns = simulated(flown, 1), 10**12
     first = flies.measurements(now_ns=began_ns)
@@ -180,7 +176,7 @@ def test_a_vehicle_tells_what_it_has_measured_when_it_is_asked() -> None:
 
 
 class Plane(Vehicle):
-    """A vehicle that is not ours: it measures now and then, and nobody knows its true state."""
+    """Vehicle of a user: it measures now and then, and has no known true state."""
 
     def __init__(self, every: int) -> None:
         self.every = every
@@ -198,7 +194,6 @@ class Plane(Vehicle):
 
 
 def test_a_vehicle_of_one_s_own_is_flown_by_what_it_tells() -> None:
-    """Its true state is nobody's: the record has the estimate, which stays between measurements."""
     flies = Plane(3)
     server = ByHand(scenario(), flies)
     server.wake()
@@ -262,7 +257,7 @@ def test_it_is_the_kalman_filter_of_its_equations(
 
 
 def test_it_is_as_wrong_as_it_says() -> None:
-    """Consistency: the error, weighed by P⁻¹, is χ² of three degrees of freedom on average."""
+    """Consistency: the error weighted with P⁻¹ is χ² with three degrees of freedom on average."""
     for sensor in (NOISE, POSITIONS):
         flown, errors = scenario(sensor=sensor), []
         for seed in range(60):
@@ -281,7 +276,7 @@ def test_it_is_as_wrong_as_it_says() -> None:
 
 
 def test_late_measurements_are_rolled_on_by_what_was_flown_since() -> None:
-    """Exact ones to a millimetre in still air; taken for the present they are decimetres off."""
+    """Exact to a millimetre in still air; without the delay in the filter, decimetres off."""
     late = {"delay_s": 0.3, "velocity_every_s": 0.2}
     flown = scenario(vehicle={"wind": 0.0})
     plant = FirstOrderPlant(flown, Weather(flown, np.random.default_rng(0)))
@@ -299,7 +294,7 @@ def test_late_measurements_are_rolled_on_by_what_was_flown_since() -> None:
 
 
 def test_wind_that_stays_and_a_wrong_gain_leave_no_offset(monkeypatch: Any) -> None:
-    """By positions alone, at 5 Hz; ablation: without w in the filter an offset remains."""
+    """By positions alone, at 5 Hz; without w in the filter an offset remains."""
     vehicle = {"wind": 0.02, "steady_wind_mps": [0.3, -0.2], "gain": 0.8}
     flown = scenario(sensor=POSITIONS, vehicle=vehicle)
     plant = FirstOrderPlant(flown, Weather(flown, np.random.default_rng(0)))
@@ -330,11 +325,11 @@ ALONE = {
     "input_reference": False,
     "trigger": "cost_gap(2) | silence(1)",
 }
-"""Committed inputs alone, at tight weights: whatever is measured is for the server to answer."""
+"""Committed inputs without feedback, at tight weights: noise acts only through the server."""
 
 
 def test_the_filter_keeps_noise_from_being_sent_and_flown() -> None:
-    """Ablation: without it the cost gap sends three times as much, where it is all in its hands."""
+    """Without the filter the cost gap sends three times as many packets."""
     quiet, with_filter, without = (
         fly(scenario(sensor=sensor, control=ALONE, duration=30.0, seed=3))
         for sensor in ({}, NOISE, NOISE | {"filter": "none"})
@@ -352,7 +347,7 @@ def test_the_filter_keeps_noise_from_being_sent_and_flown() -> None:
 
 
 def test_the_server_does_not_learn_noise_for_wind(monkeypatch: Any) -> None:
-    """Ablation: an observer that follows each velocity at once sends a twelfth more."""
+    """An observer that follows each velocity at once sends a twelfth more."""
     flown = scenario(sensor=NOISE, control=ALONE, duration=30.0)
 
     def share() -> float:
@@ -366,7 +361,7 @@ def test_the_server_does_not_learn_noise_for_wind(monkeypatch: Any) -> None:
 
 @pytest.mark.parametrize("feedback", [False, True])
 def test_a_vehicle_with_positions_alone_is_flown_through_steady_wind(feedback: bool) -> None:
-    """At 5 Hz and 0.1 s late: the server learns the wind from what the filter makes of them."""
+    """At 5 Hz and 0.1 s late: the server estimates the wind from the filter's states."""
     flown = scenario(
         sensor=POSITIONS | {"delay_s": 0.1},
         vehicle={"steady_wind_mps": [0.3, 0.0]},
@@ -402,7 +397,7 @@ def test_the_same_seed_has_the_same_noise_and_vehicles_have_their_own() -> None:
 
 
 def steps_of(flown: Scenario, awake: Iterable[int]) -> tuple[Rows, list[Message]]:
-    """Record of a vehicle that is awake at some steps, is told to fly 0.5 m/s, and what it says."""
+    """Record of a vehicle awake at some steps with an input of 0.5 m/s, and its messages."""
     server, said = ByHand(flown), []
     server.wake()
     server.welcome()
@@ -429,12 +424,12 @@ def test_the_filter_goes_on_through_a_sleep() -> None:
     assert np.abs(asleep["estimate"] - asleep["state"]).max() < 0.15
 
 
-# -- stamps of the vehicle's own -------------------------------------------------------------------
+# -- time stamps of the vehicle --------------------------------------------------------------------
 
 
 def test_a_measurement_between_two_steps_is_carried_to_the_step() -> None:
-    """By eq. (1), exactly; one at the step itself is used unchanged, to the last bit, and one that
-    is older than CARRIED_NS is carried so far and no further.
+    """By eq. (1), exactly; a measurement at the step itself is used unchanged, and one older than
+    CARRIED_NS is predicted over that time only.
     """
     flown, u = scenario(), np.array([1.0, -0.5])
     tau, position, velocity = flown.tau_s, [1.0, 2.0], [0.3, 0.4]
@@ -452,7 +447,7 @@ def test_a_measurement_between_two_steps_is_carried_to_the_step() -> None:
 
 
 class Restless(Vehicle):
-    """The simulated vehicle, measured every 30 ms whatever the steps are."""
+    """Simulated vehicle, measured every 30 ms regardless of the steps."""
 
     def __init__(self, flown: Scenario, number: int) -> None:
         fine = msgspec.structs.replace(flown.control, dt=0.005)
@@ -477,7 +472,7 @@ class Restless(Vehicle):
 def test_a_vehicle_that_measures_when_it_likes_flies_as_one_that_keeps_step(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Ablation: where stamps are ignored, what was measured before is taken for the present."""
+    """If stamps are ignored, old measurements count as present ones."""
     monkeypatch.setitem(VEHICLES, "restless", Entry(Restless, (), ""))
     flown = scenario(duration=20.0, settle=5.0, vehicle={"wind": 0.0, "steady_wind_mps": []})
     flown = msgspec.structs.replace(
@@ -493,7 +488,7 @@ def test_a_vehicle_that_measures_when_it_likes_flies_as_one_that_keeps_step(
 
 
 def test_a_flight_begins_where_the_vehicle_was_measured_last() -> None:
-    """Motion before it is not taken for a disturbance: here it has climbed for a second."""
+    """Earlier motion, here a climb of a second, does not count as a disturbance."""
     flown = scenario("autopilot")
     measured = [
         Measurement(n * SECOND_NS // 50, [0.0, 0.0, 4.0 + n / 50], [0.0, 0.0, 2.0 - n / 25])
@@ -509,7 +504,7 @@ def test_a_flight_begins_where_the_vehicle_was_measured_last() -> None:
 
 
 def test_what_is_measured_in_whole_numbers_is_a_number_like_any_other() -> None:
-    """A vehicle of one's own may tell [3, 0]: kernels read floats where integers would be."""
+    """A vehicle of the user may report [3, 0]; kernels need floats."""
     whole: list[float] = [3, 0]
     known = Navigation(scenario(sensor=NOISE))
     for step in range(2):

@@ -1,4 +1,4 @@
-"""Simulated vehicle: it is the model exactly, and wind is the stated noise."""
+"""Simulated vehicle: it follows the model exactly, and wind is noise of the stated strength."""
 
 from typing import Any
 
@@ -24,18 +24,15 @@ COMMANDS = np.random.default_rng(0).uniform(-1.8, 1.8, size=(50, 2))
 
 
 def scenario(**vehicle: object) -> Scenario:
-    """Two unlike axes and a circle of 1.5 m; a vehicle at its default but for what is given."""
     return check({**FLIGHT, "vehicle": vehicle}, "test")
 
 
 def plant(seed: int = 0, **vehicle: object) -> FirstOrderPlant:
-    """A vehicle of `scenario`, with a chance of its own."""
     flown = scenario(**vehicle)
     return FirstOrderPlant(flown, Weather(flown, np.random.default_rng(seed)))
 
 
 def flight(flown: FirstOrderPlant, commands: Array = COMMANDS) -> Array:
-    """The states after each command."""
     states = []
     for command in commands:
         flown.advance(command)
@@ -96,7 +93,7 @@ def test_dead_time_is_exact_within_a_step(dead_time_ns: int, gain: float) -> Non
 
 
 def test_a_part_of_a_step_is_not_rounded_away() -> None:
-    """Ablation: the nearest dead time of whole steps flies more than 1 cm aside."""
+    """With the dead time rounded to whole steps the error exceeds 1 cm."""
     early, right = (flight(plant(dead_time_s=dead_time_s)) for dead_time_s in (0.2, 0.22))
     assert np.abs(early - right)[:, :, 0].max() > 0.01
 

@@ -1,4 +1,4 @@
-"""The quadrotor: its rigid body against rotorpy's, its loops, its air and its battery."""
+"""Quadrotor: its rigid body compared with rotorpy's, its control loops, wind and battery."""
 
 from typing import Any
 
@@ -21,7 +21,7 @@ from skytether.shared.scenario.reading import check
 
 MS = 1_000_000
 TURNED = np.array([1.0, -1.0, -1.0])
-"""Signs between our body and rotorpy's, whose axes are forward, left and up."""
+"""Signs between our body axes and rotorpy's, which are forward, left and up."""
 COMMANDS = {
     "hover": (1788.0, 1788.0, 1788.0, 1788.0),
     "climb": (2100.0, 2100.0, 2100.0, 2100.0),
@@ -54,14 +54,14 @@ ROTORPY = {
         *(0.326574326, 0.119194039, -0.478576700),
     ],
 }
-"""Position [m], velocity [m/s], quaternion (x, y, z, w) and rates [rad/s], as of rotorpy 3.0."""
+"""Position [m], velocity [m/s], quaternion (x, y, z, w) and rates [rad/s] from rotorpy 3.0."""
 WIND = np.array([1.0, -2.0, 0.5])
 UNEVEN = CRAZYFLIE._replace(body_drag=0.005, arm_y_m=0.04)
 """Frame with all kinds of drag, and arms of two lengths."""
 
 
 def flown(frame: Frame, command: tuple[float, ...]) -> Array:
-    """States after half a second with the same commands, from a motion of all kinds."""
+    """States after half a second with constant commands, from a general initial motion."""
     x = np.zeros(STATES)
     x[3:6], x[6], x[10:13], x[13:] = (0.5, -0.3, 0.2), 1.0, (0.3, -0.2, 0.5), 1700.0
     drive(frame, x, np.array(command), WIND, 250)
@@ -75,7 +75,7 @@ def as_rotorpy(x: Array) -> Array:
 
 
 def rotorpy(frame: Frame, command: tuple[float, ...]) -> Array:
-    """States of rotorpy's vehicle of the same body, by its own integrator with 1e-10."""
+    """States of rotorpy's vehicle with the same body, by its own integrator to 1e-10."""
     multirotor = pytest.importorskip("rotorpy.vehicles.multirotor")
     place = {
         f"r{k + 1}": np.array([x * frame.arm_x_m, -y * frame.arm_y_m, 0.0])
@@ -92,7 +92,7 @@ def rotorpy(frame: Frame, command: tuple[float, ...]) -> Array:
             "Iyz": 0.0,
             "num_rotors": 4,
             "rotor_pos": place,
-            # Clockwise from above is about the downward axis, and against rotorpy's upward one.
+            # Clockwise from above is about the downward axis, opposite to rotorpy's upward axis.
             "rotor_directions": np.array([-1, -1, 1, 1]),
             "c_Dx": frame.body_drag,
             "c_Dy": frame.body_drag,
@@ -121,7 +121,7 @@ def rotorpy(frame: Frame, command: tuple[float, ...]) -> Array:
 
 @pytest.mark.parametrize("name", COMMANDS)
 def test_the_body_moves_as_rotorpy_s(name: str) -> None:
-    """Half a second with the same speeds for the rotors, in wind: within 1e-7 of all states."""
+    """Half a second with the same rotor speeds, in wind: within 1e-7 of all states."""
     ours = as_rotorpy(flown(UNEVEN, COMMANDS[name]))
     np.testing.assert_allclose(ours, ROTORPY[name], rtol=0, atol=1e-7)
 
@@ -129,7 +129,7 @@ def test_the_body_moves_as_rotorpy_s(name: str) -> None:
 @pytest.mark.parametrize("frame", FRAMES)
 @pytest.mark.parametrize("name", COMMANDS)
 def test_the_body_moves_as_rotorpy_s_where_that_is_installed(name: str, frame: str) -> None:
-    """With any frame; `pip install --no-deps rotorpy` brings it."""
+    """With any frame; `pip install --no-deps rotorpy` installs it."""
     command = tuple(np.minimum(COMMANDS[name], FRAMES[frame].rotor_max))
     theirs, ours = rotorpy(FRAMES[frame], command), as_rotorpy(flown(FRAMES[frame], command))
     np.testing.assert_allclose(ours, theirs, rtol=1e-6, atol=1e-6)
@@ -143,7 +143,6 @@ def test_what_rotorpy_gave_is_what_it_gives() -> None:
 def quadrotor(
     frame: Frame = KG15, gains: Gains = ARDUPILOT, seed: int = 0, **more: Any
 ) -> Quadrotor:
-    """A quadrotor in hover at an altitude of 5 m."""
     rng = np.random.default_rng(seed)
     return Quadrotor(frame, gains, rng, position=np.array([0.0, 0.0, 5.0]), **more)
 
@@ -182,7 +181,7 @@ def test_it_hovers(frame: Frame, gains: Gains) -> None:
 def test_a_step_of_1_mps_is_as_documented(
     frame: Frame, gains: Gains, half_s: float, most: float, axis: int
 ) -> None:
-    """Half of it is reached when docs/vehicles.md says so, its peak is no higher; both ways."""
+    """Time to half the step, and overshoot, as in docs/vehicles.md, in both directions."""
     velocity = np.eye(3)[axis]
     rows = response(quadrotor(frame, gains), tuple(velocity))
     values = rows[:, 3 + axis]
@@ -194,9 +193,8 @@ def test_a_step_of_1_mps_is_as_documented(
 
 @pytest.mark.parametrize(("frame", "gains"), FLOWN)
 def test_a_hard_turn_costs_little_height_and_yaw_comes_back(frame: Frame, gains: Gains) -> None:
-    """To and fro at 3 m/s; thrust and torques saturate on the way."""
     flown_ = quadrotor(frame, gains)
-    flown_._quad.x[6:10] = np.cos(0.5), 0.0, 0.0, np.sin(0.5)  # its nose 57° to the east
+    flown_._quad.x[6:10] = np.cos(0.5), 0.0, 0.0, np.sin(0.5)  # nose 57° to the east
     lowest = 5.0
     for k in range(8):
         rows = response(flown_, (3.0 * (-1) ** k, 2.0 * (-1) ** (k // 2), 0.0), 1.0)
@@ -206,14 +204,14 @@ def test_a_hard_turn_costs_little_height_and_yaw_comes_back(frame: Frame, gains:
 
 
 def test_the_wind_moves_it_and_the_loops_bring_it_to_rest() -> None:
-    """5 m/s from the south: it leans against it, and stands."""
+    """In 5 m/s from the south the vehicle tilts against the wind and comes to rest."""
     flown_ = quadrotor()
     flown_.blow((5.0,), 0.0)
     rows = response(flown_, (0.0, 0.0, 0.0), 12.0)
     assert rows[:, 0].max() > 0.1
     np.testing.assert_allclose(rows[-1, 3:], 0.0, rtol=0, atol=5e-3)
     assert flown_.attitude().pitch > 0.05
-    # Rotor drag in hover against the tangent of the tilt; the former grows with the rotors' speed.
+    # Rotor drag in hover balances the tangent of the tilt; drag grows with the rotors' speed.
     drag = 4 * KG15.rotor_drag * KG15.hover * 5.0 / (KG15.mass_kg * GRAVITY)
     assert np.tan(flown_.attitude().pitch) == pytest.approx(drag, rel=0.05)
 
@@ -222,7 +220,7 @@ def test_the_wind_moves_it_and_the_loops_bring_it_to_rest() -> None:
 def test_px4_stands_in_a_wind_that_drags_with_6_newtons(
     integral_max: float, drifts_mps: float
 ) -> None:
-    """Its tilt is enough; an integral that ends at 5 m/s², which PX4's does not, lets it drift."""
+    """Its tilt suffices; an integral bounded at 5 m/s², unlike PX4's, lets it drift."""
     flown_ = quadrotor(FRAMES["sih"], PX4._replace(integral_max=integral_max))
     flown_.blow((6.0,), 0.0)
     rows = response(flown_, (0.0, 0.0, 0.0), 40.0)
@@ -246,7 +244,6 @@ def test_turbulence_moves_it_as_documented(
 
 @pytest.mark.parametrize(("frame", "gains"), FLOWN)
 def test_no_integral_grows_without_end(frame: Frame, gains: Gains) -> None:
-    """In a storm that no tilt stands against, for a minute."""
     flown_ = quadrotor(frame, gains)
     flown_.blow((60.0,), 0.0)
     response(flown_, (0.0, 0.0, 0.0), 60.0)
@@ -297,7 +294,6 @@ def test_turbulence_is_dryden_s(height_m: float) -> None:
 
 @kernel
 def mixed(frame: Frame, thrust: float, torque: F1, rotor_max: float, command: F1) -> None:
-    """Thrust and torques that `mix` produces."""
     mix(frame, thrust, torque, rotor_max, command)
 
 
@@ -352,7 +348,6 @@ def test_an_endless_battery_stays_full() -> None:
 
 
 def test_it_stands_on_the_ground_and_leaves_it() -> None:
-    """It does not sink in, and does not drift in the wind."""
     flown_ = Quadrotor(
         KG15, ARDUPILOT, np.random.default_rng(0), position=np.zeros(3), ground_m=0.0, hovers=False
     )

@@ -1,4 +1,4 @@
-"""Observations by event: what the server believes of a vehicle, and when it is told more."""
+"""Observations by event: the server's prediction of a vehicle, and when the vehicle reports."""
 
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -59,19 +59,17 @@ def test_what_is_no_report_is_refused(text: str, said: str) -> None:
 
 
 def reporter(text: str = "deviation(0.05)") -> tuple[Reporter, Compensator]:
-    """A vehicle that reports, and holds no horizon."""
     terms = load("demo").terms()
     compensator = Compensator(terms)
     return Reporter(terms, text, compensator), compensator
 
 
 def horizon(step: int) -> Horizon:
-    """A horizon that stands still."""
     return Horizon(1, 1, step, 0, 0, np.zeros((2, 90), np.float32), np.zeros((2, 5), np.float32))
 
 
 def test_what_is_news_is_told_at_once() -> None:
-    """The first of a session, another horizon in force, another mode, and a step after sleep."""
+    """The first step of a session, another horizon in force or mode, and a step after sleep."""
     told, compensator = reporter()
 
     def due(step: int, session: int = 7, mode: Mode = Mode.READY, silence: int = 0) -> bool:
@@ -92,7 +90,7 @@ def test_what_is_news_is_told_at_once() -> None:
 
 
 def test_a_vehicle_that_waits_for_a_horizon_reports_again() -> None:
-    """At once, after about a round trip, and then after as long again as it has waited."""
+    """At once, after about a round trip, and then at doubled intervals."""
     told, compensator = reporter("periodic(80)")
 
     def sent(steps: range, mode: Mode) -> Iterator[int]:
@@ -108,7 +106,7 @@ def test_a_vehicle_that_waits_for_a_horizon_reports_again() -> None:
 
 
 def test_the_belief_is_the_rule_of_flight() -> None:
-    """From what was told, along the horizon that is held, with its feedback and disturbance."""
+    """From the reported state, along the horizon in force, with its feedback and disturbance."""
     terms = load("demo").terms()
     compensator = Compensator(terms)
     feedback = np.array([[0.2, 0.1, 0.05, 1.5, 0.5]] * 2, np.float32)
@@ -128,7 +126,7 @@ def test_the_belief_is_the_rule_of_flight() -> None:
 
 
 def seconds(**keys: Any) -> Record:
-    """Twenty-five seconds of plans of inputs, without loss and in calm air, but for some keys."""
+    """25 s of plans of inputs, without loss and in calm air, with some keys changed."""
     still: dict[str, Any] = {"vehicle.wind": 0.0}
     for direction in ("uplink", "downlink"):
         still |= {f"network.{direction}.loss": 0.0}
@@ -142,28 +140,25 @@ def ages(flight: Record) -> np.ndarray:
 
 
 def downs(flight: Record) -> int:
-    """Number of packets from the vehicle."""
     return int((flight.netem["direction"] == DOWNLINK).sum())
 
 
 def without(monkeypatch: pytest.MonkeyPatch, name: str, rule: Callable[..., bool]) -> None:
-    """Switch a part of a report off."""
+    """Switch off one of the rules for a report."""
     monkeypatch.setitem(REPORTS, name, REPORTS[name].__class__(rule, REPORTS[name].parameters, ""))
 
 
 PUSH = {"vehicle.gust_mps2": 3.0, "vehicle.gust_every_s": 3.0, "vehicle.gust_s": 0.5}
-"""Keys of gusts."""
 QUIET = {"vehicle.report": "deviation(0.05)", "link.timeout_s": 20.0, "link.heartbeat_s": 4.0}
-"""Keys of a vehicle that is asked for few heartbeats."""
+"""Keys for few heartbeats."""
 
 
 def waited_s(flight: Record) -> float:
-    """Time until the vehicle flies a horizon [s]."""
     return float(flight.client["step"][flight.client["mode"] == Mode.TRACK][0]) * 0.05
 
 
 def test_a_vehicle_that_reports_rarely_starts_soon(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Also where half of its packets are lost; without repetition it waits for its next report."""
+    """Also with half of its packets lost; without repetition it waits for its next report."""
     keys = QUIET | {"vehicle.report": "periodic(80)", "network.downlink.loss": 0.5, "duration": 20}
     soon = [waited_s(fly(skytether.load("target", seed=seed, **keys))) for seed in range(5)]
     monkeypatch.setattr(reporting, "RETRY_STEPS", 10**6)
@@ -173,7 +168,7 @@ def test_a_vehicle_that_reports_rarely_starts_soon(monkeypatch: pytest.MonkeyPat
 
 
 def misjudged_m(flight: Record) -> float:
-    """Root mean square of what the server's estimate is off, from 8 s on [m]."""
+    """RMS error of the server's estimate from 8 s on [m]."""
     client = {row["step"]: row["state"][:, 0] for row in flight.client}
     off = [
         row["estimate"][:, 0] - client[row["step"]]
@@ -184,7 +179,7 @@ def misjudged_m(flight: Record) -> float:
 
 
 def test_a_gust_is_told_of(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Ablation: without deviation the server is wrong for seconds."""
+    """Without deviation the server's estimate is wrong for seconds."""
     keys = PUSH | QUIET | {"vehicle.report": "deviation(0.05) | silence(3)"}
     whole = misjudged_m(seconds(**keys))
     without(monkeypatch, "deviation", lambda now, _: now.is_news)
@@ -193,7 +188,7 @@ def test_a_gust_is_told_of(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_every_horizon_is_acknowledged(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Ablation: without, the server hears of few, and learns little of the delay."""
+    """Otherwise the server receives few acknowledgements, and learns little of the delay."""
     flight = seconds(**QUIET)
     known = set(flight.client["in_force"].tolist()) - {-1}
     assert downs(flight) >= len(known) > 15
@@ -202,7 +197,7 @@ def test_every_horizon_is_acknowledged(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_silence_bounds_the_age_of_what_is_planned_from(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Ablation: a second and a delay, and without silence as much as heartbeats leave."""
+    """At most a second and a delay; without `silence`, as long as heartbeats allow."""
     keys = QUIET | {"vehicle.report": "deviation(0.3) & periodic(200) | silence(1)"}
     worst = ages(seconds(**keys))[40:].max()
     assert worst <= 20 + 14
@@ -212,7 +207,7 @@ def test_silence_bounds_the_age_of_what_is_planned_from(monkeypatch: pytest.Monk
 
 @pytest.mark.parametrize(("report", "within_s"), [("always", 2.0), ("deviation(0.05)", 4.5)])
 def test_a_longer_delay_is_found(report: str, within_s: float) -> None:
-    """Packets up take 0.3 s more from 15 s on: d follows, of a quiet vehicle a little later."""
+    """Uplink packets take 0.3 s more from 15 s on: d follows, a little later with few reports."""
     keys = {"vehicle.report": report}
     scenario = skytether.load("demo-committed", duration=25, settle=8, **keys)
     rows = fly(scenario, changes=[(15.0, {"network.uplink.paper": 0.7})]).server
@@ -237,7 +232,7 @@ def test_nobody_calls_a_quiet_vehicle_lost() -> None:
 def test_the_demo_takes_a_fifth_of_the_paper_s_packets(
     name: str, error_m: float, share: float
 ) -> None:
-    """Both ways, where the paper has 39 a second; as accurate as with a report at every step."""
+    """The paper sends 39 packets a second; the error is that of a report at every step."""
     flights = skytether.fly_batch(name, range(1, 25))
     packets = [flight.summary.packets_per_s or 0.0 for flight in flights]
     errors = [flight.summary.rmse_xy or 1.0 for flight in flights]

@@ -23,11 +23,11 @@ LOW: dict[FlavourName, dict[str, float]] = {
     "ardupilot": {"RTL_ALT": 400},
     "px4": {"RTL_RETURN_ALT": 4.0, "RTL_DESCEND_ALT": 4.0},
 }
-"""Altitudes of the return that the fence has room for."""
+"""Altitudes of the return that fit into the fence."""
 
 
 def lost(flavour: FlavourName, **keys: Any) -> Air:
-    """A vehicle in flight, 5 m or so from home, whose server has just died."""
+    """Vehicle in flight, about 5 m from home, whose server has just died."""
     air = Air(flavour, duration=120.0, fence=FENCE, vehicle=RETURNS, **keys)
     air.fly()
     air.run(20.0, lambda: abs(air.flight.position()[1]) > 2.0)
@@ -54,7 +54,7 @@ def test_a_lost_vehicle_hovers_and_returns_home_inside_its_fence(flavour: Flavou
 
 
 def test_a_return_that_the_autopilot_refuses_ends_in_landing() -> None:
-    """It knows no home, say: four seconds later it is told to land where it is."""
+    """For example without a home: four seconds later it is commanded to land where it is."""
     air = lost("ardupilot", parameters=SAFE["ardupilot"] | LOW["ardupilot"])
     switch = air.flight.switch
     air.flight.switch = lambda number: Result.FAILED if number == 6 else switch(number)
@@ -87,7 +87,7 @@ def test_vehicles_of_a_mission_land_straight_down() -> None:
 
 
 def test_only_a_vehicle_that_can_return_is_told_to() -> None:
-    """A simulated one cannot; and nobody returns to a home outside the fence."""
+    """A simulated vehicle cannot, nor one whose home is outside the fence."""
     flown = packaged("demo", {}, {"vehicle": {"on_loss": "return"}})
     with pytest.raises(ConfigError, match=r"vehicle.on_loss: .*cannot return by itself"):
         vehicles.make(flown, 1)

@@ -1,4 +1,4 @@
-"""Second commanders of an autopilot: seen on the line, or by what the vehicle does."""
+"""Second commanders of an autopilot, detected on the line or by the vehicle's motion."""
 
 from typing import Any
 
@@ -21,46 +21,44 @@ SLOW = {"axes": 3, "tau_s": [0.5, 0.5, 0.25], "u_max": [2.0]}
 
 
 def tracking(flavour: FlavourName = "ardupilot", **table: Any) -> Air:
-    """A vehicle that has followed its plan for some seconds, within a fence."""
+    """Vehicle that has followed its plan for some seconds, within a fence."""
     return flying(flavour, seconds=5.0, **{"fence": FENCE, "model": SLOW | MODELS[flavour]} | table)
 
 
 def velocity(target: int = 1) -> Message:
-    """Set-point of somebody else."""
     return dialect.MAVLink_set_position_target_local_ned_message(
         1, target, 1, 1, 0b110111000111, 0, 0, 0, 3.0, 0, 0, 0, 0, 0, 0, 0
     )
 
 
 def sticks(x: int) -> Message:
-    """Sticks of a ground station, of which one is moved."""
     return dialect.MAVLink_manual_control_message(1, x, 0, 500, 0, 0)
 
 
 def channels(roll_us: int) -> Message:
-    """Channels that a ground station overrides."""
     return dialect.MAVLink_rc_channels_override_message(1, 1, roll_us, 1500, 0, 1500, 0, 0, 0, 0)
 
 
 def goto() -> Message:
-    """Command to fly to a place."""
     return dialect.MAVLink_command_long_message(1, 1, 192, 0, -1.0, 0, 0, 0, 0, 0, 0)
 
 
 def say(air: Air, message: Message, seconds: float, every_s: float = 0.1) -> None:
-    """Let somebody else say something on the line, again and again."""
+    """Send another commander's message on the line repeatedly."""
     for _ in range(round(seconds / every_s)):
         air.tap.extra.append(STATION.encode(message))
         air.run(every_s)
 
 
-# By what the vehicle does
+# Detected by the motion of the vehicle
 
 
 def test_a_commander_that_nobody_sees_is_noticed_and_the_vehicle_lands(
     flavour: FlavourName,
 ) -> None:
-    """At 50 Hz he has the vehicle; it brakes in vain, and lands in a mode that does not obey."""
+    """The other commander sends at 50 Hz and wins; braking fails, so the vehicle lands in a mode
+    that ignores set-points.
+    """
     air = tracking(flavour)
     began, began_ns = np.array(air.flight.position()), air.world.now_ns
     air.autopilot.script._commands = True
@@ -82,7 +80,7 @@ WEATHER: dict[str, dict[str, Any]] = {
 
 
 def unlike(flavour: FlavourName, slower: float, stronger: float) -> dict[str, Any]:
-    """Model of a vehicle that is unlike it."""
+    """Keys of a model that differs from the vehicle."""
     model = {"axes": 3, "tau_s": [0.5], "gain": 1.0, "u_max": [3.0]} | MODELS[flavour]
     gain = model["gain"] if isinstance(model["gain"], list) else [model["gain"]] * 3
     return model | {
@@ -97,7 +95,6 @@ def unlike(flavour: FlavourName, slower: float, stronger: float) -> dict[str, An
 def test_neither_wind_nor_a_wrong_model_is_taken_for_a_commander(
     flavour: FlavourName, weather: str, wrong: tuple[float, float]
 ) -> None:
-    """Full speed from side to side, with the link cut for a while: nothing is noticed."""
     air = Air(
         flavour,
         duration=60.0,
@@ -114,7 +111,7 @@ def test_neither_wind_nor_a_wrong_model_is_taken_for_a_commander(
     assert str(Reason.STRAYED) not in [why for _, why in modes(air)]
 
 
-# On the line
+# Detected on the line
 
 
 @pytest.mark.parametrize("message", [velocity(), sticks(400), channels(1700)])
@@ -157,7 +154,7 @@ def test_one_stray_set_point_is_none() -> None:
 
 
 def test_a_vehicle_may_yield_to_a_second_commander_as_to_a_pilot() -> None:
-    """Nothing is sent while he commands; three seconds after his last it hovers, and flies on."""
+    """Nothing is sent meanwhile; three seconds after the last foreign set-point it hovers."""
     air = tracking(mavlink={"second_commander": "yield"})
     say(air, velocity(), 0.5)
     assert modes(air)[-1] == ("manual", str(Reason.TAKEN))
@@ -171,7 +168,7 @@ def test_a_vehicle_may_yield_to_a_second_commander_as_to_a_pilot() -> None:
 
 
 def test_a_vehicle_that_yields_sends_nothing_while_it_is_led_away(flavour: FlavourName) -> None:
-    """The line shows nobody: the vehicle moves, though it was told to stand."""
+    """No foreign message is on the line, but the vehicle moves despite a command to stand."""
     air = tracking(flavour, mavlink={"second_commander": "yield"})
     air.autopilot.script._commands = True
     air.run(3.0, lambda: bool(air.of(Strays)))

@@ -1,4 +1,4 @@
-"""The adversary: what it does, that it finds planted faults, and that what it found comes again."""
+"""Adversary: effects of its moves, planted faults that it must find, and reproducibility."""
 
 import math
 import shlex
@@ -49,7 +49,6 @@ replaced = msgspec.structs.replace
 
 
 def scenario(shape: str, duration: float = 30.0) -> Scenario:
-    """A mission, by its name or shape."""
     loaded = reading.load(shape.partition("(")[0])
     if "(" in shape:
         reference = replaced(loaded.reference, shape=shape)
@@ -60,7 +59,6 @@ def scenario(shape: str, duration: float = 30.0) -> Scenario:
 def move(
     kind: MoveKind, vehicle: int, way: str, start_s: float, length_s: float, *amounts: float
 ) -> Move:
-    """A move, in seconds."""
     start_ns, length_ns = seconds_to_ns(start_s), seconds_to_ns(length_s)
     return Move(kind, vehicle, way, start_ns, length_ns, amounts)
 
@@ -68,11 +66,11 @@ def move(
 FOUR = scenario("swap(4)")
 
 
-# -- what the adversary does ---------------------------------------------------------------------
+# -- moves ---------------------------------------------------------------------------------------
 
 
 def arrivals(*moves: Move, at_s: float, way: str = "downlink", count: int = 1) -> list[float]:
-    """Times after which packets of vehicle 2 arrive that enter the air at one time [s]."""
+    """Delays of packets of vehicle 2 that enter the network at one time [s]."""
     air, entered_ns = AdversaryNetwork(moves, seed=1), seconds_to_ns(at_s)
     for _ in range(count):
         if way == "downlink":
@@ -88,7 +86,7 @@ def arrivals(*moves: Move, at_s: float, way: str = "downlink", count: int = 1) -
 
 
 def test_a_delay_is_of_one_vehicle_and_one_way_and_grows_as_it_says() -> None:
-    """Others take the base delay, and what lasts long changes slowly; delays add up."""
+    """Other packets take the base delay, delays add up, and a long delay changes slowly."""
     grows = move(MoveKind.DELAYS, 2, "downlink", 10.0, 10.0, 0.2, 0.4)
     assert arrivals(grows, at_s=9.9) == [0.05]
     assert arrivals(grows, at_s=10.0) == pytest.approx([0.25])
@@ -109,7 +107,7 @@ def test_packets_are_cut_lost_and_copied() -> None:
 
 
 def test_a_vehicle_without_a_client_flies_on_and_is_seen() -> None:
-    """Its last velocity, for a second; the observer knows where it was meanwhile."""
+    """With its last velocity, for a second; its path is recorded meanwhile."""
     body = Body(FOUR, 1)
     body.measurements(now_ns=0)
     body.fly(np.array([0.5, 0.0]))
@@ -121,14 +119,14 @@ def test_a_vehicle_without_a_client_flies_on_and_is_seen() -> None:
     x = np.array([place[0] for _, place in body.unflown])
     assert times[0] == pytest.approx(4.05)
     assert x[19] - began == pytest.approx(0.5, abs=0.2)
-    assert abs(x[99] - x[60]) < 0.3  # it has stopped, but for the wind
+    assert abs(x[99] - x[60]) < 0.3  # stopped, except for wind
 
 
-# -- what it finds -------------------------------------------------------------------------------
+# -- planted faults ------------------------------------------------------------------------------
 
 
 def newest(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Have the server keep apart from the newest motion alone."""
+    """Planted fault: the server separates vehicles only from the newest motion."""
     motions = VehicleMotions.motions
 
     def last(self: VehicleMotions) -> list[Motion]:
@@ -138,7 +136,7 @@ def newest(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def hasty(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Have a new server plan before it has heard all vehicles."""
+    """Planted fault: a restarted server plans before it has heard all vehicles."""
     init = MissionState.__init__
 
     def begin(self: MissionState, *args: Any) -> None:
@@ -149,7 +147,7 @@ def hasty(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def certain(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Have the server take its idea of vehicles' clocks for true."""
+    """Planted fault: the server takes its estimate of vehicles' clocks as exact."""
 
     def known(_: ClockMap, rows: Indices, __: Indices, early: Array, late: Array) -> None:
         early[rows] = late[rows] = 0.0
@@ -158,12 +156,12 @@ def certain(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def forgetful(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Have clients find nothing of what they have kept."""
+    """Planted fault: restarted clients find no saved state."""
     monkeypatch.setattr(World, "memory", lambda *_: None)
 
 
 def heedless(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Have the server accept zones that vehicles may fly into."""
+    """Planted fault: the server accepts zones that vehicles may fly into."""
     monkeypatch.setattr(MissionPlanner, "objection", lambda *_: "")
 
 
@@ -182,7 +180,6 @@ def heedless(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_each_kind_of_move_finds_a_planted_fault(
     kinds: str, first: int, ablation: Patch, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """One safeguard is off; with it the same moves do no harm."""
     flown = replaced(FOUR, duration=80.0) if "server" in kinds else FOUR
     named = tuple(map(MoveKind, kinds.split(",")))
     with monkeypatch.context() as without:
@@ -195,7 +192,6 @@ def test_each_kind_of_move_finds_a_planted_fault(
 def test_a_server_that_begins_anew_takes_no_zone_before_it_has_heard_all(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Somebody rests there whom it has not heard; without the question who that is, inside."""
     moves = (
         move(MoveKind.SERVER, 0, "", 20.0, 0.5),
         move(MoveKind.ZONES, 0, "", 22.0, 4.0, -4.0, 0.0, 0.5),
@@ -205,14 +201,13 @@ def test_a_server_that_begins_anew_takes_no_zone_before_it_has_heard_all(
     assert spare_m(FOUR, fly(FOUR, moves)) < 0.0
 
 
-# -- what is found comes again -------------------------------------------------------------------
+# -- reproducibility -----------------------------------------------------------------------------
 
 DIES = move(MoveKind.CUTS, 0, "", 3.0, 2.0)
 IN_THE_WAY = move(MoveKind.ZONES, 0, "", 5.0, 4.0, 0.0, 0.0, 1.0)
 
 
 def test_a_flight_comes_again_to_the_last_bit() -> None:
-    """Also from its line of JSON, with moves of all kinds."""
     moves = (
         DIES,
         move(MoveKind.DELAYS, 1, "uplink", 0.0, 30.0, 0.1, 0.7),
@@ -228,7 +223,6 @@ def test_a_flight_comes_again_to_the_last_bit() -> None:
 
 
 def test_the_fewest_moves_are_those_that_matter(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A zone is flown into; a cut and a goal that do nothing to that are left out."""
     heedless(monkeypatch)
     found = fly(FOUR, (DIES, IN_THE_WAY, move(MoveKind.GOALS, 2, "", 20.0, 3.0, 1.0, -3.0)))
     assert found.clear.distance_m < 0.0
@@ -239,7 +233,6 @@ def test_the_fewest_moves_are_those_that_matter(monkeypatch: pytest.MonkeyPatch)
 
 
 def test_a_search_begins_elsewhere_with_another_number_and_comes_again() -> None:
-    """All its chance follows from the seed and the number."""
     tasks = [
         Climb(replaced(FOUR, duration=8.0), (MoveKind.DELAYS,), number, 3) for number in (1, 2)
     ]
@@ -261,7 +254,6 @@ SHORT = ("swap", "--reference.shape", "swap(4)", "--duration", "15")
 def test_the_command_prints_what_flies_it_again(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
-    """The line with the fewest moves, and the file with the nearest flight."""
     heedless(monkeypatch)
     monkeypatch.setattr(commands, "shrunk", lambda _, found: found)
     kept = tmp_path / "found.json"

@@ -1,6 +1,6 @@
-"""The benchmarks run, with counts too small to mean anything, and write what they say they write.
+"""Benchmarks at their smallest size: they run, and write their tables and figures.
 
-What is not installed does not compete; nothing here asserts a time.
+Solvers that are not installed are left out; no test asserts a time.
 """
 
 import json
@@ -64,11 +64,11 @@ TINY = MappingProxyType(
 
 @pytest.fixture(scope="module")
 def results() -> Iterator[dict[str, Any]]:
-    """Figures of every benchmark, as small as it goes."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(tick, "SETTLE", 2)
         patch.setattr(solvers, "TUNINGS", TUNINGS[::8])
-        patch.setattr(flood, "KINDS", (flood.HELLOS,))  # tests/lab/test_flood.py has the others
+        # The other kinds are in tests/lab/test_flood.py.
+        patch.setattr(flood, "KINDS", (flood.HELLOS,))
         yield _results()
 
 
@@ -81,12 +81,10 @@ def _results() -> dict[str, Any]:
 
 @pytest.fixture(scope="module")
 def saturated() -> RecordedProblems:
-    """A flight that often meets its bounds."""
     return record(solvers.flights()["saturated"], 1000)
 
 
 def test_the_tables_of_the_document_are_written(results: Mapping[str, Any], tmp_path: Path) -> None:
-    """Also figures and pictures; a section that is not run stays as it was."""
     file, document = tmp_path / "a.json", tmp_path / "b.md"
     document.write_text(DOCUMENT.read_text())
     write(results, file, document, tmp_path)
@@ -118,7 +116,6 @@ def test_the_flights_are_what_they_are_called(
 
 
 def test_a_fleet_that_is_listened_to_flies_the_same() -> None:
-    """Recording a fleet's problems does not change them, block by block."""
     scenario, count = tick.mixes()["half"], BLOCK + 2
     fleet = PlannedFleet(scenario, count)
     with listening() as listeners:
@@ -138,7 +135,7 @@ def test_a_fleet_that_is_listened_to_flies_the_same() -> None:
 
 @pytest.mark.parametrize("name", sorted(contestants(TUNINGS[0]).keys() - {NOTHING}))
 def test_contestants_solve_the_same_problems(name: str, saturated: RecordedProblems) -> None:
-    """All forms of the problem have the same solution; OSQP at its own tolerance is only close."""
+    """All forms of the problem have the same solution; OSQP is only close, at its own tolerance."""
     entry = solvers.SolverEntry(contestants(TUNINGS[0])[name], saturated)
     for i in range(20):
         entry.tick(i)
@@ -170,7 +167,6 @@ def test_what_is_not_installed_does_not_compete() -> None:
 def test_the_reference_is_the_same_whoever_finds_it(
     monkeypatch: pytest.MonkeyPatch, saturated: RecordedProblems
 ) -> None:
-    """Both quadprog and scipy find the same optimum, which is proved."""
     reference = Reference(saturated.problem.hessian[0], saturated.problem.mpc.bounds[0])
     gradients = saturated.gradient[0, ::50, 0]
     by_quadprog = [reference.solve(gradient) for gradient in gradients]
@@ -180,7 +176,7 @@ def test_the_reference_is_the_same_whoever_finds_it(
 
 
 def test_contestants_take_turns_at_the_same_problems() -> None:
-    """Hot in a row, of which the first only warms up; paced one by one, each after a pause."""
+    """Mode "hot": in a row, after a warm-up; "paced": one by one, each after a pause."""
     done: list[tuple[str, int]] = []
     contest = {name: lambda i, name=name: done.append((name, i)) for name in "ab"}
     lateness = WakeLateness()
@@ -200,7 +196,6 @@ def test_a_checkout_is_compared_with_itself(
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    """Both processes do the same work, and every contest and mix has a row in the table."""
     tiny = versions.VersionsCounts(1, 1, (2,), 1, 3, 1, 1, 0.5)
     monkeypatch.setattr(versions, "QUICK", tiny)
     monkeypatch.setattr(tick, "tune", lambda *_: {})
@@ -228,7 +223,7 @@ def test_a_folder_that_is_no_checkout_is_not_compared(
 
 
 def test_a_commit_is_compared_in_a_folder_that_goes_at_the_end() -> None:
-    """A checkout is named by its commit or its folder; what is neither is said in one line."""
+    """A checkout is named by its commit or its folder; anything else is refused in one line."""
     if not (ROOT / ".git").exists():
         pytest.skip("no repository here")
     with versions.checkout("HEAD") as folder:

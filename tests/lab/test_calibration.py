@@ -1,4 +1,4 @@
-"""The search for what the paper does not print: what may change, how it is judged, its journal."""
+"""Search for parameters that the paper does not print: free keys, scores, journal."""
 
 import json
 import shutil
@@ -77,7 +77,6 @@ def test_what_cannot_be_searched_for_is_refused(free: Free, said: str) -> None:
 
 
 def off_by(share: float) -> Values:
-    """The paper's own table, every entry larger by a share."""
     return {
         column: {name: value * (1.0 + share) for name, value in entries.items()}
         for column, entries in TABLE_1.items()
@@ -85,7 +84,6 @@ def off_by(share: float) -> Values:
 
 
 def test_the_score_is_the_squares_of_the_deviations_and_punishes_those_out_of_tolerance() -> None:
-    """Ten entries; the event ratio may be twice as far off as the others."""
     assert Table1().score(TABLE_1) == 0.0
     assert Table1().score(off_by(0.05)) == pytest.approx(10 * 0.05**2)
     assert Table1().score(off_by(0.15)) == pytest.approx((9 * 10 + 1) * 0.15**2)
@@ -96,7 +94,7 @@ def test_the_score_is_the_squares_of_the_deviations_and_punishes_those_out_of_to
 
 
 def weighs(trigger: str) -> Rmse:
-    """The smallest error at a tenth of the steps, with a trigger."""
+    """Objective of the smallest error at a tenth of the steps, with a trigger."""
     return Rmse(replace(PAPER, control=replace(PAPER.control, trigger=trigger)), TENTH)
 
 
@@ -107,13 +105,12 @@ def flew(
     effort_mps: float = 0.1,
     saturated: float = 0.0,
 ) -> Values:
-    """Figures of a point."""
     here = {"rmse_xy": rmse_xy, "event_ratio": event_ratio, "event_ratio_most": most}
     return {ONLY: {**here, "effort_mps": effort_mps, "saturated": saturated}}
 
 
 def test_the_smallest_error_may_not_be_bought_with_packets() -> None:
-    """If the trigger decides, a candidate is scored by the packets that other seeds may need."""
+    """With an event trigger, the score uses the upper end of the event ratio's interval."""
     event, every = weighs("state_gap"), weighs("always")
     assert event.score(flew(0.2, 0.08, 0.09)) == 0.2
     assert event.score(flew(0.2, 0.09, 0.11)) == pytest.approx(0.2 * 1.1**3)
@@ -126,7 +123,6 @@ def test_the_smallest_error_may_not_be_bought_with_packets() -> None:
 
 
 def test_the_smallest_error_may_not_be_bought_with_effort() -> None:
-    """Nor with inputs at their bounds; without a limit both are free."""
     limited = Rmse(weighs("always").scenario, SearchLimits(effort_mps=0.3, saturated=0.1))
     assert limited.score(flew(0.2, 1.0, 1.0, effort_mps=0.3, saturated=0.1)) == 0.2
     assert limited.score(flew(0.2, 1.0, 1.0, effort_mps=0.33)) == pytest.approx(0.2 * 1.1**3)
@@ -137,7 +133,9 @@ def test_the_smallest_error_may_not_be_bought_with_effort() -> None:
 
 
 def test_what_is_searched_for_follows_from_the_trigger_and_from_what_is_on() -> None:
-    """The position's weight stays, for only ratios matter; so does what is switched off."""
+    """Fixed are the position's weight, because only ratios matter, and keys that are 0 for
+    "off".
+    """
     weights = {
         "control.state_weight.1",
         "control.terminal_weight.0",
@@ -169,7 +167,7 @@ def test_a_trigger_has_the_keys_of_the_policies_in_it(trigger: str, keys: list[s
 
 
 def test_a_point_is_its_flights_with_an_upper_end_of_what_they_send() -> None:
-    """Mean, and the upper end of the 95 % interval; one that does not fly is no number."""
+    """Mean, and the upper end of the 95 % interval; None if a flight failed."""
     short = replace(PAPER, duration=4.0, settle=0.0)
     here = Rmse(short, TENTH).fly(short, [5, 6, 7])[ONLY]
     runs = summaries("", short, [5, 6, 7])
@@ -186,7 +184,6 @@ def test_a_point_is_its_flights_with_an_upper_end_of_what_they_send() -> None:
 
 
 def test_a_search_begins_where_it_was_told_to() -> None:
-    """The first point is the scenario itself; all keep within their bounds."""
     search = Optimiser(PAPER, [RADIUS, LAG], population=5, sigma=0.3, seed=1)
     first, *others = search.ask()
     assert search.values(first) == pytest.approx(search.values(PAPER), rel=1e-3)
@@ -196,7 +193,6 @@ def test_a_search_begins_where_it_was_told_to() -> None:
 
 
 def test_a_search_told_the_same_proposes_the_same() -> None:
-    """A journal of the scores therefore replaces the flights."""
     searches = [Optimiser(PAPER, [RADIUS, LAG], population=5, sigma=0.3, seed=1) for _ in range(2)]
     proposed = []
     for search in searches:
@@ -213,14 +209,12 @@ ARGV = ["calibrate", "paper", *SHORT, "--free", "reference.radius_m=0.5:5", "mod
 
 @pytest.fixture(scope="module")
 def searched(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder of a search of two generations."""
     out = tmp_path_factory.mktemp("search")
     assert main([*ARGV, "--generations", "2", "--out", str(out)]) == 0
     return out
 
 
 def flown(out: Path, objective: Objective) -> list[SearchPoint]:
-    """All points in the journal of a search."""
     free = [
         key.partition("=")[0] for key in tomllib.loads((out / "settings.toml").read_text())["free"]
     ]
@@ -244,7 +238,7 @@ def test_the_best_point_of_all_is_kept(searched: Path) -> None:
 def test_a_search_goes_on_from_its_journal_though_a_line_was_cut(
     searched: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Killed while it wrote its second generation, it makes the same journal to the last byte."""
+    """Killed during its second generation, it continues to the same journal, byte for byte."""
     whole = (searched / "journal.jsonl").read_text()
     shutil.copy(searched / "settings.toml", tmp_path)
     (tmp_path / "journal.jsonl").write_text(whole[: -len(whole.splitlines()[-1]) // 2])
@@ -256,7 +250,6 @@ def test_a_search_goes_on_from_its_journal_though_a_line_was_cut(
 def test_the_smallest_error_is_searched_for_and_shown(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Weights and the trigger's own keys; the first point is the scenario's, the best no worse."""
     argv = ["calibrate", "paper", "--objective", "rmse", "--packets", "0.3", *SHORT]
     assert main([*argv, "--generations", "2", "--out", str(tmp_path)]) == 0
     settings = tomllib.loads((tmp_path / "settings.toml").read_text())
@@ -282,7 +275,7 @@ def test_the_smallest_error_is_searched_for_and_shown(
 def test_another_search_in_the_same_folder_is_refused(
     searched: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """It would be told scores of other flights."""
+    """The search would use scores of other flights."""
     assert main([*ARGV, "--settle", "1", "--out", str(searched)]) == 2
     said = f"{searched}: settle: got 1.0, expected 0.0 to continue there; or choose another --out"
     assert capsys.readouterr().err.strip() == f"calibrate: {said}"
@@ -291,7 +284,7 @@ def test_another_search_in_the_same_folder_is_refused(
 def test_a_changed_digit_in_a_journal_is_refused(
     searched: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """A figure that was never flown would lead the search, and no other check would notice."""
+    """No other check would notice an altered result."""
     shutil.copy(searched / "settings.toml", tmp_path)
     file = tmp_path / "journal.jsonl"
     one, two, *_ = (searched / "journal.jsonl").read_text().splitlines(keepends=True)
@@ -305,7 +298,7 @@ def test_a_changed_digit_in_a_journal_is_refused(
 def test_a_trajectory_edited_between_two_calls_is_refused(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Points flown along it and points flown along the one before have no common best."""
+    """Scores along two trajectories cannot be compared."""
     table = tmp_path / "path.csv"
     table.write_text("t,x,y\n0,0,0\n5,1,1\n")
     scenario = tmp_path / "mine.toml"

@@ -1,4 +1,4 @@
-"""The comparison: who flies in what, at which weights, what is said of it, and its files."""
+"""Comparison: contenders, cases, weights, ratios, and the files of the report."""
 
 import csv
 import dataclasses
@@ -65,11 +65,11 @@ SCALE = contenders.ComparisonSize(100, 20)
 TARGET = CASES[0]
 
 
-# -- what is flown -------------------------------------------------------------------------------
+# -- contenders and choice of thresholds ---------------------------------------------------------
 
 
 def test_contenders_differ_in_scheme_and_trigger_alone_and_cases_in_what_is_met() -> None:
-    """Plant, network and trajectory are the same for all who fly a case."""
+    """Plant, network and reference are the same for all contenders of a case."""
     for contender, case in SCALE.searched:
         start = contenders.search_start(contender, case, SCALE)
         own = {f"control.{key}" for key in contender.control}
@@ -80,13 +80,11 @@ def test_contenders_differ_in_scheme_and_trigger_alone_and_cases_in_what_is_met(
 
 
 def test_the_search_never_sees_the_seeds_that_are_compared() -> None:
-    """However many runs are asked for, up to a thousand."""
     start = contenders.search_start(CONTENDERS[0], TARGET, SCALE)
     assert not set(range(start.seed, start.seed + SCALE.search_runs)) & set(range(1, 1001))
 
 
 def test_every_case_has_weights_that_were_searched_for_or_those_of_one_that_has() -> None:
-    """All who fly in it are known, and all who fly at another's weights fly there, too."""
     for case in CASES:
         assert set(case.contenders) <= BY_NAME.keys()
         base = BY_CASE[case.weights or case.name]
@@ -122,7 +120,6 @@ def test_every_contender_in_every_case_comes_along() -> None:
 
 
 def test_the_file_of_what_was_found_is_read_as_it(tmp_path: Path) -> None:
-    """The file holds what differs from the plant, and where that comes from."""
     contender, case = BY_NAME["committed-gap"], BY_CASE["gusts"]
     start = contenders.search_start(contender, case, SCALE)
     control = replace(start.control, state_weight=(7.1, 1e-4), trigger="cost_gap(12.5)")
@@ -142,7 +139,6 @@ def test_the_file_of_what_was_found_is_read_as_it(tmp_path: Path) -> None:
 
 
 def thresholds(contender: Contender, scenario: Scenario) -> dict[float | None, bool]:
-    """Those at which it flies, each with every way of reporting, and which is tuned."""
     points = budgets.flying(contender, BY_CASE["gusts"], scenario, SCALE)
     found = {point.threshold: point.tuned for point in points}
     assert [(point.threshold, point.report) for point in points] == [
@@ -152,7 +148,7 @@ def thresholds(contender: Contender, scenario: Scenario) -> dict[float | None, b
 
 
 def test_a_curve_goes_through_what_was_found_and_rises() -> None:
-    """Thresholds around it; whole steps of a period, none of them twice; one point of `always`."""
+    """Thresholds around the found one; whole steps without duplicates; one point of `always`."""
     gap = replace(PAPER, control=replace(PAPER.control, trigger="cost_gap(0.8)"))
     found = thresholds(BY_NAME["committed-gap"], gap)
     assert list(found) == pytest.approx([0.08, 0.24, 0.8, 2.4, 8.0, 24.0, 80.0])
@@ -165,7 +161,6 @@ def test_a_curve_goes_through_what_was_found_and_rises() -> None:
 
 
 def test_where_nobody_has_searched_the_weights_of_another_case_meet_what_is_met_there() -> None:
-    """The network is the case's own, whatever the weights were found with."""
     contender, case = BY_NAME["committed-gap"], BY_CASE["loss-0.5"]
     tuned = contenders.search_start(contender, TARGET, SCALE)
     lossy = "paper(0.4, 0.02, 2.0) & loss(0.2)"
@@ -192,17 +187,14 @@ def scout(
     points: Sequence[FlownContender],
     flies: Callable[[FlownContender], dict[str, float | None]],
 ) -> None:
-    """Let scouting flights end in what `flies` says of a point."""
     runs = [(replace(SUMMARY, **{**SPENT, **flies(point)}),) for point in points]
     done = {(cell, 0): run for cell, run in enumerate(runs)}
     plan.scouted(points, plan.scouts(points), done)
 
 
 def test_within_a_budget_the_nearest_is_chosen() -> None:
-    """It spends no more packets than that, nor much more effort than its case allows."""
-
     def chosen(*flown: dict[str, float | None]) -> list[int | None]:
-        """Number of what is chosen within each budget, where the first points fly like this."""
+        """Number of the chosen point within each budget, if the first points have these results."""
         plan = planned("committed-gap", every=3)
         all_flown = [*flown, *[{}] * (len(plan.points) - len(flown))]
         scout(plan, plan.points, lambda point: all_flown[plan.points.index(point)])
@@ -221,7 +213,7 @@ def test_within_a_budget_the_nearest_is_chosen() -> None:
 
 @pytest.mark.parametrize("name", ["committed-gap", "feedback-expected"])
 def test_thresholds_are_tried_until_each_budget_is_almost_used_up(name: str) -> None:
-    """More packets, less error: what is chosen could send hardly more within its budget.
+    """More packets, less error: the chosen point could send hardly more within its budget.
 
     Without these rounds a threshold left up to two thirds of its budget unused.
     """
@@ -232,7 +224,7 @@ def test_thresholds_are_tried_until_each_budget_is_almost_used_up(name: str) -> 
     assert middle
 
     def flies(point: FlownContender) -> dict[str, float | None]:
-        """Packets as the inverse of the threshold; only one way of reporting costs little."""
+        """Packets in inverse proportion to the threshold; only one reporting policy sends few."""
         assert point.threshold
         share = point.threshold / middle
         extra = 0.0 if point.report == "every 4 s" else 60.0
@@ -254,7 +246,6 @@ def test_thresholds_are_tried_until_each_budget_is_almost_used_up(name: str) -> 
 
 
 def test_nothing_is_tried_where_it_cannot_be_better() -> None:
-    """Neither beyond what is worse already, nor between thresholds that are close together."""
     plan = planned("committed-gap")
     scout(plan, plan.points, lambda point: {"packets_per_s": 6.0 / (point.threshold or 1.0)})
     assert not plan.halfway()
@@ -262,7 +253,7 @@ def test_nothing_is_tried_where_it_cannot_be_better() -> None:
     assert not plan.halfway()
 
 
-# -- what is said of it --------------------------------------------------------------------------
+# -- tables and claims ---------------------------------------------------------------------------
 
 SUMMARY = summarise(PAPER, "paper", flight.fly(replace(PAPER, duration=6.0)).client)
 
@@ -274,14 +265,12 @@ def flew(
     packets_per_s: float = 2.0,
     bytes_per_s: float = 1000.0,
 ) -> ContenderRuns:
-    """A contender with these errors, that spent this."""
     spent = {"packets_per_s": packets_per_s, "bytes_per_s": bytes_per_s}
     runs = [replace(SUMMARY, rmse_xy=error, **spent) for error in errors]
     return ContenderRuns(FlownContender(BY_NAME[name], packets_per_s, "every step", True, {}), runs)
 
 
 def test_what_has_not_flown_counts_in_nothing() -> None:
-    """Neither in its error, nor in what it spent."""
     one = flew("paper-event", [0.1, None, 0.3])
     assert one.estimate("rmse_xy")[0] == pytest.approx(0.2)
     assert len(one.values("packets_per_s")) == 2
@@ -296,7 +285,6 @@ ERRORS = st.lists(st.tuples(st.floats(0.01, 10.0), st.floats(0.01, 10.0)), min_s
 def test_a_ratio_lies_in_its_interval_and_goes_with_what_is_compared(
     errors: list[tuple[float, float]], factor: float
 ) -> None:
-    """Ratio of the means; twice the error is twice the ratio, and its interval."""
     ours, theirs = zip(*errors, strict=True)
     found = ratio(flew("paper-event", ours), flew("paper-periodic", theirs))
     more = ratio(flew("paper-event", np.multiply(ours, factor)), flew("paper-periodic", theirs))
@@ -320,7 +308,7 @@ def test_an_interval_is_of_pairs() -> None:
 
 
 def test_a_jackknife_is_an_interval_of_students_where_both_apply() -> None:
-    """Errors spread little, so that the ratio of means is nearly linear."""
+    """Errors with a small spread, so that the ratio of means is nearly linear."""
     rng = np.random.default_rng(4)
     ours, theirs = 1.0 + 0.05 * rng.standard_normal((2, 100))
     found = ratio(flew("paper-event", ours), flew("paper-periodic", theirs))
@@ -331,7 +319,6 @@ def test_a_jackknife_is_an_interval_of_students_where_both_apply() -> None:
 
 
 def test_seeds_that_did_not_fly_in_both_are_left_out() -> None:
-    """Fewer than two common seeds are no comparison."""
     ours, theirs = flew("paper-event", [1.0, None, 3.0]), flew("paper-periodic", [2.0, 2.0, 2.0])
     found = ratio(ours, theirs)
     assert found is not None
@@ -343,7 +330,6 @@ CLAIM = Claim("committed-gap", "paper-periodic", 0.25, {"target": 0.9})
 
 
 def within(case: Case, *points: tuple[float, ContenderRuns]) -> ComparedCase:
-    """A case in which these fly within these budgets."""
     bought = {(runs.what.contender.name, budget): runs for budget, runs in points}
     return ComparedCase(case, bought)
 
@@ -360,7 +346,7 @@ OURS = (
 
 
 def test_ours_is_judged_with_the_most_that_it_may_spend() -> None:
-    """Theirs is what flies within the largest budget: its share is theirs."""
+    """The other contender flies within the largest budget; the share refers to its packets."""
     judged = judge(CLAIM, within(TARGET, *THEIRS, *OURS))
     assert judged is not None
     assert judged.theirs is THEIRS[1][1]
@@ -375,7 +361,6 @@ def test_ours_is_judged_with_the_most_that_it_may_spend() -> None:
 
 
 def test_a_claim_holds_with_all_of_its_interval_or_not_at_all() -> None:
-    """A claim without a limit neither holds nor fails."""
     wide = (2.0, flew("committed-gap", [0.1, 0.1, 1.9], packets_per_s=1.5))
     judged = judge(CLAIM, within(TARGET, *THEIRS, wide))
     assert judged is not None
@@ -388,7 +373,7 @@ def test_a_claim_holds_with_all_of_its_interval_or_not_at_all() -> None:
 
 
 def test_a_run_that_went_astray_moves_the_mean_and_not_the_median() -> None:
-    """Both are told, of a contender and of a ratio."""
+    """The report has both, of a contender and of a ratio."""
     astray = (2.0, flew("committed-gap", [0.5, 0.6, 0.7, 50.0, 0.6], packets_per_s=1.5))
     steady = (40.0, flew("paper-periodic", [1.2, 1.2, 1.2, 1.2, 1.2], packets_per_s=20.0))
     assert astray[1].median() == pytest.approx(0.6)
@@ -423,7 +408,7 @@ def test_the_best_within_a_budget_is_marked_and_ours_is_measured_against_it() ->
 
 
 def test_a_contender_that_cannot_be_told_from_the_best_is_marked_as_well() -> None:
-    """Seed by seed the second is now better and now worse; the third is always worse."""
+    """Seed by seed the second is better or worse than the first; the third is always worse."""
     best = flew("feedback-gap", [0.2, 0.3, 0.2])
     equal = flew("trajectory-expected", [0.21, 0.29, 0.21])
     worse = flew("paper-event", [0.3, 0.4, 0.3])
@@ -435,7 +420,6 @@ def test_a_contender_that_cannot_be_told_from_the_best_is_marked_as_well() -> No
 
 
 def test_what_is_claimed_is_what_was_asked_for() -> None:
-    """Every claim is about contenders and cases that exist."""
     for claim in CLAIMS:
         assert {claim.ours, claim.theirs} <= BY_NAME.keys()
         assert set(claim.at_most) <= BY_CASE.keys()
@@ -445,12 +429,11 @@ def test_what_is_claimed_is_what_was_asked_for() -> None:
 
 TUNE = ["compare", "--quick", "--tune", "--generations", "1"]
 FLOWN_S = 8.0
-"""Duration of each flight of `--quick` here [s]."""
 
 
 @pytest.fixture(scope="module")
 def fewer() -> Iterator[None]:
-    """`--quick` with two thresholds, the found one first, and short flights; docs/ fly all."""
+    """`--quick` with two thresholds, the found one first, and short flights."""
     real = contenders.quick
 
     def quick(scale: contenders.ComparisonSize) -> contenders.ComparisonSize:
@@ -467,7 +450,6 @@ def fewer() -> Iterator[None]:
 
 @pytest.fixture(scope="module")
 def tuned(fewer: None, tmp_path_factory: pytest.TempPathFactory) -> Path:  # noqa: ARG001
-    """The folder of quick searches, with the file of the weights that they have found."""
     folder = tmp_path_factory.mktemp("tuned")
     assert main([*TUNE, "--out", str(folder)]) == 0
     return folder
@@ -475,7 +457,6 @@ def tuned(fewer: None, tmp_path_factory: pytest.TempPathFactory) -> Path:  # noq
 
 @pytest.fixture(scope="module")
 def out(tuned: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder of a quick comparison."""
     folder = tmp_path_factory.mktemp("compare")
     weights = str(tuned / "weights.toml")
     assert main(["compare", "--quick", "--weights", weights, "--out", str(folder)]) == 0
@@ -483,7 +464,6 @@ def out(tuned: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_every_contender_gets_the_same_search(tuned: Path) -> None:
-    """Seeds, points, flights and limits; what it found is its scenario."""
     weights, searches = tuned / "weights.toml", list((tuned / "searches").iterdir())
     assert len(searches) == len(reading.names(str(weights))) == len(QUICK)
     for folder in searches:
@@ -505,7 +485,6 @@ def test_every_contender_gets_the_same_search(tuned: Path) -> None:
 def test_searches_that_are_done_are_not_done_again(
     tuned: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A repeated command reads their journals, and writes the same."""
     kept = {path: path.read_bytes() for path in tuned.rglob("*") if path.is_file()}
     monkeypatch.setattr(pool.Crew, "share", None)
     assert main([*TUNE, "--out", str(tuned)]) == 0
@@ -513,7 +492,6 @@ def test_searches_that_are_done_are_not_done_again(
 
 
 def rows(file: Path) -> list[dict[str, str]]:
-    """Rows of a table."""
     return list(csv.DictReader(file.read_text().splitlines()))
 
 
@@ -540,7 +518,6 @@ def test_the_tables_are_what_each_contender_flew(out: Path, tuned: Path) -> None
 
 
 def test_the_curves_are_there_as_numbers_and_pictures(out: Path) -> None:
-    """A row for each budget of each contender, and PNG and PDF beside it."""
     assert (out / "trade-target.png").read_bytes().startswith(b"\x89PNG")
     assert (out / "trade-target.pdf").read_bytes().startswith(b"%PDF")
     points = rows(out / "trade-target.csv")
@@ -557,7 +534,6 @@ def test_the_curves_are_there_as_numbers_and_pictures(out: Path) -> None:
 def test_where_the_reference_is_known_it_is_flown_without_packets(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """At the weights of trajectories; no contender with packets is nearer."""
     known = [BY_NAME[name] for name in ("paper-every-step", BESIDE, REGULATED)]
     monkeypatch.setattr(contenders, "CONTENDERS", known)
     argv = ["compare", "--quick", "--cases", "wind-0.3", "--out", str(tmp_path)]
@@ -589,7 +565,6 @@ def test_the_second_time_it_only_draws(
 def test_other_weights_are_another_comparison(
     out: Path, tuned: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Flights with earlier weights are not mixed with those of new ones."""
     file = tmp_path / "mine.toml"
     weights = (tuned / "weights.toml").read_text()
     file.write_text(weights.replace("input_weight = ", "input_weight = 77", 1))
@@ -620,7 +595,6 @@ def test_weights_that_nobody_has_searched_for_are_refused(
 def test_ctrl_c_ends_a_search_in_order_and_the_same_command_goes_on(
     tuned: Path, tmp_path: Path
 ) -> None:
-    """The points in the journal are kept."""
     argv = [*TUNE[:3], "--generations", "2", "--workers", "1", "--out", str(tmp_path)]
     journal = tmp_path / "searches" / "paper-every-step-target" / "journal.jsonl"
     with subprocess.Popen(
@@ -636,7 +610,7 @@ def test_ctrl_c_ends_a_search_in_order_and_the_same_command_goes_on(
     assert f"of {2 * len(QUICK)} generations done; the same command goes on" in said
     assert not (tmp_path / "weights.toml").exists()
     flown = journal.read_text()
-    for name in QUICK[1:]:  # a generation of theirs is done
+    for name in QUICK[1:]:  # one generation of these is done
         shutil.copytree(
             tuned / "searches" / f"{name}-target",
             journal.parents[1] / f"{name}-target",

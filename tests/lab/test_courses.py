@@ -1,4 +1,4 @@
-"""What a vehicle flies under a message: by equations written anew, and by what the server keeps."""
+"""Inputs prescribed by a message: by independent equations, and by the server's copy."""
 
 from itertools import pairwise
 from typing import Any
@@ -23,13 +23,11 @@ from skytether.sim.flight import fly
 
 AXES, AGE_MAX, H = 2, 30, 20
 FLIGHT = 60
-"""Number of steps that are flown by one message: it ends, and is braked along."""
+"""Number of steps flown by one message, which ends and is then braked."""
 STAGES = 3000
-"""Number of stages that are compared."""
 
 
 def terms(scheme: str, exhausted: str, rng: np.random.Generator) -> Terms:
-    """Terms of some vehicle."""
     table = {
         "model": {"tau_s": rng.uniform(0.2, 2.0, AXES).tolist(), "gain": [0.8, 1.1]},
         "control": {"dt": 0.1, "horizon": H, "scheme": scheme},
@@ -42,7 +40,7 @@ def terms(scheme: str, exhausted: str, rng: np.random.Generator) -> Terms:
 
 @pytest.mark.parametrize("scheme", ["trajectory", "committed"])
 def test_what_is_flown_is_what_the_equations_say(scheme: str) -> None:
-    """Messages, states, wind, and the steps at which the vehicle is awake are drawn."""
+    """Messages, states, wind, and the steps at which the vehicle is awake are random."""
     rng, away, compared = np.random.default_rng(1), 0.0, 0
     while compared < STAGES:
         flown = terms(scheme, ("brake", "hold")[rng.integers(2)], rng)
@@ -63,7 +61,7 @@ def test_what_is_flown_is_what_the_equations_say(scheme: str) -> None:
             aboard.offer(horizon, step - 2, step - age)
             course = PlannedCourse(horizon, min(H, AGE_MAX - age + 1), flown)
         for k in range(step - 2, step + FLIGHT):
-            if rng.random() < 0.1:  # it has slept
+            if rng.random() < 0.1:  # the vehicle was asleep
                 continue
             state, found = rng.normal(0.0, 2.0, (AXES, 2)), rng.normal(0.0, 0.3, AXES)
             before = rng.uniform(np.negative(flown.u_max), flown.u_max)
@@ -80,7 +78,7 @@ def test_what_is_flown_is_what_the_equations_say(scheme: str) -> None:
 
 
 def kept_at_the_server(scheme: Any, found: Foresight, row: int, i: int) -> tuple[Array, Array, int]:
-    """Server's memory of the newest message: numbers, feedback, and steps between knots."""
+    """Server's copy of the newest message: numbers, feedback, and steps between knots."""
     memory = scheme._memory
     if isinstance(scheme, Guidance):
         slot = (memory.sent.delivery["sent"][row] - 1) % trajectory.RING
@@ -96,10 +94,10 @@ def kept_at_the_server(scheme: Any, found: Foresight, row: int, i: int) -> tuple
 
 
 def flown_mismatches(flown: Scenario) -> tuple[int, int]:
-    """Steps flown by a plan or along a trajectory, and inputs that are another than should be.
+    """Number of steps flown by a plan, and of inputs that differ from the prescribed ones.
 
-    What should be flown follows from what the server keeps of what it sent, from the state and the
-    disturbance that the vehicle has found, and from how fast the input may change.
+    The prescribed input follows from the server's copy of the message, the state and disturbance
+    estimated aboard, and the rate limit.
     """
     kept: dict[int, tuple[Array, Array, int]] = {}
     winds: dict[int, Array] = {}
@@ -148,7 +146,7 @@ def flown_mismatches(flown: Scenario) -> tuple[int, int]:
 
 
 def demo(scheme: str, duration_s: float, seed: int) -> Scenario:
-    """The demonstration, in wind that it does not know and with a gain that it does not have."""
+    """The demo in unknown wind, with a gain that differs from the model's."""
     table = reading.to_table(reading.load("demo")) | {"duration": duration_s, "seed": seed}
     trigger = "expected_gap(0.05)" if scheme == "trajectory" else "cost_gap(3)"
     table["control"] |= {"scheme": scheme, "trigger": f"{trigger} | silence(1)"}
@@ -159,7 +157,6 @@ def demo(scheme: str, duration_s: float, seed: int) -> Scenario:
 
 @pytest.mark.parametrize("scheme", ["trajectory", "committed"])
 def test_what_is_flown_follows_from_what_the_server_keeps(scheme: str) -> None:
-    """No input differs by a bit: mismatch 0."""
     steps, differ = flown_mismatches(demo(scheme, 30.0, 1))
     assert steps > 400
     assert differ == 0

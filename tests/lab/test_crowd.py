@@ -1,4 +1,4 @@
-"""`skytether crowd`: which numbers of vehicles are flown, and what counts as flying."""
+"""`skytether crowd`: the numbers of vehicles that are flown, and the criteria for flying."""
 
 import csv
 import signal
@@ -23,7 +23,6 @@ FAST = ("--duration", "4", "--settle", "2")
 
 
 def point(vehicles: int, rmse_m: float | None = 0.3, **keys: Any) -> CrowdPoint:
-    """A flight of so many vehicles."""
     values: dict[str, Any] = dict.fromkeys(CrowdPoint.__struct_fields__, 0)
     given = {"scheme": "budget", "vehicles": vehicles, "rmse_m": rmse_m, "rmse_worst_m": rmse_m}
     return CrowdPoint(**{**values, **given, **keys})
@@ -31,7 +30,7 @@ def point(vehicles: int, rmse_m: float | None = 0.3, **keys: Any) -> CrowdPoint:
 
 @given(st.integers(0, 400), st.integers(1, 300))
 def test_the_largest_number_that_flies_is_found(flies: int, most: int) -> None:
-    """To within a twentieth, or one vehicle; and no number is flown twice."""
+    """To within a twentieth, or one vehicle, without flying a number twice."""
     points: list[CrowdPoint] = []
     while (number := FlownScheme.of(points, "budget", 1.0).next(most)) is not None:
         assert 1 <= number <= most
@@ -59,13 +58,12 @@ def test_points_of_other_schemes_do_not_count() -> None:
     "keys", [{"rmse_m": 1.01}, {"rmse_m": None}, {"braked": 1}, {"ended": 1, "rmse_m": None}]
 )
 def test_what_is_no_flying(keys: dict[str, Any]) -> None:
-    """An error over the limit, or one vehicle that brakes, or ends early."""
+    """An error over the limit, or one vehicle that brakes or ends early."""
     assert point(3).flies(1.0)
     assert not msgspec.structs.replace(point(3), **keys).flies(1.0)
 
 
 def test_a_flight_is_judged_by_its_record() -> None:
-    """The error of all vehicles, who braked after settling, and who ended early."""
     scenario = reading.load("crowd")
     scenario = msgspec.structs.replace(scenario, duration=6.0, settle=3.0)
     record = fly(scenario, vehicles=3)
@@ -91,7 +89,7 @@ def test_a_flight_is_judged_by_its_record() -> None:
 
 
 def test_schemes_share_the_network_and_the_target() -> None:
-    """They differ in what the server sends, and the paper's vehicles report at every step."""
+    """They differ in the server's packets; the paper's vehicles report at every step."""
     plan = Crowd("crowd", reading.load("crowd"), udp=False)
     schemes: tuple[Scheme, ...] = ("paper", "threshold", "budget")
     paper, threshold, budget = map(plan.of, schemes)
@@ -113,7 +111,6 @@ def test_schemes_share_the_network_and_the_target() -> None:
 def test_it_writes_a_table_and_a_picture_and_goes_on(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """A second run keeps the flights of the first and adds other numbers of vehicles."""
     argv = ("crowd", "--out", str(tmp_path / "c"), "--schemes", "threshold", "budget", *FAST)
     assert main([*argv, "--limit", "5", "--vehicles", "1", "2"]) == 0
     said = capsys.readouterr().out

@@ -1,4 +1,4 @@
-"""The envelope of a scenario: which points are drawn, how they are judged, and what is said."""
+"""Envelope of a scenario: points, verdicts, command."""
 
 import csv
 import re
@@ -46,7 +46,7 @@ DEMO = Envelope("demo-committed", reading.load("demo-committed"))
 
 
 def test_points_lie_within_their_bounds_and_fill_them() -> None:
-    """Delays to 3 s, losses to 0.99 and half of the points to 0.5, Δt and H by logarithms."""
+    """Delays to 3 s, losses to 0.99 and half of the points to 0.5, Δt and H log-uniform."""
     points = [draw(1, number) for number in range(2000)]
     column = {key: np.array([point[key] for point in points]) for key in points[0]}
     for direction in ("uplink", "downlink"):
@@ -81,7 +81,6 @@ def test_a_point_is_the_same_whatever_else_is_flown() -> None:
 
 
 def test_the_command_line_of_a_point_flies_that_point() -> None:
-    """All its keys, and those that the user has changed; what is the scenario's own is left out."""
     plan = Envelope(
         "demo-committed", demo_with(duration=12.0, vehicle__steady_wind_mps=[0.1, -0.2])
     )
@@ -92,7 +91,7 @@ def test_the_command_line_of_a_point_flies_that_point() -> None:
     assert "--reference.radius-m" not in line
 
 
-# -- the verdict, on flights by hand -------------------------------------------------------------
+# -- verdicts on artificial records --------------------------------------------------------------
 
 SCENARIO = demo_with(
     duration=40.0, control__dt=0.05, vehicle__wind=0.0, network__uplink__loss=0.0, seed=1
@@ -105,7 +104,7 @@ YES, NO = np.ones(STEPS, np.bool_), np.zeros(STEPS, np.bool_)
 
 
 def record(state: Array, inputs: Array, covered: Flags, age_s: float = 1.0) -> Rows:
-    """The record of a client that saw these states, flew these inputs, and had plans or none."""
+    """Client's record with these states, inputs, and planned steps."""
     rows = np.zeros(len(state), client_columns(2))
     rows["step"], rows["state"], rows["input"] = np.arange(len(state)), state, inputs
     rows["covered"], rows["age_ns"] = covered, np.where(covered, round(age_s * 1e9), -1)
@@ -113,7 +112,7 @@ def record(state: Array, inputs: Array, covered: Flags, age_s: float = 1.0) -> R
 
 
 def along(command: Callable[[int, Array], Any], covered: Flags = YES) -> Rows:
-    """The record of a vehicle that flies a command of step and state, without wind."""
+    """Record of a vehicle that flies a command, a function of step and state, without wind."""
     plant = FirstOrderPlant(SCENARIO, Weather(SCENARIO, stream(1, "test")))
     states, inputs = [], []
     for step in range(STEPS):
@@ -124,23 +123,22 @@ def along(command: Callable[[int, Array], Any], covered: Flags = YES) -> Rows:
 
 
 def chase(step: int, state: Array) -> Array:
-    """A command that brings the vehicle to the reference, within its bounds."""
+    """Command that brings the vehicle to the reference, within its bounds."""
     wanted = PATH[step, :, 1] + 2.0 * (PATH[step, :, 0] - state[:, 0])
     return np.clip(wanted, -1.6, 1.6)
 
 
 def ramp(speed_mps: float, since_s: float, brake: float = BRAKE) -> Array:
-    """A command along x that brakes."""
     return np.array([max(0.0, speed_mps - brake * since_s), 0.0])
 
 
 def until(*ends: int) -> Flags:
-    """Whether there is a plan: first yes, then by turns from these steps on."""
+    """Flags that are true at first and change at each of these steps."""
     return np.array([sum(step >= end for end in ends) % 2 == 0 for step in range(STEPS)])
 
 
 def test_a_flight_near_the_reference_is_flown() -> None:
-    """Its largest error is that after settling, when it started a metre and a half away."""
+    """Only the error after settling counts; the vehicle started 1.5 m away."""
     rows = record(PATH, PATH[..., 1], YES)
     assert judge(SCENARIO, rows) == EnvelopePoint("flown", 0.0, 1.0, pytest.approx(0.0))
     late = rows.copy()
@@ -150,13 +148,12 @@ def test_a_flight_near_the_reference_is_flown() -> None:
 
 
 def test_what_never_got_a_plan_and_stood_still_is_hovering() -> None:
-    """Nothing is settled, and nothing is wrong."""
     verdict = judge(SCENARIO, along(lambda *_: [0.0, 0.0], NO))
     assert verdict == EnvelopePoint("hovering", None, 0.0, 0.0)
 
 
 def test_a_flight_that_brakes_along_the_curve_is_hovering() -> None:
-    """Planned for 20 s, then from 1.6 m/s to rest."""
+    """Planned for 20 s, then braked from 1.6 m/s to rest."""
     covered = until(400)
 
     def command(step: int, state: Array) -> Array:
@@ -169,7 +166,7 @@ def test_a_flight_that_brakes_along_the_curve_is_hovering() -> None:
 
 
 def test_a_flight_with_plans_again_at_its_end_is_interrupted() -> None:
-    """Braked from 10 s to 25 s, it comes back."""
+    """Braked from 10 s to 25 s, then planned again."""
 
     def command(step: int, state: Array) -> Array:
         return ramp(1.0, (step - 199) * DT) if 200 <= step < 500 else chase(step, state)
@@ -178,14 +175,14 @@ def test_a_flight_with_plans_again_at_its_end_is_interrupted() -> None:
 
 
 def test_a_flight_whose_plans_came_too_late_to_settle_is_interrupted() -> None:
-    """Five seconds before the end, with nothing to be judged by."""
+    """Five seconds before the end."""
     rows = along(lambda step, state: chase(step, state) if step >= 700 else [0.0, 0.0], ~until(700))
     verdict = judge(SCENARIO, rows)
     assert (verdict.outcome, verdict.error_max, verdict.covered) == ("interrupted", None, 0.125)
 
 
 def test_a_flight_beside_the_reference_is_astray() -> None:
-    """Always planned, always a metre and a half off."""
+    """Planned at all times, always 1.5 m off."""
     rows = record(PATH, PATH[..., 1], YES)
     rows["state"][:, 1, 0] += 1.5
     verdict = judge(SCENARIO, rows)
@@ -197,17 +194,17 @@ def test_a_flight_without_a_step_is_unanswered() -> None:
 
 
 def held(step: int, state: Array) -> Array:
-    """A command that is held from 20 s on, though there is no plan."""
+    """Command that is held from 20 s on, without a plan."""
     return chase(step, state) if step < 400 else np.array([0.3, 0.0])
 
 
 def slack(step: int, state: Array) -> Array:
-    """A command that falls at half the rate."""
+    """Command that falls at half the rate."""
     return chase(step, state) if step < 400 else ramp(1.6, (step - 400) * DT, 0.5 * BRAKE)
 
 
 def restarted(step: int, state: Array) -> Array:
-    """A command that brakes, and begins anew each second, with a plan that has run out."""
+    """Command that brakes, but restarts each second after the plan has run out."""
     return chase(step, state) if step < 400 else ramp(1.6, step * DT % 1.0)
 
 
@@ -244,9 +241,7 @@ def test_a_command_that_does_not_brake_without_a_plan_is_a_flyaway(rows: Rows, s
 def test_feedback_may_lead_back_after_a_horizon_s_end(
     *, feedback: bool, is_held: bool, behind_m: float, away_m: float, outcome: str
 ) -> None:
-    """Feedback may move it by a metre, and by as much as it lags behind, while the horizon is held;
-    at the end it is at rest.
-    """
+    """Feedback of a finished horizon may move the vehicle by a metre plus its lag."""
     state = PATH.copy()
     state[:, 0, 0] -= behind_m
     rest = state[400, :, 0].copy()
@@ -274,7 +269,6 @@ def test_feedback_may_lead_back_after_a_horizon_s_end(
 def test_a_vehicle_that_moves_though_its_command_is_none_is_a_flyaway(
     moves_mps: float, has_mps: float, said: str
 ) -> None:
-    """Its position, or its speed, shows the motion."""
     state = PATH.copy()
     state[400:, :, 0] = PATH[400, :, 0] + moves_mps * (TIME_S[400:, None] - 20.0) * [1.0, 0.0]
     state[400:, :, 1] = [has_mps, 0.0]
@@ -285,7 +279,7 @@ def test_a_vehicle_that_moves_though_its_command_is_none_is_a_flyaway(
 
 
 def test_a_vehicle_that_plans_lead_away_is_a_flyaway() -> None:
-    """Out of the disc, 1 m and the way to stop from full speed; it has a radius of two metres."""
+    """Beyond the disc of 2 m radius by more than 1 m and the stopping distance from full speed."""
     centre, radius_m = disc(SCENARIO)
     assert centre == pytest.approx([0.0, 0.0], abs=1e-3)
     assert radius_m == pytest.approx(2.0, abs=1e-3)
@@ -295,24 +289,23 @@ def test_a_vehicle_that_plans_lead_away_is_a_flyaway() -> None:
 
 
 def swinging(step: int) -> Array:
-    """A state that swings about the reference, wider and wider."""
+    """State that oscillates about the reference with growing amplitude."""
     swing = np.array([0.1 * TIME_S[step] * np.sin(TIME_S[step]), 0.0])
     return PATH[step] + np.stack([swing, 0.0 * swing], -1)
 
 
 def test_a_growing_swing_under_plans_is_a_flyaway() -> None:
-    """Further from the reference than if it stood still in the middle, and plans have seen it."""
+    """Further away than a vehicle at rest in the middle, under plans based on new observations."""
     state = np.array([swinging(step) for step in range(STEPS)])
     verdict = judge(SCENARIO, record(state, PATH[..., 1], YES))
     assert verdict.outcome == "flyaway"
     assert " 3 m " in verdict.line
-    # The same seen never, because no observation came through, is bad luck and no loop.
+    # Without any new observation the same motion is no fault of the loop.
     blind = judge(SCENARIO, record(state, PATH[..., 1], YES, age_s=60.0))
     assert blind.outcome == "astray"
 
 
 def test_a_state_that_is_no_number_is_a_flyaway() -> None:
-    """A comparison with it would be false."""
     rows = record(PATH, PATH[..., 1], YES)
     rows["state"][-1, 0, 0] = np.nan
     verdict = judge(SCENARIO, rows)
@@ -321,7 +314,6 @@ def test_a_state_that_is_no_number_is_a_flyaway() -> None:
 
 
 def test_wind_may_carry_a_vehicle_that_brakes() -> None:
-    """Wind may move it as far as it blows, and no further."""
     windy = demo_with(duration=40.0, vehicle__steady_wind_mps=[0.1, 0.0], vehicle__wind=0.0)
     state = np.zeros((STEPS, 2, 2))
     state[:, 0, 0], state[:, 0, 1] = 0.1 * TIME_S, 0.1
@@ -341,11 +333,11 @@ BLIND = {
     "control__input_weight": 0.01,
     "control__input_reference": False,
 }
-"""Committed inputs alone, at weights that answer all at once."""
+"""Committed inputs without feedback, at tight weights."""
 
 
 def test_a_vehicle_that_does_not_brake_is_caught_and_one_that_does_is_not() -> None:
-    """Four of five horizons of 2 s lost: they run out, and their last input is held, or braked."""
+    """Four of five horizons of 2 s are lost, so they run out; the last input is held, or braked."""
 
     def outcome(exhausted: str) -> str:
         keys = {"vehicle__exhausted": exhausted, "network__uplink__loss": 0.8} | BLIND
@@ -359,7 +351,7 @@ def test_a_vehicle_that_does_not_brake_is_caught_and_one_that_does_is_not() -> N
 def test_horizons_that_come_late_are_a_flyaway_where_nothing_guards_against_them(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Two thirds of a round trip more than they are made for: by many metres."""
+    """The round trip is two thirds longer than the delay that horizons are planned for."""
     monkeypatch.setattr(Controller, "able", _able_whatever_the_delay)
     monkeypatch.setattr(
         "skytether.server.schemes.committed.committed_max", lambda terms: terms.horizon
@@ -372,7 +364,7 @@ def test_horizons_that_come_late_are_a_flyaway_where_nothing_guards_against_them
         set_keys({f"network.{direction}": f"constant({delay_s}) & loss(0.1)"}, table)
     set_keys({key.replace("__", "."): value for key, value in BLIND.items()}, table)
     set_keys({"duration": 40.0, "control.dt": 0.02, "control.horizon": 20}, table)
-    scenario = msgspec.convert(table, Scenario)  # unchecked: it would be refused
+    scenario = msgspec.convert(table, Scenario)  # unchecked: the check would refuse it
     verdict = judge(scenario, flight.fly(scenario).client)
     assert verdict.outcome == "flyaway"
     assert verdict.outside_m is not None
@@ -382,7 +374,7 @@ def test_horizons_that_come_late_are_a_flyaway_where_nothing_guards_against_them
 def _able_whatever_the_delay(
     controller: Controller, rows: Indices, step: Indices
 ) -> tuple[Indices, Indices]:
-    """Vehicles whose step is new, and their steps."""
+    """Replacement for the controller's check: vehicles with a new step, and their steps."""
     able: Flags = (step > controller.last_step[rows]) & (controller.observed_step[rows] >= 0)
     return rows[able], step[able]
 
@@ -411,7 +403,6 @@ def test_a_point_that_raises_has_crashed(monkeypatch: pytest.MonkeyPatch) -> Non
 
 
 def test_the_worst_come_first() -> None:
-    """Crashes, then who flew furthest, then who was furthest from the reference."""
     points = [
         EnvelopePoint("astray", 1.2),
         EnvelopePoint("flyaway", None, 0.0, 3.0),
@@ -432,7 +423,6 @@ SHORT = ["envelope", "demo-committed", "--duration", "4", "--settle", "0", "--wo
 def test_more_points_go_on_where_fewer_ended(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The table of all points is the same as in one go, and the picture is drawn."""
     once, twice = tmp_path / "once", tmp_path / "twice"
     main([*SHORT, "--points", "8", "--out", str(once)])
     main([*SHORT, "--points", "3", "--out", str(twice)])
@@ -455,7 +445,6 @@ def test_more_points_go_on_where_fewer_ended(
 def test_a_flyaway_ends_the_command_with_one_and_a_command_line(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Which flies that point again; what went astray is told, too, and is no failure."""
     plan = Envelope("demo-committed", demo_with(duration=4.0, settle=0.0))
     lost = EnvelopePoint("flyaway", None, 0.0, 42.0, "at 1.50 s it is commanded 1.60 m/s")
     with closing(StudyJournal(tmp_path, plan.settings(), EnvelopePoint)) as journal:
@@ -494,7 +483,6 @@ def test_an_impossible_envelope_is_refused(
 
 
 def test_points_with_trajectories_are_flown_with_feedback() -> None:
-    """At the same points, where committed inputs are drawn with it and without."""
     along = demo_with(
         control__scheme="trajectory", control__trigger="expected_gap(0.05) | silence(1)"
     )

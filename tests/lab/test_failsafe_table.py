@@ -1,4 +1,4 @@
-"""Table of faults in flights of an autopilot: what is flown keeps what the pages promise."""
+"""Table of faults in flights of an autopilot: flights keep the documented promises."""
 
 import math
 
@@ -10,7 +10,7 @@ from skytether.autopilot.flavours import FlavourName
 
 BOTH: tuple[FlavourName, ...] = ("ardupilot", "px4")
 SILENCE_S = (1.4, 2.1)
-"""Times within which a lost server is noticed: `link.timeout_s` after what was under way [s]."""
+"""Time within which a lost server is detected: `link.timeout_s` after the last packet [s]."""
 STARTS: dict[CaseName, tuple[list[str], tuple[float, float], Ending]] = {
     "link cut": (["BRAKE", "HOVER", "LAND"], SILENCE_S, "has landed"),
     "link cut for 5 s": (["BRAKE", "HOVER", "TRACK"], SILENCE_S, "flies on"),
@@ -24,22 +24,22 @@ STARTS: dict[CaseName, tuple[list[str], tuple[float, float], Ending]] = {
     "second commander": (["BRAKE", "HOVER", "LAND"], (0.3, 1.6), "has landed"),
     "position leaps": (["BRAKE", "HOVER", "LAND"], (0.0, 0.2), "has landed"),
 }
-"""Modes of the client after each fault, when it goes into the first of them [s], and the end."""
+"""Modes of the client after each fault, time of the first of them [s], and the end."""
 STANDS_S: dict[FlavourName, float] = {"ardupilot": 4.0, "px4": 15.5}
-"""Time after which a vehicle stands, unless it flies on [s]."""
+"""Longest time until the vehicle stops, unless it flies on [s]."""
 
 OFF_PATH_M: dict[FlavourName, float] = {"ardupilot": 0.15, "px4": 2.65}
-"""Distance off its path beyond which the largest of the table in docs/fly-a-real-one.md would be
-another: 0.1 m and 2.6 m, rounded."""
+"""Largest distance off the path for which the rounded values in docs/fly-a-real-one.md, 0.1 m and
+2.6 m, stay right.
+"""
 
 COMMANDED_M = 2.5
-"""Distance off its path to which a second commander may bring a vehicle before it brakes [m]."""
+"""Largest distance off the path that a second commander may cause before the vehicle brakes [m]."""
 COMMANDED_S = 1.6
-"""Time for which a second commander may have a vehicle before it brakes [s]."""
+"""Longest time for which a second commander may move the vehicle before it brakes [s]."""
 
 
 def flown(case: CaseName, flavour: FlavourName) -> FaultOutcome:
-    """One flight with a fault, which is held to what is promised of all of them."""
     outcome = failsafe.fly(case, flavour, 1)
     names, (least_s, most_s), ending = STARTS[case]
     assert [name for name, _ in outcome.modes] == names
@@ -71,7 +71,7 @@ def test_a_client_that_is_killed_leaves_it_to_the_autopilots_time_out(
     flavour: FlavourName, mode: str, least_s: float, most_s: float
 ) -> None:
     """FS_GCS_TIMEOUT after the last heartbeat, COM_OF_LOSS_T after the last velocity."""
-    # Disarmed, PX4 is in the mode again that was asked for last.
+    # After disarming PX4 returns to the mode that was commanded last.
     (name, after_s), *_ = flown("client killed", flavour).autopilot
     assert name == mode
     assert least_s <= after_s <= most_s
@@ -81,12 +81,10 @@ def test_a_client_that_is_killed_leaves_it_to_the_autopilots_time_out(
 @pytest.mark.parametrize("flavour", BOTH)
 @pytest.mark.parametrize("case", STARTS)
 def test_each_fault_ends_as_promised(case: CaseName, flavour: FlavourName) -> None:
-    """Modes, times and the end, of each of both."""
     flown(case, flavour)
 
 
 def test_a_row_has_the_spread_of_its_flights() -> None:
-    """Times from least to most, largest distances, and both where they went different ways."""
     common = {"autopilot": (), "moved_m": 1.0, "off_path_m": 0.1}
     outcomes = [
         FaultOutcome(

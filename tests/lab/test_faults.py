@@ -1,4 +1,4 @@
-"""`lab.faults`: schedules of faults, drawn, shrunk, written and read."""
+"""`lab.faults`: schedules of faults are drawn, shrunk, written and read."""
 
 from dataclasses import replace
 
@@ -32,7 +32,6 @@ def test_the_same_seed_draws_the_same_schedule() -> None:
 
 
 def test_every_kind_is_drawn_everywhere_within_its_range() -> None:
-    """Each kind at each place, and each that has a sign with either."""
     faults = [fault for drawn in DRAWN for fault in drawn]
     assert set(RANGES) == set(FaultKind)
     places = {(kind, where) for kind in FaultKind for where in RANGES[kind].where}
@@ -50,7 +49,7 @@ def test_every_kind_is_drawn_everywhere_within_its_range() -> None:
 
 
 def test_a_schedule_is_in_order_and_has_a_fault_every_five_seconds() -> None:
-    """On the average of many, one more than that; and one at least in the shortest flight."""
+    """One more on average over many, and at least one in the shortest flight."""
     assert all(list(drawn) == sorted(drawn, key=lambda fault: fault.start_ns) for drawn in DRAWN)
     assert sum(map(len, DRAWN)) / len(DRAWN) == pytest.approx(13.0, rel=0.1)
     assert len(schedule(stream(1), 1)) == 1
@@ -85,7 +84,7 @@ def test_what_is_no_schedule_is_refused(line: str, said: str) -> None:
 @settings(max_examples=200)
 @given(st.integers(0, 299), st.data())
 def test_a_schedule_shrinks_to_the_faults_that_matter(seed: int, data: st.DataObject) -> None:
-    """Whichever these are, each as short as it may be, and within a factor of two of what fails."""
+    """For any set of relevant faults; each is shortened to within a factor of two."""
     drawn = DRAWN[seed]
     culprits = data.draw(st.sets(st.sampled_from(drawn), min_size=1, max_size=3))
     needed_ns = {fault.start_ns: fault.length_ns // 5 for fault in culprits}
@@ -102,12 +101,11 @@ def test_a_schedule_shrinks_to_the_faults_that_matter(seed: int, data: st.DataOb
 
 
 def test_what_fails_whatever_happens_shrinks_to_nothing() -> None:
-    """A flight that fails without faults needs none."""
     assert shrink(DRAWN[0], lambda _: True) == ()
 
 
 def test_shrinking_asks_seldom() -> None:
-    """For two culprits among 1000 faults, less than a tenth as often as one by one."""
+    """For two relevant faults of 1000, less than a tenth of the calls of one by one."""
     many = tuple(ScheduledFault(FaultKind.STEP, "server", start, 0, 1.0) for start in range(1000))
     asked = []
 

@@ -1,4 +1,4 @@
-"""The register of figures: its texts stand in their pages, and measured tables are in it."""
+"""Register of figures: its texts are in their pages, and every measured table is registered."""
 
 import math
 import re
@@ -36,7 +36,7 @@ NOT_MEASURED = {
     "docs/torture.md: The invariants": "bounds",
     "docs/triggers.md: Policies": "defaults",
 }
-"""Pages and sections with numbers in tables that nobody has measured, and what they are."""
+"""Pages and sections with tables of numbers that are not measured, and what the numbers are."""
 TABLE = re.compile(r"(?:^\|.*\n)+", re.MULTILINE)
 
 
@@ -54,8 +54,8 @@ def test_a_registered_table_has_a_place_in_its_page(name: str) -> None:
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_every_table_of_measurements_says_where_its_numbers_come_from(page: Path) -> None:
-    """A table with two decimals or percentages in it is taken for measured. It is registered, or
-    made by `make bench`, or its section names the commit at which it was measured.
+    """A table with two decimals or percentages counts as measured. It is registered, or made by
+    `make bench`, or its section names the commit of the measurement.
     """
     name, text = str(page.relative_to(ROOT)), "\n" + page.read_text()
     ours = [each for each in REGISTER.values() if each.page == name]
@@ -63,7 +63,8 @@ def test_every_table_of_measurements_says_where_its_numbers_come_from(page: Path
     known += [
         match.span()
         for table in [*(table for each in ours for table in each.tables), r"[\w -]+"]
-        if table in text or name == "docs/performance.md"  # of which `python -m bench` makes all
+        if table in text
+        or name == "docs/performance.md"  # `python -m bench` makes all of that page
         for match in re.finditer(rf"<!-- table: {table} -->.*?<!-- end -->", text, re.DOTALL)
     ]
     lost = []
@@ -144,7 +145,6 @@ def test_statistics_are_of_all_seeds() -> None:
 def test_the_command_says_what_has_moved_and_corrects_it_on_request(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The second run flies nothing: the flights of the first are kept."""
     (tmp_path / "figures.toml").write_text(
         """[demo]
 page = "page.md"

@@ -1,4 +1,4 @@
-"""Floods: what a server does with each packet of one, what its kernel keeps out, and a flight."""
+"""Floods: handling of each kind of packet by the server and the kernel's filter, and a flight."""
 
 import secrets
 import socket
@@ -27,8 +27,6 @@ linux = pytest.mark.skipif(sys.platform != "linux", reason="the filter is one of
 
 
 class Linked(NamedTuple):
-    """A vehicle's link with a server, and packets of the vehicle's."""
-
     gate: SecureGate
     ends: Ends
     observation: bytes
@@ -37,7 +35,7 @@ class Linked(NamedTuple):
 
 @pytest.fixture
 def linked() -> Linked:
-    """Both ends, which have shaken hands."""
+    """Both ends after the handshake."""
     plain = {type(message): encode(message) for message in messages(load("demo").terms())}
     keyring = make_keys(1, 1)
     gate = SecureGate(keyring, entropy=secrets.token_bytes)
@@ -49,7 +47,7 @@ def linked() -> Linked:
 
 
 def refusals(gate: SecureGate, packets: Iterable[bytes]) -> set[str]:
-    """Reasons for which packets are refused; "" of one that is not."""
+    """Reasons for which packets are refused; "" for an accepted packet."""
     found = set()
     for packet in packets:
         try:
@@ -62,7 +60,7 @@ def refusals(gate: SecureGate, packets: Iterable[bytes]) -> set[str]:
 
 
 def test_forgeries_get_as_far_as_they_are_meant_to(linked: Linked) -> None:
-    """Under a good header to the AEAD, with the packet of the vehicle's still to be opened."""
+    """Forgeries under a good header fail at the AEAD; the vehicle's packet can still be opened."""
     packets = flood.forgeries(linked.observation)
     assert {len(packet) for packet in packets} == {len(linked.observation)}
     assert refusals(linked.gate, packets[::2]) == {"forged"}
@@ -73,7 +71,7 @@ def test_forgeries_get_as_far_as_they_are_meant_to(linked: Linked) -> None:
 
 
 def test_hellos_get_as_far_as_they_are_meant_to(linked: Linked) -> None:
-    """Random ones to the MAC; a real one that is repeated draws a challenge and nothing more."""
+    """Random HELLOs fail at the MAC; a repeated real one is answered by a challenge only."""
     packets = flood.hellos(linked.ends.first)
     assert refusals(linked.gate, packets[::2]) == {"forged"}
     assert refusals(linked.gate, packets[1:20:2]) == {""}
@@ -84,7 +82,7 @@ def test_hellos_get_as_far_as_they_are_meant_to(linked: Linked) -> None:
 
 
 def passes(forms: Iterable[Form], packets: Iterable[bytes]) -> list[bool]:
-    """Packets that pass a socket with a filter for some forms, or without a filter."""
+    """Whether each packet passes a socket with a filter for some forms, or without a filter."""
     forms, came = tuple(forms), []
     with open_socket(("127.0.0.1", 0)) as sock, socket.socket(type=socket.SOCK_DGRAM) as sender:
         if forms:
@@ -123,7 +121,7 @@ def test_only_admitted_forms_come_through() -> None:
 
 @linux
 def test_all_that_a_vehicle_sends_comes_through_and_random_bytes_do_not(linked: Linked) -> None:
-    """A HELLO in plaintext does as well, as the operator is to be told; nothing else in it does."""
+    """A plaintext HELLO passes too, so that the server can log it; no other plaintext does."""
     ends, plain = linked.ends, linked.plain
     assert passes(FORMS, [ends.first, ends.second, linked.observation, plain[Hello]]) == [True] * 4
     rng = np.random.default_rng(1)
@@ -132,7 +130,7 @@ def test_all_that_a_vehicle_sends_comes_through_and_random_bytes_do_not(linked: 
 
 
 def test_a_flight_goes_on_beside_a_flood(monkeypatch: pytest.MonkeyPatch) -> None:
-    """With real processes, at a small rate: it is refused and kept out, and a newcomer flies."""
+    """With real processes at a small rate; a new vehicle can join."""
     monkeypatch.setattr(flood, "KINDS", (FORGED,))
     result = flood.measure(FloodCounts(seconds=2, forged=2000, hellos=0, lead_s=0.5))
     (found,) = flood.floods_of(result)

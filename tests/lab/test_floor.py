@@ -1,4 +1,4 @@
-"""`lab.floor`: what nobody can have answered yet, and a flight that needs no network."""
+"""`lab.floor`: lower bounds of the error, and flights without a network."""
 
 import math
 
@@ -18,7 +18,6 @@ from skytether.sim.flight import fly
 
 
 def aged(flown: Scenario, age_steps: int, plan_steps: int) -> Rows:
-    """Record of a flight, all of whose inputs have the same age."""
     rows = np.zeros(flown.steps, client_columns(flown.model.axes))
     rows["step"] = np.arange(flown.steps)
     rows["age_ns"] = age_steps * flown.dt_ns
@@ -44,7 +43,7 @@ def test_the_winds_floor_is_what_it_does_until_an_input_has_done_its_work() -> N
 
 
 def test_the_targets_floor_is_how_it_leaves_its_own_velocity() -> None:
-    """While the plan grows old and for a step more; what the server sees ahead does not count."""
+    """Over the age of the plan and one step; the preview does not count."""
     free = {"shape": "target", "preview": "none", "agility": 0.3}
     flown = packaged("target", duration=10.0, settle=5.0, reference=free)
     walk = reference.target(stream(1, "test"), 2, agility=0.3, speed_mps=1e3, radius_m=1e6)
@@ -62,7 +61,7 @@ def test_the_targets_floor_is_how_it_leaves_its_own_velocity() -> None:
 
 
 def test_steps_without_a_plan_lower_a_floor() -> None:
-    """Nobody knows what was flown then; what counts is from `settle` on."""
+    """Such steps count as undisturbed; only steps from `settle` on count."""
     flown = packaged("target", duration=10.0, settle=5.0, vehicle={"wind": 0.1})
     rows = aged(flown, 19, 10)
     floors = np.array([floor(flown, rows) for floor in (wind_floor_m, target_floor_m)])
@@ -73,7 +72,7 @@ def test_steps_without_a_plan_lower_a_floor() -> None:
 
 
 def test_a_reference_aboard_needs_no_packets() -> None:
-    """In calm air it flies the circle to the tenth of a millimetre."""
+    """In calm air it flies the circle within 0.1 mm."""
     summary = summarise_aboard(packaged("paper", duration=30.0, settle=20.0))
     assert summary.rmse_xy is not None
     assert summary.rmse_xy < 1e-4
@@ -82,7 +81,7 @@ def test_a_reference_aboard_needs_no_packets() -> None:
 
 
 def test_feedback_aboard_comes_as_near_as_no_packets_at_all() -> None:
-    """In wind, with the same gain: of a trajectory known for ever the network tells nothing."""
+    """In wind, with the same gain: a known trajectory needs no information from the network."""
     tight = {"state_weight": [7.1, 0.001], "terminal_weight": [15.0, 1.5]}
     tight |= {"input_weight": 0.0301, "change_weight": 0.0}
     sent = {"scheme": "committed", "feedback": True, "trigger": "cost_gap(6e-4)"}
@@ -94,7 +93,7 @@ def test_feedback_aboard_comes_as_near_as_no_packets_at_all() -> None:
 
 
 def test_a_vehicle_with_its_reference_aboard_measures_itself_with_noise() -> None:
-    """It flies by what its filter makes of that; the error is of the truth."""
+    """The vehicle flies by its filter; the error is of the true position."""
     noisy = packaged(
         "paper", duration=20.0, sensor={"position_noise_m": 0.05, "velocity_noise_mps": 0.1}
     )
@@ -106,6 +105,5 @@ def test_a_vehicle_with_its_reference_aboard_measures_itself_with_noise() -> Non
 
 
 def test_what_only_the_server_knows_is_not_aboard() -> None:
-    """A target cannot be flown without a network."""
     with pytest.raises(ValueError, match="'target'"):
         fly_aboard(packaged("target"))

@@ -1,4 +1,4 @@
-"""`fuzz`: whatever others send or write, only the documented error comes of it, and bounds hold."""
+"""`fuzz`: hostile inputs raise only documented errors, and bounds hold."""
 
 import math
 from pathlib import Path
@@ -38,12 +38,10 @@ COUNTS = {
     "page": 300,
     "log": 5_000,
 }
-"""Number of inputs of each target here; `make fuzz` gives it more."""
 BY_AXES = pytest.mark.parametrize("scenario", SCENARIOS, ids=["2-D", "3-D", "splines"])
 
 
 def attack(target: Target, count: int) -> None:
-    """Give a target so many inputs."""
     rng = Random(1)
     for _ in range(count):
         target(target.next(rng))
@@ -51,7 +49,6 @@ def attack(target: Target, count: int) -> None:
 
 @pytest.mark.parametrize("name", TARGETS)
 def test_hostile_inputs_break_no_promise(name: str, tmp_path: Path) -> None:
-    """Corpus, seeds of the target, and mutated ones of these."""
     target = TARGETS[name](tmp_path)
     for payload in (*corpus().values(), *target.seeds()[:30], b""):
         target(payload)
@@ -59,7 +56,6 @@ def test_hostile_inputs_break_no_promise(name: str, tmp_path: Path) -> None:
 
 
 def test_functions_of_a_module_are_its_own_and_those_of_its_classes() -> None:
-    """Not those that it has from elsewhere."""
     names = {each.__qualname__ for each in functions(feed)}
     assert names == {
         "pack",
@@ -83,7 +79,7 @@ def test_seeds_are_messages_of_every_type(scenario: Scenario) -> None:
 
 @BY_AXES
 def test_a_flight_goes_on_whatever_is_said_to_both_ends(scenario: Scenario) -> None:
-    """Payloads reach past the decoder, into session and plausibility, and bounds hold."""
+    """Payloads pass the decoder and reach session and plausibility checks."""
     flight = EndpointInFlight(scenario)
     attack(flight, 8_000)
     dropped = {*flight.server.dropped, *flight.client.dropped}
@@ -94,7 +90,6 @@ def test_a_flight_goes_on_whatever_is_said_to_both_ends(scenario: Scenario) -> N
 
 
 def test_strangers_are_kept_out_at_every_place() -> None:
-    """Strangers' packets are dropped for every possible reason, and the flight goes on."""
     strangers = Strangers()
     attack(strangers, 3_000)
     at_server, at_newcomer = strangers.server.dropped, strangers.newcomer.dropped
@@ -105,9 +100,7 @@ def test_strangers_are_kept_out_at_every_place() -> None:
 
 
 def test_the_holder_of_a_key_reaches_past_the_handshake() -> None:
-    """The content of its packets is opened: it is accepted as itself, or dropped for its
-    content.
-    """
+    """Its packets are decrypted, then accepted, or dropped because of their content."""
     holder, rng, came = Holder(), Random(1), set()
     for _ in range(400):
         holder(holder.next(rng))
@@ -120,13 +113,13 @@ def test_the_holder_of_a_key_reaches_past_the_handshake() -> None:
     assert dropped >= {Drop.FORGED, Drop.OUT_OF_PLACE, Drop.FIELD}
 
 
-# -- what would be found out -----------------------------------------------------------------------
+# -- planted faults --------------------------------------------------------------------------------
 
 
 def test_a_decoder_that_does_not_look_at_shapes_is_found_out(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Arrays of another shape, or no arrays, then raise an undocumented error."""
+    """Arrays of another shape, or other types, then raise an undocumented error."""
     monkeypatch.setattr(
         protocol,
         "_array",
@@ -138,7 +131,7 @@ def test_a_decoder_that_does_not_look_at_shapes_is_found_out(
 
 
 def test_a_gate_that_looks_at_no_checksum_is_found_out(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A client then answers each challenge that anybody has made up."""
+    """A client then answers every forged challenge."""
     monkeypatch.setattr(handshake, "is_authentic", lambda *_: True)
     with pytest.raises(AssertionError):
         attack(Strangers(), 3_000)
@@ -160,14 +153,14 @@ def test_a_reader_that_forgets_an_error_is_found_out(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """One that knows those of its library alone."""
+    """The reader catches only the errors of its library."""
     monkeypatch.setattr(module, errors, (msgspec.DecodeError, McapError))
     with pytest.raises(raised):
         attack(TARGETS[name](tmp_path), 2_000)
 
 
 def test_figures_without_a_value_are_those_that_were_sent(tmp_path: Path) -> None:
-    """A NaN equals nothing, itself included: read in pieces it is the same all the same."""
+    """NaN differs from itself; figures read in pieces still compare as equal."""
     TARGETS["feed"](tmp_path)(feed.encode(feed.Figures(time_ns=1, figures={"p50": math.nan})))
 
 
@@ -175,13 +168,10 @@ def test_figures_without_a_value_are_those_that_were_sent(tmp_path: Path) -> Non
 
 
 class Fussy(Decoder):
-    """A target that breaks at some inputs."""
-
     def __init__(self, _: Path, fussy: int = 250) -> None:
         self._fussy = fussy
 
     def __call__(self, payload: bytes) -> None:
-        """Break where the first byte is large."""
         if payload and payload[0] > self._fussy:
             raise ZeroDivisionError
 

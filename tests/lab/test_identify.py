@@ -1,6 +1,4 @@
-"""Identification: numbers that were true are found, steps stay inside the fence, and what is
-written flies.
-"""
+"""Identification: parameters are found, steps stay inside the fence, the result can be flown."""
 
 import csv
 import json
@@ -49,7 +47,7 @@ CALM = {"wind": 0.0, "gust_mps2": 0.0}
 
 
 def scenario(name: str = "demo", **sections: Any) -> Scenario:
-    """The scenario demo without wind, with other keys in its sections."""
+    """The scenario demo without wind, with some keys changed."""
     return packaged(name, {"vehicle": CALM} | sections)
 
 
@@ -59,14 +57,14 @@ def scenario(name: str = "demo", **sections: Any) -> Scenario:
 def answered(
     truth: Numbers, rng: np.random.Generator, *, noise: float = 0.0, count: int = 8
 ) -> list[StepResponse]:
-    """Steps out and back that a vehicle of first order answers, by small steps of time."""
+    """Steps out and back of a first-order vehicle, simulated in small time steps."""
     made = []
     for number in range(count):
         size = (1.0, -1.0)[number % 4 // 2] * 0.8
         before, after = (0.0, size) if number % 2 == 0 else (size, 0.0)
         times = np.sort(rng.uniform(-0.75, 3.0, 80))
         v, at, told = truth.gain * before, -1.0, []
-        for time in times:  # over the stretch before the input acts, and the one after it
+        for time in times:  # before the input acts, and after
             for end, u in ((min(max(truth.dead_time_s, at), time), before), (time, after)):
                 v = truth.gain * u + (v - truth.gain * u) * math.exp(-(end - at) / truth.tau_s)
                 at = end
@@ -78,7 +76,6 @@ def answered(
 
 
 def found(made: Sequence[StepResponse]) -> Fit:
-    """The fit of responses that are enough."""
     best = fit(made)
     assert best is not None
     return best
@@ -95,7 +92,7 @@ def found(made: Sequence[StepResponse]) -> Fit:
 def test_numbers_that_were_true_are_found(
     gain: float, tau: float, late: float, noise: float, seed: int
 ) -> None:
-    """Within twice their intervals, from noisy velocities by irregular stamps, in any wind."""
+    """Within twice their intervals, from noisy velocities with irregular stamps, in any wind."""
     truth = Numbers(gain, tau, late)
     best = found(answered(truth, np.random.default_rng(seed), noise=noise))
     for true, number, within in zip(truth, best.numbers, best.within, strict=True):
@@ -104,17 +101,16 @@ def test_numbers_that_were_true_are_found(
 
 
 def test_intervals_hold_the_truth_as_often_as_they_say() -> None:
-    """95 %, and no fewer than 90 % of 75 numbers."""
+    """Nominally 95 %; at least 90 % of 75 parameters here."""
     truth, shares = Numbers(0.9, 0.45, 0.27), []
     for seed in range(25):
         best = found(answered(truth, np.random.default_rng(seed), noise=0.05))
         shares += (np.abs(np.array(best.numbers) - truth) / best.within).tolist()
     assert np.mean(np.array(shares) <= 1.0) >= 0.9
-    assert np.mean(shares) > 0.2  # none is so wide that it says nothing
+    assert np.mean(shares) > 0.2  # no interval is uselessly wide
 
 
 def second_order(damping: float) -> list[StepResponse]:
-    """Steps that a vehicle answers which swings."""
     made = []
     for response in answered(Numbers(1.0, 0.3, 0.1), np.random.default_rng(1)):
         w, t = 3.0 * math.sqrt(1.0 - damping**2), np.maximum(response.times, 0.0)
@@ -125,7 +121,7 @@ def second_order(damping: float) -> list[StepResponse]:
 
 
 def test_what_is_no_first_order_is_said_to_be_none() -> None:
-    """One that swings; and one that hardly does is not refused."""
+    """An oscillating one is rejected; a nearly aperiodic one is not."""
     assert "will not do" in verdict(found(second_order(0.2)))
     assert "will do" in verdict(found(second_order(0.95)))
 
@@ -136,7 +132,7 @@ def test_what_noise_hides_is_said_to_be_unknown() -> None:
 
 
 def test_a_model_of_another_vehicle_is_off_by_as_much_as_the_vehicles_differ() -> None:
-    """A dead time of 0.1 s more is worth the rise within that time, of a step's height."""
+    """0.1 s more of dead time gives an error of the rise within that time."""
     truth = Numbers(1.0, 0.5, 0.1)
     made = answered(truth, np.random.default_rng(0))
     off = misfit(made, truth._replace(dead_time_s=0.2))
@@ -152,7 +148,7 @@ def test_too_few_steps_tell_nothing() -> None:
 
 
 def test_inputs_before_a_step_are_answered_as_well() -> None:
-    """The response that has not settled when the step comes is predicted with it."""
+    """The unsettled response to an earlier step is part of the prediction."""
     changes = np.array([[-1.0, 1.0], [0.0, -1.0]])
     times = np.array([0.0, 0.1, 0.5])
     response = StepResponse(1.0, 0.0, changes, times, times)
@@ -163,7 +159,7 @@ def test_inputs_before_a_step_are_answered_as_well() -> None:
 
 
 def test_measurements_belong_to_a_step_by_their_stamps() -> None:
-    """Whenever they came; those without a velocity, and steps with hardly any, are left out."""
+    """In any order of arrival; without measurements that have no velocity, and steps with few."""
     second = 1_000_000_000
     inputs = [(0, [0.0]), (second, [1.0]), (2 * second, [0.0])]
     measured = [Measurement(n * second // 20, [0.0], [float(n)]) for n in reversed(range(45))]
@@ -174,7 +170,7 @@ def test_measurements_belong_to_a_step_by_their_stamps() -> None:
         FlownStep(1, 1.0, 0.0, 0, second),
     ]
     (one,) = responses(inputs, measured, steps, 0)
-    assert sorted(one.velocity.tolist()) == list(range(15, 40))  # and a while before it
+    assert sorted(one.velocity.tolist()) == list(range(15, 40))  # including a time before the step
     assert one.changes.tolist() == [[0.0, 1.0]]
 
 
@@ -184,7 +180,6 @@ def test_measurements_belong_to_a_step_by_their_stamps() -> None:
 def flown(
     asked: Scenario, plan: ExperimentPlan | None = None, flies: Vehicle | None = None
 ) -> tuple[Identifying, World]:
-    """An identification in virtual time, until its end."""
     plan = plan or ExperimentPlan(default_speeds(asked), default_hold_s(asked), 1)
     within = fenced(asked, plan)
     endpoint = Identifying(within, flies or vehicles.make(asked, 1), Experiment(within, plan))
@@ -195,7 +190,6 @@ def flown(
 
 
 def fits(endpoint: Identifying) -> list[Fit | None]:
-    """Identified models of each axis."""
     steps = endpoint.experiment.steps
     return [
         fit(responses(endpoint.inputs, endpoint.measured, steps, axis))
@@ -204,7 +198,6 @@ def fits(endpoint: Identifying) -> list[Fit | None]:
 
 
 def test_a_simulated_vehicle_is_found_out() -> None:
-    """To the last digit, for it is of first order with dead time."""
     truth = {"gain": [1.1, 0.9], "tau_s": [0.5, 0.3], "dead_time_s": [0.27, 0.0]}
     endpoint, _ = flown(scenario(vehicle=CALM | truth))
     assert endpoint.why == ""
@@ -216,7 +209,6 @@ def test_a_simulated_vehicle_is_found_out() -> None:
 
 
 def test_a_vehicle_comes_back_to_where_it_began() -> None:
-    """It is never further than the plan says, and in the end it is home."""
     endpoint, _ = flown(scenario(vehicle=CALM | {"start_m": [3.0, -2.0]}))
     path = np.array([each.position for each in endpoint.measured]) - (3.0, -2.0)
     plan = endpoint.experiment.plan
@@ -226,7 +218,6 @@ def test_a_vehicle_comes_back_to_where_it_began() -> None:
 
 @pytest.mark.parametrize("seed", range(12))
 def test_an_experiment_stays_inside_the_fence(seed: int) -> None:
-    """The vehicle may be of any kind, with steps that fit the fence or do not."""
     rng = np.random.default_rng(seed)
     low, high = -rng.uniform(2.5, 7.0, 2), rng.uniform(2.5, 7.0, 2)
     truth = {
@@ -249,13 +240,13 @@ def test_an_experiment_stays_inside_the_fence(seed: int) -> None:
     experiment = endpoint.experiment
     assert len(experiment.steps) + sum(experiment.cut) == 16
     flown_at = dict(endpoint.inputs)
-    for step in experiment.steps:  # those that are used were flown at their size, all along
+    for step in experiment.steps:  # used steps were flown at full size throughout
         during = [u for t, u in flown_at.items() if step.began_ns <= t < step.ended_ns]
         assert {u[step.axis] for u in during} == {step.after}
 
 
 def test_steps_without_room_are_not_flown() -> None:
-    """The words say what would help; the other axis is identified all the same."""
+    """The message says what would help; the other axis is still identified."""
     asked = scenario(
         fence={"low_m": [-30.0, -2.2], "high_m": [30.0, 2.2]},
         reference={"shape": "hover", "points_m": [[0.0, 0.0]]},
@@ -270,7 +261,7 @@ def test_steps_without_room_are_not_flown() -> None:
 
 
 def test_a_step_down_needs_a_floor() -> None:
-    """Without one the altitude goes up and back, however little room the ceiling leaves."""
+    """Without a lower bound the altitude goes up and back, even below a low ceiling."""
     space = {"model": {"axes": 3}, "reference": {"altitude_m": 5.0}}
     plan = ExperimentPlan((0.4, 0.4, 0.4), 3.0, 1)
     ceiling = {"high_m": [30.0, 30.0, 7.5]}
@@ -284,7 +275,7 @@ def test_a_step_down_needs_a_floor() -> None:
 
 
 class Told(Endpoint):
-    """A line to hardware that notes that it was closed."""
+    """Line to hardware that records its closing."""
 
     closed = False
 
@@ -298,12 +289,11 @@ class Told(Endpoint):
         """Never."""
 
     def close(self, *, now_ns: int) -> None:  # noqa: ARG002
-        """Note it."""
         self.closed = True
 
 
 class Cart(Vehicle):
-    """A vehicle that has any velocity at once, is ready after 2 s, and may be hindered after 10."""
+    """Vehicle that reaches any velocity at once, ready after 2 s, maybe hindered after 10 s."""
 
     def __init__(self, hindrance: Reason | None = None, *, blind: bool = False) -> None:
         self.port = Told()
@@ -313,12 +303,10 @@ class Cart(Vehicle):
         self._p, self._v, self._at = np.zeros(2), np.zeros(2), 0
 
     def fly(self, velocity: Array) -> None:
-        """See `Vehicle`."""
         self.inputs.append(velocity)
         self._v = velocity
 
     def measurements(self, *, now_ns: int) -> Sequence[Measurement]:
-        """See `Vehicle`."""
         self._p = self._p + self._v * (now_ns - self._at) / 1e9
         self._at = now_ns
         known = [] if self._blind and now_ns > 5 * 10**9 else [0]
@@ -326,28 +314,24 @@ class Cart(Vehicle):
         return [Measurement(now_ns, position, self._v.tolist()) for _ in known]
 
     def take_off(self, *, now_ns: int) -> bool:
-        """See `Vehicle`."""
         self._at = now_ns
         return now_ns >= 2 * 10**9
 
     def hindrance(self, *, now_ns: int) -> Reason | None:
-        """See `Vehicle`."""
         return self._hindrance if now_ns > 10 * 10**9 else None
 
     def land(self) -> bool:
-        """See `Vehicle`."""
         self.landed = True
         return True
 
     @property
     def is_down(self) -> bool:
-        """See `Vehicle`."""
         return self.landed
 
 
 @pytest.mark.parametrize("why", [Reason.TAKEN, Reason.BATTERY, Reason.ASTRAY, Reason.DISARMED])
 def test_what_hinders_a_vehicle_ends_its_flight_at_once(why: Reason) -> None:
-    """It lands by itself, unless a pilot has it; nothing but zero is flown after that."""
+    """It lands, unless a pilot has taken over; afterwards only zero is commanded."""
     cart = Cart(why)
     endpoint, world = flown(scenario(), flies=cart)
     assert endpoint.finished
@@ -360,7 +344,6 @@ def test_what_hinders_a_vehicle_ends_its_flight_at_once(why: Reason) -> None:
 
 
 def test_a_vehicle_whose_state_is_unknown_is_not_flown() -> None:
-    """It lands after a second."""
     cart = Cart(blind=True)
     endpoint, world = flown(scenario(), flies=cart)
     assert endpoint.why == str(Reason.NOT_FINITE)
@@ -369,7 +352,6 @@ def test_a_vehicle_whose_state_is_unknown_is_not_flown() -> None:
 
 
 def test_a_flight_that_is_broken_off_closes_the_line() -> None:
-    """Which lets the vehicle land; what was measured is there."""
     cart = Cart()
     asked = scenario()
     plan = ExperimentPlan((0.5, 0.5), 3.0, 1)
@@ -404,7 +386,7 @@ def over_mavlink(asked: Scenario, flavour: FlavourName, plan: ExperimentPlan) ->
 def test_the_documented_field_flies_at_once_with_the_model_identified(
     flavour: FlavourName, tmp_path: Path
 ) -> None:
-    """That of docs/fly-a-real-one.md, with steps of the default size inside its own fence."""
+    """With steps of the default size inside the fence of docs/fly-a-real-one.md."""
     file = tmp_path / "field.toml"
     file.write_text(documented())
     loaded = reading.load(str(file))
@@ -429,7 +411,6 @@ def test_the_documented_field_flies_at_once_with_the_model_identified(
 
 @pytest.mark.parametrize("flavour", ["ardupilot", "px4"])
 def test_an_autopilot_is_identified(flavour: Any) -> None:
-    """Over MAVLink, by the clock of a client that is not the autopilot's; then it is down."""
     asked = scenario(
         model={"u_max": [3.0]},
         reference={"radius_m": 5.0},
@@ -440,7 +421,7 @@ def test_an_autopilot_is_identified(flavour: Any) -> None:
     errs = flavour == "px4"
     for each in fits(endpoint):
         assert each is not None
-        # One repetition of a PX4 that estimates its velocity within 0.16 m/s of steps of 1 m/s.
+        # PX4 estimates its velocity within 0.16 m/s; one repetition of steps of 1 m/s.
         assert list(each.numbers) == pytest.approx(expected, abs=0.15 if errs else 0.04)
         assert each.misfit.largest < (0.3 if errs else 0.1)
 
@@ -451,7 +432,6 @@ def test_an_autopilot_is_identified(flavour: Any) -> None:
 def test_what_is_identified_flies_at_once(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Better than by the model before, with what the command line changed, and what was true."""
     monkeypatch.chdir(tmp_path)
     changed = ["--vehicle.tau-s", "0.4", "--vehicle.dead-time-s", "0.2", "--vehicle.gain", "0.8"]
     changed += ["--duration", "20", "--vehicle.wind", "0", "--repeats", "1"]
@@ -471,7 +451,7 @@ def test_what_is_identified_flies_at_once(
 
 
 def rmse(asked: Scenario) -> float:
-    """Error of a flight in the plane, rms [m]."""
+    """RMS error of a flight in the plane [m]."""
     record = flight.fly(asked)
     wanted = asked.make_reference()(record.client["step"] * asked.control.dt)
     off = record.client["state"][200:, :, 0] - wanted[200:, :, 0]
@@ -481,7 +461,7 @@ def rmse(asked: Scenario) -> float:
 def test_other_sizes_of_step_and_files_for_programs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A vehicle of first order is the same at any size: a wrong one costs nothing."""
+    """A first-order vehicle has the same model at any size, so the error of a wrong size is 0."""
     monkeypatch.chdir(tmp_path)
     argv = ["simulated", "--speed", "0.5", "--also", "0.2", "--repeats", "1", "--hold", "3"]
     assert command.main(identify, [*argv, "--vehicle.wind", "0"], "identify") == 0
@@ -547,7 +527,7 @@ def test_what_cannot_be_flown_is_refused(
 
 
 def test_steps_are_as_large_as_what_will_be_flown() -> None:
-    """The figure eight's own speed; half of it where it does not go, and less where it must be."""
+    """The figure eight's speed; at least half of it on an axis at rest, and less within limits."""
     assert default_speeds(scenario()) == (0.42, 0.42)
     space = {"model": {"axes": 3}, "reference": {"altitude_m": 5.0, "radius_m": 5.0}}
     assert default_speeds(scenario(**space)) == (1.05, 1.05, 0.52)

@@ -1,4 +1,4 @@
-"""Missions whose server dies: what an operator has set, and vehicles that are found in a zone."""
+"""Missions whose server restarts: keys set by an operator, and vehicles found inside a zone."""
 
 from lives import Death, Lives
 from skytether.shared.core.events import InZone
@@ -10,16 +10,15 @@ CENTRE = zone_texts.parse(BOX, 2)
 
 
 def swap() -> Scenario:
-    """Four vehicles that swap places across the centre."""
     table = reading.to_table(reading.load("swap"))
     table |= {"duration": 50.0, "seed": 3}
-    table["link"]["timeout_s"] = 9.0  # a server that has begun anew is noticed by its silence
+    table["link"]["timeout_s"] = 9.0  # a restarted server is detected by its silence
     table["reference"]["shape"] = "swap(4)"
     return reading.check(table, "swap")
 
 
 def test_a_zone_set_in_flight_is_kept_clear_of_after_a_death_of_the_server() -> None:
-    """It was set while nobody could fly into it; without the journal vehicles are inside it."""
+    """The zone was free when it was set; without the journal vehicles fly into it."""
     setting = [(3.0, {"mission.zones": BOX})]
     kept = Lives(swap(), deaths=[Death(4.0, 1.0)], settings=setting)
     kept.fly(30.0)
@@ -30,7 +29,7 @@ def test_a_zone_set_in_flight_is_kept_clear_of_after_a_death_of_the_server() -> 
 
 
 def test_a_vehicle_found_at_rest_in_a_zone_is_told_and_led_out() -> None:
-    """The server began again with a zone across motions; nobody stays in it."""
+    """The server restarted with a zone across motions; all vehicles leave it."""
     flight = Lives(swap(), deaths=[Death(6.0, 0.5, zones="box(-2, 2, -2, 2)")])
     flight.fly(45.0)
     told = [event for _, _, event in flight.events if isinstance(event, InZone)]

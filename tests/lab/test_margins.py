@@ -1,4 +1,4 @@
-"""Margins: flights give what theory gives, and show which vehicles oscillate for ever."""
+"""Margins: flights agree with theory, and show which vehicles end in a limit cycle."""
 
 import csv
 import json
@@ -32,7 +32,7 @@ BLIND = {
     "control__input_weight": 0.1,
     "control__input_reference": False,
 }
-"""Committed inputs alone, at tight weights."""
+"""Committed inputs without feedback, at tight weights."""
 NOISE = {"sensor__position_noise_m": 0.01, "sensor__velocity_noise_mps": 0.02}
 TRAJECTORY = {
     "control__scheme": "trajectory",
@@ -43,8 +43,7 @@ TRAJECTORY = {
 def regulated(scenario: Scenario, gain: float = 1.0) -> tuple[Array, Array]:
     """Closed loop F of p, v and u(k-1) along a trajectory, and its feedback K.
 
-    Args:
-        gain: gain of the vehicle over that of the model.
+    `gain` is the vehicle's relative to the model's.
     """
     model, (gain_p, gain_v, lag) = scenario.terms().model, regulator(scenario)[0]
     K = np.array([(1.0 - lag) * gain_p, (1.0 - lag) * gain_v, -lag])
@@ -57,9 +56,7 @@ def regulated(scenario: Scenario, gain: float = 1.0) -> tuple[Array, Array]:
 
 @pytest.mark.parametrize("change_weight", [0.0, 0.05])
 def test_a_regulator_aboard_has_the_margin_of_its_lyapunov_equation(change_weight: float) -> None:
-    """Along a trajectory x and u(k-1) regulate themselves whatever arrives: P = F P Fᵀ + W, and
-    ρ(F)² is the growth.
-    """
+    """Along a trajectory x and u(k-1) are regulated aboard: P = F P Fᵀ + W; growth is ρ(F)²."""
     scenario = demo_with(
         **TRAJECTORY,
         control__input_weight=0.01,
@@ -80,7 +77,7 @@ def test_a_regulator_aboard_has_the_margin_of_its_lyapunov_equation(change_weigh
 
 
 def test_the_limit_of_a_regulators_gain_is_where_its_eigenvalue_leaves_the_circle() -> None:
-    """Bisection by flights; just below the limit a push decays, just above it grows."""
+    """Bisection by flights: just below the limit a push decays, just above it grows."""
     scenario = demo_with(**TRAJECTORY, control__input_weight=0.01, sensor__filter="none")
 
     def radius(gain: float) -> float:
@@ -100,7 +97,7 @@ def test_the_limit_of_a_regulators_gain_is_where_its_eigenvalue_leaves_the_circl
 
 
 def test_noise_does_not_hide_how_a_push_decays() -> None:
-    """The flight without the push is taken off: the same noise stays in neither."""
+    """A flight without the push, with the same noise, is subtracted."""
     scenario = demo_with(control__trigger="always", **NOISE, sensor__filter="none")
     exact = demo_with(control__trigger="always", sensor__filter="none")
     noisy, alone = (growth_of(each, "always", 2)[0] for each in (scenario, exact))
@@ -108,13 +105,12 @@ def test_noise_does_not_hide_how_a_push_decays() -> None:
 
 
 def test_a_vehicle_that_is_not_reached_is_not_stable() -> None:
-    """No plan arrives, so that nothing brings it back."""
     silent = demo_with(network__uplink="loss(1)", link__connect_s=5.0)
     assert growth_of(silent, "always", 1) == (np.inf, None)
 
 
 def test_only_what_looks_at_the_clock_sends_after_a_weak_push() -> None:
-    """Any other trigger is replaced by a period that sends as often."""
+    """Any other trigger is replaced by a period with the same rate."""
     for trigger in ("always", "periodic(7)", "periodic(7) | silence(1)", "always & budget(5, 2)"):
         assert not uses_state(demo_with(control__trigger=trigger))
     for trigger in ("cost_gap", "deviation(0.1) | silence(1)", "state_gap(3.6, 1.5)"):
@@ -122,11 +118,11 @@ def test_only_what_looks_at_the_clock_sends_after_a_weak_push() -> None:
     rare = clocked_trigger(demo_with(control__trigger="cost_gap(1e9) | silence(1)", duration=20.0))
     name, period = rare.rstrip(")").split("(")
     assert name == "periodic"
-    assert 20 <= int(period) <= 23  # a second, but for what is lost
+    assert 20 <= int(period) <= 23  # about a second, minus losses
 
 
 def test_a_slow_swing_does_not_change_the_growth() -> None:
-    """Means over a quarter take it away; the logarithm by itself follows it."""
+    """Means over a quarter remove the oscillation; the plain logarithm follows it."""
     n = np.arange(480)
     smoothed, plain = [], []
     for period in range(60, 180, 10):
@@ -146,7 +142,7 @@ def test_a_later_network_is_the_scenarios_with_a_delay_more() -> None:
 
 
 def test_the_worst_corners_of_the_box_are_stable_at_weights_that_bear_them() -> None:
-    """Quick, too strong and late; slow, too weak and late: those of the demo, not tighter ones."""
+    """Fast, strong and late; slow, weak and late: stable at the demo's weights, not at tighter."""
     corners = (Differing(0.5, 1.3, 0.3), Differing(2.0, 0.7, 0.3))
     for corner in corners:
         assert growth_of(corner.of(demo_with()), "periodic(12)", 2)[0] < 0.995
@@ -158,7 +154,7 @@ def test_the_worst_corners_of_the_box_are_stable_at_weights_that_bear_them() -> 
 def test_along_trajectories_the_worst_corner_asks_for_a_fifth_more(
     input_weight: float, stable: bool
 ) -> None:
-    """The disturbance that the filter aboard has found is taken off at once, and so is firm."""
+    """Compensation of the estimated disturbance tightens the loop, so it needs larger weights."""
     scenario = demo_with(**TRAJECTORY, control__input_weight=input_weight)
     corner = Differing(0.5, 1.3, 0.3).of(scenario)
     assert (growth_of(corner, clocked_trigger(scenario), 2)[0] < 0.995) == stable
@@ -168,13 +164,12 @@ def test_along_trajectories_the_worst_corner_asks_for_a_fifth_more(
 
 
 def at(name: str, scenario: Scenario, **box: tuple[float, ...]) -> Box:
-    """A box with one value each but for those given."""
     axes = {"tau": (1.0,), "gain": (1.0,), "dead_time_s": (0.0,), "burst_s": (0.0,)}
     return Box(name, scenario, "periodic(12)", **axes | box)
 
 
 def test_a_loop_that_is_not_stable_ends_in_a_limit_cycle(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Committed inputs at tight weights, where the vehicle is twice as quick as the model."""
+    """Committed inputs at tight weights, where the vehicle is twice as fast as the model."""
     monkeypatch.setattr(maps, "REST_S", 40.0)
     monkeypatch.setattr(maps, "RUNS", 1)
     monkeypatch.setattr(maps, "PUSHES", 2)
@@ -193,7 +188,6 @@ def test_a_loop_that_is_not_stable_ends_in_a_limit_cycle(monkeypatch: pytest.Mon
 
 
 def test_a_swing_that_dies_away_is_no_limit_cycle() -> None:
-    """The last quarter of a flight is compared with the one before."""
     scenario = maps.at_rest(demo_with())
     rows: Rows = np.zeros(400, client_columns(2))
     rows["step"] = np.arange(400)
@@ -208,7 +202,6 @@ def test_a_swing_that_dies_away_is_no_limit_cycle() -> None:
 
 
 def test_a_place_of_the_box_differs_as_it_says() -> None:
-    """Without wind, with bursts both ways; numbers count the time constants first."""
     box = at("demo", demo_with(), tau=(0.5, 2.0), gain=(0.7,), dead_time_s=(0.1,), burst_s=(2.0,))
     assert [place.tau for place in box.places] == [0.5, 2.0]
     scenario = box.scenario_of(1)
@@ -226,7 +219,6 @@ def test_a_place_of_the_box_differs_as_it_says() -> None:
 def test_the_command_says_which_vehicles_are_stable(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """A row for each vehicle, limits, the figures as JSON, and a map where it is asked for."""
     for table, few in (
         ("VEHICLES", ("half as quick", "dead time 0.3 s more")),
         ("LIMITS", ("dead time, more [s]", "delay each way, more [s]")),
@@ -255,7 +247,6 @@ def test_the_command_says_which_vehicles_are_stable(
 def test_an_empty_box_is_refused_in_a_line(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """A value that no vehicle can have is refused as a scenario's would be."""
     argv = ["margins", "demo", "--maps", str(tmp_path / "maps"), "--gain", "0", "1"]
     assert main(argv) == 2
     assert "vehicle.gain[0]: got 0.0" in capsys.readouterr().err

@@ -1,4 +1,4 @@
-"""Missions as benchmarks: reproducible, also with links that are cut and servers that die."""
+"""Missions as benchmarks: reproducible, also with cut links and restarted servers."""
 
 import math
 from functools import partial
@@ -16,7 +16,6 @@ from skytether.shared.base.errors import ConfigError
 
 
 def test_a_mission_is_drawn_from_its_seed(tmp_path: Path) -> None:
-    """Harsh ones are the same, over links that are cut as well."""
     drawn = missions.random_mission(RandomOptions(), 5, tmp_path)
     again = missions.random_mission(RandomOptions(harsh=True), 5, tmp_path)
     assert again.mission == drawn.mission
@@ -36,7 +35,7 @@ def test_harsh_missions_keep_apart() -> None:
 def test_a_gap_between_zones_that_is_too_narrow_is_flown_around(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """A way fits through it and a motion does not. Ablation: else one vehicle stays before it, or
+    """A route fits through it, a motion does not. Otherwise a vehicle waits before the gap, or
     flies to and fro there.
     """
     assert missions.fly_random(RandomOptions(), 31463).late == 0
@@ -47,7 +46,7 @@ def test_a_gap_between_zones_that_is_too_narrow_is_flown_around(
 
 @pytest.mark.long
 def test_a_vehicle_in_a_pocket_of_others_is_let_out(monkeypatch: pytest.MonkeyPatch) -> None:
-    """One of them yields, though it is nearer than plans keep. Ablation: else nobody does."""
+    """One of them yields, although it is nearer than plans keep. Otherwise none does."""
     assert missions.fly_random(RandomOptions(), 31906).late == 0
     monkeypatch.setattr(
         yielding, "_kept_distance", lambda places, _, apart_m: np.full(len(places), apart_m)
@@ -56,10 +55,9 @@ def test_a_vehicle_in_a_pocket_of_others_is_let_out(monkeypatch: pytest.MonkeyPa
 
 
 def test_what_is_kept_is_not_flown_again(tmp_path: Path) -> None:
-    """A command goes on where it ended, with more flights if asked; else nothing is kept."""
     out, one = tmp_path / "flights", Flags(1)
     assert study(math.sqrt, [4.0, 9.0], float, {"seed": 1}, out, one) == [2.0, 3.0]
-    # Another function shows which are flown now.
+    # Another function shows which cells are flown now.
     assert study(math.fabs, [4.0, 9.0, 16.0], float, {"seed": 1}, out, one) == [2.0, 3.0, 16.0]
     assert study(math.fabs, [4.0], float, {"seed": 1}, None, one) == [4.0]
     with pytest.raises(ConfigError, match="seed: got 2, expected 1"):
@@ -67,7 +65,7 @@ def test_what_is_kept_is_not_flown_again(tmp_path: Path) -> None:
 
 
 def test_a_flight_without_zones_is_kept_as_well(tmp_path: Path) -> None:
-    """Its distance from a zone is None, which JSON can hold, and no infinity."""
+    """Its distance from a zone is None, because JSON has no infinity."""
     fly = partial(missions.fly_swap, SwapOptions(vehicles=2, duration=4.0))
     again = [study(fly, [(1, "no loss")], MissionFlight, {}, tmp_path, Flags(1)) for _ in range(2)]
     assert again[0] == again[1]

@@ -1,4 +1,4 @@
-"""The reproduction: what is flown, what is said of it, and the files that it leaves."""
+"""Reproduction: methods, verdicts, and the files of the report."""
 
 import csv
 import json
@@ -56,11 +56,10 @@ FIGURES = {
 TABLES = {"table1", "traffic", "real"}
 
 
-# -- what is flown -------------------------------------------------------------------------------
+# -- methods -------------------------------------------------------------------------------------
 
 
 def test_the_methods_are_the_papers_scenarios() -> None:
-    """They equal the packaged scenarios of `skytether fly` in all but their titles."""
     plan = Sweep("paper", PAPER, [studies.METHODS], 1)
     for name, method in (
         ("paper-no-compensation", NONE),
@@ -74,7 +73,6 @@ SUMMARY = summarise(PAPER, "paper", flight.fly(replace(PAPER, duration=6.0)).cli
 
 
 def runs(*ratios: float, rmse: float = 1.0) -> list[Summary]:
-    """Runs with these event ratios."""
     traffic = {"uplink_packets": 10, "uplink_bytes": 400}
     traffic |= {"downlink_packets": 30, "downlink_bytes": 600}
     error = {"rmse_x": rmse, "rmse_y": 2.0 * rmse, "rmse_xy": 3.0 * rmse}
@@ -85,12 +83,11 @@ def runs(*ratios: float, rmse: float = 1.0) -> list[Summary]:
     ("ratio", "steps"), [(1.0, 1), (0.8, 1), (0.7, 2), (0.1, 10), (0.098, 10), (0.093, 11)]
 )
 def test_periodic_sends_at_the_nearest_rate(ratio: float, steps: int) -> None:
-    """Nearest as a rate: 0.7 lies nearer to a half than to one."""
+    """Nearest as a rate: 0.7 is nearer to 1/2 than to 1."""
     assert studies.period(runs(ratio - 0.01, ratio + 0.01)) == steps
 
 
 def test_the_baseline_has_at_each_value_the_rate_that_the_trigger_had_there() -> None:
-    """All else that belongs to the value is kept."""
     axis = GridAxis(
         "loss", (0.0, 0.5), ({"network.uplink.loss": 0.0}, {"network.uplink.loss": 0.5})
     )
@@ -112,7 +109,7 @@ def test_jitter_grows_while_the_mean_delay_stays() -> None:
             assert slot_s * math.sqrt(slots_mean) == pytest.approx(std_ms / 1e3)
 
 
-# -- what is said of it --------------------------------------------------------------------------
+# -- verdicts ------------------------------------------------------------------------------------
 
 
 def columns() -> Mapping[str, MethodFlights]:
@@ -122,7 +119,6 @@ def columns() -> Mapping[str, MethodFlights]:
 
 
 def test_a_deviation_is_what_ours_is_more_than_the_papers() -> None:
-    """Relatively; where the paper has no entry there is none."""
     entries = {(entry.column, entry.entry): entry for entry in studies.table_1(columns())}
     assert len(entries) == 16
     entry = entries[EVENT, "rmse_xy"]
@@ -134,7 +130,6 @@ def test_a_deviation_is_what_ours_is_more_than_the_papers() -> None:
 
 
 def test_the_report_says_who_wins_from_the_numbers() -> None:
-    """The trigger has twice the error here; the other way round it has half."""
     worse = columns()
     better = {**worse, EVENT: MethodFlights(runs(0.1, rmse=0.25))}
     said = [
@@ -154,7 +149,7 @@ def test_both_directions_count_in_the_total() -> None:
 
 
 def test_a_curve_is_won_only_where_intervals_are_apart() -> None:
-    """One value each: better, worse, and too near to tell."""
+    """One value each: better, worse, and overlapping."""
     spread = [*runs(0.1, rmse=0.1), *runs(0.1, rmse=2.0)]
     trigger = {0.0: runs(0.1, 0.1, rmse=2.0), 1.0: runs(0.1, 0.1, rmse=0.5), 2.0: spread}
     cells = {}
@@ -172,7 +167,6 @@ def test_a_curve_is_won_only_where_intervals_are_apart() -> None:
 
 @pytest.fixture(scope="module")
 def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder of a quick reproduction, by the documented command."""
     folder = tmp_path_factory.mktemp("reproduce")
     command = [sys.executable, "-P", "-m", "skytether", *shlex.split(LINE)[1:]]
     run = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
@@ -182,8 +176,6 @@ def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 class Page(HTMLParser):
-    """Content of the page: ids, addresses, and the cells of each table."""
-
     def __init__(self, text: str) -> None:
         super().__init__()
         self.open: list[str] = []
@@ -194,7 +186,6 @@ class Page(HTMLParser):
         self.close()
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        """Take a start tag; see `HTMLParser`."""
         found = dict(attrs)
         if tag not in ("img", "meta"):
             self.open.append(tag)
@@ -207,19 +198,15 @@ class Page(HTMLParser):
             self.tables[self.ids[-1]].append([])
 
     def handle_endtag(self, tag: str) -> None:
-        """Take an end tag; see `HTMLParser`."""
         assert self.open.pop() == tag
 
     def handle_data(self, data: str) -> None:
-        """Take text; see `HTMLParser`."""
         if self.open and self.open[-1] == "td":
             self.tables[self.ids[-1]][-1].append(data)
 
 
 def test_every_figure_is_there_three_times_and_in_a_size_to_look_at(out: Path) -> None:
-    """The files are PNG, PDF and CSV; the PNG has one or two columns' width at 220 dots per
-    inch.
-    """
+    """As PNG, PDF and CSV; the PNG is one or two columns wide at 220 dots per inch."""
     assert {path.stem for path in out.glob("*.png")} == FIGURES
     for name in FIGURES:
         png = (out / f"{name}.png").read_bytes()
@@ -233,7 +220,6 @@ def test_every_figure_is_there_three_times_and_in_a_size_to_look_at(out: Path) -
 
 
 def test_the_page_opens_offline_and_shows_all(out: Path) -> None:
-    """The page's tags are closed in order; every address in it is a picture of its own."""
     text = (out / "report.html").read_text()
     page = Page(text)
     assert page.open == []
@@ -262,7 +248,7 @@ def test_the_tables_on_the_page_are_those_of_the_csv_files(out: Path) -> None:
 
 
 def test_packets_really_took_what_was_drawn(out: Path) -> None:
-    """The delay of netem over UDP is (17), late by no more than a busy machine is."""
+    """Delays of netem over UDP follow (17), plus the lateness of a busy machine."""
     rows = list(csv.DictReader((out / "fig2.csv").read_text().splitlines()))
     lattice = [row for row in rows if row["probability"]]
     assert float(lattice[0]["delay_ms"]) == 400.0
@@ -275,7 +261,6 @@ def test_packets_really_took_what_was_drawn(out: Path) -> None:
 def test_the_second_time_it_only_draws(
     out: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Nothing is flown, and the same comes of it but for the times."""
     kept = {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
     monkeypatch.chdir(out.parent)
     assert main(shlex.split(LINE)[1:]) == 0

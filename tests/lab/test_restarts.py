@@ -1,4 +1,4 @@
-"""Restarts under way: what the benchmark finds in a record, and a flight at CI size."""
+"""Restarts in flight: evaluation of a record, and a short flight."""
 
 from dataclasses import replace
 
@@ -23,11 +23,10 @@ pytestmark = pytest.mark.long
 DT_S = 0.05
 TAU_S = 0.84
 GONE = ProcessOutage("server", CLOSED, 10 * SECOND_NS, 14 * SECOND_NS)
-"""Outage from 10 s to 14 s."""
 
 
 def life(brakes_s: float = 1.0, flies_s: float = 1.5, brake_mps2: float = 2.0) -> ProcessLife:
-    """A flight of 20 s at 1 m/s that brakes some time after 10 s and flies again after 14 s."""
+    """Flight of 20 s at 1 m/s that brakes some time after 10 s and flies again after 14 s."""
     time_s = np.arange(400) * DT_S
     at, again = 10.0 + brakes_s, 14.0 + flies_s
     gone = (time_s >= at) & (time_s < again)
@@ -47,12 +46,11 @@ def life(brakes_s: float = 1.0, flies_s: float = 1.5, brake_mps2: float = 2.0) -
 
 
 def verdict(flown: ProcessLife, outage: ProcessOutage = GONE) -> restarts.RestartVerdict:
-    """Verdict on a flight."""
     return judge(outage, [flown], restarts.scenario())
 
 
 def test_a_vehicle_that_brakes_in_time_is_inside() -> None:
-    """It lies on both curves, and every time is counted from where it has to be."""
+    """On both curves; each time is counted from the moment at which the action is due."""
     found = verdict(life())
     assert found.is_inside
     assert found.brakes_s == pytest.approx(1.0)
@@ -81,7 +79,7 @@ def test_a_vehicle_that_brakes_late_or_softly_or_never_flies_again_is_outside(
 
 
 def test_a_vehicle_that_moves_on_although_it_is_told_to_stand_is_outside() -> None:
-    """The true speed has a curve of its own."""
+    """The true speed has its own curve."""
     flown = life()
     found = verdict(replace(flown, speed=flown.speed + 0.1 * (flown.time_ns > 12 * SECOND_NS)))
     assert found.over_commanded_mps == pytest.approx(0.0, abs=1e-9)
@@ -90,7 +88,6 @@ def test_a_vehicle_that_moves_on_although_it_is_told_to_stand_is_outside() -> No
 
 
 def test_a_process_that_is_back_at_once_leaves_no_curve() -> None:
-    """The vehicle flies on with what it has."""
     flown = replace(life(), mode=np.full(400, Mode.TRACK, np.uint8), in_force=np.arange(400))
     found = verdict(
         flown, ProcessOutage("netem", KILLED, 10 * SECOND_NS, 10 * SECOND_NS + 5 * 10**8)
@@ -122,7 +119,6 @@ def test_a_new_life_has_to_stand_until_it_flies() -> None:
 
 
 def test_processes_that_are_killed_under_way_come_back() -> None:
-    """The vehicle brakes along its curve, is at rest, and flies again, as a new life does."""
     counts = RestartsCounts(kills=1, stops=0, flight_s=0.5, subjects=("server", "client"))
     result = restarts.measure(counts)
     server, client = restarts.verdicts_of(result)

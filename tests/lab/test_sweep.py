@@ -1,4 +1,4 @@
-"""Sweeps: what is flown, what is kept whatever happens, and what is said of it in the end."""
+"""Sweeps: grids, journals, tables, commands and clusters."""
 
 import csv
 import importlib.util
@@ -34,14 +34,14 @@ PATIENCE_S = 30.0
 
 SWEEP = ["sweep", "paper", "--duration", "5", "--settle", "1", "--runs", "30"]
 SWEEP += ["--grid", "control.input_weight=1:3:2", "--grid", "control.trigger=state_gap,periodic"]
-"""A sweep of four cells, with two tasks each."""
+"""Sweep of four cells, with two tasks each."""
 TASKS = 8
 TABLES = ("runs.csv", "cells.csv")
 
 PAPER = replace(reading.load("paper"), duration=5.0, settle=1.0)
 
 
-# -- what is flown -------------------------------------------------------------------------------
+# -- grids and tasks -----------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -59,7 +59,7 @@ PAPER = replace(reading.load("paper"), duration=5.0, settle=1.0)
     ],
 )
 def test_a_grid_is_read_as_it_is_meant(text: str, key: str, values: tuple[Any, ...]) -> None:
-    """Whole numbers stay whole, and what is written down is read again."""
+    """Whole numbers stay whole, and the written form is read back."""
     axis = parse_axis(text)
     assert axis == GridAxis(key, values)
     assert list(map(type, axis.values)) == list(map(type, values))
@@ -118,12 +118,10 @@ def test_a_grid_that_is_none_is_refused(text: str, said: str) -> None:
     ],
 )
 def test_a_cell_that_cannot_be_flown_is_refused_before_any_is(grids: list[str], said: str) -> None:
-    """The refusal is that of a scenario with these values, and names them."""
     assert refusal(lambda: Sweep("paper", PAPER, list(map(parse_axis, grids)), 3)) == said
 
 
 def test_seeds_end_where_a_scenarios_do() -> None:
-    """2³² - 1 is the last."""
     last = replace(PAPER, seed=2**32 - 3)
     assert next(Sweep("paper", last, [], 3).tasks()).seeds[-1] == 2**32 - 1
     with pytest.raises(ConfigError, match="expected at most 4294967292 for 4 runs"):
@@ -131,7 +129,7 @@ def test_seeds_end_where_a_scenarios_do() -> None:
 
 
 def test_a_sweep_is_every_combination_in_chunks_of_seeds() -> None:
-    """The last grid changes fastest; the last chunk holds what is left."""
+    """The last grid changes fastest; the last chunk is smaller."""
     axes = [parse_axis("control.input_weight=1,2"), parse_axis("control.trigger=state_gap,always")]
     tasks = list(Sweep("paper", replace(PAPER, seed=7), axes, CHUNK + 5).tasks())
     controls = [(t.scenario.control.input_weight, t.scenario.control.trigger) for t in tasks[::2]]
@@ -150,7 +148,6 @@ def test_a_task_gives_the_summaries_of_its_flights_one_by_one() -> None:
 
 
 def test_a_run_that_never_flew_has_no_error_and_spoils_no_mean() -> None:
-    """Such a run is a row like any other, with nothing in it."""
     deaf = "paper(0.4, 0.02, 2.0) & loss(0.85)"
     scenario = replace(
         PAPER,
@@ -183,12 +180,11 @@ def test_the_interval_is_students() -> None:
 
 
 def test_axes_of_pictures_have_units_where_these_are_known() -> None:
-    """From the name of the key, or from a list."""
     labels = {key: figures.label(key) for key in LABELS}
     assert labels == LABELS
     table = reading.to_table(PAPER)
     for key in figures.OTHER_UNITS:
-        if not key.startswith("control.trigger."):  # which has only one policy
+        if not key.startswith("control.trigger."):  # exists with one policy only
             value(table, key)
 
 
@@ -202,7 +198,7 @@ LABELS = {
 }
 
 
-# -- what is kept --------------------------------------------------------------------------------
+# -- journals ------------------------------------------------------------------------------------
 
 ONE = Sweep("paper", PAPER, [parse_axis("control.input_weight=1,2")], 3)
 OTHERS = {
@@ -221,7 +217,6 @@ OTHERS = {
 
 
 def journal_of(plan: Sweep, folder: Path) -> StudyJournal[Runs]:
-    """The journal of a sweep."""
     return StudyJournal(folder, plan.settings(), Runs)
 
 
@@ -256,7 +251,7 @@ def test_results_without_settings_are_not_taken_for_ours(tmp_path: Path) -> None
 
 @pytest.mark.parametrize("cut", [1, 8, 20])
 def test_half_a_line_at_the_end_is_overwritten(cut: int, tmp_path: Path) -> None:
-    """A killed writer's last; everything before it is kept."""
+    """A killed writer may leave half a line; everything before it is kept."""
     with closing(journal_of(ONE, tmp_path)) as journal:
         journal.add("one", ())
         journal.add("two", ())
@@ -272,7 +267,7 @@ def test_half_a_line_at_the_end_is_overwritten(cut: int, tmp_path: Path) -> None
 
 
 def test_a_line_that_is_no_result_is_named(tmp_path: Path) -> None:
-    """No kill leaves one behind: somebody has been there."""
+    """A killed writer cannot leave such a line."""
     with closing(journal_of(ONE, tmp_path)) as journal:
         journal.add("one", ())
     with (tmp_path / "journal.jsonl").open("ab") as file:
@@ -284,7 +279,7 @@ def test_a_line_that_is_no_result_is_named(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("bit", range(8))
 def test_a_line_with_a_flipped_bit_is_refused(bit: int, tmp_path: Path) -> None:
-    """Wherever it is but in the last line's end, which a killed writer may have left out."""
+    """Anywhere except in the end of the last line, which may be incomplete after a kill."""
     with closing(journal_of(ONE, tmp_path)) as journal:
         journal.add("one", ())
         journal.add("two", ())
@@ -299,7 +294,6 @@ def test_a_line_with_a_flipped_bit_is_refused(bit: int, tmp_path: Path) -> None:
 def test_a_changed_number_in_a_journal_ends_the_command_in_one_line(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """With file, line, and an exit code of its own."""
     argv = ["sweep", "paper", "--duration", "2", "--settle", "0", "--runs", "1", "--workers", "1"]
     assert main([*argv, "--out", str(tmp_path)]) == 0
     file = tmp_path / "journal.jsonl"
@@ -311,7 +305,6 @@ def test_a_changed_number_in_a_journal_ends_the_command_in_one_line(
 
 
 def along(path: Path) -> Scenario:
-    """The paper's, along a trajectory that is written to a file."""
     path.write_text(LINE)
     table = reading.to_table(PAPER) | {"reference": {"shape": "csv", "file": str(path)}}
     return reading.check(table, "mine")
@@ -321,7 +314,7 @@ LINE, OTHER_LINE = "t,x,y\n0,0,0\n5,1,1\n", "t,x,y\n0,0,0\n5,1,2\n"
 
 
 def test_a_trajectory_edited_between_two_sweeps_is_refused(tmp_path: Path) -> None:
-    """One cell would hold flights along both, and its mean would be of neither."""
+    """Otherwise a cell would mix flights along both."""
     paths = [tmp_path / name for name in ("one.csv", "two.csv")]
     scenario, _ = map(along, paths)
     grid = parse_axis(f"reference.file={paths[0]},{paths[1]}")
@@ -348,7 +341,6 @@ def test_a_task_flies_along_its_file_as_it_was_when_the_sweep_began(tmp_path: Pa
 def test_a_sweep_does_not_go_on_along_another_trajectory(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The command with the file as it was does."""
     path, out = tmp_path / "path.csv", tmp_path / "out"
     along(path)
     (tmp_path / "mine.toml").write_text(
@@ -368,28 +360,24 @@ def test_a_sweep_does_not_go_on_along_another_trajectory(
 
 
 def command(*argv: str) -> list[str]:
-    """Command line of the program in this environment."""
     return [sys.executable, "-P", "-m", "skytether", *argv]
 
 
 def run(*argv: str) -> subprocess.CompletedProcess[str]:
-    """A command to its end."""
     return subprocess.run(command(*argv), capture_output=True, text=True, timeout=300, check=False)
 
 
 def lines(out: Path) -> int:
-    """Tasks that are done in a folder."""
     file = out / "journal.jsonl"
     return file.read_bytes().count(b"\n") if file.exists() else 0
 
 
 def tables(out: Path) -> list[bytes]:
-    """The bytes of both."""
     return [(out / name).read_bytes() for name in TABLES]
 
 
 def broken_off(number: signal.Signals, out: Path) -> subprocess.CompletedProcess[str]:
-    """A sweep with one worker, ended by a signal a few tasks after its start; its workers, too."""
+    """Sweep with one worker, ended by a signal a few tasks after its start, with its workers."""
     with subprocess.Popen(
         command(*SWEEP, "--out", str(out), "--workers", "1"),
         stdout=subprocess.PIPE,
@@ -407,7 +395,6 @@ def broken_off(number: signal.Signals, out: Path) -> subprocess.CompletedProcess
 
 
 def running(pid: str) -> bool:
-    """Whether a process does anything any more."""
     try:
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
     except OSError:
@@ -416,7 +403,6 @@ def running(pid: str) -> bool:
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder of the sweep, flown by two workers without any trouble."""
     out = tmp_path_factory.mktemp("sweep") / "deep" / "whole"
     with redirect_stdout(io.StringIO()) as said:
         assert main([*SWEEP, "--out", str(out), "--workers", "2"]) == 0
@@ -446,7 +432,6 @@ def test_two_keys_make_maps(whole: Path) -> None:
 
 @pytest.mark.long
 def test_a_killed_sweep_goes_on_and_loses_nothing(whole: Path, tmp_path: Path) -> None:
-    """SIGKILL half-way: its worker ends with it, and the rest gives the same bytes as ever."""
     broken_off(signal.SIGKILL, tmp_path)
     kept = (tmp_path / "journal.jsonl").read_bytes()
     resumed = run(*SWEEP, "--out", str(tmp_path), "--workers", "1")
@@ -458,7 +443,6 @@ def test_a_killed_sweep_goes_on_and_loses_nothing(whole: Path, tmp_path: Path) -
 
 @pytest.mark.long
 def test_ctrl_c_ends_a_sweep_in_one_line_and_keeps_what_was_done(tmp_path: Path) -> None:
-    """Every line is whole, and it says how many runs they are."""
     ended = broken_off(signal.SIGINT, tmp_path)
     assert (ended.returncode, ended.stdout) == (130, "")
     said = re.fullmatch(
@@ -485,7 +469,6 @@ def test_ctrl_c_ends_a_sweep_in_one_line_and_keeps_what_was_done(tmp_path: Path)
 def test_an_impossible_sweep_is_refused(
     argv: list[str], line: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """In one line, before anything is written."""
     told = refused_before_writing(["sweep", "paper", *argv], tmp_path, capsys)
     assert told == f"sweep: {line}"
 
@@ -498,7 +481,6 @@ needs_dask = pytest.mark.skipif(
 
 
 def dask(stack: ExitStack, argv: list[str], folder: Path) -> subprocess.Popen[str]:
-    """A process of a cluster, ended with the stack."""
     process = stack.enter_context(
         subprocess.Popen(
             [sys.executable, "-P", "-m", f"distributed.cli.dask_{argv[0]}", *argv[1:]],
@@ -514,7 +496,6 @@ def dask(stack: ExitStack, argv: list[str], folder: Path) -> subprocess.Popen[st
 @pytest.mark.long
 @needs_dask
 def test_a_cluster_gives_the_same_though_a_worker_is_killed(whole: Path, tmp_path: Path) -> None:
-    """A scheduler and two workers, one of them killed on the way."""
     with ExitStack() as stack:
         argv = ["scheduler", "--host", "127.0.0.1", "--port", "0", "--no-dashboard"]
         scheduler = dask(stack, argv, tmp_path)

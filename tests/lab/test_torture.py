@@ -1,4 +1,4 @@
-"""Torture: what it flies, what it finds once a guard is switched off, and that it comes again."""
+"""Torture: trials, the faults found when a guard is switched off, and reproducibility."""
 
 import json
 import os
@@ -51,7 +51,7 @@ FAILED = [line for line in SEEDS.read_text().splitlines() if not line.startswith
 LONG = pytest.mark.skipif("SKYTETHER_LONG" not in os.environ, reason="long: set SKYTETHER_LONG=1")
 
 PLANS, FOLLOWS = 7, 11
-"""Seeds of a trial with horizons of inputs, and of one with trajectories."""
+"""Seeds of a trial with horizons, and of one with trajectories."""
 
 Patch = Callable[[pytest.MonkeyPatch], None]
 
@@ -59,13 +59,12 @@ Patch = Callable[[pytest.MonkeyPatch], None]
 def fault(
     kind: FaultKind, where: str, start_s: float, length_s: float, amount: float = 1.0
 ) -> ScheduledFault:
-    """A fault, in seconds."""
     return ScheduledFault(
         kind, where, round(start_s * SECOND_NS), round(length_s * SECOND_NS), amount
     )
 
 
-# -- what is flown ---------------------------------------------------------------------------
+# -- trials ----------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -93,7 +92,6 @@ def test_trials_differ_in_scheme_step_axes_and_vehicles() -> None:
 
 
 def test_trajectories_are_flown_by_a_third_or_more_with_all_that_belongs_to_them() -> None:
-    """Previews, triggers, reports, heartbeats, and vehicles that are not as their models say."""
     drawn = [make_scenario(seed)[0] for seed in range(200)]
     some = [each for each in drawn if each.control.scheme == "trajectory"]
     assert len(some) > len(drawn) / 3
@@ -116,7 +114,6 @@ def test_each_step_under_a_plan_is_held_against_the_equations() -> None:
 
 @pytest.mark.parametrize("line", FAILED)
 def test_what_has_failed_once_fails_no_more(line: str) -> None:
-    """Schedules that torture has found, each shrunk."""
     outcome = fly(loads(line))
     assert not outcome.failure
 
@@ -149,13 +146,11 @@ EFFECTS = [
 
 @cache
 def undisturbed() -> TrialOutcome:
-    """A trial without faults."""
     return fly(Trial(1, ()))
 
 
 @pytest.mark.parametrize(("one", "effect"), EFFECTS)
 def test_each_fault_has_its_effect_and_is_survived(one: ScheduledFault, effect: str) -> None:
-    """The effect is something that was counted, and is not without the fault."""
     assert not undisturbed().counts.get(effect)
     outcome = fly(Trial(1, (one,)))
     assert not outcome.failure
@@ -165,11 +160,11 @@ def test_each_fault_has_its_effect_and_is_survived(one: ScheduledFault, effect: 
 SIEGE = Trial(
     1, (fault(FaultKind.CROWD, "netem", 3, 12, 200.0), fault(FaultKind.PORT, "client", 8, 0))
 )
-"""An observer takes netem's places, and the vehicles' ports change."""
+"""An observer occupies netem's capacity, and the vehicles' ports change."""
 
 
 def test_an_observer_at_netem_keeps_no_vehicle_from_flying() -> None:
-    """One who copies what vehicles send, from more ports than netem has places."""
+    """It copies packets of vehicles and sends from more ports than netem's capacity."""
     outcome = fly(SIEGE)
     assert not outcome.failure
     assert outcome.counts["packets: crowd"] > 2000
@@ -178,7 +173,7 @@ def test_an_observer_at_netem_keeps_no_vehicle_from_flying() -> None:
 def test_if_one_answer_earned_a_place_an_observer_would_shut_vehicles_out(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Ablation: one answer earns a place for a minute."""
+    """Ablation: a single answer earns a flow for a minute."""
     monkeypatch.setattr(skytether.netem.places, "EXCHANGES", 1)
     monkeypatch.setattr(skytether.netem.places, "EARNED_NS", 60 * SECOND_NS)
     monkeypatch.setattr(skytether.netem.places, "HOST_FLOWS", 128)
@@ -187,7 +182,7 @@ def test_if_one_answer_earned_a_place_an_observer_would_shut_vehicles_out(
 
 @pytest.mark.parametrize("amount", [3600.0, -3600.0])
 def test_a_clock_that_is_set_costs_nothing(amount: float) -> None:
-    """Nobody brakes for it, whichever clock it is."""
+    """No vehicle brakes, whichever clock is set."""
     braked = f"brake: {Reason.STALLED}"
     for where in ("client", "server"):
         outcome = fly(Trial(1, (fault(FaultKind.STEP, where, 5, 0, amount),)))
@@ -199,29 +194,25 @@ def test_every_kind_of_fault_is_tried() -> None:
     assert {one.kind for one, _ in EFFECTS} | {FaultKind.STEP, FaultKind.SKEW} == set(RANGES)
 
 
-# -- what is found ---------------------------------------------------------------------------
+# -- ablations of guards ---------------------------------------------------------------------
 
 
 class Unchecked:
-    """ChaCha20-Poly1305 that opens whatever comes."""
-
     def __init__(self, key: bytes) -> None:
         self._key = key
         self.encrypt = ChaCha20Poly1305(key).encrypt
 
     def decrypt(self, nonce: bytes, data: bytes, _: bytes) -> bytes:
-        """Plaintext, whether or not the tag is right."""
         algorithm = algorithms.ChaCha20(self._key, (1).to_bytes(4, "little") + nonce)
         return Cipher(algorithm, mode=None).decryptor().update(data[:-16])
 
 
 def no_clamp(patch: pytest.MonkeyPatch) -> None:
-    """No last clamp aboard."""
     patch.setattr(skytether.client.pilot, "clamped", lambda wanted, *_, **__: list(wanted))
 
 
 def no_feedback_at_the_end(patch: pytest.MonkeyPatch) -> None:
-    """Feedback that stops after the last input, aboard."""
+    """Feedback aboard that stops after the last input."""
     step = rule.step
 
     def end(
@@ -236,12 +227,10 @@ def no_feedback_at_the_end(patch: pytest.MonkeyPatch) -> None:
 
 
 def no_window(patch: pytest.MonkeyPatch) -> None:
-    """No replay window."""
     patch.setattr(skytether.shared.wire.channel.ReplayWindow, "is_new", lambda *_: True)
 
 
 def no_tag(patch: pytest.MonkeyPatch) -> None:
-    """No check of the tag of a packet."""
     patch.setattr(skytether.shared.wire.channel, "ChaCha20Poly1305", Unchecked)
 
 
@@ -251,7 +240,6 @@ def no_age(patch: pytest.MonkeyPatch) -> None:
 
 
 def no_brake_without_link(patch: pytest.MonkeyPatch) -> None:
-    """No braking where the link is lost."""
     table = {(mode, cause): after for (mode, cause), after in TABLE.items() if cause != Reason.LOST}
     patch.setattr(skytether.client.endpoint, "TABLE", table)
 
@@ -264,23 +252,18 @@ def no_lock_at_restart(patch: pytest.MonkeyPatch) -> None:
 
 
 def no_stall(patch: pytest.MonkeyPatch) -> None:
-    """No braking after sleep."""
     patch.setattr(skytether.client.failsafe, "STALL_NS", 2**62)
 
 
 def no_lock(patch: pytest.MonkeyPatch) -> None:
-    """No waiting for a good link once it was broken."""
     patch.setattr(skytether.client.failsafe, "LOCKING", frozenset())
 
 
 def no_good_link(patch: pytest.MonkeyPatch) -> None:
-    """No waiting for a good link at all."""
     patch.setattr(skytether.client.failsafe, "GOOD_NS", 0)
 
 
 def no_steady(patch: pytest.MonkeyPatch) -> None:
-    """No steady time."""
-
     def as_it_is(endpoint: Endpoint) -> Endpoint:
         return endpoint
 
@@ -288,14 +271,13 @@ def no_steady(patch: pytest.MonkeyPatch) -> None:
 
 
 def no_latch(patch: pytest.MonkeyPatch) -> None:
-    """No latch in LAND."""
     patch.setattr(
         skytether.client.endpoint, "TABLE", {**TABLE, (Mode.LAND, Reason.HORIZON): Mode.TRACK}
     )
 
 
 def no_home(patch: pytest.MonkeyPatch) -> None:
-    """Packets go only where the newest observation came from."""
+    """Packets go only to the address of the newest observation."""
 
     def sealed(self: Session, payload: bytes) -> tuple[Datagram]:
         return (Datagram(self.line.seal(payload), self.address),)
@@ -304,14 +286,14 @@ def no_home(patch: pytest.MonkeyPatch) -> None:
 
 
 def no_second_try(patch: pytest.MonkeyPatch) -> None:
-    """A challenge is believed once, and the newest of all cookies is kept."""
+    """Only the first challenge is answered, and its cookie is kept."""
     patch.setattr(skytether.client.secure, "AGAIN_NS", skytether.client.secure.ATTEMPT_NS)
 
 
 def violated(trial: Trial, ablate: Patch, patch: pytest.MonkeyPatch) -> str:
-    """Invariant that a trial violates after an ablation; before it, the trial passes.
+    """Invariant that a trial violates after an ablation; without the ablation the trial passes.
 
-    In plain Python: machine code does not call what an ablation puts in place of a function.
+    Runs in plain Python: compiled code does not call replaced functions.
     """
     assert not fly(trial).failure
     ablate(patch)
@@ -352,7 +334,7 @@ ABLATIONS: list[tuple[Patch, str, tuple[ScheduledFault, ...]]] = [
 
 
 def test_feedback_that_ends_too_early_is_caught(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A flight with feedback whose observations are lost brakes, and holds its place in wind."""
+    """A flight with feedback and lost observations brakes, and holds its place in wind."""
     seed = next(
         seed
         for seed in range(100)
@@ -384,17 +366,16 @@ def test_a_guard_of_trajectories_that_is_switched_off_is_caught(
     faults: tuple[ScheduledFault, ...],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """A safeguard for trajectories, switched off, breaks an invariant, as one for horizons does.
+    """As for horizons.
 
-    Two safeguards are left out: they belong to the link alone. A server that believes a flood of
-    forgeries may also be found by its failure to recover.
+    Two guards are left out, because they belong to the link alone. A server that accepts forgeries
+    may also violate "recovers".
     """
     found = violated(Trial(FOLLOWS, faults), switch_off, monkeypatch)
     assert found in (invariant, "recovers")
 
 
 def no_disturbance(patch: pytest.MonkeyPatch) -> None:
-    """The disturbance that the filter has found is not flown off."""
     follow = spline.follow
     patch.setattr(spline, "follow", lambda *given: follow(*given[:-1], 0.0))
 
@@ -433,20 +414,18 @@ def test_a_solver_that_fails_is_nothing_to_trajectories() -> None:
 def test_schedules_that_are_drawn_catch_each_guard(
     switch_off: Patch, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """One of the first 400."""
     switch_off(monkeypatch)
     assert any(fly(short_trial(seed)).failure for seed in range(1, 401))
 
 
 @LONG
 def test_two_hours_go_well() -> None:
-    """With faults all along, and keys that are replaced on the way."""
     outcome = fly(long_trial(1, 2.0))
     assert not outcome.failure
 
 
 def test_a_failure_shrinks_to_the_fault_that_matters(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Five faults shrink to the one that the guard is there for; it fails again from its JSON."""
+    """Five faults shrink to the relevant one, which fails again from its JSON."""
     no_stall(monkeypatch)
     culprit = fault(FaultKind.FREEZE, "client", 6, 1.0)
     others = (
@@ -477,7 +456,6 @@ def test_an_endpoint_that_raises_has_failed(monkeypatch: pytest.MonkeyPatch) -> 
 
 
 def test_a_container_without_a_bound_is_found() -> None:
-    """However deep in an endpoint it is."""
     scenario, _ = make_scenario(1)
     netem = Proxy(scenario, server=("server", 0), flows=10**6)
     for port in range(2100):
@@ -490,7 +468,6 @@ def test_a_container_without_a_bound_is_found() -> None:
 
 
 def run(*argv: str) -> "subprocess.CompletedProcess[str]":
-    """The command in a process of its own."""
     line = [sys.executable, "-P", "-m", "skytether", "torture", *argv]
     return subprocess.run(line, capture_output=True, text=True, check=False)
 

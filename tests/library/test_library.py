@@ -1,4 +1,4 @@
-"""`import skytether`: what it exports, what comes of it, and what it refuses."""
+"""`import skytether`: names, results, and refusals."""
 
 import asyncio
 import signal
@@ -39,8 +39,6 @@ SHORT: dict[str, Any] = {"duration": 10, "settle": 4}
 
 
 class Constant(skytether.Endpoint):
-    """Server that tells every vehicle to fly 0.1 m/s along each axis."""
-
     def __init__(self, scenario: skytether.Scenario) -> None:
         super().__init__()
         self.terms = scenario.terms()
@@ -64,8 +62,6 @@ class Constant(skytether.Endpoint):
 
 
 class Silent(Constant):
-    """Server that answers nothing."""
-
     def receive(self, datagram: skytether.Datagram, *, now_ns: int) -> None:
         """Nothing."""
 
@@ -86,7 +82,7 @@ def test_it_exports_what_it_names() -> None:
 
 
 def test_importing_it_is_light() -> None:
-    """Neither numpy nor anything heavier; no name of it brings a compiler, pictures or a page."""
+    """Neither numpy nor anything heavier; no exported name needs compiler, pictures or page."""
     code = f"""
 import sys, skytether
 assert "numpy" not in sys.modules and "asyncio" not in sys.modules
@@ -103,7 +99,7 @@ print(*(name for name in {HEAVY} if name in sys.modules))
 
 
 def test_keys_lie_over_a_scenario_with_dots_or_as_tables() -> None:
-    """Keys that are not named stay unchanged; numpy's numbers are accepted."""
+    """Other keys stay unchanged; numpy's numbers are accepted."""
     keys = {"control.trigger": "always", "network.uplink.loss": np.float64(0.25)}
     dotted = load("demo", seed=np.int64(7), **keys)
     network = {"uplink": {"loss": 0.25}}
@@ -138,7 +134,6 @@ def test_a_scenario_made_by_hand_is_checked() -> None:
 
 
 def test_a_reference_that_nothing_can_follow_is_told() -> None:
-    """By an event of the server at its start, and in the summary; others are not."""
     keys = {"reference.radius_m": 8.0, "reference.period_s": 10.0, "model.gain": 0.5}
     flight = fly("demo", **SHORT, **keys)
     (told,) = (each for each in flight.events if isinstance(each.event, ReferenceTooFast))
@@ -169,7 +164,6 @@ def test_a_flight_is_that_of_the_simulation(flown: skytether.Flight) -> None:
 
 
 def test_arrays_have_names_shapes_and_units(flown: skytether.Flight) -> None:
-    """All of a flight's, in the order of the parts; those of the record with other names."""
     columns = {column.name: column for column in flown.columns()}
     assert columns["position_m"] == ("position_m", (200, 2), "m")
     assert columns["input_mps"] == ("input_mps", (200, 2), "m/s")
@@ -328,7 +322,7 @@ def test_a_flight_over_udp_is_a_flight(tmp_path: Path) -> None:
 
 
 async def test_a_process_that_fails_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
-    """With its last words; also where an event loop runs already, as in a notebook."""
+    """With its last lines; also if an event loop is already running, as in a notebook."""
 
     def run(*_: object, **__: object) -> list[processes.Shortfall]:
         asyncio.run(asyncio.sleep(0))
@@ -340,7 +334,6 @@ async def test_a_process_that_fails_is_an_error(monkeypatch: pytest.MonkeyPatch)
 
 
 def test_ctrl_c_ends_the_processes_first(monkeypatch: pytest.MonkeyPatch) -> None:
-    """They are told to end, and waited for; wherever Python was started with SIGINT ignored."""
     ended = threading.Event()
 
     def run(*_: object, interrupted: Callable[[], bool], **__: object) -> None:
@@ -384,7 +377,8 @@ def test_a_sweep_flies_every_combination() -> None:
     assert other is not None
     mean, half = last.mean("rmse_xy")
     assert mean == pytest.approx((one + other) / 2)
-    assert half == pytest.approx(12.7062 * abs(one - other) / 2, rel=1e-4)  # t of one degree
+    # 12.7062 is t of one degree of freedom.
+    assert half == pytest.approx(12.7062 * abs(one - other) / 2, rel=1e-4)
 
 
 @pytest.mark.long
@@ -448,7 +442,7 @@ REFUSALS: list[tuple[Callable[[], object], type[Exception], str]] = [
     (
         lambda: fly("demo", secure=True, server=mine()),
         ConfigError,
-        "secure: got True with a server of your own, which could not open what is sealed",
+        "secure: got True with a server of your own, which cannot open encrypted packets",
     ),
     (
         lambda: fly_batch("demo", 8),  # type: ignore[arg-type]

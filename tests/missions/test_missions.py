@@ -1,4 +1,4 @@
-"""Vehicles that keep apart: motions, the solver behind them, and flights over bad networks."""
+"""Missions: motions, the QP solver behind them, and flights over bad networks."""
 
 import json
 import re
@@ -92,7 +92,7 @@ def test_a_motion_is_the_spline_that_is_sent(knots: int, seed: int, step: int) -
 
 @pytest.mark.parametrize("seed", range(10))
 def test_the_solver_finds_what_osqp_finds(seed: int) -> None:
-    """At its finest tolerance, with equalities, many constraints and few variables."""
+    """At OSQP's finest tolerance, with equalities, many constraints and few variables."""
     rng = np.random.default_rng(seed)
     n, m, equal = 24, 300, 2
     root = rng.normal(size=(n, n))
@@ -139,7 +139,7 @@ def test_what_cannot_be_has_no_solution() -> None:
 def test_a_plan_ends_at_rest_within_what_the_vehicle_can(
     velocity: tuple[float, float], goal: tuple[float, float]
 ) -> None:
-    """Under inputs that leave a tenth of the bound to the regulator aboard."""
+    """Its inputs leave a tenth of the bound to the regulator aboard."""
     terms = scenario(4).terms()
     found = TrajectoryQP(terms, 0.6, 0.0).solve(
         np.zeros((1, 2)), np.array([velocity]), np.tile(goal, (INTERVALS, 1))
@@ -184,13 +184,13 @@ def test_far_from_others_axes_are_planned_one_by_one_to_the_last_bit(
 
 @given(st.integers(0, 2**31), st.integers(0, 60))
 def test_motions_come_too_near_where_any_of_their_pieces_does(seed: int, begin: int) -> None:
-    """Also those that boxes around them tell apart; near already, one need only come no nearer."""
+    """Also if bounding boxes exclude them; vehicles already too near must not come nearer."""
     rng = np.random.default_rng(seed)
     scale, keep_m, off_m = np.array([1.0, 0.7]), 1.5, 0.02
     motion, base, *others = (drawn(rng) for _ in range(12))
     flown = PossibleMotions(scale, DT_S)
     for row, other in enumerate(others):
-        flown.replace(row, [PossibleMotion(drawn(rng, knots=5))])  # which is replaced by others
+        flown.replace(row, [PossibleMotion(drawn(rng, knots=5))])  # replaced below
         flown.replace(row, [PossibleMotion(other)] * 2, 0.1 * row)
     flown.replace(3, [])
 
@@ -211,7 +211,7 @@ def test_motions_come_too_near_where_any_of_their_pieces_does(seed: int, begin: 
 
 
 def test_the_box_of_a_motion_is_just_around_it() -> None:
-    """A motion that turns between its two knots lies outside both: the box contains its turn."""
+    """A motion may turn between two knots, outside of both: the box contains the turn."""
     out_and_back = Motion(0, np.array([[1.0, 5.0]] * 2), np.array([[0.8, 0.0], [-0.8, 0.0]]))
     flown = PossibleMotions(np.array([1.0, 0.5]), DT_S)
     flown.add(1, PossibleMotion(out_and_back))
@@ -225,7 +225,7 @@ def test_the_box_of_a_motion_is_just_around_it() -> None:
 
 
 def test_a_motion_that_lands_has_a_box_down_to_the_ground() -> None:
-    """Not where it never lands, nor where it is below the ground already."""
+    """Unless it never lands, or is below the ground already."""
     flown = PossibleMotions(np.ones(3), DT_S)
     for lands, height, low in ((NEVER, 4.0, 4.0), (60, 4.0, 0.0), (60, -1.0, -1.0)):
         motion = resting(0, np.array([1.0, 2.0, height]))
@@ -271,7 +271,7 @@ def test_vehicles_that_may_land_come_too_near_below_their_motions(
 
 
 def test_half_planes_keep_a_vehicle_out_from_under_one_that_may_land() -> None:
-    """It would pass 3 m below; in the end it is to rest beside it, also if neither lands yet."""
+    """The direct way passes 3 m below; the vehicle comes to rest beside the other one."""
     above, times = resting(0, np.array([0.0, 0.0, 4.0])), np.arange(0.0, 121.0, 5.0)
     held = np.tile([1.5, 0.0, 1.0], (len(times), 1))
     flown, reach_m = PossibleMotions(np.ones(3), DT_S), np.full(len(times), 9.0)
@@ -292,7 +292,6 @@ def test_half_planes_keep_a_vehicle_out_from_under_one_that_may_land() -> None:
 def test_what_is_kept_from_are_all_motions_that_may_be_flown(
     loss: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """At every plan, though only those are gathered that are others than before."""
     real, looked_at = MissionState.update_possible, list[int]()
 
     def update_possible(self: MissionState) -> None:
@@ -313,7 +312,7 @@ def test_what_is_kept_from_are_all_motions_that_may_be_flown(
     assert max(looked_at) > 6
 
 
-# -- what may be flown -----------------------------------------------------------------------------
+# -- possible motions ------------------------------------------------------------------------------
 
 
 def test_a_motion_may_be_flown_until_an_observation_says_otherwise() -> None:
@@ -327,7 +326,7 @@ def test_a_motion_may_be_flown_until_an_observation_says_otherwise() -> None:
     assert vehicle.motions() == [first]
     vehicle.sent.append(SentMotion(40, second))
     made.observe(0, observation(40 + made._join, 10, (4.0, 0.0)))
-    assert len(vehicle.motions()) == 2  # it may have been taken at the very step of the observation
+    assert len(vehicle.motions()) == 2  # it may be adopted at the very step of the observation
     made.observe(0, observation(41 + made._join, 10, (4.0, 0.0)))
     assert vehicle.motions() == [first]
     assert made.counts["horizons_lost"] == 1
@@ -336,7 +335,7 @@ def test_a_motion_may_be_flown_until_an_observation_says_otherwise() -> None:
 
 
 def test_another_life_does_not_wait_for_what_was_sent_to_the_one_before() -> None:
-    """Its steps are smaller, so time would never tell; one that goes on tells by its motion."""
+    """Its steps are smaller, so the step count would never tell."""
     made, place = alone().state, np.array([4.0, 0.0])
     for in_force, left in ((NO_HORIZON, 0), (900, 1)):
         vehicle = made.vehicles[0] = VehicleMotions()
@@ -353,7 +352,7 @@ def test_another_life_does_not_wait_for_what_was_sent_to_the_one_before() -> Non
 
 @pytest.mark.parametrize(("beyond_m", "is_hit"), [(1e-4, False), (-1e-4, True)])
 def test_a_motion_is_too_near_below_the_distance(beyond_m: float, is_hit: bool) -> None:
-    """D = separation_m + 2 tube_m, and as much larger from one that was outside its tube."""
+    """D = separation_m + 2 tube_m, plus the distance of a vehicle outside its tube."""
     made, flown = alone(), scenario(2)
     for row, x in ((0, 4.0), (1, -4.0)):
         made.hear(row, 100, NO_HORIZON, x)
@@ -368,7 +367,9 @@ def test_a_motion_is_too_near_below_the_distance(beyond_m: float, is_hit: bool) 
 
 @pytest.mark.parametrize("turned", [0.0, 0.5])
 def test_a_vehicle_that_has_turned_goes_on_to_the_right_of_its_goal(turned: float) -> None:
-    """Though it may fly straight: it is still passing somebody. Bit by bit it turns back."""
+    """Although the direct way is free, because it still passes another one; it turns back
+    slowly.
+    """
     made = ready()
     made.vehicles[0].turned_rad = turned
     end = planned(made).position[-1]
@@ -424,7 +425,7 @@ def test_a_trajectory_is_taken_aboard_until_it_is_too_late() -> None:
 
 
 def test_a_motion_is_not_taken_aboard_before_its_first_knot() -> None:
-    """It would be a leap: the motion in force has not come that far. A copy comes in time."""
+    """The motion in force has not come that far yet. A copy arrives in time."""
     aboard, knots = Compensator(scenario(2).terms()), np.zeros((2, 1, 2), np.float32)
     told = Trajectory(1, 1, 100, 0, 10, SPACING, knots)
     with pytest.raises(ProtocolError) as refused:
@@ -445,7 +446,7 @@ def test_motions_that_may_be_flown_include_the_one_to_be_sent_now() -> None:
 
 
 def test_a_motion_is_sent_again_after_losses_until_it_is_acknowledged() -> None:
-    """Not before the first loss; the very motion of that step, within what it may be taken in."""
+    """Not before the first loss; the same motion, within the time in which it may be adopted."""
     vehicle = VehicleMotions()
     vehicle.sent.append(SentMotion(100, resting(100, np.zeros(2))))
     assert not any(vehicle.repeat_at(step) for step in range(100, 140))
@@ -482,7 +483,7 @@ def test_a_vehicle_that_creeps_is_stuck_after_its_patience() -> None:
 
 
 def test_a_foreign_motion_is_over_after_the_last_step_it_may_have() -> None:
-    """Up to there the vehicle may be anywhere; from the first observation after it, it rests."""
+    """Until then the vehicle may be anywhere on it; from the next observation on, it rests."""
     until = 70 + LONGEST
     for steps in ((100, until, until + 1, until + 2), (100, until + 100, until + 101)):
         made, x = alone(), -4.0
@@ -496,7 +497,7 @@ def test_a_foreign_motion_is_over_after_the_last_step_it_may_have() -> None:
 
 
 def test_a_vehicle_without_a_motion_is_kept_from_as_far_as_it_brakes() -> None:
-    """It comes to rest v (τ + v / 2b) further on than where it was seen."""
+    """It comes to rest v (τ + v / 2b) beyond the observed place."""
     made, terms = alone().state, scenario(2).terms()
     made.absent.clear()
     moving = observation(100, NO_HORIZON, (4.0, 0.0))
@@ -507,7 +508,7 @@ def test_a_vehicle_without_a_motion_is_kept_from_as_far_as_it_brakes() -> None:
 
 
 def test_a_vehicle_rests_once_all_its_motions_are_over() -> None:
-    """A motion that was sent and may still be taken leads away from where it is."""
+    """A sent motion that may still be adopted leads away from the place."""
     made = alone().state
     made.vehicles[1] = vehicle = VehicleMotions()
     vehicle.in_force = SentMotion(-100, resting(-100, np.array([1.0, 0.0])))
@@ -518,7 +519,7 @@ def test_a_vehicle_rests_once_all_its_motions_are_over() -> None:
 
 
 def test_who_gets_a_motion_again_says_so_again() -> None:
-    """Aboard the second copy changes nothing, but an observation is due: the first may be lost."""
+    """The second copy changes nothing aboard, but the first acknowledgement may be lost."""
     terms = scenario(2).terms()
     compensator = Compensator(terms)
     reporter = Reporter(terms, "deviation(9)", compensator)
@@ -550,7 +551,7 @@ def test_vehicles_swap_places_and_keep_apart(loss: float, within_s: float) -> No
 def test_motions_that_are_sent_again_arrive_where_half_are_lost(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Ablation: sent once each, most are lost, or their acknowledgements, and vehicles are slow."""
+    """Sent only once, most motions or their acknowledgements are lost, and vehicles are slow."""
     swaps = scenario(4, 0.5, duration=40.0)
 
     def left_over_m() -> float:
@@ -574,10 +575,10 @@ def test_a_link_that_is_cut_leaves_them_apart() -> None:
 def test_steps_that_are_miscounted_do_not_bring_vehicles_together(
     steps: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The server mistakes the steps of half the vehicles, and what is known of their clocks holds.
+    """The server has wrong steps for half the vehicles, within the known bounds of their clocks.
 
-    Miscounted by 0.25 s, they arrive. By more than `link.join_s` they take no motion aboard, for
-    each comes too early or too late, which is told as lost.
+    With an error of 0.25 s vehicles arrive. With more than `link.join_s` they adopt no motion,
+    because each comes too early or too late and counts as lost.
     """
     real = ClockMap.steps
 
@@ -607,7 +608,7 @@ def test_sixteen_swap_places_over_the_worst_networks(losses: str, seed: int) -> 
 @pytest.mark.long
 @pytest.mark.parametrize("forgets", ["what was sent before", "what may be lost"])
 def test_without_what_may_be_flown_they_meet(forgets: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Ablation: apart from the newest motion alone, or from those that are acknowledged alone."""
+    """Ablation: separation only from the newest motion, or only from acknowledged ones."""
     real = VehicleMotions.motions
     newest = forgets == "what was sent before"
 
@@ -625,7 +626,7 @@ def test_without_what_may_be_flown_they_meet(forgets: str, monkeypatch: pytest.M
 
 @pytest.mark.long
 def test_taken_late_a_motion_is_another_one(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Ablation: a vehicle that takes trajectories at any time leaves its tube."""
+    """Ablation: a vehicle that adopts trajectories at any time leaves its tube."""
     real = Compensator.__init__
 
     def careless(self: Compensator, *args: Any) -> None:
@@ -642,14 +643,14 @@ def test_taken_late_a_motion_is_another_one(monkeypatch: pytest.MonkeyPatch) -> 
 
 
 def impatient(swaps: Scenario) -> Scenario:
-    """A scenario with a failsafe that brakes after 8 s of silence, and lands after a minute."""
+    """Scenario with a failsafe that brakes after 8 s of silence, and lands after a minute."""
     link = msgspec.structs.replace(swaps.link, timeout_s=8.0)
     vehicle = msgspec.structs.replace(swaps.vehicle, land_after_s=60.0)
     return msgspec.structs.replace(swaps, link=link, vehicle=vehicle)
 
 
 def test_a_server_begins_anew_in_the_midst_of_a_mission() -> None:
-    """It reckons with motions that it does not know, and with vehicles that hover meanwhile."""
+    """It allows for unknown motions, and for vehicles that hover meanwhile."""
     swaps = impatient(scenario(8, duration=80.0))
     flown, _ = fly_with_deaths(swaps, 8, [(6.0, 7.5), (14.0, 30.0), (36.0, 38.0)])
     assert separation_m(flown) > 0.5
@@ -657,10 +658,10 @@ def test_a_server_begins_anew_in_the_midst_of_a_mission() -> None:
 
 
 class HardOfHearing(Server):
-    """A server that hears vehicle 1 at first alone, and vehicle 3 only long after that."""
+    """Server that at first hears vehicle 1 alone, and vehicle 3 only long after."""
 
     def receive(self, datagram: Datagram, *, now_ns: int) -> None:
-        """See `Endpoint`; the times are those of the day at whose midnight the flight begins."""
+        """Times are those of the day at whose midnight the flight begins."""
         number, time_s = datagram.peer[1], now_ns / SECOND_NS % 86_400
         if (number == 1 and time_s > 5.0) or (number == 3 and time_s < 15.0):
             return
@@ -671,9 +672,9 @@ class HardOfHearing(Server):
 def test_who_is_silent_for_long_keeps_its_place_when_another_joins(
     keeps: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Ablation: without a row of its own it is forgotten, and flown into by the one that joins.
+    """Without its own row it is forgotten, and the joining vehicle flies into it.
 
-    Found by 1 of 600 flights of sixteen vehicles with links that are cut.
+    Found in 1 of 600 flights of sixteen vehicles with cut links.
     """
     monkeypatch.setattr(sessions, "SESSION_NS", 8 * SECOND_NS)
     if not keeps:
@@ -687,13 +688,13 @@ def test_who_is_silent_for_long_keeps_its_place_when_another_joins(
 
 
 def forgetful(*args: Any, keeps_rows: bool) -> sessions.Sessions:
-    """Sessions whose rows are free for anybody once they have ended."""
+    """Sessions whose rows are free for reuse once they have ended."""
     assert keeps_rows
     return sessions.Sessions(*args)
 
 
 def test_who_hovers_on_a_mission_holds_its_place(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Ablation: without that, wind takes it out of its tube while the server is gone."""
+    """Otherwise wind takes it out of its tube while the server is down."""
     swaps = impatient(scenario(2, duration=60.0))
 
     def drift_m() -> float:
@@ -728,14 +729,13 @@ def test_missions_that_come_with_it(name: str, within_s: float) -> None:
 
 
 def mission_of(name: str) -> Mission:
-    """Goals of a scenario."""
     found = reading.load(name).make_reference()
     assert isinstance(found, Mission)
     return found
 
 
 def test_in_space_they_keep_further_apart_one_above_the_other(tmp_path: Path) -> None:
-    """For downwash; a zone is flown around at its own heights alone."""
+    """Because of downwash; a zone is flown around only at its own heights."""
     rows = "1,0,-3,0,1\n1,2,3,0,1\n2,0,3,0,2.2\n2,2,-3,0,2.2\n"
     table = with_goals(tmp_path, rows, height_m=1.0, zones="box(-1, 1, -4, 1, 1.8, 3)")
     high = reading.check(table | {"duration": 30.0}, "high")
@@ -747,12 +747,12 @@ def test_in_space_they_keep_further_apart_one_above_the_other(tmp_path: Path) ->
     assert clear_m(flown, high.zones) > 0.0
     assert np.abs(one[-1] - [3.0, 0.0, 1.0]).max() < 0.3
     assert np.abs(other[-1] - [-3.0, 0.0, 2.2]).max() < 0.3
-    assert np.abs(one[:, 1]).max() < 0.8  # below the box: it goes straight, but for the other
+    assert np.abs(one[:, 1]).max() < 0.8  # below the box, straight except for the other vehicle
     assert np.abs(other[:, 1]).max() > 1.0
 
 
 def test_vehicles_on_a_sphere_swap_places_through_its_centre() -> None:
-    """Six of them; the distance that is kept is that of the ellipsoid of `mission.height_m`."""
+    """Six vehicles; the distance is that of the ellipsoid of `mission.height_m`."""
     sphere = packaged("sphere", duration=25.0, reference={"shape": "sphere(6)"})
     goals = sphere.make_reference()
     assert isinstance(goals, Mission)
@@ -816,9 +816,8 @@ def test_without_routes_they_wait_before_a_wall(monkeypatch: pytest.MonkeyPatch)
 def test_a_vehicle_at_rest_in_a_gap_is_flown_around(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Ablation: where ways lead around zones alone, the gap is tried for ever.
-
-    Unless a vehicle yields, which none does here.
+    """Ablation: with routes around zones only, the vehicle waits for the gap for ever, unless the
+    other yields, which none does here.
     """
     monkeypatch.setattr(MissionPlanner, "_ask_to_yield", lambda *_: None)
     goals = "1,0,0.2,0\n2,0,2.6,-2\n2,1,2.6,2\n3,0,-0.8,-0.9\n4,0,-0.8,0.9\n"
@@ -839,7 +838,7 @@ def test_a_vehicle_at_rest_in_a_gap_is_flown_around(
 def test_a_way_begins_where_an_octagon_faces_a_place(
     angle: float, radius_m: float, room_m: float
 ) -> None:
-    """However it lies, the place is as far from it as from the circle within."""
+    """For any orientation, the place is as far from the octagon as from the inscribed circle."""
     at = np.array([1.0, -2.0])
     place = at + (radius_m + room_m) * np.array([np.cos(angle), np.sin(angle)])
     zone = waypoints._octagon("a vehicle", at, radius_m, place)
@@ -851,7 +850,7 @@ def test_a_way_begins_where_an_octagon_faces_a_place(
 def test_a_vehicle_at_its_goal_in_a_gap_yields(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It comes back once the other has passed. Ablation: else that one never gets through."""
+    """It returns once the other has passed. Otherwise that one never gets through."""
     walls = "fence(-5, 5, -3, 3) & box(-0.5, 0.5, 0.6, 4) & box(-0.5, 0.5, -4, -0.6)"
     goals, swaps = "1,0,0,0\n2,0,-3,0\n2,1,3,0\n", scenario(2, duration=35.0)
     gap = reading.check(with_goals(tmp_path, goals, swaps, zones=walls), "gap")
@@ -895,9 +894,7 @@ def test_the_first_vehicle_on_a_way_is_asked() -> None:
     assert yielding.distance_from_way(homes, way) == pytest.approx([0.5, 0.5, 1.5])
     assert yielding.first_on(way, homes, 0.9) == 1
     both, moved = np.array([[0.5, 0.2], [1.5, 0.5]]), np.array([-7.0, 0.0])
-    assert (
-        yielding.first_on(way + moved, both + moved, 0.9) == 0
-    )  # the nearer one to where it begins
+    assert yielding.first_on(way + moved, both + moved, 0.9) == 0  # the nearer one to its start
     assert yielding.first_on(way, homes[[0, 2]], 0.9) == 0
     assert yielding.first_on(way, homes[2:], 0.9) is None
     assert yielding.first_on(way + np.array([9.0, 0.0]), homes, 0.9) is None
@@ -907,7 +904,7 @@ def test_the_first_vehicle_on_a_way_is_asked() -> None:
 
 
 def test_nobody_is_asked_who_is_far_ahead_on_the_way() -> None:
-    """Before that one is reached, the way may be another."""
+    """Before it is reached, the route may have changed."""
     corner = 1.1 * yielding.AHEAD_M
     way = np.array([[0.0, 0.0], [corner, 0.0], [corner + 4.0, 0.0]])
     ahead = np.array([[corner + 2.0, 0.0]])
@@ -917,7 +914,7 @@ def test_nobody_is_asked_who_is_far_ahead_on_the_way() -> None:
 
 
 def test_one_that_is_too_near_already_yields_away_from_the_other() -> None:
-    """Vehicles at rest may be nearer than plans keep. Ablation: no place would be found for it."""
+    """Vehicles at rest may be nearer than plans keep; otherwise no place is found for one."""
     free = Zones([])
     home, way = np.array([0.91, 0.0]), np.array([[0.0, 0.0], [5.0, 0.0]])
 
@@ -937,7 +934,6 @@ def test_one_that_is_too_near_already_yields_away_from_the_other() -> None:
 
 
 def test_goals_go_to_those_that_are_nearest(tmp_path: Path) -> None:
-    """With `mission.allocate`; where each begins stays as it is."""
     goals = "1,0,0,0\n1,5,9,1\n2,0,9,0\n2,5,0,1\n"
     found = reading.check(with_goals(tmp_path, goals, allocate=True), "mission")
     ends = [found.make_reference(number)(np.array(9.0))[:, 0].tolist() for number in (1, 2)]
@@ -952,12 +948,12 @@ def test_goals_go_to_those_that_are_nearest(tmp_path: Path) -> None:
 
 
 class CutOff(Server):
-    """A server that neither hears nor reaches vehicle 1 after its first five seconds."""
+    """Server without contact to vehicle 1 after the first five seconds."""
 
     since_s = 0.0
 
     def receive(self, datagram: Datagram, *, now_ns: int) -> None:
-        """See `Endpoint`; the times are those of the day at whose midnight the flight begins."""
+        """Times are those of the day at whose midnight the flight begins."""
         self.since_s = now_ns / SECOND_NS % 86_400
         if datagram.peer[1] != 1 or self.since_s < 5.0:
             super().receive(datagram, now_ns=now_ns)
@@ -970,7 +966,7 @@ class CutOff(Server):
 def test_nobody_is_below_a_vehicle_that_lands(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It hears nothing and lands, while another one is to pass below. Ablation: they meet."""
+    """It loses the link and lands, while another one is to pass below. Otherwise they meet."""
     goals = "1,0,0,0,4\n2,0,-4,0,1\n2,43.2,4,0,1\n"
     passing = reading.check(with_goals(tmp_path, goals) | {"duration": 65.0}, "passing")
 
@@ -1006,7 +1002,7 @@ def test_nobody_is_below_a_vehicle_that_lands(
 def test_when_a_vehicle_may_begin_to_land(
     before: Mode | None, mode: Mode, lands: int, tmp_path: Path
 ) -> None:
-    """10 s of hovering in silence after it was seen to do something else; at once if it hovers."""
+    """After 10 s of hovering in silence since the last other mode; at once if it already hovers."""
     flown = reading.check(with_goals(tmp_path, "1,0,0,0,2\n"), "hover")
     goals = flown.make_reference()
     assert isinstance(goals, Mission)
@@ -1020,7 +1016,7 @@ def test_when_a_vehicle_may_begin_to_land(
     assert mission.lands(0) == lands
     mission.rows.ahead[0] = 40
     assert mission.lands(0) == lands - 40
-    # Another life counts steps of its own: of one that hovers nothing is known but that.
+    # Another life counts its own steps: of a hovering vehicle only the mode is known.
     mission.forget(0)
     hovers = Observation(1, 2, 60, NO_HORIZON, 0, 0, 0, Mode.HOVER, 1, state, NO_INPUT)
     assert mission.observe(0, hovers)
@@ -1045,7 +1041,6 @@ def test_nobody_may_rest_above_what_it_must_not_land_on(
 
 
 def test_a_zone_below_a_vehicle_that_may_land_is_refused_in_flight(tmp_path: Path) -> None:
-    """Where it never lands, there may be one."""
     table = with_goals(tmp_path, "1,0,0,0,4\n") | {"duration": 12.0}
     changes = [(9.0, {"mission.zones": "box(-1, 1, -1, 1, 0, 2)"})]
 
@@ -1109,7 +1104,7 @@ def test_a_goal_that_cannot_be_is_refused(goals: str, said: str) -> None:
 def test_goals_as_near_as_they_may_be_are_reached(
     dt_s: float, acceleration_mps2: float, tmp_path: Path
 ) -> None:
-    """To each other and to a zone; also where motions bend much between their straight pieces."""
+    """Near to each other and to a zone; also where motions curve much between knots."""
     swaps = scenario(4, duration=60.0)
 
     def made(goals: str, **mission: Any) -> Scenario:
@@ -1199,7 +1194,7 @@ def test_the_fleet_tells_how_near_they_came(
 
 
 def test_the_least_distance_is_of_one_time() -> None:
-    """Vehicles that were at one place one after the other were not near."""
+    """Vehicles that were at one place at different times were not near."""
     columns = [("step", "i8"), ("mode", "u1"), ("state", "f8", (2, 2))]
     one, other = (np.zeros(101, columns) for _ in range(2))
     for rows in (one, other):
@@ -1224,7 +1219,7 @@ def test_a_batch_flies_each_mission_alone() -> None:
 
 
 def test_places_of_published_tasks_are_as_their_authors_have_them(tmp_path: Path) -> None:
-    """Far enough apart by the stretched distance, and the scenario is one that can be flown."""
+    """Far enough apart in the stretched distance, and the scenario can be flown."""
     for name, task in missions.TASKS.items():
         begins, ends = missions.places(task, np.random.default_rng(1))
         keep_m = task.separation_m + 2.0 * task.tube_m
@@ -1239,7 +1234,6 @@ def test_places_of_published_tasks_are_as_their_authors_have_them(tmp_path: Path
 
 
 def test_four_cross_as_published() -> None:
-    """Within the 20 s that a simulation of the authors takes, and the planning is timed."""
     cell = (1, ("Luis 2020: four cross", "20 ms"))
     done = missions.fly_published(PublishedOptions(duration=25.0), cell)
     assert done.least_m > 0.2

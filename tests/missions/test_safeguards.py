@@ -1,4 +1,4 @@
-"""Safeguards of missions, one by one: each test fails where its safeguard is taken out."""
+"""Safeguards of missions, one by one: each test fails if its safeguard is removed."""
 
 import numpy as np
 import pytest
@@ -16,11 +16,10 @@ from skytether.shared.wire.protocol import NO_HORIZON
 from two_vehicles import DT_S, alone, planned, ready, scenario
 
 FAR = 100.0
-"""Place of a vehicle that nobody meets, on each axis [m]."""
 
 
 def along(start: list[float], velocity: list[float], *, first: int = 0) -> Motion:
-    """Motion over 11 knots that flies at one velocity between its ends, where it rests."""
+    """Motion over 11 knots with constant velocity between its ends, where it rests."""
     v = np.vstack([np.zeros(len(start)), *[velocity] * 9, np.zeros(len(start))])
     moved = np.cumsum(0.5 * SPACING * DT_S * (v[1:] + v[:-1]), axis=0)
     return Motion(first, np.array(start) + np.vstack([np.zeros(len(start)), moved]), v)
@@ -35,14 +34,13 @@ def is_too_near(
     lands: int = NEVER,
     error: StepError = EXACT,
 ) -> bool:
-    """Whether a motion comes too near to another one, whose step may be wrong.
+    """Whether a motion comes too near to another one with an uncertain step.
 
     Args:
-        one, other: the motions.
         keep_m: distance to keep [m].
-        begin: step from which they are compared.
+        begin: step from which the motions are compared.
         lands: first step at which the first vehicle may begin to land.
-        error: of the other's step.
+        error: error of the other's step.
     """
     axes = one.position.shape[1]
     possible = PossibleMotions(np.ones(axes), DT_S)
@@ -55,20 +53,20 @@ def is_too_near(
 
 
 def test_clocks_that_drift_over_the_time_looked_ahead_count() -> None:
-    """Two fly 1 m behind each other, 100 s from now; they pass 1.6 cm a step of error."""
+    """Two vehicles fly 1 m behind each other, 100 s from now; a step of error is 1.6 cm."""
     one = along([0.0, 0.0], [0.8, 0.0], first=2000)
     other = along([1.0, 0.0], [0.8, 0.0], first=2000)
     assert is_too_near(one, other, 0.92)
 
 
 def test_one_that_may_be_down_is_kept_away_from_by_one_that_is_late() -> None:
-    """A vehicle at rest may land while another still passes below, for its step is uncertain."""
+    """A vehicle at rest may land while a late one still passes below."""
     above, passes = resting(0, np.array([0.0, 0.0, 6.0])), along([-2.0, 0.0, 2.0], [0.8, 0.0, 0.0])
     assert is_too_near(above, passes, 0.9, lands=130, error=StepError(0.0, 100.0))
 
 
 def test_the_bend_of_a_motion_is_taken_off_its_distances() -> None:
-    """A motion that turns round between its knots comes 1 m near to a place at rest."""
+    """A motion that reverses between its knots comes 1 m near to a place at rest."""
     turns = Motion(
         0,
         np.array([[0.0, 0.0], [0.0, 0.0], [-0.2, 0.0]]),
@@ -78,7 +76,7 @@ def test_the_bend_of_a_motion_is_taken_off_its_distances() -> None:
 
 
 def test_half_planes_keep_away_from_one_outside_its_tube() -> None:
-    """By as much more as it is outside, 0.3 m."""
+    """The distance grows by that between vehicle and tube, 0.3 m."""
     possible = PossibleMotions(np.ones(2), DT_S)
     possible.add(1, PossibleMotion(resting(0, np.zeros(2))), 0.3)
     times = np.arange(0.0, 121.0, 5.0)
@@ -87,7 +85,7 @@ def test_half_planes_keep_away_from_one_outside_its_tube() -> None:
 
 
 def test_a_motion_that_takes_the_place_of_another_keeps_its_own_landing() -> None:
-    """One vehicle is gone; the one that lands from 6 m comes down on whoever is below."""
+    """One vehicle is gone; the one that lands from 6 m descends onto whoever is below."""
     possible = PossibleMotions(np.ones(3), DT_S)
     possible.add(1, PossibleMotion(resting(0, np.array([9.0, 9.0, 9.0]))))
     possible.add(2, PossibleMotion(resting(0, np.array([0.0, 0.0, 6.0])), 60))
@@ -96,11 +94,10 @@ def test_a_motion_that_takes_the_place_of_another_keeps_its_own_landing() -> Non
     assert too_near(PossibleMotion(below), far, 0, 0, possible, 0.9)[0]
 
 
-# -- what is sent --------------------------------------------------------------------------------
+# -- sending motions -----------------------------------------------------------------------------
 
 
 def test_a_plan_that_still_comes_too_near_is_not_sent() -> None:
-    """The last check before a motion is sent."""
     made = ready()
     vehicle = made.vehicles[0]
     vehicle.turned_rad = 0.5
@@ -118,7 +115,7 @@ def test_a_vehicle_inside_a_zone_does_not_leave_it_through_another() -> None:
 
 
 def test_a_vehicle_that_moves_is_not_told_to_rest_where_it_passes() -> None:
-    """Without a motion and at 0.5 m/s."""
+    """It flies at 0.5 m/s without a motion."""
     made = alone()
     for step in (100, 101):
         for row, x in ((0, 4.0), (1, -4.0)):
@@ -129,7 +126,7 @@ def test_a_vehicle_that_moves_is_not_told_to_rest_where_it_passes() -> None:
 
 
 def test_how_far_a_vehicle_is_outside_its_tube_is_kept_by_itself_and_for_its_next_motion() -> None:
-    """Towards motions that others fly, and those planned at the same step."""
+    """Against motions of others, and against those planned at the same step."""
     made = ready()
     made.align(101)
     made.state.update_possible()
@@ -146,7 +143,7 @@ def test_how_far_a_vehicle_is_outside_its_tube_is_kept_by_itself_and_for_its_nex
 
 
 def test_a_new_motion_is_the_old_one_as_long_as_it_may_be_taken() -> None:
-    """Taken late, within `link.join_s`, it is no leap."""
+    """Adopted late, within `link.join_s`, it causes no jump."""
     made = ready()
     motion, before = planned(made), made.vehicles[0].in_force.motion
     steps = np.arange(101.0, 102.0 + scenario(2).terms().join)
@@ -154,16 +151,16 @@ def test_a_new_motion_is_the_old_one_as_long_as_it_may_be_taken() -> None:
 
 
 def test_a_motion_is_sent_again_before_it_ends_aboard() -> None:
-    """A vehicle at rest would drift: twice within `link.age_max_s`, for one may be lost."""
+    """Otherwise a vehicle at rest drifts; twice within `link.age_max_s`, as one may be lost."""
     terms = scenario(2).terms()
     assert 2 * ready()._resend_after + terms.join < terms.age_max
 
 
-# -- clients that begin anew ---------------------------------------------------------------------
+# -- restarted clients ---------------------------------------------------------------------------
 
 
 def test_nothing_is_planned_for_a_vehicle_whose_client_has_begun_anew() -> None:
-    """Nobody knows where along its motions it is."""
+    """Its place along its motions is unknown."""
     made = ready()
     made.align(100)
     made.state.restart(0)
@@ -173,7 +170,6 @@ def test_nothing_is_planned_for_a_vehicle_whose_client_has_begun_anew() -> None:
 
 
 def test_others_keep_away_from_all_of_its_motions() -> None:
-    """It may be as late as any vehicle can be."""
     made = ready()
     made.align(101)
     made.state.restart(0)
@@ -182,7 +178,6 @@ def test_others_keep_away_from_all_of_its_motions() -> None:
 
 
 def test_an_observation_of_its_earlier_life_does_not_end_that() -> None:
-    """One that was under way when it began anew."""
     made = ready()
     made.align(101)
     assert made.state.restart(0)
@@ -204,7 +199,7 @@ def test_no_zone_is_taken_while_a_vehicle_flies_a_motion_of_an_earlier_server() 
 
 
 def test_a_zone_is_refused_where_a_late_vehicle_still_passes() -> None:
-    """It may be 60 steps behind the place that its step tells."""
+    """It may be 60 steps behind its counted step."""
     made = ready()
     made.vehicles[0].in_force = SentMotion(90, along([4.0, 0.0], [-0.8, 0.0], first=101))
     made.align(165)
@@ -219,7 +214,7 @@ def test_a_zone_is_refused_where_a_late_vehicle_still_passes() -> None:
 
 
 def heard(count: int, *, asymmetry_ns: int = 0) -> ClockMap:
-    """Clocks of a vehicle that is heard once a second, each packet 0.1 s under way."""
+    """Clock map of a vehicle that is heard once a second, with 0.1 s of delay."""
     clocks = ClockMap(
         1, 50 * MILLISECOND_NS, **({"asymmetry_ns": asymmetry_ns} if asymmetry_ns else {})
     )
@@ -230,13 +225,13 @@ def heard(count: int, *, asymmetry_ns: int = 0) -> ClockMap:
 
 
 def test_clocks_may_have_drifted_over_all_the_time_that_is_looked_back() -> None:
-    """Also where the operator's word on delays leaves little else."""
+    """Also where the operator's bounds on delays leave little else."""
     clocks = heard(25, asymmetry_ns=10 * MILLISECOND_NS)
     assert clocks.middle_ns(0, 24 * SECOND_NS)[1] >= 25 * MILLISECOND_NS
 
 
 def test_what_the_time_of_day_said_before_a_clock_was_set_does_not_count() -> None:
-    """Set by 5 s; then the time of day tells that, and contradicts nothing."""
+    """Set by 5 s; afterwards the time of day shows the new clock, without contradiction."""
     clocks, delay_ns = heard(10), 100 * MILLISECOND_NS
     clocks.tell(0, 0, MILLISECOND_NS, now_ns=10 * SECOND_NS)
     set_ns = 5 * SECOND_NS
@@ -247,7 +242,7 @@ def test_what_the_time_of_day_said_before_a_clock_was_set_does_not_count() -> No
 
 
 def test_a_time_of_day_that_delays_contradict_moves_no_step() -> None:
-    """0.4 s off, where delays leave 0.1 s."""
+    """0.4 s off, where delays allow 0.1 s."""
     clocks = heard(5)
     told = clocks.tell(0, 400 * MILLISECOND_NS, 5 * MILLISECOND_NS, now_ns=5 * SECOND_NS)
     assert told is Contradiction.TIME_OF_DAY
@@ -278,7 +273,7 @@ def test_zones_are_checked_whatever_is_known_of_a_clock(late: float) -> None:
 
 @pytest.mark.parametrize("late", [0.0, 1e11])
 def test_a_vehicle_moves_away_from_one_of_whose_clock_nothing_is_known(late: float) -> None:
-    """They are too near already; the answer must not take as long as the clock may be late."""
+    """Already too near; the computation must not grow with the uncertainty of the clock."""
     made = ready()
     for row, x in ((0, 0.3), (1, 0.0)):
         made.vehicles[row].in_force = SentMotion(90, resting(100, np.array([x, 0.0])))

@@ -1,8 +1,7 @@
-"""Vehicles whose present steps the server cannot know: how far motions keep apart for that.
+"""Vehicles whose present steps are uncertain to the server, and the distances kept for that.
 
-A delay that is another one way than the other is an error of a vehicle's clock that nobody sees. So
-every motion is compared with all that another one may be at a time, and no delay brings two
-vehicles together.
+Different delays in the two directions cause an error of the clock offset that no packet reveals. So
+every motion is compared with all possible places of another vehicle at each time.
 """
 
 from collections.abc import Callable
@@ -40,13 +39,13 @@ SCALE, ROWS = np.array([1.0, 0.7]), np.array([0])
 errors = st.builds(
     lambda late, width: StepError(width - late, late), st.floats(-20.0, 20.0), st.floats(0.0, 30.0)
 )
-"""Errors of steps; a vehicle may for certain be ahead of the step that is counted, or behind it."""
+"""Errors of steps; a vehicle may with certainty be ahead of its counted step, or behind."""
 
 
 def least_m(
     one: Motion, other: Motion, begin: int, mine: StepError, its: StepError, scale: Array = SCALE
 ) -> float:
-    """Least distance over all steps and all errors of both, by trying them [m]."""
+    """Least distance over all steps and all errors of both, by enumeration [m]."""
     steps = np.arange(begin, max(one.last, other.last) + 80.0, 0.5)
     here = one.at(steps, DT_S)[0]
     shifts = np.append(
@@ -63,7 +62,7 @@ def least_m(
 def test_a_motion_is_compared_with_all_that_another_may_be_at_each_time(
     seed: int, begin: int, mine: StepError, its: StepError, axes: int
 ) -> None:
-    """What comes too near for any error of both is refused; little else is."""
+    """A motion that comes too near for any pair of errors is refused, and few others are."""
     rng, keep_m = np.random.default_rng(seed), 1.5
     scale = np.array([1.0, 0.7, 0.5])[:axes]
     motion, *others = (drawn(rng, axes) for _ in range(9))
@@ -73,7 +72,7 @@ def test_a_motion_is_compared_with_all_that_another_may_be_at_each_time(
     hit = too_near(PossibleMotion(motion, error=mine), far, begin, 0, flown, keep_m)
     for other, is_hit in zip(others, hit, strict=False):
         least = least_m(motion, other, begin, mine, its, scale)
-        # Between the steps that are tried here they may be nearer by 3 cm at 1.2 m/s.
+        # Between the steps tried here they may be nearer by 3 cm at 1.2 m/s.
         assert is_hit >= (least < keep_m)
         assert is_hit <= (least < keep_m + 0.06)
 
@@ -83,7 +82,6 @@ def test_a_motion_is_compared_with_all_that_another_may_be_at_each_time(
 def test_errors_of_one_vehicle_count_as_much_as_those_of_the_other(
     seed: int, error: StepError
 ) -> None:
-    """A motion at rest is where it is, however little is known of its clock."""
     rng, keep_m = np.random.default_rng(seed), 1.5
     one, other, far = (
         drawn(rng),
@@ -128,7 +126,7 @@ def test_half_planes_are_in_front_of_all_that_another_may_be_at_a_time(
 
 
 def test_what_is_on_its_way_when_it_lands_is_so_at_its_own_time() -> None:
-    """A vehicle that lands two seconds before it is counted to is below its motion then."""
+    """A vehicle that lands two seconds earlier than counted is below its motion then."""
     above = resting(0, np.array([0.0, 0.0, 6.0]))
     T = SPACING * DT_S
     velocity = np.array([[0.0], *[[0.8]] * 9, [0.0]]) * np.array([1.0, 0.0, 0.0])
@@ -146,7 +144,7 @@ def test_what_is_on_its_way_when_it_lands_is_so_at_its_own_time() -> None:
 
 
 def test_two_that_keep_the_distance_come_no_nearer_by_what_pieces_are_off() -> None:
-    """The bound of the motion in force is another one at another step: that is not too near yet."""
+    """The tolerance of the motion in force differs at another step; that is not too near."""
     rng, far = np.random.default_rng(5), resting(0, np.array([100.0, 0.0]))
     for _ in range(200):
         base, other = drawn(rng), drawn(rng)
@@ -167,16 +165,13 @@ def test_two_that_keep_the_distance_come_no_nearer_by_what_pieces_are_off() -> N
 
 
 def above_ground(motion: Motion) -> Motion:
-    """The motion, so high that it does not pass the ground."""
     return motion._replace(position=motion.position + np.array([0.0, 0.0, 20.0]))
 
 
 def landing_m(
     one: Motion, other: Motion, begin: int, mine: StepError, its: StepError, lands: list[int]
 ) -> float:
-    """Least distance as of `least_m`, of two of which each may be below its motion from a step of
-    its own on [m]; shape of places (3,).
-    """
+    """Least distance as in `least_m`, where each vehicle may land from its own step on [m]."""
     steps = np.append(np.arange(begin, max(one.last, other.last) + 80.0, 0.5), 1e3)
     here, nearest = one.at(steps, DT_S)[0], np.inf
     for shift in np.arange(-its.late - mine.early, its.early + mine.late + 0.5, 0.5):
@@ -189,14 +184,14 @@ def landing_m(
 
 
 def test_who_keeps_the_distance_goes_on_to_keep_it() -> None:
-    """Whoever may land: only where a vehicle is too near already may it be as near as that."""
+    """For any landing; only vehicles that are already too near may stay as near."""
     keep_m, accepted = 1.2, 0
     for seed in range(1000, 1600):
         rng = np.random.default_rng(seed)
         motion, other = (above_ground(drawn(rng, 3)) for _ in range(2))
         mine, its = (StepError(*rng.uniform(0.0, 8.0, 2)) for _ in range(2))
         lands = [NEVER if rng.random() < 0.3 else int(rng.integers(250)) for _ in range(2)]
-        # At rest above the way of the other one, and from there to somewhere.
+        # At rest above the other's way, and from there to some place.
         place = other.position[len(other.position) // 2] + rng.uniform([-1, -1, 1], [1, 1, 4])
         base = resting(0, place)
         motion = Motion(0, motion.position - motion.position[0] + place, motion.velocity)
@@ -205,14 +200,14 @@ def test_who_keeps_the_distance_goes_on_to_keep_it() -> None:
         if too_near(PossibleMotion(motion, lands[0], mine), base, 0, 0, flown, keep_m)[0]:
             continue
         accepted += 1
-        # Between the steps that are tried here they may be nearer by 3 cm at 1.2 m/s.
+        # Between the steps tried here they may be nearer by 3 cm at 1.2 m/s.
         least = landing_m(motion, other, 0, mine, its, lands) + 0.06
         if least < keep_m:
             assert least > landing_m(base, other, 0, mine, its, lands)
     assert accepted > 300
 
 
-# -- what is known of a clock ----------------------------------------------------------------------
+# -- bounds of clock offsets -----------------------------------------------------------------------
 
 
 @settings(max_examples=100)
@@ -225,7 +220,6 @@ def test_who_keeps_the_distance_goes_on_to_keep_it() -> None:
 def test_no_delay_makes_the_bounds_of_an_offset_false(
     seed: int, offset_ns: int, drift: float, packets: list[tuple[float, float, float]]
 ) -> None:
-    """Also with clocks that drift, echoes that are old, and sessions that begin anew."""
     rng, known = np.random.default_rng(seed), ClockMap(1, DT_NS)
     now_ns, rows = 1000 * S, np.array([0])
     known.forget(0, 7)
@@ -237,7 +231,7 @@ def test_no_delay_makes_the_bounds_of_an_offset_false(
     came_ns, heard, backward_ns = now_ns, 0, 0
     for after_s, down_s, up_s in packets:
         sent_ns = now_ns + round(after_s * S)
-        if rng.random() < 0.7 or not heard:  # an echo came since the last observation
+        if rng.random() < 0.7 or not heard:  # an echo arrived since the last observation
             heard, came_ns = heard + 1, now_ns + round(rng.random() * (sent_ns - now_ns))
             backward_ns = true_ns(came_ns) + round(up_s * S)
         arrived_ns = sent_ns + round(down_s * S)
@@ -256,7 +250,7 @@ def test_no_delay_makes_the_bounds_of_an_offset_false(
 
 
 def test_a_bound_that_was_found_is_kept_but_for_the_drift_of_clocks() -> None:
-    """The estimate forgets after 20 s; a short delay that was met once counts for long."""
+    """The estimate forgets after 20 s; a single short delay stays valid for long."""
     known, rows, width = ClockMap(1, DT_NS), np.array([0]), []
     for at_s in range(100):
         delay_ns = (10 if at_s == 3 else 400) * MS
@@ -270,7 +264,7 @@ def test_a_bound_that_was_found_is_kept_but_for_the_drift_of_clocks() -> None:
 
 
 def test_another_life_of_a_vehicle_has_another_clock() -> None:
-    """Another session of the same life has not."""
+    """Another session of the same life has the same clock."""
     known, rows = ClockMap(1, DT_NS), np.array([0])
     known.forget(0, (1, 1))
     known.observe(0, 10 * MS, 10 * MS, heard=0, now_ns=S)
@@ -283,7 +277,7 @@ def test_another_life_of_a_vehicle_has_another_clock() -> None:
 
 
 def test_a_clock_that_was_set_is_noticed_and_known_anew() -> None:
-    """By less than a round trip it is not noticed: clocks that are set end the guarantee."""
+    """A step by less than a round trip is not detected: setting clocks voids the guarantee."""
     known, rows = ClockMap(1, DT_NS), np.array([0])
     for at_s in range(20):
         offset_ns = 5 * S if at_s > 9 else 0
@@ -295,7 +289,6 @@ def test_a_clock_that_was_set_is_noticed_and_known_anew() -> None:
 
 
 def width_s(known: ClockMap, now_ns: int) -> float:
-    """Time between the bounds of the offset of the clock in row 0 [s]."""
     early, late = np.zeros((2, 1))
     known.step_errors(ROWS, known.steps(ROWS, now_ns), early, late)
     return float(early[0] + late[0]) * DT_S
@@ -304,7 +297,7 @@ def width_s(known: ClockMap, now_ns: int) -> float:
 def listen(
     known: ClockMap, begin_s: int, end_s: int, up_s: float, down_s: float
 ) -> set[Contradiction]:
-    """What observations contradict, one a second over these delays; clocks show the same."""
+    """Contradictions found by observations, one a second over these delays, with equal clocks."""
     found = set()
     for at_s in range(begin_s, end_s):
         sample = round(down_s * S), round(up_s * S)
@@ -313,7 +306,7 @@ def listen(
 
 
 def test_an_operator_s_word_on_the_delays_bounds_the_clock() -> None:
-    """Once there are enough packets for minima; the clocks' drift over 20 s is added."""
+    """After enough packets for minima, plus the clocks' drift over 20 s."""
     known = ClockMap(1, DT_NS, asymmetry_ns=100 * MS)
     for end_s, expected_s in ((4, 0.85), (30, 0.14)):
         assert listen(known, max(end_s - 26, 0), end_s, 0.43, 0.4) == {Contradiction.NOTHING}
@@ -331,7 +324,7 @@ def test_an_operator_s_word_is_dropped_when_delays_contradict_it() -> None:
 
 
 def test_the_time_of_day_bounds_the_clock_and_the_step() -> None:
-    """Delays that differ by 0.8 s are seen then; the step that is counted is the true one."""
+    """Delays that differ by 0.8 s become visible; the counted step is the true one."""
     known = ClockMap(1, DT_NS)
     for at_s in range(0, 20, 2):
         assert listen(known, at_s, at_s + 2, 0.05, 0.85) == {Contradiction.NOTHING}
@@ -341,7 +334,7 @@ def test_the_time_of_day_bounds_the_clock_and_the_step() -> None:
 
 
 def test_a_time_of_day_that_cannot_be_is_told_and_all_counts_that_may_be() -> None:
-    """Neither the smaller nor the other bound is believed alone; nor is it when it comes right."""
+    """Neither bound is used alone, even after the time of day is right again."""
     known = ClockMap(1, DT_NS)
     listen(known, 0, 5, 0.1, 0.1)
     assert known.tell(0, 400 * MS, 5 * MS, now_ns=5 * S) is Contradiction.TIME_OF_DAY
@@ -360,7 +353,7 @@ def test_a_word_that_the_time_of_day_contradicts_is_dropped() -> None:
 
 
 def test_the_figures_tell_what_a_clock_costs(monkeypatch: pytest.MonkeyPatch) -> None:
-    """In the midst of a flight by where vehicles may be; at rest nothing, whatever is known."""
+    """In flight the uncertainty of the place; at rest 0, for any clock."""
     delay(monkeypatch, turns(0.05, 0.85))
     for duration, at_least_m, at_most_m in ((7.0, 0.2, 0.7), (2.0, 0.0, 0.01)):
         flown = flight.fly(mission("swap", "swap(2)", duration), vehicles=2)
@@ -370,25 +363,23 @@ def test_the_figures_tell_what_a_clock_costs(monkeypatch: pytest.MonkeyPatch) ->
     assert "clock_steps" not in flown.figures["server"]["counts"]
 
 
-# -- flights over delays that differ ---------------------------------------------------------------
+# -- flights with asymmetric delays ----------------------------------------------------------------
 
 Delays = Callable[[int], tuple[float, float]]
 """Delay of a vehicle up and down [s], by the number of its flow."""
 
 
 def turns(up_s: float, down_s: float) -> Delays:
-    """Vehicles by turns with the one delay up and the other down, and the reverse."""
+    """Alternating vehicles: one delay up and the other down, or the reverse."""
     return lambda flow: (up_s, down_s) if flow % 2 else (down_s, up_s)
 
 
 def odd(up_s: float, down_s: float) -> Delays:
-    """One vehicle unlike all others."""
+    """One vehicle with other delays than all others."""
     return lambda flow: (up_s, down_s) if flow == 3 else (down_s, up_s)
 
 
 def delay(monkeypatch: pytest.MonkeyPatch, delays: Delays) -> None:
-    """Give each vehicle its own constant delays."""
-
     def fates(_: Proxy, name: Literal["uplink", "downlink"], flow: int) -> Fates:
         delay_s = delays(flow)[name == "downlink"]
         return Fates(path(f"constant({delay_s})"), 1, name, flow)
@@ -397,7 +388,6 @@ def delay(monkeypatch: pytest.MonkeyPatch, delays: Delays) -> None:
 
 
 def mission(name: str, shape: str = "", duration: float = 30.0) -> Scenario:
-    """A mission that comes with Skytether."""
     reference = {"shape": shape} if shape else {}
     return packaged(name, duration=duration, seed=1, reference=reference)
 
@@ -406,7 +396,9 @@ SWAP = mission("swap", "swap(8)", 20.0)
 
 
 def test_delays_that_differ_do_not_bring_vehicles_together(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Eight that swap places came as near as 6 cm, with no packet lost and nobody out of a tube."""
+    """Without the bounds, eight swapping vehicles came as near as 6 cm, with no packet lost and
+    none outside a tube.
+    """
     delay(monkeypatch, turns(0.05, 0.85))
     flown = flight.fly(SWAP, vehicles=8)
     assert separation_m(flown) > 0.5
@@ -416,10 +408,9 @@ def test_delays_that_differ_do_not_bring_vehicles_together(monkeypatch: pytest.M
 def test_with_steps_taken_for_exact_delays_bring_vehicles_together(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """What the bounds of the clocks are for: without them the same flight ends badly."""
     delay(monkeypatch, turns(0.05, 0.85))
 
-    monkeypatch.setattr(ClockMap, "step_errors", lambda *_: None)  # they stay 0
+    monkeypatch.setattr(ClockMap, "step_errors", lambda *_: None)  # errors stay 0
     flown = flight.fly(SWAP, vehicles=8)
     assert separation_m(flown) < 0.4
     assert "left_tube" not in flown.figures["server"]["counts"]
@@ -428,7 +419,7 @@ def test_with_steps_taken_for_exact_delays_bring_vehicles_together(
 def test_with_the_time_of_day_at_both_ends_clocks_are_known(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """To within what both tell, by delays that differ by 0.8 s; each is as wrong as it may be."""
+    """To within the stated accuracy of both, with delays that differ by 0.8 s."""
     delay(monkeypatch, turns(0.05, 0.85))
     simulation = msgspec.structs.replace(SWAP.simulation, time_error_s=0.01)
     flown = flight.fly(msgspec.structs.replace(SWAP, simulation=simulation), vehicles=8)
@@ -453,7 +444,7 @@ def test_with_the_time_of_day_at_both_ends_clocks_are_known(
 def test_missions_over_delays_that_differ(
     name: str, shape: str, delays: Delays, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """With each of these vehicles came nearer than asked for, as near as 5 cm; now they arrive."""
+    """Without the bounds, vehicles came as near as 5 cm in each of these."""
     scenario = mission(name, shape, 60.0)
     delay(monkeypatch, delays)
     goals = scenario.make_reference()
@@ -461,13 +452,13 @@ def test_missions_over_delays_that_differ(
     flown = flight.fly(scenario, vehicles=len(goals.vehicles))
     assert separation_m(flown) >= scenario.mission.separation_m
     assert "left_tube" not in flown.figures["server"]["counts"]
-    if name != "warehouse":  # where goals change until 150 s
+    if name != "warehouse":  # goals change there until 150 s
         assert max(left_m(flown, scenario)) < 0.3
 
 
 @pytest.mark.long
 def test_the_flight_of_seed_9114_keeps_its_distance() -> None:
-    """Delays that stay for a minute, drawn: 0.132 m without bounds of the clocks."""
+    """Random delays that last a minute: 0.132 m without bounds of the clocks."""
     scenario = mission("swap", "swap(8)", 60.0)
     table = reading.to_table(msgspec.structs.replace(scenario, seed=9114))
     for way in ("uplink", "downlink"):

@@ -1,4 +1,4 @@
-"""The exact solver: right to rounding, the same whatever came before, and never a guess."""
+"""Exact solver: accurate to rounding, independent of earlier problems, never a wrong answer."""
 
 from collections.abc import Callable
 from functools import cache
@@ -38,7 +38,6 @@ def make(
     u_max: tuple[float, ...] = (1.8, 1.0),
     **control: Any,
 ) -> Problem:
-    """The paper's problem, with some keys of `control` changed."""
     replace = msgspec.structs.replace
     model = replace(PAPER.model, tau_s=tau_s, u_max=u_max)
     scenario = replace(PAPER, model=model, control=replace(PAPER.control, **control))
@@ -47,12 +46,11 @@ def make(
 
 
 ROUGH = {"dt": 0.1, "horizon": 30, "input_weight": 1e-3, "state_weight": (10.0, 1.0)}
-"""Long steps and hardly a cost of the input: here sets wander in circles."""
+"""Long steps and hardly any weight of the input: active sets cycle."""
 
 
 @cache
 def active_sets_with(**constants: float) -> Callable[..., int]:
-    """`active_sets` compiled with other constants than those of its module."""
     names = {**vars(exact), **constants}
     first = exact.lanes(FunctionType(exact._first_set.py_func.__code__, names))
     return part(FunctionType(exact.active_sets.py_func.__code__, {**names, "_first_set": first}))
@@ -60,13 +58,12 @@ def active_sets_with(**constants: float) -> Callable[..., int]:
 
 @pytest.fixture
 def no_pivots(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Sets that wander are given up at once."""
+    """Cycling active sets are given up at once."""
     changed = {**vars(exact), "active_sets": active_sets_with(PIVOTS_MAX=0)}
     monkeypatch.setattr(exact, "_solve", FunctionType(exact._solve.py_func.__code__, changed))
 
 
 def problems(problem: Problem, count: int, scale: float, seed: int) -> tuple[Array, Array]:
-    """Random gradients, of moving targets and states `scale` away, and random guesses."""
     rng = np.random.default_rng(seed)
     axes, H = problem.hessian.shape[:2]
     x = rng.normal(0.0, scale, (count, axes, 2))
@@ -76,7 +73,6 @@ def problems(problem: Problem, count: int, scale: float, seed: int) -> tuple[Arr
 
 
 def residual(problem: Problem, inputs: Array, gradient: Array) -> float:
-    """Violation of the optimality conditions, relative to the gradient."""
     slope = np.einsum("akl,nal->nak", problem.hessian, inputs) + gradient
     at_bound = np.abs(inputs) >= U_MAX[:, None]
     wrong = np.where(at_bound, np.maximum(np.sign(inputs) * slope, 0.0), slope)
@@ -137,7 +133,7 @@ def test_problems_that_cycle_are_solved_all_the_same(
 def test_an_input_that_daqp_leaves_just_inside_its_bound_is_at_it(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Such an answer is right to rounding and yet has a slope: no reason to refuse it."""
+    """Such an answer is accurate to rounding although it has a slope; it must not be refused."""
     dual = exact.daqp.solve
 
     def nearly(*args: object, **keys: object) -> object:
@@ -158,7 +154,7 @@ def test_an_input_that_daqp_leaves_just_inside_its_bound_is_at_it(
 def test_without_the_fallback_such_problems_fail_and_are_not_guessed(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """A wrong answer of DAQP is not believed: those vehicles keep their guess, others fly on."""
+    """A wrong answer of DAQP is refused: these vehicles keep their guess."""
     problem = make((0.4, 0.6), **ROUGH)
     gradient, guess = problems(problem, 300, 3.0, seed=1)
     right, _ = ExactSolver(problem).solve(gradient, guess)
@@ -174,7 +170,7 @@ def test_without_the_fallback_such_problems_fail_and_are_not_guessed(
 
 
 def test_a_horizon_rounded_to_float32_keeps_its_active_set() -> None:
-    """The warm start of every saturated flight: one round, though 1.8 has become 1.7999999."""
+    """Warm start of every saturated flight: one round, although 1.8 became 1.7999999."""
     problem = make((0.855, 0.855), (1.8, 1.8))
     gradient, guess = problems(problem, 20, 10.0, seed=6)
     inputs, _ = ExactSolver(problem).solve(gradient, guess)

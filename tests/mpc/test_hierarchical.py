@@ -1,6 +1,6 @@
-"""Trajectory generator (14) and tracker (15): who plans from what, along what, and after gaps.
+"""Trajectory generator (14) and tracker (15).
 
-`OnPaper` is section 4.1 once more, for one vehicle, with a dense solver and no batch.
+`OnPaper` is an independent version of section 4.1 for one vehicle, with a dense solver.
 """
 
 from typing import Any, NamedTuple
@@ -44,39 +44,35 @@ SCENARIO = check(
     },
     "test",
 )
-"""Two unlike axes, one of them too slow for its circle, and an S-term that shows."""
+"""Two different axes, one of them too slow for its circle, and a noticeable S-term."""
 TERMS = SCENARIO.terms()
 MODEL = TERMS.model
 START = np.array([[1.2, 0.3], [-0.4, 0.8]])
-"""Beside the circle, and moving."""
 CALM = np.zeros((1, 2))
 
 
 def problem(which: int) -> Problem:
-    """The QPs of the scenario."""
     return pose(MODEL, make_mpc(TERMS, SCENARIO.control), which)
 
 
 def make(capacity: int = 1, scenario: Scenario = SCENARIO) -> Planner:
-    """A planner that has not planned yet."""
     terms = scenario.terms()
     desired = Desired(scenario, terms, capacity, capacity)
     return Planner(scenario.control, terms, desired, capacity, capacity, Stopwatch())
 
 
 class Plan(NamedTuple):
-    """A copy of what a planner has to say of n vehicles, and of what it keeps of them."""
+    """Copy of a planner's results for n vehicles, and of its memory of them."""
 
     inputs: Array
     """U(k) of generator and tracker [m/s]; shape (2, n, axes, H)."""
     states: Array
-    """X(k) of the generator, behind where it starts [m, m/s]; shape (n, axes, H + 1, 2)."""
+    """X(k) of the generator, from its initial state on [m, m/s]; shape (n, axes, H + 1, 2)."""
     step: Indices
-    """Step that they start at, or -1; shape (n,)."""
+    """First step of the plans, or -1; shape (n,)."""
     planned: Array
     """Planned state x_p(k|k-1) [m, m/s]; shape (n, axes, 2)."""
     figures: Figures
-    """Figures of the plans; shape (n,)."""
     horizons: Array
     """Horizons that may be sent [m/s]; shape (n, axes, 2 H)."""
 
@@ -92,12 +88,11 @@ class Plan(NamedTuple):
 
 
 def plan(planner: Planner, rows: Indices, step: Indices, found: Foresight) -> Plan:
-    """The plans of vehicles."""
     planner.plan(rows, step, found)
     memory, n = planner._memory, len(rows)
     inputs = memory.inputs[:, rows].astype(float)
     figures = planner.figures[:n].copy()
-    figures["row"] = 0  # where a vehicle lies is nothing that its plan should know
+    figures["row"] = 0  # a plan must not depend on the vehicle's row
     figures["gap"][figures["fresh"]] = 0
     return Plan(
         inputs,
@@ -110,36 +105,32 @@ def plan(planner: Planner, rows: Indices, step: Indices, found: Foresight) -> Pl
 
 
 def seen(estimates: Array) -> Foresight:
-    """Foresight of vehicles that are known to be there; shape (n, axes, 2)."""
     found = empty_foresight(len(estimates), 2, H, H)
     found.start[:] = estimates
     return found
 
 
 def run(planner: Planner, step: int, estimate: Array) -> Plan:
-    """The plan of one vehicle at one step."""
     return plan(planner, np.array([0]), np.array([step]), seen(estimate[None]))
 
 
 def elsewhere(step: int) -> Array:
-    """Some estimate, another one at every step."""
     return START + np.random.default_rng(step).normal(scale=0.2, size=(2, 2))
 
 
 def same(one: Plan, other: Plan) -> None:
-    """Assert that two plans have the same bits."""
     for mine, yours in zip(one, other, strict=True):
         for name in FIGURES.names if mine.dtype == FIGURES else (...,):
             np.testing.assert_array_equal(mine[name], yours[name])
 
 
 def shift(inputs: Array, gap: int) -> Array:
-    """Horizons as seen some steps later (11); shape (..., H)."""
+    """Horizons shifted by some steps (11); shape (..., H)."""
     return inputs[..., np.minimum(np.arange(H) + gap, H - 1)]
 
 
 def fly(x: Array, u: Array) -> Array:
-    """State x, and the states that H inputs lead through; shape (axes, H + 1, 2)."""
+    """State x, and the states that follow with H inputs; shape (axes, H + 1, 2)."""
     states = [x]
     for stage in range(H):
         states.append(MODEL.step(states[-1], u[:, stage]))
@@ -147,15 +138,13 @@ def fly(x: Array, u: Array) -> Array:
 
 
 class OnPaper:
-    """{X_p(k), U_p(k)} ← (14), then {X(k), U(k)} ← (15)."""
-
     def __init__(self) -> None:
         self.step: int | None = None
         self.led, self.tracked = np.zeros((2, 2, H))
         self.trajectory = np.zeros((2, H + 1, 2))
 
     def plan(self, step: int, estimate: Array, wind: Array) -> Array:
-        """U(k) of the tracker; `led` and `trajectory` are the generator's."""
+        """U(k) of the tracker; sets `led` and `trajectory` of the generator."""
         gap = H + 1 if self.step is None else step - self.step
         which = FIRST if gap > H else LATER
         start = estimate if gap > H else self.trajectory[:, gap]
@@ -199,7 +188,7 @@ def test_first_plan_starts_from_the_estimate() -> None:
 
 
 def test_first_plan_has_no_change_term() -> None:
-    """E8: S = 0, which is not the same as S on a horizon of zeros."""
+    """E8: S = 0, which differs from S on a previous horizon of zeros."""
     desired = SCENARIO.make_reference()(SCENARIO.control.dt * np.arange(H + 1))
     target, still = desired.transpose(1, 0, 2)[None], np.zeros((1, 2, H))
 
@@ -214,7 +203,7 @@ def test_first_plan_has_no_change_term() -> None:
 
 @pytest.mark.parametrize("gap", [1, 3, H])
 def test_generator_goes_on_from_its_own_prediction(gap: int) -> None:
-    """Prediction x_p(k|k-1) ∈ X_p(k-1): where the last inputs lead in the steps passed."""
+    """Initial state x_p(k|k-1) ∈ X_p(k-1): the state after the inputs of the steps passed."""
     planner = make()
     before = run(planner, 10, START)
     made = run(planner, 10 + gap, elsewhere(gap))
@@ -225,7 +214,7 @@ def test_generator_goes_on_from_its_own_prediction(gap: int) -> None:
 
 
 def test_generator_never_looks_at_the_vehicle_again() -> None:
-    """E17: two vehicles with one start share X_p for ever, wherever they really fly."""
+    """E17: two vehicles with one start have the same X_p for ever, whatever their states."""
     one, other = make(), make()
     run(one, 0, START)
     run(other, 0, START)
@@ -236,7 +225,7 @@ def test_generator_never_looks_at_the_vehicle_again() -> None:
 
 
 def test_tracker_follows_all_of_the_trajectory() -> None:
-    """E9: where inputs cost nothing, the vehicle that is on X_p stays on it at every stage."""
+    """E9: without a weight on inputs, a vehicle on X_p stays on X_p at every stage."""
     free = {
         "horizon": H,
         "change_weight": 0.0,
@@ -265,7 +254,7 @@ def test_vehicle_starts_anew_after_a_long_gap_or_when_forgotten(anew: str) -> No
 
 
 def test_plan_is_exactly_what_can_be_sent() -> None:
-    """Inputs are float32 numbers, and X_p is predicted with those and no others."""
+    """Inputs are float32 numbers, and X_p is predicted with exactly these."""
     planner = make()
     made, then = run(planner, 0, START), run(planner, H, START)
     np.testing.assert_array_equal(made.horizons[:, :, :H], made.tracked)
@@ -287,7 +276,7 @@ def test_batch_is_planned_as_its_singles(solver: str) -> None:
 
 
 def crowd(rng: np.random.Generator, ahead: Indices) -> Foresight:
-    """Foresight of vehicles beside the circle, told this and that, and blown about."""
+    """Foresight of vehicles beside the circle, with random inputs and disturbances."""
     n = len(ahead)
     found = empty_foresight(n, 2, H, H)
     found.ahead[:] = ahead
@@ -299,7 +288,7 @@ def crowd(rng: np.random.Generator, ahead: Indices) -> Foresight:
 
 
 def cost_of(found: Foresight, target: Array, told: Array, inputs: Array) -> float:
-    """Cost (9) of the tracker's inputs, twice; of the states 1 … H, and of both axes."""
+    """Twice the cost (9) of the tracker's inputs, over the states 1 … H and both axes."""
     weights, wind = make_mpc(TERMS, SCENARIO.control).weights, found.disturbance[0][:, None]
     off = fly(found.start[0], inputs + wind)[:, 1:] - target[:, 1:]
     fast = inputs + wind - target[:, :-1, 1]
@@ -310,7 +299,7 @@ def cost_of(found: Foresight, target: Array, told: Array, inputs: Array) -> floa
 @settings(max_examples=20)
 @given(st.integers(0, 2**32 - 1), st.integers(1, H), st.integers(0, H))
 def test_figures_are_what_they_are_called(seed: int, gap: int, d: int) -> None:
-    """V of (16), the cost of flying on above that of the plan, and how far that leads from it."""
+    """V of (16), the additional cost of keeping the old plan, and its deviation."""
     rng, rows, planner = np.random.default_rng(seed), np.array([2]), make(3)
     before = plan(planner, rows, np.array([40 - d]), crowd(rng, np.array([d])))
     found = crowd(rng, np.array([d]))
@@ -336,7 +325,7 @@ def test_figures_are_what_they_are_called(seed: int, gap: int, d: int) -> None:
 def test_expected_gap_weighs_what_flying_on_costs_where_packets_are_lost(
     shares: tuple[float, float],
 ) -> None:
-    """Each case by its probability, and that all arrive by what is left; without doubts the gap."""
+    """Each case weighted with its probability; with no loss, the plain gap."""
     rng, rows, planner = np.random.default_rng(7), np.array([0]), make()
     before = plan(planner, rows, np.array([40]), crowd(rng, np.array([0])))
     found = crowd(rng, np.array([0]))._replace(
@@ -383,7 +372,7 @@ def test_inputs_that_are_never_flown_are_not_compared(flown: int) -> None:
 
 @pytest.mark.parametrize("first", [True, False])
 def test_figures_that_compare_with_nothing_are_zero(first: bool) -> None:
-    """V and deviation at a first step; with "predictive", what compares with what was sent."""
+    """V and deviation at a first step; with "predictive", those compared with the sent horizon."""
     control = msgspec.structs.replace(SCENARIO.control, scheme="predictive")
     scenario = SCENARIO if first else msgspec.structs.replace(SCENARIO, control=control)
     planner, rng, rows = make(scenario=scenario), np.random.default_rng(1), np.array([0])
@@ -399,14 +388,14 @@ ROUGH = {
     "control": {"dt": 0.1, "horizon": H, "input_weight": 1e-3, "state_weight": [10.0, 1.0]},
     "reference": {"shape": "square", "radius_m": 1.5, "period_s": 4.0},
 }
-"""Long steps, hardly a cost of the input, and corners."""
+"""Long steps, hardly any weight of the input, and a path with corners."""
 
 
 compiled_pass = skytether.server.mpc.hierarchical._plan
 
 
 def leaving(batch: PlanBatch, rows: Indices, steps: Indices, work: RiccatiWorkspace) -> int:
-    """Plan as the compiled pass does, but leave every third vehicle unsolved, with its memory."""
+    """Plan with the compiled pass, but leave every third vehicle unsolved, with its memory."""
     left, memory = rows[::3], batch.memory
     before = memory.inputs[:, left], memory.start[left], memory.step[left]
     compiled_pass(batch, rows, steps, work)
@@ -431,9 +420,9 @@ PREDICTIVE = {**ROUGH["control"], "scheme": "predictive", "trigger": "always"}
 def test_compiled_pass_has_the_bits_of_the_moves_around_a_solver(
     monkeypatch: pytest.MonkeyPatch, scenario: Scenario, seed: int, leaves: bool
 ) -> None:
-    """Over fresh vehicles, gaps of all lengths, disturbances, and estimates that are no numbers.
+    """Over new vehicles, gaps of all lengths, disturbances, and NaN estimates.
 
-    It makes no difference either which vehicles the pass has to leave to the moves.
+    The vehicles that the pass leaves unsolved have the same result.
     """
     if leaves:
         monkeypatch.setattr(skytether.server.mpc.hierarchical, "_plan", leaving)
@@ -463,7 +452,7 @@ def test_compiled_pass_has_the_bits_of_the_moves_around_a_solver(
 
 
 class Faulty:
-    """The exact solver, but for who of generator and tracker shall find none; they ask by turns."""
+    """Exact solver that fails for generator or tracker, which call it alternately."""
 
     def __init__(self, posed: Problem, fails: set[int]) -> None:
         self._exact = ExactSolver(posed)
@@ -471,7 +460,6 @@ class Faulty:
         self._asks = TRACKER
 
     def solve(self, gradient: Array, guess: Array) -> tuple[Array, Flags]:
-        """See `server.mpc.solver.Solver`."""
         self._asks = TRACKER if self._asks == GENERATOR else GENERATOR
         if self._asks in self._fails:
             return guess.copy(), np.zeros(len(gradient), dtype=np.bool_)
@@ -479,13 +467,13 @@ class Faulty:
 
 
 def make_faulty(fails: set[int]) -> Planner:
-    """Planner whose solver fails on the problems that are in `fails` at the time."""
+    """Planner whose solver fails for the problems that `fails` contains at the time."""
     with solving(lambda posed: Faulty(posed, fails)):
         return make()
 
 
 def test_unsolved_vehicle_goes_on_with_its_shifted_horizon() -> None:
-    """Both problems: what was planned at step 4 is flown on at 6, and X_p along with it."""
+    """Both problems: the plan of step 4 is continued at step 6, and X_p too."""
     fails: set[int] = set()
     planner = make_faulty(fails)
     before = run(planner, 4, START)
@@ -498,7 +486,6 @@ def test_unsolved_vehicle_goes_on_with_its_shifted_horizon() -> None:
 
 @pytest.mark.parametrize("who", [GENERATOR, TRACKER])
 def test_plan_is_good_only_if_both_problems_were_solved(who: int) -> None:
-    """A trajectory that is no optimum is not worth tracking."""
     assert run(make_faulty({who}), 0, START).figures["solved"].tolist() == [False]
 
 
@@ -507,7 +494,7 @@ def test_vehicle_without_any_plan_hovers() -> None:
 
 
 def test_first_plan_is_tried_again_until_it_is_solved() -> None:
-    """Nothing was sent, so the next step is the first: an event (E18), without an S-term (E8)."""
+    """Nothing was sent, so the next step is the first: an event (E18), no S-term (E8)."""
     fails = {GENERATOR}
     planner = make_faulty(fails)
     run(planner, 0, START)
@@ -532,7 +519,7 @@ def test_estimate_that_is_not_finite_spoils_its_own_vehicle_and_step_alone() -> 
 
 
 def hours_apart(rng: np.random.Generator) -> Indices:
-    """Steps of a full block of vehicles, all over a day: of more pages than there are places."""
+    """Steps of a full block of vehicles, spread over a day: more pages than places."""
     return rng.integers(0, 86_400 / SCENARIO.control.dt, BLOCK)
 
 

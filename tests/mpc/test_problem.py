@@ -1,7 +1,7 @@
-"""The optimal control problem as algebra: the QP is the printed cost, and its answer the optimum.
+"""Optimal control problem: the QP equals the printed cost, and its solution is the optimum.
 
-The printed cost (5), with the S-term of (9), is evaluated here stage by stage on the model; nothing
-of the condensed form is used to check the condensed form.
+The printed cost (5), with the S-term of (9), is evaluated stage by stage on the model,
+independently of the condensed form.
 """
 
 import numpy as np
@@ -34,7 +34,6 @@ quick = settings(max_examples=40)
 
 TAU_S = (0.81, 0.3)
 TWO_TAUS = discretise(TAU_S, 0.05)
-"""A vehicle that is not the same on both axes."""
 U_MAX = np.array([1.8, 1.0])
 
 
@@ -49,12 +48,10 @@ WEIGHTS = {
 
 
 def control(H: int, **keys: object) -> ControlConfig:
-    """Weights of the paper's scenario over H steps, some of them changed."""
     return ControlConfig(horizon=H, **(WEIGHTS | keys))
 
 
 def make(weights: ControlConfig, which: int = LATER, tau_s: tuple[float, ...] = TAU_S) -> Problem:
-    """The QPs of vehicles with these time constants."""
     u_max = tuple(np.resize(U_MAX, len(tau_s)).tolist())
     model = ModelConfig(axes=len(tau_s), tau_s=tau_s, u_max=u_max)
     terms = Scenario(model=model, control=weights).terms()
@@ -64,7 +61,7 @@ def make(weights: ControlConfig, which: int = LATER, tau_s: tuple[float, ...] = 
 def printed_cost(
     weights: ControlConfig, u: Array, *, x: Array, target: Array, previous: Array, wind: Array
 ) -> Array:
-    """J of (9) of each axis, summed up along a flight of TWO_TAUS; with E6 and E7."""
+    """J of (9) of each axis, summed along a flight of TWO_TAUS; with E6 and E7."""
     Q, P = np.array(weights.state_weight), np.array(weights.terminal_weight)
     H, cost = weights.horizon, np.zeros(len(x))
     for i in range(H):
@@ -77,7 +74,7 @@ def printed_cost(
 
 
 def optimum(problem: Problem, gradient: Array) -> Array:
-    """The bounded QPs of one vehicle by dense least squares: ½ ‖Lᵀu + L⁻¹g‖², 𝓗 = L Lᵀ."""
+    """Solution of one vehicle's bounded QPs by dense least squares: ½ ‖Lᵀu + L⁻¹g‖², 𝓗 = L Lᵀ."""
     answers = []
     for hessian, g, bound in zip(problem.hessian, gradient, U_MAX, strict=True):
         L = np.linalg.cholesky(hessian)
@@ -87,7 +84,6 @@ def optimum(problem: Problem, gradient: Array) -> Array:
 
 
 def situation(seed: int, H: int, axes: int = 2, size: float = 1.0) -> tuple[Array, Array, Array]:
-    """Some state, target and horizon before, for one vehicle."""
     rng = np.random.default_rng(seed)
     x, target = rng.normal(size=(axes, 2)), rng.normal(size=(axes, H + 1, 2))
     return size * x, size * target, size * rng.normal(size=(axes, H))
@@ -133,7 +129,7 @@ def test_cost_of_a_change_is_that_of_the_hessian(seed: int, H: int) -> None:
 
 
 def test_first_step_has_no_change_weight() -> None:
-    """E8: its QP is that of a scenario without S, whatever the horizon before."""
+    """E8: its QP equals that of a scenario without S, for any previous horizon."""
     first, without = make(control(5, change_weight=3.0), FIRST), make(control(5, change_weight=0.0))
     np.testing.assert_array_equal(first.hessian, without.hessian)
     x, target, previous = (each[None] for each in situation(1, 5))
@@ -144,7 +140,7 @@ def test_first_step_has_no_change_weight() -> None:
 @quick
 @given(st.integers(0, 2**32 - 1), st.integers(1, 60), st.sampled_from([2, 3]))
 def test_prediction_is_the_model_flown_step_by_step(seed: int, H: int, axes: int) -> None:
-    """(7): Φx + ΓU is where H single steps lead, stage by stage; there the follower is led."""
+    """(7): Φx + ΓU equals H single steps of the model, stage by stage."""
     rng = np.random.default_rng(seed)
     problem = make(control(H), tau_s=tuple(rng.uniform(0.1, 3.0, axes).tolist()))
     x, _, u = situation(seed, H, axes)
@@ -194,7 +190,7 @@ def test_solver_finds_the_optimum(
 
 
 def test_only_with_input_reference_a_steady_flight_is_optimal() -> None:
-    """E7: the literal R asks a vehicle that flies just as desired to slow down."""
+    """E7: with the literal R, a vehicle exactly on its reference is slowed down."""
     v = np.array([0.9, -0.5])
     t = 0.05 * np.arange(41)
     target = np.stack([v[:, None] * t, np.tile(v[:, None], 41)], axis=-1)[None]
@@ -210,14 +206,13 @@ def test_only_with_input_reference_a_steady_flight_is_optimal() -> None:
 
 
 def carried(inputs: Array, gap: int, *, fresh: bool = False) -> Array:
-    """A whole horizon, shifted."""
     simd = simd_batch(simd_memory(len(inputs), 1))
     set_previous(inputs, gap, fresh, simd, 0)
     return simd.previous[:, 0]
 
 
 def test_shifted_horizon_repeats_its_last_input() -> None:
-    """(11): so many steps later, however many; a vehicle that begins anew has none before."""
+    """(11): by any number of steps; a new vehicle has no previous horizon."""
     horizon = np.array([1.0, 2.0, 3.0, 4.0])
     later = [carried(horizon, gap).tolist() for gap in (0, 1, 3, 9)]
     assert later == [[1, 2, 3, 4], [2, 3, 4, 4], [4, 4, 4, 4], [4, 4, 4, 4]]

@@ -1,4 +1,4 @@
-"""The solver's promises: in the box, trouble stays with one vehicle, nothing is remembered."""
+"""Contract of the solvers: answers in the box, failures of one vehicle only, no memory."""
 
 import numpy as np
 import pytest
@@ -27,7 +27,6 @@ U_MAX = PROBLEM.mpc.bounds
 
 @pytest.fixture(scope="module", params=[ExactSolver, OsqpSolver])
 def make(request: pytest.FixtureRequest) -> type[Solver]:
-    """Each solver in turn."""
     return request.param
 
 
@@ -78,7 +77,6 @@ def test_bad_gradient_fails_its_own_vehicle_alone(
 
 
 def test_osqp_refuses_a_bad_guess() -> None:
-    """A bad guess does not reach the solver's memory either."""
     gradient, guess = problems(2, 2)
     guess[0, 0, 0] = np.nan
     _, solved = OsqpSolver(PROBLEM).solve(gradient, guess)
@@ -86,7 +84,7 @@ def test_osqp_refuses_a_bad_guess() -> None:
 
 
 def test_bad_problem_is_not_even_tried() -> None:
-    """Thousands of iterations on NaN would cost every other vehicle its step."""
+    """Thousands of iterations on NaN would delay every other vehicle."""
     _, guess = problems(2, 1)
     with pytest.raises(SolverFailed, match=r"^problem not finite after 0 iterations$"):
         OsqpSolver(PROBLEM)._solve_axis(0, np.full(H, np.nan), guess[0, 0])
@@ -133,7 +131,7 @@ def test_answer_depends_on_problem_and_guess_alone(
 
 
 def test_answer_does_not_lean_on_its_guess(make: type[Solver]) -> None:
-    """A good guess saves time and moves the answer by no more than the tolerance."""
+    """A good guess saves time and changes the answer by no more than the tolerance."""
     gradient, guess = problems(7, 1)
     solver = make(PROBLEM)
     one, _ = solver.solve(gradient, guess)

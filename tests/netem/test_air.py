@@ -26,25 +26,21 @@ P_MIN = 0.001
 
 
 def fates(text: str, seed: int = 1, count: int = SAMPLES, every: int = 7) -> list[Fate]:
-    """Fates of packets that enter every so many slots."""
     made = Fates(path(text), seed, "uplink", 0)
     return [made.at(every * number) for number in range(count)]
 
 
 def delays_s(text: str, seed: int, every: int = 7, count: int = SAMPLES) -> NDArray[np.float64]:
-    """Delays of packets [s]; shape (count,)."""
     return np.array([fate.delay_ns for fate in fates(text, seed, count, every)]) / SECOND_NS
 
 
 def lognormal(least: float, mean: float, sd: float) -> Any:
-    """The distribution of `lognormal`."""
     variance = np.log(1 + (sd / (mean - least)) ** 2)
     scale = (mean - least) * np.exp(-variance / 2)
     return stats.lognorm(np.sqrt(variance), loc=least, scale=scale)
 
 
 def gamma(least: float, mean: float, sd: float) -> Any:
-    """The distribution of `gamma`."""
     shape = ((mean - least) / sd) ** 2
     return stats.gamma(shape, loc=least, scale=(mean - least) / shape)
 
@@ -95,7 +91,7 @@ def test_what_a_law_says_of_itself_is_so(text: str) -> None:
 
 @pytest.mark.parametrize("law", ["uniform(0, 1", "gamma(0, 0.5, 0.3", "paper(0, 0.1, 3"])
 def test_correlated_delays_keep_their_law_and_their_memory(law: str) -> None:
-    """The autocorrelation falls to 1/e in the time that is asked for."""
+    """The autocorrelation falls to 1/e in the correlation time."""
     every, correlation_s = 50, 0.5
     text = f"{law}, correlation_s={correlation_s})"
     drawn = np.concatenate([delays_s(text, seed, every, 8000) for seed in SEEDS])
@@ -248,7 +244,6 @@ def test_files_are_found_beside_the_scenario(tmp_path: Any) -> None:
 
 
 def test_a_text_replaces_that_below_and_an_argument_changes_it(tmp_path: Any) -> None:
-    """Also where the scenario below has arguments alone, over the text of the default."""
     (tmp_path / "lossy.toml").write_text("extends = 'demo'\nnetwork.uplink.loss = 0.3\n")
     assert reading.load(str(tmp_path / "lossy.toml")).network.uplink == (
         "paper(0.4, 0.02, 2.0) & loss(0.3)"

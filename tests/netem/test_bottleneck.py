@@ -22,7 +22,6 @@ Packet = tuple[int, int, int]
 
 
 def linked(text: str) -> tuple[Link, Lane]:
-    """A link with these impairments, and a flow through it."""
     direction = path(text)
     return Link(UPLINK, 1472, None, direction), Lane(0, Fates(direction, 1, "uplink", 0), 0)
 
@@ -51,14 +50,14 @@ def test_a_packet_takes_its_size_over_the_rate() -> None:
 
 @pytest.mark.parametrize("serve", ["first", "fair"])
 def test_too_much_passes_at_the_rate(serve: str) -> None:
-    """The fluid limit: of twice the rate half passes, and the queue is full."""
     every_ns = SECOND_NS * 100 // 20_000  # 100 B at 20 kB/s
     packets = [(number * every_ns, 100, number % 2) for number in range(4000)]
     out, dropped = passed(f"rate(10000, queue=5000, serve={serve})", packets)
     assert len(out) == pytest.approx(2000 + 50, abs=2)
     assert len(out) + len(dropped) == 4000
     waits_ns = [out[number] - number * every_ns for number in sorted(out)[1000:]]
-    assert max(waits_ns) <= 0.54 * SECOND_NS  # 5000 B at the rate, the one served, and a turn
+    # 5000 B at the rate, the packet being served, and a turn.
+    assert max(waits_ns) <= 0.54 * SECOND_NS
     assert np.mean(waits_ns) == pytest.approx(0.505 * SECOND_NS, rel=0.01)
 
 
@@ -88,7 +87,7 @@ def test_fair_serves_each_flow_alike() -> None:
 
     share, wait_s = served("fair")
     assert share == 1.0
-    assert wait_s < 0.16  # a turn of the other, and what it is just sending
+    assert wait_s < 0.16  # a turn of the other flow, and the packet being sent
     share, wait_s = served("first")
     assert wait_s > 0.5
 
@@ -126,7 +125,7 @@ def test_codel_keeps_the_queue_short() -> None:
 
 
 def test_times_of_mahimahi_are_kept(tmp_path: Path) -> None:
-    """1504 bytes at each, shared by small packets; over and over; what nobody uses is lost."""
+    """1504 bytes at each time, shared by small packets, repeated; unused ones are lost."""
     (tmp_path / "a.mahi").write_text("10\n10\n30\n40\n")
     text = f'deliveries("{tmp_path}/a.mahi", queue=100000)'
     ms = MILLISECOND_NS
@@ -163,7 +162,7 @@ def test_every_packet_passes_once_or_is_dropped(
 
 
 def test_what_is_lost_on_the_way_has_taken_its_time() -> None:
-    """A packet lost on the air has used it; one that waits is no earlier for that."""
+    """A packet lost after the bottleneck has used it; the next packet waits all the same."""
     link, lane = linked("loss(1) & constant(0.1) & rate(12800)")
     for _ in range(3):
         link.accept(Datagram(b"x" * (128 - HEADER_BYTES), ("a", 1)), lane, now_ns=0)
@@ -173,7 +172,7 @@ def test_what_is_lost_on_the_way_has_taken_its_time() -> None:
 
 
 def test_what_is_under_way_waits_for_the_rate_or_is_delayed() -> None:
-    """Both count, but for the packet that is served; what waits counts with its header."""
+    """Both count, except for the packet being served; queued packets count with headers."""
     (link, lane), size = linked("constant(0.1) & rate(12800)"), 128 - HEADER_BYTES
     for _ in range(5):
         link.accept(Datagram(b"x" * size, ("a", 1)), lane, now_ns=0)

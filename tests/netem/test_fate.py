@@ -1,4 +1,4 @@
-"""`netem.fate`: the delays of eq. (17) as corrected, and fates that follow from names and time."""
+"""`netem.fate`: delays of eq. (17) as corrected, and fates that depend on names and time only."""
 
 from bisect import bisect_right
 
@@ -15,7 +15,7 @@ from skytether.shared.scenario.air.path import path
 
 SAMPLES = 20_000
 TAIL = 8
-"""Slots from here on are one class: Poisson(2) has 22 of 20 000 samples there."""
+"""Slots from here on form one class: Poisson(2) has 22 of 20 000 samples there."""
 
 PAPER = "paper(0.4, 0.02, 2.0)"
 LOSSY = f"{PAPER} & loss(0.1)"
@@ -29,13 +29,11 @@ def first_fates(
     flow: int = 0,
     count: int = COUNT,
 ) -> list[Fate]:
-    """The fates of the first packets of a flow's first slots."""
     fates = Fates(path(direction), seed, name, flow)
     return [fates.at(slot) for slot in range(count)]
 
 
 def delays_ns(direction: str, count: int) -> NDArray[np.int64]:
-    """Delays of a flow's first slots [ns]; shape (count,)."""
     fates = first_fates(direction, 17, count=count)
     return np.array([fate.delay_ns for fate in fates], dtype=np.int64)
 
@@ -92,7 +90,7 @@ def test_any_number_of_slots_has_its_mean_and_variance(mean: float) -> None:
 
 
 def test_a_channel_is_as_it_was_drawn_at_the_newest_moment_before() -> None:
-    """Moments of every cell, one after the other up to its end, found here all at once."""
+    """Transitions of every cell, one after the other up to its end, computed here all at once."""
     names, mean_s = (5, "uplink", 0, "moments"), 0.1
     draws, moments_of = Draws(Stream("packets"), 0, names), Stream(*names)
     drawn: list[tuple[float, float]] = []
@@ -112,7 +110,7 @@ def test_a_channel_is_as_it_was_drawn_at_the_newest_moment_before() -> None:
 
 @pytest.mark.parametrize("mean", [0.0, 0.3, 2.0, 50.0, 1000.0])
 def test_no_draw_lies_beyond_the_last_number_of_slots(mean: float) -> None:
-    """The probabilities rise to 1 exactly, for a draw may come as close to it as it likes."""
+    """The probabilities rise to 1 exactly, because a draw may come arbitrarily close to 1."""
     _, cumulative = delays._poisson(mean)
     assert cumulative[-1] == 1.0
     assert list(cumulative) == sorted(cumulative)
@@ -150,7 +148,7 @@ def test_another_seed_direction_or_flow_meets_another_network(other: dict[str, o
 
 @pytest.mark.parametrize(("loss", "burst_s"), [(0.0, 0.0), (0.5, 0.0), (1.0, 0.0), (0.5, 1.0)])
 def test_losses_change_no_delay(loss: float, burst_s: float) -> None:
-    """A lost packet draws its delay as well, so nothing after it shifts."""
+    """A lost packet draws its delay too, so later draws stay the same."""
     losses = f"gilbert_elliott({loss}, {burst_s})" if burst_s else f"loss({loss})"
     drawn = first_fates(f"{PAPER} & {losses}")
     assert [fate.delay_ns for fate in drawn] == [fate.delay_ns for fate in first_fates()]

@@ -1,4 +1,4 @@
-"""`netem.link`: one direction of the network, and what it counts."""
+"""`netem.link`: one direction of the network, and its counters."""
 
 import io
 from collections.abc import Iterable
@@ -28,12 +28,11 @@ PEER = ("192.0.2.1", 5000)
 
 
 def make_link(mtu: int = 1472) -> Link:
-    """A link that writes nothing down."""
     return Link(UPLINK, mtu, None)
 
 
 class Listed(Fates):
-    """Fates one after the other, whenever packets enter."""
+    """Given fates in order, at any times."""
 
     def __init__(self, fates: Iterable[Fate]) -> None:
         self._listed = iter(fates)
@@ -43,25 +42,24 @@ class Listed(Fates):
 
 
 def make_lane(*delays_ns: int, flow: int = 0, lost: Iterable[int] = ()) -> Lane:
-    """A flow whose packets have these delays; those with the numbers in `lost` are lost."""
+    """Flow whose packets have these delays; those with the numbers in `lost` are lost."""
     lost = set(lost)
     listed = Listed(Fate(delay_ns=delay, lost=i in lost) for i, delay in enumerate(delays_ns))
     return Lane(flow, listed, began_ns=0)
 
 
 def packet(name: str) -> Datagram:
-    """A packet that can be told from others."""
     return Datagram(name.encode(), PEER)
 
 
 def take(link: Link, lane: Lane, names: str, *, now_ns: int = 0) -> None:
-    """A packet for each letter enters."""
+    """Let a packet enter for each letter."""
     for name in names:
         link.accept(packet(name), lane, now_ns=now_ns)
 
 
 def give(link: Link, *, now_ns: int) -> str:
-    """The letters of the packets that leave."""
+    """Letters of the packets that leave."""
     return "".join(datagram.payload.decode() for datagram in link.release(now_ns=now_ns))
 
 
@@ -81,7 +79,7 @@ def test_packets_due_at_once_leave_in_the_order_in_which_they_came() -> None:
 def test_what_leaves_is_what_a_sorted_list_would_give(
     packets: list[tuple[int, int, bool]], now_ns: int
 ) -> None:
-    """The heap against an oracle: stable sort by due time, then cut."""
+    """Oracle of the heap: stable sort by due time, then cut."""
     link = make_link()
     delays = [delay for _, delay, _ in packets]
     lane = make_lane(*delays, lost=[i for i, (_, _, lost) in enumerate(packets) if lost])
@@ -134,7 +132,7 @@ def test_a_full_queue_drops_what_comes_and_counts_it_apart_from_losses(
 
 
 def test_a_packet_that_overflows_uses_up_its_fate(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Dropped or not, it counts among those of its slot, and no later one's fate shifts."""
+    """A dropped packet counts among those of its slot, so fates of later ones stay the same."""
     monkeypatch.setattr(link_module, "QUEUE_MAX", 1)
     link, lane = make_link(), make_lane(1, 100, 7)
     take(link, lane, "ab")
@@ -154,7 +152,7 @@ def test_what_is_longer_than_the_mtu_is_dropped_and_counted_apart() -> None:
 
 
 def test_what_is_under_way_is_bounded_in_bytes_too() -> None:
-    """The worst flood, packets as long as UDP takes: 64 MiB of them, whoever sent more."""
+    """Worst case: packets of UDP's largest size; 64 MiB are kept, from whatever sender."""
     link, size = make_link(mtu=65_507), 65_507
     lane = make_lane(*range(1, 2001))
     payload = bytes(size)
@@ -269,7 +267,7 @@ def test_the_fate_of_every_packet_is_written_down() -> None:
 
 def test_a_packet_meets_the_fate_of_when_it_enters() -> None:
     fates, began_ns = Fates(path("paper(0.4, 0.02, 2.0)"), 1, "uplink", 0), 500
-    for before in ([], [0, 1, 2], [59] * 3, [60, 90]):  # the last: the clock went back
+    for before in ([], [0, 1, 2], [59] * 3, [60, 90]):  # the last: a clock set back
         link, lane = make_link(), Lane(0, fates, began_ns)
         for slot in (*before, 60, 60):
             link.accept(packet("a"), lane, now_ns=began_ns + slot * SLOT_NS)

@@ -41,7 +41,6 @@ PATIENCE_S = 60.0
 
 
 def block(word: str) -> list[str]:
-    """Commands of the block that has this word, with ports that are free now."""
     (found,) = [lines for lines in BLOCKS if any(word in line for line in lines)]
     ports: dict[str, str] = {}
     for port in re.findall(r"(?<=127\.0\.0\.1:)\d+|(?<=-port )\d+", "\n".join(found)):
@@ -57,7 +56,6 @@ def _with_ports(text: str, ports: dict[str, str]) -> str:
 
 
 def argv(line: str) -> list[str]:
-    """A documented command as this environment runs it."""
     name, *rest = shlex.split(line)
     if name == "skytether":
         return [sys.executable, "-P", "-m", "skytether", *rest]
@@ -66,7 +64,7 @@ def argv(line: str) -> list[str]:
 
 @contextmanager
 def running(line: str, folder: Path, until: str = "") -> Iterator["subprocess.Popen[str]"]:
-    """A command that goes on, once it has said what is waited for; ended by Ctrl-C."""
+    """Running command, once it has printed the expected text; ended by Ctrl-C."""
     with subprocess.Popen(
         argv(line),
         cwd=folder,
@@ -92,7 +90,6 @@ def counted(said: str, name: str) -> tuple[int, int]:
 
 
 def ended(process: "subprocess.Popen[str]") -> str:
-    """All that a process says until its end."""
     process.terminate()
     return process.communicate(timeout=PATIENCE_S)[0]
 
@@ -125,7 +122,7 @@ def test_a_ground_station_and_an_autopilot(tmp_path: Path) -> None:
         running(netem, tmp_path, "listening") as relay,
         running(autopilot, tmp_path),
     ):
-        # It begins once it has heard the autopilot, which takes as long as that takes to start.
+        # The flight begins only once the autopilot has started.
         flight.communicate(timeout=PATIENCE_S)
         said = ended(relay)
     assert min(counted(said, "forwarded")) > 50
@@ -144,7 +141,7 @@ def test_dtls_gets_through(tmp_path: Path) -> None:
         assert near.stdin is not None
         assert far.stdout is not None
         told: Queue[str] = Queue()
-        # A line may be lost, so reading must not keep the next one from being sent.
+        # A line may be lost, so reading must not block the next one.
         Thread(
             target=lambda lines: list(map(told.put, lines)), args=[far.stdout], daemon=True
         ).start()
@@ -208,7 +205,6 @@ def test_a_wrong_direction_is_told_in_a_line(
 
 
 def directed(**given: str) -> Scenario:
-    """Scenario of netem with these options."""
     return _with_directions(parse(NetemOptions(**given), [], "netem", None, is_final=False)).config
 
 
@@ -268,7 +264,7 @@ def captured(content: bytes) -> list[tuple[int, bytes, bytes, int]]:
     while at < len(content):
         seconds, rest_ns, held, size = struct.unpack_from("<IIII", content, at)
         header = content[at + 16 : at + 16 + held]
-        assert sum(struct.unpack(">10H", header[:20])) % 0xFFFF == 0  # its checksum
+        assert sum(struct.unpack(">10H", header[:20])) % 0xFFFF == 0  # checksum
         assert struct.unpack_from(">H", header, 2)[0] == size
         assert struct.unpack_from(">H", header, 24)[0] == size - 20
         found.append(

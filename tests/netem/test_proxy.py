@@ -1,4 +1,4 @@
-"""`netem.proxy`: an endpoint between clients and a server that reads none of their payloads."""
+"""`netem.proxy`: an endpoint between clients and a server that does not read payloads."""
 
 import random
 from collections.abc import Callable
@@ -33,7 +33,7 @@ def make_proxy(
     flows: int = FLOWS_MAX,
     mtu: int = 1472,
 ) -> Proxy:
-    """A proxy with this network, the same both ways unless said."""
+    """Proxy with this network, the same in both directions unless given."""
     network = NetworkConfig(
         uplink=uplink, downlink=uplink if downlink is None else downlink, mtu=mtu
     )
@@ -41,12 +41,11 @@ def make_proxy(
 
 
 def hear(proxy: Proxy, payload: bytes, peer: tuple[str, int], socket: int = 0, at: int = 0) -> None:
-    """A datagram arrives."""
     proxy.receive(Datagram(payload, peer, socket), now_ns=at)
 
 
 def pass_on(proxy: Proxy, payload: bytes, client: tuple[str, int], at: int = 0) -> int:
-    """A client's packet crosses at once; the socket it leaves by."""
+    """Let a client's packet pass at once; returns the socket towards the server."""
     hear(proxy, payload, client, at=at)
     (sent,) = proxy.outbox()
     assert sent[:2] == (payload, SERVER)
@@ -54,7 +53,7 @@ def pass_on(proxy: Proxy, payload: bytes, client: tuple[str, int], at: int = 0) 
 
 
 def ask(proxy: Proxy, client: tuple[str, int], at: int = 0) -> int:
-    """A client's packet crosses and is answered; the socket of its flow."""
+    """Let a client's packet pass and be answered; returns the socket of its flow."""
     socket = pass_on(proxy, b"?", client, at)
     hear(proxy, b"!", SERVER, socket, at=at)
     assert proxy.outbox() == [Datagram(b"!", client, 0)]
@@ -62,7 +61,7 @@ def ask(proxy: Proxy, client: tuple[str, int], at: int = 0) -> int:
 
 
 def fly(proxy: Proxy, client: tuple[str, int], at: int = 0) -> int:
-    """A client earns its place; the socket of its flow."""
+    """Exchange packets until a client has earned its flow; returns the flow's socket."""
     (socket,) = {ask(proxy, client, at) for _ in range(EXCHANGES)}
     return socket
 
@@ -115,7 +114,7 @@ def test_a_client_too_many_is_refused() -> None:
 
 
 def test_a_place_is_earned_for_a_while_and_then_goes_to_a_new_client() -> None:
-    """The old client comes back where somebody else has not earned a place."""
+    """The old client returns where no other client has earned a flow."""
     proxy = make_proxy(flows=2)
     fly(proxy, ALICE, at=0)
     fly(proxy, BOB, at=1)
@@ -162,7 +161,7 @@ def test_flows_give_way_in_the_order_of_their_last_use() -> None:
 def test_a_refusal_looks_at_one_flow_however_many_there_are(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """A flood from strangers takes as long with 16 384 flows as with one."""
+    """Refusing a stranger takes as long with 16 384 flows as with one."""
     proxy = make_proxy(flows=HOST_FLOWS)
     for port in range(HOST_FLOWS):
         fly(proxy, ("192.0.2.1", port))
@@ -186,19 +185,19 @@ def test_strangers_give_way_at_once_the_one_that_is_silent_longest_first() -> No
     assert (proxy.refused, proxy.figures()["flows"]) == (0, 3)
 
 
-# -- attacks on the places -------------------------------------------------------------------
+# -- attacks on the capacity of flows --------------------------------------------------------
 
 ATTACKER = "192.0.2.66"
 
 
 class Siege:
-    """Attack on netem by an attacker who repeats one packet from many ports, to take all its flows.
+    """Attack on netem by repeating one packet from many ports, to occupy all its flows.
 
     Args:
-        proxy: the proxy; the server answers each packet at once, a step of 0.1 s after the other.
+        proxy: the proxy; the server answers each packet at once, in steps of 0.1 s.
         hosts: hosts of the attacker.
-        ports: number of ports on each.
-        rate_hz: packets a second, of all ports together.
+        ports: number of ports on each host.
+        rate_hz: packets per second, all ports together.
         stays: number of steps in a row with packets from the same ports.
     """
 
@@ -212,10 +211,9 @@ class Siege:
         self._steps = 0
 
     def step(self, *clients: tuple[str, int]) -> set[tuple[str, int]]:
-        """Let 0.1 s pass: the attacker sends, the clients send, and the server answers them all.
+        """Advance by 0.1 s: attacker and clients send, and the server answers.
 
-        Returns:
-            Those of the clients who get an answer.
+        Returns the clients that get an answer.
         """
         self.now_ns += 100 * MILLISECOND_NS
         for client in clients:
@@ -230,13 +228,12 @@ class Siege:
         return {sent.peer for sent in self.proxy.outbox()} & set(clients)
 
     def run(self, seconds: int, *clients: tuple[str, int]) -> float:
-        """Let seconds pass; returns the share of the clients' packets that were answered."""
+        """Advance by seconds; returns the share of the clients' packets that were answered."""
         steps = 10 * seconds
         return sum(len(self.step(*clients)) for _ in range(steps)) / (steps * len(clients) or 1)
 
 
 def spread(count: int) -> list[str]:
-    """Addresses of so many hosts."""
     return [f"198.51.{number // 256}.{number % 256}" for number in range(count)]
 
 
@@ -250,17 +247,17 @@ SIEGES = [
     ([ALICE[0]], 128, 60),
     ([ALICE[0]], 5_000, 60),
 ]
-"""Attackers against whom vehicles hold their places: hosts, ports of each, packets a second."""
+"""Attackers that must not evict vehicles: hosts, ports of each, packets per second."""
 
 
 @pytest.mark.parametrize(("hosts", "ports", "rate_hz"), SIEGES)
 def test_who_repeats_a_packet_from_many_ports_shuts_nobody_out(
     hosts: list[str], ports: int, rate_hz: int
 ) -> None:
-    """Neither a vehicle that flies, nor one that comes, nor one whose port changes."""
+    """Neither a vehicle in flight, nor a new one, nor one whose port changes."""
     siege = Siege(make_proxy(flows=128), hosts, ports, rate_hz)
     siege.run(3, ALICE)
-    siege.run(15)  # all places are taken
+    siege.run(15)  # all flows are taken
     siege.run(4, ALICE)
     assert siege.run(3, ALICE) == 1.0
     siege.run(4, ALICE, BOB, CAROL)
@@ -275,7 +272,7 @@ def test_who_repeats_a_packet_from_many_ports_shuts_nobody_out(
 def test_who_exchanges_packets_in_all_places_shuts_newcomers_out(
     hosts: list[str], rate_hz: int, expected: float
 ) -> None:
-    """With eight packets in ten seconds for each place, or more; a vehicle that flies flies on."""
+    """With at least eight packets in ten seconds per flow; vehicles in flight are not affected."""
     assert 90 < 128 * EXCHANGES * SECOND_NS / EARNED_NS < 150
     siege = Siege(make_proxy(flows=128), hosts, 128 // len(hosts), 0, stays=EXCHANGES)
     siege.run(2, ALICE)
@@ -290,7 +287,7 @@ def test_who_exchanges_packets_in_all_places_shuts_newcomers_out(
 
 @pytest.mark.parametrize("hosts", [spread(8), spread(128), [ALICE[0]]])
 def test_who_opens_flows_fast_enough_shuts_newcomers_out(hosts: list[str]) -> None:
-    """As many as there are places, before an answer comes; a vehicle that flies flies on."""
+    """As many as netem's flows before an answer arrives; vehicles in flight are not affected."""
     siege = Siege(make_proxy(flows=128), hosts, 2_000, 0)
     siege.run(2, ALICE)
     siege.each_step = 140
@@ -300,14 +297,12 @@ def test_who_opens_flows_fast_enough_shuts_newcomers_out(hosts: list[str]) -> No
 
 
 def old_rule(patch: pytest.MonkeyPatch) -> None:
-    """One answer earns a place for a minute, whoever comes."""
     patch.setattr(places_module, "EXCHANGES", 1)
     patch.setattr(places_module, "EARNED_NS", 60 * SECOND_NS)
     patch.setattr(places_module, "HOST_FLOWS", FLOWS_MAX)
 
 
 def no_bound_for_a_host(patch: pytest.MonkeyPatch) -> None:
-    """A host may hold all places."""
     patch.setattr(places_module, "HOST_FLOWS", FLOWS_MAX)
 
 
@@ -322,7 +317,7 @@ def test_if_places_were_earned_otherwise_newcomers_would_be_shut_out(
 
 
 def test_what_one_host_holds_against_others_is_bounded() -> None:
-    """Also where it exchanges packets in all flows; others may have all other places."""
+    """Also if it exchanges packets in all flows; others may have all flows left."""
     siege = Siege(make_proxy(flows=128), [ATTACKER], 128, 300)
     siege.run(5)
     others = [("192.0.2.1", port) for port in range(128 - HOST_FLOWS)]
@@ -333,7 +328,6 @@ def test_what_one_host_holds_against_others_is_bounded() -> None:
 
 
 def test_a_fleet_of_one_host_keeps_its_places_from_strangers() -> None:
-    """As many as one host may hold, where there are no others, and the strangers converse."""
     fleet = [("192.0.2.1", port) for port in range(HOST_FLOWS)]
     siege = Siege(make_proxy(flows=HOST_FLOWS), spread(5), 5, rate_hz=0)
     siege.run(2, *fleet)
@@ -342,7 +336,7 @@ def test_a_fleet_of_one_host_keeps_its_places_from_strangers() -> None:
 
 
 def test_a_stale_stranger_gives_way_before_a_crowd_that_begins_to_fly() -> None:
-    """A fleet behind one address takes all places of those who are there no longer."""
+    """A fleet behind one address takes the flows of clients that have gone."""
     proxy = make_proxy(flows=100)
     for number in range(30):
         ask(proxy, (f"198.51.100.{number}", 1))
@@ -363,19 +357,19 @@ def test_a_stale_stranger_gives_way_before_a_crowd_that_begins_to_fly() -> None:
     ],
 )
 def test_a_network_of_ipv6_counts_as_one_host(one: str, other: str, *, same: bool) -> None:
-    """Whoever has one address there has them all."""
+    """Whoever has one address of the network has all of them."""
     assert (host_of((one, 1)) == host_of((other, 2))) is same
 
 
-# -- packets that come back ------------------------------------------------------------------
+# -- forwarding loops ------------------------------------------------------------------------
 
 
 def circulate(*netems: Proxy, packets: int, limit: int = 5000) -> int:
-    """Let netems forward each to the next and the last to the first; number of packets forwarded.
+    """Forwarding loop of netems, each to the next; returns the number of packets forwarded.
 
     Args:
-        netems: the netems; the sockets of netem n have the host "netem n".
-        packets: packets that a client sends to the first, one after the other.
+        netems: the netems; sockets of netem n have the host "netem n".
+        packets: packets that a client sends to the first netem, one after the other.
         limit: number of forwarded packets at which a loop counts as endless.
     """
     forwarded = 0
@@ -391,7 +385,7 @@ def circulate(*netems: Proxy, packets: int, limit: int = 5000) -> int:
 
 @pytest.mark.parametrize("count", [1, 2, 3])
 def test_a_packet_that_comes_back_ends_after_a_number_of_laps(count: int) -> None:
-    """Through a netem that is its own server, or through several in a circle; it is told once."""
+    """Through a netem that is its own server, or through several in a circle; logged once."""
     netems = [make_proxy() for _ in range(count)]
     assert circulate(*netems, packets=1) == count * (LAPS_MAX + 1)
     assert circulate(*netems, packets=100) <= 101 * count * (LAPS_MAX + 1)
@@ -419,7 +413,7 @@ def test_clients_that_send_the_same_are_served_once_the_server_answers() -> None
         pass_on(proxy, b"hello", ("192.0.2.2", port))
 
 
-# -- all else --------------------------------------------------------------------------------
+# -- other properties ------------------------------------------------------------------------
 
 
 def test_a_packet_under_way_still_reaches_a_client_whose_place_was_given_away() -> None:
@@ -592,7 +586,7 @@ def test_no_packet_appears_or_vanishes(
 
 
 def is_balanced(link: Link) -> bool:
-    """Whether what entered is accounted for, and the queue within its bound."""
+    """Whether all packets that entered are accounted for, and the queue is within its bound."""
     counts = link.counts
     gone = counts.forwarded + counts.lost + counts.oversized + counts.overflowed
     return counts.packets == gone + link.depth() and link.depth() <= 8

@@ -1,4 +1,4 @@
-"""`scenario.air`: recorded networks, from files of many formats, and files that are none."""
+"""`scenario.air`: recorded networks from files of many formats, and invalid files."""
 
 import gzip
 import json
@@ -34,7 +34,6 @@ TIMED = """PING example (192.0.2.1) 56(84) bytes of data.
 
 
 def trip(sent_ns: int, rtt_ns: int | None, send_ns: int = 0) -> dict[str, object]:
-    """A round trip as irtt writes it."""
     if rtt_ns is None:
         return {"lost": "true", "timestamps": {"client": {"send": {"monotonic": sent_ns}}}}
     delay = {"rtt": rtt_ns, "send": send_ns, "receive": rtt_ns - send_ns}
@@ -57,7 +56,6 @@ IRTT = json.dumps(
 
 
 def file(tmp_path: Path, text: str) -> str:
-    """Path of a file with this text."""
     (tmp_path / "mine").write_text(text)
     return str(tmp_path / "mine")
 
@@ -90,7 +88,7 @@ def test_formats_are_told_apart_by_their_content(
     assert found.lost.astype(int).tolist() == lost
 
 
-# -- logs of ping, as each program prints them -----------------------------------------------------
+# -- logs of ping ----------------------------------------------------------------------------------
 
 IPUTILS = """$ ping -O -i 0.2 192.0.2.1
 PING 192.0.2.1 (192.0.2.1) 56(84) bytes of data.
@@ -225,7 +223,7 @@ def test_logs_are_read_in_the_codings_of_windows(codec: str) -> None:
 
 
 def answers(*numbers: int) -> str:
-    """Lines of ping without its first one and its summary."""
+    """Lines of ping without its first line and its summary."""
     line = "64 bytes from 192.0.2.1: icmp_seq={} ttl=57 time=20.0 ms\n"
     return "".join(map(line.format, numbers))
 
@@ -395,7 +393,7 @@ def test_a_file_is_read_again_where_it_has_changed(tmp_path: Path) -> None:
 
 
 def path_of(text: str) -> AirPath:
-    """A direction, with the files that its text names."""
+    """Direction of the network, with the files that its text names."""
     return path(text, reading.files_of("network.uplink", text))
 
 

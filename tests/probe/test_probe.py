@@ -1,4 +1,4 @@
-"""Measuring a path: what is told of networks that are known, and what strangers can do."""
+"""Measurement of a path: results on known networks, and abuse by strangers."""
 
 import csv
 import json
@@ -87,7 +87,7 @@ def test_a_probe_has_the_size_that_was_asked_for(
 def test_an_answer_tells_of_as_many_arrivals_as_have_room(
     arrivals: list[tuple[int, int]], sent_ns: int, size: int
 ) -> None:
-    """It is no longer than its probe, and tells of two at least where there are two."""
+    """It is no longer than its probe, and reports at least two if there are two."""
     answer = ProbeAnswer(bytes(SESSION_BYTES), 3, sent_ns, 7, 7 + len(arrivals), tuple(arrivals))
     payload = encode(answer, size)
     assert len(payload) <= size
@@ -137,7 +137,7 @@ def session_of(far: Listener, peer: tuple[str, int], now_ns: int) -> bytes:
 
 @given(st.lists(st.binary(max_size=300), max_size=20))
 def test_a_listener_answers_with_no_more_than_it_got(payloads: list[bytes]) -> None:
-    """Nobody can use the listener to amplify traffic."""
+    """So it cannot be used to amplify traffic."""
     far, peer = listener(), ("prober", 1)
     session = session_of(far, peer, 0)
     probes = [encode(Probe(session, n, n % 3, 0), 96 + n) for n in range(5)]
@@ -166,7 +166,7 @@ def test_only_who_can_be_answered_at_an_address_is_kept() -> None:
 
 @pytest.mark.parametrize("train", [0, 64])
 def test_an_open_session_is_answered_at_its_own_address_alone(train: int) -> None:
-    """Whoever knows it could have packets sent to others, as many as a train has at once."""
+    """Otherwise a train's worth of packets could be directed at others."""
     far, prober, victim = listener(), ("prober", 1), ("victim", 53)
     session = session_of(far, prober, 0)
     far.receive(Datagram(encode(Probe(session, 0, 0, 0), 96), prober), now_ns=0)
@@ -182,7 +182,6 @@ def test_an_open_session_is_answered_at_its_own_address_alone(train: int) -> Non
 
 
 def begin(far: Listener, prober: tuple[str, int], now_ns: int) -> bool:
-    """Whether a prober is told that there is room, and gets an answer to a probe."""
     far.receive(Datagram(encode(ProbeHello(b"12345678"), 64), prober), now_ns=now_ns)
     (packet,) = far.outbox()
     welcome = decode(packet.payload)
@@ -203,7 +202,7 @@ def test_a_listener_has_room_for_so_many_measurements() -> None:
 
 
 def test_a_host_with_many_measurements_keeps_no_other_out() -> None:
-    """Its oldest gives way, until it has no more than others; none of its own does."""
+    """Its oldest measurement ends, until it has no more than others."""
     far = listener()
     assert all(begin(far, ("crowd", port), port) for port in range(SESSIONS_MAX))
     assert not begin(far, ("crowd", SESSIONS_MAX), SESSIONS_MAX)
@@ -213,7 +212,7 @@ def test_a_host_with_many_measurements_keeps_no_other_out() -> None:
 
 
 def test_a_train_is_answered_together_or_as_far_as_it_has_come() -> None:
-    """The rest of it is waited for for HOLD_NS, whatever else is sent meanwhile."""
+    """The rest of a train is awaited for HOLD_NS, whatever else is sent meanwhile."""
     far, peer = listener(), ("prober", 1)
     session = session_of(far, peer, 0)
     for number in range(3):
@@ -259,12 +258,10 @@ def measure(
 
 
 def models(text: str) -> set[str]:
-    """Names of the delays and losses in a text."""
     return {name for name, _ in path(text).impairments} - {"rate", "ordered"}
 
 
 def in_order(packets: Rows, direction: int) -> Rows:
-    """Packets of a direction in the order in which they were sent."""
     mine = packets[packets["direction"] == direction]
     return mine[np.lexsort((mine["number"], mine["arrived_ns"]))]
 
@@ -280,7 +277,7 @@ def test_every_packet_is_measured_as_it_was() -> None:
     for direction in (UPLINK, DOWNLINK):
         mine, real = in_order(told, direction), in_order(truth, direction)
         came, passed = mine[~mine["lost"]], real[~real["lost"] & (real["bytes"] >= 399)]
-        # netem writes in the order of leaving, also what is sent to learn of the last arrivals.
+        # netem writes packets as they leave, including those that are sent after the last probe.
         passed = passed[: len(came)]
         shift = came["delay_ns"] - passed["delay_ns"]
         assert np.ptp(shift) < 200_000
@@ -293,7 +290,7 @@ def test_every_packet_is_measured_as_it_was() -> None:
 
 
 def test_gaps_of_a_picture_are_the_trains() -> None:
-    """A grey span for each, and none where nothing is measured but delays."""
+    """A grey span for each; none if only delays are measured."""
     text = "gamma(0.05, 0.09, 0.03) & loss(0.1)"
     for seconds, trains in ((35.0, 3), (4.0, 0)):
         measured, _ = measure(text, text, seconds=seconds)
@@ -303,7 +300,7 @@ def test_gaps_of_a_picture_are_the_trains() -> None:
 
 
 def test_a_clock_that_drifts_is_found_out() -> None:
-    """Offset and drift of the other end's clock are found within the stated uncertainty."""
+    """Offset and drift of the listener's clock are within the stated uncertainty."""
     measured, _ = measure("gamma(0.05, 0.06, 0.005)", "gamma(0.05, 0.06, 0.005)", seconds=300.0)
     told = outcome(measured, "x", secure=False).told
     assert told.drift_doubt_ppm < 5.0
@@ -322,7 +319,7 @@ def test_a_clock_that_drifts_is_found_out() -> None:
     ],
 )
 def test_a_finite_rate_is_found_where_there_is_one(text: str, rate: float | None) -> None:
-    """Within three per cent and what is said of the doubt; and none where there is none."""
+    """Within three per cent and the stated uncertainty; none where there is none."""
     measured, _ = measure(text, text, seconds=150.0)
     told = outcome(measured, "x", secure=False).told
     for way in (told.uplink, told.downlink):
@@ -347,7 +344,6 @@ def test_the_models_are_those_of_the_network_and_fly() -> None:
 
 @pytest.mark.parametrize("law", ["uniform", "normal", "gamma", "lognormal"])
 def test_the_law_of_delays_is_recognised(law: str) -> None:
-    """In each of five samples of a thousand."""
     made = {
         "uniform": stats.uniform(0.02, 0.08),
         "normal": stats.norm(0.1, 0.01),
@@ -382,7 +378,7 @@ def test_a_lower_hull_lies_below_all_points(points: list[tuple[int, float]]) -> 
 
 
 def test_what_was_measured_is_replayed_as_a_trace(tmp_path: Path) -> None:
-    """Delays over a recorded link, measured, replayed and measured again, are the same ones."""
+    """Delays over a recorded link, measured, replayed and measured again, are the same."""
     file = tmp_path / "slow.csv"
     times_s = np.arange(0.0, 60.0, 0.05)
     slow_s = 0.1 + 0.05 * np.sin(times_s / 3.0)

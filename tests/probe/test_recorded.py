@@ -1,4 +1,4 @@
-"""`probe.recorded`: figures of logs and of pairs of captures, as of a measurement."""
+"""`probe.recorded`: figures from logs and pairs of captures, as from a measurement."""
 
 import json
 import re
@@ -21,11 +21,10 @@ from skytether.shared.scenario.registry import File
 ROOT = Path(__file__).parents[2]
 RNG = np.random.default_rng(7)
 DELAYS_MS = RNG.gamma(4.0, 5.0, 400) + 30.0
-"""Round trips of a log [ms]."""
 
 
 def log(lost: Sequence[int] = ()) -> str:
-    """Log of ping, five packets a second, of which those with these numbers are lost."""
+    """Log of ping, five packets a second; those with the numbers in `lost` are lost."""
     line = "[{:.6f}] 64 bytes from 192.0.2.1: icmp_seq={} ttl=57 time={:.3f} ms\n"
     rows = [
         line.format(1.7e9 + number / 5 + trip_ms / 1e3, number, trip_ms)
@@ -43,7 +42,7 @@ def log(lost: Sequence[int] = ()) -> str:
 def test_the_documented_command_reads_a_log(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The table, the models and the traces are those of half of each round trip, both ways."""
+    """Table, models and traces are those of half the round trip in each direction."""
     (line,) = re.findall(r"^skytether (probe --from .*\.log.*)$", docs(), re.MULTILINE)
     lost = [*range(100, 110), *range(390, 401)]
     (tmp_path / "ping.log").write_text(log(lost))
@@ -101,7 +100,7 @@ Packet = tuple[int, Address, Address, bytes]
 
 
 def ethernet(source: Address, target: Address, payload: bytes) -> bytes:
-    """Frame with a VLAN's tag and, behind the packet, the padding of a short frame."""
+    """Frame with a VLAN tag, and the padding of a short frame after the packet."""
     return b"\0" * 12 + b"\x81\0\0\5\x08\0" + raw(source, target, payload) + b"\0" * 6
 
 
@@ -151,7 +150,8 @@ def pcapng(packets: Sequence[Packet], make: Callable[..., bytes] = raw) -> bytes
 def flight(count: int = 200) -> tuple[list[Packet], list[Packet]]:
     """Packets at both ends: 50 ms down, 90 ms up, each tenth lost, with clocks an hour apart.
 
-    Both send as often as the other. A stranger's packets are in both, and a NAT is between.
+    Both ends send at the same rate. Both captures contain a stranger's packets, and a NAT is
+    between.
     """
     near: list[Packet] = []
     far: list[Packet] = []
@@ -184,7 +184,7 @@ def flight(count: int = 200) -> tuple[list[Packet], list[Packet]]:
 def test_a_pair_of_captures_is_measured_each_way(
     written: Callable[[Sequence[Packet]], bytes],
 ) -> None:
-    """The loss of each way is its own; of the delays the sum, whatever the clocks."""
+    """Loss of each direction; of the delays only the sum, for any clocks."""
     near, far = flight()
     measured = recorded.of_captures(written(near), written(far) + b"cut")
     told = outcome(measured, "it", secure=False).told
@@ -209,7 +209,7 @@ def test_payloads_that_were_sent_twice_are_left_out() -> None:
 
 
 def test_packets_that_a_kernel_sent_as_one_are_cut() -> None:
-    """A sender's capture holds them before they are cut, for which each would count as lost."""
+    """The sender's capture has them in one piece, so each would count as lost."""
     near, far = flight()
     sent = [packet for packet in near if packet[3].startswith(b"down")]
     joined = [

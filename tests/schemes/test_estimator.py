@@ -1,6 +1,4 @@
-"""Downlink delay compensator, eq. (12)-(13): x̂(k) is the old state flown on by the known
-inputs.
-"""
+"""Downlink delay compensator, eq. (12)-(13): x̂(k) predicted from an old state and inputs."""
 
 from typing import Any
 
@@ -33,18 +31,16 @@ SENT = np.array([True])
 
 
 def seen(step: int, state: Array) -> Observation:
-    """Observation of the one vehicle."""
     return Observation(1, 1, step, NO_HORIZON, 0, 0, 0, Mode.TRACK, 1, state, np.zeros(2))
 
 
 def make(capacity: int = 1, *, compensate: bool = True) -> Estimator:
-    """An estimator over twelve steps."""
     flown = scenario("predictive" if compensate else "none")
     return Estimator(flown.terms(), flown.control, feedback_gain(flown), capacity)
 
 
 def scenario(scheme: str, **control: Any) -> Scenario:
-    """A network without delay, on which twelve steps may pass after an observation."""
+    """Network without delay; an observation may be twelve steps old."""
     direct = "loss(0.1)"
     raw = {
         "model": {"tau_s": TAU_S, "u_max": [1.6]},
@@ -70,13 +66,13 @@ def computed(inputs: Array) -> Foresight:
 
 
 def remember(estimator: Estimator, inputs: Array, *, start: int = 0) -> None:
-    """Remember û(start), û(start + 1), … of the one vehicle; inputs of shape (steps, axes)."""
+    """Remember û(start), û(start + 1), … of the only vehicle; inputs of shape (steps, axes)."""
     for step, u in enumerate(inputs, start):
         estimator.remember(ROW, np.array([step]), computed(u[None]), SENT)
 
 
 def estimates(estimator: Estimator, rows: Indices, step: Indices) -> Array:
-    """Estimates x̂(step), which are where planning starts: d is 0."""
+    """Estimates x̂(step), from which plans start, because d is 0."""
     found = empty_foresight(len(rows), 2, H, 1)
     estimator.foresee(rows, step, found)
     np.testing.assert_array_equal(found.start, found.estimate)
@@ -85,12 +81,10 @@ def estimates(estimator: Estimator, rows: Indices, step: Indices) -> Array:
 
 
 def estimate(estimator: Estimator, step: int) -> Array:
-    """Estimate x̂(step) of the one vehicle."""
     return estimates(estimator, ROW, np.array([step]))[0]
 
 
 def flown(x: Array, inputs: Array) -> Array:
-    """State predicted by the model from x, input by input."""
     for u in inputs:
         x = MODEL.step(x, u)
     return x
@@ -99,7 +93,7 @@ def flown(x: Array, inputs: Array) -> Array:
 @pytest.mark.parametrize("now", [20, 25, 40])
 @pytest.mark.parametrize("age", range(REACH + 1))
 def test_estimate_is_the_observation_flown_on(age: int, now: int) -> None:
-    """(13) for τ = 0 … reach, wherever the ring of inputs stands."""
+    """(13) for τ = 0 … reach, at any position of the ring buffer."""
     rng = np.random.default_rng(age)
     inputs = rng.normal(size=(now, 2)).astype(np.float32).astype(np.float64)
     x = rng.normal(size=(2, 2))
@@ -122,7 +116,6 @@ def test_input_of_the_present_step_does_not_count_yet() -> None:
 
 
 def test_vehicle_hovers_before_anything_was_computed() -> None:
-    """With û = 0 the observed velocity dies away with τ."""
     estimator = make()
     x = np.array([[1.0, 2.0], [3.0, -4.0]])
     estimator.observe(0, seen(0, x))
@@ -131,7 +124,6 @@ def test_vehicle_hovers_before_anything_was_computed() -> None:
 
 
 def test_newest_observation_wins_after_reordering() -> None:
-    """E11: what comes late is refused and says so, as is a duplicate."""
     estimator = make()
     states = {step: np.full((2, 2), float(step)) for step in (3, 5, 7)}
     kept = [estimator.observe(0, seen(step, states[step])) for step in (5, 3, 7, 7, 5)]
@@ -169,7 +161,7 @@ def test_missed_steps_are_remembered_too() -> None:
 
 
 def test_gap_longer_than_the_ring_overwrites_all_of_it() -> None:
-    """Û(19) all along the gap, then û(k); and filling takes no longer than the ring is."""
+    """Û(19) along the gap, then û(k); filling is bounded by the ring's length."""
     estimator = make()
     remember(estimator, np.full((20, 2), 7.0))
     remember(estimator, np.array([[0.5, -0.5]]), start=10**12)
@@ -180,9 +172,9 @@ def test_gap_longer_than_the_ring_overwrites_all_of_it() -> None:
 
 
 def test_estimate_right_after_a_gap_knows_no_input_of_a_ring_ago() -> None:
-    """At step 23, nothing computed since 20: û(21), û(22) are not û(9), û(10).
+    """At step 23, with nothing computed since 20: û(21), û(22) are not the ring's old û(9), û(10).
 
-    The vehicle flew on with what it had: û(20) is the best that is known.
+    The vehicle held its input: û(20) is the best knowledge.
     """
     estimator = make()
     old, new = np.full((15, 2), 7.0), np.full((6, 2), 0.5)
@@ -206,7 +198,7 @@ def test_asking_for_estimates_changes_no_later_one() -> None:
 
 
 def test_observation_from_ahead_is_taken_as_it_is() -> None:
-    """If the clocks disagree by a step there is nothing to predict."""
+    """If the clocks differ by a step there is nothing to predict."""
     estimator = make()
     remember(estimator, np.ones((10, 2)))
     x = np.array([[1.0, 2.0], [3.0, 4.0]])
@@ -215,7 +207,6 @@ def test_observation_from_ahead_is_taken_as_it_is() -> None:
 
 
 def test_without_compensation_the_observation_is_the_estimate() -> None:
-    """However old it is, and whatever was flown since."""
     estimator = make(compensate=False)
     x = np.array([[1.0, 2.0], [3.0, 4.0]])
     estimator.observe(0, seen(0, x))
@@ -263,18 +254,17 @@ def test_batch_is_estimated_as_its_singles(seed: int, vehicles: int, compensate:
     np.testing.assert_array_equal(estimates(together, rows, step + 1), expected)
 
 
-# -- with observer and feedback ------------------------------------------------------------------
+# -- observer and feedback -----------------------------------------------------------------------
 
 
 def told(step: int, state: Array, u: Array) -> Observation:
-    """Observation of the one vehicle, with the input that it flies."""
     return seen(step, state)._replace(input=u)
 
 
 def watch(
     estimator: Estimator, wind: Array, every: int = 1, *, steps: int = 200, row: int = 0
 ) -> Array:
-    """Disturbance learned of a vehicle that flies about in steady wind, seen now and then."""
+    """Disturbance estimated in steady wind with changing inputs, observed at some steps."""
     x, found = np.zeros((2, 2)), empty_foresight(1, 2, H, 1)
     for step in range(steps):
         u = 0.2 * np.array([np.sin(0.1 * step), np.cos(0.1 * step)])
@@ -286,7 +276,7 @@ def watch(
 
 
 def learning(scheme: str = "predictive", **control: Any) -> Estimator:
-    """An estimator of two vehicles with an observer of half a second."""
+    """Estimator of two vehicles with an observer of half a second."""
     flown = scenario(scheme, observer_s=0.5, **control)
     return Estimator(flown.terms(), flown.control, feedback_gain(flown), 2)
 
@@ -296,7 +286,7 @@ WIND = np.array([0.3, -0.2])
 
 @pytest.mark.parametrize("every", [1, 2, 5])
 def test_a_disturbance_is_learned_from_the_inputs_that_were_flown(every: int) -> None:
-    """Those between two observations are between theirs; and û has no part in it."""
+    """From the reported inputs, interpolated between two observations; û has no part in it."""
     estimator = learning()
     remember(estimator, np.full((200, 2), 9.0))
     np.testing.assert_allclose(watch(estimator, WIND, every), WIND, atol=5e-3)
@@ -304,16 +294,13 @@ def test_a_disturbance_is_learned_from_the_inputs_that_were_flown(every: int) ->
 
 @pytest.mark.parametrize("every", [1, 5])
 def test_where_there_is_none_none_is_learned(every: int) -> None:
-    """Changing inputs are tested too; the estimate is exact to rounding if every step is
-    seen.
-    """
+    """With changing inputs; exact to rounding if every step is observed."""
     np.testing.assert_allclose(
         watch(learning(), 0.0 * WIND, every), 0.0, atol=1e-9 if every == 1 else 5e-3
     )
 
 
 def test_observations_far_apart_teach_nothing() -> None:
-    """Nobody knows what was flown in 0.3 s."""
     assert not watch(learning(), WIND, 6).any()
 
 
@@ -356,7 +343,7 @@ def test_feedback_leads_on_from_where_the_vehicle_is_now() -> None:
 
 
 def test_the_paper_s_scheme_flies_better_with_observer_and_with_feedback() -> None:
-    """Steady wind is for the observer, wind that is noise for feedback."""
+    """The observer compensates steady wind, feedback compensates noise."""
 
     def rmse(wind: dict[str, Any], **control: Any) -> float:
         """RMSE of 25 s with a packet at every step [m]."""
@@ -376,12 +363,11 @@ def test_the_paper_s_scheme_flies_better_with_observer_and_with_feedback() -> No
     assert rmse(white, feedback=True) < 0.12
 
 
-# -- how long an observation counts --------------------------------------------------------------
+# -- age of observations -------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module", params=["none", "predictive", "committed"])
 def controller(request: pytest.FixtureRequest) -> Controller:
-    """The controller of a vehicle under each scheme, in steps of 0.05 s."""
     table = reading.to_table(reading.load("paper"))
     table["control"] = {**table["control"], "scheme": request.param, "dt": 0.05}
     flown = reading.check(table, "test")
@@ -389,7 +375,6 @@ def controller(request: pytest.FixtureRequest) -> Controller:
 
 
 def is_able(controller: Controller, step: int) -> bool:
-    """Whether the only vehicle is decided on at a step."""
     rows, steps = controller.able(ROW, np.array([step]))
     assert rows.tolist() in ([], ROW.tolist())
     assert steps.tolist() == [step] * len(rows)
@@ -402,7 +387,7 @@ def is_able(controller: Controller, step: int) -> bool:
 def test_old_observations_are_out_of_reach(
     controller: Controller, observed: int, now: int, *, able: bool
 ) -> None:
-    """Five seconds are bridged, a step more is not; one from ahead of us is as good as new."""
+    """Five seconds are allowed, a step more is not; an observation from the future is new."""
     controller.forget(0)
     controller.observe(0, seen(observed, np.zeros((2, 2))))
     assert is_able(controller, now) == able

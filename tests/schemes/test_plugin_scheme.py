@@ -1,4 +1,4 @@
-"""Schemes of plug-ins: flown as ours are, and what their mistakes lead to."""
+"""Schemes of plug-ins: flown like built-in ones, and the consequences of their mistakes."""
 
 import re
 import shlex
@@ -24,7 +24,6 @@ pytestmark = pytest.mark.usefixtures("plugin_tables")
 
 PAGE = (Path(__file__).parents[2] / "docs" / "schemes.md").read_text()
 (CHASE,) = re.findall(r"```python\n(import numpy.*?plugin_scheme.*?)```", PAGE, re.DOTALL)
-"""The scheme that the page has."""
 OURS = """
     import numpy as np
     from skytether.plugin_scheme import *
@@ -59,20 +58,18 @@ OURS = """
 
 
 def plug(folder: Path, code: str) -> None:
-    """Import a plug-in."""
     path = folder / "mine.py"
     path.write_text(dedent(code))
     plugins.load([str(path)])
 
 
 def scenario(scheme: str, trigger: str = "periodic(5)", **control: Any) -> Scenario:
-    """The scenario demo for eight seconds, with a scheme."""
     keys = {"scheme": scheme, "trigger": trigger} | control
     return packaged("demo", {"duration": 8.0, "settle": 2.0}, {"control": keys})
 
 
 def failing(method: str, wrong: str) -> str:
-    """The page's scheme, which soon does something wrong for the vehicle in row 1."""
+    """The page's scheme with a mistake that soon concerns the vehicle in row 1."""
     signature = {
         "forget": "row",
         "observe": "row, observation",
@@ -102,10 +99,10 @@ def failing(method: str, wrong: str) -> str:
 RIGHT = re.sub(r'@scheme.*\n|    """Sends.*\n', "", CHASE[CHASE.index("@scheme") :]).replace(
     "class Chase", "class Right"
 )
-"""The page's scheme without a name in the table."""
+"""The page's scheme without its registration."""
 
 
-# -- flown as ours ---------------------------------------------------------------------------------
+# -- same flights as built-in schemes --------------------------------------------------------------
 
 
 def test_the_documented_scheme_flies_with_the_documented_command(
@@ -136,7 +133,6 @@ def test_the_documented_scheme_follows_the_reference(tmp_path: Path) -> None:
     [("paper", "predictive"), ("demo-committed", "committed"), ("demo", "trajectory")],
 )
 def test_our_schemes_fly_the_same_as_plugins(base: str, scheme: str, tmp_path: Path) -> None:
-    """To the last bit of what flies and what is recorded."""
     plug(tmp_path, OURS)
     short = {"duration": 8.0, "settle": 2.0}
     ours = packaged(base, short, {"control": {"scheme": scheme}})
@@ -152,7 +148,7 @@ def test_a_batch_is_its_singles(tmp_path: Path) -> None:
 
 
 def test_a_vehicle_may_name_the_scheme_that_it_is_flown_as(tmp_path: Path) -> None:
-    """Then its host needs no plug-in."""
+    """Then the vehicle's host needs no plug-in."""
     plug(tmp_path, CHASE)
     assert scenario("chase").terms() == scenario("predictive").terms()
 
@@ -272,7 +268,7 @@ BAD_PLAN = "super().plan(*given)\nfound.horizons[rows == 1, :, :80] = {}"
 def test_a_mistake_costs_its_vehicle_the_plan_and_nobody_else(
     method: str, wrong: str, said: str, tmp_path: Path
 ) -> None:
-    """It is told once; the one vehicle flies what it holds and hovers, the other flies on."""
+    """Logged once; the vehicle flies its plan to the end and hovers, the other one flies on."""
     plug(tmp_path, failing(method, wrong))
     flight = fly(scenario("chase"), vehicles=2)
     (told,) = faults(flight)

@@ -1,4 +1,4 @@
-"""The committed scheme: the server knows what the vehicle flies, and where that leads it."""
+"""Committed scheme: the server knows the vehicle's inputs, and predicts its state with them."""
 
 from typing import Any
 
@@ -24,11 +24,10 @@ from skytether.sim.flight import fly, fly_batch
 H, BOUND, MOST = 6, 4, 50
 ROW = np.array([0])
 HORIZON_BYTES = 300
-"""More than a heartbeat has."""
+"""Larger than any heartbeat [B]."""
 
 
 def scenario(name: str = "paper", **changes: Any) -> Scenario:
-    """A packaged scenario under the committed scheme, with some keys changed."""
     return packaged(name, {"control": {"scheme": "committed"}}, changes)
 
 
@@ -37,15 +36,14 @@ TOLD_M = 2e-7
 
 
 def lossy(loss: float, down: float = 0.1) -> dict[str, Any]:
-    """The paper's network, with other losses."""
     return {"uplink": {"loss": loss}, "downlink": {"loss": down}}
 
 
-# -- by hand -------------------------------------------------------------------------------------
+# -- artificial observations ---------------------------------------------------------------------
 
 
 def small(exhausted: str = "brake", age_max_s: float = 5.0, **control: Any) -> Scenario:
-    """Six stages of 0.1 s, of which a delay takes up to four."""
+    """Six stages of 0.1 s, with a delay of up to four."""
     return scenario(
         model={"tau_s": [0.81, 0.3], "u_max": [1.8, 0.9]},
         control={"dt": 0.1, "horizon": H, "delay_bound": 0.1 * BOUND, **control},
@@ -56,7 +54,6 @@ def small(exhausted: str = "brake", age_max_s: float = 5.0, **control: Any) -> S
 
 
 def make(flown: Scenario) -> Replay:
-    """Room for one vehicle."""
     clock, gain = ClockMap(1, flown.dt_ns), feedback_gain(flown)
     return Replay(flown.terms(), flown.control, gain, 1, clock)
 
@@ -70,14 +67,14 @@ def see(
     flown: Array | None = None,
     takes: int = 1,
 ) -> bool:
-    """An observation comes, of a vehicle that flies by the rule unless it is told what it flies."""
+    """Receive an observation; the vehicle flies by the rule unless `flown` is given."""
     u = by_rule(replay, step, in_force) if flown is None else flown
     told = Mode.TRACK, takes, state, u
     return replay.observe(0, Observation(1, 1, step, in_force, since, 0, 0, *told))
 
 
 def by_rule(replay: Replay, step: int, in_force: int) -> Array:
-    """Input flown at a step with a horizon that was sent; zero without one, or with another's."""
+    """Input prescribed at a step by a sent horizon; zero without one, or with an unknown one."""
     memory, brake = replay._memory, replay._settings.brake
     bounds = replay._settings.laws["bound"].tolist()
     plans = memory.sent.plans["step"][0].tolist()
@@ -97,14 +94,13 @@ def by_rule(replay: Replay, step: int, in_force: int) -> Array:
 
 
 def foresee(replay: Replay, step: int) -> Foresight:
-    """Predicted state of the one vehicle at a step."""
     found = empty_foresight(1, 2, H, MOST)
     replay.foresee(ROW, np.array([step]), found)
     return found
 
 
 def send(replay: Replay, step: int, inputs: Array, feedback: Array | None = None) -> None:
-    """A horizon of d + H inputs is sent, from an observation of before [inputs: (axes, d + H)]."""
+    """Send a horizon of d + H inputs, from the newest observation [inputs: (axes, d + H)]."""
     if replay.observed_step[0] < 0:
         see(replay, step - 1, np.zeros((2, 2)), NO_HORIZON)
     found, length = empty_foresight(1, 2, H, MOST), inputs.shape[1]
@@ -115,14 +111,14 @@ def send(replay: Replay, step: int, inputs: Array, feedback: Array | None = None
 
 
 def plans(seed: int, *lengths: int) -> list[Array]:
-    """Inputs, some of them as float32 has the bound: a little beyond it."""
+    """Random inputs, some at the bound as rounded to float32, slightly beyond it."""
     rng = np.random.default_rng(seed)
     bound = np.array([1.8, 0.9])[:, None]
     return [(rng.uniform(-1.3, 1.3, (2, n)) * bound).clip(-bound, bound) for n in lengths]
 
 
 def test_a_horizon_in_flight_is_in_force_when_it_had_its_time() -> None:
-    """The one before is flown until then, and the state rolled on accordingly."""
+    """The previous horizon is flown until then, and the state predicted accordingly."""
     flown = small()
     old, new = plans(1, 2 * H, BOUND + H)
     replay, x = make(flown), np.array([[1.0, 0.2], [-1.0, 0.1]])
@@ -139,17 +135,17 @@ def test_a_horizon_in_flight_is_in_force_when_it_had_its_time() -> None:
 
 @pytest.mark.parametrize("under_way", [0, 1, 2, 3, 6])
 def test_each_doubt_is_what_is_flown_without_the_newest_horizons(under_way: int) -> None:
-    """By how likely it is that these are lost and no more; the last stands for all the others."""
+    """Weighted with the probability that exactly these are lost; the last covers all others."""
     loss, given = 0.2, plans(3, *[BOUND + H] * (under_way + 1))
 
     def foreseen(count: int) -> Foresight:
-        """Prediction with so many of these horizons under way."""
+        """Prediction with a number of horizons under way."""
         replay = make(small())
         send(replay, 100, given[0])
         see(replay, 103, np.array([[1.0, 0.2], [-1.0, 0.1]]), 100)
         for number, inputs in enumerate(given[1 : count + 1]):
             send(replay, 103 + number, inputs)
-        replay._memory.sent.delivery["loss"] = loss / (1.0 - LOSS_WEIGHT)  # one has come since
+        replay._memory.sent.delivery["loss"] = loss / (1.0 - LOSS_WEIGHT)  # one has arrived since
         found = empty_foresight(1, 2, H, MOST, loss_cases=3)
         replay.foresee(ROW, np.array([110]), found)
         return found
@@ -168,7 +164,7 @@ def test_each_doubt_is_what_is_flown_without_the_newest_horizons(under_way: int)
 
 
 def test_a_horizon_that_had_its_time_and_is_not_in_force_is_lost() -> None:
-    """Such a horizon is counted once, and forgotten until it comes after all."""
+    """Counted once, and ignored until it arrives after all."""
     old, lost, late = plans(2, 2 * H, BOUND + H, BOUND + H)
     replay = make(small())
     send(replay, 100, old)
@@ -188,7 +184,6 @@ def test_a_horizon_that_had_its_time_and_is_not_in_force_is_lost() -> None:
 
 
 def test_a_vehicle_without_a_horizon_hovers() -> None:
-    """Without a horizon a vehicle comes to rest."""
     replay = make(small())
     see(replay, 5, np.array([[0.0, 1.0], [0.0, 0.0]]), NO_HORIZON)
     seen = foresee(replay, 40)
@@ -197,7 +192,7 @@ def test_a_vehicle_without_a_horizon_hovers() -> None:
 
 
 def test_a_horizon_of_an_earlier_life_is_taken_for_flying_on() -> None:
-    """The inputs of that horizon are unknown: the input reported as flown is held."""
+    """Its inputs are unknown, so the reported input is held."""
     replay = make(small())
     see(replay, 50, np.array([[0.0, 1.0], [0.0, -0.5]]), 45, flown=np.array([1.0, -0.5]))
     seen = foresee(replay, 60)
@@ -206,7 +201,6 @@ def test_a_horizon_of_an_earlier_life_is_taken_for_flying_on() -> None:
 
 
 def test_the_newest_observation_counts() -> None:
-    """E11: what comes late is refused, and so is a duplicate; a forgotten vehicle begins anew."""
     replay, x = make(small()), np.zeros((2, 2))
     kept = [see(replay, step, x + step, NO_HORIZON) for step in (5, 3, 7, 7)]
     assert kept == [True, False, True, False]
@@ -220,7 +214,7 @@ def test_the_newest_observation_counts() -> None:
 @pytest.mark.parametrize("feedback", [False, True])
 @pytest.mark.parametrize("ahead", [1, BOUND, BOUND + 1, 100, 10**12])
 def test_an_observation_from_ahead_is_taken_as_it_is(ahead: int, *, feedback: bool) -> None:
-    """Clocks may disagree, by however much: nothing is flown back, and nothing made up."""
+    """Clocks may differ by any amount: nothing is predicted backwards."""
     replay, x = make(small(feedback=feedback)), np.array([[1.0, 0.3], [-2.0, -0.1]])
     send(replay, 100, np.ones((2, 2 * H)))
     see(replay, 100 + ahead, x, 100)
@@ -250,7 +244,7 @@ def test_many_horizons_are_kept_and_no_more() -> None:
 
 
 def test_what_is_flown_is_believed_and_not_what_the_rule_says() -> None:
-    """A limit of the vehicle's own holds for the step that it tells of; then the rule goes on."""
+    """A vehicle's own limit holds for the reported step; afterwards the rule applies again."""
     flown = small(observer_s=0.0)
     (inputs,), x = plans(5, 2 * H), np.array([[1.0, 0.2], [-1.0, 0.1]])
     replay, own = make(flown), np.array([0.3, -0.2])
@@ -263,7 +257,7 @@ def test_what_is_flown_is_believed_and_not_what_the_rule_says() -> None:
 
 
 def test_a_vehicle_that_takes_no_horizon_brakes_and_stands_still() -> None:
-    """Horizons under way count again as soon as the vehicle says that it takes horizons."""
+    """Horizons under way count again once the vehicle reports that it accepts horizons."""
     flown = small(observer_s=0.0)
     old, new = plans(6, 2 * H, BOUND + H)
     replay, x = make(flown), np.array([[1.0, 0.6], [-1.0, 0.0]])
@@ -279,11 +273,11 @@ def test_a_vehicle_that_takes_no_horizon_brakes_and_stands_still() -> None:
     np.testing.assert_array_equal(seen.committed[0, :, 2], np.float32(new[:, 4]))
 
 
-# -- feedback aboard, by hand --------------------------------------------------------------------
+# -- feedback aboard, artificial observations ----------------------------------------------------
 
 
 def test_it_makes_no_difference_when_a_horizon_with_feedback_arrives() -> None:
-    """Blown off in a way that nobody foresaw, the vehicle flies the same with the one before."""
+    """After an unforeseen disturbance, the vehicle flies the same with the previous horizon."""
     flown = small(feedback=True, observer_s=0.0, input_weight=1.0)
     (inputs,), x = plans(4, 2 * H), np.array([[1.0, 0.2], [-1.0, 0.1]])
     inputs = 0.3 * inputs
@@ -319,7 +313,7 @@ def estimate_error(flight: Record) -> Array:
 
 
 def settled(flight: Record, bound: int) -> Array:
-    """Ticks at which every horizon has arrived, or is known not to have."""
+    """Ticks at which every horizon has arrived, or is known to be lost."""
     sent = flight.server["step"][flight.server["event"]]
     last = np.array([sent[sent < step].max(initial=-1) for step in flight.server["step"]])
     return flight.server["observed_step"] >= last + bound
@@ -327,7 +321,7 @@ def settled(flight: Record, bound: int) -> Array:
 
 @pytest.fixture(scope="module")
 def sparse() -> tuple[Scenario, Record]:
-    """A horizon in three seconds, of which a third is lost."""
+    """Flight with a horizon every three seconds, of which a third is lost."""
     flown = scenario(
         control={"trigger": "periodic(60)", "delay_bound": 0.8, "horizon": 70},
         network=lossy(0.33),
@@ -339,24 +333,22 @@ def sparse() -> tuple[Scenario, Record]:
 def test_the_estimate_is_exact_once_every_horizon_has_arrived_or_is_known_lost(
     sparse: tuple[Scenario, Record], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Without noise, as exact as a state is told; without acknowledgements it is not."""
+    """Exact to the resolution of reports without noise; not without acknowledgements."""
     flown, flight = sparse
     certain = settled(flight, 16)
     assert certain.sum() > 300
     assert flight.figures["server"]["counts"]["horizons_lost"] > 3
     assert estimate_error(flight)[certain].max() <= TOLD_M
-    assert estimate_error(flight).max() > 1e-3  # of others it cannot be
+    assert estimate_error(flight).max() > 1e-3  # at other ticks it cannot be exact
 
     sent: list[int] = []
     remember, observe = Replay.remember, Replay.observe
 
     def note(self: Replay, rows: Indices, step: Indices, found: Foresight, event: Flags) -> None:
-        """Note what is sent."""
         sent.extend(step[event].tolist())
         remember(self, rows, step, found, event)
 
     def believe(self: Replay, row: int, observation: Observation) -> bool:
-        """Believe that all that was sent has arrived."""
         arrived = [step for step in sent if step + 9 <= observation.step]
         newest = max([observation.in_force, *arrived])
         return observe(self, row, observation._replace(in_force=newest))
@@ -368,7 +360,7 @@ def test_the_estimate_is_exact_once_every_horizon_has_arrived_or_is_known_lost(
 
 
 def test_a_packet_at_every_step_hides_what_is_lost() -> None:
-    """Each begins with the same committed inputs, so the state is known whatever arrives."""
+    """All horizons begin with the same committed inputs, so the state is always known."""
     flown = scenario(control={"trigger": "always", "delay_bound": 0.8}, duration=20.0)
     flight = fly(flown)
     assert flight.netem["lost"].sum() > 50
@@ -376,7 +368,6 @@ def test_a_packet_at_every_step_hides_what_is_lost() -> None:
 
 
 def test_every_lost_horizon_is_counted(sparse: tuple[Scenario, Record]) -> None:
-    """The count equals netem's, except for horizons too new to be known."""
     _, flight = sparse
     netem = flight.netem[flight.netem["direction"] == UPLINK]
     horizons = netem[netem["bytes"] > HORIZON_BYTES]
@@ -391,7 +382,7 @@ TIGHT = {
     "input_weight": 1e-3,
     "change_weight": 0.0,
 }
-"""Firm weights, for a scheme that knows the vehicle's state; S = 0."""
+"""Tight weights, for a scheme that knows the vehicle's state; S = 0."""
 
 
 FIRM = {
@@ -400,18 +391,16 @@ FIRM = {
     "input_weight": 0.01,
     "change_weight": 0.0,
 }
-"""Less so, for wind."""
+"""Less tight weights, for wind."""
 
 
 def rmse(flown: Scenario, flight: Record) -> float:
-    """RMSE xy [m]."""
     error = summarise(flown, "test", flight.client).rmse_xy
     assert error is not None
     return error
 
 
 def test_it_is_stable_without_the_s_term_where_the_papers_scheme_is_not() -> None:
-    """Both schemes fly with equal weights, network and seed."""
     errors = {}
     for scheme in ("predictive", "committed"):
         flown = scenario(control={"scheme": scheme, "trigger": "always", **TIGHT}, duration=40.0)
@@ -424,12 +413,11 @@ def test_it_is_stable_without_the_s_term_where_the_papers_scheme_is_not() -> Non
 def test_every_step_is_planned_whatever_the_trigger(
     trigger: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Also a step that is not going to be sent: what its plan is worth is always known."""
+    """Also a step that is not sent, so that the worth of a packet is always known."""
     planned = 0
     plan = Planner.plan
 
     def count(self: Planner, rows: Indices, step: Indices, found: Foresight) -> None:
-        """Count what is planned."""
         nonlocal planned
         planned += len(rows)
         plan(self, rows, step, found)
@@ -446,7 +434,7 @@ def test_every_step_is_planned_whatever_the_trigger(
     ids=["steady wind", "and a wrong gain"],
 )
 def test_the_disturbance_observer_leaves_no_offset(vehicle: dict[str, Any]) -> None:
-    """Hovering in constant wind, in the last twenty seconds; without it there is one."""
+    """Hovering in constant wind, in the last twenty seconds; an offset without the observer."""
     offsets = {}
     for observer_s in (0.0, 4.0):
         control = {"trigger": "cost_gap(0.01)", "observer_s": observer_s}
@@ -471,7 +459,7 @@ def test_a_mean_loss_of_half_each_way_is_flown_through() -> None:
 
 
 def test_feedback_aboard_flies_in_wind_with_a_packet_a_second() -> None:
-    """A third of the error of committed inputs alone, with fewer packets; none without a gain."""
+    """A third of the error without feedback, with fewer packets; no effect with gain 0."""
     errors, packets = {}, {}
     for feedback in (False, True):
         control = {
@@ -488,7 +476,7 @@ def test_feedback_aboard_flies_in_wind_with_a_packet_a_second() -> None:
 
 
 def test_with_feedback_aboard_the_estimate_is_as_exact() -> None:
-    """Without noise, as exact as a state is told, once each horizon has come or is lost."""
+    """Exact to the resolution of reports, once each horizon has arrived or is lost."""
     control = {
         "scheme": "committed",
         "feedback": True,
@@ -503,9 +491,7 @@ def test_with_feedback_aboard_the_estimate_is_as_exact() -> None:
 
 
 def test_the_observer_sees_past_feedback_aboard() -> None:
-    """Feedback against steady wind is not learned as a disturbance, and the wind is not
-    forgotten.
-    """
+    """Feedback against steady wind is no disturbance, and the wind's estimate stays."""
     reference = {"shape": "hover", "points_m": [[0.0, 0.0]]}
     control = {
         "scheme": "committed",
@@ -518,12 +504,12 @@ def test_the_observer_sees_past_feedback_aboard() -> None:
     flight = fly(flown)
     away = np.abs(flight.client["state"][-400:, :, 0])
     assert away.max() < 0.005
-    # At rest the input makes good for wind and gain: 0.8 u + w = 0.
+    # At rest the input compensates wind and gain: 0.8 u + w = 0.
     np.testing.assert_allclose(flight.client["input"][-1], [-0.375, 0.25], atol=0.01)
 
 
 def test_the_vehicle_says_which_horizon_it_flies_and_since_when() -> None:
-    """A horizon in force at a step was first flown at `since`; the delay bound lies above that."""
+    """A horizon was first flown at `since`; the delay bound lies above that delay."""
     flown = scenario(control={"trigger": "always"}, duration=20.0)
     flight = fly(flown)
     client = flight.client[flight.client["in_force"] >= 0]
@@ -537,7 +523,6 @@ def test_the_vehicle_says_which_horizon_it_flies_and_since_when() -> None:
 
 
 def test_a_budget_is_kept_in_any_window_of_a_flight() -> None:
-    """The budget holds even where every step would be worth a packet."""
     control = {"trigger": "cost_gap(0) & budget(5, 2)", **FIRM}
     flight = fly(scenario(control=control, vehicle={"wind": 0.3}, duration=30.0))
     sent_s = flight.server["step"][flight.server["event"]] * 0.05

@@ -1,4 +1,4 @@
-"""The scheme "trajectory": what is sent in place of a plan, when, and how it is flown."""
+"""Scheme "trajectory": splines, the rule of flight, the decision to send, and flights."""
 
 import itertools
 import math
@@ -52,13 +52,13 @@ Floats = NDArray[np.float32]
 
 SECONDS = 20.0
 LINE = {"shape": "waypoints", "points_m": [[0.0, 0.0], [80.0, 60.0]], "speed_mps": 1.0}
-"""A target of constant velocity, 0.8 and 0.6 m/s."""
+"""Target of constant velocity, 0.8 and 0.6 m/s."""
 STILL: dict[str, Any] = ""
 FAR: dict[str, Any] = "constant(0.4)"
 
 
 def scenario(**sections: Any) -> Scenario:
-    """Steps of 0.1 s without wind, along LINE, not seen ahead, over a network of no delay."""
+    """Steps of 0.1 s without wind, along LINE without preview, over a network without delay."""
     table: dict[str, Any] = {
         "duration": SECONDS,
         "settle": 12.0,
@@ -75,13 +75,11 @@ def scenario(**sections: Any) -> Scenario:
 
 
 def sent_steps(flight: Record) -> list[int]:
-    """Steps at which the server sent."""
     steps: list[int] = flight.server["step"][flight.server["event"]].tolist()
     return steps
 
 
 def rmse_m(flown: Scenario, flight: Record) -> float:
-    """Root mean square of the distance, from `settle` on [m]."""
     late = flight.client["step"] * flown.control.dt >= flown.settle
     squares = (position_error(flown, flight.client)[late] ** 2).sum(axis=1)
     return float(np.sqrt(squares.mean()))
@@ -112,7 +110,7 @@ def test_a_spline_is_exact_along_a_cubic(
 def test_pieces_join_with_the_velocity_of_the_knot(
     knots: list[tuple[float, float]], spacing: int
 ) -> None:
-    """From either side, and at both ends, where it goes straight on."""
+    """From either side, and at both ends, where the spline continues straight."""
     flat, dt_s = np.array(knots).ravel(), 1e-6
     for number, (p, v) in enumerate(knots):
         at = number * spacing
@@ -134,7 +132,6 @@ def test_pieces_join_with_the_velocity_of_the_knot(
 def test_one_knot_is_a_state_that_goes_on_by_itself(
     p: float, v: float, stage: int, spacing: int
 ) -> None:
-    """It is p + t v, whatever the spacing."""
     assert spline_at((p, v), spacing, 0.1, stage) == pytest.approx((p + stage * 0.1 * v, v))
 
 
@@ -142,7 +139,7 @@ def test_one_knot_is_a_state_that_goes_on_by_itself(
 
 
 def guide(flown: Scenario, knots: Sequence[float], **other: Any) -> AxisSpline:
-    """A spline on the first axis, flown for 100 stages."""
+    """Spline on the first axis, flown for 100 stages."""
     terms = flown.terms()
     numbers = {
         "spacing": 10,
@@ -170,7 +167,7 @@ def test_along_a_spline_the_models_velocity_is_the_splines() -> None:
 
 
 def test_input_is_that_of_the_spline_and_feedback_less_the_disturbance() -> None:
-    """Together they are held within the bound."""
+    """The sum is clamped to the bound."""
     held = guide(scenario(), (1.0, 0.5))
     u, told = follow(held, 4, 1.2, 0.5, 1.1, 0.4, 0.03, 0.0)
     assert told == pytest.approx(0.5)
@@ -180,7 +177,7 @@ def test_input_is_that_of_the_spline_and_feedback_less_the_disturbance() -> None
 
 
 def test_input_moves_from_the_one_before_by_the_regulator_s_share() -> None:
-    """By the same share of the way at each step: 1 - λ."""
+    """By the same share of the difference at each step: 1 - λ."""
     held = guide(scenario(), (1.0, 0.5), lag=0.75)
     state = (1.2, 0.5, 1.1, 0.4, 0.03)
     wanted, told = regulated(held, 4, *state)
@@ -193,7 +190,7 @@ def test_input_moves_from_the_one_before_by_the_regulator_s_share() -> None:
 
 @pytest.mark.long
 def test_weight_of_changes_buys_a_smaller_error_at_the_same_effort() -> None:
-    """After a target that only the server sees; without λ the same effort costs 0.05 m more."""
+    """Behind a target that only the server sees; without λ the same effort costs 0.05 m more."""
 
     def flown(**weights: float) -> tuple[float, float]:
         table = reading.to_table(reading.load("compare/trajectory-every-step-target"))
@@ -208,7 +205,7 @@ def test_weight_of_changes_buys_a_smaller_error_at_the_same_effort() -> None:
 
 
 def test_behind_its_last_stage_it_is_braked_along_and_comes_to_rest() -> None:
-    """The told input falls by `brake` a step, and the point that is followed comes to rest."""
+    """The prescribed input falls by `brake` a step, and the followed point comes to rest."""
     held = guide(
         scenario(), (0.0, 1.0), length=20, last=1.0, speed=1.0, brake=0.1, gain_p=0.0, gain_v=0.0
     )
@@ -223,16 +220,15 @@ def test_behind_its_last_stage_it_is_braked_along_and_comes_to_rest() -> None:
 
 
 def test_what_is_held_goes_on_for_ever() -> None:
-    """Without a brake the spline has no end."""
     held = guide(scenario(), (0.0, 1.0), length=20, brake=0.0)
     assert guided_to(held, 0, 500, 0.0, 0.0) == pytest.approx((50.0, 1.0))
 
 
-# -- what is sent, and when ------------------------------------------------------------------
+# -- decision to send ------------------------------------------------------------------------
 
 
 class Moved(Desired):
-    """Targets that are moved by hand, as the server knows them."""
+    """Targets set by the test, as the server knows them."""
 
     moved = np.zeros((1, 2, 1, 2))
 
@@ -244,7 +240,7 @@ class Moved(Desired):
 
 
 class Server:
-    """A server's part of the scheme."""
+    """Scheme with one vehicle, driven by the test."""
 
     def __init__(self, flown: Scenario, capacity: int = 1) -> None:
         self.terms = flown.terms()
@@ -267,12 +263,11 @@ class Server:
     def observe(
         self, step: int, *, in_force: int = NO_HORIZON, since: int = 0, takes: int = 1
     ) -> None:
-        """An observation of a vehicle at rest at the origin."""
         at = (step, in_force, since, 0, 0, Mode.TRACK, takes)
         self.scheme.observe(0, Observation(1, 1, *at, np.zeros((2, 2)), np.zeros(2)))
 
     def at(self, step: int, *states: Sequence[float], send: bool = False) -> Any:
-        """Figures of the vehicle whose target has come to a state, of each axis."""
+        """Figures for the vehicle with its target at this state of each axis."""
         if states:
             self.desired.moved = np.array(states, dtype=np.float64)[None, :, None]
         rows, steps = np.array([0]), np.array([step])
@@ -283,12 +278,11 @@ class Server:
 
     @property
     def d(self) -> int:
-        """The delay bound [steps]."""
         return int(self.scheme._memory.sent.bound.steps[0])
 
 
 def known(flown: Scenario, server: Server, off_m: float, off_mps: float) -> float:
-    """The gap of a trajectory that is off by so much on one axis, as the documents have it."""
+    """Gap of a trajectory with these errors on one axis, as in the documents."""
     (gain_p, gain_v, _), *_ = regulator(flown).tolist()
     h, weight = (1.0 + gain_v) / gain_p, flown.control.state_weight[0]
     times = server.d * 0.1 * np.arange(1, 4)
@@ -297,7 +291,6 @@ def known(flown: Scenario, server: Server, off_m: float, off_mps: float) -> floa
 
 
 def test_target_is_sent_as_one_knot() -> None:
-    """Its position and velocity."""
     server = Server(scenario())
     server.observe(7)
     server.at(8, (1.0, 0.5), (-2.0, -0.25), send=True)
@@ -307,7 +300,7 @@ def test_target_is_sent_as_one_knot() -> None:
 
 
 def test_a_target_faster_than_the_bound_is_sent_at_the_bound() -> None:
-    """Both ends expect it no faster than the vehicle can fly; the server sees it get away."""
+    """Both ends limit it to the vehicle's speed; the server sees the growing distance."""
     server = Server(scenario(model={"u_max": [1.5]}))
     server.observe(0)
     server.at(1, (0.0, 2.0), (0.0, -3.0), send=True)
@@ -317,7 +310,7 @@ def test_a_target_faster_than_the_bound_is_sent_at_the_bound() -> None:
 
 
 def test_gap_is_the_mean_over_what_may_be_followed() -> None:
-    """One that is under way comes with the share of those that are not lost, else it hovers."""
+    """A trajectory under way counts with its probability of arrival; otherwise hovering does."""
     flown = scenario()
     server = Server(flown)
     server.observe(0)
@@ -345,7 +338,7 @@ def test_gap_of_what_is_in_force_is_certain() -> None:
 
 
 def test_what_is_known_to_be_lost_is_followed_by_nobody() -> None:
-    """Once a delay bound has passed without it, the gap is that of what is in force."""
+    """Once a delay bound has passed, the gap is that of the trajectory in force."""
     flown = scenario()
     server = Server(flown)
     server.observe(0)
@@ -395,7 +388,7 @@ def test_a_vehicle_has_nothing_to_fly_until_it_is_sent_something_and_once_that_i
 
 
 def test_a_vehicle_that_is_not_heard_is_not_flooded() -> None:
-    """A trajectory that would arrive too old to be flown is not sent anew at every step."""
+    """A trajectory that would arrive too old is not sent anew at every step."""
     server = Server(scenario(link={"age_max_s": 2.0}, control={"delay_bound": 0.5}))
     server.observe(10)
     server.at(12, send=True)
@@ -403,7 +396,7 @@ def test_a_vehicle_that_is_not_heard_is_not_flooded() -> None:
 
 
 def test_a_vehicle_that_takes_nothing_holds_nothing() -> None:
-    """It has dropped what it had: once it takes packets again it gets one at once."""
+    """It has dropped its trajectory, and gets a new one as soon as it accepts packets again."""
     server = Server(scenario())
     server.observe(0)
     server.at(1, send=True)
@@ -426,7 +419,7 @@ def test_a_new_life_forgets_what_the_old_one_was_sent() -> None:
 
 
 def fitted(path: Any, error_m: float) -> tuple[int, int, float]:
-    """Number of knots, spacing, and largest distance of the spline of a path of the time."""
+    """Number of knots, spacing, and largest distance from a path over time."""
     times = np.arange(61) * 0.1
     states = np.stack([path(times), np.gradient(path(times), 0.1)], axis=-1)
     knots = np.zeros((2, 2 * KNOTS_MAX), dtype=np.float32)
@@ -437,7 +430,7 @@ def fitted(path: Any, error_m: float) -> tuple[int, int, float]:
 
 
 def test_as_few_knots_are_sent_as_keep_near_enough() -> None:
-    """A line has one; a wave has more, the more the nearer it is to be followed."""
+    """A line has one; a wave has more, the more the smaller the allowed error."""
     assert fitted(lambda t: 0.5 * t, 0.02)[0] == 1
     few, many = (fitted(np.sin, error) for error in (0.03, 0.003))
     assert 1 < few[0] < many[0] < KNOTS_MAX
@@ -450,7 +443,7 @@ def test_what_no_spline_follows_has_as_many_knots_as_there_may_be() -> None:
     assert (count, spacing) == (KNOTS_MAX, 4)
 
 
-# -- what is seen ahead --------------------------------------------------------------------------
+# -- preview -------------------------------------------------------------------------------------
 
 
 @given(
@@ -461,7 +454,7 @@ def test_what_no_spline_follows_has_as_many_knots_as_there_may_be() -> None:
 def test_what_a_vehicle_is_told_can_be_flown(
     start: tuple[float, float], places: list[float]
 ) -> None:
-    """Any desired trajectory gives motions that continue smoothly, by inputs within bounds."""
+    """Any reference gives motions that continue smoothly, with inputs within bounds."""
     flown = scenario(control={"horizon": 20}, reference={"preview": "all"})
     terms = flown.terms()
     nominal = make_nominal(terms, flown.control, capacity=1)
@@ -487,14 +480,10 @@ FAST = {
     "control.state_weight": [7.1, 0.07],
     "control.input_weight": 0.05,
 }
-"""A target nearly as fast as the vehicle, which the server sees for 4 s."""
+"""Target nearly as fast as the vehicle, which the server sees 4 s ahead."""
 
 
 def test_bounds_shape_what_is_told() -> None:
-    """A trajectory flies as near as plans of inputs that know of the bounds do, with fewer packets.
-
-    If it told what is desired, without regard to the bounds, its error would be twice as large.
-    """
     plans, told = (
         [
             flight.summary
@@ -511,7 +500,7 @@ def test_bounds_shape_what_is_told() -> None:
 
 @pytest.mark.parametrize("horizon", [1, 3, 8])
 def test_a_horizon_too_short_for_a_plan_still_leads_along_the_trajectory(horizon: int) -> None:
-    """The server then sends the trajectory itself; with planned motions errors are 0.3 to 2.7 m."""
+    """The server then sends the reference itself; with planned motions errors are 0.3 to 2.7 m."""
     flown = skytether.fly("demo", **{"control.horizon": horizon, "duration": 30.0})
     assert flown.summary.error_max < 0.28
 
@@ -520,14 +509,13 @@ def test_a_horizon_too_short_for_a_plan_still_leads_along_the_trajectory(horizon
 
 
 def message(step: int, knots: Floats, *, age: int = 9, spacing: int = 5) -> Trajectory:
-    """Message that the server sends at a step."""
     return Trajectory(65535, 2**32 - 1, step, 2**32 - 1, age, spacing, knots)
 
 
 @pytest.mark.parametrize("axes", [2, 3])
 @pytest.mark.parametrize("count", [1, 9, KNOTS_MAX])
 def test_a_packet_is_small(axes: int, count: int) -> None:
-    """23 bytes as a rule, 36 at most, and 8 for each knot and axis."""
+    """23 bytes typically, 36 at most, and 8 for each knot and axis."""
     knots = np.zeros((axes, count, 2), np.float32)
     longest = message(2**32 - 1, knots, age=2**32 - 1, spacing=2**16 - 1)
     longest = longest._replace(number=127, silence=2**16 - 1)
@@ -546,7 +534,7 @@ def test_what_is_sent_is_what_is_read() -> None:
 
 
 def wire(**fields: Any) -> bytes:
-    """The datagram of a TRAJECTORY of two knots with other fields."""
+    """Datagram of a TRAJECTORY of two knots with other fields."""
     usual = {"spacing": 5, "age": 3, "knots": np.ones(8, np.float32)} | fields
     knots = bytes(usual["knots"].data)
     packed = [VERSION, 7, 1, 2, 5, 9, usual["age"], usual["spacing"], knots, 4, 300]
@@ -599,7 +587,6 @@ huge = st.floats(-(2.0**99), 2.0**99, width=32)
 def test_whatever_finite_knots_say_what_is_flown_is_within_the_bound(
     knots: list[tuple[float, float]], spacing: int, stage: int
 ) -> None:
-    """Also where they are beyond all sense."""
     flown = scenario()
     terms = flown.terms()
     compensator = Compensator(terms, regulator(flown))
@@ -616,7 +603,6 @@ def test_whatever_finite_knots_say_what_is_flown_is_within_the_bound(
 
 
 def test_a_target_of_constant_velocity_takes_one_packet() -> None:
-    """Nothing is left to say after the first, and the vehicle is where the target is."""
     flown = scenario(control={"trigger": "cost_gap(0.01)"})
     flight = fly(flown)
     assert len(sent_steps(flight)) == 1
@@ -627,17 +613,17 @@ def test_a_target_of_constant_velocity_takes_one_packet() -> None:
 
 
 def test_far_away_it_is_no_worse() -> None:
-    """Half a second late the vehicle knows where the target has gone meanwhile."""
+    """With half a second of delay the vehicle still knows where the target is."""
     flown = scenario(network={"uplink": FAR, "downlink": FAR})
     assert rmse_m(flown, fly(flown)) < 1e-3
 
 
 Kept = dict[int, tuple[int, Array]]
-"""Spacing and knots that the server keeps, by the step that they were made for."""
+"""Spacing and knots in the server's memory, by the step that they were made for."""
 
 
 def flown_and_kept(flown: Scenario) -> tuple[Record, Kept]:
-    """A flight, and what the server has kept of what it sent."""
+    """Flight, and the trajectories that the server kept."""
     kept: Kept = {}
     inner = Guidance.remember
 
@@ -672,7 +658,7 @@ def test_the_server_knows_what_the_vehicle_follows(shape: str) -> None:
     for row in flight.client:
         step, made = int(row["step"]), int(row["in_force"])
         if made < 0 or step not in server or made != max(s for s in kept if s < step):
-            continue  # what was sent last is under way, or lost
+            continue  # the newest is under way, or lost
         spacing, knots = kept[made]
         followed = [spline_at(each, spacing, 0.1, step - made) for each in knots]
         np.testing.assert_allclose(server[step]["planned"], followed, rtol=0.0, atol=1e-12)
@@ -681,7 +667,7 @@ def test_the_server_knows_what_the_vehicle_follows(shape: str) -> None:
 
 
 def test_inputs_flown_are_those_of_the_spline_that_the_server_keeps() -> None:
-    """Mismatch 0: the server's knots, by the rule, give every input that was flown."""
+    """Every input that was flown follows from the server's knots by the rule."""
     flown = scenario(
         reference={"shape": "circle", "preview": "all"},
         control={"trigger": "periodic(7)", "horizon": 40},
@@ -704,7 +690,6 @@ def test_inputs_flown_are_those_of_the_spline_that_the_server_keeps() -> None:
 
 
 def test_silence_is_as_long_as_is_said() -> None:
-    """However short the horizon is of which a plan would be half gone."""
     flown = scenario(control={"trigger": "cost_gap(0.01) | silence(3)", "horizon": 4})
     assert set(np.diff(sent_steps(fly(flown)))) == {30}
 
@@ -713,7 +698,7 @@ def test_silence_is_as_long_as_is_said() -> None:
 def test_a_packet_that_has_become_too_old_is_replaced(
     renewed: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Though the target is where it is expected: without that the vehicle stands still."""
+    """Although the target is where it is expected; otherwise the vehicle stands still."""
     flown = scenario(control={"trigger": "cost_gap(0.01)"}, link={"age_max_s": 2.0})
     if not renewed:
         forgetful = Guidance.__init__
@@ -730,7 +715,7 @@ def test_a_packet_that_has_become_too_old_is_replaced(
 
 
 def test_before_a_trajectory_ends_as_many_are_sent_as_make_the_next_one_sure() -> None:
-    """At 30 % loss and one every 2 s; by the clock alone, 19 of 20 such flights brake."""
+    """At 30 % loss and one trajectory every 2 s; without the rule, 19 of 20 such flights brake."""
     slow = {
         "control.trigger": "expected_gap(1000) | silence(2)",
         "network.uplink.loss": 0.3,
@@ -742,7 +727,6 @@ def test_before_a_trajectory_ends_as_many_are_sent_as_make_the_next_one_sure() -
 
 
 def test_only_with_feedback() -> None:
-    """Nothing else would lead the vehicle along the trajectory."""
     flown = reading.to_table(scenario())
     flown["control"]["feedback"] = False
     with pytest.raises(
@@ -752,7 +736,7 @@ def test_only_with_feedback() -> None:
 
 
 def test_acknowledgements_make_good_what_is_lost() -> None:
-    """One packet of three is lost: without them the vehicle is further from its target."""
+    """One packet of three is lost; without acknowledgements the error is larger."""
     lossy = "constant(0.2) & loss(0.3)"
     target = {"shape": "target", "preview": "none", "turn_every_s": 4.0}
     errors = {}
@@ -765,7 +749,7 @@ def test_acknowledgements_make_good_what_is_lost() -> None:
         )
         deaf = trigger.startswith("cost")
         with pytest.MonkeyPatch.context() as patch:
-            if deaf:  # what was sent is taken for arrived, as where nothing is acknowledged
+            if deaf:  # sent trajectories count as arrived, as without acknowledgements
                 inner = Guidance.observe
 
                 def observe(self: Guidance, row: int, told: Observation) -> bool:
@@ -798,7 +782,7 @@ def test_acknowledgements_make_good_what_is_lost() -> None:
 def test_steady_wind_is_taken_off_by_the_vehicle_itself(
     known_aboard: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Its filter has found it; without that it would be blown off by what K leaves."""
+    """Its filter estimates the wind; without that, K alone leaves an offset."""
     if not known_aboard:
         monkeypatch.setattr(Navigation, "disturbance", property(lambda _: np.zeros(2)))
     flown = scenario(
@@ -812,7 +796,7 @@ def test_steady_wind_is_taken_off_by_the_vehicle_itself(
 def test_a_vehicle_along_a_spline_reports_where_it_leaves_it(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """In still air the server predicts the vehicle, so reports are few; ablation: it stands."""
+    """In still air the server predicts the vehicle, so reports are few."""
     silent = {"wind": 0.0, "report": "deviation(0.01) | silence(1)"}
     table = reading.to_table(reading.load("demo")) | {"duration": 20.0}
     table["control"]["scheme"] = "trajectory"

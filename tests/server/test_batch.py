@@ -1,4 +1,4 @@
-"""Runs that share a server: each is, to the last bit, what it would be alone."""
+"""Runs that share a server: each equals, to the last bit, the run alone."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -24,12 +24,10 @@ from skytether.sim.flight import COMPANY_MAX, fly, fly_batch
 
 
 def scenario(**changes: Any) -> Scenario:
-    """The scenario paper for two seconds, with some keys changed."""
     return packaged("paper", {"duration": 2.0, "settle": 0.0}, changes)
 
 
 def assert_as_alone(flown: Scenario, seeds: Sequence[int]) -> list[Record]:
-    """Every part of every run's record; the runs."""
     flights = fly_batch(flown, seeds)
     assert len(flights) == len(seeds)
     for seed, together in zip(seeds, flights, strict=True):
@@ -98,7 +96,6 @@ committing = st.builds(
         }
     ),
 )
-"""With triggers that need committed inputs."""
 guided = st.builds(
     lambda changes, control, shape: (
         changes | {"control": changes["control"] | control, "reference": {"shape": shape}}
@@ -115,10 +112,10 @@ guided = st.builds(
     ),
     st.sampled_from(["circle", "target"]),
 )
-"""With trajectories that are sent as they are."""
+"""With trajectories that are sent as splines."""
 companies = st.lists(st.integers(0, 2**32 - 1), min_size=2, max_size=4, unique=True)
 phases_ms = st.none() | st.lists(st.sampled_from([0, 5, 10, 20]), min_size=4, max_size=4)
-"""None leaves them to the seeds; the others make everything fall on the same instants."""
+"""None leaves the phases to the seeds; the others make events coincide."""
 
 
 @settings(max_examples=15)
@@ -136,18 +133,17 @@ def test_a_run_in_a_batch_equals_the_same_run_alone(
 
 
 class Drawn:
-    """A phase that is given, in place of chance."""
+    """Random generator with a given phase."""
 
     def __init__(self, phase_ns: int) -> None:
         self._phase_ns = phase_ns
 
     def integers(self, _: int) -> int:
-        """The phase."""
         return self._phase_ns
 
     @classmethod
     def of(cls, given_ns: dict[int, int], seed: int, *names: str | int) -> Any:
-        """The stream of these names, but for the phase."""
+        """The stream of these names, except for the phase."""
         return cls(given_ns[seed]) if names == ("phase",) else chance.stream(seed, *names)
 
 
@@ -178,7 +174,7 @@ def test_each_run_follows_the_target_of_its_own_seed(
 def test_a_session_expires_at_the_same_time_alone_and_in_a_batch(
     dt: float, loss: float, duration: float
 ) -> None:
-    """After 30 s of silence a lone server stops ticking, and one with further runs ticks on.
+    """After 30 s of silence a lone server stops ticking, one with further runs continues.
 
     The server looks for expired sessions on the grid of its own clock.
     """
@@ -205,7 +201,7 @@ def test_a_run_whose_sessions_expire_equals_the_same_run_alone(
 
 
 def test_a_run_that_finds_no_server_leaves_the_others_alone() -> None:
-    """Five packets in six are lost: some give up, at different times, and some fly."""
+    """Five packets in six are lost: some vehicles give up, at different times, and some fly."""
     deaf = {"uplink": {"loss": 0.85}, "downlink": {"loss": 0.5}}
     flights = assert_as_alone(scenario(network=deaf, link={"connect_s": 5.0}), range(6))
     gave_up = [isinstance(run.failure, NoAnswer) for run in flights]
@@ -216,12 +212,11 @@ def test_a_run_that_finds_no_server_leaves_the_others_alone() -> None:
 def test_a_flight_whose_trajectory_is_looked_up_anew_is_as_alone(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """A full store of reference pages is emptied for the first flight that needs room."""
+    """A full store of reference pages is emptied for the first flight that needs a page."""
     made: list[Desired] = []
     init = Desired.__init__
 
     def crowded(self: Desired, *given: Any) -> None:
-        """Room for two pages."""
         init(self, *given)
         self._keys[3:] = 2**62
         made.append(self)

@@ -1,4 +1,4 @@
-"""One budget for all vehicles: who goes first, how much goes, and the rate that an air passes."""
+"""Shared budget: priorities, amounts, and the rate estimate of the network."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -38,7 +38,7 @@ class Crowd:
         self.now_ns = 0
 
     def tick(self, worth: Array, owed: list[int] | None = None, blocks: int = 1) -> list[int]:
-        """Vehicles that are sent something at the next tick, where all of them ask."""
+        """Vehicles that are sent a packet at the next tick, if all ask."""
         self.now_ns += DT_NS
         self.since_s += DT_S
         self.budget.fill(self.rows, self.now_ns)
@@ -63,7 +63,7 @@ class Crowd:
     st.integers(0, 2**32 - 1),
 )
 def test_no_more_goes_than_the_rate(sizes: list[int], rate: float, blocks: int, seed: int) -> None:
-    """In any window of T at most r (T + BURST_S), and a packet that was longer than the last."""
+    """In any window of T at most r (T + BURST_S), plus the excess of a packet's size."""
     crowd, rng = Crowd(rate, sizes), np.random.default_rng(seed)
     spent = [
         sum(sizes[row] for row in crowd.tick(rng.random(len(sizes)), blocks=blocks))
@@ -86,14 +86,14 @@ def test_a_rate_that_is_enough_holds_nobody_back() -> None:
 def test_who_gains_most_a_byte_goes_first() -> None:
     crowd = Crowd(2 * GUESS_BYTES / DT_S, [100, 100, 200, 100])
     crowd.tick(np.zeros(4), owed=[0, 1, 2, 3])  # from here on sizes are known
-    for _ in range(8):  # the others pay for what was owed
+    for _ in range(8):  # the others pay for the obligatory packets
         crowd.tick(np.full(4, np.nan))
     crowd.since_s[:] = 0.0
     assert crowd.tick(np.array([1.0, 3.0, 5.0, 4.0])) == [1, 3]
 
 
 def test_what_is_owed_goes_in_any_case_and_the_others_pay() -> None:
-    """With a rate for one packet a tick, four that are owed take what there is for the others."""
+    """At a rate of one packet a tick, four obligatory packets use up the others' share."""
     crowd = Crowd(GUESS_BYTES / DT_S, [100] * 8)
     assert sorted(crowd.tick(np.arange(8.0), owed=[0, 1, 2, 3]))[:4] == [0, 1, 2, 3]
     after = [len(crowd.tick(np.arange(8.0))) for _ in range(4)]
@@ -111,7 +111,7 @@ def test_debts_are_bounded() -> None:
 
 
 def longest_wait_s() -> float:
-    """Longest time that one vehicle waits for which little is at stake, beside greedy ones."""
+    """Longest time that one vehicle with low priority waits beside greedy ones."""
     crowd = Crowd(2 * GUESS_BYTES / DT_S, [100] * 12)
     worth, longest_s = np.full(12, 100.0), 0.0
     worth[0] = 1.0
@@ -122,7 +122,7 @@ def longest_wait_s() -> float:
 
 
 def test_nobody_starves(monkeypatch: pytest.MonkeyPatch) -> None:
-    """After WAIT_S without a packet it goes first; ablation: without the bound it starves."""
+    """After WAIT_S without a packet it goes first; without that rule it starves."""
     assert longest_wait_s() <= WAIT_S + 3 * DT_S
     monkeypatch.setattr(budgets, "WAIT_S", np.inf)
     assert longest_wait_s() == pytest.approx(400 * DT_S)
@@ -154,12 +154,12 @@ def test_who_no_longer_asks_holds_nobody_back() -> None:
 
 
 class Air:
-    """Bytes that go through a queue of finite rate, and echoes that tell a server of their delays.
+    """Queue of finite rate, and echoes that report its delays to a server.
 
     Args:
-        rate: bytes that pass [B/s].
-        jitter_s: standard deviation of the delay beside the queue [s].
-        loss: share of echoes that never come.
+        rate: rate of the queue [B/s].
+        jitter_s: standard deviation of the additional delay [s].
+        loss: share of lost echoes.
     """
 
     def __init__(self, rate: float, *, jitter_s: float = 0.0, loss: float = 0.0) -> None:
@@ -172,7 +172,7 @@ class Air:
         self.rates: list[float] = []
 
     def run(self, seconds: float, wanted: float = np.inf) -> "Air":
-        """Let time pass in which so much was to be sent [B/s], and send what the rate lets pass."""
+        """Offer `wanted` [B/s] for some seconds, and send what the rate estimate allows."""
         rows = np.arange(self.vehicles)
         for step in range(round(seconds / DT_S)):
             self.now_ns += DT_NS
@@ -181,7 +181,7 @@ class Air:
             self.queue_s = max(self.queue_s + spent / self.rate - DT_S, 0.0)
             self.queues_s.append(self.queue_s)
             self.rates.append(spent / DT_S)
-            row = step % self.vehicles  # it tells of what was sent half a second ago
+            row = step % self.vehicles  # the echo reports a packet sent half a second ago
             before_s = self.queues_s[-min(10, len(self.queues_s))]
             delay_s = 0.4 + before_s + abs(self.rng.normal(0.0, self.jitter_s or 1e-9))
             if self.rng.random() >= self.loss:
@@ -232,11 +232,9 @@ def test_a_rate_that_nobody_uses_does_not_rise() -> None:
 # -- flights ---------------------------------------------------------------------------------
 
 AIR = "paper(0.4, 0.02, 2) & rate(3000, queue=5000)"
-"""A quarter of the air of the scenario `crowd`."""
 
 
 def crowd(keys: Mapping[str, Any], network: str = AIR) -> Scenario:
-    """The scenario `crowd` for 25 s."""
     table = reading.to_table(reading.load("crowd"))
     table["network"] = {"uplink": network, "downlink": network}
     set_keys({"duration": 25.0, "settle": 12.0, **keys}, table)
@@ -244,7 +242,7 @@ def crowd(keys: Mapping[str, Any], network: str = AIR) -> Scenario:
 
 
 def flown(keys: Mapping[str, Any], vehicles: int, network: str = AIR) -> tuple[bool, float]:
-    """Whether so many vehicles fly, and the error of all of them [m]."""
+    """Whether this number of vehicles flies, and the error of all of them [m]."""
     scenario = crowd(keys, network)
     record = fly(scenario, vehicles=vehicles)
     point = judge(scenario, "budget", vehicles, record.client, record.figures["netem"])
@@ -256,7 +254,7 @@ AUTO = {"control.shared_bytes_per_s": "auto"}
 
 @pytest.mark.long
 def test_a_budget_flies_where_thresholds_fill_the_queue() -> None:
-    """More vehicles than the air bears at their thresholds, with a share of their error alone."""
+    """More vehicles than the network carries with thresholds alone; the error is much smaller."""
     vehicles = 19
     flies, _ = flown({}, vehicles)
     assert not flies
@@ -269,7 +267,7 @@ def test_a_budget_flies_where_thresholds_fill_the_queue() -> None:
 
 @pytest.mark.long
 def test_random_loss_costs_no_budget() -> None:
-    """The error is that of thresholds; a rate that losses cut, as a queue does, is far worse."""
+    """The error equals that of thresholds; a rate reduced by losses is far worse."""
     lossy = "paper(0.4, 0.02, 2) & loss(0.5)"
     _, threshold_m = flown({}, 8, lossy)
     _, budget_m = flown(AUTO, 8, lossy)
@@ -294,7 +292,7 @@ def test_a_budget_is_told_among_the_figures() -> None:
 
 
 def test_each_vehicle_of_a_fleet_has_a_target_of_its_own() -> None:
-    """The first has the scenario's; and the record's error is from the vehicle's own."""
+    """The first has the scenario's; the record's error is from the vehicle's own."""
     scenario = crowd({"duration": 3.0, "settle": 1.0})
     times_s = np.arange(100.0)
     own = [scenario.make_reference(vehicle)(times_s) for vehicle in (1, 2, 3)]

@@ -1,4 +1,4 @@
-"""The server's clock mapped to the vehicle's: exact where it can be, honest where it cannot."""
+"""Map of the vehicle's clock at the server: exact where possible, otherwise with a bound."""
 
 from collections.abc import Callable, Iterable
 
@@ -22,7 +22,7 @@ ROW = np.array([0])
 def observe(
     clock: ClockMap, now_ns: int, offset_ns: int, *, down_ns: int, up_ns: int, row: int = 0
 ) -> int:
-    """One observation and its echo, over a network of these delays; the offset adopted then."""
+    """One observation and its echo, over a network of these delays; returns the adopted offset."""
     clock.observe(row, down_ns - offset_ns, up_ns + offset_ns, heard=now_ns // MS, now_ns=now_ns)
     return int(clock.offset_ns(np.array([row]))[0])
 
@@ -35,7 +35,6 @@ def listen(
     down_ns: int = 400 * MS,
     up_ns: int = 400 * MS,
 ) -> list[int]:
-    """Error of the adopted offset at each time, with constant delays."""
     return [
         observe(clock, now, offset_ns(now), down_ns=down_ns, up_ns=up_ns) - offset_ns(now)
         for now in times_ns
@@ -43,7 +42,6 @@ def listen(
 
 
 def times(start_s: float, end_s: float) -> range:
-    """20 observations a second."""
     return range(round(start_s * S), round(end_s * S), DT_NS)
 
 
@@ -58,7 +56,7 @@ def test_equal_delays_give_the_offset_exactly(offset_ns: int, delay_ns: int) -> 
 @quick
 @given(st.integers(0, S), st.integers(0, S))
 def test_unequal_delays_err_by_half_their_difference(down_ns: int, up_ns: int) -> None:
-    """Nobody can know better; and the error stays within the bound that is published."""
+    """The smallest possible error; it stays within the published bound."""
     clock = ClockMap(1, DT_NS)
     error = observe(clock, 5 * S, HOUR, down_ns=down_ns, up_ns=up_ns) - HOUR
     assert error == (up_ns - down_ns) // 2
@@ -75,7 +73,7 @@ def test_smallest_delay_of_each_direction_counts() -> None:
 
 
 def test_small_movements_do_not_change_the_offset() -> None:
-    """Up to half a step, 25 ms, it stays as adopted; beyond, it follows all the way."""
+    """Up to half a step, 25 ms, it stays; beyond, it follows completely."""
     clock = ClockMap(1, DT_NS)
     observe(clock, 0, 0, down_ns=400 * MS, up_ns=400 * MS)
     adopted = [
@@ -108,9 +106,9 @@ def test_nothing_is_left_of_before_a_long_silence(silence_s: int) -> None:
 def test_offset_follows_a_stepped_clock_within_a_second_and_a_half(
     jump_ns: int, at_s: float, most: int
 ) -> None:
-    """A step of either clock counts once three half seconds in a row know nothing older.
+    """A clock step counts after three consecutive half seconds with only newer measurements.
 
-    Within a half second it may come half a second later.
+    If it falls within a half second, half a second later.
     """
     clock = ClockMap(1, DT_NS)
     assert set(listen(clock, times(0, at_s), lambda _: 0)) == {0}
@@ -124,7 +122,7 @@ def test_offset_follows_a_stepped_clock_within_a_second_and_a_half(
 def test_without_the_step_rule_the_offset_does_not_follow(
     jump_ns: int, monkeypatch: pytest.MonkeyPatch, *, rule: bool
 ) -> None:
-    """Ablation: half of the jump is missing until the window of 20 s has passed."""
+    """Otherwise half of the step is missing until the window of 20 s has passed."""
     monkeypatch.setattr(clocks, "_steps", clocks._steps.py_func)
     if not rule:
         monkeypatch.setattr(clocks, "_drop_stepped", lambda *_: None)
@@ -156,7 +154,7 @@ def test_slower_network_is_no_stepped_clock(down_ms: int, up_ms: int) -> None:
 
 
 def after_change(down_ns: int, up_ns: int, *, before: range, since: int) -> int:
-    """The bound [ns] once both delays changed after 400 ms each, and `since` packets came."""
+    """Bound [ns] once both delays changed after 400 ms each, and `since` packets arrived."""
     clock = ClockMap(1, DT_NS)
     listen(clock, before, lambda _: 0)
     start_s = 4 + before[-1] / S
@@ -172,7 +170,7 @@ def after_change(down_ns: int, up_ns: int, *, before: range, since: int) -> int:
 
 @pytest.mark.parametrize(("jump_ms", "bound_ms"), [(40, 380), (41, 400)])
 def test_step_is_a_change_by_more_than_40_ms(jump_ms: int, bound_ms: int) -> None:
-    """Smaller changes wait for the window; here both delays are constant and the clock jumps."""
+    """Smaller changes wait for the window; here both delays are constant and the clock steps."""
     clock = ClockMap(1, DT_NS)
     listen(clock, times(0, 10), lambda _: 0)
     listen(clock, times(10, 13), lambda _: jump_ms * MS)
@@ -180,7 +178,7 @@ def test_step_is_a_change_by_more_than_40_ms(jump_ms: int, bound_ms: int) -> Non
 
 
 def test_change_that_differs_between_directions_is_no_stepped_clock() -> None:
-    """A step moves both by as much, to within 40 ms or a fifth: by 10 and 50 of 300 ms."""
+    """A step changes both directions equally, to within 40 ms or a fifth."""
     before = times(0, 10)
     assert after_change(300 * MS, 700 * MS, before=before, since=20) == 350 * MS
     assert after_change(300 * MS, 510 * MS, before=before, since=20) == 405 * MS
@@ -190,7 +188,7 @@ def test_change_that_differs_between_directions_is_no_stepped_clock() -> None:
 
 @pytest.mark.parametrize("every", [7, 10])
 def test_the_step_of_a_clock_is_found_of_a_quiet_vehicle(every: int) -> None:
-    """Two or three packets a second: what is recent reaches back to hold five, and no further."""
+    """At two or three packets a second, the recent past extends until it has five."""
     clock = ClockMap(1, DT_NS)
     quiet = list(times(0, 10))[::every]
     listen(clock, quiet, lambda _: 0)
@@ -199,7 +197,7 @@ def test_the_step_of_a_clock_is_found_of_a_quiet_vehicle(every: int) -> None:
 
 
 FEW = ((4, 300), (5, 400))
-"""Number of packets, and the bound that they leave [ms]."""
+"""Number of packets, and the resulting bound [ms]."""
 
 
 @pytest.mark.parametrize(
@@ -212,7 +210,7 @@ FEW = ((4, 300), (5, 400))
 def test_four_packets_are_too_few_to_tell_a_stepped_clock(
     before: range, since: int, bound_ms: int
 ) -> None:
-    """Of before or since: the minimum of four may be a bad one. Also where the ring comes round."""
+    """Before or after the step: the minimum of four is unreliable; also where the ring wraps."""
     assert after_change(200 * MS, 600 * MS, before=before, since=since) == bound_ms * MS
 
 
@@ -246,14 +244,14 @@ def test_vehicles_have_clocks_of_their_own() -> None:
 
 
 def shortest_ms(clock: ClockMap, row: int = 0) -> float:
-    """Shortest delay of the newest packets to a vehicle [ms], or -1 where it is not known."""
+    """Shortest delay of the newest packets to a vehicle [ms], or -1 if unknown."""
     clock.offset_ns(np.array([row]))
     shortest = int(shortest_ns.py_func(clock.seen, row))
     return shortest / MS if shortest >= 0 else -1.0
 
 
 def test_the_shortest_of_the_newest_echoes_tells_the_delay_of_now() -> None:
-    """It follows once all of them have grown; the map itself knows the smallest of 20 s."""
+    """It follows once all have grown; the clock map itself keeps the smallest of 20 s."""
     clock, known = ClockMap(1, DT_NS), []
     delays_ms = [400] * 6 + [700, 900, 800, 750, 900, 900, 410, 900]
     for now, up_ms in zip(times(1, 10), delays_ms, strict=False):
@@ -265,7 +263,7 @@ def test_the_shortest_of_the_newest_echoes_tells_the_delay_of_now() -> None:
 
 
 def test_a_word_of_ours_that_is_echoed_again_is_no_new_echo() -> None:
-    """While nothing comes to the vehicle nothing is known of how long that takes now."""
+    """While no packet reaches the vehicle, the present uplink delay is unknown."""
     clock = ClockMap(1, DT_NS)
     for _ in range(10 * ECHOES):
         clock.observe(0, 400 * MS, 400 * MS, heard=7, now_ns=8 * S)
@@ -279,7 +277,7 @@ def test_a_word_of_ours_that_is_echoed_again_is_no_new_echo() -> None:
 
 
 def test_an_echo_that_is_overtaken_bounds_nothing() -> None:
-    """It may be as old as the silence before it, in which the clocks drift."""
+    """It may be as old as the silence before it, during which the clocks drift."""
     clocks = [ClockMap(1, DT_NS) for _ in range(2)]
     for clock, in_order in zip(clocks, (True, False), strict=True):
         clock.observe(0, 400 * MS, 400 * MS, heard=1, now_ns=10 * S)
@@ -291,7 +289,7 @@ def test_an_echo_that_is_overtaken_bounds_nothing() -> None:
 
 @pytest.mark.parametrize("seed", range(5))
 def test_offset_is_right_to_half_a_step_on_the_papers_network(seed: int) -> None:
-    """(17) each way, one packet in ten lost, for a minute: below 25 ms once a second has passed."""
+    """(17) each way, one packet in ten lost, for a minute: below 25 ms after the first second."""
     rng, clock = np.random.default_rng(seed), ClockMap(1, DT_NS)
     errors = []
     for now in times(0, 60):

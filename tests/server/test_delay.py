@@ -1,4 +1,4 @@
-"""The delay bound: above what was seen recently, at rest where the network is."""
+"""Delay bound: above the recent delays, and constant while the network is."""
 
 from itertools import pairwise
 
@@ -26,12 +26,10 @@ MOST = 39
 
 
 def estimated(capacity: int = 1, most: int = MOST) -> DelayBound:
-    """Bounds that nobody has given."""
     return delay_bound(capacity, 0.05, most, None)
 
 
 def known(delays: list[int], first: int = 1, most: int = MOST) -> list[int]:
-    """Delay d after each sample of one vehicle."""
     bound, steps = estimated(most=most), []
     set_first(bound, 0, first)
     for sample in delays:
@@ -40,7 +38,7 @@ def known(delays: list[int], first: int = 1, most: int = MOST) -> list[int]:
     return steps
 
 
-# -- a bound that is given ------------------------------------------------------------------------
+# -- given bound ----------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -56,7 +54,7 @@ def known(delays: list[int], first: int = 1, most: int = MOST) -> list[int]:
     ],
 )
 def test_a_given_bound_is_rounded_up_to_steps(fixed_s: float, dt_s: float, steps: int) -> None:
-    """From 1 to the most there is room for, and whatever is guessed or seen."""
+    """From 1 to the largest possible, whatever is estimated."""
     bound = delay_bound(3, dt_s, MOST, fixed_s)
     for row, guess in enumerate((5, 20, 90)):
         set_first(bound, row, guess)
@@ -70,7 +68,7 @@ def test_a_given_bound_is_rounded_up_to_steps(fixed_s: float, dt_s: float, steps
     assert bound.steps.tolist() == [steps] * 3
 
 
-# -- a bound that is estimated --------------------------------------------------------------------
+# -- estimated bound ------------------------------------------------------------------------------
 
 
 def test_before_any_sample_it_is_the_guess() -> None:
@@ -81,7 +79,6 @@ def test_before_any_sample_it_is_the_guess() -> None:
 
 
 def test_what_every_packet_takes_raises_it_at_once_and_never_lowers_it() -> None:
-    """Acknowledged or not, up to the most; a delay that is not known is as good as none."""
     bound, steps = estimated(), []
     set_first(bound, 0, 11)
     for delay_now in (-(2**40), 0, 10, 11, 12, 30, 12, 90):
@@ -121,7 +118,7 @@ def test_a_few_of_a_hundred_are_no_lone_one() -> None:
 def test_either_reason_to_stay_is_needed(
     name: str, value: float, delays: list[int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Ablation: without it, d falls soon after a late horizon, into the next one."""
+    """Otherwise d falls soon after a late horizon, and the next one is late too."""
     guarded = known(delays)
     monkeypatch.setattr(delay, "add_sample", add_sample.py_func)
     assert known(delays) == guarded
@@ -191,7 +188,7 @@ def test_a_vehicle_that_is_forgotten_begins_anew() -> None:
     assert bound.steps.tolist() == [9, 30]
 
 
-# -- on a network ---------------------------------------------------------------------------------
+# -- simulated network ----------------------------------------------------------------------------
 
 SECONDS = 60.0
 
@@ -199,7 +196,7 @@ SECONDS = 60.0
 def flown(
     dt_s: float, period: int, seed: int, minima_s: tuple[float, ...] = (0.4,)
 ) -> tuple[list[int], float]:
-    """Delay d at every step on the paper's uplink, and the share in force later than it.
+    """Delay d at every step on the paper's uplink, and the share of horizons in force later than d.
 
     Args:
         period: steps from a horizon to the next.
@@ -234,13 +231,13 @@ FLIGHTS = {
     (0.02, 1): (22, 25, 30, 0.012),
     (0.02, 10): (24, 29, 12, 0.03),
 }
-"""Δt [s], period: the smallest and largest d of the last half, changes, share that is late."""
+"""By Δt [s] and period: smallest and largest d at the end, changes, share of late horizons."""
 
 
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize(("dt_s", "period"), FLIGHTS)
 def test_on_the_papers_network_it_is_at_rest(dt_s: float, period: int, seed: int) -> None:
-    """From the mean delay, 0.44 s, to 0.6 s; lower where most of the late are overtaken."""
+    """From the mean delay, 0.44 s, to 0.6 s; lower if most late ones are overtaken."""
     steps, late = flown(dt_s, period, seed)
     least, most, changes, share = FLIGHTS[dt_s, period]
     half = steps[len(steps) // 2 :]
@@ -250,7 +247,7 @@ def test_on_the_papers_network_it_is_at_rest(dt_s: float, period: int, seed: int
 
 
 def test_without_its_memory_it_chatters(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Ablation: five times the changes, and five times the late."""
+    """Five times the changes, and five times the late horizons."""
     steps, late = flown(0.02, 1, seed=0)
     monkeypatch.setattr(delay, "add_sample", add_sample.py_func)
     monkeypatch.setattr(delay, "RECENT", 1)
@@ -263,7 +260,7 @@ def test_without_its_memory_it_chatters(monkeypatch: pytest.MonkeyPatch) -> None
 
 @pytest.mark.parametrize(("dt_s", "settled_s"), [(0.05, 15.0), (0.02, 10.0)])
 def test_it_follows_a_network_that_jumps_up_and_down(dt_s: float, settled_s: float) -> None:
-    """Up with the first horizon that comes; down within SAMPLES of them, in single steps."""
+    """Up with the first horizon that arrives; down within SAMPLES of them, in single steps."""
     steps, _ = flown(dt_s, 1, seed=1, minima_s=(0.4, 0.8, 0.4))
     third = len(steps) // 3
     d_s = np.array(steps) * dt_s

@@ -1,4 +1,4 @@
-"""Desired trajectories as the server knows them: pages, preview, predictions, a live point."""
+"""References at the server: pages, preview, predictions, a live point."""
 
 from collections.abc import Callable
 from typing import Any
@@ -30,7 +30,6 @@ H = 15
 
 
 def scenario(**reference: Any) -> Scenario:
-    """A circle, with some keys of the reference changed."""
     table = {"shape": "circle", "radius_m": 1.5, "period_s": 7.0} | reference
     return check({"control": {"horizon": H}, "reference": table}, "test")
 
@@ -42,12 +41,11 @@ DT_S = SCENARIO.control.dt
 def make(
     flown: Scenario = SCENARIO, references: Callable[[int], Reference] | None = None
 ) -> Desired:
-    """The desired trajectories of a full block of vehicles."""
     return Desired(flown, flown.terms(), BLOCK, BLOCK, references)
 
 
 def window(desired: Desired, steps: Indices, ahead: Indices, rows: Indices | None = None) -> Array:
-    """The desired states at k + d … k + d + H of each vehicle; shape (n, H + 1, axes, 2)."""
+    """Desired states at k + d … k + d + H of each vehicle; shape (n, H + 1, axes, 2)."""
     rows = np.arange(len(steps)) if rows is None else rows
     states, place, first = desired.window(rows, steps, ahead)
     windows = [
@@ -58,7 +56,7 @@ def window(desired: Desired, steps: Indices, ahead: Indices, rows: Indices | Non
 
 
 def truth(start: int, sample: Reference | None = None) -> Array:
-    """The desired states from a step on; shape (H + 1, axes, 2)."""
+    """Desired states from a step on; shape (H + 1, axes, 2)."""
     return (sample or SCENARIO.make_reference())((start + np.arange(H + 1)) * DT_S)
 
 
@@ -72,18 +70,16 @@ def test_the_reference_looked_up_is_the_reference(calls: list[list[int]]) -> Non
 
 
 LATE_S = (0.27, 0.1)
-"""Dead times of a model, the first of which is no whole number of steps [s]."""
+"""Dead times of a model [s]; the first is no multiple of the step."""
 
 
 def late(**reference: Any) -> Scenario:
-    """The circle, for a vehicle with a dead time."""
     table = to_table(scenario(**reference))
     table["model"]["dead_time_s"] = LATE_S
     return check(table, "test")
 
 
 def test_a_vehicle_with_dead_time_is_planned_along_the_reference_that_much_later() -> None:
-    """Each axis by its own, from any step; what is desired now stays what it is."""
     flown, steps, ahead = late(), np.array([3, 900]), np.array([2, 0])
     desired, sample = make(flown), flown.make_reference()
     found = window(desired, steps, ahead)
@@ -122,8 +118,8 @@ def test_a_live_point_is_led_on_over_the_dead_time() -> None:
 
 
 def test_the_reference_is_right_for_vehicles_that_are_hours_apart() -> None:
-    """Also where pages have to make room for others, and where they want the same place."""
-    assert BLOCK < PAGES  # one block finds room, and a place is left EMPTY
+    """Also if pages replace others, or compete for the same place."""
+    assert BLOCK < PAGES  # one block fits, and one place is left EMPTY
     desired, rng, pages = make(), np.random.default_rng(1), set()
     for _ in range(8):
         steps, ahead = rng.integers(0, 86_400 / DT_S, BLOCK), rng.integers(0, H + 1, BLOCK)
@@ -170,7 +166,7 @@ def test_the_reference_is_computed_once_for_a_page_of_steps(
 def test_a_window_is_true_as_far_as_the_preview_reaches(
     shape: str, preview: float | str, steps: list[int], ahead: int
 ) -> None:
-    """To the last bit; beyond, the state at the last step that is seen is carried on."""
+    """To the last bit; beyond, the last visible state is extrapolated."""
     flown = scenario(shape=shape, preview=preview)
     desired, sample = make(flown), flown.make_reference()
     reach = 0 if isinstance(preview, str) else round(preview / DT_S)
@@ -188,7 +184,7 @@ def test_a_window_is_true_as_far_as_the_preview_reaches(
                 led[:, 0] += beyond_s * last[:, 1]
                 if shape == "target":
                     np.testing.assert_array_less(np.abs(states[stage, :, 0]), 1.5)
-                    far = np.abs(led[:, 0]) > 1.5  # no target here goes over more than one wall
+                    far = np.abs(led[:, 0]) > 1.5  # no target here passes more than one wall
                     led[far, 0] = 3.0 * np.sign(led[far, 0]) - led[far, 0]
                     led[far, 1] *= -1.0
                 np.testing.assert_allclose(states[stage], led, rtol=0, atol=1e-12)
@@ -204,15 +200,14 @@ def test_a_preview_longer_than_any_window_is_a_full_one() -> None:
 
 
 def test_a_table_is_previewed_too(tmp_path: Any) -> None:
-    """A path from a CSV file that turns off after a second: nobody knows before."""
     path = tmp_path / "path.csv"
     path.write_text("t,x,y\n0,0,0\n1,1,0\n2,1,1\n")
     flown = scenario(shape="csv", file=str(path), preview=0.2)
     (before,) = window(make(flown), np.array([15]), np.array([0]))
-    np.testing.assert_allclose(before[:, 1], 0.0)  # straight on
+    np.testing.assert_allclose(before[:, 1], 0.0)  # straight
     (seen,) = window(make(flown), np.array([16]), np.array([0]))
     np.testing.assert_allclose(seen[:4], truth(16, flown.make_reference())[:4])
-    np.testing.assert_allclose(seen[5:, 1, 1], 1.0)  # the corner at 20 is seen
+    np.testing.assert_allclose(seen[5:, 1, 1], 1.0)  # the corner at 20 is visible
 
 
 TURN = 60
@@ -220,8 +215,6 @@ TURN = 60
 
 
 def turning(scale: float) -> Reference:
-    """Target that changes its motion at TURN."""
-
     def sample(t: Array) -> Array:
         t = np.asarray(t, dtype=np.float64)
         after = np.maximum(t - TURN * DT_S, 0.0)
@@ -243,12 +236,10 @@ def flights_that_turn(preview: float | str, monkeypatch: pytest.MonkeyPatch) -> 
 
 
 def replaced(name: str, changes: dict[str, Any], **reference: Any) -> Scenario:
-    """A packaged scenario with some keys changed."""
     return packaged(name, changes, reference=reference)
 
 
 def first_difference(flights: list[Record]) -> int:
-    """First step at which what the servers planned or decided differs."""
     one, other = (flight.server for flight in flights)
     n = min(len(one), len(other))
     unlike = [
@@ -262,7 +253,7 @@ def first_difference(flights: list[Record]) -> int:
 def test_a_server_never_sees_ahead(
     preview: float | str, reach: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    # At TURN itself the target is where it would have been, and as fast.
+    # At TURN itself the state is the same with and without the turn.
     assert first_difference(flights_that_turn(preview, monkeypatch)) == TURN + 1 - reach
 
 
@@ -274,7 +265,7 @@ def test_a_server_that_sees_all_plans_for_what_comes(monkeypatch: pytest.MonkeyP
 
 
 def test_a_prediction_that_turns_round_at_the_bounds_is_better() -> None:
-    """The gain is that in docs/schemes.md; an acceleration estimated from the past is far worse."""
+    """By the gain in docs/schemes.md; an acceleration estimated from the past is far worse."""
     ahead_s, times = 2.0, np.arange(1.0, 300.0, 0.5)
     errors: dict[str, list[Array]] = {"turns": [], "goes on": [], "accelerates": []}
     for seed in range(1, 41):
@@ -307,16 +298,15 @@ def test_a_prediction_that_turns_round_at_the_bounds_is_better() -> None:
 def test_a_prediction_goes_to_and_fro_between_walls(
     p: float, v: float, after_s: float, expected: tuple[float, float]
 ) -> None:
-    """Walls at 2 m, however often they are met; without walls it goes straight on."""
+    """Reflected at walls at 2 m, any number of times; straight without walls."""
     assert plain(_extrapolated)(p, v, after_s, 2.0) == expected
     assert plain(_extrapolated)(p, v, after_s, np.inf) == (p + v * after_s, v)
 
 
-# -- a trajectory for each vehicle -------------------------------------------------------------
+# -- references of several vehicles ------------------------------------------------------------
 
 
 def straight(vehicle: int) -> Reference:
-    """A line of its own for each vehicle."""
     return shapes.timed_path(np.array([0.0, 1e4]), np.array([[0.0, 0.0], [1e2 * vehicle, -1e3]]))
 
 
@@ -347,7 +337,6 @@ def test_a_row_that_another_vehicle_takes_has_its_trajectory() -> None:
 
 
 def live(**reference: Any) -> Scenario:
-    """A live point that begins at (1, 2)."""
     return scenario(**{"shape": "live", "points_m": [[1.0, 2.0]]} | reference)
 
 
@@ -377,12 +366,12 @@ def test_only_a_live_point_can_be_moved() -> None:
 
 
 def point(velocity: Array | None = None) -> LivePoint:
-    """A point at the origin, for vehicles that fly 2 m/s."""
+    """Point at the origin, for vehicles that fly 2 m/s."""
     return LivePoint(np.zeros(2), velocity, np.full(2, 2.0))
 
 
 def led(hz: int, velocity: float, until_s: float = 2.0) -> LivePoint:
-    """A point that is moved so often along x at a velocity, until some time."""
+    """Point moved along x at a rate and velocity, until some time."""
     moved = point()
     for i in range(1, round(until_s * hz) + 1):
         moved.move(np.array([velocity * i / hz, 0.0]), None, seconds_to_ns(i / hz))
@@ -396,7 +385,7 @@ def test_moves_tell_the_velocity(hz: int) -> None:
 
 
 def test_a_point_that_is_not_moved_any_more_rests_where_it_was_moved_to() -> None:
-    """It is carried on for REST_S, and then no further; the next move says nothing of velocity."""
+    """It is extrapolated for REST_S; the next move gives no velocity."""
     moved = led(10, 0.7)
     assert moved.at(seconds_to_ns(2.0 + REST_S))[0, 0] == pytest.approx(0.7 * (2.0 + REST_S), 1e-3)
     np.testing.assert_allclose(moved.at(seconds_to_ns(2.01 + REST_S)), [[1.4, 0.0], [0.0, 0.0]])
@@ -411,7 +400,7 @@ def test_a_point_whose_velocity_is_told_goes_on() -> None:
 
 
 def test_a_leap_makes_no_velocity_that_no_vehicle_can_fly() -> None:
-    """Two moves at once, or a kilometre in an instant; a clock set back makes none at all."""
+    """Two moves at once, or a kilometre in an instant; a clock set back gives no velocity."""
     moved = led(10, 0.5)
     moved.move(np.array([1000.0, 0.0]), None, seconds_to_ns(2.001))
     assert moved.at(seconds_to_ns(2.001))[0].tolist() == [1000.0, 2.0]
@@ -422,7 +411,7 @@ def test_a_leap_makes_no_velocity_that_no_vehicle_can_fly() -> None:
 
 
 def test_a_mean_of_velocities_bears_moves_that_are_off(monkeypatch: pytest.MonkeyPatch) -> None:
-    """By 1 cm at 50 moves a second; ablation: the difference of two moves alone is useless."""
+    """Errors of 1 cm at 50 moves a second; the difference of two moves alone would be useless."""
 
     def spread() -> float:
         rng, moved, velocities = np.random.default_rng(1), point(), []
@@ -439,7 +428,7 @@ def test_a_mean_of_velocities_bears_moves_that_are_off(monkeypatch: pytest.Monke
 
 
 def test_a_live_flight_is_judged_by_where_the_server_knew_the_point() -> None:
-    """A point that goes straight on is followed closely; without the server nobody can tell."""
+    """A point on a straight line is followed closely; without the server its place is unknown."""
     changes = {"duration": 12.0, "settle": 8.0}
     flown = replaced(
         "target-committed", changes, shape="live", points_m=[[0.0, 0.0]], velocity_mps=[0.3, -0.2]
@@ -456,7 +445,7 @@ def test_a_live_flight_is_judged_by_where_the_server_knew_the_point() -> None:
 
 
 def test_the_desired_position_of_a_live_flight_is_held_where_the_server_has_no_row() -> None:
-    """Rows are joined by vehicle and step; before the first of them its own counts."""
+    """Rows are joined by vehicle and step; before the first of them the initial point counts."""
     flown = live()
     client = np.zeros(5, [("vehicle", "<u2"), ("step", "<i8")])
     client["vehicle"], client["step"] = 2, np.arange(5)

@@ -37,9 +37,8 @@ DT_NS, H = TERMS.dt_ns, TERMS.horizon
 HOUR = 3600 * S
 DELAY_NS = 440 * MS
 BEGAN_NS = 3 * HOUR
-"""Begin of step 0, by the server's clock."""
 BACKWARD_NS = DELAY_NS - BEGAN_NS
-"""G of a packet that comes to the vehicle after its delay."""
+"""Field G of a packet that reaches the vehicle after its delay."""
 
 
 def seen(step: int, changed: dict[str, Any] | None = None) -> Observation:
@@ -64,7 +63,6 @@ def seen(step: int, changed: dict[str, Any] | None = None) -> Observation:
 
 
 def judge(plausibility: Plausibility, told: Observation, *, row: int = 0, step: int = -1) -> Belief:
-    """The verdict on an observation that arrives after its delay, or when that of `step` would."""
     now_ns = BEGAN_NS + (told.step if step < 0 else step) * DT_NS + DELAY_NS
     forward_ns = now_ns - told.step * DT_NS
     backward_ns = stamped_ns(told.backward_us, near_ns=-forward_ns)
@@ -72,7 +70,6 @@ def judge(plausibility: Plausibility, told: Observation, *, row: int = 0, step: 
 
 
 def after(count: int = 5) -> Plausibility:
-    """Plausibility filter that has accepted the steps from 100 on."""
     plausibility = Plausibility(TERMS, 2)
     for step in range(100, 100 + count):
         assert judge(plausibility, seen(step)) == Belief.BELIEVED
@@ -80,12 +77,11 @@ def after(count: int = 5) -> Plausibility:
 
 
 def moved(metres: float, speed: float = 0.0) -> np.ndarray:
-    """The state of step 105, so far off along the first axis."""
     return seen(105).state + np.array([[metres, speed], [0.0, 0.0]])
 
 
 def test_a_predicted_position_may_be_off_by_what_the_velocity_may_over_the_dead_time() -> None:
-    """Ablation: of a vehicle whose model has none, the same position is a jump."""
+    """If the model has no dead time, the same position counts as a jump."""
     for dead_time_s, verdict in ((0.0, Belief.JUMP), (0.5, Belief.BELIEVED)):
         terms = TERMS._replace(dead_time_s=(0.0, dead_time_s))
         plausibility = Plausibility(terms, 2)
@@ -134,7 +130,6 @@ def test_a_vehicle_is_known_by_its_own_observations(row: int) -> None:
 
 
 def elsewhere(step: int, metres: float = 100.0) -> Observation:
-    """Observation of the vehicle after it has been moved."""
     told = seen(step)
     return told._replace(state=told.state + np.array([[metres, 0.0], [0.0, 0.0]]))
 
@@ -212,7 +207,7 @@ def test_whatever_a_vehicle_may_say_is_believed(
         told = seen(step)
         told = told._replace(state=told.state + rng.normal(scale=0.1, size=(2, 2)))
         up_ns, down_ns = (int(rng.integers(jitter_ms * MS + 1)) for _ in range(2))
-        # The server's clock drifts away from the vehicle's.
+        # The server's clock drifts against the vehicle's.
         drift_ns = (step - 100) * DT_NS * drift_ppm // 1_000_000
         forward_ns = BEGAN_NS + drift_ns + down_ns
         backward_us = stamp_us(up_ns - BEGAN_NS - drift_ns)
@@ -223,7 +218,7 @@ def test_whatever_a_vehicle_may_say_is_believed(
 @pytest.mark.parametrize("first", [True, False])
 @pytest.mark.parametrize("backward_us", [0, 2**31, 2**32 - 1])
 def test_the_largest_step_on_the_wire_overflows_nothing(backward_us: int, *, first: bool) -> None:
-    """First in its session, it is believed: nothing is known that would speak against it."""
+    """As the first of its session it is believed, because nothing contradicts it."""
     plausibility = Plausibility(TERMS, 1) if first else after()
     last = seen(105)._replace(step=2**32 - 1, in_force=-1, since=0, backward_us=backward_us)
     verdict = judge(plausibility, last, step=105)
@@ -242,7 +237,7 @@ def test_how_far_a_vehicle_may_have_come_grows_with_the_time_since_the_last_one(
             plausibility = Plausibility(TERMS, 1)
             still = {"state": np.zeros((2, 2))}
             assert judge(plausibility, seen(100, still)) == Belief.BELIEVED
-            # A change of velocity takes the vehicle along by its mean.
+            # A change of velocity moves the vehicle by the mean velocity.
             gone = share * np.array([p + 0.5 * v * steps * TERMS.dt_s, v])
             told = seen(100 + steps, {"state": np.array([gone, [0.0, 0.0]])})
             assert judge(plausibility, told) == verdict
@@ -264,7 +259,6 @@ def test_a_flipped_bit_of_a_state_is_a_jump_or_as_good_as_none(number: int, bit:
 
 
 def scenario(**changes: Any) -> Scenario:
-    """The demo with a report at every step, with some keys changed."""
     reports = {"vehicle": {"report": "always"}, "link": {"heartbeat_s": 0.1, "timeout_s": 1.0}}
     return packaged("demo-committed", reports, changes)
 
@@ -273,8 +267,6 @@ def flipped(share: float) -> list[Record]:
     """Flights with one bit flipped in a share of the packets to the server."""
 
     class Flipping(Proxy):
-        """Netem of a bad cable."""
-
         def __init__(self, scenario: Scenario, **more: Any) -> None:
             super().__init__(scenario, **more)
             self._rng = random.Random(scenario.seed)
@@ -298,7 +290,6 @@ LOSSLESS = {"uplink": {"loss": 0.0}, "downlink": {"loss": 0.0}}
 
 
 def rmse(flights: list[Record]) -> float:
-    """Mean RMSE xy of flights [m]."""
     errors = [summarise(scenario(), "test", flight.client).rmse_xy or 0.0 for flight in flights]
     return float(np.mean(errors))
 
@@ -311,7 +302,7 @@ def believe(*_: Any) -> Belief:
 def test_a_flipped_bit_in_one_packet_of_a_hundred_costs_nothing(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """RMSE within a tenth of that of a good cable; if all is believed it is several times that."""
+    """RMSE within a tenth of that without flips; several times as large if all are believed."""
     good, bad = rmse(flipped(0.0)), flipped(0.01)
     assert rmse(bad) == pytest.approx(good, rel=0.1)
     assert any(Drop.IMPLAUSIBLE_HORIZON in each.figures["server"]["dropped"] for each in bad)
@@ -323,7 +314,7 @@ def test_a_flipped_bit_in_one_packet_of_a_hundred_costs_nothing(
 def oddly(
     monkeypatch: pytest.MonkeyPatch, number: int, field: str, value: int, *, feedback: bool = True
 ) -> Record:
-    """A flight of which one observation, by its number from 0, has a field changed."""
+    """Flight with a changed field in one observation, by its number from 0."""
     send, said = ServerSession.send, iter(range(10**9))
 
     def lie(self: ServerSession, message: Any) -> None:
@@ -349,7 +340,6 @@ def oddly(
 def test_one_odd_observation_costs_a_few_steps_at_most(
     number: int, field: str, value: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Also where it is the first of its session."""
     flight = oddly(monkeypatch, number, field, value)
     assert flight.failure is None
     steps = flight.server["step"]
@@ -363,9 +353,9 @@ def test_one_odd_observation_costs_a_few_steps_at_most(
 def test_believed_one_odd_observation_leaves_the_vehicle_alone(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Ablation: no observation is newer than step 2^20, no horizon is for a step of now.
+    """Ablation: no observation is newer than step 2^20, so no horizon is for the present.
 
-    Without feedback: with it the server would go 2^20 steps along where its plan leads.
+    Without feedback: with it the server would predict 2^20 steps along its plan.
     """
     monkeypatch.setattr(Plausibility, "judge", believe)
     flight = oddly(monkeypatch, 300, "step", 2**20, feedback=False)
@@ -374,11 +364,10 @@ def test_believed_one_odd_observation_leaves_the_vehicle_alone(
 
 
 class Stepped(NamedTuple):
-    """A clock that is set by an hour while it runs."""
+    """Clock that is set by an hour while it runs."""
 
     clock: Clock
     at_ns: int
-    """Time of the world at which it is set."""
     by_ns: int
 
     def local(self, time_ns: int) -> int:
@@ -395,14 +384,13 @@ class Stepped(NamedTuple):
 def test_a_server_whose_clock_steps_goes_on_planning(
     by_ns: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """By an hour, in flight: the vehicle is without a plan for as long as a session takes to open.
+    """By an hour, in flight: the vehicle is without a plan while a session is opened.
 
-    No observation of before the step agrees with those after it.
+    No observation from before the step agrees with those after it.
     """
     ours = iter([False, True])
 
     def clock(*numbers: int) -> Clock | Stepped:
-        """The client's, then the server's."""
         made = Clock(*numbers)
         return Stepped(made, 15 * S, by_ns) if next(ours) else made
 
@@ -415,7 +403,7 @@ def test_a_server_whose_clock_steps_goes_on_planning(
 
 
 def test_a_state_that_leaps_is_said_at_both_ends(monkeypatch: pytest.MonkeyPatch) -> None:
-    """300 m in a step: the vehicle hovers from then on, and the server has not believed it."""
+    """300 m in a step: the vehicle hovers from then on, and the server rejects the state."""
     advance, steps = FirstOrderPlant.advance, count()
 
     def leaping(self: FirstOrderPlant, command: Array) -> None:

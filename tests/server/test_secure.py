@@ -1,4 +1,4 @@
-"""Both ends of a secured link, back to back, over good and terrible networks, and under attack."""
+"""Both ends of an encrypted link, back to back: over good and bad networks, and under attack."""
 
 import random
 from collections import Counter
@@ -44,28 +44,24 @@ SECRETS = {1: bytes([1]) * 32, 2: bytes([2]) * 32}
 KEYS = {(vehicle, 5): VehicleKey.of(vehicle, 5, secret) for vehicle, secret in SECRETS.items()}
 HELLO, WELCOME = b"\x95\x04\x01" + b"hello" * 60, b"\x98\x04\x02" + b"welcome" * 48
 OBSERVATION, HORIZON = b"\x9b\x04\x03observation", b"\x99\x04\x04horizon"
-"""Messages that begin as they do on the wire."""
+"""Messages whose first bytes are as on the wire."""
 
 
 def gate(seed: int = 1) -> Gate:
-    """A server that has the keys of two vehicles; each seed is another life."""
     return Gate(Keyring("keys", KEYS), entropy=random.Random(seed).randbytes)
 
 
 def link(seed: int = 2, key: VehicleKey = KEYS[1, 5]) -> SecureLink:
-    """A vehicle; each seed is another life."""
     return SecureLink(key, entropy=random.Random(seed).randbytes)
 
 
 def called(server: Gate, datagram: bytes, now_ns: int = 0, peer: Address = HERE) -> GateCall:
-    """Content of a datagram that the server accepts."""
     call = server.open(Datagram(datagram, peer), now_ns=now_ns)
     assert call is not None
     return call
 
 
 def refusal(end: Gate | SecureLink, datagram: bytes, now_ns: int = 0, peer: Address = HERE) -> str:
-    """Reason for which an end drops a datagram."""
     given = Datagram(datagram, peer) if isinstance(end, Gate) else datagram
     with pytest.raises(ProtocolError) as error:
         end.open(given, now_ns=now_ns)  # type: ignore[arg-type]
@@ -73,7 +69,6 @@ def refusal(end: Gate | SecureLink, datagram: bytes, now_ns: int = 0, peer: Addr
 
 
 def challenged(client: SecureLink, server: Gate, now_ns: int = 0, *, hello: bytes = HELLO) -> None:
-    """Give the client a cookie."""
     asked = Datagram(client.hello(hello, now_ns=now_ns), HERE)
     assert server.open(asked, now_ns=now_ns) is None
     (challenge,) = server.outbox()
@@ -81,14 +76,12 @@ def challenged(client: SecureLink, server: Gate, now_ns: int = 0, *, hello: byte
 
 
 def apart() -> tuple[SecureLink, Gate]:
-    """Both ends, of which the client has a cookie and no more."""
     client, server = link(), gate()
     challenged(client, server)
     return client, server
 
 
 def welcomed(client: SecureLink, server: Gate, now_ns: int = 0) -> bytes:
-    """RESPONSE to a client with a cookie, admitted and opened."""
     call = called(server, client.hello(HELLO, now_ns=now_ns), now_ns)
     assert (call.payload, call.vehicle, call.moves) == (HELLO, 1, False)
     response = call.line.seal(WELCOME)
@@ -98,7 +91,6 @@ def welcomed(client: SecureLink, server: Gate, now_ns: int = 0) -> bytes:
 
 
 def keyed(client: SecureLink, server: Gate, now_ns: int = 0) -> None:
-    """A handshake, up to its adoption."""
     challenged(client, server, now_ns)
     welcomed(client, server, now_ns)
     client.adopt(now_ns=now_ns)
@@ -112,7 +104,6 @@ def joined() -> tuple[SecureLink, Gate]:
 
 
 def live(server: Gate, vehicle: int = 1) -> int | None:
-    """Number of a vehicle's live channel."""
     channel = server._vehicles[vehicle].live
     return None if channel is None else channel.number
 
@@ -218,12 +209,12 @@ def test_a_repeated_hello_is_answered_with_other_keys() -> None:
     client.adopt(now_ns=0)
     assert called(server, client.seal(OBSERVATION)).payload == OBSERVATION
     assert live(server) == int.from_bytes(answers[1][5:9], "little")
-    # The one that was pending before it is gone.
+    # The earlier pending channel has been replaced.
     assert [*server._vehicles[1].pending] == [int.from_bytes(answers[2][5:9], "little")]
 
 
 def test_an_adopted_response_opens_no_channel_again() -> None:
-    """Its counters would begin anew, and what was recorded be opened a second time."""
+    """Otherwise its counters would restart, and recorded packets be accepted again."""
     client, server = apart()
     response = welcomed(client, server)
     client.adopt(now_ns=0)
@@ -256,11 +247,10 @@ def test_where_adopting_leaves_the_attempt_open_a_command_is_flown_twice(
     assert client.open(sent, now_ns=0) == HORIZON
 
 
-# -- who is let in -----------------------------------------------------------------------------
+# -- authentication ----------------------------------------------------------------------------
 
 
 def test_who_has_no_key_is_met_with_silence() -> None:
-    """Plaintext, another key, an unknown vehicle or number of a key: nothing is sent or kept."""
     server = gate()
     strangers = {
         "forged": VehicleKey.of(1, 5, b"x" * 32),
@@ -295,14 +285,12 @@ def test_the_key_of_another_vehicle_opens_nothing() -> None:
 
 
 def changed(datagram: bytes, at: int) -> bytes:
-    """A datagram with one bit changed."""
     found = bytearray(datagram)
     found[at] ^= 1
     return bytes(found)
 
 
 def exchanges(monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    """List that grows by an entry for each operation on the elliptic curve."""
     exchange, found = noise_nnpsk0._exchange, []
 
     def counted(private: X25519PrivateKey, public: bytes) -> bytes:
@@ -314,7 +302,7 @@ def exchanges(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 
 
 def test_the_mac_comes_before_any_costly_mathematics(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A forged INITIATION draws nothing, and a forged RESPONSE costs no elliptic curve."""
+    """A forged INITIATION draws no answer, and a forged RESPONSE costs no elliptic curve."""
     client, server = apart()
     initiation = client.hello(HELLO, now_ns=0)
     response = called(server, initiation).line.seal(WELCOME)
@@ -344,7 +332,7 @@ def test_without_the_mac_strangers_cost_mathematics_and_draw_answers(
 
 
 def test_a_cookie_is_good_for_its_address_and_up_to_two_minutes() -> None:
-    """Elsewhere and later it draws a CHALLENGE; so it does in another life of the server."""
+    """From elsewhere or later it draws a CHALLENGE; so it does in another life of the server."""
     client, server = apart()
     hello = client.hello(HELLO, now_ns=0)
     assert server.open(Datagram(hello, ELSEWHERE), now_ns=0) is None
@@ -357,7 +345,7 @@ def test_a_cookie_is_good_for_its_address_and_up_to_two_minutes() -> None:
 
 
 def test_a_challenge_answers_one_attempt_once() -> None:
-    """Repeated, changed or of another attempt it draws no HELLO: nobody makes the client flood."""
+    """Repeated, changed or of another attempt it draws no HELLO, which prevents floods."""
     client, server = link(), gate()
     server.open(Datagram(client.hello(HELLO, now_ns=0), HERE), now_ns=0)
     challenge = server.outbox()[0].payload
@@ -372,14 +360,12 @@ def test_a_challenge_answers_one_attempt_once() -> None:
 
 
 OBSERVER = [("observer", port) for port in range(50)]
-"""Addresses of somebody who copies what a vehicle sends."""
 
 
 def asked(client: SecureLink, server: Gate, now_ns: int, *, foreign_first: bool) -> list[bytes]:
-    """Answers to a HELLO that an observer has copied, and the challenges sent to him.
+    """Answers to a HELLO that an observer has copied, and the challenges sent to the observer.
 
-    Args:
-        foreign_first: whether his challenges come to the vehicle before its own, or behind it.
+    `foreign_first`: whether the observer's challenges reach the vehicle before its own.
     """
     hello = client.hello(HELLO, now_ns=now_ns)
     senders = [*OBSERVER, HERE] if foreign_first else [HERE, *OBSERVER]
@@ -392,7 +378,7 @@ def asked(client: SecureLink, server: Gate, now_ns: int, *, foreign_first: bool)
 
 @pytest.mark.parametrize("foreign_first", [False, True])
 def test_foreign_challenges_keep_no_vehicle_from_its_own(*, foreign_first: bool) -> None:
-    """However many an observer hands on, before or behind: the vehicle is answered at once."""
+    """For any number of forwarded challenges, before or after: the vehicle is answered at once."""
     client, server = link(), gate()
     drawn = asked(client, server, 0, foreign_first=foreign_first)
     calls = [server.open(Datagram(each, HERE), now_ns=0) for each in drawn]
@@ -400,7 +386,7 @@ def test_foreign_challenges_keep_no_vehicle_from_its_own(*, foreign_first: bool)
     response = call.line.seal(WELCOME)
     server.admit(call, now_ns=0)
     assert client.open(response, now_ns=0) == WELCOME
-    # Every other one has drawn the vehicle's own challenge again, which was tried just now.
+    # Every other attempt has drawn the vehicle's own challenge again, which was just tried.
     again = [each.payload for each in server.outbox()]
     assert len(again) == len(OBSERVER)
     assert {refusal(client, each) for each in again} == {"replayed"}
@@ -433,7 +419,7 @@ def test_a_cookie_that_is_tried_again_is_the_newest_of_those_tried() -> None:
 
 
 def test_a_genuine_challenge_is_tried_again_with_the_next_hello() -> None:
-    """The answer is sent again after a loss; foreign challenges in between change nothing."""
+    """The answer is sent again after a loss; foreign challenges in between have no effect."""
     client, server = link(), gate()
     asked(client, server, 0, foreign_first=False)  # all answers are lost
     hello = client.hello(HELLO, now_ns=AGAIN_NS)
@@ -445,7 +431,7 @@ def test_a_genuine_challenge_is_tried_again_with_the_next_hello() -> None:
 
 
 def test_who_repeats_an_attempt_uses_up_no_answers() -> None:
-    """A vehicle that is answered no more as often as it asks gets the same answer again."""
+    """A vehicle whose answers are used up gets the same answer again."""
     client, server = apart()
     hello = client.hello(HELLO, now_ns=0)
     for _ in range(1 + HANDSHAKES):
@@ -457,13 +443,12 @@ def test_who_repeats_an_attempt_uses_up_no_answers() -> None:
     assert client.open(response, now_ns=0) == WELCOME
     client.adopt(now_ns=0)
     assert called(server, client.seal(OBSERVATION)).payload == OBSERVATION
-    restarted = link(seed=3)  # whose attempt is another
+    restarted = link(seed=3)  # another attempt
     challenged(restarted, server)
     assert called(server, restarted.hello(HELLO, now_ns=0)).payload == HELLO
 
 
 def test_attempts_that_brought_a_channel_are_answered_no_more() -> None:
-    """Nor those before the last, which somebody has recorded: the newest 16."""
     server, recorded = gate(), []
     for seed in range(10, 27):
         client, now_ns = link(seed=seed), seed * SECOND_NS
@@ -479,7 +464,7 @@ def test_attempts_that_brought_a_channel_are_answered_no_more() -> None:
 def test_without_cookies_a_recorded_hello_draws_handshakes_from_anywhere(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Ablation of the cookie: what a stranger repeats costs state and an elliptic curve."""
+    """With the cookie check off, each replayed HELLO costs the server memory and a key exchange."""
     client, server = link(), gate()
     hello = client.hello(HELLO, now_ns=0)
     monkeypatch.setattr(Gate, "_is_valid", lambda *_: True)
@@ -501,11 +486,11 @@ def test_a_vehicle_gets_five_handshakes_a_second() -> None:
     called(server, other.hello(HELLO, now_ns=0))
 
 
-# -- a channel and its successor ---------------------------------------------------------------
+# -- change of keys ----------------------------------------------------------------------------
 
 
 def test_an_address_moves_with_the_highest_counter_only() -> None:
-    """A packet that is late, or of the channel before, says nothing of where the vehicle is."""
+    """A late packet, or one of the previous channel, does not show the present address."""
     client, server = joined()
     packets = [client.seal(OBSERVATION) for _ in range(4)]
     assert [called(server, packets[i]).moves for i in (0, 2, 1, 3)] == [True, True, False, True]
@@ -520,7 +505,7 @@ def test_an_address_moves_with_the_highest_counter_only() -> None:
 def test_without_the_order_of_counters_a_late_packet_moves_the_address(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Ablation: who holds a packet back, and sends it from elsewhere, gets what comes next."""
+    """Otherwise an attacker who delays a packet and resends it gets the next answers."""
     client, server = joined()
     held, newer = client.seal(OBSERVATION), client.seal(OBSERVATION)
     called(server, newer)
@@ -529,7 +514,6 @@ def test_without_the_order_of_counters_a_late_packet_moves_the_address(
 
 
 def test_keys_are_exchanged_under_way_without_a_lost_packet() -> None:
-    """Packets under way in the old channel are opened at both ends, for 10 s."""
     client, server = joined()
     line = called(server, client.seal(OBSERVATION)).line
     assert not client.wants_hello(FRESH_NS - 1)
@@ -579,7 +563,6 @@ def test_a_hello_that_is_repeated_ends_no_flight() -> None:
 
 
 def test_a_closed_attempt_is_not_answered() -> None:
-    """Its INITIATION, recorded and repeated, gives nobody a HELLO, cookie or not."""
     client, server = apart()
     hello = client.hello(HELLO, now_ns=0)
     welcomed(client, server)
@@ -589,15 +572,15 @@ def test_a_closed_attempt_is_not_answered() -> None:
     assert refusal(server, hello) == "replayed"
 
 
-# -- terrible networks -------------------------------------------------------------------------
+# -- bad networks ------------------------------------------------------------------------------
 
 TICK_NS = SECOND_NS // 10
 HELLO_TICKS, SILENCE_TICKS = 10, 80
-"""Ticks between two HELLOs, and ticks without a word after which the client says HELLO again."""
+"""Ticks between two HELLOs, and ticks of silence after which the client sends HELLO again."""
 
 
 class Flight:
-    """A vehicle that says HELLO until it is welcomed, then sends at every tick, over a network."""
+    """Vehicle that sends HELLO until welcomed, then a packet at every tick, over a bad network."""
 
     def __init__(self, seed: int, loss: float, delay_s: Callable[[random.Random], float]) -> None:
         self.rng = random.Random(seed)
@@ -615,7 +598,6 @@ class Flight:
         self.now_ns = 0
 
     def send(self, to_server: bool, datagram: bytes) -> None:
-        """Send a datagram: lost, once or twice, after a delay each."""
         self.sent.append((to_server, datagram))
         for _ in range(1 + (self.rng.random() < 0.2)):
             if self.rng.random() >= self.loss:
@@ -623,11 +605,9 @@ class Flight:
                 heappush(self.under_way, (due_ns, next(self.numbers), to_server, datagram))
 
     def hello(self) -> None:
-        """Say HELLO."""
         self.send(True, self.client.hello(HELLO, now_ns=self.now_ns))
 
     def deliver(self, to_server: bool, datagram: bytes) -> None:
-        """Hand over a datagram, and send what it draws."""
         try:
             if to_server:
                 self.at_server(datagram)
@@ -637,7 +617,6 @@ class Flight:
             self.dropped[error.reason] += 1
 
     def at_server(self, datagram: bytes) -> None:
-        """Let the server answer."""
         call = self.server.open(Datagram(datagram, HERE), now_ns=self.now_ns)
         for challenge in self.server.outbox():
             self.send(False, challenge.payload)
@@ -651,7 +630,6 @@ class Flight:
             self.send(False, call.line.seal(HORIZON))
 
     def at_client(self, datagram: bytes) -> None:
-        """Let the client take note."""
         payload = self.client.open(datagram, now_ns=self.now_ns)
         if payload is None:
             self.hello()
@@ -663,7 +641,6 @@ class Flight:
             self.flies = True
 
     def tick(self) -> None:
-        """Let a tenth of a second pass."""
         self.now_ns += TICK_NS
         while self.under_way and self.under_way[0][0] <= self.now_ns:
             _, _, to_server, datagram = heappop(self.under_way)
@@ -677,7 +654,6 @@ class Flight:
             self.send(True, self.client.seal(OBSERVATION))
 
     def until(self, horizons: int) -> None:
-        """Fly until so many horizons have come, at most three minutes."""
         for _ in range(1800):
             if self.heard[HORIZON] >= horizons:
                 return
@@ -687,7 +663,7 @@ class Flight:
 
 @pytest.mark.parametrize("seeds", [range(i, i + 25) for i in range(0, 100, 25)])
 def test_a_handshake_succeeds_over_a_terrible_network(seeds: range) -> None:
-    """Half of all packets lost, a fifth doubled, delays of 0 to 3 s, so everything out of order."""
+    """Half of all packets lost, a fifth duplicated, delays of 0 to 3 s, hence reordering."""
     for seed in seeds:
         flight = Flight(seed, 0.5, lambda rng: rng.uniform(0.0, 3.0))
         flight.until(horizons=30)
@@ -696,7 +672,7 @@ def test_a_handshake_succeeds_over_a_terrible_network(seeds: range) -> None:
 
 
 def test_a_handshake_succeeds_where_a_round_trip_takes_seven_hellos() -> None:
-    """The vehicle uses the first channel that it hears of, which must still be pending."""
+    """The vehicle uses the first channel that it receives, which must still be pending."""
     flight = Flight(1, 0.0, lambda _: 3.5)
     flight.until(horizons=30)
 
@@ -708,11 +684,11 @@ def test_with_fewer_pending_channels_it_does_not(monkeypatch: pytest.MonkeyPatch
         flight.until(horizons=30)
 
 
-# -- what was recorded, and is sent again ------------------------------------------------------
+# -- replays -----------------------------------------------------------------------------------
 
 
 def replayed(flight: Flight, peer: Address) -> tuple[Counter[bytes], list[int]]:
-    """Packets accepted of all that were ever sent, and the growth of answers over requests."""
+    """Accepted packets among all ever sent, and how much longer answers are than requests."""
     accepted = Counter[bytes]()
     excess = []
     for to_server, datagram in flight.sent:
@@ -733,7 +709,7 @@ def replayed(flight: Flight, peer: Address) -> tuple[Counter[bytes], list[int]]:
 
 
 def recorded(seed: int) -> Flight:
-    """A flight with a change of keys, all of whose packets have arrived."""
+    """Flight with a change of keys, all of whose packets have arrived."""
     flight = Flight(seed, 0.0, lambda rng: rng.uniform(0.0, 0.3))
     flight.until(horizons=200)
     flight.now_ns += FRESH_NS
@@ -749,7 +725,7 @@ def recorded(seed: int) -> Flight:
 @pytest.mark.parametrize("later_ns", [0, 3 * COOKIE_NS])
 @pytest.mark.parametrize("peer", [HERE, ELSEWHERE])
 def test_nothing_of_a_recorded_session_is_accepted_again(peer: Address, later_ns: int) -> None:
-    """By neither end, from wherever it comes; it draws challenges at most, each shorter."""
+    """By either end, from any address; replays draw challenges at most, each shorter."""
     flight = recorded(1)
     before = live(flight.server)
     flight.now_ns += later_ns
@@ -774,14 +750,13 @@ def test_nothing_is_accepted_after_a_restart(restarted: str) -> None:
     assert all(each < 0 for each in excess)
 
 
-# -- who has a key, and abuses it --------------------------------------------------------------
+# -- attackers with a key ----------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
     "message", [OBSERVATION, WELCOME[:2] + b"\xcc\x01", b"\xdc\x00\x05\x04\x01", b"", b"\x95"]
 )
 def test_only_a_hello_travels_in_an_initiation(message: bytes) -> None:
-    """Anything else, whose packet others could repeat, is dropped."""
     server, client = gate(), link()
     challenged(client, server, hello=message)
     assert refusal(server, client.hello(message, now_ns=0)) == "out of place"
@@ -791,7 +766,6 @@ def test_only_a_hello_travels_in_an_initiation(message: bytes) -> None:
     "message", [HELLO, WELCOME, b"\x95\xcc\x04\x01", b"\xdc\x00\x05\x04\x01", b""]
 )
 def test_no_greeting_travels_in_a_channel(message: bytes) -> None:
-    """Neither as it is, nor in a longer form of msgpack that looks like another message."""
     client, server = joined()
     line = called(server, client.seal(OBSERVATION)).line
     assert refusal(server, client.seal(message)) == "out of place"
@@ -800,7 +774,7 @@ def test_no_greeting_travels_in_a_channel(message: bytes) -> None:
 
 @pytest.mark.parametrize("in_handshake", [True, False])
 def test_what_does_not_begin_as_a_message_of_msgpack_travels_nowhere(*, in_handshake: bool) -> None:
-    """An array of up to 15, version and type, each in its shortest form; less is no message."""
+    """An array of up to 15, version and type, each in its shortest form."""
     type_ = b"\x01" if in_handshake else b"\x03"
     other = b"\x03" if in_handshake else b"\x01"
     for good in (b"\x90\x00", b"\x9f\x7f", b"\x95\x04"):
@@ -840,7 +814,7 @@ def test_a_response_with_another_message_opens_no_channel() -> None:
 
 
 def test_a_flood_of_initiations_takes_no_memory() -> None:
-    """10^5 of them, forged, of strangers and repeated: what is kept is bounded by the keys."""
+    """10^5 forged, foreign and repeated ones: the memory is bounded by the number of keys."""
     rng, server = random.Random(3), gate()
     clients = [link(seed, key) for seed in range(20) for key in KEYS.values()]
     good = []
@@ -909,7 +883,6 @@ def test_no_secret_is_shown_by_an_end() -> None:
 
 
 def test_a_hello_whose_ephemeral_key_is_none_is_dropped() -> None:
-    """Only who has the key can make one; the server drops it all the same."""
     key, server = KEYS[1, 5], gate()
     public = bytes(32)
     state = noise_nnpsk0._begin(key.psk, handshake.prologue(key)).mix_ephemeral(public)

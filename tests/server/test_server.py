@@ -1,4 +1,4 @@
-"""The server as an endpoint: sessions, ticks, and what it sends to whom."""
+"""The server as an endpoint: sessions, ticks, and messages."""
 
 import io
 import math
@@ -61,18 +61,14 @@ LINE = PlainGate().open(Datagram(b"", ("", 0)), now_ns=0).line
 SILENCE_NS = 1500 * MILLISECOND_NS
 """Time after which another life of a vehicle may take its number, in all of these tests."""
 DAY_NS = 86_400 * SECOND_NS
-"""A day [ns]."""
 
 
 def scenario(**control: Any) -> Scenario:
-    """The paper's, with some keys of `control` changed, and vehicles that are soon found silent."""
     soon = {"timeout_s": SILENCE_NS / SECOND_NS}
     return packaged("paper-every-step", control=control, link=soon)
 
 
 class Vehicles:
-    """A server, and vehicles that say to it exactly what a test wants them to."""
-
     def __init__(self, flown: Scenario, boot_id: int = 77, room: int = VEHICLES_MAX) -> None:
         self.terms = flown.terms()
         self.dt_ns = flown.dt_ns
@@ -85,29 +81,25 @@ class Vehicles:
             capacity=room,
             recorder=recorder,
         )
-        # Ticks lie on multiples of 50 ms: the first comes 30 ms after what is said first.
+        # Ticks lie on multiples of 50 ms: the first is 30 ms after the first message.
         self.now_ns = 10 * SECOND_NS + 20 * MILLISECOND_NS
         self.epochs_ns: dict[int, int] = {}
-        """Begin of step 0 of each session."""
 
     def say(self, message: Message, sender: Address = HERE) -> list[tuple[Message, Address]]:
-        """One datagram, and the answers to it."""
         self.server.receive(Datagram(encode(message), sender), now_ns=self.now_ns)
         return self.answers()
 
     def answers(self) -> list[tuple[Message, Address]]:
-        """Messages in the outbox, decoded."""
         return [(decode(out.payload, self.terms), out.peer) for out in self.server.outbox()]
 
     def ask(self, vehicle: int = 1, boot_id: int = 5, sender: Address = HERE) -> Welcome:
-        """The answer to a HELLO."""
         ((welcome, peer),) = self.say(Hello(vehicle, boot_id, self.terms), sender)
         assert isinstance(welcome, Welcome)
         assert peer == sender
         return welcome
 
     def open(self, vehicle: int = 1, boot_id: int = 5, sender: Address = HERE) -> Welcome:
-        """A session, welcomed but not yet live."""
+        """Session, welcomed but not yet live."""
         welcome = self.ask(vehicle, boot_id, sender)
         assert welcome.refusal == Refusal.ACCEPTED
         return welcome
@@ -119,7 +111,6 @@ class Vehicles:
         state: object = ((1.0, 0.0), (0.0, 0.0)),
         sender: Address = HERE,
     ) -> None:
-        """An observation that took no time, unless it is an old one."""
         epoch_ns = self.epochs_ns.setdefault(welcome.session, self.now_ns - step * self.dt_ns)
         self.now_ns = max(self.now_ns, epoch_ns + step * self.dt_ns)
         assert self.say(self.told(welcome, step, state), sender) == []
@@ -127,7 +118,6 @@ class Vehicles:
     def told(
         self, welcome: Welcome, step: int, state: object = ((1.0, 0.0), (0.0, 0.0))
     ) -> Observation:
-        """Observation of a step of a session that has an epoch."""
         epoch_ns = self.epochs_ns[welcome.session]
         return Observation(
             welcome.vehicle,
@@ -147,30 +137,26 @@ class Vehicles:
 
     @property
     def due_ns(self) -> int:
-        """Time of the next tick."""
         due_ns = self.server.next_wake_ns()
         assert due_ns is not None
         return due_ns
 
     def tick(self) -> list[tuple[Message, Address]]:
-        """Time passes until the next tick; what is sent at it."""
         self.now_ns = max(self.now_ns, self.due_ns)
         self.server.wake(now_ns=self.now_ns)
         return self.answers()
 
     def planned(self) -> tuple[Horizon, Address]:
-        """The only message of the next tick, a horizon, and to whom it is sent."""
         ((horizon, peer),) = self.tick()
         assert isinstance(horizon, Horizon)
         return horizon, peer
 
     def rows(self) -> Rows:
-        """The record so far."""
         return parse(self.sink.getvalue())
 
 
 def live(step: int = 0, **more: Any) -> tuple[Vehicles, Welcome]:
-    """A server with one vehicle, which has been observed once, and its WELCOME."""
+    """Server with one vehicle, which has been observed once, and its WELCOME."""
     vehicles = Vehicles(scenario(), **more)
     welcome = vehicles.open()
     vehicles.observe(welcome, step)
@@ -186,7 +172,7 @@ def test_hello_is_welcomed_with_the_servers_terms() -> None:
 
 
 def test_a_repeated_hello_gets_the_same_session() -> None:
-    """A WELCOME that was lost costs nothing but time, before and after the first observation."""
+    """A lost WELCOME costs only time, before and after the first observation."""
     vehicles = Vehicles(scenario())
     first = vehicles.open()
     assert vehicles.open().session == first.session
@@ -212,7 +198,7 @@ def test_of_the_refusals_that_were_told_the_newest_64_are_remembered() -> None:
     other = vehicles.terms._replace(horizon=20)
 
     def told(*boot_ids: int) -> int:
-        """Number of refusals that the operator is told of these lives of vehicle 1."""
+        """Number of logged refusals of these lives of vehicle 1."""
         for boot_id in boot_ids:
             vehicles.say(Hello(1, boot_id, other))
         return len(vehicles.server.events())
@@ -268,7 +254,7 @@ def test_the_first_tick_sends_a_horizon_for_the_step_it_is_aboard() -> None:
 
 @pytest.mark.parametrize("minutes", [36, 71, 71.6, 72, 143.2, 1000])
 def test_an_observation_that_was_held_back_is_no_new_one(minutes: float) -> None:
-    """However often stamps have begun anew since: it makes a round trip of less than nothing."""
+    """However often stamps have wrapped since: its round trip would be negative."""
     vehicles, welcome = live()
     vehicles.observe(welcome, 1)
     later = round(minutes * 60 * SECOND_NS) // vehicles.dt_ns
@@ -281,7 +267,7 @@ def test_an_observation_that_was_held_back_is_no_new_one(minutes: float) -> None
 
 
 def test_a_vehicle_that_is_begun_anew_has_its_packets_counted_anew() -> None:
-    """Else all were late after one that told of a step 71 minutes ahead, and none counted."""
+    """Otherwise all would be late after an observation of a step 71 minutes ahead."""
     vehicles = Vehicles(scenario())
     welcome = vehicles.open()
     vehicles.epochs_ns[welcome.session] = vehicles.now_ns
@@ -305,9 +291,10 @@ def test_the_newest_observation_wins_after_reordering() -> None:
 
 
 def test_answers_follow_the_vehicle_to_its_new_address() -> None:
-    """A restarted netem has other ports: the newest observation says where the vehicle is.
+    """A restarted netem has other ports: the newest observation shows the present address.
 
-    Until it says HELLO there it is answered at home as well, for somebody may send on copies.
+    Until a HELLO arrives from there, the old address is answered as well, because the packets may
+    be forwarded copies.
     """
     vehicles, welcome = live()
     assert [peer for _, peer in vehicles.tick()] == [HERE]
@@ -367,7 +354,7 @@ def test_of_two_new_clients_under_one_number_the_first_flies() -> None:
 
 
 def test_a_vehicle_that_was_silent_for_a_while_is_not_taken_over_once_it_is_heard_again() -> None:
-    """The network was away, not the vehicle: who was welcomed meanwhile is told when it asks."""
+    """The network was interrupted, not the vehicle; a life welcomed meanwhile is refused."""
     vehicles, first = live()
     vehicles.now_ns += SILENCE_NS + 1
     second = vehicles.open(boot_id=6, sender=("other", 2))
@@ -433,11 +420,11 @@ def test_ticks_slept_through_are_counted_and_skipped() -> None:
 def test_more_than_five_ticks_missed_within_a_second_make_a_degraded_server(
     late: dict[int, int], degraded: list[int]
 ) -> None:
-    """To the tick; older ones count for nothing, and then it is in time again.
+    """To the tick; older missed ticks do not count.
 
     Args:
         late: ticks of 50 ms that were missed just before each of these.
-        degraded: ticks at which the server is.
+        degraded: ticks at which the server is degraded.
     """
     events, dt_ns = Events(), 50 * MILLISECOND_NS
     grid = Grid(dt_ns, events)
@@ -513,7 +500,7 @@ def test_a_vehicle_too_many_is_told_that_the_server_is_full() -> None:
 
 
 def test_a_full_server_keeps_the_second_life_of_a_vehicle_from_a_stranger() -> None:
-    """The vehicle that restarts has its row already: no stranger is welcomed in its place."""
+    """The restarted vehicle has its row already, which no stranger can take."""
     vehicles = Vehicles(scenario(), room=2)
     for number in (1, 2):
         vehicles.observe(vehicles.open(vehicle=number), 0)
@@ -556,9 +543,9 @@ def test_welcomed_vehicles_count_as_present_until_they_are_overdue() -> None:
 def test_whoever_was_welcomed_last_and_comes_in_time_gets_a_row(
     moves: list[tuple[str, int, int]], keeps: bool
 ) -> None:
-    """Any vehicles, lives and waits: never more than there is room for, and never a crash.
+    """For any vehicles, lives and waits: never more than the capacity, and never a crash.
 
-    Where rows are kept, a row never becomes that of another vehicle.
+    If rows are kept, a row never passes to another vehicle.
     """
     ear = partial(Hearing, SILENCE_NS, 50 * MILLISECOND_NS, None)
     entropy, now_ns = stream(1, "entropy").bytes, DAY_NS
@@ -626,7 +613,7 @@ def test_each_series_of_impossible_states_is_reported_once() -> None:
 
 
 def with_session(capacity: int = 1) -> tuple[Sessions, Session]:
-    """Sessions, of which that of vehicle 1 was opened by run 5 of its client at DAY_NS."""
+    """Sessions, of which that of vehicle 1 was opened by life 5 of its client at DAY_NS."""
     ear = partial(Hearing, SILENCE_NS, 50 * MILLISECOND_NS, None)
     sessions = Sessions(capacity, stream(1, "entropy").bytes, SILENCE_NS, ear)
     welcomed = sessions.welcome(hello(1, 5), HERE, LINE, DAY_NS)
@@ -734,7 +721,7 @@ def test_an_unsolved_problem_sends_nothing_and_is_counted() -> None:
     vehicles.observe(good, 0, sender=("v", 1))
     vehicles.observe(bad, 0, sender=("v", 2))
     known = vehicles.server.controller.scheme.predictor._memory
-    known.state[1, 0] = 1e308  # no float32 is as large
+    known.state[1, 0] = 1e308  # beyond float32
     with np.errstate(all="ignore"):
         sent = vehicles.tick()
     assert [peer for _, peer in sent] == [("v", 1)]
@@ -755,6 +742,4 @@ def test_figures_tell_what_was_counted() -> None:
     figures = vehicles.server.figures()
     assert (figures["vehicles"], figures["missed"]) == (1, 0)
     assert figures["counts"] == {"events": 1, "steps": 1, "unsolved": 0}
-    assert figures["by_vehicle"] == {
-        "1": {"step": 0, "clock_bound_ms": 15.03}
-    }  # the age of the echo
+    assert figures["by_vehicle"] == {"1": {"step": 0, "clock_bound_ms": 15.03}}  # age of the echo

@@ -1,7 +1,8 @@
-"""Networks that are slow, or get slower in flight: flown while they can be, hovered through then.
+"""Networks that are slow, or become slower in flight: flown as long as possible, then hovered
+through.
 
-Delays are given by hand, as functions of the time since the first packet. Safeguards are switched
-off one after the other to show that the flight leaves without them.
+Delays are functions of the time since the first packet. Safeguards are switched off one by one to
+show that the vehicle then leaves the figure.
 """
 
 from collections.abc import Callable, Sequence
@@ -35,10 +36,10 @@ from skytether.shared.wire.protocol import IDLE_TEXTS, Idle
 from skytether.sim.flight import fly, fly_batch
 
 Delay = Callable[[float], float]
-"""Delay of a packet [s], by the time since the first [s]."""
+"""Delay of a packet [s], by the time since the first packet [s]."""
 
 TIGHT = {"feedback": False, "input_weight": 0.01, "input_reference": False}
-"""Keys for committed inputs without feedback, with weights that correct an error at once."""
+"""Keys for committed inputs without feedback, at tight weights."""
 OUTSIDE_M = 3.2
 """Largest allowed distance from the centre of the figure eight of 2 m [m]."""
 
@@ -46,7 +47,6 @@ OUTSIDE_M = 3.2
 def scenario(
     uplink_s: float = 0.05, downlink_s: float = 0.05, *, duration: float = 40.0, **sections: Any
 ) -> Scenario:
-    """A figure eight in calm air at TIGHT weights over constant delays; sections are laid over."""
     table = reading.to_table(reading.load("demo-committed")) | {"duration": duration}
     table["control"] |= TIGHT
     table["vehicle"] |= {"wind": 0.0, "report": "always"}
@@ -58,10 +58,10 @@ def scenario(
 
 
 def fly_over(flown: Scenario, delays: Sequence[tuple[Delay, Delay]]) -> list[Record]:
-    """A flight over each pair of delays, up and down, that change with time, without loss."""
+    """Flight over each pair of delays, up and down, that change with time, without loss."""
 
     class Clocked(Fates):
-        """Fates that are functions of the time, by the seed of the flight."""
+        """Fates as functions of the time, by the seed of the flight."""
 
         def __init__(self, direction: Path, seed: int, name: str, flow: int) -> None:
             super().__init__(direction, seed, name, flow)
@@ -76,11 +76,10 @@ def fly_over(flown: Scenario, delays: Sequence[tuple[Delay, Delay]]) -> list[Rec
 
 
 def far_m(flight: Record) -> float:
-    """Largest distance from the centre of the figure eight [m]."""
     return float(np.linalg.norm(flight.client["state"][:, :, 0], axis=1).max())
 
 
-# -- delays that are known before ------------------------------------------------------------------
+# -- constant delays -------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -92,7 +91,7 @@ def test_a_round_trip_much_longer_than_the_horizon_is_flown(
     """1.55 s with a horizon of 0.4 s, one packet in ten lost, in wind: 42 m off without d > H."""
     control = {"dt": 0.02, "horizon": 20}
     flown = scenario(uplink_s, downlink_s, control=control, vehicle={"wind": 0.05})
-    # It is flown after a second of good link, a heartbeat's trip later, and then a round trip.
+    # Flown after a second of good link, a heartbeat's delay, and a round trip.
     flown = msgspec.structs.replace(flown, settle=10.0)
     flight = fly(flown)
     assert flight.failure is None
@@ -100,11 +99,10 @@ def test_a_round_trip_much_longer_than_the_horizon_is_flown(
     assert error < error_m
 
 
-# -- delays that grow in flight --------------------------------------------------------------------
+# -- growing delays --------------------------------------------------------------------------------
 
 
 def short(_: float) -> float:
-    """A delay that stays."""
     return 0.05
 
 
@@ -119,18 +117,16 @@ GROWING: dict[str, Delay] = {
 
 
 def ways(side: str, delay: Delay) -> tuple[Delay, Delay]:
-    """Delay of the uplink and of the downlink, of which one or both grow."""
+    """Delays of uplink and downlink, of which one or both grow."""
     return delay if side != "downlink" else short, delay if side != "uplink" else short
 
 
 SIDES = ("uplink", "downlink", "both")
 FIRM = {"feedback": True, "input_weight": 1.0, "input_reference": True}
-"""Keys of a vehicle with feedback aboard."""
 
 
 @cache
 def growing_flights(dt: float, horizon: int, *, feedback: bool) -> dict[tuple[str, str], Record]:
-    """A flight over each delay that grows, on each side, by the names of both."""
     flown = scenario(control={**(FIRM if feedback else TIGHT), "dt": dt, "horizon": horizon})
     names = list(product(GROWING, SIDES))
     flights = fly_over(flown, [ways(side, GROWING[growing]) for growing, side in names])
@@ -184,16 +180,16 @@ def test_a_delay_that_comes_and_goes_is_flown_again() -> None:
     assert flight.client["covered"][-500:].all()
 
 
-# -- without its safeguards ------------------------------------------------------------------------
+# -- ablations of safeguards -----------------------------------------------------------------------
 
 
 def forget_late(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Ablation: a horizon is taken however late it comes."""
+    """Ablation: a horizon is accepted however late it arrives."""
     monkeypatch.setattr(Compensator, "_comes_too_late", lambda *_: False)
 
 
 def forget_echoes(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Ablation: what every packet takes just now is not known: no `raise_to`, no `Idle.DELAY`."""
+    """Ablation: the present delay is unknown: no `raise_to`, no `Idle.DELAY`."""
     observe = ClockMap.observe
 
     def deaf(self: ClockMap, row: int, *ways_ns: int, heard: int, **told: Any) -> Contradiction:
@@ -209,7 +205,6 @@ def far_without_m(*growing: tuple[str, str]) -> list[float]:
 
 
 def test_without_a_bound_on_lateness_it_flies_away(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Horizons that come after other inputs were flown make the plans swing."""
     forget_late(monkeypatch)
     assert min(far_without_m(("slowly", "uplink"), ("slowly", "both"))) > 2 * OUTSIDE_M
 
@@ -217,7 +212,7 @@ def test_without_a_bound_on_lateness_it_flies_away(monkeypatch: pytest.MonkeyPat
 def test_without_echoes_a_longer_delay_is_never_flown_again(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """All horizons are too late then, and so nothing is acknowledged that could raise d."""
+    """All horizons are too late then, so no acknowledgement raises d."""
     known = growing_flights(0.02, 20, feedback=False)
     forget_echoes(monkeypatch)
     flown = scenario(control={"dt": 0.02, "horizon": 20})

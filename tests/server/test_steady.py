@@ -1,4 +1,4 @@
-"""`shared.core.steady`: an endpoint goes on where the clock of its host jumps."""
+"""`shared.core.steady`: an endpoint continues when the clock of its host jumps."""
 
 import io
 from collections.abc import Callable, Sequence
@@ -31,7 +31,7 @@ MIDNIGHT = Clock(MIDNIGHT_NS)
 
 
 class Probe(Endpoint):
-    """Writes down when something happens to it, and wakes when it was told to."""
+    """Endpoint that logs its calls, and wakes at times set by the test."""
 
     def __init__(self, due_ns: int | None = None) -> None:
         super().__init__()
@@ -39,29 +39,23 @@ class Probe(Endpoint):
         self.times_ns: list[int] = []
 
     def receive(self, datagram: Datagram, *, now_ns: int) -> None:
-        """Note it, and answer."""
         self.times_ns.append(now_ns)
         self._out.append(datagram)
 
     def wake(self, *, now_ns: int) -> None:
-        """Note it."""
         self.times_ns.append(now_ns)
 
     def close(self, *, now_ns: int) -> None:
-        """Note it."""
         self.times_ns.append(now_ns)
 
     def change(self, scenario: Scenario, keys: frozenset[str], *, now_ns: int) -> None:  # noqa: ARG002
-        """Note it."""
         self.times_ns.append(now_ns)
 
     def next_wake_ns(self) -> int | None:
-        """Wake time that the test set [ns]."""
         return self.due_ns
 
 
 def hear(endpoint: Endpoint, times_ns: Sequence[int]) -> None:
-    """A datagram arrives at each of these times."""
     for now_ns in times_ns:
         endpoint.receive(Datagram(b"?", ("peer", 1)), now_ns=now_ns)
 
@@ -110,7 +104,7 @@ SHOWN: dict[str, tuple[int | None, list[int], list[int], int | None]] = {
     "waits for datagrams": (None, [0, HOUR_NS, HOUR_NS - 1], [0, HOUR_NS, HOUR_NS], None),
     "a wake late": (HOUR_NS, [0, HOUR_NS + JUMP_NS], [0, HOUR_NS + JUMP_NS], HOUR_NS),
 }
-"""Wake that is asked for, what the clock shows, what the endpoint is shown, and the wake then."""
+"""Requested wake, readings of the clock, times passed to the endpoint, and the resulting wake."""
 
 
 @pytest.mark.parametrize(("due_ns", "times_ns", "shown_ns", "wake_ns"), SHOWN.values(), ids=SHOWN)
@@ -148,11 +142,12 @@ def rmse(
     client_clock: Clock = MIDNIGHT,
     steps: Sequence[tuple[float, str, int]] = (),
 ) -> list[float]:
-    """Errors in the plane of flights in virtual time [m]; infinite where one does not end in time.
+    """Horizontal errors of flights in virtual time [m]; infinite for a flight that does not end in
+    time.
 
     Args:
-        seeds: of vehicles with the same server, each with a network of its own.
-        wrap: made of each end.
+        seeds: of vehicles with the same server, each with its own network.
+        wrap: wrapper for each end.
         server_clock, client_clock: clocks at the start.
         steps: time in the flight [s], host, and step of its clock [ns].
     """
@@ -197,7 +192,6 @@ SEEDS = range(1, 7)
 
 @cache
 def usual_rmse() -> list[float]:
-    """Error with equal clocks of each seed [m]."""
     return rmse(*SEEDS)
 
 
@@ -206,7 +200,6 @@ STEPS = {
     for host in ("client", "server")
     for step_ns in (HOUR_NS, -HOUR_NS)
 }
-"""Clocks that are stepped in flight, by name."""
 
 CLOCKS: dict[str, dict[str, Any]] = {
     "an hour apart": {"client_clock": Clock(MIDNIGHT_NS + HOUR_NS)},
@@ -227,17 +220,17 @@ CLOCKS: dict[str, dict[str, Any]] = {
 
 
 AGAIN = ("an hour apart the other way", "slower by 200 ppm", "client -1 h", "server -1 h")
-"""Clocks that differ from another one's in sign alone."""
+"""Cases that differ from another one only in sign."""
 
 
 @pytest.mark.parametrize(
     "name", [pytest.param(name, marks=[pytest.mark.long] * (name in AGAIN)) for name in CLOCKS]
 )
 def test_the_error_is_the_same_whatever_the_clocks_do(name: str) -> None:
-    """It is within 5 % of that with equal clocks, as far as six seeds can tell.
+    """Within 5 % of the error with equal clocks, as far as six seeds can show.
 
-    Whatever the clocks do changes which packets are lost, and that alone scatters the mean of six
-    by some 5 %: it counts only beyond twice its standard error.
+    Clocks change which packets are lost, which scatters the mean of six by about 5 %; only a
+    difference of more than twice its standard error counts.
     """
     errors = rmse(*SEEDS, **CLOCKS[name])
     usual = usual_rmse()
@@ -248,6 +241,6 @@ def test_the_error_is_the_same_whatever_the_clocks_do(name: str) -> None:
 
 @pytest.mark.parametrize("name", STEPS)
 def test_without_steady_time_a_step_loses_the_flight(name: str) -> None:
-    """The error doubles at least, or the vehicle stands still until its clock has come back."""
+    """The error doubles at least, or the vehicle stands still until its clock has returned."""
     (error,) = rmse(2, wrap=lambda endpoint: endpoint, steps=STEPS[name])
     assert error > 2.0 * mean(usual_rmse())

@@ -1,4 +1,4 @@
-"""Triggers, alone and combined, against numbers worked out by hand."""
+"""Triggers, alone and combined, against numbers computed by hand."""
 
 import math
 from collections.abc import Iterator
@@ -46,7 +46,7 @@ def figures_of(
     cost_gap: float = 0.0,
     deviation_m: float = 0.0,
 ) -> Figures:
-    """Known figures of n equal vehicles."""
+    """Given figures of n equal vehicles."""
     figures = np.zeros(n, dtype=FIGURES)
     figures["step"], figures["state_gap"], figures["fresh"] = step, error, fresh
     figures["cost_gap"], figures["deviation_m"] = cost_gap, deviation_m
@@ -64,27 +64,22 @@ KNOWN = SituationArrays(
     heartbeat_due=np.array([False, True]),
     desired=lambda rows, *_: np.zeros((len(rows), 2, 4, 2)),
 )
-"""Known state of two vehicles at most."""
 
 
 def facing(rows: Indices, figures: Figures) -> Situation:
-    """A situation of vehicles that are where they were planned to be."""
     states = np.zeros((len(rows), 2, 2))
     return Situation(rows, figures, states, states, KNOWN)
 
 
 def ask(trigger: Trigger, step: int, error: float, *, fresh: bool = False) -> Verdict:
-    """The verdict on one vehicle with V = error."""
     return trigger.test(facing(ROW, figures_of(step=step, error=error, fresh=fresh)))
 
 
 def tell(trigger: Trigger, step: int, error: float = 0.0) -> None:
-    """One vehicle is sent a horizon at this step, with V = error."""
     trigger.sent(ROW, figures_of(step=step, error=error))
 
 
 def trigger_of(text: str, *, dt: float = 0.1, capacity: int = 1) -> Trigger:
-    """Trigger of a scenario with this text and CONTROL's weights."""
     return make_trigger(msgspec.structs.replace(CONTROL, trigger=text, dt=dt), capacity)
 
 
@@ -102,14 +97,13 @@ def test_threshold_decays_per_second() -> None:
 
 
 def test_first_step_is_an_event_however_small_the_error() -> None:
-    """E18: the vehicle has nothing to fly yet."""
+    """E18: the vehicle has no plan yet."""
     verdict = ask(trigger_of("state_gap(3)"), 0, 0.0, fresh=True)
     assert (verdict.event.tolist(), verdict.figure.tolist()) == ([True], [0.0])
     assert verdict.threshold.tolist() == [3.0]
 
 
 def test_nothing_happens_without_an_event() -> None:
-    """Asking is not sending: the threshold goes on from the event before."""
     trigger = after_event(0, 10.0)
     for step in (1, 2, 3):
         ask(trigger, step, 100.0)
@@ -149,7 +143,7 @@ def test_new_life_forgets_them_also_if_its_first_horizon_was_not_sent() -> None:
 def test_an_event_is_an_error_above_the_threshold_of_eq_16(
     error: float, steps: int, rate: float, epsilon: float, dt: float, off: float
 ) -> None:
-    """S(k) = V(k_i) exp(-λ (k - k_i) Δt) + ε, however time is cut into steps."""
+    """S(k) = V(k_i) exp(-λ (k - k_i) Δt) + ε, for any length of the step."""
     control = ControlConfig(trigger=f"state_gap({epsilon!r}, {rate!r})", dt=dt)
     S = error * math.exp(-rate * steps * dt) + epsilon
     V = max(S + off, 0.0)
@@ -170,7 +164,6 @@ def test_some_send_at_every_step_whatever_the_error(text: str, error: float) -> 
 
 
 def events(trigger: Trigger, first: int, last: int, *, unsent: tuple[int, ...] = ()) -> list[int]:
-    """The steps at which it wants to send; it does, but for those in `unsent`."""
     wanted = []
     for step in range(first, last + 1):
         verdict = ask(trigger, step, 100.0, fresh=step == first)
@@ -182,7 +175,7 @@ def events(trigger: Trigger, first: int, last: int, *, unsent: tuple[int, ...] =
 
 
 Life = tuple[int, int, tuple[int, ...], list[int]]
-"""First and last step, steps at which nothing can be sent, and those at which it wants to send."""
+"""First and last step, steps at which nothing can be sent, and steps at which the trigger fires."""
 WANTED: dict[str, tuple[str, list[Life]]] = {
     "the first step, and every fourth after it": ("periodic(4)", [(3, 16, (), [3, 7, 11, 15])]),
     "due until it is sent": ("periodic(4)", [(0, 13, (4, 5), [0, 4, 5, 6, 10])]),
@@ -208,7 +201,6 @@ WANTED: dict[str, tuple[str, list[Life]]] = {
 
 @pytest.mark.parametrize(("text", "lives"), WANTED.values(), ids=WANTED)
 def test_steps_at_which_a_policy_wants_to_send(text: str, lives: list[Life]) -> None:
-    """In steps of 0.05 s."""
     trigger = trigger_of(text, dt=0.05)
     for first, last, unsent, wanted in lives:
         assert events(trigger, first, last, unsent=unsent) == wanted
@@ -225,7 +217,7 @@ def test_periodic_counts_for_each_vehicle_by_itself() -> None:
 
 
 def test_heartbeat_sends_where_one_is_due() -> None:
-    """To the second vehicle here, which is owed one; and to one that has nothing to fly on with."""
+    """To the second vehicle here, whose heartbeat is due; and to a vehicle without a plan."""
     sent = trigger_of("heartbeat")
     both = np.array([0, 1])
     known = KNOWN._replace(sent_step=np.array([40, 40]))
@@ -235,7 +227,7 @@ def test_heartbeat_sends_where_one_is_due() -> None:
 
 
 def test_a_horizon_takes_the_place_of_a_heartbeat() -> None:
-    """The server says no more often that it lives, and the target is followed closer."""
+    """The number of packets stays the same, and the target is followed more closely."""
     few, owed = (
         [
             flight.summary
@@ -259,7 +251,7 @@ def test_a_horizon_takes_the_place_of_a_heartbeat() -> None:
 
 @pytest.mark.parametrize(("horizon", "steps"), [(40, 20), (41, 20), (3, 1), (2, 1), (1, 1)])
 def test_silence_is_no_longer_than_half_a_horizon(horizon: int, steps: int) -> None:
-    """However long a scenario allows: one that is lost can be made good; a step at least."""
+    """For any allowed silence, so that a lost packet can be replaced; at least a step."""
     control = msgspec.structs.replace(CONTROL, trigger="silence(60)", horizon=horizon)
     assert events(make_trigger(control, 1), 0, 80) == list(range(0, 81, steps))
 
@@ -295,11 +287,11 @@ def test_packet_that_another_policy_asked_for_takes_what_tokens_there_are() -> N
 
 
 gaps = st.lists(st.tuples(st.integers(1, 200), st.booleans()), min_size=1, max_size=120)
-"""Steps since the one before, and whether something else wants to send there."""
+"""Steps since the previous one, and whether another policy fires there."""
 
 
 def packets(trigger: Trigger, walk: list[tuple[int, bool]]) -> list[int]:
-    """The steps with a packet, where one goes out if both want it."""
+    """Steps with a packet, which is sent if both fire."""
     sent, step = [], 0
     for gap, wanted in walk:
         step += gap
@@ -331,7 +323,7 @@ def test_budget_is_the_token_bucket_filled_step_by_step(
         for _ in range(gap):
             tokens, step = min(tokens + rate * 0.05, burst), step + 1
         if abs(tokens - 1.0) < 1e-9:
-            return  # a matter of rounding
+            return  # depends on rounding
         if wanted and tokens >= 1.0:
             tokens -= 1.0
             sent.append(step)
@@ -372,7 +364,7 @@ def test_figure_for_the_record_is_that_of_the_leftmost_policy_that_has_one() -> 
 
 
 def test_eq_16_counts_from_v_whichever_figure_is_recorded() -> None:
-    """V(k_i) of eq. (16) is V, also behind a policy whose cost gap is recorded in its stead."""
+    """V(k_i) of eq. (16) is V, also after a policy whose cost gap is recorded instead."""
     trigger = trigger_of("cost_gap(3) | state_gap(3, 2)")
     figures = figures_of(step=20, error=10.0, cost_gap=7.0)
     assert trigger.test(facing(ROW, figures)).figure.tolist() == [7.0]
@@ -382,7 +374,7 @@ def test_eq_16_counts_from_v_whichever_figure_is_recorded() -> None:
 
 
 class Listener(Trigger):
-    """A trigger with a figure of its own, which keeps what it is told."""
+    """Trigger with a figure of its own that records its calls."""
 
     def __init__(self, figure: float, *, compares: bool) -> None:
         self._compared = Compared.COST_GAP if compares else Compared.NOTHING
@@ -390,16 +382,13 @@ class Listener(Trigger):
         self._figure = figure
 
     def forget(self, row: int) -> None:
-        """Keep the row, too."""
         self.told.append(-row)
 
     def test(self, situation: Situation) -> Verdict:
-        """Fire where the figure is positive."""
         figure = np.full(len(situation.rows), self._figure)
         return Verdict(figure > 0.0, figure, figure, self._compared)
 
     def sent(self, rows: Indices, figures: Figures) -> None:  # noqa: ARG002
-        """Keep the rows told."""
         self.told += rows.tolist()
 
 
@@ -439,11 +428,9 @@ trees = st.recursive(
     lambda tree: st.tuples(tree, st.sampled_from("&|"), tree),
     max_leaves=6,
 )
-"""Expressions as nested triples."""
 
 
 def written(tree: Any) -> str:
-    """Trigger in the form of a scenario."""
     return tree if isinstance(tree, str) else f"({written(tree[0])} {tree[1]} {written(tree[2])})"
 
 
@@ -503,7 +490,6 @@ def test_batch_is_judged_as_its_singles(tree: Any, seed: int) -> None:
 
 
 def test_columns_of_a_plugin_reach_kernels_as_kernels_read_them() -> None:
-    """Numbers of another kind, or not side by side, are copied; kernels do not check them."""
     for values in (np.arange(3), np.arange(6.0)[::2], np.ones(3, dtype=np.float32), [1, 2, 3]):
         column = _column(values, np.float64, 3)
         assert (column.dtype, column.flags.c_contiguous) == (np.dtype(np.float64), True)

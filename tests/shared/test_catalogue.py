@@ -1,4 +1,4 @@
-"""Catalogue of a scenario's keys: their owners, which change in flight, and the page of all."""
+"""Catalogue of a scenario's keys: their owners, those changeable in flight, and docs/keys.md."""
 
 import re
 import typing
@@ -21,14 +21,10 @@ DOCS = Path(__file__).parents[2] / "docs"
 
 
 class Free(Section, frozen=True):
-    """A key that names no owner."""
-
     wind: Strength = 0.0
 
 
 class Shared(Section, frozen=True):
-    """A key that names two."""
-
     wind: OfServer[Annotated[float, Key(Owner.VEHICLE)]] = 0.0
 
 

@@ -1,4 +1,4 @@
-"""`shared.base.chance`: streams that are known by their names."""
+"""`shared.base.chance`: random streams, identified by names."""
 
 import os
 import subprocess
@@ -12,7 +12,6 @@ NAMES = ("uplink", "delay", 7)
 
 
 def numbers(seed: int, *names: str | int) -> list[int]:
-    """The first numbers of a stream."""
     return stream(seed, *names).integers(2**63, size=4).tolist()
 
 
@@ -21,7 +20,7 @@ def test_the_same_names_give_the_same_stream() -> None:
 
 
 def test_a_stream_is_the_same_in_another_process() -> None:
-    """Python's own hash of a text would not be."""
+    """Python's own hash of a text differs between processes."""
     drawn = f"stream(3, *{NAMES}).integers(2**63)"
     program = f"from skytether.shared.base.chance import stream; print({drawn})"
     environment = {**os.environ, "PYTHONHASHSEED": "12345"}
@@ -46,5 +45,4 @@ def test_other_names_give_another_stream(other: tuple[int, str | int]) -> None:
 
 
 def test_a_further_name_gives_another_stream_even_if_it_is_zero() -> None:
-    """Flow 0 of a purpose is not the purpose itself."""
     assert numbers(3, "delay", 0) != numbers(3, "delay")

@@ -1,4 +1,4 @@
-"""The sealed packets of a channel: each is opened once, and nobody else can make one.
+"""Sealed packets of a channel: each is accepted once, and cannot be forged.
 
 With SKYTETHER_LONG=1 in the environment, 10^7 steps of the window and 10^7 forgeries.
 """
@@ -40,7 +40,6 @@ OTHER_FORTH, OTHER_BACK = bytes([3]) * 32, bytes([4]) * 32
 def ends(
     vehicle: int = 1, number: int = 7, forth: bytes = FORTH, back: bytes = BACK
 ) -> tuple[Channel, Channel]:
-    """Both ends of a channel: the vehicle's and the server's."""
     return (
         Channel(vehicle, number, seal=forth, open_=back, born_ns=0),
         Channel(vehicle, number, seal=back, open_=forth, born_ns=0),
@@ -48,7 +47,6 @@ def ends(
 
 
 def refusal(channel: Channel, packet: bytes, now_ns: int = 0) -> str:
-    """Reason for which a packet is not opened."""
     with pytest.raises(ProtocolError) as error:
         channel.open(packet, now_ns=now_ns)
     return error.value.reason
@@ -58,18 +56,16 @@ def refusal(channel: Channel, packet: bytes, now_ns: int = 0) -> str:
 
 
 class Oracle:
-    """The window as a set."""
+    """Replay window as a set."""
 
     def __init__(self) -> None:
         self.seen: set[int] = set()
         self.newest = -1
 
     def is_new(self, counter: int) -> bool:
-        """Whether the window may open it."""
         return counter > self.newest - WINDOW and counter not in self.seen
 
     def add(self, counter: int) -> None:
-        """Note it."""
         self.seen.add(counter)
         self.newest = max(self.newest, counter)
         if len(self.seen) > 4 * WINDOW:
@@ -77,7 +73,7 @@ class Oracle:
 
 
 def agree(counters: Iterator[int] | list[int]) -> int:
-    """Number of counters taken; window and oracle must say the same of each."""
+    """Number of accepted counters; window and oracle must agree on each."""
     window, oracle, taken = ReplayWindow(), Oracle(), 0
     for counter in counters:
         new = window.is_new(counter)
@@ -152,7 +148,7 @@ def test_packets_are_opened_in_any_order_and_once() -> None:
 
 
 def test_a_forged_counter_does_not_move_the_window() -> None:
-    """Else one packet from a stranger would end the channel."""
+    """Otherwise one forged packet would end the channel."""
     vehicle, server = ends()
     packet = vehicle.seal(b"message")
     far = HEADER.pack(VERSION, DATA, 1, 7, PACKETS_MAX - 1) + packet[HEADER.size :]
@@ -179,7 +175,6 @@ def test_a_channel_is_replaced_and_ends_by_age() -> None:
 
 
 def test_a_channel_is_replaced_and_ends_by_packets() -> None:
-    """Another is wanted after 2^22, sent or received; nothing is opened after 2^32."""
     vehicle, server = ends()
     vehicle._sent = FRESH_PACKETS - 1
     assert not vehicle.wants_successor(0)
@@ -206,7 +201,7 @@ def test_a_retired_channel_opens_what_is_under_way() -> None:
 
 
 def test_without_expiry_an_old_packet_is_opened(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Ablation of the end by age: a packet held back for a day would be believed."""
+    """Ablation: without expiry, a packet held back for a day would be believed."""
     monkeypatch.setattr(channels, "LIFE_NS", 2**62)
     vehicle, server = ends()
     assert server.open(vehicle.seal(b"old"), now_ns=86_400 * 10**9).payload == b"old"
@@ -223,14 +218,12 @@ Forger = Callable[[random.Random, bytes, bytes], bytes]
 
 
 def flip_bit(rng: random.Random, packet: bytes, _: bytes) -> bytes:
-    """One bit is another."""
     changed = bytearray(packet)
     changed[rng.randrange(len(packet))] ^= 1 << rng.randrange(8)
     return bytes(changed)
 
 
 def change_bytes(rng: random.Random, packet: bytes, _: bytes) -> bytes:
-    """One to four bytes are others."""
     changed = bytearray(packet)
     for _each in range(rng.randrange(1, 5)):
         changed[rng.randrange(len(packet))] = rng.randrange(256)
@@ -238,30 +231,25 @@ def change_bytes(rng: random.Random, packet: bytes, _: bytes) -> bytes:
 
 
 def change_header(rng: random.Random, packet: bytes, _: bytes) -> bytes:
-    """The counter is another, near or far, and its seal as it was."""
     at = HEADER.size - 8
     counter = rng.choice([rng.randrange(64), rng.randrange(2**32), rng.randrange(2**64)])
     return packet[:at] + struct.pack("<Q", counter) + packet[at + 8 :]
 
 
 def cut(rng: random.Random, packet: bytes, _: bytes) -> bytes:
-    """The end is missing."""
     return packet[: rng.randrange(len(packet))]
 
 
 def extend(rng: random.Random, packet: bytes, _: bytes) -> bytes:
-    """Something follows."""
     return packet + rng.randbytes(rng.randrange(1, 40))
 
 
 def splice(rng: random.Random, packet: bytes, other: bytes) -> bytes:
-    """The beginning of one packet, and the end of another."""
     at = rng.randrange(1, min(len(packet), len(other)))
     return packet[:at] + other[at:]
 
 
 def invent(rng: random.Random, packet: bytes, _: bytes) -> bytes:
-    """A right header, and anything behind it."""
     return packet[: HEADER.size] + rng.randbytes(rng.randrange(80))
 
 
@@ -290,14 +278,14 @@ def test_no_forgery_is_opened() -> None:
             accepted += 1
     assert (accepted, made) == (0, FORGERIES)
     assert reasons <= REASONS
-    # None of them has moved the window: what was truly sent is still opened.
+    # The window has not moved: the genuine packets are still opened.
     assert all(server.open(packet, now_ns=0) for packet in packets)
 
 
 def test_a_packet_of_another_channel_is_not_opened() -> None:
-    """One of the other direction, another vehicle, another channel or another handshake.
+    """Packets of the other direction, another vehicle, another channel or another handshake.
 
-    Both as it is, and with the header that this channel expects.
+    Both unchanged, and with the header that this channel expects.
     """
     vehicle, server = ends()
     others = {

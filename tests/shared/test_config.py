@@ -1,4 +1,4 @@
-"""Scenarios: one is right, or it is refused in one line that says what is wrong."""
+"""Scenarios: valid, or refused in one line that names the mistake."""
 
 import os
 import re
@@ -323,12 +323,10 @@ WRONG = {
 
 
 def refusal(path: Path | str) -> str:
-    """Message about a scenario that cannot be flown."""
     return helpers.refusal(lambda: reading.load(str(path)))
 
 
 def write(folder: Path, name: str, text: str) -> Path:
-    """A file in a folder."""
     path = folder / name
     path.write_text(text)
     return path
@@ -358,7 +356,6 @@ def test_what_is_wrong_is_said_with_file_key_given_and_expected(
     ],
 )
 def test_a_number_that_is_not_finite_is_refused(key: str, value: str, tmp_path: Path) -> None:
-    """TOML knows inf and nan; no flight has a use for them."""
     path = write(tmp_path, "mine.toml", f"{key} = {value}")
     assert refusal(path).startswith(
         f"{path}: {key.removesuffix('.slots_mean').removesuffix('.paper')}"
@@ -392,7 +389,7 @@ def test_a_delay_bound_is_a_time_or_seen(bound: float | str, tmp_path: Path) -> 
 
 @pytest.mark.parametrize("bound", [0.44, 1.5, 4.4])
 def test_a_delay_bound_may_be_longer_than_the_horizon(bound: float) -> None:
-    """From the very delay on; what fits the datagram and the age bound is planned beyond it."""
+    """From the delay on; the part within the datagram and the age bound is planned beyond it."""
     control = {"horizon": 10, "dt": 0.05, "delay_bound": bound}
     assert reading.check({"control": control}, "mine.toml").control.delay_bound == bound
 
@@ -414,7 +411,6 @@ def test_an_unknown_scenario_is_refused_with_the_nearest_name() -> None:
 
 
 def test_a_file_of_scenarios_holds_one_in_each_table(tmp_path: Path) -> None:
-    """Each is flown by the path of the file and its own name, and laid over what it extends."""
     path = write(tmp_path, "many.toml", '[one]\nextends = "paper"\nseed = 9\n["two.5"]\nseed = 8')
     mine = write(tmp_path, "mine.toml", 'extends = "many.toml/one"\nduration = 7.0')
     assert reading.names(str(path)) == [f"{path}/one", f"{path}/two.5"]
@@ -427,7 +423,6 @@ def test_a_file_of_scenarios_holds_one_in_each_table(tmp_path: Path) -> None:
 
 
 def test_the_compared_scenarios_are_no_scenario_themselves() -> None:
-    """But one of them is, and one that is not there is refused."""
     assert refusal("compare").startswith("compare: no such scenario; there are 5g-")
     assert reading.load("compare/paper-event-gusts").vehicle.gust_mps2 == 1.0
     said = "compare/paper-evnt-gusts: no such scenario; did you mean paper-event-gusts?"
@@ -447,7 +442,7 @@ def test_a_file_that_is_no_toml_is_refused(content: bytes, tmp_path: Path) -> No
 
 
 def test_only_a_plain_file_of_a_thought_of_size_is_read(tmp_path: Path) -> None:
-    """A pipe would be waited for, and a device or a flood would never end."""
+    """A pipe would block, and a device would never end."""
     path, link = tmp_path / "mine.toml", tmp_path / "link.toml"
     os.mkfifo(path)
     assert refusal(path) == f"{path}: cannot be read: it is no plain file"
@@ -474,7 +469,6 @@ def test_a_long_chain_of_scenarios_is_refused(tmp_path: Path) -> None:
 
 
 def test_extends_needs_the_name_of_a_scenario(tmp_path: Path) -> None:
-    """A number is refused, and so is a name that no scenario has."""
     number = write(tmp_path, "number.toml", "extends = 3")
     assert refusal(number) == f"{number}: extends: got 3, expected the name of a scenario"
     unknown = write(tmp_path, "unknown.toml", 'extends = "papr"')
@@ -497,7 +491,6 @@ def test_a_path_with_a_zero_byte_is_refused(tmp_path: Path) -> None:
 
 
 def test_extends_lays_a_scenario_over_another_key_by_key(tmp_path: Path) -> None:
-    """Over two floors, and down to the keys of inner tables."""
     write(
         tmp_path,
         "base.toml",
@@ -526,7 +519,7 @@ def test_what_is_left_out_is_the_default(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", reading.names())
 def test_every_scenario_that_comes_with_skytether_can_be_flown(name: str) -> None:
-    """A scenario says in a line what it shows; its trajectory has as many axes as its model."""
+    """It has a title of one line, and its reference has as many axes as its model."""
     scenario = reading.load(name)
     assert scenario.title
     assert "\n" not in scenario.title
@@ -599,7 +592,6 @@ def test_a_trajectory_is_looked_for_beside_the_scenario_that_names_it(tmp_path: 
 def test_a_trajectory_that_cannot_be_flown_is_refused(
     table: str | None, said: str, tmp_path: Path
 ) -> None:
-    """With the line that is wrong, where one is."""
     path = write(tmp_path, "mine.toml", '[reference]\nshape = "csv"\nfile = "path.csv"')
     trajectory = tmp_path / "path.csv"
     if table is not None:
@@ -609,14 +601,14 @@ def test_a_trajectory_that_cannot_be_flown_is_refused(
 
 
 def test_a_trajectory_that_is_no_text_table_is_refused(tmp_path: Path) -> None:
-    """The csv module has an error of its own for lines that never end."""
+    """The csv module has its own error for endless lines."""
     write(tmp_path, "path.csv", f"t,x,y\n0,1,{'9' * 200_000}\n")
     path = write(tmp_path, "mine.toml", '[reference]\nshape = "csv"\nfile = "path.csv"')
     assert refusal(path).startswith(f"{path}: reference.file: got ")
 
 
 def test_only_a_plain_table_of_a_thought_of_size_is_read(tmp_path: Path) -> None:
-    """A pipe is not waited for, and ten gigabytes are not read."""
+    """A pipe is not awaited, and ten gigabytes are not read."""
     trajectory = tmp_path / "path.csv"
     path = write(tmp_path, "mine.toml", '[reference]\nshape = "csv"\nfile = "path.csv"')
     before = f"{path}: reference.file: got {str(trajectory)!r}, expected a file that can be read"
@@ -636,7 +628,6 @@ def test_a_trajectory_out_of_this_world_is_refused(table: str, tmp_path: Path) -
 
 
 def test_one_value_is_for_all_axes() -> None:
-    """A list has one value for each axis."""
     scenario = reading.check(
         {"model": {"axes": 3, "tau_s": [0.5], "u_max": [1.0, 2.0, 3.0]}}, "mine.toml"
     )
@@ -645,7 +636,6 @@ def test_one_value_is_for_all_axes() -> None:
 
 
 def test_the_vehicle_is_what_the_model_says_unless_it_is_told_otherwise() -> None:
-    """The vehicle's time constants are the model's by default."""
     model = {"tau_s": [0.5, 0.6]}
     same = reading.check({"model": model}, "mine.toml")
     other = reading.check({"model": model, "vehicle": {"tau_s": [0.9]}}, "mine.toml")
@@ -654,7 +644,6 @@ def test_the_vehicle_is_what_the_model_says_unless_it_is_told_otherwise() -> Non
 
 
 def test_the_terms_hold_what_both_ends_must_agree_on() -> None:
-    """With one number an axis, and the step in nanoseconds."""
     terms = Scenario().terms()
     assert terms[:5] == (50_000_000, 80, 2, (0.84, 0.84), (1.0, 1.0))
     assert terms[5:7] == ((0.0, 0.0), (1.6, 1.6))
@@ -665,5 +654,4 @@ def test_the_terms_hold_what_both_ends_must_agree_on() -> None:
 
 @pytest.mark.parametrize(("duration", "steps"), [(60.0, 1200), (0.12, 2), (0.001, 1)])
 def test_a_flight_has_as_many_steps_as_fit_its_duration(duration: float, steps: int) -> None:
-    """Rounded, and at least one."""
     assert reading.check({"duration": duration}, "mine.toml").steps == steps

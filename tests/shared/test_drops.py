@@ -1,4 +1,4 @@
-"""Dropped packets by end and reason, from the figures of processes; the page that lists all."""
+"""Dropped packets by end and reason, from the figures of processes, and the page that lists all."""
 
 import re
 from pathlib import Path
@@ -14,7 +14,7 @@ OPERATING = Path(__file__).parents[2] / "docs" / "operating.md"
 
 
 def test_drops_are_by_end_and_reason() -> None:
-    """Each vehicle has its own, the workers of a server one sum; zeros are left out."""
+    """By vehicle, and summed over the workers of a server; zeros are left out."""
     figures: dict[str, dict[str, Any]] = {
         "server": {"dropped": {"replayed": 2, "forged": 0}, "refused": {"full": 7}},
         "server.1": {"dropped": {"replayed": 1}, "kernel_drops": 4, "step": "other figures"},

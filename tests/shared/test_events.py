@@ -1,4 +1,4 @@
-"""Events: a text for the operator, tagged JSON for a program, figures in columns."""
+"""Events: a text for the operator, tagged JSON for programs, figures in columns."""
 
 import os
 import re
@@ -27,7 +27,7 @@ from skytether.shared.core.events import (
 )
 from skytether.shell.log import Log, LogLine, line_of, rendered
 
-# What msgspec takes for a number: of 64 bits, and finite.
+# Numbers that msgspec can encode: of 64 bits, and finite.
 st.register_type_strategy(int, st.integers(0, 2**63))
 st.register_type_strategy(float, st.floats(-1e9, 1e9))
 TABLES = st.dictionaries(st.text(max_size=9), st.integers(0, 9) | st.booleans(), max_size=3)
@@ -39,12 +39,12 @@ TABLES = st.dictionaries(st.text(max_size=9), st.integers(0, 9) | st.booleans(),
 def test_an_event_has_a_text_and_survives_its_line_of_json(
     kind: type[Event], data: st.DataObject
 ) -> None:
-    """Whatever its values are: another version's texts are not known here."""
+    """For any values, because texts of other versions are unknown."""
     fields = {
         name: TABLES if typing.get_origin(of) is dict else st.from_type(of)
         for name, of in typing.get_type_hints(kind).items()
     }
-    for name in fields.keys() & {"parameters", "changes"}:  # nobody tells of none
+    for name in fields.keys() & {"parameters", "changes"}:  # never empty
         fields[name] = fields[name].filter(len)
     event = data.draw(st.builds(kind, **fields))
     assert str(event).splitlines()
@@ -79,7 +79,7 @@ def test_a_line_that_is_none_of_the_logs_is_no_event(line: bytes) -> None:
     ],
 )
 def test_an_ipv6_host_is_written_in_brackets(host: str, text: str) -> None:
-    """Or its last number would be taken for the port."""
+    """Otherwise its last number would be taken for the port."""
     assert address_text(host, 5) == text
 
 
@@ -94,7 +94,6 @@ FIGURES = {
 
 
 def test_figures_are_names_and_numbers_in_two_columns() -> None:
-    """Groups are indented, and an empty one says so."""
     assert rendered(FIGURES) == [
         "missed       3",
         "tick_ms_p50  0.25",
@@ -124,12 +123,11 @@ def test_two_groups_of_a_kind_share_the_lines() -> None:
 
 
 AT = re.compile(r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d\.\d{3} server\.1: ")
-"""Beginning of a line of text."""
 
 
 @contextmanager
 def piped(monkeypatch: pytest.MonkeyPatch) -> Iterator[IO[bytes]]:
-    """A standard output whose every write is read as one."""
+    """Standard output as a pipe whose every write is read as one."""
     reading, writing = os.pipe2(os.O_DIRECT)
     with os.fdopen(reading, "rb", buffering=0) as read, os.fdopen(writing, "w") as stdout:
         monkeypatch.setattr("sys.stdout", stdout)
@@ -142,7 +140,7 @@ FIGURES_LONG = {f"vehicle {number}": {"step": number, "missed": 0} for number in
 def test_workers_who_share_a_pipe_do_not_mix_up_their_lines(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """No write is longer than what a pipe takes whole, and each ends with a line."""
+    """No write exceeds a pipe's atomic size, and each ends with a line."""
     with piped(monkeypatch) as pipe:
         log = Log("server.1", "text")
         log.say(Counted(figures=FIGURES_LONG))
@@ -167,7 +165,7 @@ def test_an_event_in_json_is_one_write(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_lines_that_nobody_reads_are_counted_for_whoever_reads_later(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """The first ones are kept; those for which there is no room are a line themselves."""
+    """The first lines are kept; the number of omitted ones is a line itself."""
     with piped(monkeypatch) as pipe:
         line = b"2026-11-22 22:51:58.123 client: vehicle 1: session open, flying\n"
         monkeypatch.setattr("skytether.shell.log.ROOM_BYTES", 10 * len(line))
@@ -185,14 +183,13 @@ def test_lines_that_nobody_reads_are_counted_for_whoever_reads_later(
         assert [pipe.read(4096) for _ in range(filled)] == [b"before"] * filled
         assert [pipe.read(4096)[24:] for _ in range(10)] == [line[24:]] * 10
         os.set_blocking(pipe.fileno(), False)
-        while (told := pipe.read(4096)) is None:  # until the thread knows that there is room
+        while (told := pipe.read(4096)) is None:  # until the thread notices that the pipe is empty
             log.each_second()
         assert told.decode()[24:] == "client: … and 990 more lines\n"
         log.close()
 
 
 def test_a_log_of_text_names_its_process_in_every_line(capfd: pytest.CaptureFixture[str]) -> None:
-    """Also in those of the figures, and of a traceback."""
     log = Log("client", "text")
     log.say(Flying(vehicle=1))
     log.say(Counted(figures={"missed": 3}))
@@ -215,7 +212,7 @@ def test_a_log_of_text_names_its_process_in_every_line(capfd: pytest.CaptureFixt
 def test_an_endpoints_events_are_told_as_far_as_they_can_be_read(
     capfd: pytest.CaptureFixture[str],
 ) -> None:
-    """A process's own events are never omitted; the omitted ones are counted before the end."""
+    """A process's own events are never omitted; the number of omitted ones is logged."""
     log = Log("client", "text")
     for vehicle in range(4318):
         log.hear(Flying(vehicle=vehicle))
@@ -230,7 +227,7 @@ def test_an_endpoints_events_are_told_as_far_as_they_can_be_read(
     ]
     left_out = [int(found[1].replace(" ", "")) for found in re.finditer(OMITTED, "\n".join(lines))]
     assert len(told) + sum(left_out) == 4318
-    assert len(told) < 500  # five in each second that this takes
+    assert len(told) < 500  # five per second of the test
     assert sum("PLAINTEXT" in line for line in lines) == 9
 
 
@@ -238,22 +235,19 @@ OMITTED = re.compile("client: … and ([0-9 ]+) more Flying$", re.MULTILINE)
 
 
 class Talker(Endpoint):
-    """Says that vehicles fly, as many as it is woken for."""
+    """Endpoint that reports a number of flying vehicles at each wake."""
 
     def receive(self, datagram: Datagram, *, now_ns: int) -> None:
         """Take nothing."""
 
     def wake(self, *, now_ns: int) -> None:
-        """Say that so many vehicles fly."""
         self._events += [Flying(vehicle=number) for number in range(now_ns)]
 
     def next_wake_ns(self) -> int | None:
-        """Time of no wake."""
         return None
 
 
 def test_events_that_nobody_takes_give_way_and_are_counted() -> None:
-    """The oldest of them; once taken, there is room again."""
     talker = Talker()
     talker.wake(now_ns=EVENTS_MAX + 7)
     omitted, *events = talker.events()

@@ -1,4 +1,4 @@
-"""Every scenario that is not refused can be flown, however extreme its values are."""
+"""Every scenario that is accepted can be flown, however extreme its values are."""
 
 import os
 import typing
@@ -19,7 +19,7 @@ TRIGGERS = ["always", "periodic", "state_gap", "cost_gap | silence(1)", "budget(
 
 
 def values(kind: Any) -> st.SearchStrategy[Any]:
-    """Values of a type of a scenario: the extremes of its range, and anything between."""
+    """Values of a scenario's type: the extremes of its range, and any between."""
     origin, arguments = typing.get_origin(kind), typing.get_args(kind)
     if origin is typing.Annotated:
         metas = [each for each in arguments if isinstance(each, msgspec.Meta)]
@@ -35,7 +35,7 @@ def values(kind: Any) -> st.SearchStrategy[Any]:
 
 
 def bounded(base: type, meta: msgspec.Meta) -> st.SearchStrategy[Any]:
-    """Values of an annotated type: of a text, triggers."""
+    """Values of an annotated type; for a text, triggers."""
     if base is str:
         return st.sampled_from(TRIGGERS)
     low, high = meta.gt if meta.ge is None else meta.ge, meta.le
@@ -53,7 +53,6 @@ def bounded(base: type, meta: msgspec.Meta) -> st.SearchStrategy[Any]:
 
 
 def keys(section: type[msgspec.Struct], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Every key of a scenario, as it is written there, and its type."""
     for key, kind in typing.get_type_hints(section, include_extras=True).items():
         if isinstance(kind, type) and issubclass(kind, msgspec.Struct):
             yield from keys(kind, f"{prefix}{key}.")
@@ -66,13 +65,13 @@ KEYS = dict(keys(Scenario))
 
 @st.composite
 def drawn(draw: st.DrawFn) -> dict[str, Any]:
-    """Keys and values of a scenario: a few of them, or there would hardly be two that agree."""
+    """Keys and values of a scenario; few, because many random ones would contradict each other."""
     chosen = draw(st.lists(st.sampled_from(sorted(KEYS)), min_size=1, max_size=6, unique=True))
     return {key: draw(values(KEYS[key])) for key in chosen}
 
 
 def made(flat: Mapping[str, Any]) -> Scenario:
-    """The scenario with these keys, which takes at most fifty steps and two seconds to connect."""
+    """Scenario with these keys, with at most fifty steps and two seconds to connect."""
     table: dict[str, Any] = {}
     for key, value in {"settle": 0.0, **flat}.items():
         *sections, last = key.split(".")
@@ -87,7 +86,7 @@ def made(flat: Mapping[str, Any]) -> Scenario:
 
 
 def fly(scenario: Scenario) -> str:
-    """Fly a scenario; returns why it was not flown. What was flown and sent are numbers."""
+    """Fly a scenario; returns why it was not flown. Inputs and packets must be finite."""
     flown = flight.fly(scenario)
     assert np.isfinite(flown.client["state"]).all()
     assert np.isfinite(flown.client["input"]).all()
@@ -101,7 +100,6 @@ def fly(scenario: Scenario) -> str:
 )
 @given(drawn())
 def test_extreme_values_are_flown_or_refused_in_one_line(flat: dict[str, Any]) -> None:
-    """No number overflows, no step is divided by zero, and no warning is given."""
     try:
         said = fly(made(flat))
     except ConfigError as error:

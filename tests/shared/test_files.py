@@ -1,4 +1,4 @@
-"""Files that commands write: a plain file or a new name, whatever the option is called."""
+"""Outputs of commands: only a plain file or a new name is written, for every option."""
 
 import os
 import stat
@@ -40,17 +40,15 @@ CALLS: list[tuple[Any, tuple[str, ...], str]] = [
 
 
 def link(path: Path) -> None:
-    """A link to a file that is somebody else's."""
     path.symlink_to("precious")
 
 
 def dangling(path: Path) -> None:
-    """A link to where nothing is yet."""
     path.symlink_to("nothing")
 
 
 def device(path: Path) -> None:
-    """A device, by a name of its own where this user may make one."""
+    """Device, with a node of its own if this user may make one."""
     try:
         os.mknod(path, stat.S_IFCHR | 0o666, os.makedev(1, 3))
     except PermissionError:
@@ -59,7 +57,6 @@ def device(path: Path) -> None:
 
 @pytest.fixture(scope="module")
 def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A recording."""
     path = tmp_path_factory.mktemp("flight") / "flight.mcap"
     assert command.main(fly, ["demo", *SHORT, "--record", str(path)], "fly") == 0
     return path
@@ -78,7 +75,6 @@ def test_no_command_writes_through_a_link_or_to_a_device(
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    """It is refused before anything is flown, in one line, and stays what it is."""
     precious, at = tmp_path / "precious", tmp_path / f"it{suffix}"
     precious.write_text("precious")
     made(at)
@@ -126,7 +122,7 @@ def test_a_file_that_is_there_is_written_anew(tmp_path: Path) -> None:
 def test_a_file_that_is_exchanged_meanwhile_is_not_followed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Between the look at it and the opening, somebody puts a link there."""
+    """Between check and opening, another process puts a link there."""
     at, precious = tmp_path / "it", tmp_path / "precious"
     precious.write_text("precious")
 

@@ -1,4 +1,4 @@
-"""Gain of feedback aboard: that of the Riccati equation, whatever the dead time."""
+"""Gain of feedback aboard: that of the Riccati equation, for any dead time."""
 
 from typing import Any
 
@@ -38,7 +38,7 @@ def test_it_is_that_of_the_riccati_equation(q: float, r: float, s: float) -> Non
 def test_a_trajectory_s_regulator_is_that_of_the_riccati_equation_with_changes(
     q: float, r: float, s: float
 ) -> None:
-    """The input before is a state of its own: u = λ u(k-1) - (1 - λ) K x."""
+    """The previous input is a state: u = λ u(k-1) - (1 - λ) K x."""
     weights = {"state_weight": [7.1, q], "input_weight": r, "change_weight": s}
     flown = scenario(model={"tau_s": [0.81, 0.3], "gain": 0.8}, control=weights)
     model = flown.terms().model
@@ -75,7 +75,7 @@ def test_noise_of_the_measurements_asks_for_no_other_gain() -> None:
     Q, R = np.diag(FIRM.state_weight), FIRM.input_weight
 
     def cost(gain: Array) -> float:
-        """Mean cost of a step in which the estimate is what is fed back."""
+        """Mean cost of a step with feedback of the estimate."""
         left = MODEL.A[0] - np.outer(MODEL.B[0], gain)
         if np.abs(np.linalg.eigvals(left)).max() >= 1.0:
             return np.inf
@@ -92,7 +92,7 @@ def test_noise_of_the_measurements_asks_for_no_other_gain() -> None:
 
 
 def scenario(**sections: Any) -> Scenario:
-    """The demo at firm weights in calm air, its inputs 0.3 s late; sections are laid over."""
+    """The demo at tight weights in calm air, with 0.3 s of dead time and sections changed."""
     late = {
         "duration": 20.0,
         "settle": 5.0,

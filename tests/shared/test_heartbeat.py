@@ -1,4 +1,4 @@
-"""Heartbeats: how long an end may be silent, and what that costs."""
+"""Heartbeats: allowed silence of an end, and its cost."""
 
 from functools import partial
 
@@ -40,12 +40,11 @@ ear = partial(Hearing, 2 * SECOND_NS, DT_NS, None)
     ids=["twice", "heartbeats are given", "as long as it remembers", "as the vehicle asks"],
 )
 def test_the_server_waits_longer_than_the_vehicle(link: LinkConfig, patience_s: float) -> None:
-    """Twice as long where heartbeats follow the loss, but no longer than it remembers a vehicle."""
+    """Twice as long with adaptive heartbeats, but no longer than it remembers a vehicle."""
     assert link.patience_ns == round(patience_s * SECOND_NS)
 
 
 def hear(hearing: Hearing, number: int) -> None:
-    """Hear a packet by its number in the session; one is sent a millisecond."""
     hearing.hear(number % NUMBERS, number * MILLISECOND_NS)
 
 
@@ -56,7 +55,7 @@ def hear(hearing: Hearing, number: int) -> None:
 def test_false_losses_are_runs_of_lost_heartbeats(
     timeout_s: float, period_s: float, loss: float, per_h: float
 ) -> None:
-    """3600/T pⁿ (1 - p): n = 9, 9 and 3 fit into 0.95 of the time-out."""
+    """3600/T pⁿ (1 - p): n = 9, 9 and 3 fit into 0.95 of the timeout."""
     found = false_per_h(round(period_s * SECOND_NS), round(timeout_s * SECOND_NS), loss)
     assert found == pytest.approx(per_h, rel=2e-3)
 
@@ -65,7 +64,7 @@ def test_false_losses_are_runs_of_lost_heartbeats(
 def test_what_is_asked_for_meets_the_goal_or_is_the_shortest(
     timeout_ms: int, step_ms: int, loss: float
 ) -> None:
-    """A whole number of steps, from a fifteenth to a third of the time-out where steps allow."""
+    """A whole number of steps, from a fifteenth to a third of the timeout if steps allow."""
     timeout_ns, step_ns = timeout_ms * MILLISECOND_NS, step_ms * MILLISECOND_NS
     table = silences(timeout_ns, step_ns)
     times_ns = [ns for _, ns in table]
@@ -83,14 +82,13 @@ def test_what_is_asked_for_meets_the_goal_or_is_the_shortest(
     ("loss", "period_s"), [(0.0, 0.6), (0.05, 0.45), (0.1, 0.35), (0.2, 0.2), (0.3, 0.15)]
 )
 def test_a_lossier_link_is_asked_for_more(loss: float, period_s: float) -> None:
-    """With a time-out of 2 s and steps of 50 ms, once much has been heard."""
     table = silences(2 * SECOND_NS, DT_NS)
     found = next(ns for up_to, ns in table if loss + 0.005 * (loss == 0.0) <= up_to)
     assert found == round(period_s * SECOND_NS)
 
 
 def test_a_new_session_assumes_a_loss_of_three_in_ten() -> None:
-    """It unlearns that with what comes; late, doubled and missing packets count as they are."""
+    """The estimate follows the packets; late, duplicate and missing ones count correctly."""
     hearing = ear()
     assert hearing.loss == ASSUMED
     assert hearing.silence_ns == 150 * MILLISECOND_NS - DT_NS // 2
@@ -132,14 +130,14 @@ def test_of_a_burst_no_more_than_its_rest_by_the_modulus_is_seen(burst: int) -> 
 
 def test_a_number_that_is_asked_for_is_asked_for_whatever_the_loss() -> None:
     hearing = Hearing(2 * SECOND_NS, DT_NS, SECOND_NS // 4)
-    assert hearing.silence == 10  # of half a step of 50 ms
+    assert hearing.silence == 10  # half steps of 50 ms
     hear(hearing, 100)
     assert hearing.silence == 10
 
 
 @pytest.mark.parametrize(("loss", "packets_per_s"), [(0.1, 1.4), (0.3, 2.7)])
 def test_a_link_at_rest_is_rarely_taken_for_lost(loss: float, packets_per_s: float) -> None:
-    """In three hours; where heartbeats do not follow the loss, far more often."""
+    """Over three hours; with fixed heartbeats, far more often."""
     network = f"paper(0.4, 0.02, 2.0) & loss({loss})"
     kept = keep(network, 18, LinkConfig(timeout_s=2.0))
     assert kept.false_per_h <= 0.34
@@ -151,7 +149,7 @@ def test_a_link_at_rest_is_rarely_taken_for_lost(loss: float, packets_per_s: flo
 
 @pytest.mark.parametrize("loss", [0.0, 0.1])
 def test_a_hover_in_still_air_costs_the_heartbeats_and_no_more(loss: float) -> None:
-    """Both ends settle at what the loss asks for, and the vehicle's at what a longer wait needs."""
+    """Both ends settle at the rate that the loss requires."""
     calm = {"vehicle.wind": 0.0, "reference.shape": "hover", "reference.points_m": [[0.0, 0.0]]}
     way = {"network.uplink.loss": loss, "network.downlink.loss": loss}
     scenario = skytether.load("demo", duration=60, settle=5, **calm, **way)

@@ -1,11 +1,10 @@
-"""`shared.telemetry.histogram`: durations in bins, and quantiles that do not flatter."""
+"""`shared.telemetry.histogram`: durations in bins, and quantiles that are never too small."""
 
 from skytether.shared.base.units import MILLISECOND_NS
 from skytether.shared.telemetry.histogram import BINS, Histogram
 
 
 def filled(*values_ns: int) -> Histogram:
-    """A histogram with bins of 10 ns."""
     histogram = Histogram(10)
     for value_ns in values_ns:
         histogram.add(value_ns)

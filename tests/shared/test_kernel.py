@@ -1,4 +1,4 @@
-"""Machine code of kernels on disk is used as long as all that it was made of is the same."""
+"""Cache of compiled kernels: valid as long as all sources of a kernel are unchanged."""
 
 import resource
 import subprocess
@@ -112,21 +112,19 @@ print([each.name for each in kernels], len(done), kernel.missing())
 
 
 def put(folder: Path, helper: str = HELPER, caller: str = CALLER) -> Path:
-    """A folder with both modules."""
     (folder / "helper.py").write_text(helper)
     (folder / "caller.py").write_text(caller)
     return folder
 
 
 MODULE = CALLER.split("\nvalues = ", maxsplit=1)[0]
-"""The caller's kernel alone."""
+"""The caller's kernel without the call."""
 
 
 def run(folder: Path, file_bytes: int = resource.RLIM_INFINITY) -> str:
     """Output of the caller: the result, and 1 if its machine code came from the disk.
 
-    Args:
-        file_bytes: size at which a file cannot grow, as if the disk were full.
+    `file_bytes`: size beyond which a file cannot grow, as on a full disk.
     """
     done = subprocess.run(
         [sys.executable, "caller.py"],
@@ -134,7 +132,7 @@ def run(folder: Path, file_bytes: int = resource.RLIM_INFINITY) -> str:
         env={
             "PYTHONPATH": f"{Path(__file__).parents[2]}:{folder}",
             "HOME": str(folder),
-            "PYTHONDONTWRITEBYTECODE": "1",  # Python itself keeps what it could write half of
+            "PYTHONDONTWRITEBYTECODE": "1",  # Python would leave a truncated .pyc
         },
         capture_output=True,
         text=True,
@@ -172,7 +170,6 @@ def test_a_help_and_a_refusal_compile_nothing(tmp_path: Path) -> None:
 
 
 def test_what_is_compiled_is_said_once(tmp_path: Path) -> None:
-    """A line where there is no terminal; nothing where machine code is on disk."""
     put(tmp_path, caller=MODULE)
     said = "compiling control loops, once on this machine: takes up to a minute\n"
     assert quiet(tmp_path, PREPARED) == said
@@ -181,7 +178,7 @@ def test_what_is_compiled_is_said_once(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("helpers", ["helped", "alone"])
 def test_kernels_are_compiled_by_other_processes(tmp_path: Path, helpers: str) -> None:
-    """Their machine code is read from the disk; where no helper can be started, it is made here."""
+    """Their machine code is read from the disk; without helpers this process compiles."""
     (tmp_path / "helper.py").write_text(HELPER)
     for name in ("caller", "second"):
         (tmp_path / f"{name}.py").write_text(MODULE)
@@ -253,7 +250,7 @@ for name in sys.argv[1:]:  # each in a process that has nothing in memory, but t
 
 
 def test_a_server_has_all_kernels_of_its_scheme_in_memory_before_it_flies() -> None:
-    """No other kernel is called in flight, and nothing at all is compiled, not even for figures."""
+    """In flight no other kernel is called, and nothing is compiled, not even for figures."""
     names = ["demo", "demo-committed", "paper", "paper-no-compensation", "swap"]
     done = subprocess.run(
         [sys.executable, "-P", "-c", CALLED, *names], capture_output=True, text=True, check=True
@@ -267,7 +264,7 @@ ALWAYS = {"clock", "controller", "desired", "plausibility"}
 
 @pytest.mark.parametrize("scenario", ["demo", "demo-committed", "paper", "swap"])
 def test_a_server_loads_no_kernel_of_another_scheme(scenario: str) -> None:
-    """A module with kernels belongs to schemes that are named, or to all of them."""
+    """A module with kernels belongs to named schemes, or to all of them."""
     import_module("skytether.server.endpoint")
     own = other_schemes(reading.load("paper")) | other_schemes(reading.load("swap"))
     own -= other_schemes(reading.load(scenario))
@@ -277,7 +274,6 @@ def test_a_server_loads_no_kernel_of_another_scheme(scenario: str) -> None:
 
 
 def test_a_kernel_refuses_other_types_than_its_own(tmp_path: Path) -> None:
-    """At its first call, and at each where that is asked for, as in all tests."""
     put(tmp_path, caller=MODULE)
     assert quiet(tmp_path, REFUSING) == ""
     assert quiet(tmp_path, REFUSING, "checked") == ""

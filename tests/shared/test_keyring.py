@@ -1,4 +1,4 @@
-"""Keys: the file that holds them, the command that makes it, and that no secret is shown."""
+"""Keys: their file, the command that makes it, and that no secret is shown."""
 
 import pickle
 import re
@@ -21,27 +21,22 @@ A, B, C = (bytes([i]) * 32 for i in (0xA1, 0xB2, 0xC3))
 
 
 class Run(NamedTuple):
-    """Outcome of a command."""
-
     returncode: int
     stdout: str
     stderr: str
 
 
 def keygen(*argv: str, cwd: Path) -> Run:
-    """`skytether keygen` in a folder."""
     with chdir(cwd), redirect_stdout(StringIO()) as out, redirect_stderr(StringIO()) as err:
         code = command.main(keygen_, argv, "keygen")
     return Run(code, out.getvalue(), err.getvalue())
 
 
 def keyring(*lines: str) -> Keyring:
-    """Keys in the given lines."""
     return parse("keys", "".join(lines).encode())
 
 
 def put(path: Path, content: bytes, mode: int = 0o600) -> Path:
-    """A file with a mode."""
     path.write_bytes(content)
     path.chmod(mode)
     return path
@@ -93,7 +88,6 @@ GOOD = f"1 1 {A.hex()}"
     ],
 )
 def test_a_line_that_is_none_is_refused_and_not_repeated(content: str, message: str) -> None:
-    """The message says where and what was expected, and shows nothing of a secret."""
     with pytest.raises(ConfigError, match=f"^keys: {message}") as error:
         parse("keys", content.encode())
     assert "\n" not in str(error.value)
@@ -118,7 +112,7 @@ def test_a_file_that_others_can_read_or_write_is_refused(mode: int, tmp_path: Pa
 
 
 def test_a_file_that_others_can_put_another_for_is_refused(tmp_path: Path) -> None:
-    """By a link, in a folder that anybody may write to, sticky or not, and within such a folder."""
+    """Links, and folders that anybody may write to, sticky or not, and folders within them."""
     content = write(1, 1, A).encode()
     folder = tmp_path / "open" / "own"
     folder.mkdir(parents=True)

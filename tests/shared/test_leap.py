@@ -1,11 +1,10 @@
-"""Leaps: how far a vehicle's own state may change within a time, by value."""
+"""Jumps: the largest change of a vehicle's own state within a time, in numbers."""
 
 import pytest
 
 from skytether.shared.law.leap import position_leaps, velocity_leaps
 
 LEAST = 1e-9
-"""Smallest excess over a bound that counts [m, m/s]."""
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""Checks of missions: which goals are too near to each other, whatever the number of vehicles."""
+"""Checks of missions: goals that are too near to each other, for any number of vehicles."""
 
 import resource
 from itertools import combinations
@@ -13,7 +13,7 @@ from skytether.shared.scenario.tracks import tracks
 Goals = dict[int, tuple[Array, Array]]
 MANY = 20_000
 CPU_S = 30.0
-"""Longest time for MANY vehicles [s], which take half a second; each with each takes minutes."""
+"""Time limit for MANY vehicles [s]: the check takes half a second, comparing all pairs minutes."""
 
 
 def each_with_each(goals: Goals, apart_m: float, height: float) -> tuple[float, float] | None:
@@ -76,7 +76,6 @@ def test_paths_that_come_too_near_are_found_between_their_points(seed: int) -> N
 
 
 def grid(vehicles: int) -> Array:
-    """Places on a square grid of 1 m."""
     return np.stack(np.divmod(np.arange(vehicles), round(vehicles**0.5)), axis=1).astype(float)
 
 
@@ -100,7 +99,7 @@ def test_many_vehicles_are_checked_in_proportion() -> None:
 
 
 def test_numbers_of_vehicles_are_those_that_fly() -> None:
-    """The link has two bytes for them."""
+    """Numbers have two bytes on the wire."""
     for number in (0, 65_536, 1.5):
         with pytest.raises(ValueError, match="line 2: vehicle: expected numbers"):
             tracks(f"vehicle,t,x,y\n{number},0,0,0\n".encode(), 2)

@@ -1,4 +1,4 @@
-"""The model of the UAV, eq. (1)-(4): its discretisation is exact, for every axis and any Δt."""
+"""Model of the UAV, eq. (1)-(4): the discretisation is exact, for every axis and any Δt."""
 
 from collections.abc import Callable
 from typing import Any
@@ -17,7 +17,7 @@ quick = settings(max_examples=60)
 
 
 def sampled(tau_s: float, dt_s: float) -> tuple[np.ndarray, np.ndarray]:
-    """A and B of one axis: the exponential of eq. (2)-(3), the input held beside the state."""
+    """A and B of one axis: the exponential of eq. (2)-(3), with constant input."""
     rate = np.array([[0.0, 1.0, 0.0], [0.0, -1.0 / tau_s, 1.0 / tau_s], [0.0, 0.0, 0.0]])
     exponential = expm(rate * dt_s)
     return exponential[:2, :2], exponential[:2, 2]
@@ -67,7 +67,7 @@ def test_a_roll_is_its_steps() -> None:
 
 @pytest.mark.parametrize("step", [advance, part(shared)])
 def test_one_axis_in_numbers_steps_as_all_in_arrays(step: Callable[..., Any]) -> None:
-    """To the last bit, compiled or not: what a client flies is what the server reckons with."""
+    """To the last bit, compiled or not, because client and server must agree."""
     model, rng = discretise([0.8, 0.3, 1.1], 0.05), np.random.default_rng(1)
     x, u = rng.normal(size=(3, 2)), rng.normal(size=3)
     for _ in range(100):

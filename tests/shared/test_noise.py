@@ -1,4 +1,4 @@
-"""The handshake: byte for byte Noise, and what it refuses."""
+"""Handshake: equal to Noise byte for byte, and refusals."""
 
 import hashlib
 from functools import partial
@@ -26,15 +26,10 @@ class Vector(NamedTuple):
     hello: str
     welcome: str
     first: str
-    """First message of the handshake."""
     second: str
-    """Second message."""
     forth_0: str
-    """First packet of the initiator, "forth"."""
     forth_1: str
-    """Second packet of the initiator, "forth"."""
     back_0: str
-    """First packet of the responder, "back"."""
 
 
 # fmt: off
@@ -74,18 +69,15 @@ VECTORS = [
 
 
 def fixed(name: str) -> bytes:
-    """Key for the vectors."""
     return hashlib.blake2s(name.encode()).digest()
 
 
 def shake(psk: bytes, prologue: bytes = b"") -> tuple[Initiator, Responder]:
-    """Two ends, after the first message."""
     initiator = Initiator(psk, prologue, fixed("a"), b"hello")
     return initiator, Responder(psk, prologue, initiator.message)
 
 
 def packet(key: bytes, counter: int, payload: bytes) -> bytes:
-    """Transport message of Noise."""
     nonce = bytes(4) + counter.to_bytes(8, "little")
     return ChaCha20Poly1305(key).encrypt(nonce, payload, b"")
 
@@ -134,7 +126,7 @@ def test_a_message_that_was_changed_is_refused() -> None:
             changed = bytearray(message)
             changed[i // 8] ^= 1 << i % 8
             wrong.append(bytes(changed))
-        # The highest bit of a public key has no meaning, but is authenticated all the same.
+        # The highest bit of a public key has no effect on the secret, but is authenticated.
         for changed in wrong:
             with pytest.raises(NoiseError):
                 read(bytes(changed))
@@ -157,7 +149,7 @@ def test_an_answer_to_another_attempt_is_refused() -> None:
 
 
 def test_an_ephemeral_key_without_secret_is_refused() -> None:
-    """The point 0 gives the same secret with every private key; only who has the psk can try."""
+    """The point 0 gives the same secret with every key; only the owner of the psk can try."""
     initiator, _ = shake(PSK)
     with pytest.raises(NoiseError):
         initiator.open(bytes(KEY_BYTES) + bytes(16))

@@ -1,4 +1,4 @@
-"""Plug-ins: triggers and references of files and packages, in every process; their mistakes."""
+"""Plug-ins: triggers and references from files and packages in all processes; mistakes."""
 
 import csv
 import importlib.util
@@ -60,7 +60,6 @@ class bad(Impairment):
 
 
 def plug(folder: Path, code: str, name: str = "mine.py") -> str:
-    """Path of a plug-in that is imported."""
     path = folder / name
     path.write_text(HEAD + dedent(code))
     plugins.load([str(path)])
@@ -68,20 +67,17 @@ def plug(folder: Path, code: str, name: str = "mine.py") -> str:
 
 
 def scenario(**sections: Any) -> Scenario:
-    """The scenario demo-committed for ten seconds, with other keys in its sections."""
     return packaged("demo-committed", {"duration": 10.0}, sections)
 
 
 def flown(trigger: str, **control: Any) -> Record:
-    """The scenario's flight with a trigger."""
     return fly(scenario(control={"trigger": trigger} | control))
 
 
-# -- what the documents say ------------------------------------------------------------------------
+# -- documented plug-ins ---------------------------------------------------------------------------
 
 
 def example(document: Path) -> str:
-    """The one plug-in in a document."""
     blocks: list[str] = re.findall(r"```python\n(.*?)```", document.read_text(), re.DOTALL)
     (code,) = (block for block in blocks if "skytether.plugin import" in block)
     return code
@@ -100,7 +96,6 @@ def example(document: Path) -> str:
 def test_the_documented_plugin_flies_with_the_documented_command(
     document: Path, file: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The page's example, saved under the name it gives, flies with the page's command."""
     (line,) = re.findall(rf"^skytether .*--plugin {file}.*$", document.read_text(), re.MULTILINE)
     (tmp_path / file).write_text(example(document))
     with chdir(tmp_path):
@@ -109,7 +104,7 @@ def test_the_documented_plugin_flies_with_the_documented_command(
 
 
 def test_the_documented_trigger_sends_where_the_velocity_is_off(tmp_path: Path) -> None:
-    """More often with a tighter bound, and never later than the silence beside it."""
+    """More often with a tighter bound, and never later than the `silence` combined with it."""
     plug(tmp_path, example(TRIGGERS_MD))
     loose, tight = (flown(f"slip({mps}) | silence(1)").server for mps in (0.3, 0.05))
     assert 0 < loose["event"].sum() < tight["event"].sum()
@@ -117,7 +112,6 @@ def test_the_documented_trigger_sends_where_the_velocity_is_off(tmp_path: Path) 
 
 
 def test_the_documented_reference_moves_as_fast_as_it_says(tmp_path: Path) -> None:
-    """Its velocity is the slope of its positions; at the end it rests at `radius_m`."""
     plug(tmp_path, example(SCHEMES_MD))
     wanted = {"shape": "spiral(2)", "period_s": 40.0, "radius_m": 3.0}
     at = scenario(reference=wanted).make_reference()
@@ -132,7 +126,7 @@ def test_the_documented_policies_are_those_that_there_are() -> None:
     assert set(TRIGGERS) <= set(rows)
 
 
-# -- how they are listed ---------------------------------------------------------------------------
+# -- lists -----------------------------------------------------------------------------------------
 
 
 def test_triggers_are_listed_with_a_sentence_each(
@@ -153,11 +147,11 @@ def test_references_are_listed_with_a_sentence_each(capsys: pytest.CaptureFixtur
     assert "figure-eight\n    Lemniscate, 2 `radius_m` wide" in said
 
 
-# -- what a policy is given ------------------------------------------------------------------------
+# -- situation of a policy -------------------------------------------------------------------------
 
 
 def test_a_policy_is_given_what_it_may_know(tmp_path: Path) -> None:
-    """Every field has its shape, and nothing can be written into the server's own arrays."""
+    """Every field has its shape, and the server's own arrays cannot be written."""
     code = """
         @trigger
         def look(now):
@@ -180,7 +174,6 @@ def test_a_policy_is_given_what_it_may_know(tmp_path: Path) -> None:
 
 
 def test_plan_horizon_and_desired_states_are_those_that_are_flown(tmp_path: Path) -> None:
-    """A plan is what is sent; with no loss, what is held aboard is the plan that was sent last."""
     code = """
         @trigger
         def look(now):
@@ -204,7 +197,7 @@ def test_plan_horizon_and_desired_states_are_those_that_are_flown(tmp_path: Path
         last = max((each for each in sent if each < step), default=None)
         if last is not None:
             inputs = sent[last]["inputs"][:, start - sent[last]["begins"] :]
-            # The vehicle's clamp cuts off what a float32 is above the bound.
+            # The vehicle's clamp removes the excess of a rounded float32 over the bound.
             np.testing.assert_allclose(held[:, : inputs.shape[1]], inputs, rtol=1e-7)
             compared += 1
         times = (start + np.arange(desired.shape[1])) * asked.control.dt
@@ -214,7 +207,7 @@ def test_plan_horizon_and_desired_states_are_those_that_are_flown(tmp_path: Path
 
 
 def test_what_is_held_aboard_is_known_with_committed_inputs_alone(tmp_path: Path) -> None:
-    """Elsewhere it is a mistake to ask, which is told."""
+    """With other schemes asking is a mistake, which is logged."""
     plug(tmp_path, "@trigger\ndef look(now):\n    return now.held[:, 0, 0] > 0.0\n")
     (said,) = faults(flown("look", scheme="predictive"))
     known = "held: expected control.scheme = 'committed'"
@@ -245,7 +238,6 @@ def test_a_vehicle_that_was_sent_nothing_is_sent_to_whatever_a_function_says(
 
 
 def test_a_class_remembers_what_was_sent(tmp_path: Path) -> None:
-    """Written anew, `periodic` flies as ours does, to the last bit."""
     code = """
         @trigger(name="every")
         class Every(Trigger):
@@ -270,7 +262,6 @@ def test_a_class_remembers_what_was_sent(tmp_path: Path) -> None:
 
 
 def test_figures_of_a_plugin_are_recorded_and_a_batch_is_its_singles(tmp_path: Path) -> None:
-    """With `above`, the record has figure and threshold."""
     code = """
         @trigger
         def far(now, m: float = 0.2):
@@ -329,7 +320,6 @@ def test_arguments_of_a_plugin_are_checked_like_ours(
 def test_every_bound_of_msgspec_holds(
     bound: str, right: str, wrong: str, form: str, tmp_path: Path
 ) -> None:
-    """As it does for keys of a scenario: `jolt(-0.2)` does not fly where it is to be above 0."""
     code = f"""
         from typing import Annotated
         from msgspec import Meta
@@ -356,7 +346,6 @@ def test_every_bound_of_msgspec_holds(
 def test_every_bound_of_a_text_holds(
     bound: str, right: str, wrong: str, form: str, tmp_path: Path
 ) -> None:
-    """Impairments take words and names of files."""
     code = f"""
         from typing import Annotated, Literal
         from msgspec import Meta
@@ -397,7 +386,6 @@ def test_a_plugin_may_take_negative_numbers_and_have_defaults(tmp_path: Path) ->
 
 
 def test_a_plugin_that_needs_a_scheme_is_refused_with_another(tmp_path: Path) -> None:
-    """The refusal is worded as for a packaged trigger."""
     code = """
         @trigger(needs="held")
         def mine(now):
@@ -498,7 +486,7 @@ def test_a_file_that_cannot_be_read_is_refused_in_one_line(
 
 
 def test_two_files_cannot_have_one_name(tmp_path: Path) -> None:
-    """A file that is imported again, with other content, takes the place of itself."""
+    """A file that is imported again, with other content, replaces itself."""
     one = plug(tmp_path, NEVER, "one.py")
     said = refusal(lambda: plug(tmp_path, NEVER, "two.py"))
     assert said.endswith(f"policy never: expected another name, {one} has one of this name")
@@ -535,7 +523,6 @@ MISTAKES = {
 
 @pytest.mark.parametrize(("body", "said"), MISTAKES.values(), ids=MISTAKES)
 def test_a_trigger_that_fails_sends_and_is_told_once(body: str, said: str, tmp_path: Path) -> None:
-    """A packet too many costs bytes, one too few the flight."""
     plug(tmp_path, f"@trigger\ndef bad(now):\n    {body}\n")
     flight, always = flown("bad"), flown("always")
     assert faults(flight) == [f"the trigger bad: {said}; when it fails, a horizon is sent"]
@@ -545,13 +532,11 @@ def test_a_trigger_that_fails_sends_and_is_told_once(body: str, said: str, tmp_p
 
 
 def test_a_budget_caps_a_trigger_that_fails(tmp_path: Path) -> None:
-    """Two packets at once, and one a second."""
     plug(tmp_path, "@trigger\ndef bad(now):\n    raise RuntimeError\n")
     assert 0 < flown("bad & budget(1, 2)").server["event"].sum() <= 12
 
 
 def test_a_class_may_fail_anywhere(tmp_path: Path) -> None:
-    """It is told once in all, and the flight goes on."""
     code = """
         @trigger(name="bad")
         class Bad(Trigger):
@@ -574,7 +559,6 @@ def test_a_class_may_fail_anywhere(tmp_path: Path) -> None:
 
 
 def test_a_batch_with_a_trigger_that_fails_is_no_measurement(tmp_path: Path) -> None:
-    """It ends with what the trigger's mistake is."""
     plug(tmp_path, "@trigger\ndef bad(now):\n    raise RuntimeError('no')\n")
     said = refusal(lambda: fly_batch(scenario(control={"trigger": "bad"}), [1, 2]))
     assert said == "the trigger bad: RuntimeError: no; when it fails, a horizon is sent"
@@ -625,7 +609,7 @@ def test_a_reference_that_cannot_be_flown_is_refused(body: str, said: str, tmp_p
     "shape", [" circle", "circle()", "slope & circle", "slope(1, 2)", "circle(1)"]
 )
 def test_a_shape_is_written_in_one_way(shape: str, tmp_path: Path) -> None:
-    """Code that compares a shape with a name meets no other text for it."""
+    """Code that compares a shape with a name must meet only one form."""
     plug(tmp_path, SLOPE)
     assert f"reference.shape: got {shape!r}" in refusal(
         lambda: scenario(reference={"shape": shape})
@@ -633,7 +617,6 @@ def test_a_shape_is_written_in_one_way(shape: str, tmp_path: Path) -> None:
 
 
 def test_ends_whose_references_differ_have_other_terms(tmp_path: Path) -> None:
-    """In name, numbers or what the function gives, but not in how that is computed."""
     terms = []
     for states in ("mps * t", "t * mps + 1e-9", "0.999 * mps * t"):
         plug(tmp_path, SLOPE.replace("mps * t", states))
@@ -649,7 +632,6 @@ def test_ends_whose_references_differ_have_other_terms(tmp_path: Path) -> None:
 
 
 def test_a_long_shape_fits_the_wire(tmp_path: Path) -> None:
-    """Its beginning and a digest, 32 characters at most."""
     name = "a_name_that_is_a_good_deal_longer_than_others"
     plug(tmp_path, SLOPE.replace("slope", name))
     shapes = [scenario(reference={"shape": f"{name}({mps})"}).terms().shape for mps in (0.1, 0.2)]
@@ -658,7 +640,6 @@ def test_a_long_shape_fits_the_wire(tmp_path: Path) -> None:
 
 
 def test_the_terms_of_our_shapes_are_their_names() -> None:
-    """Their other properties follow from other terms."""
     for shape in ("circle", "figure-eight", "square", "target", "live"):
         assert scenario(reference={"shape": shape}).terms().shape == shape
     assert all(entry.is_ours for entry in REFERENCES.values())
@@ -668,7 +649,6 @@ def test_the_terms_of_our_shapes_are_their_names() -> None:
 
 
 def test_a_worker_is_given_the_plugin_with_its_content(tmp_path: Path) -> None:
-    """Also where the file is gone, or is another one by now."""
     path = plug(tmp_path, NEVER)
     job = partial(_equipped, lambda name: name in TRIGGERS, plugins.loaded())
     Path(path).unlink()
@@ -679,7 +659,7 @@ def test_a_worker_is_given_the_plugin_with_its_content(tmp_path: Path) -> None:
 
 
 def test_a_journal_knows_the_plugins_that_its_results_follow_from(tmp_path: Path) -> None:
-    """By the digest of their content; those that are not named do not count."""
+    """By the digest of their content; unused plug-ins do not count."""
     path = plug(tmp_path, NEVER)
     plug(tmp_path, SLOPE, "unused.py")
     named = scenario(control={"trigger": "never | silence(1)"})
@@ -704,7 +684,6 @@ def test_a_journal_knows_the_plugins_that_its_results_follow_from(tmp_path: Path
 def test_commands_of_the_laboratory_take_the_flag_several_times(
     argv: list[str], said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Each file is imported, in order, before the command refuses something else."""
     files = [tmp_path / "one.py", tmp_path / "two.py"]
     for path, code in zip(files, (NEVER, SLOPE), strict=True):
         path.write_text(HEAD + code)
@@ -717,7 +696,7 @@ def test_commands_of_the_laboratory_take_the_flag_several_times(
 
 @pytest.mark.usefixtures("here")
 def test_a_sweep_flies_with_the_triggers_of_several_files(tmp_path: Path) -> None:
-    """A cell for each: one never sends but for silence, one whenever it can."""
+    """A cell for each: one never sends except by `silence`, one whenever possible."""
     other = NEVER.replace("never", "ever").replace("zeros", "ones")
     given = []
     for name, code in (("one.py", NEVER), ("two.py", other)):
@@ -736,7 +715,6 @@ SHORT = "--settle 0 --duration 4 --reference.shape slope(0.4)"
 
 
 def run(line: str, *more: str, folder: Path, path: str = "") -> str:
-    """Output of a command that must succeed, run as a process of its own."""
     argv = [sys.executable, "-P", "-m", "skytether", *line.split(), *more]
     env = os.environ | {"PYTHONPATH": path}
     done = subprocess.run(argv, cwd=folder, env=env, capture_output=True, text=True, check=False)
@@ -746,7 +724,6 @@ def run(line: str, *more: str, folder: Path, path: str = "") -> str:
 
 @pytest.fixture(scope="session")
 def installed(tmp_path_factory: pytest.TempPathFactory) -> str:
-    """Folder that tests/plugin_package is installed into."""
     folder = tmp_path_factory.mktemp("installed")
     with chdir(ROOT / "tests" / "plugin_package"):
         wheel = build_wheel(str(folder))
@@ -757,23 +734,23 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> str:
 def test_an_installed_package_adds_a_trigger_a_reference_and_a_vehicle(
     installed: str, tmp_path: Path
 ) -> None:
-    """Without a flag, and without a change of Skytether."""
-    about = "Sends where the velocity is off its plan by more than so many m/s. (from my_package)"
+    about = (
+        "Sends if the velocity differs from its plan by more than so many m/s. (from my_package)"
+    )
     listed = run("triggers", folder=tmp_path, path=installed)
     assert f"slip(mps=0.3) with 0 <= mps\n    {about}\n" in listed
     trigger = ("--control.trigger", "slip & budget(5, 2) | silence(1)")
     flies = ("--vehicle.kind", "rail")
     argv = (*trigger, *flies)
     assert "RMSE" in run(f"fly demo --virtual {SHORT}", *argv, folder=tmp_path, path=installed)
-    assert "rail\n    Vehicle that has any velocity" in run(
+    assert "rail\n    Vehicle that reaches any velocity" in run(
         "vehicles", folder=tmp_path, path=installed
     )
 
 
 def test_an_installed_package_adds_a_scheme(installed: str, tmp_path: Path) -> None:
-    """It is listed, and flown by the trigger whose figure it computes."""
     listed = run("schemes", folder=tmp_path, path=installed)
-    assert "beacon\n    Sends where the vehicle should be now and how fast" in listed
+    assert "beacon\n    Sends the present state of the reference" in listed
     control = "--control.scheme beacon --control.trigger deviation(0.1)"
     line = f"fly demo --virtual --settle 0 --duration 8 {control}"
     assert "RMSE" in run(line, folder=tmp_path, path=installed)
@@ -816,7 +793,6 @@ def test_an_installed_package_adds_an_impairment(installed: str, tmp_path: Path)
     ],
 )
 def test_a_mistake_of_an_impairment_ends_no_flight(mistake: str, tmp_path: Path) -> None:
-    """It changes nothing, and is told once a flow and direction."""
     plug(tmp_path, IMPAIRING.format(mistake=mistake))
     network = {"uplink": "constant(0.2) & bad", "downlink": "constant(0.2)"}
     flight = fly(scenario(network=network))
@@ -828,7 +804,7 @@ def test_a_mistake_of_an_impairment_ends_no_flight(mistake: str, tmp_path: Path)
 @pytest.mark.long
 @pytest.mark.timeout(400)
 def test_every_process_of_a_flight_knows_the_plugin(tmp_path: Path) -> None:
-    """Over UDP: a trigger's mistake is told, and a reference is flown by both ends."""
+    """Over UDP: a trigger's mistake is logged, and both ends know the reference."""
     bad = "@trigger\ndef bad(now):\n    raise RuntimeError('no')\n"
     (tmp_path / "mine.py").write_text(HEAD + SLOPE + bad)
     plugged = f"{SHORT} --plugin mine.py --record flight.mcap"
@@ -841,7 +817,6 @@ def test_every_process_of_a_flight_knows_the_plugin(tmp_path: Path) -> None:
 @pytest.mark.long
 @pytest.mark.timeout(400)
 def test_workers_of_every_kind_know_the_plugin(tmp_path: Path) -> None:
-    """Processes of sweep and calibrate, and of a fleet's server."""
     (tmp_path / "mine.py").write_text(HEAD + SLOPE + NEVER)
     here = f"--workers 2 --plugin mine.py {SHORT}"
     grid = 'control.trigger="never | silence(1)","always"'
@@ -855,7 +830,6 @@ def test_workers_of_every_kind_know_the_plugin(tmp_path: Path) -> None:
 @pytest.mark.timeout(400)
 @pytest.mark.skipif(importlib.util.find_spec("distributed") is None, reason="needs `distributed`")
 def test_a_dask_worker_knows_the_plugin(tmp_path: Path) -> None:
-    """One that was there before, in a folder without the file."""
     (tmp_path / "mine.py").write_text(HEAD + NEVER)
     elsewhere = tmp_path / "elsewhere"
     elsewhere.mkdir()

@@ -1,4 +1,4 @@
-"""Triggers as texts: one is a trigger, or it is refused in one line; nothing in it is ever run."""
+"""Texts of triggers: parsed, or refused in one line; never executed."""
 
 import string
 from typing import Any
@@ -99,17 +99,15 @@ REFUSED = {
     "state_gap(1, epsilon=2)": ("state_gap(1, epsilon=2)", GAP),
     "state_gap(lambda=2)": ("state_gap(lambda=2)", GAP),
 }
-"""Texts that are no trigger, each with the part that is named as wrong and what was expected."""
+"""Invalid texts, each with the part that is named as wrong and the expected form."""
 
 
 def refusal(text: str) -> str:
-    """Refusal of a scenario with this trigger."""
     return helpers.refusal(lambda: reading.check({"control": {"trigger": text}}, "mine"))
 
 
 @pytest.mark.parametrize(("text", "read"), READ.items(), ids=READ)
 def test_what_is_written_is_read(text: str, read: Expression) -> None:
-    """Names, numbers, &, | and parentheses, as Python reads them."""
     assert TRIGGERS.parse(text) == read
     control = {"scheme": "committed", "trigger": text}
     assert reading.check({"control": control}, "mine").control.trigger == text
@@ -180,7 +178,6 @@ words = st.sampled_from(
 @example("\ud800")
 @example("[" * 100 + "]" * 100)
 def test_whatever_is_written_is_a_trigger_or_refused(text: str) -> None:
-    """Nothing else: no other error, no warning of Python's, and nothing happens."""
     said, found = "", []
     try:
         found = list(leaves(TRIGGERS.parse(text)))
@@ -194,7 +191,6 @@ def test_whatever_is_written_is_a_trigger_or_refused(text: str) -> None:
 
 
 def test_nothing_written_is_ever_run() -> None:
-    """A call that would end the process is a name that nobody knows."""
     assert "there are always" in refusal("exit(1)")
     assert refusal("__import__('os')._exit(1)").endswith(FORM)
 
@@ -207,7 +203,6 @@ trees = st.recursive(
 
 
 def written(tree: Expression) -> str:
-    """With every parenthesis."""
     if isinstance(tree, Call):
         values = ", ".join(map(repr, tree.values))
         return f"{tree.name}({values})"

@@ -1,4 +1,4 @@
-"""The wire: what is written is read again, and nothing else is."""
+"""Messages on the wire: round trips, and refusals."""
 
 import math
 
@@ -87,12 +87,10 @@ terms = st.builds(
     join_s=positive,
     land_after_s=positive,
 )
-"""Any terms that another end may have."""
 
 
 @st.composite
 def observed(draw: st.DrawFn, *, splines: bool = False) -> Observation:
-    """Any observation that a vehicle can make."""
     step = draw(u32)
     since = step - draw(st.integers(0, step))
     ahead = st.integers(max(0, since - 2**32 + 1), since + 2**15)
@@ -158,7 +156,6 @@ along_splines = TERMS._replace(scheme="trajectory")
 
 
 def same(one: Message, other: Message) -> bool:
-    """Equal type and equal fields, arrays to the bit."""
     return type(one) is type(other) and all(
         np.array_equal(a, b) if isinstance(a, np.ndarray) else a == b
         for a, b in zip(one, other, strict=True)
@@ -202,7 +199,7 @@ def test_a_stamp_is_the_time_nearest_to_what_is_expected(time_ns: int, off_ns: i
 def test_a_stamp_of_long_ago_is_taken_for_one_of_half_an_hour_about_now(
     stamp: int, near_ns: int
 ) -> None:
-    """The time read has this stamp, and is no more than half an hour from the expected one."""
+    """The decoded time has this stamp, and is at most half an hour from the expected one."""
     time_ns = stamped_ns(stamp, near_ns)
     assert stamp_us(time_ns) == stamp
     assert abs(time_ns - near_ns) <= HALF_NS + MICROSECOND
@@ -217,12 +214,13 @@ def test_a_stamp_of_long_ago_is_taken_for_one_of_half_an_hour_about_now(
 def test_the_delays_of_both_directions_come_out(
     began_ns: int, sent_ns: int, held_ns: int, late_ns: int, slept_ns: int, back_ns: int
 ) -> None:
-    """The delay each way follows from a server's packet and the observation that echoes it.
+    """The delay of each direction follows from a server's packet and the observation that echoes
+    it.
 
-    Clocks may be centuries apart, delays and the time between the packets a quarter of an hour.
-    Sealed packets are opened for ten minutes.
+    Clocks may be centuries apart; delays and the time between the packets may be a quarter of an
+    hour. Sealed packets are accepted for ten minutes.
     """
-    received_ns = sent_ns + back_ns  # by the server's clock; step 0 was at began_ns of it
+    received_ns = sent_ns + back_ns  # on the server's clock; step 0 was at began_ns
     welcomed_ns = sent_ns - slept_ns
     server_ns = stamped_ns(stamp_us(sent_ns), welcomed_ns + slept_ns + back_ns - late_ns)
     assert 0 <= sent_ns - server_ns < MICROSECOND
@@ -235,7 +233,7 @@ def test_the_delays_of_both_directions_come_out(
 
 @pytest.mark.parametrize("minutes", [36, 71, 72, 143, 10_000])
 def test_what_was_held_back_for_long_makes_a_round_trip_of_less_than_nothing(minutes: int) -> None:
-    """Or one that its own time does not bear: against what came in time it is implausible."""
+    """Or a time that contradicts its own stamp, which is implausible."""
     delay_ns, held_ns, began_ns = 440 * 10**6, minutes * 60 * 10**9, 10**15
     told = stamp_us(delay_ns - began_ns)
     in_time_ns, late_ns = began_ns + delay_ns, began_ns + delay_ns + held_ns
@@ -246,7 +244,6 @@ def test_what_was_held_back_for_long_makes_a_round_trip_of_less_than_nothing(min
 
 @pytest.mark.parametrize("axes", [2, 3])
 def test_the_longest_horizon_fits_one_datagram(axes: int) -> None:
-    """All numbers at their largest, and as many inputs as the limit allows."""
     longest = INPUTS_MAX // axes
     horizon = Horizon(
         2**16 - 1,
@@ -287,7 +284,6 @@ def told_by(step: int, flown: int, *, splines: bool, silence: int = 25) -> Obser
 
 
 def test_documented_sizes_are_the_real_ones() -> None:
-    """The examples of docs/protocol.md: 40 inputs on two axes."""
     inputs = np.zeros((2, 40), np.float32)
     none = NO_FEEDBACK
     assert len(encode(Horizon(1, SESSION, 500, 2**31, 9, inputs, none, **USUAL))) == 345
@@ -312,13 +308,12 @@ def test_documented_sizes_are_the_real_ones() -> None:
 @pytest.mark.parametrize("step", [60, 60 * 20, 72_000, 360_000])
 @pytest.mark.parametrize("flown", [0, 60])
 def test_an_observation_is_small_for_an_hour(step: int, flown: int) -> None:
-    """At steps from 10 to 50 ms, of two axes, with a silence of a few seconds asked for."""
+    """At steps from 10 to 50 ms, of two axes, with a requested silence of a few seconds."""
     assert len(encode(told_by(step, min(flown, step), splines=True, silence=255))) <= 48
     assert len(encode(told_by(step, step, splines=True, silence=255))) <= 48
 
 
 def test_the_longest_silence_is_told_as_far_as_the_wire_has_numbers() -> None:
-    """An hour in steps of a millisecond would be 7.2 million half steps."""
     asked = Hearing(SECOND_NS, MILLISECOND_NS, 3600 * SECOND_NS)
     beat = Heartbeat(1, 1, 0, 0, 0, 0, asked.silence)
     assert decode(encode(beat), TERMS) == beat
@@ -336,7 +331,6 @@ def test_the_longest_observation() -> None:
 
 
 def test_a_horizon_made_of_bytes_is_the_message() -> None:
-    """Encoding a horizon from raw bytes or from arrays is equal, with and without feedback."""
     inputs = np.arange(84, dtype=np.float32).reshape(2, 42) / 84
     for count in (0, FEEDBACK):
         feedback = np.ones((2, count), np.float32)
@@ -347,7 +341,6 @@ def test_a_horizon_made_of_bytes_is_the_message() -> None:
 
 
 def body(message: Message) -> list[object]:
-    """The message as the list that is packed."""
     fields: list[object] = msgpack.unpackb(encode(message))
     return fields
 
@@ -361,7 +354,6 @@ WELCOME = Welcome(1, 7, 99, 98, 10, 0, TERMS)
 
 
 def terms_with(**wrong: object) -> list[object]:
-    """Terms as they are packed, with a field that cannot be."""
     return list(TERMS._replace(**wrong))
 
 
@@ -477,14 +469,13 @@ def test_a_wrong_field_is_the_peers_mistake(
     ],
 )
 def test_what_is_no_message_is_refused(payload: bytes, reason: str) -> None:
-    """Truncated, overlong, nested, huge by its own word, or something else altogether."""
+    """Truncated, overlong, nested, with a false length, or of another kind."""
     with pytest.raises(ProtocolError) as error:
         decode(payload, TERMS)
     assert error.value.reason == reason
 
 
 def test_no_field_of_any_message_goes_unchecked() -> None:
-    """Each field in turn made a string: never accepted."""
     for message in (HELLO, WELCOME, OBSERVATION, HORIZON, HEARTBEAT):
         for field in range(len(body(message))):
             fields = body(message)
@@ -506,14 +497,14 @@ def test_random_bytes_are_refused_or_are_a_message(payload: bytes) -> None:
 def test_the_table_of_messages_is_complete() -> None:
     """Every message has as many checks as fields; an observation has two fewer on the wire."""
     for message, checks in protocol._TYPES:
-        fewer = 2 if message is Observation else 0  # mode and takes, and state and input, are one
+        # Mode and takes are one number, and so are state and input.
+        fewer = 2 if message is Observation else 0
         assert len(checks) == len(message._fields) - fewer
-        assert len(checks) + 2 < 16  # a length of one byte
+        assert len(checks) + 2 < 16  # the length has one byte
 
 
 @given(terms, terms)
 def test_terms_differ_in_keys_exactly_where_they_are_not_equal(one: Terms, other: Terms) -> None:
-    """Both ends name the same keys, with the values changed over."""
     assert bool(differences(one, other)) == (one != other)
     assert differences(one, other) == tuple(
         Difference(difference.key, here=difference.there, there=difference.here)
@@ -533,7 +524,6 @@ anything = st.one_of(
 
 
 def verdict(payload: bytes) -> Message | Drop:
-    """Message of a datagram, or the reason why there is none."""
     try:
         return decode(payload, TERMS)
     except ProtocolError as error:
@@ -544,7 +534,7 @@ def verdict(payload: bytes) -> Message | Drop:
 def test_an_observation_is_read_at_once_as_it_is_field_by_field(
     observation: Observation, field: int, value: object, more: bytes
 ) -> None:
-    """The quick decoder takes nothing that the checks refuse, and every reason is theirs."""
+    """The fast decoder accepts only what the field checks accept, and gives their reasons."""
     fields = list(msgpack.unpackb(encode(observation)))
     for payload in (encode(observation) + more, replaced(fields, field, value)):
         quick = verdict(payload)
@@ -558,5 +548,4 @@ def test_an_observation_is_read_at_once_as_it_is_field_by_field(
 
 
 def replaced(fields: list[object], field: int, value: object) -> bytes:
-    """Datagram with one field replaced."""
     return msgpack.packb([*fields[:field], value, *fields[field + 1 :]])

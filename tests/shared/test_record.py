@@ -1,4 +1,4 @@
-"""`shared.telemetry.record`: what is written down is what is read back."""
+"""`shared.telemetry.record`: rows are read back as written."""
 
 import io
 import struct
@@ -28,7 +28,6 @@ COLUMN_SETS = {
 
 
 def some_rows(columns: Columns, count: int) -> dict[str, np.ndarray]:
-    """Values for every column, no two columns alike."""
     rng = np.random.default_rng(len(columns))
     return {
         name: rng.integers(0, 2 if kind.base.kind == "b" else 250, (count, *kind.shape))
@@ -38,12 +37,10 @@ def some_rows(columns: Columns, count: int) -> dict[str, np.ndarray]:
 
 @pytest.fixture(params=COLUMN_SETS.values(), ids=COLUMN_SETS)
 def columns(request: pytest.FixtureRequest) -> Columns:
-    """Each set of columns in turn."""
     return request.param
 
 
 def written(columns: Columns, count: int = 3) -> bytes:
-    """A part with some rows."""
     sink = io.BytesIO()
     Recorder(columns, sink).append(count, **some_rows(columns, count))
     return sink.getvalue()
@@ -65,13 +62,12 @@ def test_one_row_is_written_as_many_are(columns: Columns) -> None:
 
 @pytest.mark.parametrize("count", [0, 7, 9])
 def test_a_row_with_too_few_or_too_many_numbers_is_our_own_mistake(count: int) -> None:
-    """Such a row would put all others out of place."""
+    """Such a row would displace all others."""
     with pytest.raises(struct.error, match="expected 8 items"):
         Recorder(PACKET_COLUMNS, io.BytesIO()).append_row(*[0] * count)
 
 
 def test_a_row_cut_short_is_left_out(columns: Columns) -> None:
-    """A writer that is killed loses no more than its last row, wherever the cut is."""
     part = written(columns)
     for cut in (1, columns.itemsize // 2, columns.itemsize):
         np.testing.assert_array_equal(parse(part[:-cut]), parse(part)[:2])
@@ -96,7 +92,7 @@ def test_what_is_no_part_is_a_value_error(header: bytes) -> None:
 
 
 def test_a_part_begins_with_its_columns_in_a_line() -> None:
-    """A stranger can therefore read a part with numpy alone."""
+    """So a part can be read with numpy alone."""
     header, _, _ = written(PACKET_COLUMNS).partition(b"\n")
     assert header.startswith(b'[["direction", "|u1"], ["flow", "<u4"], ["number", "<u4"]')
 

@@ -1,4 +1,4 @@
-"""Desired trajectories: where they are, how fast, when they come round, and what a file may say."""
+"""References: positions, velocities, periods, and files."""
 
 from pathlib import Path
 from typing import Any
@@ -15,13 +15,12 @@ from skytether.shared.scenario.reading import check
 quick = settings(max_examples=80)
 
 SLOPE_S = 1e-5
-"""Half width of a central difference."""
+"""Half width of a central difference [s]."""
 ROUTE = np.array([[0.0, 0.0], [3.0, 4.0], [3.0, 6.0], [-1.0, 6.0]])
 """Legs of 5, 2 and 4 m, and √37 m back."""
 
 
 def sample(desired: reference.Reference, t: float) -> tuple[list[float], list[float]]:
-    """Position and velocity at one time."""
     state = desired(np.array(t))
     return state[:, 0].tolist(), state[:, 1].tolist()
 
@@ -73,7 +72,7 @@ def test_closed_curves_repeat_every_period(t: float, rounds: int, shape: str) ->
 @quick
 @given(st.floats(0.0, 60.0), st.sampled_from(["circle", "figure_eight"]), st.sampled_from([2, 3]))
 def test_velocity_is_the_slope_of_a_smooth_curve(t: float, shape: str, axes: int) -> None:
-    """E6: the velocity that the controller is given is the derivative of the position."""
+    """E6: the velocity that the controller uses is the derivative of the position."""
     desired = getattr(reference, shape)(1.5, 14.2, axes, 0.7)
     before, after = desired(np.array([t - SLOPE_S, t + SLOPE_S]))[..., 0]
     slope = (after - before) / (2 * SLOPE_S)
@@ -166,7 +165,7 @@ def test_array_of_times_is_its_single_times(table: dict[str, object], axes: int)
 
 
 def test_a_target_stays_within_its_bounds_and_comes_back_the_way_it_went() -> None:
-    """However far in the future it is asked for: no more of it is drawn than an hour."""
+    """At any time in the future; an hour of its motion is random, then it repeats backwards."""
     rng = np.random.default_rng(1)
     desired = reference.target(rng, 2, agility=0.5, speed_mps=0.8, radius_m=2.0)
     times = np.arange(0.0, 200.0, 0.01)
@@ -180,11 +179,11 @@ def test_a_target_stays_within_its_bounds_and_comes_back_the_way_it_went() -> No
     np.testing.assert_allclose(back[1:, :, 1], -states[1:, :, 1], atol=1e-6)
     again = desired(times + 1e6 * reference.TURN_S)
     np.testing.assert_allclose(again[..., 0], states[..., 0], atol=1e-5)
-    assert desired(np.array(9e9)).shape == (2, 2)  # and no memory is asked for
+    assert desired(np.array(9e9)).shape == (2, 2)  # without allocating memory up to that time
 
 
 def test_a_target_that_turns_now_and_then_flies_straight_in_between() -> None:
-    """In the mean square its velocity changes as much as that of one that turns all the time."""
+    """The mean square change of its velocity equals that of a target that turns all the time."""
     far: dict[str, Any] = {"agility": 0.3, "speed_mps": 1e3, "radius_m": 1e6}
     desired = reference.target(np.random.default_rng(1), 2, **far, turn_every_s=4.0)
     grid_s = np.arange(0.0, 3000.0, reference.GRID_S)

@@ -1,4 +1,4 @@
-"""The rule of flight: in plain numbers, and flown alike by the vehicle and the server's replay."""
+"""Rule of flight: in plain numbers, and equal for the vehicle and the server's replay."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -34,7 +34,7 @@ from skytether.shared.wire.protocol import NO_HORIZON, Horizon, Mode, Observatio
 
 quick = settings(max_examples=200)
 
-# -- in plain numbers ----------------------------------------------------------------------------
+# -- scalar functions ----------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -71,7 +71,7 @@ def test_feedback_leads_back_in_position_and_velocity() -> None:
 def test_feedback_is_added_within_the_bound_from_the_first_stage_on(
     told: float, back: float, u: float
 ) -> None:
-    """Also after the last; before the first there is nothing to be led back to."""
+    """Also after the last stage; before the first there is no reference for feedback."""
     assert [flown(stage, told, back, 1.8) for stage in (0, 9, 10, 10**12)] == [u] * 4
     assert flown(-1, told, back, 1.8) == told
 
@@ -87,7 +87,7 @@ def test_braking_takes_away_its_part_of_the_speed_at_every_step_until_rest() -> 
     left = [remaining(stage, 10, 0.5, 0.125) for stage in range(10, 16)]
     assert left == [0.75, 0.5, 0.25, 0.0, 0.0, 0.0]
     assert remaining(10**12, 10, 0.5, 0.125) == 0.0
-    assert remaining(10, 10, 0.0, 0.125) == 0.0  # at rest already
+    assert remaining(10, 10, 0.0, 0.125) == 0.0  # already at rest
 
 
 def test_where_it_leads_is_blown_along_only_until_it_stands() -> None:
@@ -97,7 +97,7 @@ def test_where_it_leads_is_blown_along_only_until_it_stands() -> None:
 
 
 def held(inputs: Sequence[float], *, feeds_back: bool = True, **changed: Any) -> AxisHorizon:
-    """A horizon of some inputs, all of them flown; braked from its last one on."""
+    """Horizon of some usable inputs, followed by the braking curve."""
     axis = Axis(a01=0.09, a11=0.88, b0=0.01, b1=0.12)
     numbers = {"speed": abs(inputs[-1]), "brake": 0.125, "bound": 1.8, "disturbance": 0.25}
     gain = {"gain_p": 3.0, "gain_v": 1.5}
@@ -112,7 +112,7 @@ def held(inputs: Sequence[float], *, feeds_back: bool = True, **changed: Any) ->
 def test_a_step_flies_what_is_told_and_leads_on_along_it(
     stage: int, told: float, along: float
 ) -> None:
-    """Two inputs, then braked; x̄ goes on with the disturbance until it stands."""
+    """Two inputs, then the braking curve; x̄ continues with the disturbance until it rests."""
     u, without, *after = rule.step(held([0.25, 0.5]), stage, 1.0, 0.5, 0.75, 0.0)
     assert (u, without) == (min(told + 3.0 * 0.25 + 1.5 * 0.5, 1.8), told)
     assert tuple(after) == advance(held([0.0]).model, 1.0, 0.5, along)
@@ -172,12 +172,11 @@ def test_compiled_it_says_the_same(
         assert COMPILED["step"](horizon, stage, *states) == rule.step(horizon, stage, *states)
 
 
-# -- at both ends --------------------------------------------------------------------------------
+# -- client and server ---------------------------------------------------------------------------
 
 H, BOUND, MOST = 6, 4, 70
 ROW = np.array([0])
 FIRST = 100
-"""Step that the horizon in force is made for."""
 
 
 def scenario(exhausted: str, age_max: int, *, feedback: bool) -> Scenario:
@@ -201,9 +200,9 @@ def scenario(exhausted: str, age_max: int, *, feedback: bool) -> Scenario:
 
 
 def make_horizon(rng: np.random.Generator, step: int, d: int, near: Array, gain: Array) -> Horizon:
-    """A horizon of any inputs, some beyond the bound, d committed, that leads on from near a state.
+    """Horizon of random inputs, some beyond the bound, d committed, with a reference near a state.
 
-    It brings feedback if there is a gain.
+    With feedback if there is a gain.
     """
     bound = np.array([[1.8], [0.9]])
     inputs = rng.uniform(-1.2, 1.2, (2, d + H)) * bound
@@ -215,7 +214,6 @@ def make_horizon(rng: np.random.Generator, step: int, d: int, near: Array, gain:
 
 
 def send(replay: Replay, horizon: Horizon) -> None:
-    """The server remembers that it has sent a horizon."""
     found, length = empty_foresight(1, 2, H, MOST), horizon.inputs.shape[1]
     found.ahead[:], found.horizons[0, :, :length] = length - H, horizon.inputs
     if horizon.feedback.size:
@@ -224,7 +222,6 @@ def send(replay: Replay, horizon: Horizon) -> None:
 
 
 def foresee(replay: Replay, step: int) -> Foresight:
-    """Foresight of the server at a step."""
     found = empty_foresight(1, 2, H, MOST)
     replay.foresee(ROW, np.array([step]), found)
     return found
@@ -254,10 +251,10 @@ def test_the_vehicle_and_the_replay_fly_by_the_same_rule(
 ) -> None:
     """To the last bit, before the first stage of a horizon, within, and after the last.
 
-    The vehicle was last seen `age` stages into its horizon, which was planned from what was seen
-    `observed` steps before it came; others in flight were made so many steps after that, and come
-    into force when each has had its time. The age bound is `spare` steps more than is needed, and
-    cuts horizons off. The observer sees that nothing else acts on the vehicle.
+    The newest observation is `age` stages into the vehicle's horizon, which was planned from an
+    observation `observed` steps before its arrival. Horizons in flight were made so many steps
+    later, and come into force after their delay. The age bound is `spare` steps above the necessary
+    one, and shortens horizons. The observer finds no disturbance.
     """
     rng, seen = np.random.default_rng(seed), FIRST + age
     begin = min(FIRST, seen)

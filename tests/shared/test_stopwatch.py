@@ -1,4 +1,4 @@
-"""Laps of a clock that somebody lends."""
+"""Laps of a stopwatch on a given clock."""
 
 from skytether.shared.core.stopwatch import Stopwatch
 

@@ -1,4 +1,4 @@
-"""Terms of a flight: for every key of a scenario, two ends differ and are told, or may differ."""
+"""Terms of a flight: for every key, ends that differ are refused with a message, or may differ."""
 
 import math
 import re
@@ -76,11 +76,10 @@ OTHER: dict[str, Any] = {
     "title": "another",
     "armed": False,
 }
-"""Another value of the keys that are no numbers, or that not every number may be."""
+"""Another value of each key that is no number, or is restricted."""
 
 
 ON_MISSION = reading.load("swap")
-"""A scenario in which vehicles keep apart."""
 MISSION: dict[str, Any] = {
     "mission.separation_m": 0.6,
     "mission.height_m": 1.0,
@@ -91,15 +90,13 @@ MISSION: dict[str, Any] = {
     "mission.goals": "goal(2, 5.5, 1)",
     "mission.zones": "fence(-9, 9, -9, 9)",
 }
-"""Another value of each key of its own."""
+"""Another value of each key of `mission`."""
 
 
 ALL = dict(flat(reading.to_table(HERE)))
-"""Every key of a scenario with dots, and its value."""
 
 
 def with_(key: str, value: Any) -> Scenario:
-    """The scenario with one key changed."""
     table = reading.to_table(HERE)
     set_keys({key: value}, table)
     if key == "model.axes":
@@ -108,7 +105,6 @@ def with_(key: str, value: Any) -> Scenario:
 
 
 def differing(key: str, folder: Path) -> tuple[Scenario, Scenario]:
-    """Two scenarios that differ in this key."""
     if key == "reference.file":
         made = []
         for name, end in (("one", 1.0), ("other", 2.0)):
@@ -136,7 +132,6 @@ def differing(key: str, folder: Path) -> tuple[Scenario, Scenario]:
 
 
 def shake_hands(ours: Scenario, theirs: Scenario) -> tuple[Server, Client]:
-    """A server of one scenario and a client of another, after HELLO and WELCOME."""
     server = Server(ours, boot_id=7, entropy=stream(1, "entropy").bytes)
     client = Client(theirs, simulated(theirs, 1), server=("server", 0), vehicle=1, boot_id=9)
     client.wake(now_ns=0)
@@ -148,7 +143,7 @@ def shake_hands(ours: Scenario, theirs: Scenario) -> tuple[Server, Client]:
 
 
 def test_every_key_is_a_term_or_free_to_differ() -> None:
-    """There is no third kind: a key of both ends is a term, and each term has one key."""
+    """A key of both ends is a term, and each term has one key."""
     assert set(ALL) == set(KEYS)
     of_both = [name for name, key in KEYS.items() if key.owner is Owner.BOTH]
     assert sorted(TERMS.values()) == sorted(of_both)
@@ -157,7 +152,6 @@ def test_every_key_is_a_term_or_free_to_differ() -> None:
 
 @pytest.mark.parametrize("key", list(TERMS.values()))
 def test_ends_that_differ_in_a_term_are_refused_and_told(key: str, tmp_path: Path) -> None:
-    """Both operators read the key and both values; no session is opened."""
     ours, theirs = differing(key, tmp_path)
     server, client = shake_hands(ours, theirs)
     (difference,) = differences(ours.terms(), theirs.terms())[:1]
@@ -196,7 +190,6 @@ def test_a_trajectory_is_compared_by_what_stands_in_its_file(tmp_path: Path) -> 
 
 
 def test_a_difference_is_told_as_the_scenario_writes_it() -> None:
-    """Seconds for the step, lists for axes, true and false."""
     here = HERE.terms()
     there = here._replace(dt_ns=20_000_000, tau_s=(0.5, 0.6), loop=True)
     assert differences(here, there) == (
@@ -207,7 +200,6 @@ def test_a_difference_is_told_as_the_scenario_writes_it() -> None:
 
 
 def test_the_longest_terms_fit_one_datagram() -> None:
-    """Three axes, and texts as long as they may be."""
     terms = HERE.terms()._replace(tau_s=(math.pi,) * 3, u_max=(math.pi,) * 3, points="x" * 32)
     terms = terms._replace(scheme="x" * 32, exhausted="x" * 32, shape="x" * 32, table="x" * 32)
     assert len(encode(Hello(2**16 - 1, 2**64 - 1, terms))) <= PAYLOAD_BYTES_MAX
@@ -232,7 +224,7 @@ def test_the_documents_name_every_term_in_its_place() -> None:
 def test_what_follows_from_the_terms_of_a_scheme(
     scheme: str, indexed: bool, commits: bool, splines: bool, planned: int, reach: int
 ) -> None:
-    """Steps of 50 ms, H = 40, and an age bound of 3 s: 60 steps; it brakes at 2 m/s²."""
+    """Steps of 50 ms, H = 40, an age bound of 3 s, 60 steps, and braking at 2 m/s²."""
     agreed = (
         reading.load("demo")
         .terms()

@@ -1,4 +1,4 @@
-"""What parsers take at most for a text that somebody has made to take much."""
+"""Resources of parsers on hostile texts."""
 
 import os
 import subprocess
@@ -10,9 +10,9 @@ import pytest
 from skytether.shared.base import toml
 
 MEMORY_MB = 600
-"""Largest memory that a command may take for a text."""
+"""Largest memory of a command for a text [MB]."""
 CPU_S = 60
-"""Longest time that a command may compute [s]; endless loops take more."""
+"""Longest computing time of a command [s]; an endless loop exceeds it."""
 LIMITED = f"""
 import resource, sys
 from skytether.__main__ import main
@@ -26,7 +26,6 @@ PARTS = 30_000
 
 
 def limited(*argv: str) -> tuple[int, str]:
-    """Exit code of a command with little memory, and the last line that it said."""
     run = subprocess.run(
         [sys.executable, "-P", "-c", LIMITED, *argv],
         capture_output=True,
@@ -54,7 +53,7 @@ def limited(*argv: str) -> tuple[int, str]:
     ],
 )
 def test_a_text_that_takes_too_much_is_refused(text: str, said: str) -> None:
-    """Before it is parsed: the memory is the square of the parts, the depth ends in an error."""
+    """Before parsing: memory grows with the square of the parts, and depth ends in an error."""
     with pytest.raises(ValueError, match=said):
         toml.loads(text)
 
@@ -112,7 +111,7 @@ AROUND = {
 
 @pytest.mark.parametrize("name", FILES)
 def test_no_file_takes_much_memory(name: str, tmp_path: Path) -> None:
-    """Whichever parser reads it: the command says what is wrong with the file, and ends."""
+    """With every parser: the command names the mistake in the file, and ends."""
     file, text, said = FILES[name]
     (tmp_path / file).write_text(text)
     scenario = tmp_path / "it.toml"

@@ -1,4 +1,4 @@
-"""Zones: what a scenario writes, how far points are from them, and ways around."""
+"""Zones: their texts and files, distances from them, and routes around them."""
 
 import json
 import re
@@ -23,13 +23,12 @@ from two_vehicles import with_goals
 
 BOX = "box(1, 2, -1, 1)"
 U = "polygon(0, 0, 4, 0, 4, 3, 3, 3, 3, 1, 1, 1, 1, 3, 0, 3)"
-"""A polygon that is open above, between x = 1 and 3."""
+"""Polygon that is open above, between x = 1 and 3."""
 FENCE = "fence(-5, 5, -5, 5)"
 place = st.floats(-6.0, 6.0)
 
 
 def away_m(text: str, *points: tuple[float, ...]) -> list[float]:
-    """Distance of points from what is forbidden [m]."""
     given = np.array(points)
     kept = zone_texts.parse(text, given.shape[1])
     found: list[float] = kept.clearance(given).min(axis=1).tolist()
@@ -96,8 +95,8 @@ def test_a_straight_piece_is_no_nearer_than_it_says(
 def test_straight_pieces_in_space(
     ends: list[tuple[float, float, float]], room_m: float, text: str
 ) -> None:
-    """A piece is near if one of its points is. One that is not level may be taken for nearer, as if
-    it were at all of its heights at once.
+    """A piece is as near as its nearest point. A piece that is not level may count as nearer, as if
+    at all of its heights at once.
     """
     kept, given = zone_texts.parse(text, 3), np.array(ends)
     level = given.copy()
@@ -135,7 +134,7 @@ def test_nobody_is_above_a_zone_that_reaches_to_the_sky() -> None:
     assert raised.clearance(points)[:, 1].tolist() == kept.clearance(points)[:, 1].tolist()
 
 
-# -- what is written -------------------------------------------------------------------------------
+# -- texts and files -------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -162,7 +161,6 @@ def test_what_is_no_zone_is_told(text: str, said: str) -> None:
 
 
 def parsed(text: str, axes: int = 2) -> Zones:
-    """Zones of a text and its files."""
     return zone_texts.parse(text, axes, reading.files_of("mission.zones", text))
 
 
@@ -173,7 +171,6 @@ def geojson(features: Any, **more: Any) -> str:
 
 
 def polygon(points: Any, **properties: Any) -> dict[str, Any]:
-    """A feature."""
     shape = {"type": "Polygon", "coordinates": [points]}
     return {"type": "Feature", "properties": properties, "geometry": shape}
 
@@ -206,7 +203,6 @@ MEMBER = {"type": "Feature", "properties": None}
 
 
 def shape(geometry_type: str, coordinates: Any, **properties: Any) -> str:
-    """A file with one feature of a geometry."""
     geometry = {"type": geometry_type, "coordinates": coordinates}
     return geojson([MEMBER | {"properties": properties, "geometry": geometry}])
 
@@ -301,7 +297,7 @@ def test_neither_winding_nor_hole_changes_where_a_vehicle_may_be(tmp_path: Path)
 
 
 def test_a_border_that_crosses_itself_is_refused_in_a_text_as_well() -> None:
-    """By the even-odd rule a vehicle would be free within what is enclosed twice."""
+    """By the even-odd rule a vehicle would be free within a doubly enclosed region."""
     star = "polygon(0, 10, -6, -8, 9.5, 3, -9.5, 3, 6, -8)"
     with pytest.raises(GrammarError, match="does not cross itself"):
         zone_texts.parse(star, 2)
@@ -347,11 +343,10 @@ def test_a_file_lies_beside_the_scenario(tmp_path: Path) -> None:
     assert len(reading.load(str(file)).zones.zones) == 1
 
 
-# -- ways around -----------------------------------------------------------------------------------
+# -- routes ----------------------------------------------------------------------------------------
 
 
 def length_m(way: Array) -> float:
-    """Length of a way."""
     return float(np.linalg.norm(np.diff(way, axis=0), axis=1).sum())
 
 

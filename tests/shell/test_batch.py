@@ -1,4 +1,4 @@
-"""`shell.batch`: many datagrams in one system call, and the driver that uses it."""
+"""`shell.batch`: many datagrams in one system call, and the driver with it."""
 
 import asyncio
 import socket
@@ -55,7 +55,6 @@ def received(sock: socket.socket) -> list[bytes]:
 
 
 def raw_of(sock: socket.socket) -> bytes:
-    """Address of a socket in the kernel's own form."""
     return pack_address(sock.getsockname())
 
 
@@ -73,7 +72,7 @@ def test_datagrams_arrive_whole_in_order_and_with_their_senders(
     came, raws, came_ns = batch.receive(here)
     assert came == payloads
     assert len(came_ns) == len(payloads)
-    assert min(came_ns) >= before_ns  # nobody has asked for stamps
+    assert min(came_ns) >= before_ns  # no stamps were requested
     assert [unpack_address(raw) for raw in raws] == [there.getsockname()] * len(payloads)
     assert batch.receive(here) == ([], [], [])
 
@@ -81,7 +80,7 @@ def test_datagrams_arrive_whole_in_order_and_with_their_senders(
 def test_the_kernel_tells_when_each_came(
     host: str, ends: tuple[socket.socket, socket.socket]
 ) -> None:
-    """However late they are read; sizes of one call are not those of the next."""
+    """However late they are read; sizes of one call do not affect the next."""
     here, there = ends
     batch = DatagramBatch(FAMILIES[host])
     DatagramBatch.stamp(here)
@@ -93,8 +92,8 @@ def test_the_kernel_tells_when_each_came(
         _, _, (came_ns,) = batch.receive(here)
         return came_ns < sent_ns + 5 * MILLISECOND_NS
 
-    # The first socket of a host that asks for stamps makes the kernel begin with them, a moment
-    # later: what comes before is stamped when it is read.
+    # The kernel begins to stamp a moment after the first socket asks for stamps; earlier datagrams
+    # are stamped when they are read.
     until(is_stamped_on_arrival)
     for _ in range(2):
         sent_ns = []
@@ -104,7 +103,7 @@ def test_the_kernel_tells_when_each_came(
             time.sleep(0.01)
         _, _, came_ns = batch.receive(here)
         assert len(came_ns) == 3
-        # Each was there before the next was sent, 10 ms or more later.
+        # Each had arrived before the next was sent, 10 ms or more later.
         for each_ns, later_ns in zip(came_ns, sent_ns[1:], strict=False):
             assert each_ns < later_ns
         assert sorted(came_ns) == came_ns
@@ -113,7 +112,6 @@ def test_the_kernel_tells_when_each_came(
 def test_a_batch_is_bounded_and_the_rest_comes_with_the_next(
     host: str, ends: tuple[socket.socket, socket.socket]
 ) -> None:
-    """Timers and other sockets have their turn in between."""
     here, there = ends
     batch, numbered = DatagramBatch(FAMILIES[host]), [b"%d" % i for i in range(BATCH_MAX + 3)]
     assert batch.send(there, numbered[:BATCH_MAX], [raw_of(here)] * BATCH_MAX) == BATCH_MAX
@@ -123,7 +121,6 @@ def test_a_batch_is_bounded_and_the_rest_comes_with_the_next(
 
 
 def test_each_datagram_goes_to_its_own_peer(host: str) -> None:
-    """Also after a batch of other sizes and peers: nothing of it is left in the arrays."""
     with ExitStack() as stack:
         socks = [stack.enter_context(open_socket((host, 0))) for _ in range(5)]
         batch, payloads = DatagramBatch(FAMILIES[host]), [b"%d" % i * (i + 1) for i in range(4)]
@@ -134,7 +131,7 @@ def test_each_datagram_goes_to_its_own_peer(host: str) -> None:
 
 
 def test_sending_stops_at_the_first_that_fails() -> None:
-    """Datagrams that went are counted from the first on; nobody can have port 0."""
+    """The number of sent datagrams is returned; port 0 cannot be sent to."""
     with open_socket(("127.0.0.1", 0)) as here, open_socket(("127.0.0.1", 0)) as there:
         batch, good, bad = (
             DatagramBatch(socket.AF_INET),
@@ -147,7 +144,7 @@ def test_sending_stops_at_the_first_that_fails() -> None:
 
 
 def test_nothing_is_sent_that_is_too_long_or_of_another_family() -> None:
-    """The plain call of the socket sends it, or says why it cannot."""
+    """The plain call of the socket sends it, or raises the error."""
     with open_socket(("127.0.0.1", 0)) as here:
         batch, own = DatagramBatch(socket.AF_INET), raw_of(here)
         assert batch.send(here, [b"1", b"2" * (SIZE_MAX + 1)], [own, own]) == 0
@@ -173,7 +170,7 @@ def test_addresses_keep_their_value_in_the_kernels_form(
 
 @pytest.mark.parametrize("address", [("nobody.invalid", 1), ("", 1), ("192.0.2", 1)])
 def test_a_name_has_no_kernels_form(address: Address) -> None:
-    """Nothing is looked up while datagrams wait."""
+    """Names are not looked up while datagrams wait."""
     with pytest.raises(OSError, match="illegal"):
         pack_address(address)
     names = Names(())
@@ -226,12 +223,12 @@ def test_segments_arrive_as_the_datagrams_that_they_were(
     ],
 )
 def test_segments_suit_payloads_of_few_sizes(sizes: Sequence[int], suit: bool) -> None:
-    """An empty datagram is none of them: a call cannot be cut into empty pieces."""
+    """An empty datagram does not: a call cannot be cut into empty segments."""
     assert Segments().suits([bytes(size) for size in sizes]) is suit
 
 
 def test_segments_that_the_kernel_refuses_are_not_tried_again() -> None:
-    """Such as those longer than the path's MTU; shorter ones still are."""
+    """For example segments longer than the path's MTU; shorter ones are still tried."""
     with open_socket(("127.0.0.1", 0)) as here:
         segments, nowhere = Segments(), ("127.0.0.1", 0)
         assert segments.send(here, [bytes(900)] * 3, nowhere) == 0
@@ -243,7 +240,7 @@ def test_segments_that_the_kernel_refuses_are_not_tried_again() -> None:
 
 
 class Answering(Idle):
-    """An endpoint that answers what it hears, in one go, once it has heard enough."""
+    """Endpoint that answers all datagrams together once it has received enough."""
 
     def __init__(self, enough: int, answer: Callable[[Datagram], Sequence[Datagram]]) -> None:
         super().__init__()
@@ -267,7 +264,7 @@ class Answering(Idle):
 
 @pytest.fixture(params=[True, False], ids=["batches", "plain"])
 def batches(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> bool:
-    """Whether the system has the calls for batches; where it has none, the plain ones serve."""
+    """Whether the system has the calls for batches; otherwise the plain ones are used."""
     if not request.param:
 
         def missing(_: int) -> DatagramBatch:
@@ -281,7 +278,6 @@ def batches(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> 
 def drive(
     endpoint: Endpoint, talk: Callable[[Shell], Awaitable[None]]
 ) -> tuple[Shell, list[Event]]:
-    """Drive an endpoint while somebody talks to it, and until it has finished."""
     events: list[Event] = []
 
     async def fly() -> Shell:
@@ -306,7 +302,7 @@ async def has_heard(endpoint: "Answering", count: int) -> None:
 def converse(
     endpoint: Endpoint, pieces: Sequence[tuple[socket.socket, Sequence[bytes]]]
 ) -> tuple[Shell, list[Event]]:
-    """Send pieces to a driven endpoint, each after the one before was heard, until it finishes."""
+    """Send bursts to a driven endpoint, each after receipt of the previous one."""
 
     async def talk(shell: Shell) -> None:
         for sock, payloads in pieces:
@@ -389,8 +385,6 @@ def test_a_fault_in_the_middle_of_a_batch_costs_no_other_datagram() -> None:
 
 
 class Crowd:
-    """Datagrams sent to a driven endpoint, and how its sockets are read."""
-
     def __init__(self, endpoint: Answering, monkeypatch: pytest.MonkeyPatch) -> None:
         self.endpoint = endpoint
         self.read: list[int] = []
@@ -405,7 +399,7 @@ class Crowd:
         monkeypatch.setattr(DatagramBatch, "receive", receive)
 
     def send(self, counts: Sequence[int]) -> None:
-        """Send so many datagrams at once, one time after the other, and end once all are heard."""
+        """Send bursts of these sizes, one after the other, and end once all are received."""
 
         async def talk(shell: Shell) -> None:
             with open_socket(("127.0.0.1", 0)) as sock:
@@ -425,7 +419,7 @@ def test_a_crowded_socket_is_read_in_slices_and_a_quiet_one_is_not(
     crowd = Crowd(Answering(31, lambda _: []), monkeypatch)
     crowd.endpoint.patience_ns = 20_000_000
     crowd.send((1, 10, 10, 10))
-    assert sum(crowd.read) == 20  # the first ten made it crowded
+    assert sum(crowd.read) == 20  # the first ten switched to batches
     assert max(crowd.read) > 1
     stamps_ns = crowd.endpoint.stamps_ns
     assert sorted(stamps_ns) == stamps_ns
@@ -444,11 +438,7 @@ class TwoSockets(Answering):
 
 
 def send_to_both(pieces: Sequence[Sequence[int]]) -> TwoSockets:
-    """Send numbered datagrams to two sockets of an endpoint.
-
-    Args:
-        pieces: sockets of the datagrams of each burst, one after the other.
-    """
+    """Send numbered datagrams to an endpoint; `pieces` has the sockets of each burst."""
     endpoint = TwoSockets(1 + sum(map(len, pieces)), lambda _: [])
 
     async def talk(shell: Shell) -> None:
@@ -496,7 +486,7 @@ def test_two_crowded_sockets_are_heard_in_the_order_of_arrival() -> None:
 
 
 def test_a_quiet_socket_beside_a_crowded_one_shows_no_earlier_time() -> None:
-    """A datagram that came to the crowded one before, but is read later, is shown as come now."""
+    """A datagram that arrived at the crowded socket before, but is read later, counts as new."""
     endpoint = send_to_both([[0] * 20, [0, 0, 0, 0, 1, 0, 0, 0, 0], [0] * 5 + [1, 1] + [0] * 5])
     assert {each.socket for each in endpoint.heard} == {0, 1}
     assert sorted(endpoint.stamps_ns) == endpoint.stamps_ns
@@ -522,7 +512,6 @@ def test_a_clock_that_is_set_moves_no_stamp_out_of_order(
 def test_who_loses_the_core_between_two_clocks_reads_them_again(
     ends: tuple[socket.socket, socket.socket], host: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Else what came 30 ms ago would seem to come in the future."""
     here, there = ends
     batch, real, slept = DatagramBatch(FAMILIES[host]), time.time_ns, iter([0.03])
 
@@ -545,9 +534,9 @@ def test_who_loses_the_core_between_two_clocks_reads_them_again(
 def test_who_came_over_an_interface_that_is_gone_costs_no_other_datagram(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """The others of the slice are heard, each with its own sender, and no time goes back.
+    """The others of the batch are received, each with its own sender, in order of time.
 
-    Their times are those of reading, and what is read next may have come before.
+    Their times are those of reading, and the next datagrams may have arrived earlier.
     """
     received = DatagramBatch.receive
 
@@ -601,7 +590,7 @@ def test_a_crowd_that_has_gone_is_waited_for_no_longer(monkeypatch: pytest.Monke
 
 
 def test_what_came_before_a_wake_is_heard_before_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Though the slice is not over: what is planned knows all that has come."""
+    """Although the slice is not over, so that plans use all datagrams that have arrived."""
 
     class Ticking(Answering):
         """Endpoint with a slice far longer than the 20 ms until its wake."""

@@ -1,4 +1,4 @@
-"""The socket of `--control`, and `skytether set`, which speaks to it."""
+"""Socket of `--control`, and `skytether set`, which uses it."""
 
 import os
 import random
@@ -29,8 +29,6 @@ DEMO = reading.load("demo")
 
 
 class Closing(Proxy):
-    """A netem that ends once a key has got a certain value."""
-
     finished = False
 
     def change(self, scenario: schema.Scenario, keys: frozenset[str], *, now_ns: int) -> None:
@@ -43,7 +41,7 @@ def running() -> Running:
 
 
 def heeding(control: Control) -> tuple[HandLoop, list[None]]:
-    """A loop in which requests are heeded, and a list that grows by one with each."""
+    """Loop that serves requests, and a list that grows with each."""
     loop, heeded = HandLoop(), []  # type: ignore[var-annotated]
     control.begin(loop, lambda: heeded.append(None))  # type: ignore[arg-type]
     return loop, heeded
@@ -100,7 +98,7 @@ def test_a_flood_of_requests_is_read_one_at_a_time_with_a_rest_after_each(tmp_pa
 def test_a_request_that_takes_long_is_followed_by_a_rest_that_is_longer(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Requests cost a share of the time, whatever they ask for."""
+    """Requests take a bounded share of the time, whatever they ask for."""
     seconds = iter((10.0, 10.5))
     with closing(Control(tmp_path / "netem", running())) as control:
         loop, _ = heeding(control)
@@ -119,7 +117,6 @@ def test_a_socket_that_is_closed_while_it_rests_reads_no_more(tmp_path: Path) ->
 
 
 def test_whoever_sends_garbage_and_does_not_read_costs_others_nothing(tmp_path: Path) -> None:
-    """Also one without an address, and one that is gone; a fault is the loop's to tell."""
     rng = random.Random(1)
     path = tmp_path / "netem"
     with closing(Control(path, running())) as control:
@@ -127,7 +124,7 @@ def test_whoever_sends_garbage_and_does_not_read_costs_others_nothing(tmp_path: 
         with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as hostile:
             hostile.bind(str(tmp_path / "hostile"))
             for count in range(1000):
-                if count == 500:  # from here on answers have nowhere to go
+                if count == 500:  # from here on answers cannot be delivered
                     (tmp_path / "hostile").unlink()
                 hostile.sendto(rng.randbytes(rng.randrange(9000)), str(path))
                 loop.look()
@@ -141,7 +138,7 @@ def test_whoever_sends_garbage_and_does_not_read_costs_others_nothing(tmp_path: 
 
 
 def test_what_is_too_long_for_a_datagram_is_refused_whole(tmp_path: Path) -> None:
-    """A change may not be cut off where it still makes sense."""
+    """A truncated change might still be valid."""
     path = tmp_path / "netem"
     flown = running()
     with closing(Control(path, flown)) as control, closing(Caller(path)) as caller:
@@ -165,7 +162,7 @@ def test_an_answer_of_something_else_is_a_control_error(said: bytes, tmp_path: P
                 caller.ask({})
 
 
-# -- its place -------------------------------------------------------------------------------------
+# -- path of the socket ----------------------------------------------------------------------------
 
 
 def test_a_socket_that_a_killed_process_left_behind_gives_way(tmp_path: Path) -> None:
@@ -304,7 +301,7 @@ def test_where_nobody_listens_is_said_in_a_line(
 def test_answers_come_to_beside_the_socket_that_was_asked(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """In another container there is no other folder of ours; where that is too deep, elsewhere."""
+    """In another container no other folder is shared; if its path is too long, another folder."""
     deep = tmp_path / ("d" * 90)
     deep.mkdir()
     monkeypatch.chdir(deep)

@@ -1,4 +1,4 @@
-"""The driver: mistakes of an endpoint's code are told, and the endpoint is driven on."""
+"""Driver: errors of an endpoint's code are logged, and the endpoint continues."""
 
 from helpers import Idle
 from skytether.shared.core.events import Event, Fault, Flying
@@ -6,7 +6,7 @@ from skytether.shell.driver import Shell, run
 
 
 class Faulty(Idle):
-    """An endpoint that fails at its first wake, and has finished after its second."""
+    """Endpoint that fails at its first wake, and finishes after its second."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -37,7 +37,7 @@ def test_a_mistake_in_the_code_is_an_event_and_does_not_end_the_flight() -> None
 
 
 def test_a_log_that_fails_does_not_stop_the_endpoints_clock() -> None:
-    """The timer is armed before anybody is told anything."""
+    """The timer is armed before anything is logged."""
     endpoint, failed = Faulty(), []
 
     def fail(event: Event) -> None:

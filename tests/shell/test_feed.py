@@ -1,4 +1,4 @@
-"""The feed of a process: what its readers get, and what none of them can do to it."""
+"""Feed of a process: frames for its readers, and protection against them."""
 
 import asyncio
 import io
@@ -65,7 +65,6 @@ PATIENCE_S = 30.0
 
 
 def rows(number: int, part: str = "netem", size: int = 28) -> Rows:
-    """A frame that can be told from others."""
     return Rows(part=part, time_ns=number, rows=bytes([number % 256]) * size)
 
 
@@ -105,7 +104,6 @@ def test_garbage_is_a_feed_error_or_waits_for_more(garbage: bytes, framed: bool)
 @given(st.sampled_from(FRAMES), st.data())
 @settings(max_examples=300)
 def test_a_damaged_frame_is_another_one_or_a_feed_error(frame: Frame, data: st.DataObject) -> None:
-    """One byte of it is another; where the length has grown, a reader waits for the rest."""
     whole = encode(frame)
     at = data.draw(st.integers(0, len(whole) - 1))
     damaged = bytearray(whole)
@@ -123,12 +121,12 @@ def test_a_damaged_frame_is_another_one_or_a_feed_error(frame: Frame, data: st.D
     else:
         (other,) = read
         assert encode(other) != whole
-    with pytest.raises(FeedError):  # a frame of no bytes, or one that has ended in the midst
+    with pytest.raises(FeedError):  # an empty or truncated frame
         reader.read(bytes(size + LENGTH_BYTES))
 
 
 def test_a_frame_longer_than_any_is_refused_before_it_has_come() -> None:
-    """A reader would else gather 4 GiB of a stream that is none."""
+    """Otherwise a reader would collect 4 GiB of an invalid stream."""
     head = (FRAME_BYTES_MAX + 1).to_bytes(4, "big")
     with pytest.raises(FeedError, match="got a frame of 4194305 B, expected at most 4194304 B"):
         Reader().read(head)
@@ -172,8 +170,6 @@ def test_columns_that_are_none_are_a_feed_error(text: str) -> None:
 
 
 class Driven:
-    """A feed in a loop, and its readers."""
-
     def __init__(self, path: Path) -> None:
         self.path = path
         self.loop = HandLoop()
@@ -184,20 +180,18 @@ class Driven:
         self.opened: list[Looker] = []
 
     def turn(self) -> None:
-        """Let time pass, and let happen what can."""
         self.loop.pass_time()
         self.loop.look()
         for write in tuple(self.loop.writes.values()):
             write()
 
     def look(self) -> "Looker":
-        """Somebody who looks on from now on."""
         self.opened.append(Looker(self.path))
         self.turn()
         return self.opened[-1]
 
     def tell(self, *numbers: int, size: int = 28) -> None:
-        """Make rows, each in a call of its own, and let them be sent."""
+        """Write rows, each in a call of its own, and let them be sent."""
         for number in numbers:
             self.part.write(bytes([number % 256]) * size)
             self.feed.take()
@@ -205,7 +199,7 @@ class Driven:
 
 
 class Looker:
-    """Somebody who connects, and reads when told to."""
+    """Reader that connects, and reads when the test says so."""
 
     def __init__(self, path: Path) -> None:
         self.socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
@@ -215,7 +209,7 @@ class Looker:
         self.gone = False
 
     def read(self) -> list[Frame]:
-        """Frames that have come since; notes whether the feed has hung up."""
+        """Frames that have arrived since; notes whether the feed has closed the connection."""
         frames = []
         try:
             while piece := self.socket.recv(1 << 20):
@@ -229,7 +223,6 @@ class Looker:
 
 
 def numbers(frames: list[Frame]) -> list[int]:
-    """First byte of the rows of each frame that has rows."""
     return [frame.rows[0] for frame in frames if isinstance(frame, Rows)]
 
 
@@ -243,7 +236,6 @@ def driven(tmp_path: Path) -> Iterator[Driven]:
 
 
 def test_a_reader_gets_the_scenario_then_what_was_then_what_comes(driven: Driven) -> None:
-    """In the order in which it was made, none missing and none twice, whenever they come."""
     driven.tell(1, 2, 3)
     first = driven.look()
     driven.tell(4)
@@ -264,7 +256,7 @@ def test_a_reader_gets_the_scenario_then_what_was_then_what_comes(driven: Driven
 
 
 def test_rows_of_one_call_are_one_frame_of_each_part(driven: Driven) -> None:
-    """However many they are, unless that would be a very long frame; no row is torn."""
+    """For any number, unless the frame would be very long; no row is split."""
     looker, plans = driven.look(), driven.feed.part("plan", plan_columns(2, 40))
     for _ in range(100):
         driven.part.write(b"a" * 36)
@@ -301,10 +293,9 @@ def test_what_is_kept_for_readers_to_come_is_bounded(driven: Driven) -> None:
 
 
 def flooded(driven: Driven) -> tuple[int, int]:
-    """Tell 8 MiB to one who reads and one who does not.
+    """Send 8 MiB to a reader that reads and to one that does not.
 
-    Returns:
-        How many were dropped, and the most bytes that waited for one of them.
+    Returns the number of dropped readers, and the most bytes queued for one of them.
     """
     slow, quick = driven.look(), driven.look()
     got, waiting = list[Frame](), 0
@@ -333,7 +324,6 @@ def test_who_does_not_read_is_dropped_and_all_else_goes_on(driven: Driven) -> No
 def test_without_the_bound_memory_grows_for_who_does_not_read(
     driven: Driven, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Nobody is dropped then, and all that was told waits."""
     monkeypatch.setattr(skytether.shell.feed, "WAITING_BYTES_MAX", 1 << 60)
     dropped, waiting = flooded(driven)
     assert dropped == 0
@@ -374,7 +364,7 @@ def test_what_a_reader_sends_is_never_read(driven: Driven) -> None:
 
 
 def test_one_reader_is_let_in_at_a_time_with_a_rest_after_each(driven: Driven) -> None:
-    """The pause bounds what readers that reconnect all the time cost the process."""
+    """The pause bounds the cost of readers that reconnect all the time."""
     waiting = [Looker(driven.path) for _ in range(4)]
     driven.opened += waiting
     for count in range(1, 5):
@@ -424,7 +414,7 @@ def test_nobody_but_the_owner_can_look(driven: Driven) -> None:
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root can be another user")
 def test_another_user_is_refused_by_the_system() -> None:
-    """He sees the socket, and cannot connect; it is its mode that keeps him out."""
+    """The user sees the socket, and its mode prevents a connection."""
     nobody = 65534
     code = (
         f"import os, socket, sys; os.setgid({nobody}); os.setuid({nobody})\n"
@@ -456,7 +446,7 @@ def test_a_feed_that_cannot_be_made_is_said_before_anything_flies(
 
 
 def test_a_feed_takes_the_place_of_one_that_nobody_tells(tmp_path: Path) -> None:
-    """A process that was killed leaves one; that of a process that lives stays."""
+    """A killed process leaves a socket, which is replaced; that of a living process stays."""
     path = tmp_path / "feed"
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as killed:
         killed.bind(str(path))
@@ -468,7 +458,7 @@ def test_a_feed_takes_the_place_of_one_that_nobody_tells(tmp_path: Path) -> None
 
 
 class Passing(Proxy):
-    """A netem that makes a row whenever it is changed, and ends with the last of the changes."""
+    """Netem that writes a row whenever it is changed, and ends with the last change."""
 
     finished = False
 
@@ -508,9 +498,9 @@ class Seen:
 def test_a_process_tells_its_readers_while_it_is_driven(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Rows go to file and feed alike; a reader that comes later is told the scenario as it is then.
+    """Rows go to file and feed alike; a later reader gets the scenario as it is then.
 
-    The feed ends with the process, its last words included.
+    The feed ends with the process, last events included.
     """
     monkeypatch.setattr(skytether.shell.feed, "AGAIN_S", 0.05)
     path, seen, late, sink = tmp_path / "feed", Seen(), Seen(), io.BytesIO()
@@ -596,7 +586,7 @@ def test_a_subscriber_begins_anew_where_a_process_does(
 def test_the_plans_told_are_those_that_are_sent(
     scheme: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Each horizon has a row: its inputs behind the committed ones, and where they begin."""
+    """Each horizon has a row: its inputs after the committed ones, and their first state."""
     sent, encode_horizon, encode = [], horizons.encode_horizon, splines.encode
 
     def spied(vehicle: int, session: int, step: int, *rest: Any) -> bytes:
@@ -639,7 +629,7 @@ def test_the_plans_told_are_those_that_are_sent(
         np.testing.assert_array_equal(one["state"], made["estimate"])
     elif scheme == "trajectory":
         np.testing.assert_allclose(one["state"], made["planned"], atol=1e-5)
-    else:  # where it was to be, it has come to be, but for what it never heard of
+    else:  # at the predicted place, except for unreceived information
         steps = flight_.client[flight_.client["vehicle"] == 1]
         late = one[(one["step"] > 60) & (one["begins"] < len(steps))]
         off = late["state"][..., 0] - steps["state"][late["begins"], :, 0]
@@ -647,7 +637,6 @@ def test_the_plans_told_are_those_that_are_sent(
 
 
 def test_flights_of_a_batch_keep_no_plans() -> None:
-    """Thousands of them would fill the memory."""
     flown = msgspec.structs.replace(DEMO, duration=6.0)
     (one,) = flight.fly_batch(flown, [1])
     assert len(one.plan) == 0

@@ -1,4 +1,4 @@
-"""The journal of what an operator has set in flight: it outlives the process, or is refused."""
+"""Journal of keys set in flight by an operator: it outlives the process, or is refused."""
 
 import json
 import threading
@@ -26,7 +26,7 @@ BOX = "box(1, 2, 5, 6)"
 
 
 def begun(folder: Path, scenario: Scenario = DEMO, *, new_flight: bool = False) -> TakenUp:
-    """What a process that begins takes up."""
+    """State that a starting process takes over."""
     return take_up(folder / "netem", scenario, new_flight=new_flight)
 
 
@@ -35,7 +35,7 @@ def kept(folder: Path) -> Path:
 
 
 def driven(folder: Path, ask: Callable[[Caller], Any]) -> tuple[list[Any], list[Event]]:
-    """Answers to what a thread asks of a netem that is driven meanwhile, and its events."""
+    """Answers to requests from a thread to a driven netem, and its events."""
     answers, events = list[Any](), list[Event]()
     taken_up = begun(folder)
     assert taken_up.journal
@@ -46,7 +46,7 @@ def driven(folder: Path, ask: Callable[[Caller], Any]) -> tuple[list[Any], list[
             answers.append(ask(caller))
         endpoint.finished = True  # type: ignore[misc]
         with suppress(ControlError), closing(Caller(folder / "netem")) as caller:
-            caller.ask({})  # it looks once more whether it has ended
+            caller.ask({})  # it checks once more whether it has ended
 
     with controlled(folder / "netem", taken_up.journal.running(endpoint), taken_up.journal) as it:
         thread = threading.Thread(target=operate)
@@ -60,7 +60,6 @@ LOSSY = "paper(0.4, 0.02, 2.0) & loss({})".format
 
 
 def write(folder: Path, scenario: Scenario, values: dict[str, object]) -> None:
-    """Keep what is set in a flight of a scenario."""
     kept_by = begun(folder, scenario).journal
     assert kept_by
     kept_by.write(values)
@@ -68,7 +67,6 @@ def write(folder: Path, scenario: Scenario, values: dict[str, object]) -> None:
 
 @pytest.fixture(autouse=True)
 def _ends(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let a netem end when it is told to."""
     monkeypatch.setattr(Proxy, "finished", False)
 
 
@@ -124,7 +122,6 @@ def test_a_zone_that_was_set_in_flight_is_in_force_in_the_next_life_of_a_server(
 
 
 def test_a_journal_that_is_cut_or_flipped_anywhere_is_refused_or_exact(tmp_path: Path) -> None:
-    """A process that would begin with other values does not begin."""
     write(tmp_path, SWAP, {"mission.zones": BOX})
     whole = kept(tmp_path).read_bytes()
     wrong = [whole[:size] for size in range(len(whole))]
@@ -175,7 +172,7 @@ def test_where_nothing_can_be_written_the_operator_hears_that_it_is_forgotten(
 
 
 def test_what_is_decided_once_is_not_decided_again_by_the_next_run() -> None:
-    """A choice after a leap belongs to that leap."""
+    """A choice after a position jump belongs to that jump."""
     endpoint = mock.Mock(changeable=frozenset({"vehicle.after_leap", "armed"}))
     endpoint.objection.return_value = ""
     running = Running(endpoint, DEMO)

@@ -1,4 +1,4 @@
-"""Lines to a vehicle's own hardware: how they are written, and real UDP, TCP and serial ports."""
+"""Lines to a vehicle's own hardware: their texts, and real UDP, TCP and serial ports."""
 
 import asyncio
 import os
@@ -41,7 +41,7 @@ def test_what_is_no_line_is_refused_with_its_key(text: str) -> None:
 
 
 class Echo(Idle):
-    """Says what it hears at socket 1 back to whoever said it; ends once it has heard `enough`."""
+    """Endpoint that echoes what arrives at socket 1; ends after `enough` bytes."""
 
     def __init__(self, enough: bytes) -> None:
         super().__init__()
@@ -59,18 +59,16 @@ class Echo(Idle):
 
 
 def drive(coroutine: Any) -> Any:
-    """Run on the loop that processes run on, which is uvloop's."""
     with asyncio.Runner(loop_factory=new_event_loop) as runner:
         return runner.run(asyncio.wait_for(coroutine, 30))
 
 
 def shell(endpoint: Endpoint, line: str) -> Shell:
-    """A shell whose socket 1 is a line."""
     return Shell(endpoint, ("127.0.0.1", 0), line=parse_line("line", line))
 
 
 def test_tcp_is_heard_and_opened_again_where_it_has_ended() -> None:
-    """The autopilot's end goes away in between; what was sent before came."""
+    """The autopilot's end closes in between; earlier bytes arrive."""
 
     async def main() -> tuple[bytes, list[bytes]]:
         answers: list[bytes] = []
@@ -95,7 +93,7 @@ def test_tcp_is_heard_and_opened_again_where_it_has_ended() -> None:
 
 
 def test_a_serial_port_carries_bytes_as_they_are() -> None:
-    """Those that a terminal would take for an end of line, or an end, too."""
+    """Including those that a terminal would interpret as an end of line or of input."""
     master, slave = pty.openpty()
     tty.setraw(master)
     sent = bytes(range(256))
@@ -105,7 +103,7 @@ def test_a_serial_port_carries_bytes_as_they_are() -> None:
         running = asyncio.create_task(shell(echo, f"serial:{os.ttyname(slave)}:57600").run())
         back = b""
         os.set_blocking(master, False)
-        await asyncio.sleep(0.2)  # a terminal throws away what came before it was set up
+        await asyncio.sleep(0.2)  # a terminal discards input from before its set-up
         os.write(master, sent)
         while not (running.done() and len(back) == len(sent)):
             await asyncio.sleep(0.01)

@@ -1,4 +1,4 @@
-"""Limit of the log: a few events of a kind per second, and the number of further ones."""
+"""Limit of the log: a few events of a kind per second, and the number of omitted ones."""
 
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.core.events import Event, Flying, Omitted, SessionEnded
@@ -6,12 +6,12 @@ from skytether.shell.limit import KIND_MAX, Limit
 
 
 def told(limit: Limit, events: list[Event], now_ns: int) -> list[Event]:
-    """All that is told of these events, which happen at the same time."""
+    """Logged events among these, which occur at the same time."""
     return [one for event in events for one in limit.admit(event, now_ns=now_ns)]
 
 
 def test_the_first_few_of_a_kind_are_told_and_the_others_counted() -> None:
-    """A thousand vehicles that fly off together are five lines, and one more when it is over."""
+    """A thousand vehicles that start together give five lines, and one more afterwards."""
     limit, events = Limit(), [Flying(vehicle=n) for n in range(1000)]
     assert told(limit, list(events), 7) == events[:KIND_MAX]
     assert limit.omitted(now_ns=7 + SECOND_NS - 1) == []

@@ -1,4 +1,4 @@
-"""The file of a client's memory: whole or refused in words, of this vehicle, and of one process."""
+"""File of a client's saved state: complete or refused, of this vehicle, used by one process."""
 
 import asyncio
 from collections.abc import Callable, Mapping
@@ -19,12 +19,10 @@ WRITTEN_NS = 12_345_678_901
 
 @pytest.fixture
 def path(tmp_path: Path) -> Path:
-    """Place of a file in a folder that is not there yet."""
     return tmp_path / "state" / "client-1"
 
 
 def put(path: Path, held: bytes) -> None:
-    """Write a file by hand, as only its owner may read it."""
     path.parent.mkdir(mode=0o700, exist_ok=True)
     path.write_bytes(held)
     path.chmod(0o600)
@@ -45,8 +43,6 @@ def read(
 
 
 class Keeps(Idle):
-    """An endpoint that keeps what it is told to."""
-
     keeps = True
 
     def __init__(self) -> None:
@@ -128,7 +124,7 @@ def test_two_processes_do_not_share_a_memory(path: Path) -> None:
 
 
 async def test_a_thread_writes_the_newest_and_says_so(path: Path) -> None:
-    """What comes while it writes is written after that, and only the last is told."""
+    """Newer state during a write is written afterwards, and only the last is reported."""
     kept, endpoint = MemoryFile(path, IDENTITY, SECRET), Keeps()
     kept.begin(endpoint, asyncio.get_running_loop())
     for content in (b"one", b"two", b"three"):

@@ -1,4 +1,4 @@
-"""Metrics: every figure has a name or is left out on purpose, and who asks holds nobody up."""
+"""Metrics: every figure has a name or is left out on purpose, and requests delay nothing."""
 
 import json
 import re
@@ -109,7 +109,6 @@ def test_every_figure_is_told_or_left_out(process: str, figures: dict[str, dict[
 
 
 def test_a_figure_that_is_not_known_is_found(figures: dict[str, dict[str, Any]]) -> None:
-    """It is counted where metrics are served, so that nothing goes missing in silence."""
     told = figures["server"] | {"brand": {"new": 1}}
     assert families("server", told)[1] == ["brand/new"]
     assert numbers("server", told)["skytether_unmapped_figures", ()] == 1.0
@@ -117,14 +116,14 @@ def test_a_figure_that_is_not_known_is_found(figures: dict[str, dict[str, Any]])
 
 
 def test_no_line_of_the_tables_is_about_nothing(figures: dict[str, dict[str, Any]]) -> None:
-    """Each metric tells something in a flight, and each that is left out is there."""
+    """Each metric occurs in a flight, and so does each omitted figure."""
     rare = {
         "counts/horizons_lost",
         "counts/scheme_errors",  # of a plug-in
         "by_vehicle/{vehicle}/age_ms",
         "by_vehicle/{vehicle}/plan_age_ms",
         "by_vehicle/{vehicle}/clock_m",  # on missions
-        "others_dropped/{reason}",  # of more than 16 vehicles
+        "others_dropped/{reason}",  # with more than 16 vehicles
     }
     for process, table in TABLES.items():
         paths = [path for path, _ in flat(figures[process])]
@@ -134,7 +133,7 @@ def test_no_line_of_the_tables_is_about_nothing(figures: dict[str, dict[str, Any
 
 
 def test_names_follow_prometheus() -> None:
-    """Base units last, `_total` for what only grows; letters alone, as dashboards are checked."""
+    """Base units last, `_total` for counters; letters only, as in the check of dashboards."""
     for table in (*TABLES.values(), metrics.OWN):
         for metric in table:
             assert re.fullmatch("[a-z_]+", metric.name)
@@ -186,7 +185,7 @@ def test_a_vehicle_is_in_one_mode(figures: dict[str, dict[str, Any]]) -> None:
 
 
 def test_vehicles_told_of_are_bounded(figures: dict[str, dict[str, Any]]) -> None:
-    """Twenty fly, and a gatherer is told of sixteen: it keeps each of them for weeks."""
+    """Twenty fly, and sixteen are reported, because Prometheus stores each for weeks."""
     told = {
         labels for name, labels in numbers("client", figures["client"]) if "client_step" in name
     }
@@ -231,7 +230,7 @@ def test_a_server_is_well_while_it_is_in_time() -> None:
 
 
 def test_a_process_that_is_stuck_is_not_well(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Its figures grow old; before the first there is nothing to tell."""
+    """Its figures become old; before the first figures its state is unknown."""
     collected = Collected("server.1", "demo", 0.05)
     assert collected.health()[0] == "503 Service Unavailable"
     collected.take({"degraded": False})
@@ -265,7 +264,6 @@ def said(sock: socket.socket) -> bytes:
 
 
 def asked(served: Metrics, request: bytes) -> tuple[bytes, bytes]:
-    """Status line and body of the answer to a request."""
     with calling(served) as sock:
         sock.sendall(request)
         head, _, body = said(sock).partition(b"\r\n\r\n")
@@ -322,9 +320,7 @@ def test_anything_else_is_refused(served: Metrics, request_: bytes, status: byte
 def test_who_comes_by_the_name_of_a_website_is_refused(
     served: Metrics, host: str, status: bytes
 ) -> None:
-    """A stranger may have pointed it at this machine; nobody can do so with a number, or with the
-    name of a container.
-    """
+    """A stranger's name may resolve to this machine; an address or a container's name is safe."""
     request = f"GET /metrics HTTP/1.1\r\nHost: {host}\r\n\r\n".encode("latin-1")
     said_, text = asked(served, request)
     assert said_ == b"HTTP/1.0 " + status

@@ -1,4 +1,4 @@
-"""The Compose profile `observe`: what its dashboard asks for is there, and it is locked in.
+"""Compose profile `observe`: every metric of its dashboard is served, and access is restricted.
 
 Neither Prometheus nor Grafana runs here; server, netem and client do.
 """
@@ -37,7 +37,7 @@ NEVER_YET = {
     "skytether_server_dropped_datagrams_total",
     "skytether_client_dropped_datagrams_total",
 }
-"""Metrics that are there once something of the kind has happened."""
+"""Metrics that exist only after an event of their kind."""
 EXPRESSIONS = [
     *(target["expr"] for panel in DASHBOARD["panels"] for target in panel["targets"]),
     *(rule["expr"] for group in RULES["groups"] for rule in group["rules"]),
@@ -51,7 +51,7 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, set[str]]
 
 @pytest.fixture(scope="module")
 def exported(flown: tuple[dict[str, set[str]], str]) -> dict[str, set[str]]:
-    """Names of the numbers that processes serve while they fly, and of their labels."""
+    """Names of the metrics that processes serve in flight, and of their labels."""
     return flown[0]
 
 
@@ -83,7 +83,7 @@ async def _flown(feeds: Path) -> tuple[dict[str, set[str]], str]:
         await asyncio.wait_for(flying.wait(), 60.0)
         found: dict[str, set[str]] = {}
         deadline = asyncio.get_running_loop().time() + 30.0
-        # Figures are a second old: until they have the first plan, too.
+        # Figures are a second old: wait until they include the first plan.
         while "skytether_client_age_seconds" not in found:
             assert asyncio.get_running_loop().time() < deadline
             await asyncio.sleep(0.2)
@@ -131,7 +131,7 @@ def test_the_documented_reader_of_a_feed_reads_it(flown: tuple[dict[str, set[str
 
 
 def test_every_label_that_is_asked_for_is_served(exported: dict[str, set[str]]) -> None:
-    """In selections and sums; those that Prometheus adds are known."""
+    """In selections and sums; labels added by Prometheus are known."""
     for expression in EXPRESSIONS:
         labels = set(re.findall(r"(\w+)(?:=|=~|!=)\"", expression))
         labels |= {
@@ -153,7 +153,7 @@ def test_expressions_fit_what_they_are_about(expression: str) -> None:
     for name in re.findall(r"(?:rate|increase)\(skytether_(\w+)", expression):
         assert kinds[name.removesuffix("_bucket")] in ("counter", "histogram")
     for name in re.findall(r"skytether_(\w+_total)\b(?![^)]*\[)", expression):
-        assert name == "feed_dropped_readers_total"  # a number so far is what is wanted there
+        assert name == "feed_dropped_readers_total"  # a total is intended there
     if "histogram_quantile" in expression:
         assert "sum by (le" in expression
         assert "_bucket" in expression

@@ -1,4 +1,4 @@
-"""The progress bar of all commands: what it shows, and that it shows nothing without a terminal."""
+"""Progress bar of all commands; nothing is shown without a terminal."""
 
 import sys
 
@@ -10,7 +10,7 @@ from skytether.shell.terminal import progress
 def test_a_bar_shows_title_amount_unit_and_text(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The texts are shown literally: brackets and braces in them are no markup."""
+    """Texts are shown literally: brackets and braces are no markup."""
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
     monkeypatch.setenv("TERM", "xterm")
     monkeypatch.setenv("COLUMNS", "120")

@@ -1,4 +1,4 @@
-"""A part of the record on its way to a file: all rows, or as many as fit and a line about it."""
+"""Writing a part of the record to a file: all rows, or as many as fit and a line about it."""
 
 import os
 import time
@@ -33,7 +33,6 @@ def test_rows_are_in_the_file_at_the_end(tmp_path: Path) -> None:
 
 
 def test_rows_reach_the_file_while_the_flight_goes_on(tmp_path: Path) -> None:
-    """A process that is killed keeps them."""
     path = tmp_path / "netem"
     with recorded(path, PACKET_COLUMNS) as part:
         append(part, 10)
@@ -43,8 +42,6 @@ def test_rows_reach_the_file_while_the_flight_goes_on(tmp_path: Path) -> None:
 
 
 class OnAFullDisk(files.Growing):
-    """A file for which there is no room."""
-
     def __init__(self, path: Path, buffering: int = -1) -> None:
         self._path = self.at = path
         self.file = Path("/dev/full").open("r+b", buffering)  # noqa: SIM115 - closed by `end`
@@ -94,7 +91,7 @@ def test_without_a_temporary_file_a_flight_is_flown_all_the_same(
 
 
 def test_a_disk_that_is_too_slow_loses_whole_rows(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Those for which there is no room in memory, and those not written when patience ends."""
+    """Rows beyond the memory's capacity, and those not written within the final timeout."""
     monkeypatch.setattr(recording, "ROOM_BYTES", 1000)
     monkeypatch.setattr(recording, "PATIENCE_S", 0.01)
     reading, writing = os.pipe()
@@ -118,7 +115,7 @@ def test_a_disk_that_is_too_slow_loses_whole_rows(monkeypatch: pytest.MonkeyPatc
 
 
 def test_a_file_of_any_name_can_be_told_of() -> None:
-    """Its name need not be Unicode, but a line of JSON is."""
+    """Its name may be invalid Unicode, but a line of JSON must not."""
     part = RecordFile("netem\udcff", PACKET_COLUMNS, OSError(28, "No space left on device"))
     part.end()
     assert part.news() == RecordIncomplete(file="netem?", reason="No space left on device")
@@ -126,8 +123,6 @@ def test_a_file_of_any_name_can_be_told_of() -> None:
 
 
 def test_a_command_that_fails_otherwise_says_only_that(full: Path) -> None:
-    """A vehicle that was refused is the reason, whatever is in the record."""
-
     def fly() -> None:
         with recorded(full, PACKET_COLUMNS) as part:
             append(part, 3)

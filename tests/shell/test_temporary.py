@@ -1,4 +1,4 @@
-"""Temporary folders: gone at the end, and after a death with the next one that is made."""
+"""Temporary folders: removed at the end, or after a kill by the next process that makes one."""
 
 import os
 import signal
@@ -31,7 +31,7 @@ def _place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def holding() -> "subprocess.Popen[str]":
-    """A process that holds a folder until its standard input ends."""
+    """Process that holds a folder until its standard input ends."""
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
     return subprocess.Popen([sys.executable, "-P", "-c", HOLDING], **pipes, text=True)  # type: ignore[call-overload]
 
@@ -63,7 +63,7 @@ def test_the_next_start_clears_what_a_dead_process_has_left(
 
 
 def test_what_is_not_ours_stays(tmp_path: Path) -> None:
-    """A folder by hand of such a name, a file, a link to a folder, and one of another user."""
+    """A user's folder of such a name, a file, a link to a folder, and another user's folder."""
     (tmp_path / "skytether-results").mkdir()
     (tmp_path / "skytether-file").touch()
     with holding() as owner:

@@ -1,4 +1,4 @@
-"""Tests of the time of day of a host."""
+"""Time of day of a host, and its error as known to the kernel."""
 
 from unittest.mock import call, create_autospec
 
@@ -11,7 +11,7 @@ from skytether.shell.time_of_day import HostTime, TimeTeller, stated
 
 
 def test_a_host_s_clock_counts_where_its_kernel_tells_how_wrong_it_is() -> None:
-    """By chrony it tells both errors; a clock that nothing disciplines, or 0 wrong, is unknown."""
+    """chrony sets both errors; an undisciplined clock, or one with error 0, counts as unknown."""
     assert stated(0, 0x2001, 1500, 40) == 1_500_000
     for answer, status, most_us, estimate_us in (
         (5, 0x40, 16_000_000, 16_000_000),

@@ -1,4 +1,4 @@
-"""Writing in the background: in order, whole, bounded; never waited for, and never a fault."""
+"""Background writing: ordered, complete, bounded; never blocks or raises."""
 
 import errno
 import os
@@ -15,7 +15,7 @@ PATIENCE_S = 30.0
 
 @pytest.fixture
 def pipe() -> Iterator[tuple[IO[bytes], IO[bytes]]]:
-    """A pipe of 4096 bytes whose every write is read as one: what to read from, and write to."""
+    """Pipe of 4096 bytes whose every write is read as one: ends to read from and write to."""
     reading, writing = os.pipe2(os.O_DIRECT)
     with (
         os.fdopen(reading, "rb", buffering=0) as read,
@@ -62,7 +62,7 @@ def test_nobody_waits_for_a_reader_who_does_not_read(pipe: tuple[IO[bytes], IO[b
 
 
 def test_a_pipe_that_does_not_block_loses_nothing(pipe: tuple[IO[bytes], IO[bytes]]) -> None:
-    """Such is what another program may have made of a standard output that it shares."""
+    """Another program may have made a shared standard output non-blocking."""
     reading, writing = pipe
     os.set_blocking(writing.fileno(), False)
     writer = Writer(writing, room=10**6, together=10)

@@ -1,4 +1,4 @@
-"""Flights by machine code, as in virtual time, and by plain Python, as aboard: the same bits."""
+"""Flights with compiled code, as in virtual time, and in plain Python, as aboard: the same bits."""
 
 from typing import Any
 
@@ -14,11 +14,10 @@ from skytether.shared.telemetry.record import Reason, Record
 from skytether.sim.flight import fly, fly_batch
 
 SHORT = {"duration": 4.0, "settle": 0.0}
-"""A few seconds of a scenario."""
 
 
 def assert_same(flown: Scenario, **keys: Any) -> Record:
-    """The record of a flight that is the same in plain Python."""
+    """Record of a flight, after checking that it is the same in plain Python."""
     compiled = fly(flown, **keys)
     with interpreted():
         plain = fly(flown, **keys)
@@ -30,7 +29,7 @@ def assert_same(flown: Scenario, **keys: Any) -> Record:
 
 
 def test_virtual_time_flies_by_machine_code_and_plain_python_does_not() -> None:
-    """Else the other tests here would compare a thing with itself."""
+    """Otherwise the other tests here would compare a thing with itself."""
     assert all(hasattr(each.func, "dispatcher") for each in COMPILABLE)
     with interpreted():
         assert not any(hasattr(each.func, "dispatcher") for each in COMPILABLE)
@@ -121,7 +120,7 @@ def test_vehicles_of_a_batch_and_of_a_fleet_keep_the_order_of_their_records() ->
 
 
 def test_wind_and_gusts_of_a_noisy_vehicle_may_come_and_go() -> None:
-    """Numbers that were drawn in advance are given back where gusts begin to draw theirs."""
+    """Numbers drawn in advance are returned when gusts begin to draw theirs."""
     changes = [
         (1.0, {"vehicle.wind": 0.0}),
         (1.5, {"vehicle.wind": 0.3}),

@@ -1,4 +1,4 @@
-"""Whole flights in virtual time: reproducible, and as good as they are said to be."""
+"""Whole flights in virtual time: reproducible, and with the documented errors."""
 
 import os
 import subprocess
@@ -29,18 +29,16 @@ from skytether.sim.flight import fly, fly_batch
 
 
 def summary(flown: Scenario, flight: Record) -> Summary:
-    """Summary of a flight's three parts."""
     return summarise(flown, "test", flight.client, flight.server, flight.netem)
 
 
 def flew(name: str = "paper-every-step", **changes: Any) -> Summary:
-    """Summary of a flight of a packaged scenario with other keys."""
     flown = packaged(name, **changes)
     return summary(flown, fly(flown))
 
 
 QUIET = {"uplink": "", "downlink": ""}
-"""A network that does nothing."""
+"""Network without delay and loss."""
 
 HASH = """
 from skytether.shared.scenario import reading
@@ -83,14 +81,13 @@ def test_without_network_the_estimate_is_the_state() -> None:
     """Zero delay, no loss: x̂(k) = x(k) to the last bit of float32, at every step."""
     flown = packaged("paper-every-step", duration=10.0, network=QUIET)
     flight = fly(flown)
-    # The flight is over with step 199, before the server has ticked for it.
+    # The flight ends with step 199, before the server has ticked for it.
     assert flight.server["step"].tolist() == list(range(199))
     state = flight.client["state"][:199].astype(np.float32)
     np.testing.assert_array_equal(flight.server["estimate"], state)
 
 
 def test_a_flight_that_is_over_before_it_has_settled_has_an_error() -> None:
-    """The error is that of its second half; `demo` leaves out 8 s, where it is long enough."""
     flown = packaged("demo", duration=5.0)
     flight = fly(flown)
     error = position_error(flown, flight.client, flight.server)[50:]
@@ -109,7 +106,7 @@ def test_the_summary_counts_what_the_network_saw() -> None:
     down = flight.netem[flight.netem["direction"] == DOWNLINK]
     assert result.steps == 400
     assert result.duration_s == 20.0
-    # HELLO, an observation a step; the last half second of them is still on its way at the end.
+    # HELLO and an observation per step; the last half second is still under way at the end.
     assert result.downlink_packets == len(down) >= 390
     assert result.downlink_bytes == down["bytes"].sum()
     assert result.uplink_packets == len(up)
@@ -176,7 +173,6 @@ def test_unsynchronised_clocks_change_nothing(offset_s: float) -> None:
 
 
 def test_a_drifting_clock_is_followed() -> None:
-    """200 ppm for a minute are 12 ms: the flight is as good as without."""
     plain, drifted = flew(seed=3), flew(seed=3, simulation={"clock_drift_ppm": 200.0})
     assert drifted.rmse_xy == pytest.approx(plain.rmse_xy, rel=0.05)
 
@@ -254,7 +250,7 @@ def test_budget_caps_a_flight_and_a_heartbeat_ends_its_silences() -> None:
         return server["step"][server["event"]] * flown.control.dt
 
     def most(sent_s: Array) -> float:
-        """Packets in any window, less 5/s of its length."""
+        """Packets in any window, minus 5/s times its length."""
         n, i = np.arange(len(sent_s)), np.tril_indices(len(sent_s))
         return ((n[:, None] - n + 1) - 5.0 * (sent_s[:, None] - sent_s))[i].max()
 
@@ -264,12 +260,12 @@ def test_budget_caps_a_flight_and_a_heartbeat_ends_its_silences() -> None:
 
 
 def test_what_is_never_flown_costs_no_packets() -> None:
-    """Over a round trip of 1.6 s the last 1.3 s of a plan are too old before their turn comes."""
+    """Over a round trip of 1.6 s, the last 1.3 s of a plan are too old to be flown."""
     slow = "paper(0.76, 0.02, 2.0) & loss(0.1)"
     long = packaged("demo-committed", duration=30.0, network={"uplink": slow, "downlink": slow})
     assert long.link.age_max_s == 5.0
     found = [summary(long, flight) for flight in fly_batch(long, range(1, 7))]
-    assert max(each.event_ratio or 1.0 for each in found) < 0.08  # 0.6 where all of it is compared
+    assert max(each.event_ratio or 1.0 for each in found) < 0.08  # 0.6 if all of it is compared
     assert np.median([each.rmse_xy or 1.0 for each in found]) < 0.035
 
 
@@ -278,7 +274,7 @@ def test_what_is_never_flown_costs_no_packets() -> None:
 def test_a_flight_is_the_same_whenever_stamps_begin_anew(
     name: str, midnight_s: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Every 71 minutes of the server's clock: 15 s after its begin, and where the clocks differ."""
+    """Every 71 minutes of the server's clock: 15 s after its start, and where the clocks differ."""
     flown = packaged(name, duration=25.0)
     usual = fly(flown)
     monkeypatch.setattr(skytether.sim.flight, "MIDNIGHT_NS", midnight_s * SECOND_NS)
@@ -290,7 +286,6 @@ def test_a_flight_is_the_same_whenever_stamps_begin_anew(
 def test_a_server_that_takes_stamps_as_they_are_plans_for_nobody(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Ablation: a day after its begin no round trip is one."""
     monkeypatch.setattr(reception, "stamped_ns", lambda stamp, near_ns: stamp * 1000)  # noqa: ARG005
     flight = fly(packaged("demo", duration=10.0))
     assert not flight.client["covered"].any()

@@ -1,4 +1,4 @@
-"""Flights without a plan: never flown, ended in hover, or with a gap, and how they end."""
+"""Flights without a plan: never flown, ended in hover, or with a gap."""
 
 from typing import Any
 
@@ -18,7 +18,7 @@ from skytether.sim.flight import MIDNIGHT_NS, fly
 
 
 def scenario(**sections: Any) -> Scenario:
-    """Twenty seconds of the demo over 0.2 s each way without loss; sections are laid over."""
+    """Twenty seconds of the demo over 0.2 s each way without loss, with sections changed."""
     quick = "constant(0.2)"
     preset = {
         "duration": 20.0,
@@ -29,17 +29,16 @@ def scenario(**sections: Any) -> Scenario:
 
 
 def said(flight: Record, host: str = "client") -> list[Any]:
-    """Events of a host of the flight."""
     return [event for _, name, event in flight.events if name.split()[0] == host]
 
 
 class Interrupted(Server):
-    """A server that is gone for a while, and may come back as another life of it."""
+    """Server that is down for a while, and may return as another life."""
 
     gone_s = 0.0, 0.0
     """Begin and end of the server's absence, from the start of the world [s]."""
     mute = False
-    """Whether it does everything but send horizons while it is gone."""
+    """Whether the server is up during the absence but sends no horizons."""
 
     def __init__(self, flown: Scenario, **keys: Any) -> None:
         super().__init__(flown, **keys)
@@ -47,7 +46,7 @@ class Interrupted(Server):
         self._made: tuple[Scenario, dict[str, Any]] | None = flown, keys
 
     def gone(self, now_ns: int) -> bool:
-        """Whether it is gone; the first that comes after that is heard by another life."""
+        """Whether the server is down; the first datagram afterwards is received by another life."""
         begin, end = (MIDNIGHT_NS + round(each * SECOND_NS) for each in self.gone_s)
         if now_ns >= end and self._made is not None and not self.mute:
             flown, keys = self._made
@@ -56,7 +55,6 @@ class Interrupted(Server):
         return begin <= now_ns < end
 
     def muted(self, payload: bytes) -> bytes:
-        """A heartbeat in place of a horizon."""
         message = decode(payload, self._terms)
         if not isinstance(message, Horizon):
             return payload
@@ -80,7 +78,7 @@ class Interrupted(Server):
 def interrupted(
     flown: Scenario, begin_s: float, end_s: float = 1e6, *, mute: bool = False
 ) -> Record:
-    """A flight with a server that is gone, or sends no horizon, from one time to another."""
+    """Flight with a server that is down, or sends no horizon, from one time to another."""
     server = Interrupted(flown, boot_id=1, entropy=stream(1, "entropy").bytes)
     server.gone_s, server.mute = (begin_s, end_s), mute
     return fly(flown, server=server)
@@ -110,7 +108,7 @@ def test_a_vehicle_that_hovers_to_the_end_has_not_been_flown(*, mute: bool) -> N
 
 
 def test_a_server_that_dies_within_the_last_horizon_leaves_a_flight() -> None:
-    """No longer without a plan than `link.timeout_s`: it was flown to the end."""
+    """Without a plan for less than `link.timeout_s`, so it was flown to the end."""
     flight = interrupted(scenario(), 18.5)
     assert not flight.client["covered"][-1]
     assert flight.failure is None
@@ -134,7 +132,7 @@ def test_a_flight_with_a_gap_is_a_flight() -> None:
 
 
 def test_after_a_restart_a_vehicle_is_flown_that_drifts_faster_than_any_input() -> None:
-    """Wind of 4 m/s against inputs of up to 1.6 m/s: what is committed is kept within these."""
+    """Wind of 4 m/s against inputs of up to 1.6 m/s: committed inputs are kept within the bound."""
     wind = {"steady_wind_mps": [4.0, 0.0], "start_m": [-10.0, 0.0]}
     flown = scenario(vehicle=wind, model={"u_max": [1.6]})
     flight = interrupted(flown, 3.0, 10.0)
@@ -143,4 +141,4 @@ def test_after_a_restart_a_vehicle_is_flown_that_drifts_faster_than_any_input() 
     assert not before["covered"]
     assert flight.client["covered"][-100:].all()
     assert after["in_force"] > 200
-    assert after["state"][0, 1] < 2.5  # all that 1.6 m/s can do
+    assert after["state"][0, 1] < 2.5  # the effect of 1.6 m/s

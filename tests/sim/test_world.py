@@ -1,4 +1,4 @@
-"""Virtual time itself: clocks, order, computing time."""
+"""Virtual time: clocks, order of events, computing time."""
 
 from collections.abc import Callable
 from functools import partial
@@ -20,7 +20,7 @@ times = st.integers(0, 10**15)
 
 
 class Probe(Endpoint):
-    """Writes down what happens to it, answers once, and wakes as it was told to."""
+    """Endpoint that logs its calls, answers once, and wakes at given times."""
 
     def __init__(self, wakes_ns: list[int], answer_to: Address | None = None) -> None:
         super().__init__()
@@ -29,38 +29,30 @@ class Probe(Endpoint):
         self.log: list[tuple[str, int]] = []
 
     def receive(self, datagram: Datagram, *, now_ns: int) -> None:
-        """Note it."""
         name, socket = datagram.peer
         self.log.append((f"{datagram.payload.decode()} from {name} {socket}", now_ns))
 
     def wake(self, *, now_ns: int) -> None:
-        """Note it, and send one datagram."""
         self.wakes_ns.pop(0)
         self.log.append(("wake", now_ns))
         if self.answer_to is not None:
             self._out.append(Datagram(b"hi", self.answer_to, 2))
 
     def next_wake_ns(self) -> int | None:
-        """The next of the list."""
         return self.wakes_ns[0] if self.wakes_ns else None
 
 
 class Finite(Probe):
-    """Ends with its last wake."""
-
     @property
     def finished(self) -> bool:
-        """Whether it has been woken as often as it was to be."""
         return not self.wakes_ns
 
 
 def run(world: World, limit_ns: int = SECOND_NS) -> None:
-    """Let everything happen, up to a time."""
     world.run(lambda: False, limit_ns=limit_ns)
 
 
 def hosted(*wakes_ns: int, **keys: Any) -> tuple[World, Probe]:
-    """A world with one host, and what happens to that."""
     world, probe = World(), Probe(list(wakes_ns))
     world.add("host", probe, **keys)
     return world, probe
@@ -122,7 +114,7 @@ def test_what_arrives_is_heard_before_anybody_acts_on_that_instant() -> None:
     there = world.add("there", receiver)
     world.add("here", Probe([50], answer_to=there))
     run(world)
-    # Both wake at 50; the sender was asked second, but what it sends still comes at 50.
+    # Both wake at 50; the sender was woken second, but its datagram still arrives at 50.
     assert receiver.log == [("wake", 50), ("hi from here 2", 50)]
     later = Probe([50, 60])
     world = World()
@@ -133,7 +125,7 @@ def test_what_arrives_is_heard_before_anybody_acts_on_that_instant() -> None:
 
 
 def test_a_computing_host_sends_late_and_hears_at_once() -> None:
-    """A host woken at 50 is busy for 30 ns: its word leaves at 80, but it heard one at 60."""
+    """Woken at 50 for 30 ns of computing: sends at 80, but receives a datagram at 60."""
     world, busy, other = World(), Probe([50]), Probe([60])
     busy_address = world.add("busy", busy, compute_ns=30)
     other_address = world.add("other", other)
@@ -158,7 +150,7 @@ def test_at_one_instant_hosts_are_woken_in_the_order_they_were_added() -> None:
         world.add(name, probe)
     woken: list[int] = []
     world.run(lambda: bool(woken.append(len(first.log) - len(second.log))), limit_ns=SECOND_NS)
-    # `second` has wanted to be woken at 90 all along, `first` only since 70.
+    # `second` has been due at 90 since the start, `first` only since 70.
     assert max(woken) == 2
 
 
@@ -179,7 +171,6 @@ def test_the_end_of_an_endpoint_is_told_once_and_at_once() -> None:
 def test_every_event_is_told_with_its_time_and_host_before_the_end_of_its_endpoint() -> None:
     class Talker(Finite):
         def wake(self, *, now_ns: int) -> None:
-            """Say something."""
             super().wake(now_ns=now_ns)
             self._events.append(Flying(vehicle=len(self.log)))
 
@@ -210,7 +201,6 @@ def test_time_stops_at_its_limit(limit_ns: int) -> None:
 
 
 def at(world: World, time_ns: int, action: Callable[..., None], *args: Any, **named: Any) -> None:
-    """Have something done to the world at a time."""
     world.at(time_ns, partial(action, *args, **named))
 
 
@@ -309,7 +299,7 @@ def test_a_timer_counts_on_while_its_host_is_frozen() -> None:
 
 
 def test_another_rate_holds_from_now_on() -> None:
-    """A clock that runs twice as fast from 50 on has shown 300 at 175."""
+    """A clock that runs twice as fast from 50 on shows 300 at 175."""
     world, probe = hosted(100, 300)
     at(world, 50, world.set_clock, "host", drift_ppb=1_000_000_000)
     run(world)

@@ -1,6 +1,6 @@
-"""The page in a real browser: Chromium, which `CHROMIUM` or PATH names.
+"""The page in Chromium, which `CHROMIUM` or PATH names.
 
-Pictures of it lie in `page-test/` afterwards, light and dark, wide and narrow.
+Pictures are left in `page-test/`, light and dark, wide and narrow.
 """
 
 import os
@@ -41,7 +41,7 @@ sync_api = pytest.importorskip("playwright.sync_api", reason="Playwright is not 
 PICTURES = Path("page-test")
 RANGES = """() => Object.values(window.__viserTestpoints.uplots).slice(0, 2).map(({chart}) =>
     [chart.data[0].at(-1) - chart.scales.x.max, chart.scales.y.max - chart.scales.y.min])"""
-"""Of the plots of x and y: newest time beyond the shown ones [s], and height of the range [m]."""
+"""For the plots of x and y: newest time beyond the shown ones [s], and height of the range [m]."""
 WIDTHS = (("narrow", 2), ("wide", 9))
 """Tables of a report and their numbers of columns."""
 
@@ -73,7 +73,7 @@ def flight(browser: "sync_api.Browser") -> Iterator[str]:
 def test_moving_data_is_drawn_within_three_seconds_and_nobody_outside_is_asked(
     browser: "sync_api.Browser", flight: str
 ) -> None:
-    """The quickest of three times, on a machine that is not busy with others."""
+    """The shortest of three times, allowing for a busy machine."""
     took_s, asked = [], []
     for _ in range(3):
         page = browser.new_page(viewport={"width": 1400, "height": 900})
@@ -178,7 +178,7 @@ def test_a_website_cannot_show_the_page_in_a_frame_and_catch_a_click(
         assert button
         attacked = browser.new_page(viewport=page.viewport_size)
         attacked.goto(f"http://localhost:{website.server_port}/")
-        attacked.wait_for_timeout(5000)  # longer than the page takes to be drawn
+        attacked.wait_for_timeout(5000)  # longer than drawing the page takes
         x, y = button["x"] + button["width"] / 2, button["y"] + button["height"] / 2
         attacked.mouse.click(x, y)
         picture(attacked, PICTURES / "framed.png")
@@ -233,7 +233,7 @@ def test_a_network_is_written_and_measured_on_a_page_of_its_own(
 
 
 def arrow(page: "sync_api.Page") -> tuple[float, float] | None:
-    """Where the arrow is by which a handle is dragged along x [pixels]; None without one."""
+    """Position of the arrow that drags a handle along x [pixels]; None if there is none."""
     left, width = 400, 640  # of the map, between the panels
     clip: sync_api.FloatRect = {"x": left, "y": 0, "width": width, "height": 900}
     seen = imread(BytesIO(page.screenshot(clip=clip))) * 255.0
@@ -249,8 +249,8 @@ def arrow(page: "sync_api.Page") -> tuple[float, float] | None:
 def test_zones_and_goals_of_a_mission_are_changed_and_refused_in_words(
     browser: "sync_api.Browser",
 ) -> None:
-    """A zone that a vehicle is in is not taken; another is, and is what the page shows. The chosen
-    vehicle is sent along x by its handle, and elsewhere by a click.
+    """A zone around a vehicle is refused; another one is accepted and shown. The chosen vehicle is
+    sent along x by its handle, and elsewhere by a click.
     """
     argv = ("fleet", "--mission", "warehouse", "--duration", "300", "--page", "127.0.0.1:0")
     with served(*argv) as address, opened(browser, address) as page:
@@ -267,20 +267,20 @@ def test_zones_and_goals_of_a_mission_are_changed_and_refused_in_words(
         page.mouse.move(x, y)
         page.mouse.down()
         page.mouse.move(x + 30.0, y, steps=10)
-        page.wait_for_timeout(2000)  # longer than it waits for an answer
-        assert page.get_by_text("mission.goals is").count() == 0  # it is still held
+        page.wait_for_timeout(2000)  # longer than the timeout for an answer
+        assert page.get_by_text("mission.goals is").count() == 0  # the handle is still held
         page.mouse.up()
         until(lambda: page.get_by_text('mission.goals is "goal(').count(), "it is sent there")
         page.mouse.move(x, 800.0)  # its arrow has another colour under the mouse
-        page.wait_for_timeout(2000)  # by then the handle is where the goal is known to be
+        page.wait_for_timeout(2000)  # by then the handle is at the confirmed goal
         moved = pytest.approx((x + 30.0, y), abs=12.0)
         until(lambda: arrow(page) == moved, "the handle is there")
         page.get_by_label("A click").click()
         page.get_by_role("option", name="sends the vehicle").click()
 
         def sent() -> int:
-            """Whether a click on the map has sent a vehicle; the first click may be too early, or
-            choose another vehicle that happens to be there.
+            """Whether a click on the map has sent a vehicle. The first click may be too early, or
+            choose another vehicle at that place.
             """
             page.mouse.click(720, 250)
             return page.get_by_text('from now on, it was "goal(').count()
@@ -334,7 +334,7 @@ def test_a_wide_table_of_a_report_fits_the_window(browser: "sync_api.Browser") -
 
 
 def test_who_has_no_token_can_only_look(browser: "sync_api.Browser") -> None:
-    """Under a name that is not this machine's alone there are no buttons before the token."""
+    """Under a name that may mean another machine, buttons appear only with the token."""
     with served("fly", "demo", "--duration", "120", "--page", "0.0.0.0:0") as address:
         port, token = re.search(r":(\d+)/.*token=(\S+)", address).groups()  # type: ignore[union-attr]
         with opened(browser, f"http://0.0.0.0:{port}/") as page:
@@ -362,11 +362,11 @@ def test_a_recording_can_be_scrubbed(browser: "sync_api.Browser", tmp_path: Path
         until(lambda: flown_s(page) > 0, "it plays")
         page.get_by_role("button", name="Pause").click()
         until(lambda: page.get_by_role("button", name="Go on").count(), "it is paused")
-        page.wait_for_timeout(1000)  # until what the slider was told before has come
+        page.wait_for_timeout(1000)  # until the slider's earlier value has arrived
         for at_s in (30, 12, 20):
             put(page, "Time [s]", at_s)
             until(lambda at_s=at_s: abs(flown_s(page) - at_s) <= 2, f"{at_s} s is shown")
-        page.wait_for_timeout(1500)  # until the last seconds up to there are shown as well
+        page.wait_for_timeout(1500)  # until the last seconds are shown too
         paused_s = flown_s(page)
         page.wait_for_timeout(1500)
         assert flown_s(page) == paused_s

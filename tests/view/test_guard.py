@@ -1,4 +1,4 @@
-"""The page's websocket with real clients: who may open it, and what may be sent by it."""
+"""The page's websocket with real clients: admission, and allowed messages."""
 
 import base64
 import os
@@ -29,7 +29,6 @@ from skytether.view.frames import of_flight
 PATIENCE_S = 30.0
 PROTOCOL = Subprotocol(f"viser-v{viser.__version__}")
 BINARY, PING = 2, 9
-"""Opcodes of websocket frames."""
 CAMERA = {
     "type": "ViewerCameraMessage",
     "wxyz": [1.0, 0.0, 0.0, 0.0],
@@ -52,7 +51,7 @@ def messages(payload: bytes) -> list[dict[str, Any]]:
 
 
 def frame(opcode: int, payload: bytes, *, last: bool = True) -> bytes:
-    """Websocket frame of a browser; its mask is zeros."""
+    """Websocket frame of a browser, with a mask of zeros."""
     size = len(payload)
     if size < 126:
         length = bytes([0x80 | size])
@@ -66,8 +65,7 @@ def frame(opcode: int, payload: bytes, *, last: bool = True) -> bytes:
 def opened(port: int) -> socket.socket:
     """Open the page's websocket on a raw socket with a small receive buffer.
 
-    Raises:
-        OSError: the connection is refused.
+    Raises OSError if the connection is refused.
     """
     sock = socket.socket()
     try:
@@ -93,10 +91,9 @@ def opened(port: int) -> socket.socket:
 
 
 def arriving(browser: ClientConnection) -> Iterator[dict[str, Any]]:
-    """Messages that come to a browser.
+    """Messages that arrive at a browser.
 
-    Raises:
-        ConnectionClosed: the browser is refused.
+    Raises ConnectionClosed if the browser is refused.
     """
     while True:
         payload = browser.recv(timeout=PATIENCE_S)
@@ -105,17 +102,14 @@ def arriving(browser: ClientConnection) -> Iterator[dict[str, Any]]:
 
 
 def told(browser: ClientConnection, kind: str) -> dict[str, Any]:
-    """The next message of a kind."""
     return next(message for message in arriving(browser) if message["type"] == kind)
 
 
 def element(browser: ClientConnection) -> str:
-    """Id of an element of the page that the browser could change."""
     return str(told(browser, "GuiDropdownMessage")["uuid"])
 
 
 def labelled(browser: ClientConnection, label: str) -> str:
-    """Id of the next element that is shown with a label."""
     shown = (each for each in arriving(browser) if each.get("props", {}).get("label") == label)
     return str(next(shown)["uuid"])
 
@@ -193,14 +187,14 @@ def test_a_website_of_a_stranger_reads_nothing(
 
 @pytest.mark.parametrize("host", ["127.0.0.1", "localhost", "192.0.2.7", "[::1]"])
 def test_the_page_itself_reads_the_flight_under_any_number(page: Page, host: str) -> None:
-    """A number cannot be rebound; through a tunnel or a container it may be any."""
+    """An IP address cannot be rebound; through a tunnel or a container it may be any."""
     with joined(page, f"http://{host}:{page.port}", host) as browser:
         assert browser.recv(timeout=PATIENCE_S)
     assert not counts(page)
 
 
 def test_who_has_the_token_in_the_address_is_asked_nothing_else(flown: PageFlight) -> None:
-    """The right token lets a browser in by any host name; a wrong one counts as none."""
+    """The right token admits a browser under any host name; a wrong one has no effect."""
     with closing(Page("127.0.0.1", 0, [flown], token="secret")) as page:
         with joined(page, "https://fleet.example", "fleet.example", "/?token=secret") as browser:
             assert browser.recv(timeout=PATIENCE_S)
@@ -230,8 +224,6 @@ def test_no_answer_may_be_shown_in_a_frame(
 
 
 class Asked:
-    """Operator that notes what it is asked for."""
-
     def __init__(self) -> None:
         self.asked: list[tuple[str, dict[str, Any]]] = []
 
@@ -310,18 +302,18 @@ def test_a_huge_frame_ends_the_connection(page: Page) -> None:
     [frame(BINARY, b"", last=False) + frame(0, b"", last=False) * 100, frame(BINARY, b"") * 20_000],
 )
 def test_a_message_of_countless_frames_ends_the_connection(page: Page, sent: bytes) -> None:
-    """However short they are: each takes room."""
+    """Even if they are short, because each takes memory."""
     with closing(opened(page.port)) as sock:
         with suppress(OSError):
             sock.sendall(sent)
         until(lambda: counts(page).get(TurnedAway.ROOM))
         until(lambda: not page._guard.connections)
-    # Nor does it keep a browser's place until what it has sent was read at the allowed rate.
+    # Nor does it occupy a browser's place until its data was read at the allowed rate.
     until(lambda: not page._guard.browsers)
 
 
 def test_who_never_reads_is_cut_off_once_he_pings(page: Page) -> None:
-    """The answers would fill the memory; whoever does not ping is cut off by the page's pings."""
+    """The answers would fill the memory; other clients are cut off by the page's pings."""
     with closing(opened(page.port)) as sock:
         sock.sendall(frame(BINARY, msgspec.msgpack.encode(CAMERA)))
         with suppress(OSError):  # reset, or a broken pipe
@@ -408,7 +400,7 @@ def test_browsers_beyond_the_most_are_turned_away(
 
 
 def test_a_page_of_another_version_is_told_so(page: Page) -> None:
-    """By the code that viser's browsers show; nothing is printed."""
+    """By the close code that viser's browsers show; nothing is printed."""
     with (
         connect(f"ws://127.0.0.1:{page.port}/", subprotocols=["viser-v0"]) as browser,  # type: ignore[list-item]
         pytest.raises(ConnectionClosed) as closed,
@@ -440,7 +432,7 @@ async def test_messages_wait_for_their_turn(monkeypatch: pytest.MonkeyPatch) -> 
 
 
 def test_a_page_is_not_served_where_viser_would_listen_without_the_guard() -> None:
-    """A version that opens its websocket in another way is refused, and not trusted."""
+    """Another version of viser, which opens its websocket differently, is refused."""
     with pytest.raises(RuntimeError, match="not known"), guard.Guard("").served():
         pass
 

@@ -1,4 +1,4 @@
-"""The page without a browser: who may play, what a slider asks for, and what is answered."""
+"""The page without a browser: access, requests of sliders, and answers."""
 
 import contextlib
 import re
@@ -52,10 +52,10 @@ HERE = {"Host": "127.0.0.1:8080", "Origin": "http://127.0.0.1:8080"}
         ("::1", "/", {"Host": "[::1]:8080", "Origin": "http://[::1]:8080"}, "", True),
         ("::ffff:127.0.0.1", "/", HERE, "", True),
         ("127.0.0.1", "/", {"Host": "127.0.0.1:8080"}, "", True),  # no browser
-        # A page of a stranger, in a browser on this machine.
+        # A stranger's page, in a browser on this machine.
         ("127.0.0.1", "/", HERE | {"Origin": "http://evil.example"}, "", False),
         ("127.0.0.1", "/", HERE | {"Origin": "null"}, "", False),
-        # The same under a name that the stranger lets mean this machine.
+        # The same under a name that the stranger resolves to this machine.
         ("127.0.0.1", "/", {"Host": "evil.io:8080", "Origin": "http://evil.io:8080"}, "", False),
         ("127.0.0.1", "/", {"Host": "[", "Origin": "http://["}, "", False),
         ("127.0.0.1", "/", {}, "", False),
@@ -65,7 +65,7 @@ HERE = {"Host": "127.0.0.1:8080", "Origin": "http://127.0.0.1:8080"}
         ("192.0.2.7", "/?token=Secret", HERE, "secret", False),
         ("192.0.2.7", "/", HERE, "secret", False),
         ("127.0.0.1", "/", HERE, "secret", True),
-        ("", "", {}, "", False),  # viser has not told
+        ("", "", {}, "", False),  # viser gave no details
     ],
 )
 def test_only_this_machine_and_who_knows_the_token_may_play(
@@ -80,7 +80,7 @@ def test_a_name_that_only_looks_like_this_machine_is_none() -> None:
 
 
 def running(process: str, scenario: schema.Scenario) -> tuple[Running, dict[str, Any]]:
-    """An endpoint of a process that can be changed, and the values that it has."""
+    """Endpoint of a process that can be changed, and its values."""
     from skytether.client.endpoint import Client
     from skytether.client.simulated.vehicle import simulated
     from skytether.netem.proxy import Proxy
@@ -103,7 +103,7 @@ def running(process: str, scenario: schema.Scenario) -> tuple[Running, dict[str,
 def test_every_slider_asks_for_what_the_processes_take(axes: int) -> None:
     scenario = reading.load("demo")
     model = msgspec.structs.replace(scenario.model, axes=axes)
-    control = msgspec.structs.replace(scenario.control, horizon=50)  # fits, whatever the delay
+    control = msgspec.structs.replace(scenario.control, horizon=50)  # fits, for any delay
     trigger = "state_gap & cost_gap | expected_gap & deviation | periodic"
     control = msgspec.structs.replace(control, scheme="committed", trigger=trigger)
     scenario = msgspec.structs.replace(scenario, model=model, control=control)
@@ -137,7 +137,7 @@ def test_every_trigger_that_is_offered_can_be_flown() -> None:
 
 PAPER = "paper(0.4, 0.02, 2.0) & loss(0.1)"
 NETWORK = {"network.uplink": PAPER, "network.downlink": PAPER}
-"""Values of netem as it tells them."""
+"""Values of netem in its frames."""
 
 
 @pytest.mark.parametrize(
@@ -166,7 +166,7 @@ def test_a_direction_without_loss_or_delay_has_no_slider_for_it() -> None:
 
 
 def test_healing_brings_back_what_was_before_the_link_was_cut(tmp_path: Path) -> None:
-    """Each direction its own loss; a link that is cut is not cut again."""
+    """Each direction its own loss; a cut link is not cut again."""
     asked: list[tuple[str, Any]] = []
     flight = PageFlight("", tmp_path)
     flight.ask = lambda process, values: asked.append((process, dict(values)))  # type: ignore[method-assign]
@@ -185,7 +185,6 @@ def test_healing_brings_back_what_was_before_the_link_was_cut(tmp_path: Path) ->
 
 
 def test_a_page_that_came_later_heals_as_well() -> None:
-    """Also what a slider has cut."""
     cuts = {"network.uplink": "rate(5000) & loss(1)", "network.downlink": "loss(1.0)"}
     assert is_cut(cuts)
     assert cut({"network.uplink": "rate(5000)"}) == {"network.uplink": "rate(5000) & loss(1)"}
@@ -194,7 +193,7 @@ def test_a_page_that_came_later_heals_as_well() -> None:
 
 
 def test_that_nobody_answers_is_said_in_words(tmp_path: Path) -> None:
-    """Once somebody has asked for a change; not where the page itself asks what may change."""
+    """Once a change was requested; not for the page's own question about changeable keys."""
     flight = PageFlight("", tmp_path)
     flight.ask("netem", {})
     flight.ask("client", {"armed": False})
@@ -239,7 +238,7 @@ def test_a_duel_is_on_the_same_network_and_seed() -> None:
 
 
 def test_a_gap_of_a_plot_is_drawn_as_a_gap() -> None:
-    """Nothing is where nothing is known: the browser would draw no line that has a NaN in it."""
+    """Unknown values are left out, because the browser draws no line that contains NaN."""
     nan = np.nan
     x, late, never = np.arange(4.0), np.array([nan, nan, 5.0, 6.0]), np.full(4, nan)
     cut = np.array([nan, 1.0, nan, 3.0])
@@ -285,7 +284,7 @@ def test_the_lines_of_a_scene_have_the_gaps_of_what_is_known() -> None:
 
 
 def test_the_figures_of_a_report_have_a_gap_where_rows_are_missing() -> None:
-    """A server that plans nothing has no line then; one that plans has one that is whole."""
+    """A server without plans has no line then; one with plans has a complete line."""
     steps, values = np.array([3, 4, 9, 10]), np.array([1.0, 2.0, 3.0, 4.0])
     assert np.array_equal(with_gaps(steps, values), [1.0, 2.0, np.nan, 3.0, 4.0], equal_nan=True)
     assert np.array_equal(with_gaps(np.arange(4), values), values)
@@ -326,7 +325,6 @@ def test_a_fence_is_drawn_as_far_as_it_has_bounds() -> None:
 
 
 def heard(at: str, folder: Path) -> list[str]:
-    """Lines said by a page's process about its address, and the page itself if it is served."""
     said: list[str] = []
     with pytest.MonkeyPatch.context() as patch, page_process.beside([folder], at):
         patch.setattr(page_process, "say", said.append)
@@ -339,7 +337,7 @@ def heard(at: str, folder: Path) -> list[str]:
 
 @pytest.fixture
 def neighbours() -> Iterator[int]:
-    """A port that is taken, and so is the next one; the one after these is free."""
+    """A port that is taken, like the next one; the following ones are free."""
     for port in range(20_000, 60_000, 7):
         with contextlib.suppress(OSError), contextlib.ExitStack() as taken:
             for each in (port + 2, port + 1, port):

@@ -33,8 +33,6 @@ from skytether.view.state import SAID_MAX, SLOTS_MAX, VEHICLES_MAX, State
 
 @dataclass(frozen=True)
 class Shown:
-    """A flight, and what is shown at its end."""
-
     scenario: Scenario
     flown: Record
     frames: tuple[tuple[int, str, Frame], ...]
@@ -42,13 +40,13 @@ class Shown:
 
     @property
     def now_ns(self) -> int:
-        """Time of its last frame, and a bin of the network later."""
+        """Time of its last frame, plus a bin of the network."""
         return self.state.newest_ns + SECOND_NS // 4
 
 
 @cache
 def demo(cut_s: float = 0.0, vehicles: int = 1, name: str = "demo-committed") -> Shown:
-    """Twelve seconds of the demonstration, with plans of inputs, the link of which may be cut."""
+    """Twelve seconds of the demo with plans of inputs, whose link may be cut."""
     scenario = msgspec.structs.replace(reading.load(name), duration=12.0)
     lost = {"network.uplink.loss": 1.0, "network.downlink.loss": 1.0}
     changes = [(cut_s, lost)] if cut_s else []
@@ -86,7 +84,7 @@ def test_the_curves_of_a_vehicle_are_its_record() -> None:
 
 
 def test_a_cut_link_is_a_gap_in_all_that_nobody_knows_meanwhile() -> None:
-    """In age and reference, as soon as the words say a dash; the vehicle itself is seen on."""
+    """In age and reference, from the moment the texts show a dash; the vehicle is still shown."""
     shown = demo(cut_s=6.0)
     track, client, server = shown.state.vehicles[1], shown.flown.client, shown.flown.server
     curves, dt = track.curves(1201), shown.scenario.control.dt  # a grid of the steps themselves
@@ -113,7 +111,7 @@ def test_a_cut_link_is_a_gap_in_all_that_nobody_knows_meanwhile() -> None:
 
 
 def test_packets_are_plotted_as_a_rate_both_ways() -> None:
-    """At every step a line at the top, and not at all before the flight."""
+    """At every step a line at the top, and none before the flight."""
     shown = demo()
     look = plots.Look(shown.state, shown.state.vehicles[1].curves(400), shown.now_ns)
     (packets,) = (each for each in plots.of_flight(2) if each.title == "Packets in a second")
@@ -139,7 +137,7 @@ def test_a_flight_longer_than_the_servers_scenario_is_as_long_as_the_clients() -
 
 @pytest.mark.parametrize("is_here", [True, False])
 def test_a_mission_whose_table_is_on_another_machine_is_shown(is_here: bool) -> None:
-    """Where the table is here, the map shows all of its places."""
+    """If the table is on this machine, the map shows all of its places."""
     mission = reading.load("warehouse")
     if not is_here:
         away = msgspec.structs.replace(mission.reference, file="/nowhere/warehouse.csv")
@@ -179,7 +177,7 @@ def test_the_plan_leads_on_from_where_the_vehicle_is() -> None:
 
 @pytest.mark.parametrize(("name", "least"), [("demo-committed", 320), ("demo", 50)])
 def test_loss_and_rates_are_those_of_the_packets(name: str, least: int) -> None:
-    """Counted in bins, they are what netem recorded; packets with a plan are the long ones."""
+    """Counted in bins, they equal netem's record; packets with a plan are the long ones."""
     shown = demo(name=name)
     packets, network = shown.flown.netem, shown.state.network
     for direction in (UPLINK, DOWNLINK):
@@ -268,7 +266,7 @@ def test_a_mission_s_zones_waits_and_distances_are_shown() -> None:
 
 
 def test_a_mission_s_motions_that_may_be_flown_are_shown() -> None:
-    """The one in force, and one that was sent since; not one that came too late to be accepted."""
+    """The one in force, and one sent since; not one that arrived too late."""
     scenario = reading.load("swap")
     shape = msgspec.structs.replace(scenario.reference, shape="swap(2)")
     scenario = msgspec.structs.replace(scenario, duration=6.0, settle=1.0, reference=shape)
@@ -290,10 +288,10 @@ def test_a_mission_s_motions_that_may_be_flown_are_shown() -> None:
 
 
 def test_what_comes_again_counts_once() -> None:
-    """A feed tells its newest frames to whoever connects anew."""
+    """A feed repeats its newest frames to a new reader."""
     shown = demo()
     state = state_of(shown.frames)
-    for _, process, frame in shown.frames:  # a feed tells its newest to whoever comes anew
+    for _, process, frame in shown.frames:  # a feed repeats its newest frames to a new reader
         state.take(process, frame)
     assert state.network.rates(UPLINK, shown.now_ns).sum() == (
         shown.state.network.rates(UPLINK, shown.now_ns).sum()
@@ -365,7 +363,7 @@ def test_a_day_takes_no_more_memory_than_a_minute() -> None:
 
 
 def test_what_makes_no_sense_is_refused_and_changes_nothing() -> None:
-    """A scenario of another version, a mode that there is none of, and columns of other axes."""
+    """A scenario of another version, an unknown mode, and columns of other axes."""
     shown = demo()
     state, newest_ns = state_of(shown.frames), shown.state.newest_ns
     does, trail = state.vehicles[1].does, state.vehicles[1].trail().tolist()
@@ -392,7 +390,7 @@ def test_a_part_with_columns_of_no_flight_is_left_out() -> None:
 
 
 def test_rows_of_an_hour_ago_change_nothing() -> None:
-    """The ring has room for a minute, and the newest of it wins."""
+    """The ring holds a minute, and the newest rows replace older ones."""
     state = State()
     columns = client_columns(2)
     state.take("client", opened("client", {"client": columns}))
@@ -414,7 +412,7 @@ def test_what_is_said_cannot_become_part_of_the_page() -> None:
 
 
 def test_it_says_how_old_what_the_server_knows_is() -> None:
-    """A vehicle that reports seldom is seen at every step all the same, and planned from less."""
+    """A vehicle that reports rarely is shown at every step; plans use older observations."""
     shown = demo()
     track, newest = shown.state.vehicles[1], shown.flown.server[-1]
     behind = int(newest["step"] - newest["observed_step"])

@@ -1,4 +1,4 @@
-"""Recordings: what is written comes back to the last bit, from a whole file and from a torn one."""
+"""Recordings: exact to the last bit, from complete and from damaged files."""
 
 import csv
 import io
@@ -84,7 +84,7 @@ def write_frames(
     chunk: int | None = None,
     end: bool = True,
 ) -> None:
-    """Record frames, so many in a chunk, with the end of a file or without."""
+    """Record frames, so many in a chunk, with or without the end of a file."""
     about = recorder._about(scenario, "demo", began=None, offset_ns=0, secure=False)
     made = Recording(file, scenario, about)
     for number, (_, process, frame) in enumerate(frames):
@@ -119,7 +119,6 @@ def refusal(argv: list[str], of: Any, capsys: pytest.CaptureFixture[str]) -> tup
 
 
 def refused(path: Path, folder: Path, capsys: pytest.CaptureFixture[str]) -> list[str]:
-    """Lines of the two commands that refuse a recording."""
     tables, page = str(folder / "tables"), str(folder / "page.html")
     told = [
         refusal([str(path), "--csv", tables], export, capsys),
@@ -129,7 +128,7 @@ def refused(path: Path, folder: Path, capsys: pytest.CaptureFixture[str]) -> lis
     return [line for _, line in told]
 
 
-# --- What is written comes back.
+# --- Round trips.
 
 
 def test_a_flight_comes_back_to_the_last_bit(recording: Path) -> None:
@@ -150,7 +149,6 @@ def test_a_network_that_nobody_could_fly_over_is_recorded(tmp_path: Path) -> Non
 
 
 def test_frames_of_a_flight_are_in_the_order_of_their_times() -> None:
-    """From 0 on; a step's row has the time at which the step began."""
     frames = list(of_flight(SCENARIO, "demo", flown()))
     times_ns = [time_ns for time_ns, _, _ in frames]
     assert times_ns == sorted(times_ns)
@@ -193,7 +191,7 @@ COLUMNS += [PACKET_COLUMNS]
 def test_any_bits_of_a_row_become_a_message_of_its_schema(
     columns: np.dtype[np.void], bits: bytes, count: int
 ) -> None:
-    """What JSON has no number for is left out: NaN of every kind, and infinity."""
+    """Values without a number in JSON are left out: NaN of every kind, and infinity."""
     several = (bits * columns.itemsize)[: columns.itemsize] * count
     rows = np.frombuffer(several, columns).copy()
     for name in columns.names or ():
@@ -219,7 +217,7 @@ def test_what_json_has_no_number_for_is_left_out(number: float) -> None:
 
 
 def fault(message: Any, schema: Mapping[str, Any]) -> str:
-    """Fault of a message by its schema, as far as these schemas use JSON schema."""
+    """First mismatch of a message with its schema, for the parts of JSON schema in use."""
     match schema["type"]:
         case "object":
             if not isinstance(message, dict):
@@ -310,7 +308,7 @@ def test_a_plan_is_drawn_where_its_inputs_and_the_disturbance_lead() -> None:
 
 
 def test_rows_are_read_in_the_order_in_which_they_were_made(tmp_path: Path) -> None:
-    """Also where a clock has gone back between them; frames are in the order of their times."""
+    """Also if a clock was set back between them; frames are in the order of their times."""
     path, columns = tmp_path / "back.mcap", client_columns(2)
     frames = [opened(columns)]
     for step, time_ns in enumerate((300, 100, 200)):
@@ -357,7 +355,7 @@ def torn(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @cache
 def ends(path: Path) -> list[tuple[int, int]]:
-    """End of each whole record of a torn file [B], and number of frames up to there."""
+    """End of each whole record of a truncated file [B], and number of frames up to there."""
     stream, feeds, count = io.BytesIO(path.read_bytes()), set[int](), 0
     found = [(len(container.MAGIC), 0)]
     with suppress(EndOfFile):
@@ -402,7 +400,7 @@ def test_joined_alone_a_torn_recording_has_an_end_for_other_programs(
 def test_cut_anywhere_no_whole_chunk_is_lost(
     data: st.DataObject, torn: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
-    """At a byte of the whole file, or near the end of a chunk, where it matters most."""
+    """At any byte of the whole file, or near the end of a chunk, where it matters most."""
     size = torn.stat().st_size
     near = st.builds(lambda end, off: end[0] + off, st.sampled_from(ends(torn)), st.integers(-3, 3))
     cut = min(data.draw(st.integers(0, size) | near), size)
@@ -428,7 +426,7 @@ def chunked(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_damaged_byte_is_never_believed(
     at: int, by: int, chunked: Path, torn: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
-    """A whole file is refused; of one without an end, what comes before the byte is read."""
+    """A complete file is refused; of one without an end, the part before the byte is read."""
     path = tmp_path_factory.mktemp("damaged") / "damaged.mcap"
     for file in (chunked, torn):
         content = bytearray(file.read_bytes())
@@ -440,7 +438,7 @@ def test_a_damaged_byte_is_never_believed(
             continue
         undamaged = read(file).frames
         assert back.frames == undamaged[: len(back.frames)]
-        if file == chunked and back.lost_bytes is None:  # in the index, which is for others
+        if file == chunked and back.lost_bytes is None:  # in the index, which is for other programs
             assert len(back.frames) == len(undamaged)
 
 
@@ -528,7 +526,7 @@ def test_without_its_flush_a_recorder_would_lose_all(
 
 
 class Feeds:
-    """Stands in for `Subscriber`: the frames are given by hand."""
+    """Stand-in for `Subscriber` with frames from the test."""
 
     def __init__(self, paths: object, take: Any, lost: Any) -> None:  # noqa: ARG002
         self.take, self.lost = take, lost
@@ -573,7 +571,7 @@ def recorded_steps(path: Path) -> list[int]:
 def test_a_feed_that_begins_anew_is_recorded_once(
     live: tuple[Live, Feeds, list[str]], tmp_path: Path
 ) -> None:
-    """It repeats its last frames, and nothing was missed."""
+    """It repeats its last frames, and none was missed."""
     made, feeds, told = live
     for frame in (opened(client_columns(2)), row_at(1), row_at(2)):
         feeds.take("client", frame)
@@ -589,7 +587,7 @@ def test_a_feed_that_begins_anew_is_recorded_once(
 def test_a_feed_that_begins_anew_would_be_recorded_twice(
     live: tuple[Live, Feeds, list[str]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """If what has come before were not known."""
+    """Ablation: earlier frames are not recognised."""
     monkeypatch.setattr(recorder._Source, "is_new", lambda *_: True)
     made, feeds, _ = live
     for _ in range(2):
@@ -601,7 +599,6 @@ def test_a_feed_that_begins_anew_would_be_recorded_twice(
 
 
 def test_a_gap_in_a_feed_is_told_once(live: tuple[Live, Feeds, list[str]], tmp_path: Path) -> None:
-    """The recorder was dropped, and what it was not sent is gone."""
     made, feeds, told = live
     for begin in (1, 3, 5):
         for frame in (opened(client_columns(2)), row_at(begin)):
@@ -662,7 +659,7 @@ def test_a_flight_over_udp_is_recorded_from_its_first_step_on(tmp_path: Path) ->
     assert counted == {"server", "netem", "client"}
 
 
-# --- What is made of one.
+# --- Exports.
 
 
 def test_tables_have_plain_columns_with_units(recording: Path, tmp_path: Path) -> None:
@@ -691,7 +688,6 @@ def exported(recording: Path, folder: Path, part: str) -> list[dict[str, str]]:
 
 
 def test_what_is_not_known_is_empty_and_times_are_in_ms(recording: Path, tmp_path: Path) -> None:
-    """Times are in ms; before the first horizon its step and age are empty."""
     client = flown().client
     rows = exported(recording, tmp_path, "client")
     assert client["in_force"][0] == client["age_ns"][0] == -1
@@ -720,7 +716,7 @@ def test_a_table_says_how_far_off_the_vehicle_was(recording: Path, tmp_path: Pat
 
 
 def test_no_text_of_a_table_is_a_formula() -> None:
-    """A spreadsheet would compute it; a number stays a number, in words and as one."""
+    """A spreadsheet would compute it; numbers stay numbers, as text too."""
     texts = ["=1+1", "+1 m", "-x", "@SUM(1)", "\t=1", "a\r=1", "a=b", "-1.5", "+2", "-inf", ""]
     written = to_csv(["text", "number"], [(text, -1.5) for text in texts])
     assert to_csv(["=1+1"], []) == "'=1+1\n"
@@ -733,7 +729,7 @@ def test_no_text_of_a_table_is_a_formula() -> None:
 def test_no_text_of_a_table_or_a_line_is_obeyed_by_a_terminal(
     capfdbinary: pytest.CaptureFixture[bytes],
 ) -> None:
-    """It would clear the screen, or turn what follows: texts come from files and peers."""
+    """Escape sequences would clear the screen: texts come from files and peers."""
     text = "\x1b[2J\x07\u202e\x9bm"
     safe = r"\x1b[2J\x07\u202e\x9bm"
     assert to_csv(["text"], [[text]]) == f"text\n{safe}\n"
@@ -758,7 +754,7 @@ def test_a_report_is_one_page_that_needs_nothing_else(recording: Path, tmp_path:
     assert f"uplink lost {lost}" in page[page.index("dropped by netem") :]
 
 
-# --- What is refused.
+# --- Refusals.
 
 
 def other_mcap(path: Path) -> None:
@@ -790,11 +786,11 @@ def test_what_is_no_recording_is_refused_in_a_line(
     assert set(tmp_path.iterdir()) == before
 
 
-# --- What somebody has changed with care.
+# --- Manipulated recordings.
 
 
 def changed(path: Path, out: Path, change: Callable[[list[Any]], object]) -> Path:
-    """A recording with something changed in its records, and all checksums right."""
+    """Recording with changed records, and all checksums right."""
     found = records(path.read_bytes())
     change(found)
     out.write_bytes(written(found))
@@ -878,7 +874,7 @@ def chunk_starts(path: Path) -> list[int]:
 def bombed(
     recording: Path, chunk: Chunk, out: Path, capsys: pytest.CaptureFixture[str]
 ) -> tuple[str, int]:
-    """Line about a recording with a chunk more, and the most memory that reading it took [B]."""
+    """Message about a recording with an additional chunk, and the peak memory of reading it [B]."""
     builder = RecordBuilder()
     chunk.write(builder)
     content, at = recording.read_bytes(), chunk_starts(recording)[2]
@@ -897,7 +893,7 @@ def bombed(
 def test_a_chunk_that_is_far_larger_inside_is_not_opened(
     size: int, lies: bool, recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Whether the chunk says so, its compressed frame does, or that lies of even more."""
+    """Whether the chunk states its size, its compressed frame does, or that states a false one."""
     frame = zstandard.compress(bytes(2**28))
     if lies:
         frame = b"\x28\xb5\x2f\xfd\xe0" + (2**40).to_bytes(8, "little") + frame[9:]
@@ -910,7 +906,7 @@ def test_a_chunk_that_is_far_larger_inside_is_not_opened(
 def test_more_messages_than_there_is_an_index_for_are_not_made(
     recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """A few bytes of a message take hundreds in memory, so the number of messages is bounded."""
+    """A message of few bytes takes hundreds in memory, so the number of messages is bounded."""
     builder = RecordBuilder()
     Message(2, 0, pack(Figures(time_ns=0, figures={})), 0, 0).write(builder)
     inside = builder.end() * 70_000
@@ -921,7 +917,7 @@ def test_more_messages_than_there_is_an_index_for_are_not_made(
 
 
 def test_figures_of_a_damaged_recording_are_checked(recording: Path, tmp_path: Path) -> None:
-    """Drops are counted of them whenever a summary is asked for, long after the file was read."""
+    """Summaries count drops from them, long after the file was read."""
 
     def say_more(found: list[Any]) -> None:
         at, frame = next(iter(frames_of(found, "Figures").items()))
@@ -932,7 +928,7 @@ def test_figures_of_a_damaged_recording_are_checked(recording: Path, tmp_path: P
 
 
 def test_packets_are_drawn_of_a_flight_that_began_before_all_time() -> None:
-    """The step of a damaged first row may put its begin where no number of 64 bits is."""
+    """The step of a damaged first row may put the start beyond a 64-bit number."""
     from matplotlib.figure import Figure
 
     flown = flight.fly(msgspec.structs.replace(SCENARIO, duration=1.0, settle=0.0))
@@ -946,7 +942,7 @@ def test_packets_are_drawn_of_a_flight_that_began_before_all_time() -> None:
 def test_a_process_that_begins_thousands_of_times_is_checked_once(
     recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Each check of a scenario takes milliseconds, and a file has room for very many."""
+    """Each check of a scenario takes milliseconds, and a file may contain very many."""
 
     def repeat(found: list[Any]) -> None:
         found += [found[next(iter(frames_of(found, "Opened")))]] * 2000

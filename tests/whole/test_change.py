@@ -1,4 +1,4 @@
-"""Changes in flight: checked as a scenario is, made between two steps, told as events."""
+"""Changes in flight: checked like a scenario, made between two steps, logged as events."""
 
 import random
 import string
@@ -34,8 +34,6 @@ FORGOTTEN = {"vehicle.wind": 2.5}
 
 
 class Probe(Idle):
-    """Takes note of the changes that are made."""
-
     changeable = frozenset({"vehicle.wind", "network.uplink", "vehicle.steady_wind_mps"})
 
     def __init__(self) -> None:
@@ -55,7 +53,7 @@ PAPER = "paper(0.4, 0.02, 2.0)"
 
 
 def lossier(loss: float) -> Changed:
-    """The uplink loses another share of the packets than 0.1."""
+    """Change of the uplink's loss, which was 0.1."""
     before, after = f'"{PAPER} & loss(0.1)"', f'"{PAPER} & loss({loss})"'
     return Changed(key="network.uplink", before=before, after=after)
 
@@ -64,11 +62,11 @@ def answer(running: Running, request: bytes) -> Answer:
     return msgspec.json.decode(running.answer(request, now_ns=7), type=Answer)
 
 
-# -- what is checked -------------------------------------------------------------------------------
+# -- checks of changes -----------------------------------------------------------------------------
 
 
 def test_a_change_is_laid_over_all_changes_before_it() -> None:
-    """The endpoint is given the whole scenario, the keys and the time; its events tell of it."""
+    """The endpoint gets the whole scenario, the keys and the time; its events report the change."""
     endpoint, running = probe()
     running.change({"vehicle.wind": 2}, now_ns=5)
     changed = running.change({"network.uplink.loss": 0.25}, now_ns=6)
@@ -136,7 +134,7 @@ def test_a_request_without_keys_is_answered_with_what_may_change() -> None:
 def test_the_trajectory_s_file_is_not_read_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A disk may be slow, and a control tick is not; with another check the change would fail."""
+    """A disk may be too slow for a control tick; and the file may have changed since."""
     file = tmp_path / "way.csv"
     file.write_text("t,x,y\n0,0,0\n9,1,1\n")
     table = reading.to_table(DEMO) | {"reference": {"shape": "csv", "file": str(file)}}
@@ -205,12 +203,11 @@ def scenario(**changes: Any) -> Scenario:
 
 
 def told(flight: Record, *kinds: type[Event]) -> list[tuple[float, str, Event]]:
-    """Events of these kinds: time [s], host, event."""
     return [(at / 1e9, host, event) for at, host, event in flight.events if type(event) in kinds]
 
 
 def test_netem_loses_what_it_is_told_to_from_then_on() -> None:
-    """Packets that are under way arrive; with the same loss as before nothing is another."""
+    """Packets under way arrive; setting the same loss again has no effect."""
     flown = scenario()
     flight = fly(flown, changes=[(4.0, {"network.uplink.loss": 1.0})])
     up = flight.netem[flight.netem["direction"] == UPLINK]
@@ -260,7 +257,7 @@ def test_a_threshold_changes_without_its_trigger() -> None:
 
 
 def test_wind_blows_from_the_next_step_on_and_changes_nothing_before() -> None:
-    """To the last bit; and gusts begin, and end. No feedback answers them aboard."""
+    """To the last bit; and gusts begin, and end. There is no feedback aboard."""
     flown = scenario(vehicle={"wind": 0.0}, control={"feedback": False})
     calm = fly(flown).client
     for values in ({"vehicle.steady_wind_mps": [0.5, 0.0]}, {"vehicle.wind": 0.2}):
@@ -287,7 +284,6 @@ def test_a_gust_that_blows_goes_on_with_its_new_strength() -> None:
 
 
 def test_a_live_point_is_led() -> None:
-    """The server knows it as it was told last, carried on, and the vehicle comes after it."""
     flown = scenario(reference={"shape": "live"}, duration=14.0)
     place, way = "reference.points_m", "reference.velocity_mps"
     flight = fly(
@@ -319,7 +315,7 @@ def test_only_a_live_point_can_be_led() -> None:
 
 
 def arming(*changes: tuple[float, bool], armed: bool = True) -> Record:
-    """A flight in which the vehicle is armed and disarmed at these times [s]."""
+    """Flight in which the vehicle is armed and disarmed at these times [s]."""
     flown = scenario(armed=armed, duration=12.0)
     return fly(flown, changes=[(at, {"armed": value}) for at, value in changes])
 
@@ -339,7 +335,7 @@ def test_a_vehicle_that_waits_is_armed_in_flight() -> None:
 
 
 def test_a_vehicle_that_is_disarmed_brakes_at_once_and_flies_again_when_armed() -> None:
-    """It drops its plan, hovers, takes no other meanwhile, and needs no new session."""
+    """It drops its plan, hovers, accepts no other meanwhile, and needs no new session."""
     flight = arming((5.0, False), (8.0, True))
     modes = [
         (round(at, 1), event.after, event.reason) for at, _, event in told(flight, ModeChanged)
@@ -359,7 +355,7 @@ def test_a_vehicle_that_is_disarmed_brakes_at_once_and_flies_again_when_armed() 
 def test_without_its_rows_in_the_table_a_disarmed_vehicle_would_fly_on(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """The guard of the test above: it would fly its plan to the end."""
+    """Ablation for the test above: it would fly its plan to the end."""
     rows = {key: mode for key, mode in TABLE.items() if key[1] is not Reason.UNARMED}
     monkeypatch.setattr("skytether.client.endpoint.TABLE", rows)
     flight = arming((5.0, False))

@@ -1,4 +1,4 @@
-"""The services of docker-compose.yml, as far as can be told without an engine."""
+"""Services of docker-compose.yml, as far as they can be checked without an engine."""
 
 import re
 import shutil
@@ -26,14 +26,13 @@ DOCKERFILE = (ROOT / "Dockerfile").read_text()
 
 
 def argv(service: str, scenario: str) -> list[str]:
-    """Command line of a service, with its variables as they are unless set, but for SCENARIO."""
     told = SERVICES[service]["command"]
     named = [re.sub(r"\$\{SCENARIO:-demo\}", scenario, each) for each in told]
     return [re.sub(r"\$\{\w+:-(.*?)\}", r"\1", each) for each in named]
 
 
 def test_a_profile_adds_services_and_changes_none() -> None:
-    """Without one there are the five of a flight; none of them waits for one of a profile."""
+    """Without a profile there are the five services of a flight, independent of profiles."""
     assert {name for name, each in SERVICES.items() if "profiles" not in each} == ALWAYS
     for profile, added in PROFILES.items():
         assert {n for n, each in SERVICES.items() if each.get("profiles") == [profile]} == added
@@ -72,7 +71,7 @@ def test_the_autopilot_is_pinned_and_speaks_to_the_computer_aboard_alone() -> No
 
 
 def test_the_computer_aboard_flies_it_by_the_scenario_that_the_server_has() -> None:
-    """The vehicle is the autopilot of its own loopback, with parameters that are set."""
+    """The vehicle is the autopilot on its own loopback, with parameters set."""
     name, *flags = argv("aboard", "px4")
     assert (name, argv("server", "px4")[1]) == ("client", flags[0])
     here = [flag for flag in flags if "=/" not in flag]  # paths are those of the container

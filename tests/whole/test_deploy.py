@@ -1,4 +1,4 @@
-"""The units of systemd in `deploy/`: what they start, and that it never takes off by itself."""
+"""Units of systemd in `deploy/`: their commands, and that a vehicle never takes off by itself."""
 
 import re
 import shlex
@@ -19,20 +19,19 @@ BINARY = "/opt/skytether/bin/skytether"
 
 
 def settings(unit: Path) -> dict[str, str]:
-    """Settings of a unit by name; the last one counts."""
     text = re.sub(r"\\\n\s*", "", unit.read_text())
     return dict(re.findall(r"^(\w+)=(.*)$", text, re.MULTILINE))
 
 
 def started(unit: Path, name: str) -> list[str]:
-    """Arguments of the command that a unit starts, with a scenario that is there."""
+    """Arguments of the command that a unit starts, with an existing scenario."""
     words = shlex.split(settings(unit)["ExecStart"].replace("%i", "1"))
     assert words[:3] == [BINARY, name, "/etc/skytether/field.toml"]
     return ["demo", *words[3:]]
 
 
 def test_the_client_starts_unarmed_and_as_a_flight_that_goes_on() -> None:
-    """Whatever ends it, it is started again: a person arms it, and nobody else."""
+    """It is always restarted; only a person arms the vehicle."""
     options = command.parse(ClientOptions(), started(CLIENT, "client"), "client", "")
     assert not options.config.armed
     assert not options.new_flight

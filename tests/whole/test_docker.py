@@ -1,8 +1,8 @@
-"""The containers, flown for real: how they are locked in, and what a flight survives.
+"""The containers in a real flight: isolation, and recovery from faults.
 
-`make docker-test` needs a Docker engine with Compose and takes about three minutes; `-s` shows how
-it goes. COMPOSE is the command to use where neither `docker compose` nor `docker-compose` will do,
-BASE_IMAGE what to build the images on.
+`make docker-test` needs a Docker engine with Compose and takes about three minutes; `-s` shows the
+progress. COMPOSE is the command to use in place of `docker compose` or `docker-compose`, BASE_IMAGE
+the base of the images.
 """
 
 import contextlib
@@ -39,11 +39,10 @@ STEPS_PER_S = round(1 / reading.load("demo").control.dt)
 FLIGHT_S = 60
 GATE_FLIGHT_S = 10
 FAULTY_FLIGHT_S = 110
-"""Duration of the flight with faults [s]; faults and what proves their end take 45 s of it."""
+"""Duration of the flight with faults [s]; faults and the checks after them take 45 s of it."""
 FAULT_S = 3.0
-"""Duration of a fault [s]: more than the demo's `link.timeout_s`, so that the client notices."""
+"""Duration of a fault [s]: more than the demo's `link.timeout_s`, so that the client detects it."""
 HORIZONS = 6
-"""Number of new horizons that shows that orders flow."""
 HOVER_M = 1.58
 """Error `rmse_xy` of the demo for a vehicle that stays at its start [m]."""
 
@@ -72,7 +71,7 @@ def test_a_flight_in_containers(compose: list[str], tmp_path: Path) -> None:
         for service in SERVICES:
             three.check_privileges(service)
         three.check_isolation()
-        # A kernel that had to be compiled would lie in the copy alone.
+        # A compiled kernel would be in the copy only.
         copied = ("diff", "-r", "/opt/skytether/kernels", "/tmp/kernels")
         assert three.inside("server", *copied) == (0, "")
         say("locked in: not root, read-only, no capabilities, no way round netem")
@@ -87,7 +86,7 @@ def test_a_flight_in_containers(compose: list[str], tmp_path: Path) -> None:
         assert summary.secure
         check_capture(captured, tmp_path / "client")
 
-        # As they are, even if somebody has built the image anew meanwhile.
+        # Existing containers, even if an image has been rebuilt meanwhile.
         three.compose("up", "--detach", "--no-recreate")
         until("a second flight", lambda: three.said("client").count("session open, flying") == 2)
         say("flying again, until SIGTERM")
@@ -159,7 +158,7 @@ def test_a_flight_goes_on_after_every_fault(compose: list[str], tmp_path: Path) 
         assert three.said("client").count("the server has restarted") >= 2
         assert summary.steps + summary.deadline_misses == FAULTY_FLIGHT_S * STEPS_PER_S
         assert summary.rmse_xy is not None
-        # The engine may take long: the vehicle hovers meanwhile, at worst at the end of its path.
+        # The engine may be slow: the vehicle hovers meanwhile, at worst at the end of its path.
         assert summary.rmse_xy < 2 * HOVER_M
         three.compose("stop")
         assert [three.state(service)["ExitCode"] for service in SERVICES] == [0, 0, 0]
@@ -168,15 +167,12 @@ def test_a_flight_goes_on_after_every_fault(compose: list[str], tmp_path: Path) 
 @dataclass
 class Containers:
     command: list[str]
-    """Compose."""
     seconds: int
-    """Length of the flight."""
     project: str = field(default_factory=lambda: f"skytether-test-{secrets.token_hex(4)}")
     ids: dict[str, str] = field(default_factory=dict)
     """Identifiers of the containers, by service; they stay the same from `up` to `down`."""
 
     def compose(self, *arguments: str) -> str:
-        """Output of Compose."""
         return run(*self.argv(*arguments), more_env=self.flight)
 
     def attempt(self, *arguments: str) -> tuple[int, str]:
@@ -194,7 +190,6 @@ class Containers:
         return run("docker", *arguments)
 
     def id(self, service: str) -> str:
-        """The container of a service, running or not."""
         if service not in self.ids:
             self.ids[service] = self.compose("ps", "--all", "--quiet", service).strip()
         return self.ids[service]
@@ -224,7 +219,7 @@ class Containers:
     # -- the flight --------------------------------------------------------------------------
 
     def figures(self, service: str) -> str:
-        """The lines of figures that a process prints at SIGUSR1, up to the last of them."""
+        """Figures that a process prints at SIGUSR1, up to the last line."""
         pattern = r"(?s)counted so far:.*?send_errors +\d+"
         before = len(re.findall(pattern, self.said(service)))
         self.docker("kill", "--signal", "USR1", self.id(service))
@@ -234,7 +229,6 @@ class Containers:
         return str(new[-1])
 
     def flies(self) -> None:
-        """Wait until orders reach the vehicle, newly made ones."""
         until("the session", lambda: self.has_said("server", "vehicle 1 flies"))
         first = self.figures("client")
         # A second later all packets that netem holds now have been delivered.
@@ -246,7 +240,7 @@ class Containers:
         say(f"orders reach the vehicle: {counts[0]} ... {counts[1]}")
 
     def figures_with(self, name: str, least: int) -> str:
-        """The first figures of the client that count so many of something."""
+        """First figures of the client in which a counter reaches a value."""
 
         def enough() -> str | None:
             assert self.state("client")["Status"] == "running", "the flight has ended too soon"
@@ -257,7 +251,7 @@ class Containers:
 
     @contextlib.contextmanager
     def fault(self, what: str) -> Iterator[None]:
-        """Something that the client notices, and that is over when this block has ended."""
+        """Fault that the client detects, and that ends with the block."""
         before = len(self.said("client"))
         say(what)
         yield
@@ -269,7 +263,7 @@ class Containers:
 
     @contextlib.contextmanager
     def squatter(self, network: str) -> Iterator[None]:
-        """A stranger who takes the address that a container had in a network."""
+        """Container of a stranger at the address that a container had in a network."""
         argv = ["run", "--detach", "--rm", "--network", self.network(network)]
         argv += ["--entrypoint", "sleep", "skytether-client", "600"]
         stranger = self.docker(*argv).strip()
@@ -290,11 +284,11 @@ class Containers:
         say(f"landed: {summary.steps} steps, rmse_xy {summary.rmse_xy:.3f} m")
         return summary
 
-    # -- the locks ---------------------------------------------------------------------------
+    # -- isolation ---------------------------------------------------------------------------
 
     @contextlib.contextmanager
     def capture(self) -> Iterator[Path]:
-        """File of every UDP payload that netem hears and sends meanwhile, on both networks."""
+        """File of every UDP payload that netem receives and sends meanwhile, on both networks."""
         script = (ROOT / "tests" / "sniff.py").read_text()
         with tempfile.TemporaryDirectory() as folder:
             file = Path(folder) / "capture.pcap"
@@ -359,7 +353,7 @@ class Containers:
 
         for service in ("server", "netem"):
             assert self.state(service)["Health"]["Status"] == "healthy"
-            # The same question in a container where nobody listens: it can say no.
+            # The health check must fail in a container where nobody listens.
             _, *question = self.inspect(service)["Config"]["Healthcheck"]["Test"]
             assert self.inside(service, *question)[0] == 0
             assert self.inside("client", *question)[0] == 1
@@ -371,7 +365,6 @@ class Containers:
         assert (code, f"no answer from {address}" in output) == (1, True), output
 
     def ask_for_the_server(self, host: str) -> tuple[int, str]:
-        """Exit code and output of another client, where the client is."""
         argv = ["docker", "run", "--rm", "--network", f"container:{self.id('client')}"]
         argv += ["skytether-client", "client", "demo", "--id=2", "--link.connect-s=2"]
         return attempt(*argv, f"--server={host}:47001", "--insecure")
@@ -379,7 +372,7 @@ class Containers:
 
 @contextlib.contextmanager
 def containers(compose: list[str], seconds: int) -> Iterator[Containers]:
-    """The three, up; whatever happens, nothing of them stays."""
+    """The three containers, running; removed at the end in any case."""
     three = Containers(compose, seconds)
     try:
         three.compose("up", "--detach")
@@ -395,7 +388,7 @@ def containers(compose: list[str], seconds: int) -> Iterator[Containers]:
 
 @pytest.fixture(scope="module")
 def compose() -> list[str]:
-    """The command for Compose, after it has built the images."""
+    """Command for Compose, after it has built the images."""
     given = os.environ.get("COMPOSE")
     known = [given] if given else ["docker compose", "docker-compose"]
     if not works("docker", "version"):
@@ -409,11 +402,11 @@ def compose() -> list[str]:
 
 
 def check_capture(capture: Path, part: Path) -> None:
-    """No position or velocity that was flown stands in what went over the networks."""
+    """No position or velocity of the flight is visible in the captured packets."""
     payloads, rows = capture.read_bytes(), read(part)
-    assert len(payloads) > 100 * len(rows)  # an OBSERVATION a step, before netem and behind
+    assert len(payloads) > 100 * len(rows)  # an OBSERVATION a step, before netem and after
     states = {number.tobytes() for number in rows["state"].ravel()}
-    states = {state for state in states if len(set(state)) > 5}  # 0 and 2.0 stand everywhere
+    states = {state for state in states if len(set(state)) > 5}  # 0 and 2.0 occur everywhere
     assert len(states) > len(rows)
     found = [state for state in states if state in payloads]
     assert not found

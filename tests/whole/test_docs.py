@@ -1,4 +1,4 @@
-"""The documents: their commands run, their links lead somewhere, their names exist."""
+"""Documents: their commands run, their links have targets, their names exist."""
 
 import re
 import shlex
@@ -24,7 +24,7 @@ DOCUMENTS += sorted((ROOT / "docs").glob("*.md"))
 
 
 def blocks(document: Path) -> list[list[str]]:
-    """The commands in each shell block of a document, without comments."""
+    """Commands in each shell block of a document, without comments."""
     found = re.findall(r"```sh\n(.*?)```", document.read_text(), re.DOTALL)
     return [
         [line for line in (raw.split("#")[0].strip() for raw in block.splitlines()) if line]
@@ -57,7 +57,7 @@ def skytether(line: str) -> list[str]:
         if line.startswith("skytether ")
         and line.split()[1] not in ELSEWHERE
         and "--control " not in line  # by test_the_documented_changes_are_made_in_flight
-        and "mavlink" not in line  # there is no autopilot to be heard; by test_identify.py
+        and "mavlink" not in line  # no autopilot is there; by test_identify.py
         and "--record" not in line
         and "--plugin" not in line  # by test_plugins.py
     ],
@@ -66,7 +66,6 @@ def skytether(line: str) -> list[str]:
 def test_a_documented_flight_flies(
     line: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Each documented command succeeds, with shorter flights, fewer runs and smaller fleets."""
     if "sweep" in line:
         line += " --settle 0 --duration 1 --runs 2"
     if "envelope" in line:
@@ -103,7 +102,6 @@ def test_a_documented_flight_flies(
 
 @pytest.mark.usefixtures("documented_ports")
 def test_the_three_documented_terminals_fly_together(tmp_path: Path) -> None:
-    """Block of docs/running.md with server, netem and client, each line in a process of its own."""
     on_one, _ = terminals()
     said = fly_together(on_one, tmp_path)
     assert "PLAINTEXT" in said
@@ -112,7 +110,6 @@ def test_the_three_documented_terminals_fly_together(tmp_path: Path) -> None:
 
 @pytest.mark.usefixtures("documented_ports")
 def test_the_three_documented_machines_fly_together(tmp_path: Path) -> None:
-    """Block of docs/running.md with keys, all of its hosts being this one."""
     _, on_three = terminals()
     keygen, *processes = on_three
     assert ran(*skytether(keygen), cwd=tmp_path).returncode == 0
@@ -150,7 +147,6 @@ def fly_together(lines: list[str], folder: Path) -> str:
 def test_the_documented_changes_are_made_in_flight(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Those of docs/operating.md, one after the other, and the flight that they are for."""
     monkeypatch.chdir(tmp_path)
     (flies,), changes, *_ = blocks(ROOT / "docs" / "operating.md")
     with subprocess.Popen(
@@ -176,7 +172,7 @@ def test_the_documented_changes_are_made_in_flight(
 def test_the_documented_pages_are_served(
     document: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Replays and duels of a document, until Ctrl-C; what they show is recorded before."""
+    """Replays and duels of a document, until Ctrl-C; their recordings are made before."""
     lines = [line for block in blocks(ROOT / document) for line in block]
     served = [line for line in lines if line.startswith(("skytether replay ", "skytether duel "))]
     assert served
@@ -214,7 +210,7 @@ def test_the_documented_recordings_are_made_and_read(
     for line in lines:
         short = "--duration 20" if "--virtual" in line else "--duration 5 --settle 0"
         made = warm.skytether(*shlex.split(line.replace("--duration 20", short))[1:])
-        # A flight in real time may have been woken late, beside all other tests.
+        # A flight in real time may be woken late, because other tests run.
         said = made.stderr if "--virtual" in line else WOKEN_LATE.sub("", made.stderr)
         assert (made.returncode, said) == (0, "")
         assert made.stdout.strip()
@@ -227,7 +223,7 @@ def test_the_documented_python_runs_and_prints_what_it_says(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    """Every block of a document, one after the other; `# →` is what a block prints."""
+    """Every block of a document in order; `# →` is the output of a block."""
     pytest.importorskip("pandas")
     monkeypatch.chdir(tmp_path)
     names: dict[str, object] = {"__name__": "docs"}
@@ -263,7 +259,7 @@ def test_links_lead_somewhere(document: Path) -> None:
 
 @pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.name)
 def test_named_places_in_the_code_exist(document: Path) -> None:
-    """`path/file.py` and, behind it, the names it is said to hold."""
+    """`path/file.py` and, after it, names that the file must contain."""
     text = document.read_text()
     for path, names in re.findall(r"`((?:\w+/)+\w+\.py)`?(?::((?:,? ?`?\.?[\w.]+`?)+))?", text):
         code = (ROOT / path).read_text()

@@ -1,4 +1,4 @@
-"""Keys as a user meets them: real processes, sealed packets, and one line for what is wrong."""
+"""Keys as a user meets them: real processes, sealed packets, and one line for each mistake."""
 
 import json
 import os
@@ -17,7 +17,7 @@ from warm import Process, skytether
 QUICK = [
     *("--network.uplink", "none", "--network.downlink", "none", "--settle", "0"),
 ]
-"""A network that does nothing."""
+"""Network without delay and loss."""
 SECRET = "6f" * 32
 
 
@@ -71,7 +71,6 @@ def test_a_server_with_keys_answers_nothing_in_plaintext(
 
 
 def test_plaintext_is_said_loudly(start: Callable[..., Process]) -> None:
-    """Also where only this machine can be reached."""
     server = start(*SERVER)
     server.address()
     assert server.end() == 0

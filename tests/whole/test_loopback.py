@@ -51,7 +51,7 @@ of_either_family = pytest.mark.parametrize(
 
 
 class Echo(Endpoint):
-    """Sends back what it hears, by its sockets in turn; wakes at given times."""
+    """Endpoint that echoes datagrams through its sockets in turn, and wakes at given times."""
 
     def __init__(
         self, wakes_ns: list[int] | None = None, *, last: int = 10**9, sockets: int = 1
@@ -85,7 +85,7 @@ class Echo(Endpoint):
 async def test_datagrams_come_and_go_through_several_sockets(
     loopback: Address, family: socket.AddressFamily
 ) -> None:
-    """Every second answer leaves by a socket that was opened for it; every event is handed on."""
+    """Every second answer leaves by a newly opened socket, and every event is passed on."""
     echo = Echo(last=4, sockets=2)
     events: list[Event] = []
     with socket.socket(family, socket.SOCK_DGRAM) as peer:
@@ -113,7 +113,7 @@ async def test_datagrams_come_and_go_through_several_sockets(
 async def test_wakes_come_in_time_and_never_early(
     kernel: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Both timers, twenty wakes: some already past when asked for, some in the future."""
+    """Both timers, twenty wakes, some of them already in the past."""
     if not kernel:
         monkeypatch.setattr("skytether.shell.driver.make_timer", timer.LoopTimer)
     now_ns = time.monotonic_ns()
@@ -149,13 +149,13 @@ async def test_a_closed_port_and_an_unknown_network_are_lost_packets() -> None:
 def test_packets_to_a_closed_port_are_not_forwarded_and_told_once(
     loopback: Address, family: socket.AddressFamily
 ) -> None:
-    """On the loop of a process: uvloop's stops to watch a socket that has an error."""
+    """On uvloop, which stops watching a socket after an error."""
     with asyncio.Runner(loop_factory=new_event_loop) as runner:
         runner.run(refused_and_heard_again(loopback, family))
 
 
 async def heard(sock: socket.socket) -> tuple[bytes, Any]:
-    """Datagram that comes to a socket, and its sender; uvloop has no call for it."""
+    """Next datagram of a socket, and its sender; uvloop has no call for it."""
     while True:
         try:
             return sock.recvfrom(100)
@@ -194,7 +194,7 @@ async def refused_and_heard_again(loopback: Address, family: socket.AddressFamil
 
 
 class Asker(Echo):
-    """Sends one datagram to a peer, and notes from which address the answer came."""
+    """Endpoint that sends one datagram to a peer, and records the address of the answer."""
 
     def __init__(self, peer: Address) -> None:
         super().__init__(last=1)
@@ -229,7 +229,7 @@ async def test_a_peer_is_seen_as_it_was_written_whatever_the_kernel_calls_it(
 
 
 async def test_a_host_with_a_new_address_is_found_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Names are looked up all along, and the old address stands for the name no more."""
+    """Names are looked up repeatedly, and the old address no longer belongs to the name."""
     addresses = {"first": ("127.0.0.1", 1), "then": ("127.0.0.2", 1)}
     looked_up: list[Address] = []
 
@@ -304,7 +304,7 @@ def test_an_ipv6_socket_hears_ipv6_alone() -> None:
 
 
 class Asking(Echo):
-    """Says HELLO to a peer every 20 ms until something is heard."""
+    """Endpoint that sends HELLO to a peer every 20 ms until an answer arrives."""
 
     def __init__(self, peer: Address) -> None:
         super().__init__(last=10**6)
@@ -345,7 +345,7 @@ async def test_a_patient_endpoint_is_driven_before_its_peer_is_found(
         monkeypatch.setattr(udp, "look_up", look_up)
         asking, events = Asking(peer), list[Event]()
         driver = Shell(asking, None, [peer], is_patient=True)
-        assert not driver.is_local  # as far as it is known
+        assert not driver.is_local  # as far as is known
         loop = asyncio.get_running_loop()
         task = asyncio.create_task(driver.run(events.append))
         await asyncio.sleep(0.2)
@@ -395,8 +395,7 @@ def test_addresses_of_no_use_are_named() -> None:
 async def fly(flown: Scenario, *, vehicles: int = 1, at_phase: float | None = None) -> Record:
     """The three endpoints in this process, over real UDP.
 
-    Args:
-        at_phase: start when the server's clock is so far into one of its steps.
+    `at_phase`: phase of the server's clock within a step at which the flight starts.
     """
     axes = flown.model.axes
     sinks = [io.BytesIO() for _ in range(3)]
@@ -438,7 +437,7 @@ FAST = {
 
 
 async def test_two_vehicles_fly_in_space_over_real_sockets() -> None:
-    """Delays of 20 ms, an observation and a horizon a step, and the circle is flown."""
+    """Delays of 20 ms, an observation and a horizon per step along the circle."""
     flown = packaged("paper-every-step", settle=0.0, duration=4.0, network=FAST, model={"axes": 3})
     flight = await fly(flown, vehicles=2)
     for vehicle in (1, 2):
@@ -446,7 +445,8 @@ async def test_two_vehicles_fly_in_space_over_real_sockets() -> None:
         assert rows["step"][-1] == 79
         assert len(rows) + rows["missed"][-1] == 80
         assert rows["state"].shape[1:] == (3, 2)
-        # An observation takes 20 ms down, waits for a tick, and takes 20 ms up: at most 3 steps.
+        # An observation takes 20 ms down, waits for a tick, and the horizon 20 ms up: at most 3
+        # steps.
         assert np.median(rows["step"][5:] - rows["in_force"][5:]) in (1, 2)
     assert flight.server["solved"].all()
     assert flight.server["event"].all()
@@ -487,9 +487,9 @@ async def test_both_worlds_decide_the_same_on_a_network_without_delay(
 ) -> None:
     """Over loopback and in virtual time a scenario has equal events and inputs, in one order.
 
-    Steps are 0.2 s, and the server ticks in the middle of the vehicle's. Only a pause of the
-    machine by 0.1 s can change a decision; then the flight is flown again. No two flights are alike
-    to the last bit by chance.
+    Steps are 0.2 s, and the server ticks in the middle of the vehicle's steps. Only a pause of the
+    machine by 0.1 s can change a decision; then the flight is repeated. Equality to the last bit
+    cannot be chance.
     """
     none = ""
     changes = {

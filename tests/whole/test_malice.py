@@ -1,4 +1,4 @@
-"""Anybody can send anything: it is dropped, counted, and changes nothing."""
+"""Hostile packets are dropped and counted, and change nothing."""
 
 import random
 from collections.abc import Iterator
@@ -36,7 +36,7 @@ DATAGRAMS = 10_000
 
 
 def hostile(rng: random.Random) -> Iterator[bytes]:
-    """Random bytes, and real messages with bytes changed, cut off, put in or doubled."""
+    """Random bytes, and real messages with bytes changed, cut off, inserted or duplicated."""
     inputs = np.zeros((2, 40), np.float32)
     real = [
         encode(message)
@@ -82,7 +82,7 @@ def test_ten_thousand_hostile_datagrams_are_counted_and_change_nothing(
 ) -> None:
     asleep_until = endpoint.next_wake_ns()
     datagrams = hostile(random.Random(1))
-    sender = SERVER if isinstance(endpoint, Client) else STRANGER  # others are not even heard
+    sender = SERVER if isinstance(endpoint, Client) else STRANGER  # others are ignored
     for _ in range(DATAGRAMS):
         endpoint.receive(Datagram(next(datagrams), sender), now_ns=SECOND_NS)
     assert endpoint.outbox() == []
@@ -97,9 +97,7 @@ def test_ten_thousand_hostile_datagrams_are_counted_and_change_nothing(
 
 
 def test_a_flood_of_hellos_stays_within_the_servers_bounds() -> None:
-    """Many vehicles with many lives each: one answer each, no more kept than there is room, and
-    each refusal told.
-    """
+    """Many vehicles with many lives: one answer each, bounded memory, each refusal logged."""
     server = Server(SCENARIO, boot_id=1, entropy=stream(1, "entropy").bytes)
     answers = 0
     for boot_id in range(3):
@@ -113,7 +111,7 @@ def test_a_flood_of_hellos_stays_within_the_servers_bounds() -> None:
 
 
 def test_an_answer_is_no_longer_than_its_question() -> None:
-    """HELLO and WELCOME: nobody can use the server to flood somebody else tenfold."""
+    """HELLO and WELCOME: the server cannot be used to amplify a flood."""
     hello = encode(Hello(1, 2**63, TERMS))
     server = Server(SCENARIO, boot_id=2**63, entropy=stream(1, "entropy").bytes)
     server.receive(Datagram(hello, STRANGER), now_ns=3 * 10**14)
@@ -127,7 +125,7 @@ def test_an_answer_is_no_longer_than_its_question() -> None:
 def test_no_observation_in_a_session_stops_the_server(
     step: int, backward_us: int, began_ns: int
 ) -> None:
-    """The largest and the smallest of all numbers, said first, and said again."""
+    """The largest and the smallest of all numbers, as a first message and repeated."""
     server = Server(SCENARIO, boot_id=1, entropy=stream(1, "entropy").bytes)
     server.receive(Datagram(encode(Hello(1, 2, TERMS)), STRANGER), now_ns=began_ns)
     ((payload, _, _),) = server.outbox()

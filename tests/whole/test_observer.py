@@ -1,4 +1,4 @@
-"""Somebody beside a flight over real UDP who copies each packet and hands on what answers it."""
+"""Observer of a flight over real UDP who copies each packet and forwards the answers."""
 
 import asyncio
 import io
@@ -33,13 +33,13 @@ SERVER_SIDE, OWN, ADDRESSES = 1, 2, 50
 
 
 class Observer(Idle):
-    """Passes on everything at once between a vehicle and its server.
+    """Observer that passes on everything at once between a vehicle and its server.
 
     Args:
         server: address of the server.
-        attacks: whether copies of what the vehicle sends go to the server from other addresses,
-            before the originals; and whatever comes from the server goes to the vehicle twice more,
-            from the server's address and from another, and so do the answers to the copies.
+        attacks: whether copies of the vehicle's packets go to the server from other addresses,
+            before the originals, and all packets from the server go to the vehicle twice more, from
+            the server's address and from another one, as do the answers to the copies.
     """
 
     def __init__(self, server: Address, *, attacks: bool) -> None:
@@ -47,7 +47,6 @@ class Observer(Idle):
         self._server, self._attacks = server, attacks
         self._vehicle: Address | None = None
         self.copied = 0
-        """Number of copies so far."""
 
     def receive(self, datagram: Datagram, *, now_ns: int) -> None:  # noqa: ARG002
         payload, peer, socket = datagram
@@ -71,14 +70,12 @@ class Observer(Idle):
 class Outcome:
     rmse_m: float
     changes: list[tuple[str, str]] = field(default_factory=list)
-    """Modes that it changed to, and why."""
     keys: int = 0
-    """Number of channels that the vehicle has sent in."""
+    """Number of channels in which the vehicle has sent."""
     copied: int = 0
 
 
 async def fly(flown: Scenario, *, attacked: bool, restart_s: float) -> Outcome:
-    """A flight with keys, whose server is killed once and begun anew at the same address."""
     keyring, sink, changes = make_keys(flown.seed, 1), io.BytesIO(), []
     entropy = stream(flown.seed, "entropy", int(attacked)).bytes
 
@@ -128,11 +125,11 @@ async def fly(flown: Scenario, *, attacked: bool, restart_s: float) -> Outcome:
 
 
 async def test_an_observer_who_can_send_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Restarts and new keys every 15 s go as they go without him; two flights, side by side."""
+    """Restarts and new keys every 15 s work as without the observer; two flights, compared."""
     monkeypatch.setattr(skytether.shared.wire.channel, "FRESH_NS", 15 * SECOND_NS)
     monkeypatch.setattr(skytether.client.failsafe, "STALL_NS", 60 * SECOND_NS)  # busy machines
     table = reading.to_table(reading.load("demo")) | {"duration": 60.0}
-    table["vehicle"]["report"] = "always"  # much to copy
+    table["vehicle"]["report"] = "always"  # many packets to copy
     flown = reading.check(table, "test")
     alone, attacked = await asyncio.gather(
         fly(flown, attacked=False, restart_s=25.0), fly(flown, attacked=True, restart_s=25.0)

@@ -1,4 +1,4 @@
-"""The distribution: one package, whole from a checkout and from a source distribution."""
+"""Distribution: one package, complete from a checkout and from a source distribution."""
 
 import os
 import re
@@ -16,7 +16,7 @@ from skytether.shared.scenario import reading
 
 ROOT = Path(__file__).parents[2]
 OLD_NAMES = ("shared", "shell", "server", "client", "netem", "sim", "lab", "view", "scenarios")
-"""Names that were ours before there was one package, and that anybody may have."""
+"""Former names of top-level packages, which other distributions may have."""
 LOCKS = sorted((ROOT / "locks").glob("*.lock"))
 SOMEBODY_ELSE = "raise SystemExit('somebody else')"
 
@@ -47,7 +47,7 @@ def contents(wheel: Path) -> dict[str, int]:
 
 
 def files(folder: Path) -> set[str]:
-    """Files below a folder and below what it links to, but for what Python compiled."""
+    """Files below a folder and its links, without Python's compiled files."""
     found = {Path(at, name) for at, _, names in os.walk(folder, followlinks=True) for name in names}
     kept = {path for path in found if "__pycache__" not in path.parts}
     return {path.relative_to(folder.parent).as_posix() for path in kept}
@@ -65,7 +65,6 @@ def test_the_wheel_is_our_package_and_nothing_else(wheel: Path) -> None:
 def test_a_checkout_and_its_source_distribution_make_the_same_wheel(
     wheel: Path, tmp_path: Path
 ) -> None:
-    """To the byte, though rooms are links in the one and folders in the other."""
     assert contents(hatchling(ROOT, "wheel", tmp_path / "built")) == contents(wheel)
 
 
@@ -90,12 +89,12 @@ def test_what_is_in_two_lock_files_has_one_version() -> None:
 
 
 @pytest.mark.long
-@pytest.mark.timeout(600)  # the server compiles its kernels where it is new
+@pytest.mark.timeout(600)  # a new server compiles its kernels
 @pytest.mark.parametrize("kind", ["wheel", "editable"])
 def test_it_flies_in_an_environment_that_has_a_package_called_server(
     kind: str, wheel: Path, tmp_path: Path
 ) -> None:
-    """`skytether` alone is added to it; README's example flies, whatever folders are there."""
+    """With `skytether` added, README's example flies, whatever folders are in the directory."""
     python, packages = environment(tmp_path / "environment")
     (packages / "server").mkdir()
     (packages / "server" / "__init__.py").write_text("NAME = 'unrelated'")
@@ -113,7 +112,7 @@ def test_it_flies_in_an_environment_that_has_a_package_called_server(
     example += "\nimport server\nprint(skytether.__file__, server.NAME)"
     beside = tmp_path / "beside"
     strangers(beside, *(name for name in OLD_NAMES if name != "server"))
-    # -c, without -P: folders here come before those installed
+    # -c, without -P: folders here precede installed packages
     done = ran(python, "-c", example, cwd=beside)
     assert done.returncode == 0, done.stderr
     compiled = "compiling control loops, once on this machine: takes up to a minute\n"
@@ -129,10 +128,10 @@ def test_it_flies_in_an_environment_that_has_a_package_called_server(
 
 
 def environment(folder: Path) -> tuple[Path, Path]:
-    """Python and packages of a new environment that sees what is installed here, ourselves not.
+    """Python and packages of a new environment that sees all installed packages except Skytether.
 
-    A .pth is not followed from a folder that another .pth names, so that what is editable here is
-    not found there.
+    A .pth in a folder named by another .pth is not followed, so the editable installation is not
+    found.
     """
     venv.create(folder, symlinks=True)
     python = folder / "bin" / "python"
@@ -148,7 +147,6 @@ def names(folder: Path) -> set[str]:
 
 
 def strangers(folder: Path, *packages: str) -> None:
-    """Packages in a folder, none of which may be imported or run."""
     for package in packages:
         (folder / package).mkdir(parents=True)
         for name in ("__init__.py", "__main__.py"):
@@ -165,7 +163,7 @@ def test_rooms_of_a_checkout_run_as_processes(name: str) -> None:
 
 @pytest.mark.long
 def test_folders_with_our_names_are_not_taken_for_ours(tmp_path: Path) -> None:
-    """Folders in the user's directory are ignored by the command, its processes, `python -P`."""
+    """Folders in the user's directory are ignored by commands, processes, and `python -P`."""
     strangers(tmp_path, *OLD_NAMES, "skytether")
     skytether = str(Path(sys.executable).with_name("skytether"))
     flags = ["--duration", "3", "--settle", "0"]

@@ -1,4 +1,4 @@
-"""The site of docs/, and that its pages of commands and of the library name all there are."""
+"""Site of docs/, whose pages of commands and of the library must be complete."""
 
 import re
 import sys
@@ -29,7 +29,7 @@ def test_the_page_of_the_library_has_every_name() -> None:
 @pytest.mark.long
 @pytest.mark.skipif(not util.find_spec("mkdocs"), reason="needs the extra docs: make docs")
 def test_the_site_is_built_and_loads_nothing_from_outside(tmp_path: Path) -> None:
-    """Strictly: a link that leads nowhere fails. What a browser loads by itself lies in it."""
+    """Strictly: a dead link fails. Everything that a browser loads by itself is included."""
     site = tmp_path / "site"
     build = ("-m", "mkdocs", "build", "--strict", "--site-dir", site)
     run = ran(sys.executable, *build, cwd=ROOT)

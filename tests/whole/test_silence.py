@@ -1,4 +1,4 @@
-"""The contracts of `make check` hold for whole packages: no module of a core escapes them."""
+"""Contracts of `make check` hold for whole packages, including new modules of a core."""
 
 import os
 import re
@@ -22,12 +22,12 @@ WITHOUT_FILES = (
 )
 """Rooms whose modules import neither paths nor the operating system."""
 DRIVERS = ("lab/commands", "view/browser")
-"""Rooms within a core that drive processes, and are none themselves."""
+"""Packages within a core that drive processes and are exempt."""
 
 
 @pytest.fixture
 def copy(tmp_path: Path) -> Path:
-    """A copy of the packages, in which links are folders, and of the contracts."""
+    """Copy of the packages, with folders in place of links, and of the contracts."""
     ignore = shutil.ignore_patterns("__pycache__")
     for package in ("skytether", "bench", "fuzz"):
         shutil.copytree(ROOT / package, tmp_path / package, ignore=ignore)
@@ -41,7 +41,7 @@ def name(module: Path, copy: Path) -> str:
 
 
 def cores(copy: Path, rooms: Iterable[str]) -> list[Path]:
-    """Files of all core modules of some rooms; a `__main__` is a process, and none of them."""
+    """Files of all core modules of some rooms, without `__main__` modules."""
     files = (file for room in rooms for file in (copy / room).rglob("*.py"))
     drivers = tuple(copy / room for room in DRIVERS)
     return [
@@ -52,13 +52,12 @@ def cores(copy: Path, rooms: Iterable[str]) -> list[Path]:
 
 
 def append(lines: str, files: Iterable[Path]) -> None:
-    """Put lines at the end of each file."""
     for file in files:
         file.write_text(f"{file.read_text()}\n{lines}\n")
 
 
 def complaints(copy: Path, *imported: str) -> list[set[str]]:
-    """Modules said to import each of `imported` against a contract; none where all are kept."""
+    """Modules reported to import each of `imported` against a contract; empty if all are kept."""
     lint = Path(sys.executable).with_name("lint-imports")
     environment = {**os.environ, "PYTHONPATH": str(copy.parent), "COLUMNS": "200"}
     run = ran(lint, "--no-cache", cwd=copy.parent, env=environment)
@@ -78,7 +77,7 @@ def test_a_process_which_builds_and_drives_an_endpoint_may_have_a_clock(copy: Pa
 def test_every_core_module_is_named_for_a_clock_a_socket_dice_paths_or_the_system(
     copy: Path,
 ) -> None:
-    """Also a new one: no list has to be kept of them."""
+    """Also a new module: there is no list to maintain."""
     forbidden = {
         "import time": "time",
         "import random": "random",

@@ -1,4 +1,4 @@
-"""Files are written by `shared.base.files` alone."""
+"""Only `shared.base.files` writes files."""
 
 import ast
 from pathlib import Path
@@ -16,23 +16,22 @@ ALLOWED = {
 }
 """Files of code that open something for writing, and what."""
 SCRATCH = "fuzz/"
-"""The fuzzer rewrites a file thousands of times a minute, in a folder that it throws away."""
+"""The fuzzer rewrites a file thousands of times a minute, in a folder that it deletes."""
 WRITING = set("wax+")
 METHODS = {"write_text", "write_bytes", "touch", "symlink_to", "hardlink_to"}
 FLAGS = {"O_WRONLY", "O_RDWR", "O_CREAT", "O_TRUNC", "O_APPEND"}
 IN_MEMORY = {"png", "pdf", "content", "file", "figure"}
-"""Names of what pictures and arrays are saved to: buffers, and files of `files.replacing`."""
+"""Names of targets for pictures and arrays: buffers, and files of `files.replacing`."""
 
 
 def modules() -> dict[str, ast.Module]:
-    """Every module of the package, by its path in the house."""
     paths = [path for room in ROOMS for path in sorted((HOUSE / room).rglob("*.py"))]
     own = [path for path in paths if path.resolve() == path]  # not through a room's link
     return {str(path.relative_to(HOUSE)): ast.parse(path.read_text()) for path in own}
 
 
 def mode_of(call: ast.Call, place: int) -> str:
-    """The mode with which `open` is called; all of them where it is no literal."""
+    """Mode of a call of `open`; every mode if it is no literal."""
     given = [each.value for each in call.keywords if each.arg == "mode"]
     given += call.args[place : place + 1]
     if not given:
@@ -42,7 +41,7 @@ def mode_of(call: ast.Call, place: int) -> str:
 
 
 def writes(call: ast.Call) -> bool:  # noqa: PLR0911 - one for each way to write
-    """Whether a call opens a file for writing, or gives one another name."""
+    """Whether a call opens a file for writing, or renames one."""
     match call.func:
         case ast.Name(id="open"):
             return bool(WRITING & set(mode_of(call, 1)))
@@ -65,7 +64,7 @@ def writes(call: ast.Call) -> bool:  # noqa: PLR0911 - one for each way to write
 
 
 def test_nothing_else_writes_a_file() -> None:
-    """So that nothing is cut before it is replaced, and no input becomes an output."""
+    """Otherwise a file may be truncated before it is replaced, or an input become an output."""
     elsewhere = {
         f"{path}:{node.lineno}"
         for path, tree in modules().items()

@@ -41,18 +41,16 @@ TRIES_MAX = 10**6
 
 
 class Kept(msgspec.Struct, frozen=True):
-    """Results in the file of `--json`."""
+    """Content of the file that `--json` writes."""
 
     nearest: Approach
-    """Flight with the least spare distance."""
     spares_m: Sequence[float]
-    """Spare distance of each flight, see `spare_m` [m]."""
+    """Distance minus the required one for each flight [m]."""
 
 
 ATTACK_BYTES_MAX = 16_000_000
-"""Largest size of a file of moves [B]."""
 OWN = ("with", "tries", "moves", "first", "workers", "out", "json")
-"""Options with a value that concern the search, not a flight."""
+"""Options of the search, which are left out of the command line of a single flight."""
 
 
 @dataclass(frozen=True)
@@ -70,7 +68,7 @@ class AdversaryOptions:
     random: bool = False
     """Draw the moves of each flight at random, without a search."""
     first: Annotated[int, Argument(metavar="N")] = 0
-    """Number of the first climb: another number begins elsewhere."""
+    """Number of the first climb, which seeds its random moves."""
     workers: Annotated[int | None, Argument(metavar="N")] = None
     """Number of worker processes; one per core unless given."""
     out: Path | None = None
@@ -96,8 +94,8 @@ def adversary(argv: Sequence[str]) -> None:
     """
     options = command.parse(AdversaryOptions(), argv, "skytether adversary", adversary.__doc__)
     if not isinstance(options.config.unallocated_reference(), Mission):
-        said = f"{options.scenario}: expected a mission, such as swap"
-        raise CommandError(said, command.CONFIGURATION)
+        message = f"{options.scenario}: expected a mission, such as swap"
+        raise CommandError(message, command.CONFIGURATION)
     title = f"{options.scenario}, seed {options.config.seed}"
     if options.attack is not None:
         found, spares_m = fly(options.config, _moves(options.attack)), list[float]()
@@ -105,15 +103,14 @@ def adversary(argv: Sequence[str]) -> None:
         found, spares_m = _search(options, title)
     _finish(options, argv, title, found, spares_m)
     if spares_m and len(spares_m) < options.tries:
-        said = f"interrupted with {len(spares_m)} of {options.tries} flights done"
-        raise CommandError(said, command.INTERRUPTED)
+        message = f"interrupted with {len(spares_m)} of {options.tries} flights done"
+        raise CommandError(message, command.INTERRUPTED)
 
 
 def _search(options: AdversaryOptions, title: str) -> tuple[Approach, list[float]]:
     """Flight with the least spare distance, and the spare distances of all flights [m].
 
-    Raises:
-        CommandError: interrupted before any climb was done.
+    Raises CommandError if interrupted before any climb was done.
     """
     command.check_count("--tries", options.tries, TRIES_MAX)
     command.claim_folder("--out", options.out, ENTRIES)
@@ -157,11 +154,11 @@ def _search(options: AdversaryOptions, title: str) -> tuple[Approach, list[float
 
 
 def _moves(text: str) -> Moves:
-    """Moves in a text, or in the file of `--json` that it names.
+    """Moves in a JSON text, or in the file of `--json` that the text names.
 
     Raises:
         CommandError: the file cannot be read.
-        ConfigError: there are none.
+        ConfigError: text or file has no valid moves.
     """
     if text.startswith("["):
         return loads(text)
@@ -175,11 +172,6 @@ def _moves(text: str) -> Moves:
 
 
 def _kinds(text: str) -> tuple[MoveKind, ...]:
-    """Kinds that a text names.
-
-    Raises:
-        CommandError: it names something else.
-    """
     try:
         return tuple(map(MoveKind, dict.fromkeys(text.split(","))))
     except ValueError:
@@ -194,11 +186,7 @@ def _finish(
     found: Approach,
     spares_m: Sequence[float],
 ) -> None:
-    """Write and print the result of the search.
-
-    Raises:
-        CommandError: a required distance was violated.
-    """
+    """Write and print the result; raises CommandError if a required distance was violated."""
     if options.json is not None:
         command.write(options.json, msgspec.json.encode(Kept(found, spares_m)))
     failed, apart, clear = sum(each < 0.0 for each in spares_m), found.apart, found.clear
@@ -207,7 +195,7 @@ def _finish(
     if spares_m:
         rows.append(("flights", f"{len(spares_m)}, {options.kinds}"))
         rows.append(("with a violated distance", failed))
-    # With all digits: the same moves give the same distance.
+    # All digits, so that a repeated flight can be compared exactly.
     rows.append(("least separation, required [m]", f"{apart.away_m!r}, {asked_m:g}"))
     rows.append(("  at [s], of vehicles", f"{apart.at_s:.2f}, {apart.vehicles}"))
     if clear.vehicles:

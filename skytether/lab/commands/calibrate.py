@@ -1,6 +1,4 @@
-"""`skytether calibrate`: search for parameters that the paper does not print, or for the best
-ones.
-"""
+"""`skytether calibrate`: search for parameters that the paper does not print, or the best ones."""
 
 import math
 from collections.abc import Sequence
@@ -24,9 +22,7 @@ from skytether.shell import command
 from skytether.shell.command import CommandError, ScenarioFlags, ScenarioName
 
 BEST = "best.toml"
-"""File of the best point, as a scenario."""
 POPULATION_MIN, POPULATION_MAX = 4, 1000
-"""Fewest and most points in a generation."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +35,7 @@ class CalibrateOptions:
     """Goal of the search: table1, to reproduce the paper's Table 1, or rmse, the smallest mean RMSE
     xy."""
     packets: float = 0.1
-    """Largest event ratio; with the objective rmse, and a trigger that uses the state."""
+    """Largest event ratio, for the objective rmse with a trigger that uses the state."""
     effort: Annotated[float, tyro.conf.arg(metavar="MPS")] = math.inf
     """Largest effort with the objective rmse, the RMS change of the command from step to step
     [m/s]; no limit unless given."""
@@ -116,21 +112,19 @@ def calibrate(argv: Sequence[str]) -> None:
 
 
 def _print_rmse(points: Sequence[SearchPoint]) -> None:
-    """Print the best point of a search for the smallest error."""
     found = best(points)
-    here = found.values[ONLY]
+    means = found.values[ONLY]
     rows = [
         ("score", f"{found.score:.4f}"),
-        ("RMSE xy [m]", as_text(here["rmse_xy"], ".4f")),
-        ("event ratio", as_text(here["event_ratio"], ".4f")),
-        ("effort [m/s]", as_text(here["effort_mps"], ".4f")),
+        ("RMSE xy [m]", as_text(means["rmse_xy"], ".4f")),
+        ("event ratio", as_text(means["event_ratio"], ".4f")),
+        ("effort [m/s]", as_text(means["effort_mps"], ".4f")),
     ]
     rows += [(key, f"{value:g}") for key, value in found.keys.items()]
     tables.show(f"the best of {len(points)} points", (), rows)
 
 
 def _print_table_1(points: Sequence[SearchPoint]) -> None:
-    """Print the best point beside Table 1, and the ranges of all points within tolerance."""
     found, rows = best(points), []
     _print_entries(found.values)
     near = [point for point in points if calibration.is_admissible(point.values)]
@@ -143,10 +137,9 @@ def _print_table_1(points: Sequence[SearchPoint]) -> None:
 
 
 def _print_entries(values: Values) -> None:
-    """Print the entries of Table 1, the paper's figures beside those of a point."""
     rows = []
     for (column, name), off in calibration.deviations(values).items():
-        paper, here = calibration.TABLE_1[column][name], values[column][name]
+        paper, reproduced = calibration.TABLE_1[column][name], values[column][name]
         mark = "" if calibration.within(name, off) else " !"
-        rows.append((column, name, f"{paper:.4f}", as_text(here, ".4f"), f"{off:+.1%}{mark}"))
+        rows.append((column, name, f"{paper:.4f}", as_text(reproduced, ".4f"), f"{off:+.1%}{mark}"))
     tables.show("Table 1", ("", "entry", "paper", "here", "off"), rows)

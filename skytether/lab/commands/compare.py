@@ -24,7 +24,6 @@ from skytether.shell import command
 from skytether.shell.options import read
 
 WEIGHTS = "weights.toml"
-"""File of the weights found by a search."""
 
 
 @dataclass(frozen=True)
@@ -73,7 +72,6 @@ def compare(argv: Sequence[str]) -> None:
 
 
 def _compare(options: CompareOptions, scale: ComparisonSize, call: CommandCall) -> None:
-    """Fly all contenders in all cases, and write the report."""
     plans = [Plan(case, options.weights, scale) for case in scale.cases]
     command.claim_folder("--out", options.out, report_folder.PAGE)
     runs = sum(_scout(options, plans, number) for number in range(1 + scale.rounds))
@@ -95,10 +93,9 @@ def _compare(options: CompareOptions, scale: ComparisonSize, call: CommandCall) 
 
 
 def _scout(options: CompareOptions, plans: Sequence[Plan], number: int) -> int:
-    """Fly the scouting flights of one round: of all points, and later of those near the budgets.
+    """Fly the scouting flights of a round: all points first, later points near the budgets.
 
-    Returns:
-        the number of flights flown now.
+    Returns the number of flights flown by this call.
     """
     asked = [plan.halfway() if number else plan.points for plan in plans]
     if not any(asked):
@@ -113,7 +110,7 @@ def _scout(options: CompareOptions, plans: Sequence[Plan], number: int) -> int:
 
 
 def _beside(flyers: Crew, plan: Plan, folder: Path) -> Baselines:
-    """Baselines beside the contenders of a case that has its own weights."""
+    """Baselines of a case; none in a case that has its own weights."""
     if plan.case.weights:
         return Baselines()
     work, no_work = Work(plan), lambda _: 0.0
@@ -126,7 +123,6 @@ def _beside(flyers: Crew, plan: Plan, folder: Path) -> Baselines:
 
 
 def _tune(options: CompareOptions, scale: ComparisonSize) -> None:
-    """Search for the weights of every contender in every case, and write them to a file."""
     command.claim_folder("--out", options.out, WEIGHTS)
     found = []
     total = len(scale.searched) * scale.generations
@@ -145,11 +141,11 @@ def _tune(options: CompareOptions, scale: ComparisonSize) -> None:
             folder = options.out / "searches" / name
             *_, points = flyers.search(search, folder, scale.generations, f"{name}: ")
             point = best(points)
-            here = point.values[ONLY]
+            means = point.values[ONLY]
             says = (
-                f"RMSE xy {as_text(here['rmse_xy'], '.4f')} m at "
-                f"{as_text(here['event_ratio'], '.1%')} of the steps, effort "
-                f"{as_text(here['effort_mps'], '.3f')} m/s"
+                f"RMSE xy {as_text(means['rmse_xy'], '.4f')} m at "
+                f"{as_text(means['event_ratio'], '.1%')} of the steps, effort "
+                f"{as_text(means['effort_mps'], '.3f')} m/s"
             )
             found.append(TunedWeights(contender, case, search.scenario(point), says))
             print(f"{name}: {says}")

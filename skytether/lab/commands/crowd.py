@@ -24,7 +24,6 @@ from skytether.shell.command import CommandError, ScenarioFlags, ScenarioName
 from skytether.sim import flight
 
 VEHICLES_MAX = 4096
-"""Most vehicles of a flight."""
 
 
 @dataclass(frozen=True)
@@ -77,7 +76,7 @@ def crowd(argv: Sequence[str]) -> None:
             points = {(each.scheme, each.vehicles): each for each in journal.results.values()}
         try:
             with crew(
-                # over UDP one after the other: they would share the machine
+                # One after the other over UDP: parallel flights would compete for the processor.
                 Flags(1 if options.udp else None),
                 f"flying {options.scenario}",
                 len(options.schemes),
@@ -105,27 +104,24 @@ def crowd(argv: Sequence[str]) -> None:
 
 
 Cell = tuple[Scheme, int]
-"""Scheme, and number of vehicles."""
 
 
 def _missing(options: CrowdOptions, points: Sequence[CrowdPoint]) -> list[Cell]:
-    """Flights to fly next; none when all is known."""
+    """Flights to fly next; empty when every scheme's limit is found."""
     cells: list[Cell] = []
     for scheme in options.schemes:
         flown = FlownScheme.of(points, scheme, options.limit)
         numbers = options.vehicles or (flown.next(options.most),)
-        known = {None, *(point.vehicles for point in flown.points)}
-        cells += [(scheme, number) for number in numbers if number and number not in known]
+        flown_numbers = {None, *(point.vehicles for point in flown.points)}
+        cells += [(scheme, number) for number in numbers if number and number not in flown_numbers]
     return cells
 
 
 def _doing(cells: Sequence[Cell], _: object = None) -> str:
-    """Flights under way, in words."""
     return ", ".join(f"{scheme} {vehicles}" for scheme, vehicles in cells)
 
 
 def _fly(plan: Crowd, cell: Cell) -> CrowdPoint:
-    """Fly a number of vehicles; called in a worker."""
     scheme, vehicles = cell
     scenario = plan.of(scheme)
     if not plan.udp:
@@ -136,7 +132,9 @@ def _fly(plan: Crowd, cell: Cell) -> CrowdPoint:
             scenario,
             parts,
             on_second=lambda _: None,
-            interrupted=lambda: False,  # it ends with its worker
+            interrupted=lambda: (
+                False
+            ),  # The crew's Ctrl-C ends the worker process, and with it the flight.
             vehicles=vehicles,
             watched=False,
         )
@@ -146,7 +144,6 @@ def _fly(plan: Crowd, cell: Cell) -> CrowdPoint:
 
 
 def _finish(options: CrowdOptions, points: Sequence[CrowdPoint]) -> None:
-    """Write and print the results."""
     flown = {scheme: FlownScheme.of(points, scheme, options.limit) for scheme in TITLES}
     where = "over UDP" if options.udp else "in virtual time"
     title = f"{options.scenario}, {where}, seed {options.config.seed}"

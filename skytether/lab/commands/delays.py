@@ -18,34 +18,32 @@ from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import DOWNLINK, UPLINK, read
 
 EVERY_S = 0.002
-"""Time between packets [s]."""
 BYTES = 350
-"""Size of a packet [B], that of a horizon."""
+"""Size of a packet [B], about that of a horizon."""
 LAST_S = 1.0
-"""Wait for the last packets, beyond the mean delay [s]."""
+"""Waiting time for the last packets, in addition to the mean delay [s]."""
 
 
 class _End(asyncio.DatagramProtocol):
-    """End of the path: records the arrival of the other end's numbered and timestamped packets."""
+    """Endpoint of the path: records the delays of the numbered, timestamped packets that it
+    receives.
+    """
 
     def __init__(self, answers: bool) -> None:
         self._answers = answers
         self._sent = 0
         self.delays_ns: dict[int, int] = {}
-        """Delay of each received packet [ns], by its number."""
+        """Delay of each received packet [ns], by its sequence number."""
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """See `asyncio.DatagramProtocol`."""
         self.transport = transport
 
     def send(self, peer: Address) -> None:
-        """Send the next packet."""
         stamp = self._sent.to_bytes(8) + time.monotonic_ns().to_bytes(8)
         self.transport.sendto(stamp.ljust(BYTES, b"."), peer)  # type: ignore[attr-defined]
         self._sent += 1
 
     def datagram_received(self, data: bytes, peer: Address) -> None:
-        """See `asyncio.DatagramProtocol`."""
         now_ns = time.monotonic_ns()
         number, sent_ns = int.from_bytes(data[:8]), int.from_bytes(data[8:16])
         self.delays_ns[number] = now_ns - sent_ns
@@ -56,16 +54,14 @@ class _End(asyncio.DatagramProtocol):
 def measure(
     scenario: Scenario, folder: Path, packets: int, on_second: Callable[[float], None]
 ) -> Array:
-    """Send packets through netem, and the received ones back.
+    """Send packets through netem in one direction, and an answer for each in the other.
 
     Args:
-        scenario: scenario, of which `network` and `seed` are used.
-        folder: folder for the scenario file that netem is given, and for its record.
-        packets: number of packets to send.
+        folder: folder for the scenario file that netem reads, and for netem's record.
         on_second: called often with the elapsed time [s].
 
     Returns:
-        Delays of the received packets, measured and drawn [ms]; shape (packets, 2).
+        Delays of the received packets, measured and drawn by netem [ms]; shape (packets, 2).
 
     Raises:
         CommandError: netem failed.
@@ -78,9 +74,9 @@ async def _measure(
     scenario: Scenario, folder: Path, packets: int, on_second: Callable[[float], None]
 ) -> Array:
     loop = asyncio.get_running_loop()
-    here = ("127.0.0.1", 0)
-    back, server = await loop.create_datagram_endpoint(lambda: _End(True), local_addr=here)
-    forth, client = await loop.create_datagram_endpoint(lambda: _End(False), local_addr=here)
+    loopback = ("127.0.0.1", 0)
+    back, server = await loop.create_datagram_endpoint(lambda: _End(True), local_addr=loopback)
+    forth, client = await loop.create_datagram_endpoint(lambda: _End(False), local_addr=loopback)
     at = address_text(*back.get_extra_info("sockname"))
     file, record = folder / "scenario.toml", folder / "netem.rec"
     arguments = [str(file), "--bind", "127.0.0.1:0", "--server", at, "--record", str(record)]
@@ -95,7 +91,7 @@ async def _measure(
     finally:
         back.close()
         forth.close()
-    # The rows of netem are in order of entry, and so of the packets' numbers.
+    # Rows of netem's record are in order of entry, hence of sequence numbers.
     drawn, rows = read(record), []
     for direction, end in ((DOWNLINK, server), (UPLINK, client)):
         of = drawn[drawn["direction"] == direction]

@@ -1,6 +1,4 @@
-"""`skytether envelope`: networks and settings under which a scenario flies, tested at many
-points.
-"""
+"""`skytether envelope`: networks and settings under which a scenario flies, by many flights."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -20,7 +18,6 @@ from skytether.shell import command
 from skytether.shell.command import CommandError, ScenarioFlags, ScenarioName
 
 TOLD_MAX = 10
-"""Most bad points that are printed with their command lines."""
 
 
 @dataclass(frozen=True)
@@ -67,11 +64,7 @@ def envelope(argv: Sequence[str]) -> None:
 
 
 def _finish(options: EnvelopeOptions, plan: Envelope, points: Sequence[EnvelopePoint]) -> None:
-    """Write and print the outcomes of all points.
-
-    Raises:
-        CommandError: some points are bad.
-    """
+    """Write and print all outcomes; raises CommandError if some points flew away or crashed."""
     title = f"{options.scenario}, {len(points)} points, in virtual time, seed {plan.scenario.seed}"
     files.write(options.out / "points.csv", plan.csv(points).encode())
     figures.envelope(options.out / "envelope.png", title, plan, points)
@@ -79,8 +72,10 @@ def _finish(options: EnvelopeOptions, plan: Envelope, points: Sequence[EnvelopeP
     rows = [(each, counts[each], f"{counts[each] / len(points):.1%}") for each in get_args(Outcome)]
     tables.show(title, ("outcome", "points", "share"), rows)
     for number, point in worst_first(points)[:TOLD_MAX]:
-        said = f": {point.line}" if point.line else f": {point.error_max:.2f} m from the reference"
-        print(f"{point.outcome}{said}\n    {plan.command(number)}")
+        detail = (
+            f": {point.line}" if point.line else f": {point.error_max:.2f} m from the reference"
+        )
+        print(f"{point.outcome}{detail}\n    {plan.command(number)}")
     print(f"{options.out}: points.csv, envelope.png")
     if bad := sum(counts[outcome] for outcome in BAD):
         raise CommandError(f"{bad} of {len(points)} points flew away or crashed")

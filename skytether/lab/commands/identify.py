@@ -42,14 +42,10 @@ from skytether.shell.udp import AddressError
 from skytether.sim.world import World
 
 SCENARIO, PICTURE, MEASURED = "scenario.toml", "steps.png", "measured.csv"
-"""Files in the folder of an identification, beside the one for programs."""
 OUTCOME = "identified.json"
 NUMBER = 1
-"""Number of the vehicle in its events."""
 REPEATS_MAX, HOLD_MAX_S = 100, 60.0
-"""Most repetitions, and the longest time after a step [s]."""
 VIRTUAL_MAX_NS = 7200 * SECOND_NS
-"""Longest flight in virtual time [ns]."""
 
 
 @dataclass(frozen=True)
@@ -87,14 +83,12 @@ class IdentifyOptions:
 
 @dataclass(frozen=True, slots=True)
 class SizeFlown:
-    """Results of steps of one size."""
-
     flight: Identifying
     axes: list[AxisOutcome]
 
 
 class IdentificationTold(msgspec.Struct, frozen=True):
-    """Results of an identification, as written to identified.json."""
+    """Content of identified.json."""
 
     scenario: str
     kind: str
@@ -142,10 +136,9 @@ def identify(argv: Sequence[str]) -> None:
 
 
 def _asked(options: IdentifyOptions) -> tuple[Scenario, list[ExperimentPlan]]:
-    """Scenario with the requested kind of vehicle, and the experiment to fly.
+    """Scenario with the requested kind of vehicle, and one experiment for each size of step.
 
-    Raises:
-        CommandError, ConfigError: the request cannot be flown.
+    Raises CommandError or ConfigError if the request cannot be flown.
     """
     table = reading.to_table(options.config)
     if options.kind:
@@ -162,11 +155,7 @@ def _asked(options: IdentifyOptions) -> tuple[Scenario, list[ExperimentPlan]]:
 
 
 def _size(scenario: Scenario, flag: str, given: Sequence[float]) -> tuple[float, ...]:
-    """Size of step on each axis [m/s].
-
-    Raises:
-        CommandError: a size cannot be flown.
-    """
+    """Size of step on each axis [m/s]; raises CommandError if a size cannot be flown."""
     axes = scenario.model.axes
     if len(given) not in (1, axes):
         raise CommandError(f"{flag}: got {len(given)} numbers, expected 1 or {axes}", 2)
@@ -181,13 +170,13 @@ def _size(scenario: Scenario, flag: str, given: Sequence[float]) -> tuple[float,
 
 
 def _fly(scenario: Scenario, plan: ExperimentPlan, *, sets: bool) -> SizeFlown:
-    """Fly an experiment, in real time if the vehicle has hardware; returns the results.
+    """Fly an experiment, in real time if the vehicle has hardware.
 
     Args:
-        sets: whether parameters of its hardware may be set.
+        sets: whether parameters of the autopilot may be set.
 
     Raises:
-        CommandError: the connection to its hardware cannot be opened.
+        CommandError: the connection to the hardware cannot be opened.
     """
     flies = vehicles.make(scenario, NUMBER)
     if sets and not flies.set_parameters():
@@ -217,14 +206,12 @@ def _fly(scenario: Scenario, plan: ExperimentPlan, *, sets: bool) -> SizeFlown:
 
 
 def _doing(flight: Identifying) -> str:
-    """Present activity of the flight, in words."""
     if not flight.flown_s:
-        return "on its way into the air"
+        return "taking off"
     return f"{len(flight.experiment.steps)} steps" if not flight.is_over else "landing"
 
 
 def _virtually(flight: Identifying, show: Callable[[], None]) -> None:
-    """Fly in virtual time."""
     world = World()
     world.add("vehicle", flight)
     with command.interruptible() as interrupted:
@@ -239,11 +226,7 @@ def _virtually(flight: Identifying, show: Callable[[], None]) -> None:
 
 
 def _really(flight: Identifying, scenario: Scenario, show: Callable[[], None]) -> None:
-    """Fly in real time, over the connection to the vehicle's hardware.
-
-    Raises:
-        CommandError: the connection cannot be opened.
-    """
+    """Fly in real time; raises CommandError if the connection to the hardware cannot be opened."""
     line = parse_line("vehicle.address", scenario.vehicle.address)
     try:
         shell = driver.Shell(Steady(flight), None, line=line)
@@ -260,10 +243,9 @@ def _say(line: Event | str) -> None:
 
 
 def _tell(options: IdentifyOptions, scenario: Scenario, flown: Sequence[SizeFlown]) -> None:
-    """Write and print measurements and results."""
     first, out = flown[0], options.out
     costs = _costs(flown) if len(flown) > 1 else []
-    told = IdentificationTold(
+    results = IdentificationTold(
         scenario=options.scenario,
         kind=scenario.vehicle.kind,
         ended=first.flight.why,
@@ -274,7 +256,9 @@ def _tell(options: IdentifyOptions, scenario: Scenario, flown: Sequence[SizeFlow
         costs=costs,
     )
     with writing(out):
-        files.write(out / OUTCOME, msgspec.json.format(msgspec.json.encode(told), indent=2) + b"\n")
+        files.write(
+            out / OUTCOME, msgspec.json.format(msgspec.json.encode(results), indent=2) + b"\n"
+        )
         files.write(out / MEASURED, _measured(first.flight, scenario.model.axes).encode())
         figures.save(picture.drawn(first.axes), out / PICTURE, dpi=130)
     _show_models(first)
@@ -289,7 +273,7 @@ def _all_told(flown: SizeFlown) -> list[AxisTold]:
 
 
 def _measured(flight: Identifying, axes: int) -> str:
-    """All measurements, each with the input in force, as CSV text."""
+    """All measurements as CSV text, each with the input in force at its time."""
     names = AXES[:axes]
     header = ["time_s", *(f"{what}_{name}" for what in ("p", "v", "u") for name in names)]
     inputs, nothing, rows, at = flight.inputs, [None] * axes, [], 0
@@ -304,7 +288,6 @@ def _measured(flight: Identifying, axes: int) -> str:
 
 
 def _show_models(flown: SizeFlown) -> None:
-    """Print the model of each axis."""
     rows = []
     heading = ("axis", "step [m/s]", "steps", "gain", "time constant [s]", "dead time [s]")
     for name, axis in zip(AXES, flown.axes, strict=False):
@@ -337,7 +320,6 @@ def _costs(flown: Sequence[SizeFlown]) -> list[dict[str, float]]:
 
 
 def _show_costs(flown: Sequence[SizeFlown], costs: Sequence[dict[str, float]]) -> None:
-    """Print the errors of models identified at other sizes of step."""
     rows = []
     for one, cost in zip(flown, costs, strict=True):
         of = ", ".join(f"{axis.speed:g}" for axis in one.axes)
@@ -351,8 +333,7 @@ def _show_costs(flown: Sequence[SizeFlown], costs: Sequence[dict[str, float]]) -
 def _write_scenario(options: IdentifyOptions, scenario: Scenario, flown: SizeFlown) -> None:
     """Write the scenario with the identified model, and check that it can be flown.
 
-    Raises:
-        CommandError: there is no model, or the scenario cannot be flown.
+    Raises CommandError if there is no model, or the scenario cannot be flown.
     """
     base = reading.load_base(options.scenario)
     text = outcome.scenario_text(scenario, options.scenario, base, flown.axes)

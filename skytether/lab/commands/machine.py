@@ -8,7 +8,6 @@ from pathlib import Path
 
 
 def processor() -> str:
-    """Name of this machine's processor."""
     with contextlib.suppress(OSError):
         for line in Path("/proc/cpuinfo").read_text().splitlines():
             if line.startswith("model name"):
@@ -20,7 +19,7 @@ def processor() -> str:
 def commit() -> str | None:
     """Commit of the checkout that this code runs from; None without a checkout.
 
-    It is asked once: a benchmark that writes down its figures changes the checkout.
+    Cached, because a benchmark that writes its results into the checkout makes it dirty.
     """
     command = ["git", "describe", "--always", "--abbrev=12", "--dirty", "--exclude=*"]
     here = Path(__file__).parent

@@ -24,7 +24,6 @@ from skytether.shell import command
 from skytether.shell.command import CommandError, ScenarioFlags, ScenarioName
 
 POINTS_MAX = 100_000
-"""Most points of a map."""
 
 
 @dataclass(frozen=True)
@@ -114,12 +113,11 @@ def margins(argv: Sequence[str]) -> None:
 
 
 def _fly(part: Callable[[], Margin | MarginLimit]) -> Margin | MarginLimit:
-    """Result of a part; called in a worker."""
     return part()
 
 
 def _box(options: MarginsOptions, trigger: str) -> Box:
-    """Box given by the options.
+    """Box of vehicles given by the options.
 
     Raises:
         CommandError: the box is empty, or too large.
@@ -142,7 +140,6 @@ def _box(options: MarginsOptions, trigger: str) -> Box:
 
 
 def _map(options: MarginsOptions, folder: Path, trigger: str) -> None:
-    """Fly the missing points of the box; write and print the results of all."""
     box = _box(options, trigger)
     numbers, title = range(len(box.places)), f"flying vehicles like {options.scenario}'s"
     points = study(
@@ -157,7 +154,6 @@ def _map(options: MarginsOptions, folder: Path, trigger: str) -> None:
 
 
 def _show_points(title: str, box: Box, points: Sequence[MapPoint]) -> None:
-    """Print a row for each map."""
     groups: dict[tuple[float, float], list[MapPoint]] = defaultdict(list)
     for place, point in zip(box.places, points, strict=True):
         groups[place.burst_s, place.dead_time_s].append(point)
@@ -181,7 +177,6 @@ def _show_points(title: str, box: Box, points: Sequence[MapPoint]) -> None:
 
 
 def _show(options: MarginsOptions, trigger: str, found: Sequence[Margin]) -> None:
-    """Print a row for each vehicle."""
     scenario = options.config
     title = f"{options.scenario}, {options.runs} seeds, white wind {lab.wind_of(scenario):g}"
     noises = scenario.sensor.position_noise_m, scenario.sensor.velocity_noise_mps
@@ -209,14 +204,12 @@ def _show(options: MarginsOptions, trigger: str, found: Sequence[Margin]) -> Non
 
 
 def _with_interval(value: float | None, half: float | None) -> str:
-    """Value and half-width of its interval in a table."""
     if value is None:
         return "-"
     return f"{value:.4f}" + ("" if half is None else f" ± {half:.4f}")
 
 
 def _show_limits(limits: Sequence[MarginLimit]) -> None:
-    """Print a row for each limit."""
     rows = []
     for each in limits:
         beyond = "<" if each.quantity.endswith("least") else ">"

@@ -1,8 +1,8 @@
-"""Core of every study: workers fly its cells, and a journal stores the results.
+"""Parallel studies: worker processes fly the cells of a study, and a journal stores the results.
 
-A study is a list of cells and a function that flies and evaluates one (`Crew.study`). Stored
+A study is a list of cells and a function that flies and evaluates one cell (`Crew.study`). Stored
 results are not flown again, Ctrl-C stops cleanly, and a bar shows the progress. A sweep is a study
-of its tasks, a search one of its points, generation by generation. The workers are processes of
+of its tasks, a search a study of its points, generation by generation. The workers are processes on
 this machine, or of a Dask cluster.
 """
 
@@ -44,11 +44,9 @@ from skytether.shell.terminal import Bar
 from skytether.shell.workers import die_with_parent
 
 UNDER_WAY_MAX = 256
-"""Most tasks handed out at once: more than any machine has cores."""
+"""Largest number of tasks submitted at once; more than the cores of any machine."""
 POLL_S = 0.2
-"""Interval at which Ctrl-C is checked [s]."""
 CONNECT_S = 10.0
-"""Time that a scheduler may take to answer [s]."""
 
 K = TypeVar("K", bound=Hashable)
 T = TypeVar("T")
@@ -69,15 +67,11 @@ class Flags:
             metavar="FILE",
             help="Python file with own triggers or references; may be repeated.",
         ),
-        tyro.conf.UseAppendAction,  # `read` tells tyro of the outermost record's annotations alone
+        tyro.conf.UseAppendAction,  # tyro reads annotations of the outermost dataclass only
     ] = ()
 
     def check(self) -> None:
-        """Refuse impossible options.
-
-        Raises:
-            CommandError: with the values that are accepted.
-        """
+        """Raise CommandError if the options are impossible, with the values that are accepted."""
         if self.workers is not None:
             command.check_count("--workers", self.workers, 1024)
             if self.scheduler:
@@ -91,34 +85,27 @@ class Interrupted(CommandError):
     """Error: interrupted by Ctrl-C; the same command continues the work."""
 
     def __init__(self, done: float, total: float, unit: str) -> None:
-        said = f"interrupted with {done:.0f} of {total:.0f} {unit} done"
-        super().__init__(f"{said}; the same command goes on from here", command.INTERRUPTED)
+        message = f"interrupted with {done:.0f} of {total:.0f} {unit} done"
+        super().__init__(f"{message}; the same command goes on from here", command.INTERRUPTED)
         self.results: Mapping[Any, Any] = {}
-        """Results of the study so far."""
+        """Results that the study had when it was interrupted."""
 
 
 @dataclass(slots=True)
 class Crew:
-    """Workers, with a progress bar."""
-
     executor: Executor
     bar: Bar
     total: float
-    """Amount of work in total, in the unit."""
     unit: str
-    """Unit of the work."""
     interrupted: Callable[[], bool]
     done: float = 0.0
-    """Amount of finished work."""
     cpu_s: float = 0.0
-    """CPU time of the workers [s]."""
     runs: int = 0
-    """Number of flights of sweeps, without those that were kept before."""
+    """Number of flights of sweeps flown by this command, without stored ones."""
     fresh: list[Any] = field(default_factory=list)
-    """Results of this command, without those that were kept before."""
+    """Results of this command, without stored ones."""
 
     def advance(self, amount: float, text: str = "") -> None:
-        """Count finished work, and show it."""
         self.done += amount
         self.bar(self.done, text)
 
@@ -137,8 +124,8 @@ class Crew:
 
         Args:
             fly: flies a cell, and evaluates the flight; called in a worker.
-            cells: the cells, by the key of the result in the journal.
-            kind: type of a result; only needed with a folder.
+            cells: the cells, by their keys in the journal.
+            kind: type of a result, for decoding the journal; only needed with a folder.
             settings: all settings that determine the results, besides the cells.
             out: folder of the journal; None: results are not stored.
             size: amount of work of a cell, in the unit of the bar.
@@ -178,11 +165,7 @@ class Crew:
         return list(self.study(fly, dict(enumerate(items)), size=lambda _: 0.0).values())
 
     def sweep(self, plan: Sweep, out: Path, text: str = "") -> Results:
-        """Results of all tasks of a sweep; see `study`.
-
-        Args:
-            text: text of the bar.
-        """
+        """Results of all tasks of a sweep; stored and raised as in `study`."""
         tasks, before = {(task.cell, task.chunk): task for task in plan.tasks()}, len(self.fresh)
         results = self.study(
             skytether.lab.sweep.fly,
@@ -199,11 +182,7 @@ class Crew:
     def search(
         self, search: Search, out: Path, generations: int, text: str = ""
     ) -> Iterator[list[SearchPoint]]:
-        """All points of a search so far, after each generation; see `study`.
-
-        Args:
-            text: text of the bar, before the best score.
-        """
+        """All points of a search so far, after each generation; stored and raised as in `study`."""
 
         def fly_all(cells: Mapping[Point, Scenario]) -> Mapping[Point, Values]:
             kind, settings = dict[str, dict[str, float | None]], search.settings()
@@ -219,7 +198,7 @@ class Crew:
         """Run a function for all items in the workers, in any order.
 
         Args:
-            on_done: called with the number of an item and its result.
+            on_done: called in this process with the number of an item and its result.
 
         Raises:
             CommandError: interrupted, a worker has died, or the cluster is lost.
@@ -249,12 +228,10 @@ class Crew:
 
 @contextmanager
 def crew(flags: Flags, title: str, total: float, unit: str = "runs") -> Iterator[Crew]:
-    """Workers with a bar on stderr; Ctrl-C ends their work in order.
-
-    Args:
-        total: amount of work in total, including finished work, in the unit.
+    """Workers with a progress bar on stderr, which shows `total` in the unit. Ctrl-C ends them in
+    order.
     """
-    if not flags.scheduler:  # compile now: otherwise each worker would compile all kernels
+    if not flags.scheduler:  # Compile now: otherwise every worker would compile all kernels.
         terminal.prepare(kernel.missing())
     with (
         command.interruptible() as interrupted,
@@ -277,8 +254,7 @@ def study(
     """Results of all cells of a study that is a whole command, in order; see `Crew.study`.
 
     Args:
-        cells: what is flown, each its own key; the same folder may be given more later.
-        title, unit: title and unit of the bar.
+        cells: items to fly, each its own key in the journal; a later call may have more.
 
     Raises:
         CommandError: interrupted, a worker has died, or the folder cannot be written.
@@ -290,11 +266,7 @@ def study(
 
 @contextmanager
 def writing(out: Path | None) -> Iterator[None]:
-    """Within the block, replace an OSError by a one-line message with the file or folder.
-
-    Raises:
-        CommandError: the block raised an OSError.
-    """
+    """Replace an OSError of the block by a CommandError that names the file or folder."""
     try:
         yield
     except OSError as error:
@@ -303,7 +275,7 @@ def writing(out: Path | None) -> Iterator[None]:
 
 @contextmanager
 def _deaf() -> Iterator[None]:
-    """Start workers with SIGINT ignored, so that Ctrl-C reaches only the command."""
+    """Start workers with SIGINT blocked, so that Ctrl-C reaches only the command."""
     signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
@@ -314,15 +286,14 @@ def _deaf() -> Iterator[None]:
 def _equipped(function: Callable[[T], R], plugged: tuple[Plugin, ...], item: T) -> R:
     """Result of a function for an item; called in a worker, which first loads the plug-ins.
 
-    Plug-ins are passed with their content: a worker may be on another machine, or be started later,
-    and edits of a file after the start must have no effect.
+    Plug-ins are passed with their content: a worker may be on another machine or start later, and
+    edits of a file after the start must have no effect.
     """
     plugins.use(plugged)
     return function(item)
 
 
 def _work(fly: Callable[[T], R], item: T) -> tuple[R, float]:
-    """Result of a cell, and its CPU time [s]; called in a worker."""
     kernel.load()
     began_s = time.thread_time()
     result = fly(item)
@@ -337,7 +308,6 @@ def _executor(flags: Flags) -> AbstractContextManager[Executor]:
 
 @contextmanager
 def _processes(count: int) -> Iterator[Executor]:
-    """Worker processes on this machine, one per core; all have ended at the end of the block."""
     for library in ("OMP", "OPENBLAS", "MKL", "NUMBA"):
         os.environ[f"{library}_NUM_THREADS"] = "1"
     pool = ProcessPoolExecutor(count, multiprocessing.get_context("spawn"), _start, (os.getpid(),))
@@ -351,15 +321,14 @@ def _processes(count: int) -> Iterator[Executor]:
 
 
 def _start(parent: int) -> None:
-    """Initialise a worker, which ends with the command."""
+    """Initialise a worker, which ends with the process that started it."""
     die_with_parent()
-    if os.getppid() != parent:  # the command had ended before
+    if os.getppid() != parent:  # the command had already ended
         os._exit(1)
 
 
 @contextmanager
 def _cluster(address: str) -> Iterator[Executor]:
-    """Workers of a Dask scheduler."""
     from distributed import Client
 
     try:

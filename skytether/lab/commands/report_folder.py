@@ -19,35 +19,25 @@ from skytether.shared.base import files
 from skytether.shared.scenario.schema import Scenario
 
 PAGE = "report.html"
-"""File of the page."""
 CALLS = "calls.jsonl"
-"""File with a line for each command that added to the folder, or drew it again."""
+"""File with a line for each command that wrote the report."""
 PACKAGES = ("skytether", "numpy", "scipy", "numba", "daqp", "msgpack", "matplotlib")
-"""Packages whose versions are on the page."""
+"""Packages whose versions the page shows."""
 
 
 @dataclass(frozen=True, slots=True)
 class CommandCall:
-    """Command that is running."""
-
     command: str
-    """Command line."""
     began: datetime
-    """Time of day at which the command began."""
     began_s: float
     """Time at which the command began, on a monotonic clock [s]."""
 
     @classmethod
     def now(cls, name: str, argv: Sequence[str]) -> "CommandCall":
-        """Call of the command with this name, which begins now."""
         return cls(shlex.join(["skytether", name, *argv]), datetime.now(UTC), time.monotonic())
 
     def facts(self, runs: int) -> dict[str, Any]:
-        """Facts about the call for a reader of the report, as plain values.
-
-        Args:
-            runs: number of flights flown by the call.
-        """
+        """Facts about the call for the report; `runs` is the number of flights that it flew."""
         return {
             "command": self.command,
             "date": self.began.isoformat(timespec="seconds"),
@@ -65,7 +55,6 @@ def write(out: Path, drawn: Drawn, scenario: Scenario, call: CommandCall, runs: 
     """Write all files of a report.
 
     Args:
-        scenario: scenario of the report.
         runs: number of flights flown by this call.
 
     Raises:

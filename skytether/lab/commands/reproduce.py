@@ -76,7 +76,7 @@ def reproduce(argv: Sequence[str]) -> None:
 def _measure(
     options: ReproduceOptions, scenario: Scenario, scale: ReproductionSize
 ) -> tuple[Reproduction, int]:
-    """All flights, including earlier ones, and the number of those flown now."""
+    """All flights, stored ones included, and the number of flights flown by this call."""
     table = studies.table_study(scenario, scale)
     curves = studies.curve_studies(scenario, scale)
     maps, periods = studies.map_sweep(scenario, scale), studies.period_sweep(scenario, scale)
@@ -84,7 +84,7 @@ def _measure(
     total = points * (len(studies.METHODS.values) + 1)
     total += maps.flights + periods.flights
     sweeps = options.out / "sweeps"
-    # A folder of another reproduction is refused before anything is flown.
+    # Refuse a folder of another reproduction before anything is flown.
     StudyJournal(sweeps / table.name, table.first().settings(), Runs).close()
     terminal.prepare(kernel.missing())
     # Real-time measurements come first, while the cores are idle.
@@ -108,7 +108,6 @@ def _measure(
 
 
 def _fly_study(flyers: Crew, out: Path, study: Study, title: str) -> Cells:
-    """Fly both sweeps of a study."""
     first = study.first()
     firstly = flyers.sweep(first, out / study.name, title)
     second = study.second(studies.flown(first, firstly))
@@ -117,7 +116,6 @@ def _fly_study(flyers: Crew, out: Path, study: Study, title: str) -> Cells:
 
 
 def _delays(out: Path, scenario: Scenario, scale: ReproductionSize) -> Array:
-    """Delays of packets through netem, as returned by `delays.measure` [ms]."""
     file = out / "delays.npy"
     if not file.exists():
         folder = out / "netem"
@@ -132,7 +130,7 @@ def _delays(out: Path, scenario: Scenario, scale: ReproductionSize) -> Array:
 
 
 def _really(out: Path, table: Study, method: str, scale: ReproductionSize) -> report.Real:
-    """Flight over UDP, with the scenario's seed, unless it was flown before."""
+    """Flight over UDP with the scenario's seed; a stored flight is not flown again."""
     plan = table.first()
     scenario = plan.scenario_of(scale.real_s, method)
     folder = out / "real" / method.replace(" ", "-")
@@ -149,8 +147,8 @@ def _really(out: Path, table: Study, method: str, scale: ReproductionSize) -> re
             raise CommandError("; ".join(map(str, shortfalls)))
         steps = record.read(part / "client")["step"]
         if not len(steps) or steps[-1] < scenario.steps - 2:
-            said = "interrupted; the same command goes on from here"
-            raise CommandError(said, command.INTERRUPTED)
+            message = "interrupted; the same command goes on from here"
+            raise CommandError(message, command.INTERRUPTED)
         part.rename(folder)
     client, server, netem = (record.read(folder / part) for part in processes.NAMES)
     figures = json.loads((folder / "netem.json").read_bytes())

@@ -18,13 +18,11 @@ from skytether.shell import command
 from skytether.shell.command import ScenarioFlags, ScenarioName
 
 DRAWN = {"rmse_xy": "RMSE xy [m]", "event_ratio": "event ratio"}
-"""Figures that are drawn, and their labels."""
 SHOWN = {
     "rmse_xy": ("RMSE xy [m]", ".4f"),
     "event_ratio": ("event ratio", ".4f"),
     "packets_per_s": ("packets/s both ways", ".2f"),
 }
-"""Figures in the printed table, with their headings and formats."""
 
 
 @dataclass(frozen=True)
@@ -70,7 +68,6 @@ def sweep(argv: Sequence[str]) -> None:
 
 
 def _finish(options: SweepOptions, plan: Sweep, done: Results, flyers: Crew) -> None:
-    """Write and print the tables and pictures of a complete sweep."""
     written = ["runs.csv", "cells.csv"]
     files.write(options.out / "runs.csv", plan.runs_csv(done).encode())
     files.write(options.out / "cells.csv", plan.cells_csv(done).encode())
@@ -102,7 +99,7 @@ def _finish(options: SweepOptions, plan: Sweep, done: Results, flyers: Crew) -> 
     tables.show(title, headings, rows)
     failed = sum(not run.steps for runs in cells for run in runs)
     if failed:
-        print(f"{failed} runs found no server and count in no mean of the error")
+        print(f"{failed} runs found no server, and are left out of the mean errors")
     if flyers.cpu_s:
         steps = sum(run.steps for runs in flyers.fresh for run in runs)
         print(f"{steps} vehicle-steps, {steps / flyers.cpu_s:.0f} per core-second")

@@ -11,8 +11,7 @@ from skytether.shell import terminal
 def show(title: str, headings: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
     """Print a table: the first column flush left, the others right, and nothing cut off.
 
-    Args:
-        headings: heading of each column; none for a table of names and values.
+    Without headings the table is a list of names and values.
     """
     table = Table(
         title=Text(title, style="table.title"),

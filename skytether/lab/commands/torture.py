@@ -23,13 +23,9 @@ from skytether.shell.command import CommandError
 from skytether.shell.options import read
 
 SEEDS = 2**32
-"""Number of seeds."""
 HOURS_MAX = 10_000
-"""Largest number of hours."""
 SCHEDULES_BYTES_MAX = 64_000_000
-"""Largest size of a file of schedules [B]."""
 TOLD_MAX = 10
-"""Most failures that are shrunk and printed."""
 
 
 @dataclass(frozen=True)
@@ -81,14 +77,13 @@ def torture(argv: Sequence[str]) -> None:
         failed = [each for each in done if each.failure]
     _finish(options, title, done, failed)
     if failed:
-        said = f"{len(failed)} of {len(done)} flights failed"
-        raise CommandError(f"{interrupted}, and {said}" if interrupted else said)
+        message = f"{len(failed)} of {len(done)} flights failed"
+        raise CommandError(f"{interrupted}, and {message}" if interrupted else message)
     if interrupted:
         raise CommandError(interrupted, command.INTERRUPTED)
 
 
 def _failures(done: Collection[TrialOutcome]) -> str:
-    """Number of failures, in words; nothing without any."""
     failed = sum(bool(each.failure) for each in done)
     return f"{failed} failed" if failed else ""
 
@@ -101,9 +96,9 @@ def _trials(options: TortureOptions) -> tuple[list[Trial], str]:
         ConfigError: a text is no schedule.
     """
     asked = ("seed", "hours", "replay", "schedule")
-    given = [name for name in asked if getattr(options, name) is not None]
-    if len(given) > 1 and given != ["seed", "hours"]:
-        together = " and ".join(f"--{name}" for name in given)
+    given_options = [name for name in asked if getattr(options, name) is not None]
+    if len(given_options) > 1 and given_options != ["seed", "hours"]:
+        together = " and ".join(f"--{name}" for name in given_options)
         raise CommandError(f"got {together}, expected one of them", command.CONFIGURATION)
     if options.schedule is not None:
         return [loads(options.schedule)], "torture by a schedule"
@@ -144,7 +139,6 @@ def _read(path: Path) -> list[Trial]:
 def _finish(
     options: TortureOptions, title: str, done: Collection[TrialOutcome], failed: list[TrialOutcome]
 ) -> None:
-    """Write and print the counters and the failures."""
     counts: Counter[str] = Counter()
     for outcome in done:
         counts.update(outcome.counts)

@@ -1,5 +1,6 @@
 """Identification of a vehicle's model from small steps of velocity.
 
-steps: experiment → flight: endpoint that flies it → responses: measurements of each step → fit:
-gain, time constant and dead time → outcome: words, table, picture and scenario
+`steps` commands the experiment, `flight` is the endpoint that flies it, `responses` extracts the
+measurements of each step, `fit` finds gain, time constant and dead time, and `outcome` writes
+words, table, picture and scenario.
 """

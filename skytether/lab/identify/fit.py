@@ -2,11 +2,11 @@
 
     v(t) = g Σ Δu (1 - exp(-(t - t_u - θ) / τ)) + w       over the changes Δu at times t_u < t - θ
 
-Gain g, time constant τ and dead time θ are the least-squares solution over all steps of an axis; w
-is a constant offset of each step by wind or sensor error, and is removed by subtracting each step's
-mean from both sides. Residuals are correlated within a step: so the intervals treat steps as
-clusters (the sandwich estimator; Liang and Zeger, Biometrika 73, 1986), and are never narrower than
-those for white noise.
+Gain g, time constant τ and dead time θ are the least-squares solution over all steps of an axis.
+The offset w, constant within a step, comes from wind or sensor error; subtracting each step's mean
+from both sides removes it. Residuals are correlated within a step, so the intervals treat steps as
+clusters (the sandwich estimator; Liang and Zeger, Biometrika 73, 1986). They are never narrower
+than those for white noise.
 """
 
 import math
@@ -21,17 +21,13 @@ from skytether.lab.intervals import students
 from skytether.shared.law.model import Array
 
 STEPS_MIN = 2
-"""Smallest number of steps for a fit with intervals."""
 DEAD_MAX_S = 2.0
-"""Longest dead time that a scenario allows [s]."""
 TAU_MIN_S = 1e-3
-"""Shortest time constant that a scenario allows [s]."""
 GAIN_MIN = 1e-3
 """Smallest gain that a scenario allows."""
 GRID_S = 0.08
 """Spacing of the grid of dead times from which fits start [s]."""
 BEGINNINGS = 2
-"""Number of starting points of a fit."""
 BIN_S = 0.05
 """Time over which the residuals of steps are averaged [s]."""
 GOOD = 0.1
@@ -41,23 +37,18 @@ SURE = 4.0
 
 
 class StepResponse(NamedTuple):
-    """Response of an axis to one step of its input."""
-
     before: float
-    """Input before the step [m/s]."""
     after: float
-    """Input after the step [m/s]."""
     changes: Array
     """Earlier changes of the input that still have an effect: time relative to the step [s], and
     amount [m/s]; shape (n, 2)."""
     times: Array
-    """Times of the measurements relative to the step, starting before it [s]; shape (m,)."""
+    """Times of the measurements relative to the step, some of them before it [s]; shape (m,)."""
     velocity: Array
     """Measured velocity [m/s]; shape (m,)."""
 
     @property
     def height(self) -> float:
-        """Height of the step, signed [m/s]."""
         return self.after - self.before
 
     @property
@@ -70,18 +61,14 @@ class Numbers(NamedTuple):
     """Parameters of a first-order model with dead time, or half-widths of their intervals."""
 
     gain: float
-    """Gain."""
     tau_s: float
-    """Time constant [s]."""
     dead_time_s: float
-    """Dead time [s]."""
 
 
 class Misfit(NamedTuple):
     """Residual of a model, as shares of the predicted height of steps."""
 
     rms: float
-    """Root mean square over all measurements."""
     largest: float
     """Largest difference at any time, in the mean of all starting or of all ending steps."""
     at_s: float
@@ -91,14 +78,10 @@ class Misfit(NamedTuple):
 
 
 class Fit(NamedTuple):
-    """First-order model with dead time, fitted to steps."""
-
     numbers: Numbers
-    """Parameters of the model."""
     within: Numbers
     """Half-widths of their 95 % intervals; infinite if the steps do not determine them."""
     misfit: Misfit
-    """Residual of the fit."""
 
 
 def fit(responses: Sequence[StepResponse]) -> Fit | None:
@@ -110,16 +93,16 @@ def fit(responses: Sequence[StepResponse]) -> Fit | None:
 
 
 def unit_response(times: Array, numbers: Numbers) -> Array:
-    """Velocity after a unit step of the input, divided by the gain; shape of the times [s]."""
+    """Velocity after a unit step of the input, divided by the gain; shape of `times` [s]."""
     return -np.expm1(-np.maximum(times - numbers.dead_time_s, 0.0) / numbers.tau_s)
 
 
 def predicted(response: StepResponse, numbers: Numbers) -> Array:
-    """Velocity predicted by a model at the measurements of a step [m/s]; shape (m,)."""
+    """Velocity that a model predicts at the measurements of a step [m/s]; shape (m,)."""
     since = response.times[:, None] - response.changes[:, 0]
     first = response.before - response.changes[response.changes[:, 0] < 0.0, 1].sum()
-    told = first + unit_response(since, numbers) @ response.changes[:, 1]
-    velocity: Array = numbers.gain * told
+    predicted_input = first + unit_response(since, numbers) @ response.changes[:, 1]
+    velocity: Array = numbers.gain * predicted_input
     return velocity
 
 
@@ -146,10 +129,10 @@ def _slopes(response: StepResponse, numbers: Numbers) -> Array:
 
 
 def _best(responses: Sequence[StepResponse]) -> Numbers:
-    """Least-squares parameters: a grid, each point with its best gain, then a local search.
+    """Least-squares parameters: a grid search, each point with its best gain, then a local search.
 
-    The sum of squares has a kink, and local minima, wherever a dead time ends at a measurement: so
-    the search uses no derivatives, and starts at several points.
+    The sum of squares has kinks and local minima where a dead time coincides with a measurement. So
+    the local search uses no derivatives, and starts at several points.
     """
     longest_s = max(float(each.times[-1]) for each in responses)
     dead_max_s = min(DEAD_MAX_S, longest_s / 2.0)
@@ -179,7 +162,7 @@ def _best(responses: Sequence[StepResponse]) -> Numbers:
 def _projection(responses: Sequence[StepResponse]) -> Callable[[float, float], tuple[float, float]]:
     """Function of time constant and dead time that returns the sum of squares and the best gain.
 
-    It evaluates all responses at once, because it is called a thousand times.
+    Called a thousand times, so it evaluates all responses at once.
     """
     lengths = [len(each.times) for each in responses]
     edges = np.cumsum([0, *lengths[:-1]])
@@ -198,15 +181,17 @@ def _projection(responses: Sequence[StepResponse]) -> Callable[[float, float], t
 
     def projected(tau: float, late: float) -> tuple[float, float]:
         unit = unit_response(since, Numbers(1.0, tau, late))
-        told = centred(np.einsum("ij,ij->i", unit, change))
-        gain = max(float(told @ velocity) / max(float(told @ told), 1e-12), GAIN_MIN)
-        return float(np.sum((velocity - gain * told) ** 2)), gain
+        unit_velocity = centred(np.einsum("ij,ij->i", unit, change))
+        gain = max(
+            float(unit_velocity @ velocity) / max(float(unit_velocity @ unit_velocity), 1e-12),
+            GAIN_MIN,
+        )
+        return float(np.sum((velocity - gain * unit_velocity) ** 2)), gain
 
     return projected
 
 
 def _within(responses: Sequence[StepResponse], numbers: Numbers) -> Numbers:
-    """Half-widths of the intervals of the best parameters."""
     slopes = [_slopes(each, numbers) for each in responses]
     left = [remainder(each, numbers) for each in responses]
     count, samples = len(responses), sum(map(len, left))
@@ -230,7 +215,7 @@ def differences(response: StepResponse, numbers: Numbers) -> Array:
 
 
 def misfit(responses: Sequence[StepResponse], numbers: Numbers) -> Misfit:
-    """Residual of a model for responses, which need not be those of its fit."""
+    """Residual of a model for responses, which may differ from those that it was fitted to."""
     shares = [differences(each, numbers) for each in responses]
     rms = float(np.sqrt(np.mean(np.concatenate(shares) ** 2)))
     worst = Misfit(rms, 0.0, 0.0, 0.0)
@@ -252,7 +237,7 @@ def binned(curves: Sequence[tuple[Array, Array]]) -> tuple[Array, Array, Array]:
     values.
 
     Args:
-        curves: times from the step [s] and values of each.
+        curves: times from the step [s] and values of each curve.
 
     Returns:
         times [s], means, and standard errors, which are infinite for a single curve.
@@ -261,20 +246,21 @@ def binned(curves: Sequence[tuple[Array, Array]]) -> tuple[Array, Array, Array]:
     table = np.full((len(curves), count), np.nan)
     for row, (times, values) in zip(table, curves, strict=True):
         after = times >= 0.0
-        which = (times[after] / BIN_S + 1e-6).astype(int)  # at a bin's border: the later bin
+        # A time on a bin's border counts for the later bin.
+        which = (times[after] / BIN_S + 1e-6).astype(int)
         number = np.bincount(which, minlength=count)
         with np.errstate(invalid="ignore"):
             row[:] = np.bincount(which, values[after], minlength=count) / number
     having = np.isfinite(table).sum(axis=0)
-    told = having >= max(1, (len(curves) + 1) // 2)
-    table, having = table[:, told], having[told]
+    is_shown = having >= max(1, (len(curves) + 1) // 2)
+    table, having = table[:, is_shown], having[is_shown]
     mean = np.nansum(table, axis=0) / having
     variance = np.nansum((table - mean) ** 2, axis=0) / np.maximum(having - 1, 1)
     several = having > 1
-    # with two curves, the scatter of one degree of freedom says little
+    # The variance of two curves is too uncertain, so all times have at least the mean variance.
     pooled = variance[several].mean() if several.any() else np.inf
     error = np.sqrt(np.maximum(variance, pooled) / having)
-    return BIN_S * (np.flatnonzero(told).astype(np.float64) + 0.5), mean, error
+    return BIN_S * (np.flatnonzero(is_shown).astype(np.float64) + 0.5), mean, error
 
 
 def verdict(found: Fit) -> str:
@@ -285,5 +271,5 @@ def verdict(found: Fit) -> str:
         return f"first order with dead time will do: it is off by at most {where}"
     if off.certain > GOOD:
         return f"first order with dead time will not do: it is off by {where}"
-    said = "for the steps differ among themselves: fly in calm air, or more --repeats"
-    return f"whether first order with dead time will do cannot be told ({where}), {said}"
+    advice = "because the steps differ too much: fly in calm air, or with more --repeats"
+    return f"it cannot be told whether first order with dead time will do ({where}), {advice}"

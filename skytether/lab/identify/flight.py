@@ -19,19 +19,13 @@ from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Reason
 
 BLIND_NS = SECOND_NS
-"""Longest time for which the vehicle's state may be unknown [ns]."""
+"""Longest time without a known state of the vehicle, before the flight ends [ns]."""
 FLOWN_MAX_NS = 3600 * SECOND_NS
 """Longest flight [ns]; it bounds the memory for measurements."""
 
 
 class Identifying(Endpoint):
-    """Vehicle that flies an experiment.
-
-    Args:
-        scenario: scenario of the vehicle.
-        flies: the vehicle.
-        experiment: the experiment.
-    """
+    """Endpoint that flies an experiment with a vehicle."""
 
     def __init__(self, scenario: Scenario, flies: Vehicle, experiment: Experiment) -> None:
         super().__init__()
@@ -42,17 +36,15 @@ class Identifying(Endpoint):
         self._next_ns = 0
         self._step = -1
         self._known_ns = 0
-        """Time at which the vehicle's state was last known."""
+        """Newest time at which the vehicle's state was known [ns]."""
         self._input = np.zeros(scenario.model.axes)
         self._ends: Reason | str | None = None
         self.inputs: list[tuple[int, list[float]]] = []
-        """Times of changes of the input, and the input of each axis from then on [m/s]."""
+        """Times of changes of the input [ns], and the input of each axis from then on [m/s]."""
         self.measured: list[Measurement] = []
-        """All measurements."""
 
     @property
     def failure(self) -> Failure | None:
-        """Event that made the flight impossible."""
         return self._flies.failure
 
     @property
@@ -62,29 +54,25 @@ class Identifying(Endpoint):
 
     @property
     def is_over(self) -> bool:
-        """Whether the flight is over."""
         return self._ends is not None
 
     @property
     def flown_s(self) -> float:
-        """Time of flight so far [s]."""
         return 0.0 if self._epoch_ns is None else (self._step + 1) * self._dt_ns / SECOND_NS
 
     @property
     def finished(self) -> bool:
-        """Whether the flight is over and the vehicle has landed, or the flight cannot begin."""
+        """Whether the flight is over with the vehicle on the ground, or cannot begin."""
         if self._ends is Reason.TAKEN:
             return True
         return (self._ends is not None or self.failure is not None) and self._flies.is_down
 
     def receive(self, datagram: Datagram, *, now_ns: int) -> None:
-        """Pass bytes from the vehicle's hardware on."""
         if self._port is not None and datagram.socket == VEHICLE_SOCKET:
             self._port.receive(datagram, now_ns=now_ns)
             self._attend()
 
     def next_wake_ns(self) -> int | None:
-        """Beginning of the next step, or the next wake of the vehicle's port."""
         if self.finished:
             return None
         due_ns = None if self._ends is not None else self._next_ns
@@ -92,7 +80,6 @@ class Identifying(Endpoint):
         return min((each for each in (due_ns, port_ns) if each is not None), default=None)
 
     def wake(self, *, now_ns: int) -> None:
-        """Fly the steps that are due."""
         if self._port is not None:
             port_ns = self._port.next_wake_ns()
             if port_ns is not None and port_ns <= now_ns:
@@ -102,7 +89,7 @@ class Identifying(Endpoint):
         self._attend()
 
     def _go_on(self, now_ns: int) -> None:
-        """Fly a step, or check whether the first one can be flown."""
+        """Fly a step; before the first one, take off once the vehicle is ready."""
         if self._epoch_ns is None:
             if not (self._flies.is_ready and self._flies.take_off(now_ns=now_ns)):
                 self._next_ns = now_ns + self._dt_ns
@@ -118,37 +105,35 @@ class Identifying(Endpoint):
         self._fly(now_ns)
 
     def _fly(self, now_ns: int) -> None:
-        """Fly the experiment's input, or end."""
-        known, hindrance = self._navigation, self._flies.hindrance(now_ns=now_ns)
-        if known.is_known:
+        navigation, hindrance = self._navigation, self._flies.hindrance(now_ns=now_ns)
+        if navigation.is_known:
             self._known_ns = now_ns
         elif now_ns - self._known_ns > BLIND_NS:
             hindrance = hindrance or Reason.NOT_FINITE
-        if known.leapt:
+        if navigation.leapt:
             hindrance = hindrance or Reason.LEAPT
         if hindrance is not None:
             self._end(hindrance)
             return
         chosen = [0.0] * len(self._input)
-        if known.is_known:
-            chosen = self.experiment.choose(known.predicted.tolist(), now_ns=now_ns)
+        if navigation.is_known:
+            chosen = self.experiment.choose(navigation.predicted.tolist(), now_ns=now_ns)
         self._input = np.array(chosen)
         self._flies.fly(self._input)
         self.inputs.append((now_ns, chosen))
         if self.experiment.is_over:
-            self._end("everything is flown")
+            self._end("the experiment is complete")
         elif now_ns - (self._epoch_ns or 0) > FLOWN_MAX_NS:
-            self._end("it takes too long")
+            self._end("it has reached the longest flight time")
 
     def _end(self, why: Reason | str) -> None:
-        """End the flight; the vehicle lands by itself, unless a pilot has it."""
+        """End the flight. The vehicle lands, unless a pilot has taken over."""
         self._ends = why
         if why is not Reason.TAKEN:
             self._flies.fly(np.zeros(len(self._input)))
             self._flies.land()
 
     def _attend(self) -> None:
-        """Pass on datagrams and events of the vehicle's port."""
         if self._port is not None:
             self._out += [
                 Datagram(said, peer, VEHICLE_SOCKET) for said, peer, _ in self._port.outbox()
@@ -156,7 +141,6 @@ class Identifying(Endpoint):
             self._events += self._port.events()
 
     def close(self, *, now_ns: int) -> None:
-        """Let the vehicle land, because the process ends."""
         if self._port is not None:
             self._port.close(now_ns=now_ns)
             self._attend()
@@ -164,5 +148,4 @@ class Identifying(Endpoint):
             self._ends = "interrupted"
 
     def figures(self) -> dict[str, Any]:
-        """See `Endpoint`."""
         return {"steps": len(self.experiment.steps), "measured": len(self.measured)}

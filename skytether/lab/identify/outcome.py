@@ -1,6 +1,6 @@
 """Results of an identification: each axis in words, and a scenario with the identified model.
 
-Keys changed on the command line are also in the written scenario.
+The scenario also contains the keys changed on the command line.
 """
 
 import math
@@ -17,24 +17,18 @@ from skytether.shared.scenario import reading
 from skytether.shared.scenario.schema import Scenario
 
 AXES = "xyz"
-"""Names of the axes."""
 BEYOND = 1.5
-"""Largest allowed input over the largest step; the response to larger inputs was not measured."""
+"""Largest allowed input over the largest step; larger inputs were not measured."""
 FASTER = 1.25
-"""Required speed over the desired trajectory's, to catch up, and over the fence's wind."""
+"""Required speed relative to the desired trajectory's, to catch up, and to the fence's wind."""
 DIGITS = 4
-"""Significant digits of written numbers."""
 
 
 class AxisOutcome(NamedTuple):
-    """Results of one axis."""
-
     speed: float
-    """Size of step [m/s]."""
     cut: int
-    """Number of steps that the fence cut short or left no room for."""
+    """Number of steps that the fence cut short, or for which the fence left no room."""
     responses: Sequence[StepResponse]
-    """Responses to the usable steps."""
     fit: Fit | None
     """Fitted model; None with too few steps."""
 
@@ -45,13 +39,11 @@ class AxisOutcome(NamedTuple):
 
 
 def with_interval(name: str, numbers: Numbers, within: Numbers) -> str:
-    """Number and its interval, as text."""
     half = getattr(within, name)
     return f"{getattr(numbers, name):.3f} ± {f'{half:.3f}' if math.isfinite(half) else '?'}"
 
 
 def describe(axis: AxisOutcome) -> str:
-    """Results of an axis, in words."""
     fit = axis.fit
     if fit is None:
         return f"too few steps ({axis.steps}), {_remedy(axis)}"
@@ -61,9 +53,8 @@ def describe(axis: AxisOutcome) -> str:
 
 
 def _remedy(axis: AxisOutcome) -> str:
-    """Advice on how to get more steps."""
     if axis.cut < STEPS:
-        return "fly it to its end, and measure velocities"
+        return "let the flight finish, and measure velocities"
     return "the fence leaves no room: expected a wider one, a smaller --speed, or a shorter --hold"
 
 
@@ -105,19 +96,18 @@ def scenario_text(
         "gain": [_rounded(each.gain) for each in numbers],
         "dead_time_s": [round(each.dead_time_s, 3) for each in numbers],
     }
-    made = f"Made by `skytether identify {flown.vehicle.kind}`: steps of velocity, and the model of"
     lines = [
-        f"{made} first order with dead time",
-        "that answers them alike; with 95 % intervals.",
+        f"Made by `skytether identify {flown.vehicle.kind}`: first-order model with dead time,",
+        "fitted to steps of velocity; with 95 % intervals.",
         *(f"{name}: {describe(axis)}" for name, axis in zip(AXES, axes, strict=False)),
-        f"u_max: {BEYOND:g} times the size of the steps, for nobody has seen larger ones, or what",
-        f"{FASTER:g} times the desired trajectory's speed and the fence's wind need.",
+        f"u_max: {BEYOND:g} times the size of the steps, because larger inputs were not measured;",
+        f"more if {FASTER:g} times the desired trajectory's speed or the fence's wind needs more.",
     ]
     return "".join(f"# {line}\n" for line in lines).encode() + tomli_w.dumps(told).encode()
 
 
 def differing(base: dict[str, Any], table: dict[str, Any]) -> dict[str, Any]:
-    """Values of a table that differ from the base, as a table."""
+    """Values of a table that differ from the base, nested as in the table."""
     found: dict[str, Any] = {}
     for key, value in table.items():
         before = base.get(key)
@@ -134,8 +124,8 @@ def _rounded(number: float) -> float:
 
 
 def _u_max(flown: Scenario, axes: Sequence[AxisOutcome], numbers: Sequence[Numbers]) -> list[float]:
-    """Bounds of the input [m/s]: no more than was tested, and enough for the desired trajectory
-    and against the fence's wind.
+    """Bounds of the input [m/s]: sufficient for the desired trajectory and against the fence's
+    wind, and otherwise no more than was measured.
     """
     wind_mps = flown.fence.wind_mps if flown.fence.is_there else 0.0
     wanted = [max(speed, wind_mps) for speed in reference_speeds(flown)]
@@ -148,7 +138,7 @@ def _u_max(flown: Scenario, axes: Sequence[AxisOutcome], numbers: Sequence[Numbe
 
 
 class AxisTold(msgspec.Struct, frozen=True):
-    """Results of one axis in identified.json; None for unknown values."""
+    """Results of an axis in identified.json; None for unknown values."""
 
     axis: str
     step_mps: float
@@ -167,7 +157,6 @@ class AxisTold(msgspec.Struct, frozen=True):
 
 
 def told(name: str, axis: AxisOutcome) -> AxisTold:
-    """Results of an axis, for identified.json."""
     steps, fit = len(axis.responses), axis.fit
     if fit is None:
         return AxisTold(name, axis.speed, steps, axis.cut, describe(axis))

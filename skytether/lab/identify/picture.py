@@ -13,12 +13,13 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 COLOURS = {True: "tab:blue", False: "tab:orange"}
-"""Colours of steps that start a motion, and of steps that end one."""
 WORDS = {True: "sets out", False: "stops"}
 
 
 def drawn(axes: Sequence[AxisOutcome]) -> "Figure":
-    """Steps of each axis over its model, scaled to height 1, and the residuals below."""
+    """Figure with the steps of each axis over its model, scaled to height 1, and the residuals
+    below.
+    """
     figure = blank(4.2 * len(axes), 5.0)
     grid = figure.subplots(2, len(axes), squeeze=False, sharex="col", height_ratios=(3, 2))
     for name, axis, (above, below) in zip(AXES, axes, grid.T, strict=False):
@@ -40,7 +41,6 @@ def drawn(axes: Sequence[AxisOutcome]) -> "Figure":
 
 
 def _draw(axis: AxisOutcome, fit: Fit, above: Any, below: Any) -> None:
-    """Draw the steps of an axis as thin lines, and their means as thick ones."""
     for starts in (True, False):
         colour, curves = COLOURS[starts], []
         for response in axis.responses:

@@ -10,12 +10,12 @@ from skytether.lab.identify.steps import FlownStep
 from skytether.shared.base.units import SECOND_NS
 
 LOOKBACK = 2.0
-"""Length of the input's history for a step, in step durations."""
+"""Time over which earlier inputs are included in a response, in step durations."""
 LEAD = 0.25
-"""Time before a step whose measurements are included, in step durations: without a dead time,
-nothing else separates gain from wind."""
+"""Time before a step from which measurements are included, in step durations. Without a dead time
+they are the only data that separate gain from wind.
+"""
 SAMPLES_MIN = 10
-"""Smallest number of measurements for a step to be usable."""
 
 
 def responses(
@@ -30,26 +30,31 @@ def responses(
         inputs: times of changes of the input [ns], and the input of each axis from then on [m/s].
         measured: measurements, in any order.
         steps: steps of any axis.
-        axis: number of the axis.
     """
     flown_ns = np.array([time_ns for time_ns, _ in inputs], dtype=np.int64)
     flown = np.array([each[axis] for _, each in inputs])
     change = np.diff(flown, prepend=0.0)
-    known = [each for each in measured if each.velocity is not None]
-    stamps_ns = np.array([each.stamp_ns for each in known], dtype=np.int64)
-    velocity = np.array([each.velocity[axis] for each in known if each.velocity is not None])
-    found = []
+    with_velocity = [each for each in measured if each.velocity is not None]
+    stamps_ns = np.array([each.stamp_ns for each in with_velocity], dtype=np.int64)
+    velocity = np.array(
+        [each.velocity[axis] for each in with_velocity if each.velocity is not None]
+    )
+    responses_found = []
     for step in steps:
         if step.axis != axis:
             continue
         since_ns = step.began_ns - round(LOOKBACK * (step.ended_ns - step.began_ns))
-        told = (change != 0.0) & (flown_ns >= since_ns) & (flown_ns < step.ended_ns)
+        affects_step = (change != 0.0) & (flown_ns >= since_ns) & (flown_ns < step.ended_ns)
         after = (stamps_ns >= step.began_ns) & (stamps_ns < step.ended_ns)
         lead_ns = round(LEAD * (step.ended_ns - step.began_ns))
         during = (stamps_ns >= step.began_ns - lead_ns) & (stamps_ns < step.ended_ns)
         if after.sum() < SAMPLES_MIN:
             continue
-        changes = np.stack([(flown_ns[told] - step.began_ns) / SECOND_NS, change[told]], axis=1)
+        changes = np.stack(
+            [(flown_ns[affects_step] - step.began_ns) / SECOND_NS, change[affects_step]], axis=1
+        )
         times = (stamps_ns[during] - step.began_ns) / SECOND_NS
-        found.append(StepResponse(step.before, step.after, changes, times, velocity[during]))
-    return found
+        responses_found.append(
+            StepResponse(step.before, step.after, changes, times, velocity[during])
+        )
+    return responses_found

@@ -19,58 +19,41 @@ from skytether.shared.scenario.fence import SLOW_STEPS, margins
 from skytether.shared.scenario.schema import Scenario
 
 ALTITUDE = 2
-"""Index of the altitude axis, if there is one."""
 STEPS = 4
-"""Number of steps in one repetition."""
 HOMEWARD = 0.3
-"""Gain from distance to speed towards home [1/s], low enough for a second of dead time."""
+"""Gain from distance to speed on the way home [1/s]; stable with dead times up to a second."""
 NEAR_M, SLOW_MPS = 0.3, 0.2
-"""Distance and speed on an axis below which the vehicle counts as home."""
+"""Distance [m] and speed [m/s] on an axis below which the vehicle counts as home."""
 HOMEWARD_S = 15.0
 """Longest time for the way home [s]; steady wind may keep a vehicle away."""
 HOLD_MIN_S, HOLD_MAX_S = 3.0, 6.0
-"""Shortest and longest default time after a step [s]."""
 STEP_MPS = 0.5
 """Size of step if the desired trajectory stands still [m/s]."""
 STEP_MIN_MPS = 0.05
-"""Smallest size of step [m/s]."""
 FAST = 1.3
-"""Allowance for how much further a step may carry a vehicle than its input says."""
+"""Safety factor on the distance that the input of a step predicts."""
 
 
 class ExperimentPlan(NamedTuple):
-    """Requested experiment."""
-
     speeds: tuple[float, ...]
-    """Size of step on each axis [m/s]."""
     hold_s: float
-    """Time after each step [s]."""
     repeats: int
-    """Number of repetitions on each axis."""
 
     @property
     def duration_s(self) -> float:
-        """Approximate duration of the experiment [s]."""
         return len(self.speeds) * self.repeats * ((STEPS + 1) * self.hold_s + 2.0)
 
 
 class FlownStep(NamedTuple):
-    """Step that was flown."""
-
     axis: int
-    """Axis whose input changed."""
     before: float
-    """Input before [m/s]."""
     after: float
-    """Input after [m/s]."""
     began_ns: int
-    """Time of the change."""
     ended_ns: int
-    """Time until which the input was constant."""
+    """Time at which the input changed again, or the step was cut short [ns]."""
 
 
 def reference_speeds(scenario: Scenario) -> list[float]:
-    """Largest speed of the desired trajectory on each axis [m/s]."""
     times = np.arange(scenario.steps + 1) * scenario.control.dt
     states = scenario.make_reference()(times)
     speeds: list[float] = np.abs(states[..., 1]).max(axis=0).tolist()
@@ -80,8 +63,8 @@ def reference_speeds(scenario: Scenario) -> list[float]:
 def default_speeds(scenario: Scenario) -> tuple[float, ...]:
     """Default size of step on each axis, similar to the later flight [m/s].
 
-    It is the largest speed of the desired trajectory on the axis, but at least half of its largest
-    speed on any axis: on an axis at rest, feedback still makes inputs.
+    The largest speed of the desired trajectory on the axis, but at least half of its largest speed
+    on any axis: on an axis without motion, feedback still causes inputs.
     """
     speeds = reference_speeds(scenario)
     least = max(speeds) / 2.0 or STEP_MPS
@@ -98,23 +81,21 @@ def default_hold_s(scenario: Scenario) -> float:
 
 
 def fenced(scenario: Scenario, plan: ExperimentPlan) -> Scenario:
-    """Scenario with a fence around the experiment, if it has none."""
+    """Scenario with a fence around the experiment, if the scenario has none."""
     if scenario.fence.is_there:
         return scenario
     fastest, brake = max(plan.speeds), scenario.vehicle.brake_mps2
     slow = max(scenario.tau_s.tolist()) + SLOW_STEPS * scenario.control.dt
-    room = FAST * fastest * plan.hold_s + fastest * slow + fastest**2 / (2.0 * brake)
-    radius = math.ceil(room + max(margins(scenario)))
+    reach_m = FAST * fastest * plan.hold_s + fastest * slow + fastest**2 / (2.0 * brake)
+    radius = math.ceil(reach_m + max(margins(scenario)))
     fence = msgspec.structs.replace(scenario.fence, radius_m=float(radius))
     return msgspec.structs.replace(scenario, fence=fence)
 
 
 class Experiment:
-    """Experiment in flight, which chooses the input at each step of control.
+    """Generator of the experiment's input at each control step.
 
-    Args:
-        scenario: scenario of the vehicle, with a fence.
-        plan: experiment to fly.
+    The scenario needs a fence.
     """
 
     def __init__(self, scenario: Scenario, plan: ExperimentPlan) -> None:
@@ -128,23 +109,21 @@ class Experiment:
         self._script: Iterator[list[float]] | None = None
         self._input = [0.0] * len(plan.speeds)
         self.steps: list[FlownStep] = []
-        """Complete steps."""
         self.cut = [0] * len(plan.speeds)
-        """Number of steps of each axis that the fence cut short or left no room for."""
+        """Number of steps of each axis that the fence cut short, or for which it left no room."""
         self.is_over = False
-        """Whether the experiment is complete."""
 
     def choose(self, state: Sequence[tuple[float, float]], *, now_ns: int) -> list[float]:
-        """Input to fly from now on, of each axis [m/s].
+        """Input to fly from now on, for each axis [m/s].
 
         Args:
-            state: state of each axis when the input takes effect [m, m/s]; the first one is home.
-            now_ns: time now.
+            state: state of each axis when the input takes effect [m, m/s]; the first position is
+                home.
         """
         self._now_ns, self._state = now_ns, state
         if self._script is None:
             self._home = [p for p, _ in state]
-            # the home position is known from now on
+            # fixes the home position of the fence
             self._fence.limited([0.0] * len(state), state, self._u_max)
             self._script = self._flown()
         wanted = next(self._script, None)
@@ -154,7 +133,6 @@ class Experiment:
         return self._input
 
     def _flown(self) -> Iterator[list[float]]:
-        """Desired input at each step of control, of each axis [m/s]."""
         for axis, speed in enumerate(self.plan.speeds):
             for _ in range(self.plan.repeats):
                 yield from self._go_home()
@@ -181,7 +159,6 @@ class Experiment:
             before = after
 
     def _go_home(self) -> Iterator[list[float]]:
-        """Fly back home."""
         began_ns = self._now_ns
         while self._now_ns - began_ns < HOMEWARD_S * SECOND_NS:
             away = zip(self._state, self._home, strict=True)
@@ -190,12 +167,11 @@ class Experiment:
             yield self._homeward()
 
     def _homeward(self) -> list[float]:
-        """Input towards home, of each axis [m/s]."""
         axes = zip(self._state, self._home, self._u_max, strict=True)
         return [min(max(HOMEWARD * (h - p), -most), most) for (p, _), h, most in axes]
 
     def _direction(self, axis: int) -> float:
-        """Direction in which there is room for a step; 0 if there is none.
+        """Direction in which the fence leaves room for a step; 0 if there is none.
 
         Up is tried first, and down only if the fence has a lower bound.
         """

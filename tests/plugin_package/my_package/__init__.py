@@ -1,4 +1,4 @@
-"""A trigger, a reference and a vehicle of a package of its own."""
+"""A trigger, a reference, a vehicle and an impairment in a package of their own."""
 
 from collections.abc import Sequence
 from typing import Annotated
@@ -27,7 +27,7 @@ from skytether.plugin import (
 
 @trigger
 def slip(now: Situation, mps: Annotated[float, Meta(ge=0)] = 0.3) -> Verdict:
-    """Sends where the velocity is off its plan by more than so many m/s."""
+    """Sends if the velocity differs from its plan by more than so many m/s."""
     off = now.estimate[:, :, 1] - now.planned[:, :, 1]
     return above(now, np.linalg.norm(off, axis=1), mps)
 
@@ -46,7 +46,7 @@ def slope(scenario: Scenario, mps: Annotated[float, Meta(ge=-1, le=1)]) -> Refer
 
 @vehicle
 class Rail(Vehicle):
-    """Vehicle that has any velocity at once, and measures its state every 30 ms."""
+    """Vehicle that reaches any velocity at once, and measures its state every 30 ms."""
 
     def __init__(self, scenario: Scenario, _: int) -> None:
         start = scenario.make_reference()(np.zeros(()))
@@ -54,11 +54,11 @@ class Rail(Vehicle):
         self._measured_ns: int | None = None
 
     def fly(self, velocity: NDArray[np.float64]) -> None:
-        """Fly with this velocity from the measurement on that comes next [m/s]."""
+        """Fly with this velocity from the next measurement on [m/s]."""
         self._velocity = velocity
 
     def measurements(self, *, now_ns: int) -> Sequence[Measurement]:
-        """States at all times that are due by now."""
+        """States at all measurement times that are due by now."""
         told = []
         while self._measured_ns is None or self._measured_ns + 30_000_000 <= now_ns:
             if self._measured_ns is not None:
@@ -77,5 +77,4 @@ class Dark(Impairment):
         self._every_s, self.loss = every_s, 0.5
 
     def __call__(self, fate: Fate, draws: Draws) -> None:  # noqa: ARG002
-        """Change the fate of a packet that enters."""
         fate.lost |= fate.time_s // self._every_s % 2 == 1

@@ -1,4 +1,4 @@
-"""A scheme of a package of its own, which only a server has to import."""
+"""Scheme in a package of its own, which only a server has to import."""
 
 import numpy as np
 
@@ -15,7 +15,7 @@ from skytether.plugin_scheme import (
 
 @scheme(name="beacon")
 class Beacon(SplineScheme):
-    """Sends where the vehicle should be now and how fast, and compares by how far it is away."""
+    """Sends the present state of the reference; compares by the distance from it."""
 
     properties = SchemeProperties(flown_as="trajectory", figures=("deviation_m",), feedback=True)
 
@@ -25,11 +25,9 @@ class Beacon(SplineScheme):
         self._state = np.zeros((fleet.capacity, fleet.terms.axes, 2))
 
     def forget(self, row: int) -> None:
-        """See `Scheme`."""
         self.observed_step[row] = -1
 
     def observe(self, row: int, observation: Observation) -> bool:
-        """See `Scheme`."""
         newer = observation.step > self.observed_step[row]
         if newer:
             self.observed_step[row] = observation.step
@@ -37,11 +35,11 @@ class Beacon(SplineScheme):
         return newer
 
     def foresee(self, rows: Indices, step: Indices, foresight: Foresight) -> None:  # noqa: ARG002
-        """See `Scheme`: what was observed, as it is."""
+        """Use the observed states unchanged."""
         foresight.estimate[:] = foresight.start[:] = self._state[rows]
 
     def plan(self, rows: Indices, step: Indices, foresight: Foresight) -> None:
-        """See `Scheme`: a spline of one knot."""
+        """Plan a spline of one knot."""
         now = self._desired.states(rows, step, foresight.ahead)[:, :, 0]
         foresight.splines.knots[:, :, :2] = now
         away = np.linalg.norm(now[:, :, 0] - self._state[rows, :, 0], axis=1)
