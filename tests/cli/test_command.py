@@ -78,7 +78,7 @@ QUICK = [
         ("fleet --workers 99", "fleet: --workers: got 99, expected 1 to 64"),
         ("fleet --virtual --workers 2", "fleet: --workers: got --virtual as well, expected 1 in"),
         ("fleet --virtual --page 127.0.0.1:0", "fleet: --page: got --virtual as well, expected a"),
-        ("fleet demo --mission swap", "fleet: --mission: got the scenario demo as well, expected"),
+        ("fleet demo --mission swap", "fleet: --mission: got demo as well, expected"),
         ("fleet --mission swap --vehicles 3", "fleet: --vehicles: got 3, expected 16 on this"),
         ("server --vehicles -1", "server: --vehicles: got -1, expected 1 to 65536"),
         ("netem --flows 0", "netem: --flows: got 0, expected 1 to 65536"),
