@@ -40,6 +40,11 @@ class Gate(Protocol):
             ProtocolError: it is not from a vehicle.
         """
 
+    def repeated(self, datagram: Datagram) -> int | None:
+        """Number of the vehicle of which a replayed datagram repeats a recent packet; None if it
+        does not.
+        """
+
     def admit(self, call: GateCall, *, now_ns: int) -> None:
         """Accept the sender of this HELLO: its further packets are opened."""
 
@@ -52,6 +57,9 @@ class PlainGate:
 
     def open(self, datagram: Datagram, *, now_ns: int) -> GateCall:  # noqa: ARG002 - as of any `Gate`
         return GateCall(datagram.payload, None, _PLAIN_REPLY, moves=True)
+
+    def repeated(self, datagram: Datagram) -> int | None:  # noqa: ARG002 - as of any `Gate`
+        return None
 
     def admit(self, call: GateCall, *, now_ns: int) -> None:
         """See `Gate`."""

@@ -110,6 +110,8 @@ class Reception:
             call = self._gate.open(datagram, now_ns=now_ns)
         except ProtocolError as error:
             self.dropped[error.reason] += 1
+            if error.reason is Drop.REPLAYED:
+                self._note_repeat(datagram, now_ns)
             self._unauthenticated += 1
             if now_ns >= self._report_ns:
                 self._report_unauthenticated(datagram.peer, error.reason, now_ns)
@@ -127,6 +129,13 @@ class Reception:
             self.dropped[dropped] += 1
         self._stopwatch.lap("observe")
         return dropped
+
+    def _note_repeat(self, datagram: Datagram, now_ns: int) -> None:
+        """Note where else a recent packet of a vehicle has come from."""
+        vehicle = self._gate.repeated(datagram)
+        session = None if vehicle is None else self._sessions.live(vehicle)
+        if session and datagram.peer not in (session.address, session.home):
+            session.other, session.other_ns = datagram.peer, now_ns
 
     def _take(self, call: GateCall, address: Address, now_ns: int) -> None:
         """Process one message.
@@ -231,7 +240,7 @@ class Reception:
         # Only the packet with the highest counter may change the address: a copy sent from
         # elsewhere does not, once the original has arrived.
         if call.moves:
-            session.address, session.line = address, call.line
+            session.move(address, call.line, now_ns)
         self._grid.arm(now_ns)
 
     def _hear_time(self, message: Time, now_ns: int) -> None:

@@ -192,6 +192,15 @@ class SecureGate:
                 return self._initiation(datagram, now_ns)
         raise ProtocolError(Drop.NOT_FOR_A_SERVER)
 
+    def repeated(self, datagram: Datagram) -> int | None:
+        packet = datagram.payload
+        if channel.kind(packet) != channel.DATA:
+            return None
+        vehicle, number = channel.address(packet)
+        keyed = self._vehicles.get(vehicle)
+        live = keyed and keyed.live
+        return vehicle if live and live.number == number and live.repeats(packet) else None
+
     def admit(self, call: GateCall, *, now_ns: int) -> None:  # noqa: ARG002 - as of any `Gate`
         """Keep the channel created by the answer to this HELLO as pending."""
         answer = call.line

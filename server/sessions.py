@@ -23,6 +23,8 @@ from skytether.shared.law.model import Indices
 from skytether.shared.wire.drop import Drop, ProtocolError
 from skytether.shared.wire.protocol import Hello, Observation, Time
 
+OTHER_NS = 2 * SECOND_NS
+"""Time for which packets are also sent where a repeat of a recent one has come from [ns]."""
 WELCOME_NS = 5 * SECOND_NS
 """Time after the last HELLO for which a row is kept for a vehicle without an observation [ns]."""
 
@@ -58,6 +60,11 @@ class Session:
     """Longest silence that the vehicle asks of the server [ns]; 0 for no bound."""
     sent: int = 0
     """Number of packets sent in the session, modulo NUMBERS."""
+    other: Address | None = None
+    """Address from which a recent packet came a second time: one of both senders may forward
+    copies, and the other one is then the vehicle."""
+    other_ns: int = 0
+    """Time of the newest such repeat."""
 
     def number_next(self, now_ns: int) -> int:
         number = self.sent
@@ -69,16 +76,25 @@ class Session:
         return 0 < self.asked_ns <= now_ns - self.sent_ns
 
     def sealed(self, payload: bytes) -> Sequence[Datagram]:
-        """Datagram that carries a message to the vehicle; two if it may be at two addresses.
+        """Datagram that carries a message to the vehicle; several if it may be at several
+        addresses.
 
         Its address may have changed since its HELLO, or somebody may forward copies of its packets
-        that arrive first; in that case it must still be reached at its home address.
+        that arrive first; in that case it must still be reached at its home address, or where the
+        repeats come from.
         """
-        # Sealed once: with keys the vehicle opens the first copy, and drops the other as a repeat.
+        # Sealed once: with keys the vehicle opens the first copy, and drops others as repeats.
         packet = self.line.seal(payload)
-        if self.address == self.home:
+        if self.address == self.home and self.other is None:
             return (Datagram(packet, self.home),)
-        return Datagram(packet, self.address), Datagram(packet, self.home)
+        places = dict.fromkeys((self.address, self.home, self.other or self.home))
+        return [Datagram(packet, place) for place in places]
+
+    def move(self, address: Address, line: ReplyPath, now_ns: int) -> None:
+        """Note the address of a newest packet."""
+        self.address, self.line = address, line
+        if self.other is not None and now_ns - self.other_ns > OTHER_NS:
+            self.other = None
 
 
 class Sessions:
@@ -134,6 +150,9 @@ class Sessions:
 
     def heartbeats_due(self, now_ns: int) -> list[Session]:
         return [session for session in self._live.values() if session.is_heartbeat_due(now_ns)]
+
+    def live(self, vehicle: int) -> Session | None:
+        return self._live.get(vehicle)
 
     def at(self, row: int) -> Session:
         return self._by_row[row]

@@ -31,6 +31,9 @@ OVERHEAD_BYTES = HEADER.size + 16
 
 WINDOW = 2048
 """Number of newest counters that are tracked; a packet with an older one is not opened."""
+RECENT, REPEATS = 64, 2
+"""Number of newest counters whose repeats are checked, and most checks until a newer packet comes,
+see `Channel.repeats`."""
 FRESH_NS, FRESH_PACKETS = 300 * SECOND_NS, 2**22
 """Age and number of packets of a channel after which a new one is needed."""
 LIFE_NS, PACKETS_MAX = 600 * SECOND_NS, 2**32
@@ -106,6 +109,7 @@ class Channel:
         "_open",
         "_opens_until_ns",
         "_prefix",
+        "_repeats",
         "_seal",
         "_sent",
         "_window",
@@ -121,6 +125,8 @@ class Channel:
         self._open = ChaCha20Poly1305(open_).decrypt
         self._sent = 0
         self._window = ReplayWindow()
+        self._repeats = 0
+        """Number of repeats checked since the newest packet."""
         self._fresh_until_ns = born_ns + FRESH_NS
         self._opens_until_ns = born_ns + LIFE_NS
 
@@ -154,7 +160,24 @@ class Channel:
         # Only after checking the tag: a forged counter must not move the window.
         newest = counter > window.newest
         window.add(counter)
+        self._repeats = 0 if newest else self._repeats
         return OpenedPacket(payload, newest)
+
+    def repeats(self, packet: bytes) -> bool:
+        """Whether a packet is authentic and repeats one of the newest.
+
+        It costs cryptography, so at most REPEATS packets are checked until a newer one comes.
+        """
+        (counter,) = _COUNTER.unpack_from(packet, _PREFIX.size)
+        back = self._window.newest - counter
+        if not 0 <= back < RECENT or self._repeats == REPEATS:
+            return False
+        self._repeats += 1
+        try:
+            self._open(_NONCE.pack(counter), packet[HEADER.size :], packet[: HEADER.size])
+        except InvalidTag:
+            return False
+        return True
 
     def retire(self, *, now_ns: int) -> None:
         """From now on open only packets that are still on their way, for OVERLAP_NS."""

@@ -111,6 +111,9 @@ class Gatekeeper:
         self._down.believe(call.vehicle, call.payload, kind_of(call.payload))
         return call._replace(line=_Noted(call.line, call.vehicle, self._life, self._up))
 
+    def repeated(self, datagram: Datagram) -> int | None:
+        return self.gate.repeated(datagram)
+
     def admit(self, call: GateCall, *, now_ns: int) -> None:
         assert isinstance(call.line, _Noted)
         self.gate.admit(call._replace(line=call.line.inner), now_ns=now_ns)

@@ -37,6 +37,7 @@ from skytether.lab.torture import (
     shrunk,
 )
 from skytether.netem.proxy import Proxy
+from skytether.server.reception import Reception
 from skytether.server.sessions import Session
 from skytether.server.tick import Ticker
 from skytether.shared.base.units import SECOND_NS
@@ -373,6 +374,18 @@ def test_a_guard_of_trajectories_that_is_switched_off_is_caught(
     """
     found = violated(Trial(FOLLOWS, faults), switch_off, monkeypatch)
     assert found in (invariant, "recovers")
+
+
+def test_a_vehicle_with_a_new_port_is_reached_behind_faster_copies(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Not at the copier's address alone, nor at the one of the newest HELLO, which is dead."""
+    trial = loads(next(line for line in FAILED if '"seed":2711171' in line))
+
+    def no_other(patch: pytest.MonkeyPatch) -> None:
+        patch.setattr(Reception, "_note_repeat", lambda *_: None)
+
+    assert violated(trial, no_other, monkeypatch) == "recovers"
 
 
 def no_disturbance(patch: pytest.MonkeyPatch) -> None:

@@ -22,6 +22,7 @@ from skytether.shared.wire.channel import (
     OVERHEAD_BYTES,
     OVERLAP_NS,
     PACKETS_MAX,
+    RECENT,
     VERSION,
     WINDOW,
     Channel,
@@ -145,6 +146,21 @@ def test_packets_are_opened_in_any_order_and_once() -> None:
         assert [each.payload[0] for each in opened] == [1, 0, 4, 2, 3]
         assert [each.newest for each in opened] == [True, False, True, False, False]
         assert {refusal(receiver, packet) for packet in packets} == {"replayed"}
+
+
+def test_repeats_of_recent_packets_are_known_but_for_forgeries_and_floods() -> None:
+    vehicle, server = ends()
+    packets = [vehicle.seal(bytes([i])) for i in range(RECENT + 1)]
+    for packet in packets[:3]:
+        server.open(packet, now_ns=0)
+    assert server.repeats(packets[2])
+    assert not server.repeats(packets[1][:-1] + bytes([packets[1][-1] ^ 1]))
+    assert not server.repeats(packets[0])  # REPEATS were checked since the newest packet
+    server.open(packets[3], now_ns=0)
+    assert server.repeats(packets[0])
+    assert not server.repeats(packets[4])  # it has not come yet
+    server.open(packets[-1], now_ns=0)
+    assert not server.repeats(packets[0])
 
 
 def test_a_forged_counter_does_not_move_the_window() -> None:
