@@ -6,8 +6,10 @@ import shlex
 import signal
 import subprocess
 import sys
+from collections.abc import Mapping
 from itertools import combinations
 from pathlib import Path
+from typing import NamedTuple
 
 import msgspec
 import numpy as np
@@ -27,7 +29,7 @@ from skytether.shared.scenario.dotted import set_keys
 from skytether.shared.scenario.reading import check
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry import record
-from skytether.shared.telemetry.record import TRUTH_COLUMNS, Recorder, parse
+from skytether.shared.telemetry.record import TRUTH_COLUMNS, Recorder, client_columns, parse
 from skytether.shared.telemetry.summary import least_separation
 from skytether.shell.log import LogLine
 from skytether.sim.world import Clock, World
@@ -54,31 +56,51 @@ def apart_m(paths: list[Array]) -> float:
     return min(float(np.linalg.norm(one - other, axis=1).min()) for one, other in pairs)
 
 
-@pytest.mark.parametrize(
-    ("flavour", "loss"), [("ardupilot", 0.1), pytest.param("px4", 0.4, marks=pytest.mark.long)]
-)
-def test_three_swap_places_within_a_fence(flavour: FlavourName, loss: float) -> None:
-    world, clients, truths = World(lambda *_: None), [], []
-    for number in NUMBERS:
-        flown = scenario(flavour, number, loss)
+class Flown(NamedTuple):
+    """What three autopilots have flown."""
+
+    server: Server
+    paths: list[Array]
+    """True positions of each [m]; shape (n, 3) each."""
+    rows: list[record.Rows]
+    """Record of each client."""
+
+
+def fly(flavour: FlavourName, scenarios: Mapping[int, Scenario]) -> Flown:
+    world, clients, truths, sinks = World(lambda *_: None), [], [], []
+    for number, flown in scenarios.items():
         truths.append(io.BytesIO())
+        sinks.append(io.BytesIO())
         pilot = Autopilot(flown, flavour, ready_s=1.0, recorder=Recorder(TRUTH_COLUMNS, truths[-1]))
         pilot.flight.parameters |= SAFE[flavour]
         world.add(f"autopilot{number}", pilot)
-        flies = vehicles.make(flown, number)
-        client = Client(flown, flies, server=("netem", 0), vehicle=number, boot_id=number)
+        recorder = Recorder(client_columns(3), sinks[-1])
+        flies, server_at = vehicles.make(flown, number), ("netem", 0)
+        client = Client(
+            flown, flies, server=server_at, vehicle=number, boot_id=number, recorder=recorder
+        )
         clients.append(client)
         world.add(f"client{number}", client, clock=Clock(number * OFFSET_NS))
-    world.add("netem", Proxy(flown, server=("server", 0), flows=len(NUMBERS)))
+    world.add("netem", Proxy(flown, server=("server", 0), flows=len(scenarios)))
     server = Server(flown, boot_id=9, entropy=bytes)
     world.add("server", server, clock=Clock(OFFSET_NS))
     world.run(lambda: all(client.finished for client in clients), limit_ns=300 * 10**9)
     assert [client.failure for client in clients] == [None, None, None]
-    paths = []
-    for number, truth in zip(NUMBERS, truths, strict=True):
-        stands = flown.start_m(number) * [1.0, 1.0, 0.0]  # its local frame begins at its start
-        path = parse(truth.getvalue())["state"][:, :, 0] + stands
-        paths.append(path)
+    paths = [
+        # The local frame of each begins at its start.
+        parse(truth.getvalue())["state"][:, :, 0] + flown.start_m(number) * [1.0, 1.0, 0.0]
+        for number, truth in zip(scenarios, truths, strict=True)
+    ]
+    return Flown(server, paths, [parse(sink.getvalue()) for sink in sinks])
+
+
+@pytest.mark.parametrize(
+    ("flavour", "loss"), [("ardupilot", 0.1), pytest.param("px4", 0.4, marks=pytest.mark.long)]
+)
+def test_three_swap_places_within_a_fence(flavour: FlavourName, loss: float) -> None:
+    scenarios = {number: scenario(flavour, number, loss) for number in NUMBERS}
+    server, paths, _ = fly(flavour, scenarios)
+    for (number, flown), path in zip(scenarios.items(), paths, strict=True):
         goal = flown.make_reference(number)(np.array(flown.duration))[:, 0]
         assert np.linalg.norm(path[-1, :2] - goal[:2]) < 0.5
         assert path[-1, 2] < 0.1
@@ -86,6 +108,32 @@ def test_three_swap_places_within_a_fence(flavour: FlavourName, loss: float) -> 
     assert apart_m(paths) > flown.mission.separation_m
     if flavour == "ardupilot":
         assert server.figures()["counts"].get("left_tube", 0) == 0
+
+
+def test_three_follow_the_paths_of_a_show(tmp_path: Path) -> None:
+    """At 0.84 m/s, from 8 s on, one behind the other on a circle; the dead time is their lag."""
+    rows = ["vehicle,t,x,y,z"]
+    for number in NUMBERS:
+        for t in np.arange(0.0, 45.1, 0.25):
+            gone_s = max(t - 9.5, 0.0) if t > 11.0 else max(t - 8.0, 0.0) ** 2 / 6.0
+            angle = 2.0 * np.pi * ((number - 1) / 3.0 + gone_s / 30.0)
+            rows.append(f"{number},{t},{4 * np.cos(angle):.3f},{4 * np.sin(angle):.3f},3")
+    file = tmp_path / "show.csv"
+    file.write_text("\n".join(rows))
+    scenarios = {}
+    for number in NUMBERS:
+        table = reading.to_table(scenario("ardupilot", number, 0.1))
+        table["reference"] |= {"shape": "show", "file": str(file)}
+        scenarios[number] = check(table, "show")
+    server, paths, records = fly("ardupilot", scenarios)
+    for (number, flown), own in zip(scenarios.items(), records, strict=True):
+        times_s = own["step"] * flown.control.dt
+        moving = (times_s > 15.0) & (times_s < 44.0)
+        desired = flown.make_reference(number)(times_s)[moving][..., 0]
+        off_m = np.linalg.norm(own["state"][moving][..., 0] - desired, axis=1)
+        assert 0.1 < off_m.mean() < 0.3
+    assert apart_m(paths) > 5.0
+    assert server.figures()["counts"].get("left_tube", 0) == 0
 
 
 @pytest.mark.usefixtures("documented_ports")
