@@ -107,6 +107,7 @@ class MissionState:
         self.is_show = isinstance(mission, Mission) and mission.is_show
         """Whether vehicles follow timed paths."""
         self._tube_m, self._dt_s, self._join = scenario.mission.tube_m, terms.dt_s, terms.join
+        self._dead_time_s = terms.dead_time_s
         self.kept_steps = -(-terms.join // SPACING) * SPACING
         """Steps after the first knot up to which a motion equals the one in force."""
         self._land_after = terms.land_after if scenario.lands else NEVER
@@ -337,9 +338,13 @@ class MissionState:
         return self._desired(row, np.array((self.now + self.ahead(row) + steps) * self._dt_s))
 
     def targets(self, row: int) -> Array:
-        """Points of a show's path at the planned knots of a motion [m]; shape (N, axes)."""
+        """Points of a show's path for the planned knots of a motion [m]; shape (N, axes).
+
+        A vehicle is behind its motion by its dead time, so the motion is ahead of the path.
+        """
         steps = self.now + self.ahead(row) + self.kept_steps + SPACING * PLANNED
-        return self._desired(row, steps * self._dt_s)
+        places = [self._desired(row, steps * self._dt_s + dead_s) for dead_s in self._dead_time_s]
+        return np.stack([place[:, axis] for axis, place in enumerate(places)], axis=1)
 
     def _desired(self, row: int, times_s: Array) -> Array:
         desired = self._references(self.number_of(row))(times_s)
