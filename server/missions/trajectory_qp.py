@@ -32,13 +32,11 @@ from skytether.server.missions.dual_active_set import (
 from skytether.server.missions.half_planes import HalfPlanes
 from skytether.shared.base.kernel import F1, F2, F3, kernel, making_kernel, part
 from skytether.shared.law.model import Array, Indices
-from skytether.shared.law.motion import INTERVALS, SPACING
+from skytether.shared.law.motion import INTERVALS, SPACING, speed_bounds
 from skytether.shared.law.terms import Terms
 
 TIMES_PER_INTERVAL = 2
 """Number of times per interval at which distances are kept."""
-INPUT_SHARE = 0.9
-"""Share of the input bound that a motion may use."""
 ACCELERATION_WEIGHT = 0.05
 """Weight r of accelerations [s⁴]."""
 LAST_WEIGHT = 5.0
@@ -87,11 +85,7 @@ class TrajectoryQP:
         n, axes = INTERVALS, terms.axes
         T = SPACING * terms.dt_s
         tau_s, gain = np.array(terms.tau_s), np.array(terms.gain)
-        most = INPUT_SHARE * np.array(terms.u_max) * gain
-        if speed_mps:
-            # A bound per axis keeps the constraints linear: exact on the diagonal, stricter along
-            # an axis.
-            most = np.minimum(most, speed_mps / np.sqrt(axes))
+        most = speed_bounds(np.array(terms.u_max), gain, speed_mps)
         place = np.arange(n)
         to_velocity = T * np.tril(np.ones((n, n)))
         to_position = _positions(np.arange(1.0, n + 1.0), place, T)

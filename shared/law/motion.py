@@ -17,12 +17,27 @@ JOIN_MAX = 3
 """Largest number of intervals that a new motion copies from the motion in force."""
 SAMPLES = 4
 """Number of straight pieces that approximate an interval of a motion."""
+INPUT_SHARE = 0.9
+"""Share of the input bound that a motion may use."""
 MARGIN_M = 0.03
 """Smallest margin of a plan, see `Clearances`."""
 
 
 Knots = Annotated[Array, 2]
 """Values at the knots; shape (knots, axes). The 2 is the number of dimensions, for kernels."""
+
+
+def speed_bounds(u_max: Array, gain: Array, speed_mps: float) -> Array:
+    """Largest speed of a motion on each axis [m/s]; shape (axes,).
+
+    Args:
+        u_max: bound of the input [m/s]; shape (axes,).
+        gain: steady velocity over input; shape (axes,).
+        speed_mps: largest speed over all axes [m/s]; 0: limited by the input bound only.
+    """
+    most: Array = INPUT_SHARE * u_max * gain
+    # A bound per axis keeps constraints linear: exact on the diagonal, stricter along an axis.
+    return np.minimum(most, speed_mps / np.sqrt(len(most))) if speed_mps else most
 
 
 class Motion(NamedTuple):

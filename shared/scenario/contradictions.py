@@ -7,7 +7,7 @@ from itertools import pairwise
 import numpy as np
 
 from skytether.shared.law.model import Array
-from skytether.shared.law.motion import INTERVALS, JOIN_MAX, SPACING
+from skytether.shared.law.motion import INTERVALS, JOIN_MAX, SPACING, speed_bounds
 from skytether.shared.scenario import reference as shapes
 from skytether.shared.scenario import schemes
 from skytether.shared.scenario.fence import inner_bounds, is_home_inside, margins
@@ -226,10 +226,13 @@ def _no_places(scenario: Scenario) -> Iterator[Contradiction]:
     """Contradictions of the goals of a mission's shape: too near to each other, or to zones."""
     mission, goals = scenario.mission, scenario.unallocated_reference()
     assert isinstance(goals, Mission)
-    if mission.allocate and not goals.in_step:
-        expected = "false, or goals of all vehicles at the same times"
-        yield "mission.allocate", "true", expected
+    if mission.allocate and (goals.is_show or not goals.in_step):
+        others = (
+            "a mission of goals" if goals.is_show else "goals of all vehicles at the same times"
+        )
+        yield "mission.allocate", "true", f"false, or {others}"
         return
+    yield from _too_fast(scenario, goals)
     zones, clear_m = scenario.zones, scenario.clearances.planned_clear_m
     for vehicle in goals.vehicles if zones else ():
         places = goals.goals(vehicle)
@@ -262,6 +265,16 @@ def _no_places(scenario: Scenario) -> Iterator[Contradiction]:
         if scenario.lands:
             expected += " side by side, for both may land (vehicle.land_after_s = 0: never)"
         yield "mission.separation_m", mission.separation_m, expected
+
+
+def _too_fast(scenario: Scenario, show: Mission) -> Iterator[Contradiction]:
+    most_mps = speed_bounds(scenario.u_max, scenario.model_gain, scenario.mission.speed_mps)
+    if show.is_show and (found := show.too_fast(most_mps)):
+        vehicle, at_s, axis, speed_mps = found
+        bound = f"{most_mps[axis]:.3g} m/s on an axis, by model.u_max and mission.speed_mps"
+        asked = f"vehicle {vehicle} to fly {speed_mps:.3g} m/s from {at_s:.6g} s on"
+        expected = f"a show of at most {bound}; this asks {asked}"
+        yield "reference.file", repr(scenario.reference.file), expected
 
 
 def _too_late(scenario: Scenario) -> Iterator[Contradiction]:

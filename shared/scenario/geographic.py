@@ -34,9 +34,12 @@ def number(given: Any, key: str = "origin") -> float:
     """Value of a member as a number; raises ValueError for a text, a truth value, NaN or anything
     else.
     """
-    if isinstance(given, bool) or not isinstance(given, int | float) or math.isnan(given):
-        raise ValueError(f"{key} a number, got {str(given)[:80]!r}")
-    return float(given)
+    try:
+        if isinstance(given, bool) or not isinstance(given, int | float) or math.isnan(given):
+            raise ValueError(f"{key} a number, got {str(given)[:80]!r}")
+        return float(given)
+    except OverflowError:  # a whole number of more than 308 digits
+        raise ValueError(f"{key} a smaller number") from None
 
 
 def coordinates(points: Any) -> Array:

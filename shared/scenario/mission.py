@@ -20,6 +20,10 @@ SWAP_AT_S = 2.0
 """Time at which vehicles that swap places depart."""
 GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))
 """Azimuth between consecutive points of a Fibonacci sphere [rad]."""
+TINY_MPS = 1e-6
+"""Tolerance of speeds [m/s]."""
+PLACES_AT_ONCE = 1_000_000
+"""Number of places of a show that are compared at once, which bounds memory."""
 CROWDED = 32
 """Number of simultaneous stays in neighbouring cells above which two are certainly too near."""
 
@@ -106,6 +110,24 @@ class Mission:
             return None
         one, other = sorted(stays.vehicles[list(pair)].tolist())
         return one, other, float(stays.begin_s[list(pair)].max()), stays.distance_m(*pair)
+
+    def too_fast(self, most_mps: Array) -> tuple[int, float, int, float] | None:
+        """First vehicle of a show that is faster than a vehicle can fly.
+
+        Args:
+            most_mps: largest speed on each axis [m/s]; shape (axes,).
+
+        Returns:
+            number of the vehicle, time [s], axis and speed [m/s]; None if there is no such vehicle.
+        """
+        for vehicle, (times_s, points_m) in self._goals.items():
+            with np.errstate(over="ignore"):
+                speeds_mps = np.abs(np.diff(points_m, axis=0)) / np.diff(times_s)[:, None]
+            over = np.argwhere(speeds_mps > most_mps + TINY_MPS)
+            if len(over):
+                k, axis = over[0].tolist()
+                return vehicle, float(times_s[k]), axis, float(speeds_mps[k, axis])
+        return None
 
     def allocated(self) -> "Mission":
         """Mission with the goals of each time allocated to vehicles by linear assignment.
@@ -241,6 +263,25 @@ def _nearest_on_paths(
     """
     numbers = list(goals)
     times_s = np.unique(np.concatenate([own_s for own_s, _ in goals.values()]))
+    at_once = max(PLACES_AT_ONCE // len(numbers), 1)
+    for first in range(0, len(times_s), at_once):
+        chunk_s = times_s[first : first + at_once + 1]
+        nearest = _nearest_during(numbers, goals, chunk_s, apart_m, height)
+        if nearest:
+            return nearest
+    return None
+
+
+def _nearest_during(
+    numbers: Sequence[int],
+    goals: Mapping[int, tuple[Array, Array]],
+    times_s: Array,
+    apart_m: float,
+    height: float,
+) -> tuple[int, int, float, float] | None:
+    """First two vehicles that are too near between these times; all times of points are among
+    them.
+    """
     places = np.stack(
         [
             np.stack([np.interp(times_s, own_s, along) for along in points_m.T], axis=1)

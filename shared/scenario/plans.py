@@ -16,14 +16,14 @@ from skytether.shared.scenario.grammar import GrammarError
 from skytether.shared.scenario.registry import File
 from skytether.shared.scenario.zones import CORNERS_MAX, ROUND, Zone, around, ring
 
-WAYPOINT, LOITER_TIME, RETURN, LAND, TAKEOFF, SPEED = 16, 19, 20, 21, 22, 178
+WAYPOINT, LOITER_TIME, RETURN, LAND, TAKEOFF, DELAY, SPEED = 16, 19, 20, 21, 22, 93, 178
 """MAV_CMD of the items that are flown."""
-STILL = frozenset(
-    (93, 195, 197, 201, 203, 204, 205, 206, 214, 530, 531, 532, 2000, 2001, 2500, 2501)
-)
-"""MAV_CMD of items that do not move the vehicle: cameras, gimbals, delays of photos."""
+STILL = frozenset((195, 197, 201, 203, 204, 205, 206, 214, 530, 531, 532, 2000, 2001, 2500, 2501))
+"""MAV_CMD of items that do not move the vehicle: cameras and gimbals."""
 ITEMS_MAX = 10_000
 """Largest number of items of a mission."""
+LONG_S = 1e6
+"""Longest duration of an item [s]."""
 FRAMES = {0: "above the sea", 3: "above home"}
 """MAV_FRAME of altitudes that can be flown."""
 WRONG = (KeyError, TypeError, AttributeError, IndexError)
@@ -34,8 +34,8 @@ class Home(NamedTuple):
     """Origin of a plan's coordinates."""
 
     origin: Origin
-    altitude_m: float
-    """Altitude of the planned home above the sea [m]."""
+    altitude_m: float | None
+    """Altitude of the planned home above the sea [m]; None: not known."""
 
     def local(self, latitude: Any, longitude: Any) -> Array:
         """Metres east and north [m]; shape (2,)."""
@@ -51,9 +51,9 @@ def fences(file: File) -> list[Zone]:
         GrammarError: a part is invalid; the message names it and the expected form.
     """
     plan, home = _plan(file.content, file.origin)
-    name, fence, zones = file.name.rpartition("/")[2], plan.get("geoFence") or {}, list[Zone]()
-    for kind in ("polygons", "circles"):
-        for i, part in enumerate(fence.get(kind) or []):
+    name, zones = file.name.rpartition("/")[2], list[Zone]()
+    for kind, parts in _fence(plan).items():
+        for i, part in enumerate(parts):
             title = f"{name}: {kind[:-1]} {i + 1} of the geofence"
             try:
                 is_fence = bool(part["inclusion"])
@@ -90,28 +90,40 @@ def _circle(part: Any, home: Home) -> Array:
 def has_fence(content: bytes) -> bool:
     """Whether a plan has a geofence; raises ValueError if it is no plan."""
     plan, _ = _plan(content, ())
+    return any(_fence(plan).values())
+
+
+def _fence(plan: dict[str, Any]) -> dict[str, list[Any]]:
+    """Parts of a plan's geofence, by kind; raises ValueError if it is invalid."""
     fence = plan.get("geoFence") or {}
-    return bool(fence.get("polygons") or fence.get("circles"))
+    kinds: dict[str, Any] = dict.fromkeys(("polygons", "circles"))
+    if isinstance(fence, dict) and "polygon" not in fence:
+        kinds = {kind: fence.get(kind) or [] for kind in kinds}
+    if not all(isinstance(each, list) for each in kinds.values()):
+        raise ValueError("a geofence of version 2: lists of polygons and circles")
+    return kinds
 
 
 def route(content: bytes, axes: int, origin: Origin) -> tuple[Array, Array]:
     """Mission of a plan for one vehicle: times [s; shape (n,)] and places [m; shape (n, axes)].
 
     The vehicle flies straight from place to place, at the plan's speed, and holds where an item
-    says so. It starts at the planned home, and ends where it would land.
+    says so. It starts at the planned home, takes off straight up, and ends where it would land.
 
     Raises:
         ValueError: it is no plan, or an item cannot be flown; the message names it.
     """
     plan, home = _plan(content, origin)
     mission = plan.get("mission")
-    if not (isinstance(mission, dict) and mission.get("items")):
+    if not (
+        isinstance(mission, dict) and isinstance(items := mission.get("items"), list) and items
+    ):
         raise ValueError("a plan with mission items")
     speed_mps = number(mission.get("hoverSpeed", 0.0), "hoverSpeed")
     start = np.zeros(3)
     start[:2] = home.local(*mission["plannedHomePosition"][:2])
     times, places = [0.0], [start]
-    for count, item in enumerate(_items(mission["items"]), start=1):
+    for count, item in enumerate(_items(items), start=1):
         try:
             if count > ITEMS_MAX:
                 raise ValueError(f"at most {ITEMS_MAX} items")
@@ -119,23 +131,28 @@ def route(content: bytes, axes: int, origin: Origin) -> tuple[Array, Array]:
             if command in STILL:
                 continue
             if command == SPEED:
-                speed_mps = number(params[1], "speed")
+                speed_mps = _speed(params, speed_mps)
                 continue
-            hold_s = (
-                number(params[0] or 0.0, "hold time") if command in (WAYPOINT, LOITER_TIME) else 0.0
-            )
+            holds = command in (WAYPOINT, LOITER_TIME, DELAY)
+            hold_s = number(params[0] or 0.0, "hold time") if holds else 0.0
+            if not hold_s <= LONG_S or (command == DELAY and hold_s < 0.0):
+                raise ValueError(f"a hold time from 0 to {LONG_S:g} s, got {hold_s:g}")
             place = _place(command, item, params, places[-1], start, home)
         except ValueError as error:
             raise ValueError(f"mission item {count}: {error}") from None
-        except WRONG:
+        except (*WRONG, OverflowError):
             raise ValueError(f"mission item {count}: expected a command and its params") from None
-        away_m = float(np.linalg.norm(place - places[-1]))
-        if away_m and not 0.0 < speed_mps <= 1e3:
-            raise ValueError(f"mission item {count}: hoverSpeed above 0, got {speed_mps:g}")
-        for wait_s, at in ((away_m / speed_mps if away_m else 0.0, place), (hold_s, place)):
-            if wait_s > 0.0:
-                times.append(times[-1] + wait_s)
+        above = np.append(places[-1][:2], place[2])
+        for at in (above, place) if command == TAKEOFF else (place,):
+            away_m = float(np.linalg.norm(at - places[-1]))
+            if away_m and not 0.0 < speed_mps <= 1e3:
+                raise ValueError(f"mission item {count}: hoverSpeed above 0, got {speed_mps:g}")
+            if away_m:
+                times.append(times[-1] + away_m / speed_mps)
                 places.append(at)
+        if hold_s > 0.0:
+            times.append(times[-1] + hold_s)
+            places.append(place)
     return np.array(times), np.array(places)[:, :axes]
 
 
@@ -145,12 +162,21 @@ def _items(items: Any, depth: int = 0) -> Iterator[Any]:
         if not isinstance(item, dict) or item.get("type") == "SimpleItem":
             yield item
             continue
-        inner = item.get("TransectStyleComplexItem") or {}
-        if depth or not inner.get("Items"):
+        inner = item.get("TransectStyleComplexItem")
+        inner = inner.get("Items") if isinstance(inner, dict) else None
+        if depth or not (isinstance(inner, list) and inner):
             kind = str(item.get("complexItemType"))[:40]
             expected = "expected a simple item, a survey or a corridor scan"
             raise ValueError(f"mission item {i + 1}: {expected}, got {kind}")
-        yield from _items(inner["Items"], depth + 1)
+        yield from _items(inner, depth + 1)
+
+
+def _speed(params: list[Any], before_mps: float) -> float:
+    """Speed after an item that changes it [m/s]; -1 and -2 leave it as it is."""
+    if params[0] not in (0, 1):
+        raise ValueError(f"expected a speed over ground or in the air, got type {params[0]}")
+    speed_mps = number(params[1], "speed")
+    return before_mps if speed_mps in (-1.0, -2.0) else speed_mps
 
 
 def _place(
@@ -160,6 +186,7 @@ def _place(
     place = before.copy()
     if command == RETURN:
         place[:2] = start[:2]
+    if command in (RETURN, DELAY):
         return place
     if command not in (WAYPOINT, LOITER_TIME, LAND, TAKEOFF):
         known = "a waypoint, take-off, landing, return or speed"
@@ -171,7 +198,9 @@ def _place(
         if frame not in FRAMES:
             known = " or ".join(FRAMES.values())
             raise ValueError(f"expected an altitude {known}, got one of frame {frame}")
-        place[2] = number(params[6], "altitude") - (home.altitude_m if frame == 0 else 0.0)
+        if frame == 0 and home.altitude_m is None:
+            raise ValueError("an altitude above home, for the home's above the sea is not known")
+        place[2] = number(params[6], "altitude") - ((home.altitude_m or 0.0) if frame == 0 else 0.0)
     return place
 
 
@@ -189,5 +218,6 @@ def _plan(content: bytes, origin: Origin) -> tuple[dict[str, Any], Home]:
         raise ValueError("a plan with plannedHomePosition: latitude, longitude, altitude") from None
     form = '"plannedHomePosition": [latitude, longitude, altitude]'
     return plan, Home(
-        origin or check_origin(latitude, longitude, form), number(altitude_m, "altitude of home")
+        origin or check_origin(latitude, longitude, form),
+        None if altitude_m is None else number(altitude_m, "altitude of home"),
     )

@@ -17,8 +17,9 @@ import io
 import re
 import zipfile
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import suppress
+from functools import lru_cache
 from math import isfinite
 from typing import NamedTuple
 
@@ -76,6 +77,7 @@ FORMS = (
 )
 
 
+@lru_cache(maxsize=2)  # each vehicle's reference needs them
 def tracks(content: bytes, axes: int, origin: Origin | None = ()) -> Tracks:
     """Tracks in a file, of one of the kinds above.
 
@@ -124,7 +126,7 @@ def lasts_s(content: bytes, axes: int) -> float:
 def axes_of(content: bytes) -> int:
     """Number of axes of a file: 3 if its points have heights."""
     head = content[:4096].partition(b"\n")[0].decode("utf-8-sig", "replace")
-    names = {name.strip() for name in head.split(",")}
+    names = {*_names(head.split(","))}
     flat = any(set(form.columns[:3]) <= names and form.columns[3] not in names for form in FORMS)
     return 2 if flat else 3
 
@@ -189,7 +191,7 @@ def _zip(content: bytes, axes: int, origin: Origin | None) -> Tracks:
     """Tracks of the CSV files in a zip, one vehicle each, in the natural order of their names."""
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
-            files = [each for each in archive.infolist() if each.filename.lower().endswith(".csv")]
+            files = [each for each in archive.infolist() if _is_table(each.filename)]
             if (
                 not 0 < len(files) <= VEHICLES_MAX
                 or sum(each.file_size for each in files) > ZIP_BYTES_MAX
@@ -197,6 +199,8 @@ def _zip(content: bytes, axes: int, origin: Origin | None) -> Tracks:
                 most = f"at most {VEHICLES_MAX} with {ZIP_BYTES_MAX / 1e6:g} MB together"
                 raise ValueError(f"expected CSV files, {most}, got {len(files)}")
             named = {each.filename: _member(archive, each) for each in files}
+            if len(named) < len(files):
+                raise ValueError("expected a zip without two files of the same name")
     except (zipfile.BadZipFile, zlib.error, RuntimeError, NotImplementedError, EOFError) as error:
         raise ValueError(f"expected a zip that can be read ({error})") from None
     found: Tracks = {}
@@ -211,8 +215,15 @@ def _zip(content: bytes, axes: int, origin: Origin | None) -> Tracks:
     return found
 
 
+def _is_table(name: str) -> bool:
+    """Whether it is a CSV file, and not a copy of its attributes by macOS."""
+    return name.lower().endswith(".csv") and not name.rpartition("/")[2].startswith("._")
+
+
 def _member(archive: zipfile.ZipFile, file: zipfile.ZipInfo) -> bytes:
     """Content of a file in a zip, which may be longer than the zip says."""
+    if file.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+        raise ValueError(f"{file.filename[:80]}: expected the compression deflate, or none")
     with archive.open(file) as member:
         content = member.read(file.file_size + 1)
     if len(content) > file.file_size:
@@ -228,7 +239,13 @@ def _natural(name: str) -> list[tuple[int, str]]:
 
 def _header(content: bytes) -> list[str]:
     head = content[: 64 * 1024].partition(b"\n")[0].decode("utf-8-sig", "replace")
-    return [name.strip().strip('"') for name in head.split(",")] if head.strip() else []
+    return _names(head.split(",")) if head.strip() else []
+
+
+def _names(header: Iterable[str]) -> list[str]:
+    """Names of columns. Crazyswarm's tools begin the header with `#`, or write Duration."""
+    names = [name.strip().strip('"').removeprefix("#").strip() for name in header]
+    return ["duration" if name == "Duration" else name for name in names]
 
 
 def _check_times(times_s: Array, lines: Indices) -> None:
@@ -257,10 +274,10 @@ def _read(content: bytes, names: list[str]) -> tuple[Array, Indices]:
     rows: list[list[float]] = []
     lines: list[int] = []
     try:
-        table.fieldnames = header = [name.strip() for name in table.fieldnames or ()]
+        table.fieldnames = header = _names(table.fieldnames or ())
         if len(header) > COLUMNS_MAX:
             raise ValueError(f"line 1: expected at most {COLUMNS_MAX} columns")
-        if any(name not in header for name in names):
+        if any(header.count(name) != 1 for name in names):
             got = ", ".join(map(repr, header))[:80] or "nothing"
             raise ValueError(f"line 1: expected the columns {', '.join(names)}, got {got}")
         for row in table:

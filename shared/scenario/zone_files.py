@@ -3,6 +3,7 @@
 import json
 import math
 from collections.abc import Callable, Iterator
+from itertools import islice
 from typing import Any
 from xml.etree import ElementTree
 
@@ -26,7 +27,8 @@ CRS84 = {"type": "name", "properties": {"name": "urn:ogc:def:crs:OGC:1.3:CRS84"}
 """The only value of the member `crs` that is accepted: the coordinates of RFC 7946."""
 Frame = Callable[[Any], Array]
 """Function from a list of coordinates to metres east and north of the origin; shape (n, 2)."""
-SHAPES = ("Polygon", "Point", "LineString", "LinearRing", "Track", "Model")
+RING = "LinearRing"
+SHAPES = ("Polygon", "Point", "LineString", RING, "Track", "Model")
 """Geometries that a placemark of a KML file may have."""
 _NOWHERE: Array = np.zeros((0, 2))
 
@@ -56,12 +58,15 @@ def kml(file: File, *, is_fence: bool) -> list[Zone]:
         ValueError: it is no KML file.
         GrammarError: a placemark is invalid; the message names it and the expected form.
     """
-    if b"<!DOCTYPE" in file.content or b"<!ENTITY" in file.content:
+    text = file.content.replace(b"\0", b"")  # also in UTF-16
+    if b"<!DOCTYPE" in text or b"<!ENTITY" in text:
         raise ValueError("a KML file without a document type or entities")
     try:
         root = ElementTree.fromstring(file.content)
     except (ElementTree.ParseError, ValueError, LookupError) as error:
         raise ValueError(f"a KML file ({error}); a KMZ has to be unpacked") from None
+    if next(_tagged(root, "NetworkLink"), None) is not None:
+        raise ValueError("a KML file without links to others")
     zones, name = list[Zone](), file.name.rpartition("/")[2]
     for i, placemark in enumerate(_below(root, "Placemark")):
         title = f"{name}: {_text(placemark, 'name') or f'placemark {i + 1}'}"
@@ -84,8 +89,12 @@ def _placemark(
         raise ValueError(f"a Polygon, not a {other}")
     for polygon in _below(placemark, "Polygon"):
         for kind in ("outerBoundaryIs", "innerBoundaryIs") if is_fence else ("outerBoundaryIs",):
-            for border in _below(polygon, kind):
-                corners = ring(local(_coordinates(_text(border, "coordinates")), origin))
+            # Google Earth writes several holes into one innerBoundaryIs.
+            rings = [each for border in _below(polygon, kind) for each in _below(border, RING)]
+            if not rings and kind == "outerBoundaryIs":
+                raise ValueError("a Polygon with an outerBoundaryIs")
+            for each in rings:
+                corners = ring(local(_coordinates(_text(each, "coordinates")), origin))
                 within_it = is_fence and kind == "outerBoundaryIs"
                 yield Zone(name, corners, is_fence=within_it)
 
@@ -106,7 +115,18 @@ def _coordinates(text: str) -> Array:
 
 
 def _below(element: ElementTree.Element, tag: str) -> Iterator[ElementTree.Element]:
-    """Elements with a tag, of any namespace, below an element."""
+    """Elements with a tag, of any namespace, below an element.
+
+    Raises:
+        ValueError: one is within another; searching them would take quadratic time.
+    """
+    for found in _tagged(element, tag):
+        if next(islice(_tagged(found, tag), 1, None), None) is not None:
+            raise ValueError(f"no {tag} within another")
+        yield found
+
+
+def _tagged(element: ElementTree.Element, tag: str) -> Iterator[ElementTree.Element]:
     return (each for each in element.iter() if str(each.tag).rpartition("}")[2] == tag)
 
 

@@ -280,6 +280,8 @@ class Raid:
         return self._air.packets
 
     def _has_arrived(self) -> bool:
+        if self._world.now_ns < seconds_to_ns(self._lives.mission.lasts_s):
+            return False
         for number, body in self._lives.bodies.items():
             goal = self._lives.mission.of(number)(np.array(self._scenario.duration))[:, 0]
             p, v = body.plant.state().T

@@ -20,6 +20,7 @@ from skytether.lab.adversary import (
     Climbed,
     Move,
     MoveKind,
+    Raid,
     climb,
     dumps,
     fly,
@@ -330,3 +331,13 @@ def test_each_mission_can_be_searched(name: str) -> None:
     found = climb(Climb(replaced(reading.load(name), duration=30.0), tuple(MoveKind), 1, 2))
     assert math.isfinite(found.best.apart.distance_m)
     assert len(found.spares_m) == 2
+
+
+def test_a_show_that_ends_where_it_began_is_flown_to_its_end(tmp_path: Path) -> None:
+    file = tmp_path / "loop.csv"
+    file.write_text("vehicle,t,x,y\n1,0,0,0\n1,8,0,0\n1,14,3,0\n1,20,0,0\n2,0,0,4\n")
+    base = reading.to_table(scenario("swap"))
+    base["reference"] |= {"shape": "show", "file": str(file)}
+    raid = Raid(reading.check(base, "loop"), ())
+    assert raid.run().apart.distance_m is not None
+    assert max(packet.time_ns for packet in raid.packets) > 19 * SECOND_NS

@@ -9,7 +9,7 @@ import pytest
 
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.law.model import Array
-from skytether.shared.scenario import reading
+from skytether.shared.scenario import mission, reading
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Record
 from skytether.sim import flight
@@ -92,3 +92,47 @@ def test_a_goal_set_in_flight_replaces_the_path(tmp_path: Path) -> None:
     flown = flight.fly(shown, vehicles=VEHICLES)
     last = flown.client[flown.client["vehicle"] == 2][-1]
     assert np.abs(last["state"]).max() < 0.1
+
+
+def test_a_path_faster_than_the_vehicle_is_refused(tmp_path: Path) -> None:
+    text = "vehicle,t,x,y\n1,0,0,0\n1,8,0,0\n1,18,{far},0\n2,0,0,3\n"
+    with pytest.raises(ConfigError, match=r"vehicle 1 to fly 1.45 m/s from 8 s on$"):
+        scenario(tmp_path, text.format(far=14.5))
+    slow = text.format(far=7.2)
+    scenario(tmp_path, slow)
+    with pytest.raises(ConfigError, match=r"at most 0.707 m/s on an axis"):
+        scenario(tmp_path, slow, mission={"speed_mps": 1.0})
+
+
+def test_a_show_is_not_allocated(tmp_path: Path) -> None:
+    """Its paths would be flown as goals, one after the other."""
+    with pytest.raises(ConfigError, match=r"mission.allocate: got true"):
+        scenario(tmp_path, ring(), mission={"allocate": True})
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_the_nearest_paths_are_those_of_a_dense_grid(
+    seed: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(mission, "PLACES_AT_ONCE", 8)  # in several parts
+    rng = np.random.default_rng(seed)
+    goals = {}
+    for vehicle in range(1, 5):
+        times_s = np.append(0.0, np.cumsum(rng.uniform(0.5, 4.0, int(rng.integers(0, 6)))))
+        goals[vehicle] = times_s, rng.uniform(-8.0, 8.0, (len(times_s), 2))
+    show = mission.Mission(goals, 2, 1, is_show=True)
+    dense_s = np.arange(0.0, show.lasts_s + 1.0, 0.001)
+    at = np.stack([show.of(vehicle)(dense_s)[..., 0] for vehicle in goals])
+    away_m = np.array(
+        [np.linalg.norm(at[i] - at[j], axis=1) for i in range(4) for j in range(i + 1, 4)]
+    )
+    assert show.nearest(float(away_m.min()) - 0.02, 1.0) is None
+    apart_m = float(away_m.min()) + 0.5
+    found = show.nearest(apart_m, 1.0)
+    assert found is not None
+    one, other, at_s, distance_m = found
+    both = np.array([show.of(each)(np.array(at_s))[:, 0] for each in (one, other)])
+    assert np.linalg.norm(both[0] - both[1]) == pytest.approx(distance_m, abs=1e-9)
+    knots_s = np.unique(np.concatenate([times_s for times_s, _ in goals.values()]))
+    first_s = dense_s[(away_m < apart_m).any(axis=0).argmax()]
+    assert np.searchsorted(knots_s, first_s, "right") == np.searchsorted(knots_s, at_s, "right")

@@ -266,8 +266,86 @@ def test_the_origin_of_the_scenario_counts_more_than_the_plans() -> None:
         (plan(item(16, 0, 0, 0, 0, NORTH, 8, 9), hoverSpeed=0), "hoverSpeed above 0, got 0"),
         (plan({"type": "ComplexItem", "complexItemType": "fwLandingPattern"}), "fwLandingPattern"),
         (plan(item(16), plannedHomePosition=[1]), "a plan with plannedHomePosition"),
+        (plan({}).replace(b"[{}]", b"5"), "a plan with mission items"),
+        (plan(item(16, 10**400)), "mission item 1: hold time a smaller number"),
+        (plan(item(93, 1e999)), "mission item 1: a hold time from 0 to 1e+06 s, got inf"),
+        (plan(item(93, -1, 12)), "mission item 1: a hold time from 0 to 1e+06 s, got -1"),
+        (plan(item(1e999)), "mission item 1: expected a command and its params"),
+        (plan(item(178, 2, 5)), "mission item 1: expected a speed over ground or in the air"),
+        (plan(item(177, 1, 3)), "mission item 1: expected a waypoint, "),
+        (plan({"type": "ComplexItem", "TransectStyleComplexItem": [1]}), "got None"),
+        (plan({"TransectStyleComplexItem": {"Items": 5}}), "expected a simple item"),
     ],
 )
 def test_a_plan_that_cannot_be_flown_is_refused(content: bytes, said: str) -> None:
     with pytest.raises(ValueError, match=re.escape(said)):
         tracks.tracks(content, 3)
+
+
+def test_crazyswarms_tools_write_the_header_in_other_ways() -> None:
+    """uav_trajectories' savecsv writes a comment, other scripts a capital letter."""
+    text = polynomials((1.0, [0, 1], [0]))
+    for header in (b"# duration", b"Duration"):
+        _, points_m = only(tracks.tracks(text.replace(b"duration", header), 2))
+        assert points_m[-1] == pytest.approx([1.0, 0.0])
+
+
+def test_a_column_given_twice_is_refused() -> None:
+    with pytest.raises(ValueError, match="line 1: expected the columns t, x, y"):
+        tracks.tracks(b"t,x,y,x\n0,0,0,9\n", 2)
+
+
+def test_a_zip_made_by_macos_is_read_without_its_attributes() -> None:
+    content = io.BytesIO()
+    with zipfile.ZipFile(content, "w") as archive:
+        archive.writestr("show/Drone 1.csv", "t,x,y\n0,1,2\n")
+        archive.writestr("__MACOSX/show/._Drone 1.csv", b"\0\5\x16\7")
+    assert list(tracks.tracks(content.getvalue(), 2)) == [1]
+
+
+@pytest.mark.filterwarnings("ignore:Duplicate name")
+def test_a_zip_with_two_files_of_one_name_is_refused() -> None:
+    """Only one of the two would be flown."""
+    content = io.BytesIO()
+    with zipfile.ZipFile(content, "w") as archive:
+        for x in (0, 9):
+            archive.writestr("a.csv", f"t,x,y\n0,{x},0\n")
+    with pytest.raises(ValueError, match="two files of the same name"):
+        tracks.tracks(content.getvalue(), 2)
+
+
+@pytest.mark.parametrize("compression", [zipfile.ZIP_LZMA, zipfile.ZIP_BZIP2])
+def test_a_zip_with_another_compression_is_refused(compression: int) -> None:
+    """Their decoders raise other errors, and LZMA's takes as much memory as the file says."""
+    content = io.BytesIO()
+    with zipfile.ZipFile(content, "w", compression) as archive:
+        archive.writestr("a.csv", "t,x,y\n0,0,0\n" * 99)
+    with pytest.raises(ValueError, match=r"^a.csv: expected the compression deflate"):
+        tracks.tracks(content.getvalue()[:60] + b"x" + content.getvalue()[61:], 2)
+
+
+def test_a_vehicle_takes_off_straight_up() -> None:
+    _, points_m = only(tracks.tracks(plan(item(22, 0, 0, 0, None, NORTH, 8.0, 20)), 3))
+    assert points_m == pytest.approx(np.array([[0, 0, 0], [0, 0, 20], [0, 100, 20]]), abs=0.01)
+
+
+def test_a_delay_in_a_plan_holds_the_vehicle() -> None:
+    flown = plan(item(22, 0, 0, 0, 0, 0, 0, 20), item(93, 7, frame=2))
+    times_s, points_m = only(tracks.tracks(flown, 3))
+    assert times_s == [0.0, 4.0, 11.0]
+    assert points_m[:, 2].tolist() == [0.0, 20.0, 20.0]
+
+
+def test_a_speed_of_minus_one_leaves_the_speed_as_it_is() -> None:
+    times_s, _ = only(tracks.tracks(plan(item(178, 1, -1), item(22, 0, 0, 0, 0, 0, 0, 20)), 3))
+    assert times_s == [0.0, 4.0]
+
+
+def test_the_homes_altitude_matters_only_for_altitudes_above_the_sea() -> None:
+    """QGroundControl writes null where it has no terrain data."""
+    home = [*ORIGIN, None]
+    over = plan(item(22, 0, 0, 0, 0, 0, 0, 20), plannedHomePosition=home)
+    assert only(tracks.tracks(over, 3))[1][-1].tolist() == [0.0, 0.0, 20.0]
+    above_sea = plan(item(22, 0, 0, 0, 0, 0, 0, 420, frame=0), plannedHomePosition=home)
+    with pytest.raises(ValueError, match="mission item 1: an altitude above home"):
+        tracks.tracks(above_sea, 3)

@@ -425,6 +425,10 @@ def test_polygons_of_a_kml_file_are_kept_out_of_or_stayed_within(tmp_path: Path)
         (placemark(polygon_of("8,47 8.1,47 nan,47.1")), "a number"),
         (placemark(polygon_of("8,47 8.1,47 east,47.1")), "east"),
         (placemark(polygon_of(OUTER.replace("8.01", "9.9"))), "of at most 100000 m"),
+        (placemark("<Polygon/>"), "a Polygon with an outerBoundaryIs"),
+        (placemark(polygon_of(OUTER)) + "<NetworkLink/>", "without links"),
+        ("<Placemark>" * 9000 + "</Placemark>" * 9000, "no Placemark within another"),
+        (placemark("<Polygon>" * 9000 + "</Polygon>" * 9000), "no Polygon within another"),
     ],
 )
 def test_a_kml_file_that_has_no_zones_is_refused(text: str, said: str, tmp_path: Path) -> None:
@@ -432,9 +436,16 @@ def test_a_kml_file_that_has_no_zones_is_refused(text: str, said: str, tmp_path:
         kml(tmp_path, text)
 
 
-def test_entities_of_a_kml_file_are_not_expanded(tmp_path: Path) -> None:
+def test_several_holes_in_one_boundary_of_a_kml_file_are_kept_out_of(tmp_path: Path) -> None:
+    rings = polygon_of(OUTER, INNER, INNER).replace("</innerBoundaryIs><innerBoundaryIs>", "")
+    zones = kml(tmp_path, placemark(rings), ", fence").zones
+    assert [each.is_fence for each in zones] == [True, False, False]
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-16"])
+def test_entities_of_a_kml_file_are_not_expanded(encoding: str, tmp_path: Path) -> None:
     file = tmp_path / "bomb.kml"
-    file.write_text('<!DOCTYPE k [<!ENTITY a "aaaaaaaa">]><kml>&a;</kml>')
+    file.write_text('<!DOCTYPE k [<!ENTITY a "aaaaaaaa">]><kml>&a;</kml>', encoding)
     read = reading.files_of("mission.zones", f'kml("{file}")')
     with pytest.raises(GrammarError, match="without a document type"):
         zone_texts.parse(f'kml("{file}")', 2, read)
@@ -470,6 +481,8 @@ def test_a_geofence_of_a_plan_is_stayed_within_and_kept_out_of(tmp_path: Path) -
     ("fence", "said"),
     [
         ({}, "a plan with a geofence"),
+        ({"version": 1, "polygon": [[47, 8], [47, 8.1], [47.1, 8]]}, "a geofence of version 2"),
+        ({"polygons": 5}, "a geofence of version 2"),
         ({"polygons": [{"polygon": []}]}, "inclusion, and corners or a centre and radius"),
         ({"circles": [{"inclusion": True, "circle": {"center": [47, 8], "radius": 0}}]}, "above 0"),
         ({"polygons": [{"inclusion": True, "polygon": [[47, 8], [47, 10]]}]}, "of at most"),
