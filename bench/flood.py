@@ -78,7 +78,7 @@ class Flood:
     kept_out: float
     """Flood packets per second that the kernel's filter rejected."""
     unread: float
-    """Datagrams per second that the kernel dropped for lack of room."""
+    """Datagrams per second that the kernel dropped because the receive buffer was full."""
     good: int
     lost: int
     """Number of sent observations that the server never handled."""

@@ -103,7 +103,7 @@ class Vehicle(ABC):
 
     @property
     def waits_for(self) -> str:
-        """What prevents the flight, in words; empty if nothing does."""
+        """Reason why the vehicle cannot fly yet, in words; empty if there is none."""
         return ""
 
     def take_off(self, *, now_ns: int) -> bool:  # noqa: ARG002 - ignored by default

@@ -91,7 +91,7 @@ class _KeyedVehicle:
 
     def __init__(self, now_ns: int) -> None:
         self.attempts = _HandshakeRate(now_ns)
-        """Limit of attempts, which need the key; repeats, which anybody can send, do not count."""
+        """Rate limit of new handshake attempts, which only a holder of the key can make."""
         self.repeats = _HandshakeRate(now_ns)
         """Limit of answers to repeats of an attempt."""
         self.live: Channel | None = None
@@ -192,7 +192,7 @@ class SecureGate:
                 return self._initiation(datagram, now_ns)
         raise ProtocolError(Drop.NOT_FOR_A_SERVER)
 
-    def admit(self, call: GateCall, *, now_ns: int) -> None:  # noqa: ARG002 - as of any `Gate`
+    def admit(self, call: GateCall, *, now_ns: int) -> None:  # noqa: ARG002 - interface of `Gate`
         """Keep the channel created by the answer to this HELLO as pending."""
         answer = call.line
         assert isinstance(answer, _Answer)

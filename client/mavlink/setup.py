@@ -29,7 +29,7 @@ TRIES = 10
 """Number of times that a question is asked; with 10 % loss each way, one in ten million stays
 open."""
 AT_ONCE = 4
-"""Number of open questions at a time: a serial line takes no more."""
+"""Largest number of open questions at once, for the sake of serial lines."""
 VERSION = int(dialect.MAVLINK_MSG_ID_AUTOPILOT_VERSION)
 BYTEWISE = dialect.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE
 CONVERTED = dialect.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_C_CAST

@@ -38,7 +38,8 @@ FOUND = -1
 TRAJECTORY = 2**40
 """Stride between keys of trajectories: page p of trajectory t has the key t * TRAJECTORY + p."""
 SPREAD = 31
-"""Number of slots between the first pages of successive trajectories; odd, so that all differ."""
+"""Distance between the slots of the first pages of successive trajectories, modulo PAGES; odd, so
+that these slots differ."""
 TINY = 1e-9
 """Rounding tolerance of a quotient such as 0.15 / 0.05."""
 

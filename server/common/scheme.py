@@ -232,7 +232,7 @@ class Scheme(ABC):
         Args:
             rows: rows of the vehicles; shape (n,).
             step: step k of each; shape (n,).
-            foresight: output: all fields but the plans.
+            foresight: output: all fields except the plans.
         """
 
     @abstractmethod

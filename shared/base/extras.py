@@ -6,7 +6,7 @@ from contextlib import contextmanager
 from importlib import util
 
 MODULES = {"pillow": "PIL"}
-"""Import names of packages, where they differ."""
+"""Import names of packages, where they differ from the names of the packages."""
 
 
 class ExtraMissing(ModuleNotFoundError):

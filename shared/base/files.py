@@ -307,7 +307,7 @@ def appending(path: Path) -> BinaryIO:
     """Open a file for reading and appending, locked until it is closed.
 
     Raises:
-        OSError: the file cannot be written, is no plain file, or another command has locked it.
+        OSError: the file cannot be written, is not a plain file, or another command has locked it.
     """
     check(path)
     file = os.fdopen(os.open(path, os.O_RDWR | os.O_CREAT | FLAGS, MODE), "r+b")
@@ -324,10 +324,10 @@ class Growing:
     beside it as NAME.part1.SUFFIX until it is complete, see `end`.
 
     Args:
-        buffering: as in `open`; 0 for none.
+        buffering: as in `open`; 0: no buffer.
 
     Raises:
-        OSError: it cannot be written, or is no plain file.
+        OSError: it cannot be written, or is not a plain file.
     """
 
     def __init__(self, path: Path, buffering: int = -1) -> None:

@@ -19,10 +19,11 @@ Origin = tuple[float, ...]
 
 
 def check_origin(latitude: Any, longitude: Any, form: str) -> Origin:
-    """Origin from two members of a file; raises ValueError if they are none.
+    """Origin from two members of a file; raises ValueError if they are not a latitude and a
+    longitude.
 
     Args:
-        form: how the file writes it, for the message.
+        form: expected form of the members in the file, for the message.
     """
     origin = number(latitude), number(longitude)
     if not (abs(origin[0]) <= NORTH_MAX and abs(origin[1]) <= 180.0):

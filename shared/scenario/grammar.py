@@ -5,7 +5,7 @@
     argument := value | key=value
 
 `&` binds tighter than `|`. A value is a number or a word, such as a file name; in quotes it may
-have any character but a quote. Impairments, zones and goals are calls joined by `&` only. The
+have any character except a quote. Impairments, zones and goals are calls joined by `&` only. The
 tables in `shared.scenario.registry` list the names.
 """
 

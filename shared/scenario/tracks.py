@@ -77,7 +77,7 @@ FORMS = (
 
 
 def tracks(content: bytes, axes: int, origin: Origin | None = ()) -> Tracks:
-    """Tracks in a file, of one of the kinds above.
+    """Tracks in a file, in one of the formats listed at the top of this module.
 
     Args:
         origin: latitude and longitude of the scenario's origin [degrees]; None: any.
@@ -163,7 +163,7 @@ def _table(content: bytes, axes: int, origin: Origin | None) -> Tracks:
 
 
 def _polynomials(content: bytes, axes: int) -> tuple[Array, Array]:
-    """Points along polynomials of time since the begin of each piece."""
+    """Points along polynomials of time since the beginning of each piece."""
     names = [f"{axis}^{power}" for axis in "xyz"[:axes] for power in range(DEGREE + 1)]
     rows, lines = _read(content, ["duration", *names])
     lengths_s = rows[:, 0]

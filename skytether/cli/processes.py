@@ -279,7 +279,7 @@ def fly_chain(
     """Run processes, each connected to the one before, until one of them ends, or Ctrl-C.
 
     Args:
-        chain: name and arguments of each process; the last argument of each but the first is the
+        chain: name and arguments of each process; the last argument of each except the first is the
             flag for the address of the process before.
         flies: name of the process whose end is the flight's.
         timeout_s: longest time that they run [s].

@@ -45,7 +45,7 @@ MOVES_MAX = 64
 DRAWN = 10
 """Number of random attacks before a climb, which starts from the best of them."""
 PATIENCE = 40
-"""Number of tries without improvement after which the climb starts anew from random attacks."""
+"""Number of tries without improvement after which the climb starts again from random attacks."""
 CLIMB = 100
 """Largest number of tries of one climb."""
 
