@@ -93,7 +93,8 @@ class _KeyedVehicle:
         self.attempts = _HandshakeRate(now_ns)
         """Rate limit of new handshake attempts, which only a holder of the key can make."""
         self.repeats = _HandshakeRate(now_ns)
-        """Limit of answers to repeats of an attempt."""
+        """Rate limit of answers to repeated INITIATIONs, which anybody who has recorded one can
+        send."""
         self.live: Channel | None = None
         """Channel in which the vehicle sends."""
         self.previous: Channel | None = None

@@ -110,12 +110,12 @@ class Setup:
         if name in self._setting:
             before, wanted = self._setting[name]
             if abs(value - wanted) > safety.TOLERANCE:
-                return  # an answer to an earlier question, or a refusal: it is set again
+                return  # an old answer, or a refusal: set it again
             del self._setting[name]
             self._changed.append((name, before, value))
         self._values[name], self._kinds[name] = value, kind
         for rule in self._rules:
-            if name in rule.names:  # an autopilot has only one of the names
+            if name in rule.names:  # an autopilot uses one of the rule's names
                 for other_name in rule.names:
                     self._tries.pop(other_name, None)
 

@@ -83,7 +83,8 @@ def _deviate(
 
     Args:
         i: index of the vehicle in the block.
-        distance: sums to which the stages add, as far as both are flown [m²]; shape (H + 1,).
+        distance: input and output: sum over the axes at each stage, as far as both are flown [m²];
+            shape (H + 1,).
     """
     held, usable = foresight.held[i, axis], foresight.usable[i]
     model, w, H = axis_at(mpc.model, axis), foresight.disturbance[i, axis], len(held)

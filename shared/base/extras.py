@@ -10,7 +10,7 @@ MODULES = {"pillow": "PIL"}
 
 
 class ExtraMissing(ModuleNotFoundError):
-    """An extra is needed; the message says which, and how to install it."""
+    """An extra is needed; the message names it, and the command that installs it."""
 
     def __init__(self, module: str, extra: str) -> None:
         command = f"pip install 'skytether[{extra}]', or in a checkout make setup"

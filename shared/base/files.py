@@ -96,7 +96,7 @@ def claim(path: Path, *, is_input: bool = False) -> None:
         return
     folder = path.absolute().parent
     if not os.access(folder, os.W_OK | os.X_OK):
-        folder.stat()  # raises if it is missing, which access does not distinguish
+        folder.stat()  # raises if the folder is missing
         raise OSError(EACCES, os.strerror(EACCES), str(path))
     with ExitStack() as stack:
         flags = os.O_WRONLY | FLAGS | (os.O_CREAT | os.O_EXCL if is_new else 0)
@@ -281,7 +281,7 @@ def replacing(
         flags = os.O_TMPFILE | os.O_RDWR | os.O_CLOEXEC
         descriptor = os.open(path.absolute().parent, flags, MODE if mode is None else mode)
     except OSError as error:
-        if error.errno not in (EISDIR, EOPNOTSUPP):  # the latter on NFS, for example
+        if error.errno not in (EISDIR, EOPNOTSUPP):  # EOPNOTSUPP for example on NFS
             raise
         part, descriptor = _unused(path, partial(_new, mode=MODE if mode is None else mode))
     try:

@@ -71,7 +71,7 @@ def local(degrees: Array, origin: Origin) -> Array:
     longitude, latitude = degrees.T
     if not ((np.abs(longitude) <= 180.0).all() and (np.abs(latitude) <= NORTH_MAX).all()):
         raise ValueError("coordinates of longitude and latitude")
-    away = np.mod(longitude - east + 180.0, 360.0) - 180.0  # works across the antimeridian
+    away = np.mod(longitude - east + 180.0, 360.0) - 180.0  # correct across the antimeridian
     degree = math.radians(1.0) * EARTH_M
     scale = np.cos(np.radians((latitude + north) / 2.0))
     return within(

@@ -36,7 +36,7 @@ NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?", re.IGNORECASE | r
 
 
 class GrammarError(Exception):
-    """Error in a text: the invalid part `given`, and what was `expected`."""
+    """Error in a text: the invalid part, and the expected form."""
 
     def __init__(self, given: str, expected: str) -> None:
         super().__init__(f"got {given!r}, expected {expected}")

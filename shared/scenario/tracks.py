@@ -83,7 +83,7 @@ def tracks(content: bytes, axes: int, origin: Origin | None = ()) -> Tracks:
         origin: latitude and longitude of the scenario's origin [degrees]; None: any.
 
     Raises:
-        ValueError: the file is invalid; says what and where.
+        ValueError: the file is invalid; the message names the fault and its place.
     """
     if content.startswith(b"PK"):
         found = _zip(content, axes, origin)
@@ -100,7 +100,7 @@ def path(content: bytes, axes: int, origin: Origin = ()) -> Reference:
     """Path of the single vehicle in a file, straight from point to point.
 
     Raises:
-        ValueError: the file is invalid; says what and where.
+        ValueError: the file is invalid; the message names the fault and its place.
     """
     found = tracks(content, axes, origin)
     if len(found) > 1:
@@ -116,7 +116,7 @@ def lasts_s(content: bytes, axes: int) -> float:
     """Time of the last point in a file, wherever the scenario's origin is [s].
 
     Raises:
-        ValueError: the file is invalid; says what and where.
+        ValueError: the file is invalid; the message names the fault and its place.
     """
     return float(max(times_s[-1] for times_s, _ in tracks(content, axes, None).values()))
 
@@ -244,7 +244,7 @@ def _read(content: bytes, names: list[str]) -> tuple[Array, Indices]:
     """Named columns of a CSV table, shape (rows, columns), and the number of each row's line.
 
     Raises:
-        ValueError: the table is invalid; says what and in which line.
+        ValueError: the table is invalid; the message names the fault and the line.
     """
     import csv  # needed for files only
 

@@ -51,7 +51,7 @@ class SituationArrays(NamedTuple):
     largest d + H)."""
     held: Array | None
     """Inputs that are flown from k+d on if nothing is sent [m/s]; shape (block, axes, H). None if
-    the scheme does not know them."""
+    the scheme does not compute them."""
     sent_step: Indices
     """Step at which a horizon was last sent to each vehicle, or -1; shape (capacity,)."""
     heartbeat_due: Flags
@@ -94,7 +94,7 @@ class Situation(NamedTuple):
         """Inputs that the vehicle flies from k+d on if nothing is sent [m/s]; shape (n, axes, H).
 
         Raises:
-            ValueError: the scheme does not know them.
+            ValueError: the scheme does not compute them.
         """
         if self.arrays.held is None:
             able = " or ".join(map(repr, that_compute(HELD)))

@@ -261,7 +261,7 @@ def run(
         interrupted=interrupted,
         on_event=hear,
     )
-    client_figures = parts / "client.json"  # created at the start, and written at the end
+    client_figures = parts / "client.json"  # empty until the client ends
     if interrupted() and not (client_figures.exists() and client_figures.stat().st_size):
         raise CommandError("interrupted before the first step", INTERRUPTED)
     return shortfalls

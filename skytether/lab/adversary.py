@@ -64,7 +64,7 @@ class MoveKind(StrEnum):
     """The client of a vehicle is down, and restarts with its saved state; with
     `vehicle.memory = "none"` it has none."""
     GOALS = "goals"
-    """The vehicle's goal is the place in the amounts [m]; after the move, its own goal again."""
+    """The vehicle's goal is moved to the place in the amounts [m], and back at the end."""
     ZONES = "zones"
     """Additional zone, a cylinder with x, y and radius in the amounts [m]."""
 

@@ -91,7 +91,7 @@ class Shell:
         line: connection to an autopilot, which becomes socket 1.
         is_patient: whether to start although a peer's name cannot be resolved yet; the lookup is
             then repeated.
-        memory: file of what the endpoint keeps for the next run of its process.
+        memory: file for the state that the endpoint keeps for the next run of its process.
 
     Raises:
         AddressError: the address cannot be bound, or a name cannot be resolved.
