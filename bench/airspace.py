@@ -61,7 +61,9 @@ class Vehicles:
 
 
 class PlannedFleet:
-    """Planner that knows the states of its vehicles, and plans in blocks as the server does."""
+    """Planner that is given the exact states of its vehicles, and plans in blocks as the server
+    does.
+    """
 
     def __init__(self, scenario: Scenario, count: int) -> None:
         terms = scenario.terms()

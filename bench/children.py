@@ -48,7 +48,7 @@ class ChildProcess:
         stack.callback(self.kill)
         self.lines: list[LogLine] = []
         self.words: list[str] = []
-        """Output that is no event."""
+        """Lines of output that are not events."""
         self._heard = threading.Condition()
         self._reader = threading.Thread(target=self._read, daemon=True)
         self._reader.start()

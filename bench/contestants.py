@@ -311,7 +311,7 @@ class Ipopt:
 class EmptySolver:
     """Solver that does nothing, to measure the cost of the measurement itself."""
 
-    def __init__(self, problem: Problem) -> None:  # noqa: ARG002 - as of any `Solver`
+    def __init__(self, problem: Problem) -> None:  # noqa: ARG002 - interface of `Solver`
         self._solved = np.array([True])
 
     def solve(self, gradient: Array, guess: Array) -> tuple[Array, Flags]:  # noqa: ARG002

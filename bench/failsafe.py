@@ -84,9 +84,9 @@ class FaultOutcome(NamedTuple):
     off_path_m: float
     """Largest horizontal distance from the nearest point of the desired path [m]."""
     still_s: float
-    """Time until the horizontal speed was below STILL_MPS [s]; NaN for never."""
+    """Time until the horizontal speed was below STILL_MPS [s]; NaN if it never was."""
     down_s: float
-    """Time until the motors were off [s]; NaN for never."""
+    """Time until the motors were off [s]; NaN if they never were."""
     ending: Ending
 
 
@@ -241,7 +241,9 @@ def _row(case: CaseName, outcomes: Sequence[FaultOutcome]) -> list[str]:
 
 
 def _down(outcomes: Sequence[FaultOutcome]) -> str:
-    """Range of times after which the motors were off, behind a comma; "" if they never were."""
+    """Text with the range of times after which the motors were off, beginning with a comma; empty
+    if they never were.
+    """
     times_s = [each.down_s for each in outcomes]
     return "" if np.isnan(times_s).all() else f", {_span(times_s)}"
 

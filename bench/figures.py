@@ -1,5 +1,5 @@
-"""Figures of the documents: each is made anew by its command, and compared with the number in its
-page.
+"""Figures of the documents: each is measured again by its command, and compared with the number in
+its page.
 
 `figures.toml` beside this file registers them. A figure is a text of a page in which every measured
 number is a placeholder, with the commands that fly for it and their seeds; or the tables that a

@@ -78,7 +78,7 @@ class Flood:
     kept_out: float
     """Flood packets per second that the kernel's filter rejected."""
     unread: float
-    """Datagrams per second that the kernel dropped for lack of room."""
+    """Datagrams per second that the kernel dropped because the receive buffer was full."""
     good: int
     lost: int
     """Number of sent observations that the server never handled."""
@@ -243,7 +243,7 @@ class _State:
 
 def _fly(kind: str, counts: FloodCounts, lateness: WakeLateness) -> Flood:
     duration_s = counts.lead_s + counts.seconds + AFTER_S
-    # A report at every step: a missing report was lost.
+    # The vehicle reports at every step, so that each missing report counts as lost.
     scenario = derive(
         "demo-committed", duration=duration_s, settle=0.0, vehicle={"report": "always"}
     )

@@ -178,7 +178,9 @@ def _gate(vehicles: int) -> tuple[server.SecureGate, Keyring]:
 
 
 def _handshakes(counts: LinkCounts, lateness: WakeLateness) -> dict[str, Any]:
-    """Cost of a handshake to either end; each is another vehicle's, since their rate is limited."""
+    """Cost of a handshake to either end; each is made for another vehicle, since the rate per
+    vehicle is limited.
+    """
     terms, count = load("demo").terms(), counts.handshakes
     hello = encode(Hello(1, 2**60, terms))
     welcome = encode(Welcome(1, 2**31, 2**60, 2**60, NOW_NS, 0, terms))

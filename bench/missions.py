@@ -392,7 +392,7 @@ def _network(rng: np.random.Generator) -> str:
 
 
 def fly_random(options: RandomOptions, seed: int) -> MissionFlight:
-    """Fly a random mission; half of its time if all vehicles have arrived by then."""
+    """Fly a random mission, and only half of its duration if all vehicles have arrived by then."""
     if not options.harsh:
         half = _fly_random(replace(options, duration=options.duration / 2.0), seed)
         if not half.late:

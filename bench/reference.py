@@ -22,7 +22,7 @@ ROUNDING = 1e-11
 
 
 class NoReference(Exception):
-    """No solution was found that is proved optimal."""
+    """No solution was found that could be proved optimal."""
 
 
 class Reference:
@@ -65,7 +65,7 @@ class Reference:
         return lsq_linear(self._root, aim, (-self._bound, self._bound), "bvls", tol=1e-15).x
 
     def _polish(self, side: Array, gradient: Array) -> Array:
-        """Optimal inputs with the inputs at a side fixed to their bound; shape (H,)."""
+        """Optimal inputs when the inputs that are at a bound are fixed there; shape (H,)."""
         inputs, free = side * self._bound, side == 0.0
         if free.any():
             toward = -gradient[free] - self._hessian[np.ix_(free, ~free)] @ inputs[~free]

@@ -98,7 +98,7 @@ class ProcessLife:
     off_m: Array
     """Distance from the reference [m]; shape (n,)."""
     in_force: NDArray[np.int64]
-    """Step that the horizon in force was made for, -1 for none; shape (n,)."""
+    """Step that the horizon in force was made for, -1 if none is; shape (n,)."""
     mode: NDArray[np.uint8]
 
     @classmethod
@@ -131,7 +131,7 @@ class RestartVerdict:
     over_true_mps: float | None
     """Largest excess of the true speed over its curve [m/s]."""
     flies_s: float
-    """Time from the return to flying again [s]; infinite for never."""
+    """Time from the return to flying again [s]; infinite if it never flies again."""
     on_path_s: float
     """Time from the return until the vehicle was within half a metre of the reference [s]."""
 

@@ -29,7 +29,7 @@ from skytether.shell.workers import die_with_parent
 
 MB = 1_000_000
 POLL_S = 0.01
-"""Interval at which the memory of a command that ends by itself is read [s]."""
+"""Interval at which the memory of a command is sampled until the command ends [s]."""
 
 
 class Start(NamedTuple):

@@ -32,7 +32,9 @@ def where() -> dict[str, Any]:
 
 
 def ticks(name: str, vehicles: int, count: int, paced: bool) -> list[float]:
-    """CPU time of whole ticks per vehicle [ns]: hot, without the first; or each after a pause."""
+    """CPU time of whole ticks per vehicle [ns]: without pauses, the first tick left out; or each
+    tick after a pause.
+    """
     space, spent = _space(name, vehicles, timed=False), []
     for number in range(count):
         space.prepare()

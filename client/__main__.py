@@ -4,7 +4,7 @@ import sys
 
 from skytether.shell.start import run
 
-if __name__ == "__main__":  # before the imports below, which are slow
+if __name__ == "__main__":  # called before the slow imports below
     sys.exit(run("skytether.client.__main__:fly", "client"))
 
 import secrets
@@ -97,7 +97,7 @@ def fly(argv: Sequence[str]) -> None:
         if keyring is None:
             return PlainLink()
 
-        from skytether.client.secure import SecureLink  # its ciphers take 6 MB, and time to import
+        from skytether.client.secure import SecureLink  # imports ciphers: slow, 6 MB
 
         return SecureLink(keyring.of(number, options.key_id), entropy=secrets.token_bytes)
 
@@ -178,7 +178,7 @@ def fly(argv: Sequence[str]) -> None:
 def _memory(
     options: ClientOptions, flying: Sequence[Vehicle], keyring: Keyring | None
 ) -> Iterator[MemoryFile | None]:
-    """File that keeps the client's state for its next run; None if the scenario wants none.
+    """File that keeps the client's state for its next run; None with `vehicle.memory = "none"`.
 
     Raises:
         CommandError: the file cannot be written, or another process uses it.

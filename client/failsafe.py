@@ -38,7 +38,7 @@ BRAKE_SPARE_NS = 500 * MILLISECOND_NS
 """Margin added to the time that braking takes."""
 
 YIELDING = frozenset({Reason.TAKEN, Reason.DISARMED})
-"""Causes for which a pilot flies the vehicle, or nobody."""
+"""Causes for which the vehicle is left to a pilot, or is disarmed."""
 GROUNDING = frozenset({Reason.BATTERY, Reason.ASTRAY, Reason.RIVAL, Reason.STRAYED})
 BROKEN = frozenset(
     {
@@ -336,7 +336,7 @@ class Failsafe:
         if after is None:
             return
         if cause in LOCKING or cause is Reason.OPENED:
-            # The second for which the link has to be good begins now.
+            # From now on the link has to be good for GOOD_NS.
             self._good_ns = now_ns
         if cause in CLOSING:
             self._heard_ns = None

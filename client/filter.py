@@ -54,7 +54,7 @@ Gain = tuple[float, float, float]
 
 def widened(axis: Axis, P: Spread, noise: Spread) -> Spread:
     """P one step later, F P Fᵀ + Q."""
-    pv = P.pv + axis.a01 * P.vv + axis.b0 * P.vw  # of the next p and this v
+    pv = P.pv + axis.a01 * P.vv + axis.b0 * P.vw  # covariance of the next p and the present v
     pw = P.pw + axis.a01 * P.vw + axis.b0 * P.ww
     vw = axis.a11 * P.vw + axis.b1 * P.ww
     return Spread(

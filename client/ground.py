@@ -1,5 +1,5 @@
-"""Log events of a vehicle on the ground: what prevents its flight, and whether its server is
-silent.
+"""Log events of a vehicle on the ground: the reason why it cannot fly yet, and the silence of its
+server.
 """
 
 from skytether.shared.base.units import SECOND_NS
@@ -8,7 +8,7 @@ from skytether.shared.core.endpoint import Address, Events
 from skytether.shared.core.events import ServerHeard, ServerSilent, Welcomed
 
 WAITED_NS = 2 * SECOND_NS
-"""Delay before the log says what prevents the flight."""
+"""Delay before the log gives the reason why the vehicle cannot fly."""
 SILENT_NS = 3 * SECOND_NS
 """Time beyond the time-out after which the server of a vehicle on the ground counts as silent.
 
@@ -17,7 +17,7 @@ of the packets each way."""
 
 
 class GroundReports:
-    """Log events of one vehicle that cannot be flown yet, appended to `events`.
+    """Reporter of one vehicle on the ground; it appends log events to `events`.
 
     `timeout_ns` is the time of silence after which the link counts as lost.
     """
@@ -26,14 +26,17 @@ class GroundReports:
         self._vehicle, self._server, self._events = vehicle, server, events
         self._silence_ns = timeout_ns + SILENT_NS
         self._waits_for, self._waits_ns, self._reported_wait = "", 0, ""
-        """What prevents the flight, since when, and what of it was logged."""
+        """Reason why the vehicle cannot fly, the time since which it holds, and the reason logged
+        last."""
         self._welcomed: int | None = None
         self._silent_ns: int | None = None
         """Time of the newest packet before the server was reported as silent; None if it is not
         silent."""
 
     def wait(self, waits_for: str, *, now_ns: int) -> None:
-        """Report what prevents the flight (empty: nothing), once it has done so for a while."""
+        """Report the reason why the vehicle cannot fly (empty for none), once it has held for a
+        while.
+        """
         if waits_for != self._waits_for:
             self._waits_for, self._waits_ns = waits_for, now_ns
         if now_ns - self._waits_ns >= WAITED_NS and waits_for != self._reported_wait:

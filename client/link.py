@@ -26,7 +26,7 @@ class ClientLink(Protocol):
         pass
 
     def seal(self, payload: bytes) -> bytes:
-        """Datagram that carries any message but a HELLO."""
+        """Datagram that carries any message except a HELLO."""
 
     def open(self, datagram: bytes, *, now_ns: int) -> bytes | None:
         """Message in a datagram; None if it was part of the handshake, whose answer is in the

@@ -81,7 +81,7 @@ class SavedState(msgspec.Struct, frozen=True, kw_only=True):
         """State from bytes that were written at `written_ns`.
 
         Raises:
-            ValueError: the bytes are invalid; says why.
+            ValueError: the bytes are invalid; the message gives the reason.
         """
         try:
             saved = msgspec.msgpack.decode(content, type=cls)
@@ -108,7 +108,7 @@ def recall(content: bytes, written_ns: int | None, now_ns: int, terms: Terms) ->
         terms: terms of the flight, which have not changed.
 
     Raises:
-        ValueError: the content is invalid; says why.
+        ValueError: the content is invalid; the message gives the reason.
     """
     saved = SavedState.decode(content, written_ns or 0, terms.axes)
     if written_ns is None:

@@ -140,7 +140,7 @@ class Pilot:
         if horizon.step > self.compensator.newest:
             passed = self.step - horizon.step
             if isinstance(horizon, Horizon):
-                # Its committed inputs are meant to have passed when it arrives.
+                # Committed inputs come first, and have normally been flown at its arrival.
                 passed -= horizon.inputs.shape[1] - terms.planned
             self._failsafe.horizon_arrived(late=passed > LATE_SHARE * terms.reach, now_ns=now_ns)
         observed = horizon.step - horizon.age

@@ -81,7 +81,7 @@ class SecureLink:
         return self._initiation(attempt, now_ns)
 
     def seal(self, payload: bytes) -> bytes:
-        """Datagram that carries any message but a HELLO; needs an adopted WELCOME."""
+        """Datagram that carries any message except a HELLO; needs an adopted WELCOME."""
         assert self._current is not None
         return self._current.seal(payload)
 

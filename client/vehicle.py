@@ -1,9 +1,9 @@
 """Interface of a vehicle to the pilot: it accepts a velocity and returns measurements.
 
 A vehicle measures at its own rate with its own time stamps, and may return measurements late or not
-at all; the client knows its state from them alone. `client.simulated` contains simulated vehicles.
-A real one communicates with its autopilot through a `port`, an endpoint like any other, driven by
-datagrams and time. `client.vehicles` has the table of all kinds.
+at all; they are the client's only source of its state. `client.simulated` contains simulated
+vehicles. A real one communicates with its autopilot through a `port`, an endpoint like any other,
+driven by datagrams and time. `client.vehicles` has the table of all kinds.
 """
 
 import math
@@ -103,7 +103,7 @@ class Vehicle(ABC):
 
     @property
     def waits_for(self) -> str:
-        """What prevents the flight, in words; empty if nothing does."""
+        """Reason why the vehicle cannot fly yet, in words; empty if there is none."""
         return ""
 
     def take_off(self, *, now_ns: int) -> bool:  # noqa: ARG002 - ignored by default

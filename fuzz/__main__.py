@@ -22,7 +22,8 @@ except ImportError:
 LOOK_EVERY = 100
 """Number of inputs between two checks of the time."""
 GUIDED_SHARE = 0.5
-"""Share of inputs mutated by the target, which knows the format; atheris mutates the rest."""
+"""Share of inputs mutated by the target's own mutator, which keeps to the format; atheris mutates
+the rest."""
 SHM = Path("/dev/shm")
 """Folder in memory for files that are rewritten often."""
 

@@ -59,7 +59,9 @@ class Datagrams(Target):
 
 
 class Decoder(Datagrams):
-    """Decoder of a scenario's messages: it rejects a payload, or its message encodes again."""
+    """Decoder of a scenario's messages: a payload is rejected, or its message can be encoded
+    again.
+    """
 
     code = (protocol,)
 
@@ -79,8 +81,8 @@ class EndpointInFlight(Datagrams):
     """Server and client in flight, which each receive a payload besides their own messages.
 
     Args:
-        sealed: whether they have keys; then each payload is encrypted by the other end, as by a
-            faulty peer, and so passes all checks against senders without a key.
+        sealed: whether they have keys; then each payload is encrypted by the other end, as a faulty
+            peer would, and so passes all checks against senders without a key.
     """
 
     code: Sequence[ModuleType] = (

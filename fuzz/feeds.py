@@ -28,7 +28,9 @@ POINTS = 50
 
 
 class FeedTarget(Text):
-    """Target for a process's feed in pieces: it raises `FeedError`, or its frames encode again."""
+    """Target for a process's feed in pieces: a feed raises `FeedError`, or its frames can be
+    encoded again.
+    """
 
     code: Sequence[ModuleType] = (feed,)
 
@@ -111,7 +113,7 @@ class PageTarget(FeedTarget):
 
 
 def read(*pieces: bytes) -> list[Frame] | None:
-    """Frames of a feed; None if the bytes are no feed."""
+    """Frames of a feed; None if the bytes are not a feed."""
     reader = Reader()
     try:
         return [frame for piece in pieces for frame in reader.read(piece)]

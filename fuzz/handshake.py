@@ -76,7 +76,7 @@ class Strangers(EndpointInFlight):
         return bytes_changed(rng, payload)
 
     def _note(self, sender: str, payload: bytes) -> None:
-        if sender != "answer":  # a stranger who forwards all packets of both ends is no intruder
+        if sender != "answer":  # a stranger may forward all packets of both ends
             self.newest[sender, payload[1]] = payload
 
     def _attack(self, payload: bytes) -> None:
@@ -97,8 +97,8 @@ class Strangers(EndpointInFlight):
         assert self.newcomer._session.number is None, payload.hex()
 
     def _unheard(self, end: Server | Client, payload: bytes, peer: Address) -> None:
-        """Send an end a datagram that no peer has sealed: it must be dropped, or answered by a
-        cookie.
+        """Send a datagram that no peer has sealed to an end, where it must be dropped, or answered
+        by a cookie.
         """
         dropped = end.dropped.total()
         end.receive(Datagram(payload, peer), now_ns=self._now_ns)

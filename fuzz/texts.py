@@ -247,7 +247,7 @@ class ControlTarget(Text, EndpointInFlight):
             assert bool(parsed.changed) == (running.scenario != before), payload.hex()
             assert not (parsed.refused and parsed.changed), payload.hex()
             reading.check(reading.to_table(running.scenario), known=running.scenario)
-        running._endpoint.events()  # nobody else empties netem's events
+        running._endpoint.events()  # empties the list of netem's events
 
 
 class LogLines(Text):

@@ -4,7 +4,7 @@ import sys
 
 from skytether.shell.start import run
 
-if __name__ == "__main__":  # before the imports below, which take a while
+if __name__ == "__main__":  # called before the slow imports below
     sys.exit(run("skytether.netem.__main__:emulate", "netem"))
 
 import gc
@@ -24,7 +24,7 @@ from skytether.shell.process import ProcessOptions
 from skytether.shell.udp import files_max, leads_back, sockets_max
 
 COLLECT_AFTER = 100_000
-"""Number of new objects after which garbage is collected. Queued packets are no garbage, and the
+"""Number of new objects after which garbage is collected. Queued packets are not garbage, and the
 default of 700 would scan all of them many times a second."""
 
 
@@ -76,7 +76,7 @@ def emulate(argv: Sequence[str]) -> None:
 
 
 def _with_directions(options: NetemOptions) -> NetemOptions:
-    """Options with the network of --to-client and --to-server.
+    """Options with the network of --to-client and --to-server put into the scenario.
 
     Raises:
         ConfigError: the network is invalid.

@@ -4,7 +4,7 @@ import sys
 
 from skytether.shell.start import run
 
-if __name__ == "__main__":  # before the imports below, which take a while
+if __name__ == "__main__":  # called before the slow imports below
     sys.exit(run("skytether.server.__main__:serve", "server"))
 
 import secrets
@@ -121,7 +121,7 @@ def _work(
     gate: Gate = PlainGate()
     forms: tuple[Form, ...] = ()
     if keyring:
-        from skytether.server.secure import FORMS, SecureGate  # its ciphers take 30 ms, and 9 MB
+        from skytether.server.secure import FORMS, SecureGate  # ciphers: 30 ms, 9 MB
 
         gate, forms = SecureGate(keyring, entropy=secrets.token_bytes), FORMS
     axes, control = options.config.model.axes, options.config.control

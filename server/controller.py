@@ -251,7 +251,7 @@ class Controller:
             urgent = self._heartbeat_due[rows] | figures["fresh"] | (self._sent_step[rows] < 0)
             event = self.budget.choose(rows, event, urgent, worth, situation.since_sent_s)
             events = int(np.count_nonzero(event))
-        # After the budget: the committed scheme may only replay what is really sent.
+        # After the budget: the committed scheme may only replay horizons that are really sent.
         self.scheme.remember(rows, step, predicted, event)  # eq. (12)
         _note_sent(rows, step, event, self._sent_step)
         if events == n:  # with one vehicle: all or none

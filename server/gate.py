@@ -55,7 +55,7 @@ class Gate(Protocol):
 class PlainGate:
     secure = False
 
-    def open(self, datagram: Datagram, *, now_ns: int) -> GateCall:  # noqa: ARG002 - as of any `Gate`
+    def open(self, datagram: Datagram, *, now_ns: int) -> GateCall:  # noqa: ARG002 - interface of `Gate`
         return GateCall(datagram.payload, None, _PLAIN_REPLY, moves=True)
 
     def repeated(self, datagram: Datagram) -> int | None:  # noqa: ARG002 - as of any `Gate`

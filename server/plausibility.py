@@ -68,7 +68,7 @@ class HeardNumbers(NamedTuple):
     numbers: Annotated[NDArray[np.void], records(STATEMENT, 2)]
     """Last accepted, last rejected and new observation of each vehicle; shape (3, capacity)."""
     states: F4
-    """Positions [m] and velocities [m/s]; shape (3, capacity, axes, 2)."""
+    """Positions [m] and velocities [m/s] in these observations; shape (3, capacity, axes, 2)."""
 
 
 class Plausibility:

@@ -91,9 +91,10 @@ class _KeyedVehicle:
 
     def __init__(self, now_ns: int) -> None:
         self.attempts = _HandshakeRate(now_ns)
-        """Limit of attempts, which need the key; repeats, which anybody can send, do not count."""
+        """Rate limit of new handshake attempts, which only a holder of the key can make."""
         self.repeats = _HandshakeRate(now_ns)
-        """Limit of answers to repeats of an attempt."""
+        """Rate limit of answers to repeated INITIATIONs, which anybody who has recorded one can
+        send."""
         self.live: Channel | None = None
         """Channel in which the vehicle sends."""
         self.previous: Channel | None = None
@@ -201,7 +202,7 @@ class SecureGate:
         live = keyed and keyed.live
         return vehicle if live and live.number == number and live.repeats(packet) else None
 
-    def admit(self, call: GateCall, *, now_ns: int) -> None:  # noqa: ARG002 - as of any `Gate`
+    def admit(self, call: GateCall, *, now_ns: int) -> None:  # noqa: ARG002 - interface of `Gate`
         """Keep the channel created by the answer to this HELLO as pending."""
         answer = call.line
         assert isinstance(answer, _Answer)

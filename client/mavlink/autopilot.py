@@ -56,11 +56,11 @@ class Autopilot:
     """
 
     parts: Parts | None = None
-    """None until a heartbeat of a suitable autopilot has arrived."""
+    """Parts of the autopilot; None until a heartbeat of a suitable autopilot has arrived."""
     _unfit: NotTakenOff | None = None
     """Event that makes the vehicle unusable: unsuitable or silent."""
     _set_up_ns: int | None = None
-    """Time at which everything but the clock was ready."""
+    """Time at which everything except the clock was ready."""
     _began_ns: int | None = None
 
     def __init__(self, scenario: Scenario, vehicle: int, altitude: float, events: Events) -> None:
@@ -92,7 +92,7 @@ class Autopilot:
 
     @property
     def waits_for(self) -> str:
-        """What prevents the flight, in words; empty if nothing does."""
+        """Reason why the vehicle cannot fly yet, in words; empty if there is none."""
         if self.parts is None:
             return f"a heartbeat of its autopilot at {self._scenario.vehicle.address}"
         setup, launch, _ = self.parts
@@ -242,7 +242,7 @@ class Autopilot:
         ]
 
     def _await_clock(self, setup: Setup, now_ns: int) -> None:
-        """Give up if everything but the clock has been ready for too long."""
+        """Give up if everything except the clock has been ready for too long."""
         if not setup.is_done or self.clock.is_known or self._unfit:
             self._set_up_ns = None
         elif self._set_up_ns is None:

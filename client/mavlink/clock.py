@@ -32,7 +32,7 @@ SPREAD_NS = MILLISECOND_NS
 DRIFT_SPAN_NS = 10 * SECOND_NS
 """Time span of the answers above which drift is fitted."""
 DRIFT_MAX = 0.02
-"""Largest drift that is followed: PX4's own simulator runs 0.9 % slow."""
+"""Largest drift of the autopilot's clock that is followed: PX4's own simulator runs 0.9 % slow."""
 WANDER = 500e-6
 """Largest change of the drift within the window, from a warming crystal or a busy simulator."""
 RATED = 8

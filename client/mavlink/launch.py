@@ -115,7 +115,7 @@ class Launch:
         """Whether take-off is no longer allowed."""
         self._landing_mode = flavour.land
         self.waits_for = ""
-        """What prevents the take-off, in words; empty if nothing does."""
+        """Reason why the vehicle cannot take off yet, in words; empty if there is none."""
         self._stated_reason = ""
         """Reason that the autopilot gave in this step."""
         self._refused: set[tuple[int, int]] = set()
@@ -309,7 +309,9 @@ class Launch:
         return [self._mode_command(self._flavour.land)]
 
     def _is_ours(self, now_ns: int) -> bool:
-        """Whether the vehicle is armed and in a mode of ours, as far as is currently known."""
+        """Whether the vehicle is armed and in a mode of `Flavour.own`, as far as is currently
+        known.
+        """
         condition = self._condition
         in_ours = condition.mode in self._flavour.own and condition.armed
         return in_ours and condition.is_fresh(now_ns=now_ns)

@@ -49,7 +49,8 @@ class Obedience:
         self._outside_ns: int | None = None
         """Time since which the velocity has been outside the bounds; None while it is inside."""
         self._strayed_ns: int | None = None
-        """Newest time at which the velocity had been outside for NOTICED_NS; None for never."""
+        """Newest time at which the velocity had been outside for NOTICED_NS; None if it never had
+        been."""
         self.off_mps = 0.0
         """Newest distance of the velocity from its bounds [m/s]."""
 

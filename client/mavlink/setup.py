@@ -29,7 +29,7 @@ TRIES = 10
 """Number of times that a question is asked; with 10 % loss each way, one in ten million stays
 open."""
 AT_ONCE = 4
-"""Number of open questions at a time: a serial line takes no more."""
+"""Largest number of open questions at once, for the sake of serial lines."""
 VERSION = int(dialect.MAVLINK_MSG_ID_AUTOPILOT_VERSION)
 BYTEWISE = dialect.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE
 CONVERTED = dialect.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_C_CAST
@@ -110,12 +110,12 @@ class Setup:
         if name in self._setting:
             before, wanted = self._setting[name]
             if abs(value - wanted) > safety.TOLERANCE:
-                return  # an answer to an earlier question, or a refusal: it is set again
+                return  # an old answer, or a refusal: set it again
             del self._setting[name]
             self._changed.append((name, before, value))
         self._values[name], self._kinds[name] = value, kind
         for rule in self._rules:
-            if name in rule.names:  # an autopilot has only one of the names
+            if name in rule.names:  # an autopilot uses one of the rule's names
                 for other_name in rule.names:
                     self._tries.pop(other_name, None)
 

@@ -16,7 +16,7 @@ SILENT_NS = 10 * SECOND_NS
 
 
 class Timesync:
-    """Asks one autopilot for its clock, which the answers set."""
+    """Requests the time of one autopilot; the answers set the `BootClock`."""
 
     def __init__(self, clock: BootClock, vehicle: int, events: Events) -> None:
         self._clock, self._vehicle, self._events = clock, vehicle, events

@@ -47,7 +47,7 @@ class MavlinkVehicle(Vehicle):
         return True
 
     def fly(self, velocity: Array) -> None:
-        """In the plane the vehicle keeps its altitude."""
+        """Fly with a velocity; in the plane the vehicle keeps its altitude."""
         x, y, *up = velocity.tolist()
         self._port.fly((x, y, up[0] if up else 0.0))
 
@@ -63,7 +63,7 @@ class MavlinkVehicle(Vehicle):
         return self._autopilot.waits_for
 
     def take_off(self, *, now_ns: int) -> bool:
-        """A vehicle on the ground is armed only if its scenario is."""
+        """Take off; a vehicle on the ground is armed only if the scenario's key `armed` is true."""
         return self._port.take_off(may_arm=self._may_arm, now_ns=now_ns)
 
     def is_up(self, *, now_ns: int) -> bool:
@@ -105,7 +105,7 @@ class MavlinkVehicle(Vehicle):
         return self._port.is_down
 
     def change(self, scenario: Scenario) -> None:
-        """Arming the scenario lets the vehicle take off."""
+        """Apply changed keys; setting `armed` lets the vehicle take off."""
         self._may_arm = scenario.armed
         origin, positions = given_origin(scenario), self._autopilot.positions
         if origin is not None and not positions.has_origin:

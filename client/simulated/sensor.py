@@ -1,6 +1,6 @@
 """Sensor of position and velocity, with its rate, delay, noise and bias.
 
-    z(k) = x(k - D) + b + σ n          D: delay [steps]   b: bias   σ n: noise, drawn anew each time
+    z(k) = x(k - D) + b + σ n          D: delay [steps]   b: bias   σ n: noise
 
 A measurement is made at the start of a step, and becomes available at the start of the first step
 at which it is due and its delay has passed. At step 0 everything measured at all is due; before
@@ -54,7 +54,7 @@ class Sensor:
         self._normals = Normals(rng, (len(noisy), len(nothing))) if noisy else None
         """Random numbers n of a sensor that measures the whole state at every step."""
         self._noisy = noisy
-        """Which of position (0) and velocity (1) have noise."""
+        """Indices of the measured quantities with noise: position 0, velocity 1."""
         self._drawn = np.zeros_like(self._bias)
         """Numbers n if only one has noise; shape (2, axes)."""
         self._states: deque[Array] = deque(maxlen=self.delay + 1)

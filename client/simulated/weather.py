@@ -48,7 +48,8 @@ class Weather:
         L = vehicle.wind * white_acceleration(self._tau, self._dt_s)
         self._white = np.stack((L[:, 0, 0], L[:, 1, 0], L[:, 1, 1]), -1) if vehicle.wind else None
         self._gust_mps2 = vehicle.gust_mps2
-        # Probability per step of an event of constant rate: exact for any length of a step.
+        # Probability that an event of constant rate occurs in a step, exact for any length of a
+        # step.
         self._gust_end_chance = float(-np.expm1(-self._dt_s / vehicle.gust_s))
         self._gust_start_chance = float(-np.expm1(-self._dt_s / vehicle.gust_every_s))
         self._steady_mps = np.array(vehicle.steady_wind_mps or np.zeros(len(self._tau)))

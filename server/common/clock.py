@@ -123,7 +123,7 @@ class Seen(NamedTuple):
     """Clock samples of up to `capacity` vehicles."""
 
     vehicles: Annotated[NDArray[np.void], records(VEHICLE_CLOCK, 1)]
-    """Shape (capacity,)."""
+    """Clock of each vehicle; shape (capacity,)."""
     minimum: I3
     """Smallest F and G of each interval [ns], as a ring; shape (capacity, 2, BUCKETS)."""
     samples: I2
@@ -388,7 +388,7 @@ def _observe(
     vehicle, bucket = seen.vehicles[row], now // BUCKET_NS
     is_new = is_newest and heard != vehicle.heard
     contradiction = _bound(seen, row, forward, backward, is_new, now)
-    # A repeated echo is no new sample of the delay.
+    # A repeated echo is not a new sample of the delay.
     if heard != vehicle.heard:
         vehicle.heard = heard
         seen.echoes[row, vehicle.echoes % ECHOES] = backward

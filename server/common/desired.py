@@ -30,7 +30,7 @@ from skytether.shared.wire.protocol import committed_max
 PAGE = 128
 """Number of steps of a desired trajectory in a page."""
 PAGES = 256
-"""Number of slots for pages: more than a block of vehicles can need at once."""
+"""Number of slots for pages; a block of vehicles needs fewer at once."""
 EMPTY = -1
 """Key of an empty slot."""
 FOUND = -1
@@ -38,7 +38,8 @@ FOUND = -1
 TRAJECTORY = 2**40
 """Stride between keys of trajectories: page p of trajectory t has the key t * TRAJECTORY + p."""
 SPREAD = 31
-"""Number of slots between the first pages of successive trajectories; odd, so that all differ."""
+"""Distance between the slots of the first pages of successive trajectories, modulo PAGES; odd, so
+that these slots differ."""
 TINY = 1e-9
 """Rounding tolerance of a quotient such as 0.15 / 0.05."""
 
@@ -84,7 +85,8 @@ class Desired:
         self._point = _live(scenario) if wanted.shape == "live" else None
         self._all = wanted.preview == "all" and self._point is None
         self._reach = H
-        """Steps in a page after its PAGE steps; without a full preview, the visible steps."""
+        """Steps that a page covers beyond its first PAGE steps: H, or with a limited preview the
+        visible steps."""
         if not self._all:
             seen_s = 0.0 if self._point or isinstance(wanted.preview, str) else wanted.preview
             # TINY: 0.15 / 0.05 is 2.9999999999999996.
@@ -105,7 +107,8 @@ class Desired:
         self._dt_s = terms.dt_s
         self._steps = np.arange(PAGE + self._reach + 1)
         self._axes, self._late, shifts = axes, bool(late_s.any()), bool(self._ahead_s.any())
-        # Pages shifted by a dead time also have rows for the states at the steps themselves.
+        # With a dead time a page holds two sets of rows: the states shifted by it, and those at the
+        # steps.
         rows = 2 * axes if shifts else axes
         pages = (1, axes, 1, 2) if self._point else (PAGES, rows, len(self._steps), 2)
         self._pages = np.zeros(pages)
@@ -113,7 +116,7 @@ class Desired:
         self._at_once = np.zeros(block, dtype=np.int64)
         """Zeros in place of d, for states from k on."""
         self._keys = np.full(PAGES, EMPTY, dtype=np.int64)
-        """Key of the page in each slot, or EMPTY; shape (PAGES,)."""
+        """Key of the page stored in each slot, or EMPTY; shape (PAGES,)."""
         self._found = Window(
             self._pages, np.zeros(block, dtype=np.int64), np.zeros(block, dtype=np.int64)
         )
@@ -177,8 +180,8 @@ class Desired:
             return self._found
         keys = self._keys
         while (i := _find(keys, self._number, rows, steps, ahead, self._found)) != FOUND:
-            # The search of `_slot` needs an empty slot to end: before the last one is used, all
-            # pages are dropped. A block of vehicles needs half of PAGES at most.
+            # The search of `_slot` ends at an empty slot. So before the last empty slot is used,
+            # all pages are dropped. A block of vehicles needs half of PAGES at most.
             if np.count_nonzero(keys == EMPTY) == 1:
                 keys[:] = EMPTY
             number, page = int(self._number[rows[i]]), int(steps[i] + ahead[i]) // PAGE
@@ -186,7 +189,7 @@ class Desired:
             at = plain(_slot)(keys, number, page)
             times_s = (page * PAGE + self._steps) * self._dt_s
             states = sample(times_s).transpose(1, 0, 2)
-            # If no axis is shifted, both slices are the same rows, written twice.
+            # Without a dead time both slices are the same rows, which are then written twice.
             self._pages[at, : self._axes] = self._pages[at, -self._axes :] = states
             for axis in np.flatnonzero(self._ahead_s):
                 self._pages[at, axis] = sample(times_s + self._ahead_s[axis])[:, axis]

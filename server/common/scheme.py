@@ -232,7 +232,7 @@ class Scheme(ABC):
         Args:
             rows: rows of the vehicles; shape (n,).
             step: step k of each; shape (n,).
-            foresight: output: all fields but the plans.
+            foresight: output: all fields except the plans.
         """
 
     @abstractmethod
@@ -283,7 +283,7 @@ class Scheme(ABC):
         """Vehicles that rest inside a zone, and the zone's name; the caller empties the list."""
         return []
 
-    def change_zones(self, zones: Zones) -> None:  # noqa: B027 - most schemes know no zones
+    def change_zones(self, zones: Zones) -> None:  # noqa: B027 - most schemes fly no missions
         """Replace the zones that vehicles keep out of."""
 
     def objection(self, zones: Zones) -> str:  # noqa: ARG002

@@ -35,7 +35,7 @@ class DualWorkspace(NamedTuple):
     R: F2
     """Upper triangle: active normals transformed by Jᵀ; shape (n, n)."""
     work: F2
-    """Shape (5, n + 1)."""
+    """Scratch array; shape (5, n + 1)."""
     active: I1
     """Active constraints; shape (n + 1,)."""
 

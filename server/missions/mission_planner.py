@@ -255,7 +255,7 @@ class MissionPlanner(SplineScheme):
         if row in self._state.restarted:
             return "its client, which has begun anew"
         if vehicle.sent:
-            return "an acknowledgement"  # until then it is unknown which motion it flies
+            return "an acknowledgement"  # before it, the motion flown is unknown
         has_motion = vehicle.in_force is not None and vehicle.in_force.step >= 0
         return "" if has_motion or vehicle.speed_mps <= RESTS_MPS else "coming to rest"
 

@@ -225,7 +225,7 @@ class MissionState:
                 None,
             )
             vehicle.is_foreign = accepted is None
-            if accepted is None:  # of another server, or of another vehicle that was in this row
+            if accepted is None:  # sent by another server, or to the row's previous vehicle
                 self.rows.unknown_until[row] = observation.in_force + LONGEST
                 accepted = SentMotion(observation.in_force, resting(k, observation.state[:, 0]))
             vehicle.in_force = accepted

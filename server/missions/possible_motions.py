@@ -93,7 +93,7 @@ class PossibleMotions:
         return self.arrays.row[: self.count]
 
 
-@making_part  # numba counts references to what it returns
+@making_part  # numba counts references to the arrays that the function returns
 def motion_at(arrays: MotionArrays, m: int) -> PossibleMotion:
     n = arrays.knots[m]
     return PossibleMotion(

@@ -31,7 +31,7 @@ class Routes:
         self._graph = lru_cache(GRAPHS_MAX)(self._make)
 
     def way(self, place: Array, goal: Array) -> Array:
-        """Corners of the shortest route, then the goal; without a route only the goal; shape (n,
+        """Corners of the shortest route and the goal; only the goal if there is no route; shape (n,
         axes).
         """
         if not self._zones:

@@ -24,7 +24,8 @@ CLOSED_MAX = 8
 NEARER_M = 0.3
 """Reduction of the remaining path that counts as progress [m]."""
 PROMPT_COUNT = 8
-"""Number of successive motions acknowledged at once after which motions are sent less often."""
+"""Number of motions in a row, each acknowledged promptly, after which motions are sent less
+often."""
 
 
 class SentMotion(NamedTuple):
@@ -72,7 +73,7 @@ class VehicleMotions:
         self.copies = 1
         """Number of times that a motion is sent."""
         self.prompt_count = 0
-        """Number of successive motions acknowledged at once."""
+        """Number of motions in a row that were acknowledged promptly."""
         self.repeat: SentMotion | None = None
 
     def motions(self) -> list[Motion]:

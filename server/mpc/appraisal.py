@@ -16,7 +16,7 @@ GENERATOR, TRACKER = 0, 1
 class PlanMemory(NamedTuple):
     """Latest plans of both MPCs for every vehicle."""
 
-    # Inputs are float32, and states are computed from them anew: 0.8 MB for a thousand vehicles.
+    # Inputs are float32, and states are computed from them again: 0.8 MB for a thousand vehicles.
     # With float64 and stored states it was four times as large, and exceeded the cache of a core.
     inputs: S4
     """Latest inputs U(k-1) [m/s], rounded as sent; shape (2, capacity, axes, H)."""
@@ -83,7 +83,8 @@ def _deviate(
 
     Args:
         i: index of the vehicle in the block.
-        distance: sums to which the stages add, as far as both are flown [m²]; shape (H + 1,).
+        distance: input and output: sum over the axes at each stage, as far as both are flown [m²];
+            shape (H + 1,).
     """
     held, usable = foresight.held[i, axis], foresight.usable[i]
     model, w, H = axis_at(mpc.model, axis), foresight.disturbance[i, axis], len(held)

@@ -247,7 +247,8 @@ def active_sets(mpc: MPC, axis: int, which: int, simd: SimdBatch, free: F4, sett
 
     Args:
         which: FIRST or LATER weights.
-        simd: reads gradient and previous, whose active set is the first; fills in inputs [m/s].
+        simd: input: gradient, and the previous plan, with whose active set the iteration starts;
+            output: inputs [m/s].
         free: `RiccatiWorkspace.free`.
         settled: set to False for a vehicle without a solution; shape (L,).
 

@@ -47,7 +47,7 @@ def observe_disturbance(
     if replayable:
         first = first_in_flight(sent, row, seen.base_in_force, begin)
         legs = make_schedule(schedule, sent, row, begin, before, range(first, after))
-        # The newest observation reports the horizon in force, and since when.
+        # The newest observation reports the horizon in force, and the step from which it was flown.
         while legs > 1 and schedule.begins[legs - 1] >= delivery.since:
             legs -= 1
         if delivery.since <= begin:

@@ -91,9 +91,9 @@ class ReplayMemory(NamedTuple):
 
     sent: Sent
     seen: Annotated[NDArray[np.void], records(OBSERVATIONS, 1)]
-    """Shape (capacity,)."""
+    """Newest two observations of each vehicle; shape (capacity,)."""
     state: Annotated[NDArray[np.void], records(AXIS_STATE, 2)]
-    """Shape (capacity, axes)."""
+    """Newest two observations of each vehicle on each axis; shape (capacity, axes)."""
     horizons: Annotated[NDArray[np.void], records(SENT_HORIZON, 2)]
     """Horizons in the ring; shape (capacity, ring)."""
     inputs: S4
@@ -144,7 +144,8 @@ def store_sent(
         for axis in range(len(settings.laws)):
             for stage in range(length):
                 memory.inputs[row, slot, axis, stage] = foresight.horizons[i, axis, stage]
-            # Computed as by `HorizonFollower` aboard: both ends have to brake from the same speed.
+            # Computed as `HorizonFollower` does aboard: both ends have to brake from the same
+            # speed.
             last = bounded(
                 float(foresight.horizons[i, axis, length - 1]), settings.laws[axis].bound
             )

@@ -7,7 +7,7 @@ import numpy as np
 
 def stream(seed: int, *names: str | int) -> np.random.Generator:
     """Independent random generator for one purpose, as in `stream(3, "uplink", "delay", flow)`."""
-    # The count comes first: to a SeedSequence [1, 2] and [1, 2, 0] are the same.
+    # The number of names comes first: a SeedSequence takes [1, 2] and [1, 2, 0] for equal.
     numbers = [zlib.crc32(name.encode()) if isinstance(name, str) else name for name in names]
     return np.random.Generator(
         np.random.Philox(np.random.SeedSequence([seed, len(numbers), *numbers]))

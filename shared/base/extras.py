@@ -6,11 +6,11 @@ from contextlib import contextmanager
 from importlib import util
 
 MODULES = {"pillow": "PIL"}
-"""Import names of packages, where they differ."""
+"""Import names of packages, where they differ from the names of the packages."""
 
 
 class ExtraMissing(ModuleNotFoundError):
-    """An extra is needed; the message says which, and how to install it."""
+    """An extra is needed; the message names it, and the command that installs it."""
 
     def __init__(self, module: str, extra: str) -> None:
         command = f"pip install 'skytether[{extra}]', or in a checkout make setup"

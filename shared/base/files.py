@@ -96,7 +96,7 @@ def claim(path: Path, *, is_input: bool = False) -> None:
         return
     folder = path.absolute().parent
     if not os.access(folder, os.W_OK | os.X_OK):
-        folder.stat()  # raises if it is missing, which access does not distinguish
+        folder.stat()  # raises if the folder is missing
         raise OSError(EACCES, os.strerror(EACCES), str(path))
     with ExitStack() as stack:
         flags = os.O_WRONLY | FLAGS | (os.O_CREAT | os.O_EXCL if is_new else 0)
@@ -281,7 +281,7 @@ def replacing(
         flags = os.O_TMPFILE | os.O_RDWR | os.O_CLOEXEC
         descriptor = os.open(path.absolute().parent, flags, MODE if mode is None else mode)
     except OSError as error:
-        if error.errno not in (EISDIR, EOPNOTSUPP):  # the latter on NFS, for example
+        if error.errno not in (EISDIR, EOPNOTSUPP):  # EOPNOTSUPP for example on NFS
             raise
         part, descriptor = _unused(path, partial(_new, mode=MODE if mode is None else mode))
     try:
@@ -307,7 +307,7 @@ def appending(path: Path) -> BinaryIO:
     """Open a file for reading and appending, locked until it is closed.
 
     Raises:
-        OSError: the file cannot be written, is no plain file, or another command has locked it.
+        OSError: the file cannot be written, is not a plain file, or another command has locked it.
     """
     check(path)
     file = os.fdopen(os.open(path, os.O_RDWR | os.O_CREAT | FLAGS, MODE), "r+b")
@@ -324,10 +324,10 @@ class Growing:
     beside it as NAME.part1.SUFFIX until it is complete, see `end`.
 
     Args:
-        buffering: as in `open`; 0 for none.
+        buffering: as in `open`; 0: no buffer.
 
     Raises:
-        OSError: it cannot be written, or is no plain file.
+        OSError: it cannot be written, or is not a plain file.
     """
 
     def __init__(self, path: Path, buffering: int = -1) -> None:

@@ -455,7 +455,7 @@ class ClockContradicted(VehicleEvent, frozen=True, kw_only=True):
 
 
 class TimeUnknown(msgspec.Struct, frozen=True, tag=True, kw_only=True):
-    """`link.time_of_day` is "host", but the host does not know the error of its clock."""
+    """`link.time_of_day` is "host", but the error of the host's clock is unknown."""
 
     def __str__(self) -> str:
         return (

@@ -38,7 +38,7 @@ def dead_time(tau_s: float, dead_time_s: float, dt_ns: int, gain: float = 1.0) -
     steps, rest_ns = divmod(seconds_to_ns(dead_time_s), dt_ns)
     if not rest_ns:
         return DeadTime(steps, None, (0.0, 0.0))
-    # B is not linear in time, so B(Δt - r) is discretised anew, not taken as a share of B.
+    # B is not linear in time, so B(Δt - r) is discretised by itself, not taken as a share of B.
     times_s = (dt_ns / SECOND_NS, (dt_ns - rest_ns) / SECOND_NS, rest_ns / SECOND_NS)
     whole, after, rest = (discretise([tau_s], time_s, gain).axes()[0] for time_s in times_s)
     return DeadTime(steps, rest, (whole.b0 - after.b0, whole.b1 - after.b1))

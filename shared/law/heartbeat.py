@@ -28,17 +28,17 @@ TIMEOUT_SHARE = 0.95
 WINDOW = 128
 """Number of newest packets whose arrival is recorded."""
 ASSUMED, WEIGHT = 0.3, 4
-"""Share lost that is assumed initially, and the weight of this assumption in packets."""
+"""Loss ratio that is assumed initially, and the weight of this assumption in packets."""
 NUMBERS = 128
 BEFORE = -(2**64)
 SILENCE_MAX = 2**16 - 1
 """Longest silence that can be requested [half steps]."""
 SESSION_NS = 30 * SECOND_NS
 """Silence after which the server forgets a vehicle."""
-# Three were worse: the observations behind the plans became so old that at 30 % loss 5 of 30
-# flights of `target` braked before a newer plan came; with two, none.
+# Three were worse: the observations from which plans were made became so old that at 30 % loss 5 of
+# 30 flights of `target` braked before a newer plan came; with two, none.
 PATIENCE = 2
-"""Time for which the server waits for a vehicle, in time-outs of the vehicle."""
+"""Server's time-out for a vehicle, as a multiple of the vehicle's own time-out."""
 
 
 def false_per_h(silence_ns: int, timeout_ns: int, loss: float) -> float:
@@ -125,7 +125,7 @@ class Hearing:
 
     @property
     def loss(self) -> float:
-        """Share of the other end's packets that are lost, rather too large than too small."""
+        """Share of the other end's packets that are lost, estimated on the high side."""
         counted = min(self.newest + 1, WINDOW)
         lost = counted - self._received.bit_count()
         # A prior of WEIGHT packets: among the first few of a session a single loss must not look

@@ -10,7 +10,7 @@ NOISE_M, NOISE_MPS = 1.0, 2.0
 
 
 def velocity_leaps(v: float, after_v: float, time: float, noise: float) -> bool:
-    """Whether no vehicle can have changed its velocity so much.
+    """Whether a change of velocity is larger than any vehicle can make.
 
     Args:
         v, after_v: velocity on one axis before and after [m/s].
@@ -35,7 +35,7 @@ def displacement(p: float, v: float, after_p: float, after_v: float, time: float
 def position_leaps(
     p: float, v: float, after_p: float, after_v: float, time: float, noise: float
 ) -> bool:
-    """Whether no vehicle can have moved from one position to the other; arguments as in
+    """Whether a change of position is larger than any vehicle can make; arguments as in
     `displacement`.
 
     `noise` is the change of position that noise may cause [m].

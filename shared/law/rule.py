@@ -96,7 +96,7 @@ def bounded(u: float, bound: float) -> float:
 
 
 def braked(speed: float, steps: int, brake: float) -> float:
-    """Speed that is left after so many steps of braking [m/s]; `brake` is the decrease per step
+    """Speed that is left after a number of steps of braking [m/s]; `brake` is the decrease per step
     [m/s].
     """
     return max(0.0, speed - steps * brake)

@@ -16,8 +16,8 @@ The vehicle flies, at each stage i,
 regulator (`shared.scenario.gain`), u(i-1) the input flown until now, and ŵ the disturbance
 estimated by the vehicle's own filter. x is the state in which the input takes effect
 (`shared.law.dead_time`), so the spline is the desired trajectory later by the dead time. No input
-is flown for longer than `link.age_max_s` after the observation behind it: from then on ū is held,
-or braked as in `shared.law.rule`, and x̄ follows eq. (4) with this ū until it rests.
+is flown for longer than `link.age_max_s` after the observation from which it was planned: from then
+on ū is held, or braked as in `shared.law.rule`, and x̄ follows eq. (4) with this ū until it rests.
 
 The client flies by these functions, and the server compiles them.
 """

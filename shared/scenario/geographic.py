@@ -19,10 +19,11 @@ Origin = tuple[float, ...]
 
 
 def check_origin(latitude: Any, longitude: Any, form: str) -> Origin:
-    """Origin from two members of a file; raises ValueError if they are none.
+    """Origin from two members of a file; raises ValueError if they are not a latitude and a
+    longitude.
 
     Args:
-        form: how the file writes it, for the message.
+        form: expected form of the members in the file, for the message.
     """
     origin = number(latitude), number(longitude)
     if not (abs(origin[0]) <= NORTH_MAX and abs(origin[1]) <= 180.0):
@@ -73,7 +74,7 @@ def local(degrees: Array, origin: Origin) -> Array:
     longitude, latitude = degrees.T
     if not ((np.abs(longitude) <= 180.0).all() and (np.abs(latitude) <= NORTH_MAX).all()):
         raise ValueError("coordinates of longitude and latitude")
-    away = np.mod(longitude - east + 180.0, 360.0) - 180.0  # works across the antimeridian
+    away = np.mod(longitude - east + 180.0, 360.0) - 180.0  # correct across the antimeridian
     degree = math.radians(1.0) * EARTH_M
     scale = np.cos(np.radians((latitude + north) / 2.0))
     return within(

@@ -5,7 +5,7 @@
     argument := value | key=value
 
 `&` binds tighter than `|`. A value is a number or a word, such as a file name; in quotes it may
-have any character but a quote. Impairments, zones and goals are calls joined by `&` only. The
+have any character except a quote. Impairments, zones and goals are calls joined by `&` only. The
 tables in `shared.scenario.registry` list the names.
 """
 
@@ -36,7 +36,7 @@ NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?", re.IGNORECASE | r
 
 
 class GrammarError(Exception):
-    """Error in a text: the invalid part `given`, and what was `expected`."""
+    """Error in a text: the invalid part, and the expected form."""
 
     def __init__(self, given: str, expected: str) -> None:
         super().__init__(f"got {given!r}, expected {expected}")

@@ -324,8 +324,8 @@ class Guided:
         self._references, self.goals = references, goals
 
     def of(self, vehicle: int) -> Reference:
-        """Reference of a vehicle: its replaced goal, if any; its start at time
-        0 is never replaced.
+        """Reference of a vehicle: after time 0 its replaced goal, if it has one; otherwise that of
+        the mission.
         """
         original = self._references(vehicle)
 

@@ -46,15 +46,16 @@ def periodic(now: Unreported, N: Annotated[int, Meta(ge=1, le=PERIOD_MAX)]) -> b
 
 @REPORTS
 def deviation(now: Unreported, metres: Annotated[float, Meta(ge=0, le=1e9)]) -> bool:
-    """Sends if the vehicle is more than so many metres from where the server expects it, if another
-    horizon has come into force or the same one was received again, or if its mode has changed.
+    """Sends if the vehicle is farther than this many metres from where the server expects it, if
+    another horizon has come into force or the same one was received again, or if its mode has
+    changed.
     """
     return now.is_news or now.off_m > metres
 
 
 @REPORTS
 def silence(now: Unreported, seconds: Annotated[float, Meta(ge=0.001, le=3600)]) -> bool:
-    """Sends after so many seconds without an observation."""
+    """Sends after this many seconds without an observation."""
     return now.steps * now.dt_s > seconds - now.dt_s / 2.0
 
 

@@ -27,7 +27,7 @@ LONG_S = 1e6
 FRAMES = {0: "above the sea", 3: "above home"}
 """MAV_FRAME of altitudes that can be flown."""
 WRONG = (KeyError, TypeError, AttributeError, IndexError)
-"""Errors of Python where a file has not the structure of a plan."""
+"""Exceptions that Python raises where a file does not have the structure of a plan."""
 
 
 class Home(NamedTuple):
@@ -47,7 +47,7 @@ def fences(file: File) -> list[Zone]:
     """Zones of a plan's geofence.
 
     Raises:
-        ValueError: it is no plan, or has no geofence.
+        ValueError: the file is not a plan, or has no geofence.
         GrammarError: a part is invalid; the message names it and the expected form.
     """
     plan, home = _plan(file.content, file.origin)
@@ -88,7 +88,7 @@ def _circle(part: Any, home: Home) -> Array:
 
 
 def has_fence(content: bytes) -> bool:
-    """Whether a plan has a geofence; raises ValueError if it is no plan."""
+    """Whether a plan has a geofence; raises ValueError if the file is not a plan."""
     plan, _ = _plan(content, ())
     return any(_fence(plan).values())
 
@@ -111,7 +111,7 @@ def route(content: bytes, axes: int, origin: Origin) -> tuple[Array, Array]:
     says so. It starts at the planned home, takes off straight up, and ends where it would land.
 
     Raises:
-        ValueError: it is no plan, or an item cannot be flown; the message names it.
+        ValueError: the file is not a plan, or an item cannot be flown; the message names it.
     """
     plan, home = _plan(content, origin)
     mission = plan.get("mission")
@@ -205,7 +205,7 @@ def _place(
 
 
 def _plan(content: bytes, origin: Origin) -> tuple[dict[str, Any], Home]:
-    """A plan, and the origin of its coordinates; raises ValueError if it is none."""
+    """A plan, and the origin of its coordinates; raises ValueError if the content is not a plan."""
     try:
         plan = json.loads(content)
     except (ValueError, RecursionError) as error:

@@ -2,7 +2,7 @@
 
     @trigger
     def slip(now: Situation, mps: Annotated[float, Meta(ge=0)]) -> Flags:
-        '''Sends where the velocity is off its plan by more than so many m/s.'''
+        '''Sends where the velocity is off its plan by more than this many m/s.'''
 
 A table is used as the decorator of its entries, built-in or from a plug-in. The entry's name,
 bounds and help come from the decorated function or class. The program passes a fixed number of

@@ -350,7 +350,7 @@ class MavlinkConfig(Section, frozen=True):
     restarts in the air without a saved origin hovers until this key is set."""
     second_commander: OfVehicle[Literal["brake", "yield"]] = "brake"
     """Reaction to a second commander, or to a vehicle that ignores its commands: brake and then
-    land; or yield, as to a pilot."""
+    land; or yield, as if a pilot had taken over."""
     patience_s: OfVehicle[Annotated[float, Meta(ge=1, le=600)]] = 60.0
     """Longest wait for the first heartbeat, and for each step of take-off [s]."""
 
@@ -372,8 +372,8 @@ class LinkConfig(Section, frozen=True):
     """Longest silence allowed to the other end [s]; auto: from this end's `timeout_s` and the
     measured loss."""
     age_max_s: Term[Annotated[float, Meta(gt=0, le=60)]] = 5.0
-    """Largest age of the observation behind an input [s]; after that the vehicle acts as at the end
-    of a horizon (`vehicle.exhausted`)."""
+    """Largest age of the observation from which an input was computed [s]; after that the vehicle
+    acts as at the end of a horizon (`vehicle.exhausted`)."""
     join_s: Term[Annotated[float, Meta(ge=0, le=10)]] = 0.0
     """Time after a trajectory's first knot during which the vehicle accepts it [s]; 0: always. With
     a limit the server knows which trajectory is flown."""
@@ -451,7 +451,7 @@ class Scenario(Section, frozen=True):
 
     @property
     def table(self) -> bytes:
-        """Content of `reference.file`, for a shape that is read from it; else empty.
+        """Content of `reference.file`, for a shape that is read from it; otherwise empty.
 
         Raises:
             ConfigError: the file was not read with the scenario.

@@ -48,7 +48,9 @@ class SchemeProperties(NamedTuple):
 
     @property
     def computes(self) -> tuple[str, ...]:
-        """Figures that the scheme provides to triggers, and HELD if it knows those inputs."""
+        """Figures that the scheme provides to triggers, and HELD if it computes the inputs that are
+        flown if nothing is sent.
+        """
         return (*self.figures, HELD) if self.commits else self.figures
 
 

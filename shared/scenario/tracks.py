@@ -79,13 +79,13 @@ FORMS = (
 
 @lru_cache(maxsize=2)  # each vehicle's reference needs them
 def tracks(content: bytes, axes: int, origin: Origin | None = ()) -> Tracks:
-    """Tracks in a file, of one of the kinds above.
+    """Tracks in a file, in one of the formats listed at the top of this module.
 
     Args:
         origin: latitude and longitude of the scenario's origin [degrees]; None: any.
 
     Raises:
-        ValueError: the file is invalid; says what and where.
+        ValueError: the file is invalid; the message names the fault and its place.
     """
     if content.startswith(b"PK"):
         found = _zip(content, axes, origin)
@@ -102,7 +102,7 @@ def path(content: bytes, axes: int, origin: Origin = ()) -> Reference:
     """Path of the single vehicle in a file, straight from point to point.
 
     Raises:
-        ValueError: the file is invalid; says what and where.
+        ValueError: the file is invalid; the message names the fault and its place.
     """
     found = tracks(content, axes, origin)
     if len(found) > 1:
@@ -118,7 +118,7 @@ def lasts_s(content: bytes, axes: int) -> float:
     """Time of the last point in a file, wherever the scenario's origin is [s].
 
     Raises:
-        ValueError: the file is invalid; says what and where.
+        ValueError: the file is invalid; the message names the fault and its place.
     """
     return float(max(times_s[-1] for times_s, _ in tracks(content, axes, None).values()))
 
@@ -165,7 +165,7 @@ def _table(content: bytes, axes: int, origin: Origin | None) -> Tracks:
 
 
 def _polynomials(content: bytes, axes: int) -> tuple[Array, Array]:
-    """Points along polynomials of time since the begin of each piece."""
+    """Points along polynomials of time since the beginning of each piece."""
     names = [f"{axis}^{power}" for axis in "xyz"[:axes] for power in range(DEGREE + 1)]
     rows, lines = _read(content, ["duration", *names])
     lengths_s = rows[:, 0]
@@ -261,7 +261,7 @@ def _read(content: bytes, names: list[str]) -> tuple[Array, Indices]:
     """Named columns of a CSV table, shape (rows, columns), and the number of each row's line.
 
     Raises:
-        ValueError: the table is invalid; says what and in which line.
+        ValueError: the table is invalid; the message names the fault and the line.
     """
     import csv  # needed for files only
 

@@ -51,7 +51,7 @@ class SituationArrays(NamedTuple):
     largest d + H)."""
     held: Array | None
     """Inputs that are flown from k+d on if nothing is sent [m/s]; shape (block, axes, H). None if
-    the scheme does not know them."""
+    the scheme does not compute them."""
     sent_step: Indices
     """Step at which a horizon was last sent to each vehicle, or -1; shape (capacity,)."""
     heartbeat_due: Flags
@@ -94,7 +94,7 @@ class Situation(NamedTuple):
         """Inputs that the vehicle flies from k+d on if nothing is sent [m/s]; shape (n, axes, H).
 
         Raises:
-            ValueError: the scheme does not know them.
+            ValueError: the scheme does not compute them.
         """
         if self.arrays.held is None:
             able = " or ".join(map(repr, that_compute(HELD)))
@@ -161,7 +161,7 @@ class Verdict(NamedTuple):
     threshold: Array
     """Threshold of `figure`, or 0 if nothing is compared; shape (n,)."""
     compared: Compared = Compared.OWN
-    """Which figure is compared with the threshold."""
+    """Figure that is compared with the threshold."""
 
     @property
     def compares(self) -> bool:
@@ -350,7 +350,7 @@ class ExpectedGap(Trigger):
 
 @trigger(needs="deviation_m")
 def deviation(situation: Situation, metres: Amount = 0.05) -> Verdict:
-    """Sends if flying on with the inputs already sent leads more than so many metres off the
+    """Sends if flying on with the inputs already sent leads farther than this many metres from the
     plan.
     """
     return above(situation, Compared.DEVIATION_M, metres)
@@ -358,7 +358,7 @@ def deviation(situation: Situation, metres: Amount = 0.05) -> Verdict:
 
 @trigger(name="silence")
 class Silence(Periodic):
-    """Sends after so many seconds without a packet, or after half a horizon if that is shorter.
+    """Sends after this many seconds without a packet, or after half a horizon if that is shorter.
 
     A horizon that is replaced at its half does not run out, even if the first replacement is lost.
     Trajectories do not run out, so only the seconds count for them.

@@ -52,10 +52,10 @@ def geojson(file: File) -> list[Zone]:
 
 
 def kml(file: File, *, is_fence: bool) -> list[Zone]:
-    """Zones of the polygons in a KML file; of a hole, see `geojson`.
+    """Zones of the polygons in a KML file; holes are treated as in `geojson`.
 
     Raises:
-        ValueError: it is no KML file.
+        ValueError: it is not a KML file.
         GrammarError: a placemark is invalid; the message names it and the expected form.
     """
     text = file.content.replace(b"\0", b"")  # also in UTF-16
@@ -100,7 +100,7 @@ def _placemark(
 
 
 def _bare(placemark: ElementTree.Element, kind: str) -> Iterator[ElementTree.Element]:
-    """Geometries of a kind in a placemark, but for the rings of its polygons."""
+    """Geometries of a kind in a placemark, except the rings of its polygons."""
     rings = {id(each) for polygon in _below(placemark, "Polygon") for each in polygon.iter()}
     return (each for each in _below(placemark, kind) if id(each) not in rings)
 

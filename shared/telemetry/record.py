@@ -116,8 +116,8 @@ def client_columns(axes: int) -> np.dtype[np.void]:
             ("estimate", "<f8", (axes, 2)),  # for feedback and observations, see docs/vehicles.md
             ("input", "<f8", (axes,)),  # desired velocity that is flown from this step on [m/s]
             ("covered", "?"),  # whether the input is from a horizon: not when hovering or braking
-            ("in_force", "<i8"),  # step that the horizon in force was made for; -1 for none
-            ("age_ns", "<i8"),  # age of the observation behind that horizon; -1 for none
+            ("in_force", "<i8"),  # step that the horizon in force was made for; -1 if none is
+            ("age_ns", "<i8"),  # age of the observation it was planned from; -1 without it
             ("stale", "<i8"),  # number of horizons older than the one in force, so far
             ("missed", "<i8"),  # number of missed steps so far
             ("mode", "<u1"),  # mode from this step on, a `shared.wire.protocol.Mode`
@@ -141,11 +141,11 @@ def server_columns(axes: int, scheme: str) -> np.dtype[np.void]:
             ("ahead", "<i8"),  # d: planning starts at k + d
             ("planned", "<f8", (axes, 2)),  # x_p(k+d|k-1)
             ("input", "<f8", (axes,)),  # û(k), or the committed input of k
-            ("observed_step", "<i8"),  # step of the observation behind x̂
+            ("observed_step", "<i8"),  # step of the observation from which x̂ was predicted
             # state_gap [cost], cost_gap [cost], expected_gap [cost], deviation_m [m]; NaN without a
             # plan, or without a trigger that needs expected_gap
             *((figure, "<f8") for figure in properties(scheme).figures),
-            (str(Compared.OWN), "<f8"),  # figure of a plug-in's policy, in its own unit; else NaN
+            (str(Compared.OWN), "<f8"),  # figure of a plug-in's policy, in its own unit, or NaN
             ("threshold", "<f8"),  # of the compared figure; 0 if nothing is compared
             ("compared", "<u1"),  # figure compared with the threshold, a `Compared`
             ("event", "?"),

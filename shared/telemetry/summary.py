@@ -81,11 +81,11 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
     server and netem count the packets of all vehicles. None without the figures of the
     processes."""
     age_ms_p50: float | None
-    """Age of the observation behind the input being flown [ms], over all steps."""
+    """Age of the observation from which the input being flown was computed [ms], over all steps."""
     age_ms_p99: float | None
     aoi_s_mean: float | None
-    """Mean age of information: the age of the observation behind the input [s], over the steps from
-    `settle` on."""
+    """Mean age of information: the age of the observation from which the input was computed [s],
+    over the steps from `settle` on."""
     aoi_s_peak: float | None
     """Mean of the peaks of the age of information [s]: its value at each step before it
     decreases."""

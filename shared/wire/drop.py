@@ -52,7 +52,7 @@ class Drop(StrEnum):
     IMPLAUSIBLE_HORIZON = "implausible: horizon"
     IMPLAUSIBLE_JUMP = "implausible: jump"
 
-    # Horizons that are not flown, see `client.compensator`.
+    # Horizons that are not flown, see `client.compensator`:
     FROM_THE_FUTURE = "from the future"
     OBSERVATION = "observation"
     """The observation from which the horizon was planned is impossible."""

@@ -262,7 +262,7 @@ class Close(NamedTuple):
 
 
 class Time(NamedTuple):
-    """Time of day at which a vehicle's step 0 began; sent if the vehicle's host knows it."""
+    """Time of day at which a vehicle's step 0 began; sent if it is known on the vehicle's host."""
 
     vehicle: int
     session: int
@@ -534,7 +534,8 @@ def encode_horizon(
 
 
 def kind_of(payload: bytes) -> int | None:
-    """Type number of a message, from its first bytes; None if it is not one of ours.
+    """Type number of a message, from its first bytes; None for bytes that no message of this
+    protocol begins with.
 
     Array header, version and type must be in msgpack's shortest form, so that the bytes are
     unambiguous.

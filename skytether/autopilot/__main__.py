@@ -4,7 +4,7 @@ import sys
 
 from skytether.shell.start import run
 
-if __name__ == "__main__":  # called before the imports below, which take a while
+if __name__ == "__main__":  # called before the slow imports below
     sys.exit(run("skytether.autopilot.__main__:pilot", "autopilot"))
 
 from collections.abc import Sequence

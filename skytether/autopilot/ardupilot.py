@@ -54,18 +54,18 @@ class ArduPilot(PilotedVehicle):
         return ""
 
     def mode_number(self, main: int, sub: int) -> int:  # noqa: ARG002
-        """The mode number is the first part."""
+        """Number of the mode: the first of the command's two parts."""
         return main
 
     def takes_setpoints(self) -> bool:
         return self.mode is FlightMode.GUIDED
 
     def altitude_of(self, told: float) -> float | None:
-        """The altitude is above home."""
+        """Altitude above home, as commanded."""
         return told
 
     def enter_takeoff(self) -> bool:
-        """GUIDED itself climbs."""
+        """Enter GUIDED, which climbs by itself."""
         return self.mode is FlightMode.GUIDED
 
     def limits(self) -> OwnSpeeds:
@@ -96,12 +96,12 @@ class ArduPilot(PilotedVehicle):
         return system == self.parameters["SYSID_MYGCS"]
 
     def return_altitude(self, distance: float) -> float:
-        """RTL_ALT, or lower near home."""
+        """Altitude for the flight home: RTL_ALT, or lower near home."""
         cone = self.parameters["RTL_CONE_SLOPE"] * distance
         return min(self.parameters["RTL_ALT"] / 100.0, max(cone, 2.0))
 
     def silence(self, setpoint: CompanionSetpoint) -> bool:
-        """The vehicle brakes after GUID_TIMEOUT, if it moves."""
+        """Brake after GUID_TIMEOUT without set-points, if the vehicle moves."""
         past_s = (self.now_ns - setpoint.came_ns) / SECOND_NS
         return past_s > self.parameters["GUID_TIMEOUT"]
 

@@ -36,7 +36,7 @@ from skytether.shared.telemetry.record import Recorder
 SYSTEM, COMPONENT = 1, int(dialect.MAV_COMP_ID_AUTOPILOT1)
 """System and component id of the autopilot."""
 PEERS_MAX = 8
-"""Most peers at once; a new one replaces the one that was silent longest."""
+"""Largest number of peers at once; a new one replaces the one that was silent longest."""
 PATIENCE_NS = SECOND_NS
 """Silence after which a peer may be replaced [ns]."""
 BEHIND_MAX_NS = SECOND_NS
@@ -186,7 +186,7 @@ class Autopilot(Endpoint):
         return 0 if self._began_ns is None else self._began_ns + self.flight.now_ns + TICK_NS
 
     def change(self, scenario: Scenario, keys: frozenset[str], *, now_ns: int) -> None:  # noqa: ARG002
-        """Only the wind changes."""
+        """Adopt the changed wind, the only key that may change."""
         vehicle = scenario.vehicle
         self.flight.quadrotor.blow(vehicle.steady_wind_mps, vehicle.turbulence_mps)
 
@@ -443,5 +443,5 @@ def _is_ours(message: Message) -> bool:
 
 
 def _whole(value: float) -> int:
-    """Integer in a command's float parameter; -1 if it is none."""
+    """Integer in a command's float parameter; -1 if it is not an integer."""
     return int(value) if isfinite(value) and value == int(value) else -1

@@ -31,14 +31,14 @@ class ScriptedFault(NamedTuple):
     name: str
     from_ns: int
     until_ns: int | None
-    """None for a fault that does not end."""
+    """Time at which the fault ends; None for a fault that does not end."""
 
 
 def parse(text: str) -> ScriptedFault:
     """Scripted fault from NAME@SECONDS, or NAME@SECONDS-SECONDS for one that ends.
 
     Raises:
-        ConfigError: the text is no fault.
+        ConfigError: the text is not a fault.
     """
     number = r"(\d+(?:\.\d+)?)"
     match = re.fullmatch(rf"(\w+)@{number}(?:-{number})?", text)

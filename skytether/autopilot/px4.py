@@ -78,7 +78,7 @@ class PX4(PilotedVehicle):
             self.enter(self.flavour.number(FlightMode.GUIDED))
 
     def why_not_armed(self) -> str:
-        """Texts as PX4 sends them; some end with a tabulator."""
+        """Reason why arming is refused, in the texts that PX4 sends; some end with a tabulator."""
         unguided = self.mode is FlightMode.GUIDED and self.why_not_guided()
         if unguided or not self.ready:
             return "Arming denied: Resolve system health failures first\t"
@@ -89,14 +89,14 @@ class PX4(PilotedVehicle):
         return ""
 
     def why_not_guided(self) -> str:
-        """Set-points must already be arriving."""
+        """Reason why OFFBOARD is refused: set-points must already be arriving."""
         setpoint = self._setpoint
         if setpoint is None or self._past_s(setpoint) > self.parameters["COM_OF_LOSS_T"]:
             return "Switching to mode 'Offboard' is currently not possible"
         return ""
 
     def forget(self) -> None:
-        """Keep the stream that allowed OFFBOARD, and fly it."""
+        """Keep and fly the stream of set-points with which OFFBOARD was allowed."""
 
     def mode_number(self, main: int, sub: int) -> int:
         return main << 16 | max(sub, 0) << 24
@@ -105,7 +105,7 @@ class PX4(PilotedVehicle):
         return True
 
     def altitude_of(self, told: float) -> float | None:
-        """Commanded altitudes are above the sea, or missing."""
+        """Altitude above home; commanded altitudes are above the sea, or missing."""
         if isfinite(told):
             return told - self.flavour.home[2]
         return self.parameters["MIS_TAKEOFF_ALT"]
@@ -142,7 +142,7 @@ class PX4(PilotedVehicle):
         return kind == dialect.MAV_TYPE_GCS
 
     def return_altitude(self, distance: float) -> float:
-        """RTL_RETURN_ALT, or lower near home."""
+        """Altitude for the flight home: RTL_RETURN_ALT, or lower near home."""
         cone = distance * tan(radians(self.parameters["RTL_CONE_ANG"]))
         return min(self.parameters["RTL_RETURN_ALT"], cone)
 
@@ -150,7 +150,7 @@ class PX4(PilotedVehicle):
         return (self.now_ns - setpoint.came_ns) / SECOND_NS
 
     def silence(self, setpoint: CompanionSetpoint) -> bool:
-        """PX4 leaves OFFBOARD after COM_OF_LOSS_T."""
+        """Leave OFFBOARD after COM_OF_LOSS_T without set-points."""
         if self._past_s(setpoint) <= self.parameters["COM_OF_LOSS_T"] + SILENCE_LAG_S:
             return False
         value = int(self.parameters["COM_OBL_RC_ACT"])

@@ -267,4 +267,4 @@ GROUPS: dict[int, tuple[int, ...]] = {
 }
 """Messages of each group of REQUEST_DATA_STREAM, as ArduCopter groups them."""
 ALL = int(dialect.MAV_DATA_STREAM_ALL)
-"""Group of all groups."""
+"""Number of the group that stands for all groups."""

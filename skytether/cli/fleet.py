@@ -130,7 +130,7 @@ class FleetFlight:
     record: Record
     machine: "Lateness | None" = None
     cpu_s: float | None = None
-    """In virtual time [s]."""
+    """CPU time of a flight in virtual time [s]."""
 
 
 def fleet(argv: Sequence[str]) -> None:
@@ -272,7 +272,9 @@ class Lateness:
 
 @contextmanager
 def metronome(dt_s: float) -> Iterator[Lateness]:
-    """Let a thread sleep step by step during the block; the steps it misses are the machine's."""
+    """Run a thread during the block that sleeps from step to step; a step that it misses is due to
+    the machine.
+    """
     late, over = Lateness(), threading.Event()
 
     def sleep() -> None:

@@ -47,7 +47,7 @@ def beside(folders: Sequence[Path], at: str) -> Iterator[None]:
         stderr=subprocess.STDOUT,
         stdin=subprocess.DEVNULL,
         start_new_session=True,
-        preexec_fn=die_with_parent,  # noqa: PLW1509 - no thread of ours runs yet
+        preexec_fn=die_with_parent,  # noqa: PLW1509 - no other thread runs yet
     )
     ended = threading.Event()
 

@@ -261,7 +261,7 @@ def run(
         interrupted=interrupted,
         on_event=hear,
     )
-    client_figures = parts / "client.json"  # created at the start, and written at the end
+    client_figures = parts / "client.json"  # empty until the client ends
     if interrupted() and not (client_figures.exists() and client_figures.stat().st_size):
         raise CommandError("interrupted before the first step", INTERRUPTED)
     return shortfalls
@@ -279,7 +279,7 @@ def fly_chain(
     """Run processes, each connected to the one before, until one of them ends, or Ctrl-C.
 
     Args:
-        chain: name and arguments of each process; the last argument of each but the first is the
+        chain: name and arguments of each process; the last argument of each except the first is the
             flag for the address of the process before.
         flies: name of the process whose end is the flight's.
         timeout_s: longest time that they run [s].

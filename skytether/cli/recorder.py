@@ -131,7 +131,7 @@ class Live:
         """First fault of the recording."""
         self._growing: files.Growing | None = None
         self._recording: Recording | None = None
-        """None once the file has failed."""
+        """Recording being written; None once its file has failed."""
         self._rows: dict[str, int] = {}
         """Bytes of rows received so far, by part."""
         self._sources = {process: _Source() for process in feeds}

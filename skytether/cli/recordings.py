@@ -12,7 +12,7 @@ def opened(path: Path) -> Recorded:
 
     Raises:
         CommandError: the file cannot be read.
-        RecordingError: it is no recording, or damaged.
+        RecordingError: it is not a recording, or damaged.
     """
     try:
         recorded = read(path)

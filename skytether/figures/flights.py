@@ -25,7 +25,7 @@ FORMATS = (".png", ".pdf", ".svg")
 
 
 def check(path: Path, *others: str) -> None:
-    """Refuse a file that is no picture, before anything is flown.
+    """Refuse a file without the suffix of a picture, before anything is flown.
 
     Args:
         others: suffixes accepted beside FORMATS.
@@ -49,7 +49,7 @@ def save(figure: "Figure", path: Path, *, dpi: int) -> None:
     """Write a figure to a file in one of FORMATS.
 
     Raises:
-        OSError: the file cannot be written, or is no regular file.
+        OSError: the file cannot be written, or is not a regular file.
     """
     with files.replacing(path) as file:
         figure.savefig(file, format=path.suffix[1:], dpi=dpi)

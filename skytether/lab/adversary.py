@@ -45,7 +45,7 @@ MOVES_MAX = 64
 DRAWN = 10
 """Number of random attacks before a climb, which starts from the best of them."""
 PATIENCE = 40
-"""Number of tries without improvement after which the climb starts anew from random attacks."""
+"""Number of tries without improvement after which the climb starts again from random attacks."""
 CLIMB = 100
 """Largest number of tries of one climb."""
 
@@ -64,7 +64,7 @@ class MoveKind(StrEnum):
     """The client of a vehicle is down, and restarts with its saved state; with
     `vehicle.memory = "none"` it has none."""
     GOALS = "goals"
-    """The vehicle's goal is the place in the amounts [m]; after the move, its own goal again."""
+    """The vehicle's goal is moved to the place in the amounts [m], and back at the end."""
     ZONES = "zones"
     """Additional zone, a cylinder with x, y and radius in the amounts [m]."""
 

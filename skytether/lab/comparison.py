@@ -131,7 +131,8 @@ def compared(
 
 
 def ratio(ours: ContenderRuns, theirs: ContenderRuns) -> tuple[float, float, float] | None:
-    """Ratio of the mean RMSE xy of ours to theirs, and its 95 % interval, see `jackknife`.
+    """Ratio of the mean RMSE xy of our contender to that of the other, and its 95 % interval, see
+    `jackknife`.
 
     None if fewer than two seeds have flown in both.
     """

@@ -31,9 +31,9 @@ In the case `target`, at 1 packet/s, 5 % more packets reduce the error by a fift
 thresholds, contenders that left much of a budget unused would look too bad.
 """
 NEAR = (0.1, 0.3, 1, 3, 10, 30, 100)
-"""Factors on a threshold; each gives a point."""
+"""Factors on a threshold, each of which is flown."""
 PERIODS = (0.1, 0.2, 0.5, 1, 2, 4, 8)
-"""Factors on a period of ten steps; each gives a point."""
+"""Factors on a period of ten steps, each of which is flown."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +53,9 @@ class Contender:
 
     @property
     def factors(self) -> Sequence[float]:
-        """Factors on the threshold that the search found; each gives a point of the curve."""
+        """Factors on the threshold that the search found; each gives a point of the contender's
+        curve.
+        """
         if not self.threshold:
             return ()
         return PERIODS if self.threshold == "trigger.periodic" else NEAR

@@ -25,7 +25,7 @@ class PlannedCourse:
     """Inputs prescribed by a horizon.
 
     Args:
-        length: number of usable inputs.
+        length: number of inputs that may be flown.
     """
 
     def __init__(self, horizon: Horizon, length: int, terms: Terms) -> None:

@@ -255,7 +255,8 @@ def _faults(
     behind_m = guided * (NEAR_M + error_m[begun])
     curve_mps = speed[begun] * left(since_s)
     curve_mps += gain * on_its_way * left(since_s - stopping_s)
-    # Time for which the vehicle had flown plans, at the observation behind the plan in force.
+    # Time for which the vehicle had flown plans, at the observation from which the plan in force
+    # was made.
     seen_s = np.where(age_s >= 0.0, since_s - age_s, -1.0)
     rules: tuple[tuple[str, Flags, Array, Any], ...] = (
         (

@@ -32,7 +32,7 @@ class FaultKind(StrEnum):
     """A host's clock runs fast by the amount [ppm]."""
     RESTART = "restart"
     FREEZE = "freeze"
-    """Freeze of a host, as by SIGSTOP."""
+    """Freeze of a host, as SIGSTOP freezes a process."""
     SOLVER = "solver"
     """Failure of the solver in a share of its solves."""
     OVERLOAD = "overload"
@@ -236,7 +236,7 @@ def dumps(trial: Trial) -> str:
 def loads(line: str) -> Trial:
     """Decode a trial from JSON.
 
-    Raises ConfigError if the line is no trial.
+    Raises ConfigError if the line is not a trial.
     """
     try:
         trial = msgspec.json.decode(line, type=Trial)

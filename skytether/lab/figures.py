@@ -136,7 +136,7 @@ def curve(
 
     Args:
         name: label of the measured figure, with its unit.
-        means: mean at each value, NaN for none; shape (values,).
+        means: mean at each value, NaN without a value; shape (values,).
         halves: half the width of each mean's interval; shape (values,).
     """
     figure = blank(6.4, 4.4)
@@ -165,7 +165,7 @@ def heat_map(
     Args:
         axes: horizontal axis, and vertical axis.
         name: label of the measured figure, with its unit.
-        means: mean in each cell, NaN for none; shape (values across, values up).
+        means: mean in each cell, NaN without a value; shape (values across, values up).
     """
     figure = blank(6.4, 5.0)
     plane = figure.subplots()

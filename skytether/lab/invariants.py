@@ -44,7 +44,7 @@ ONCE = frozenset({OBSERVATION, HORIZON, HEARTBEAT, TRAJECTORY})
 REMEMBERED = 8192
 """Number of newest messages of a direction that are stored; more than can be in flight."""
 STEPS_REMEMBERED = 4096
-"""Number of newest steps of a life whose time is stored."""
+"""Number of newest steps of a client's run whose times are stored."""
 HORIZONS_MAX = 1024
 ROUNDING = 1e-6
 """Rounding tolerance of a speed [m/s], because horizons are sent as float32."""
@@ -60,11 +60,13 @@ class Violation(Exception):
 
 
 class Ledger:
-    """Messages of one direction: the sender's life, and how often each was sent and accepted."""
+    """Messages of one direction: the run of the process that sent each, and how often it was sent
+    and accepted.
+    """
 
     def __init__(self) -> None:
         self._sealed: OrderedDict[tuple[int, bytes], list[int]] = OrderedDict()
-        """Sender's life, times sent and times accepted, by vehicle and message."""
+        """Sender's run, times sent and times accepted, by vehicle and message."""
 
     def seal(self, vehicle: int, payload: bytes, life: int) -> None:
         entry = self._sealed.setdefault((vehicle, payload), [life, 0, 0])
@@ -86,12 +88,12 @@ class Ledger:
             raise Violation("once", f"a message of type {kind} was accepted again")
 
     def life(self, vehicle: int, payload: bytes) -> int:
-        """Sender's life of a message, or -1 if it was not sent."""
+        """Number of the sender's run that sent a message, or -1 if it was not sent."""
         return self._sealed.get((vehicle, payload), (-1,))[0]
 
 
 class Gatekeeper:
-    """Wrapper around the real gate of one life of the server.
+    """Wrapper around the real gate of one run of the server.
 
     `up` and `down` are the ledgers of the server's and of the vehicles' messages.
     """
@@ -137,15 +139,15 @@ class _Noted:
 
 
 class WatchedLife(Recorder):
-    """Wrapper around the real link of one life of a vehicle, which also checks its record.
+    """Wrapper around the real link of one run of a client, which also checks its record.
 
     Args:
-        number: number of this life.
+        number: number of this run.
         up, down: ledgers of the server's and of the vehicles' messages.
         clock: returns the time of the virtual world [ns].
         overdue: returns whether all faults ended so long ago that the vehicle must fly.
         rekey_ns: time after which the vehicle asks for new keys, if the link does not ask earlier.
-        drifted_m: distance that the vehicle may have flown while frozen, in earlier lives [m].
+        drifted_m: distance that the vehicle may have flown while frozen, in earlier runs [m].
     """
 
     def __init__(  # noqa: PLR0915 - a docstring counts for a statement
@@ -180,9 +182,9 @@ class WatchedLife(Recorder):
         self._adopted_ns = 0
         """Time at which the newest keys were adopted [ns; vehicle's clock]."""
         self._welcome: tuple[int, int] | None = None
-        """Session and server's life of the newest WELCOME that was opened."""
+        """Session of the newest WELCOME that was opened, and number of the server's run."""
         self._session: tuple[int, int] | None = None
-        """Session and server's life that were adopted."""
+        """Session that was adopted, and number of the server's run."""
         self._heard = False
         """Whether a packet of the session has arrived since the last step."""
         self._silent = 0
@@ -194,9 +196,9 @@ class WatchedLife(Recorder):
         self._times_ns: OrderedDict[int, int] = OrderedDict()
         """Virtual time of each step that was flown [ns]."""
         self._horizons: deque[tuple[int, int, bytes]] = deque(maxlen=HORIZONS_MAX)
-        """Session, server's life and message of each horizon that was received."""
+        """Session, number of the server's run, and message of each horizon that was received."""
         self._in_force: tuple[int, int, Horizon | Trajectory] | None = None
-        """Session, server's life, and the horizon or trajectory in force."""
+        """Session, number of the server's run, and the horizon or trajectory in force."""
         self._observed = -1
         """Step of the observation that the plan in force is based on."""
         self._course: Course | None = None
@@ -206,7 +208,7 @@ class WatchedLife(Recorder):
         self._speed = 0.0
         """Magnitude of the last input without feedback [m/s]."""
         self.drifted_m = drifted_m
-        """Distance that the vehicle may have flown while frozen, over all lives so far [m]."""
+        """Distance that the vehicle may have flown while frozen, over all runs so far [m]."""
         self.disturbance: Callable[[], Sequence[float]] = tuple
         """Function that returns the filter's disturbance estimate, of each axis [m/s]."""
         self.input = [0.0] * self._terms.axes
@@ -333,7 +335,7 @@ class WatchedLife(Recorder):
             raise Violation("table", f"from {before} to {after} at once")
 
     def _check_horizon(self, step: int, in_force: int, age_ns: int, now_ns: int) -> None:
-        """Check that the horizon in force is from the server's present life and session, and is not
+        """Check that the horizon in force is from the server's present run and session, and is not
         too old.
         """
         if in_force == NO_HORIZON:
@@ -363,7 +365,7 @@ class WatchedLife(Recorder):
 
     def _find(self, made_for: int) -> tuple[int, int, Horizon | Trajectory]:
         """Horizon in force, identified by its step and its observation."""
-        # The step alone is ambiguous: two lives of the server may have planned for the same step.
+        # The step alone is ambiguous: two runs of the server may have planned for the same step.
         for session, life, payload in reversed(self._horizons):
             horizon = decode(payload, self._terms)
             assert isinstance(horizon, Horizon | Trajectory)
@@ -409,7 +411,9 @@ class WatchedLife(Recorder):
         self._covered = covered
 
     def _check_age(self, step: int, observed: int) -> None:
-        """Check that the observation behind the input is not older than allowed."""
+        """Check that the observation from which the input was computed is
+        not older than allowed.
+        """
         limit_ns = self._terms.age_max * self._dt_ns
         # By both clocks: a vehicle with a slow clock must not fly old inputs either.
         old_ns = max(self._clock() - self._times_ns[observed], (step - observed) * self._dt_ns)

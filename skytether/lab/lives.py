@@ -149,7 +149,7 @@ class Lives:
         self.world.stop(f"client {number}")
 
     def start_client(self, number: int, *, remembers: bool = True) -> None:
-        """Start the next life of a vehicle's client; `remembers` tells whether it finds the saved
+        """Start the next run of a vehicle's client; `remembers` tells whether it finds the saved
         state.
         """
         body, remembers = self.bodies[number], remembers and self._keeps(number)
@@ -164,7 +164,7 @@ class Lives:
         self.world.stop(SERVER[0])
 
     def start_server(self, changes: Mapping[str, Any], *, remembers: bool = True) -> None:
-        """Start the next life of the server.
+        """Start the next run of the server.
 
         Args:
             changes: keys that differ from the scenario, and their values.
@@ -184,7 +184,9 @@ class Lives:
     # -- the flight --------------------------------------------------------------------------------
 
     def track(self, number: int) -> Track:
-        """Flown path of a vehicle through all its lives, from its first step on the mission."""
+        """Flown path of a vehicle through all runs of its client, from its first step on the
+        mission.
+        """
         dt_s, scale = self.scenario.control.dt, self.scenario.mission.height_scale
         tracks: list[Track] = []
         for client, sink in self._lives[number]:

@@ -61,7 +61,7 @@ class Free:
 
 
 def check_free(free: Sequence[Free], start: Scenario) -> None:
-    """Raise ConfigError if a key is no number of the scenario, or its value is out of bounds."""
+    """Raise ConfigError if a key is not a number of the scenario, or its value is out of bounds."""
     for key in free:
         try:
             value = key.of(plain(start))

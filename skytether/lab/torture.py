@@ -5,7 +5,7 @@
 
 The scenario is drawn from a trial's seed, and the faults are part of the trial, so every trial is
 reproducible. A failure is a `Violation` of an invariant (`lab.invariants`), or an exception of an
-endpoint. A vehicle that has landed is restarted after a while, as by an operator.
+endpoint. A vehicle that has landed is restarted after a while, as an operator would do.
 """
 
 import traceback
@@ -182,7 +182,7 @@ class TrialOutcome(msgspec.Struct, frozen=True, kw_only=True):
     flown_s: float
     """Length of the trial in virtual time [s]."""
     counts: dict[str, int]
-    """Counters of steps, lives, packets and so on, by name."""
+    """Counters of steps, runs of processes, packets and so on, by name."""
 
 
 class Failing:
@@ -200,11 +200,11 @@ class Failing:
 
 @dataclass(slots=True)
 class TorturedVehicle:
-    """Vehicle through its lives: runs of its client between restarts."""
+    """Vehicle through all runs of its client."""
 
     name: str
     plant: FirstOrderPlant
-    """Simulated vehicle, which persists through all lives."""
+    """Simulated vehicle, which persists through all runs of the client."""
     life: WatchedLife
     lives: int = 1
     down: int = 0
@@ -393,7 +393,7 @@ class Torture:
         return [each.name for each in self.vehicles] if where == "client" else [where]
 
     def set_down(self, name: str, *, down: bool) -> None:
-        """Take a host down, or start a new life once no fault keeps it down."""
+        """Take a host down, or start its process again once no fault keeps it down."""
         self._down_hosts[name] += 1 if down else -1
         if down:
             self.world.stop(name)
@@ -401,11 +401,11 @@ class Torture:
             self._renew(name)
 
     def set_keys(self, *, right: bool) -> None:
-        """Let the server's next lives use the vehicles' keys, or wrong ones."""
+        """Let the server's next runs use the vehicles' keys, or wrong ones."""
         self._wrong_keys += -1 if right else 1
 
     def set_solver(self, share: float, *, failing: bool) -> None:
-        """Let a share of the solves of the server's present life fail, or none."""
+        """Let a share of the solves of the server's present run fail, or none."""
         scheme = self._server.controller.scheme
         if not isinstance(scheme, HorizonScheme):  # trajectories need no solver
             return
@@ -461,7 +461,7 @@ def recovery_ns(scenario: Scenario, *, restarts: bool) -> int:
 
     The sum of the stages: the client notices the end of the session; HELLO, cookie and session are
     exchanged; the link is good for the required time; a horizon planned after that arrives. With
-    `restarts` the server may have to wait for the end of the vehicle's earlier life.
+    `restarts` the server may have to wait for the end of the session of the client's earlier run.
     """
     (paper,) = IMPAIRMENTS.calls(scenario.network.uplink)
     least_s, slot_s, *_ = map(float, paper.values)

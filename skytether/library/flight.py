@@ -193,7 +193,7 @@ class Flight:
 
         Raises:
             OSError: the file cannot be read.
-            RecordingError: the file is no recording, or damaged.
+            RecordingError: the file is not a recording, or damaged.
         """
         from skytether.view.recorded import read
 
@@ -245,7 +245,7 @@ def table(flights: Iterable[Flight]) -> "pandas.DataFrame":
 
 
 def values(summary: Summary) -> dict[str, Any]:
-    """Single-valued fields of a summary: all but the tables `modes` and `drops`."""
+    """Single-valued fields of a summary: all except the tables `modes` and `drops`."""
     fields = msgspec.structs.asdict(summary)
     return {name: value for name, value in fields.items() if name not in ("modes", "drops")}
 

@@ -24,7 +24,7 @@ Given = str | PathLike[str] | Scenario
 
 
 def load(scenario: Given, /, **keys: Any) -> Scenario:
-    """Scenario, with keys replaced as by flags on the command line.
+    """Scenario, with keys replaced as flags on the command line do.
 
         skytether.load("demo", duration=20, **{"control.trigger": "always"})
 
@@ -176,7 +176,7 @@ def _check_server(server: Endpoint, *, udp: bool, secure: bool) -> None:
 
     Raises:
         ConfigError: the kind of flight needs Skytether's server.
-        TypeError: the server is no endpoint.
+        TypeError: the server is not an endpoint.
     """
     if not isinstance(server, Endpoint):
         raise TypeError(f"server: got {server!r}, expected an Endpoint")

@@ -39,7 +39,7 @@ class Swept:
         The mean is None if no flight has the figure, the interval if fewer than two have it.
 
         Raises:
-            KeyError: `figure` is no numeric figure of a summary.
+            KeyError: `figure` is not a numeric figure of a summary.
         """
         if figure not in lab.FIGURES:
             raise KeyError(f"no figure {figure!r}; {hint(str(figure), lab.FIGURES)}")
@@ -123,7 +123,7 @@ def _axis(key: str, values: Iterable[Any]) -> lab.GridAxis:
 
     Raises:
         ConfigError: the key cannot be swept, or has no values, or a value twice.
-        TypeError: the values are no list.
+        TypeError: the values are not a list.
     """
     if key == "seed":
         raise ConfigError("grid: got 'seed', expected another key: it counts the runs")

@@ -8,7 +8,7 @@ from skytether.mavlink.dialect import dialect
 CHUNK_BYTES = 50
 """Longest text of a message [B]."""
 UNFINISHED_MAX = 8
-"""Most unfinished texts that are kept; a new one replaces the oldest."""
+"""Largest number of unfinished texts that are kept; a new one replaces the oldest."""
 CHUNKS_MAX = 8
 
 

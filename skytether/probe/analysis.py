@@ -88,7 +88,7 @@ class Delays:
     delay_s: Array
     """One-way delay; NaN for a lost packet; shape (n,)."""
     rate: BottleneckRate | None
-    """None if trains give no finite rate."""
+    """Rate of the bottleneck; None if trains give no finite rate."""
 
     @property
     def came(self) -> Flags:
@@ -281,7 +281,9 @@ def correlation_time_s(apart_s: Array, correlations: Array, count: int) -> float
 
 
 def wilson(share: float, count: float) -> tuple[float, float]:
-    """Wilson's 95 % confidence interval of a share of so many independent packets."""
+    """Wilson's 95 % confidence interval of a share, estimated from this number of independent
+    packets.
+    """
     if count <= 0.0:
         return 0.0, 1.0
     z2 = Z95 * Z95

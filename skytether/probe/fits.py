@@ -92,7 +92,7 @@ def _normal(delay_s: Array) -> Found:
 
 
 def _with_least(delay_s: Array, name: str) -> Found:
-    """Gamma or lognormal distribution beyond the best least delay, which is found by trial."""
+    """Gamma or lognormal distribution above a least delay, for which a grid of values is tried."""
     first, span = float(delay_s.min()), float(np.mean(delay_s) - delay_s.min())
     law = _gamma if name == "gamma" else _lognormal
     below = np.minimum(np.geomspace(RESOLUTION_S, 30.0 * span, LEASTS), first)

@@ -36,11 +36,12 @@ from skytether.shared.wire.drop import Drop, ProtocolError
 from skytether.shared.wire.protocol import PAYLOAD_BYTES_MAX
 
 SESSIONS_MAX = 16
-"""Most measurements at once; see `Listener._gives_way` for a further one."""
+"""Largest number of measurements at once; see `Listener._gives_way` for a further one."""
 IDLE_NS = 60 * SECOND_NS
 """Time without a probe after which a measurement may be replaced by another [ns]."""
 HISTORY_MAX = 65_536
-"""Most arrivals kept until the prober has acknowledged them; older ones are dropped."""
+"""Largest number of arrivals kept until the prober has acknowledged them; older ones are
+dropped."""
 HOLD_NS = 200 * MILLISECOND_NS
 """Time to wait for the rest of a train after each of its packets [ns]."""
 _ARRIVALS_MAX = PAYLOAD_BYTES_MAX // 12

@@ -93,9 +93,9 @@ class PathFigures(msgspec.Struct, frozen=True, kw_only=True):
     unreported: int
     """Arrivals that the listener dropped before reporting them, or captured packets left out."""
     uplink: DirectionFigures
-    """From the listener to the prober."""
+    """Figures of the packets from the listener to the prober."""
     downlink: DirectionFigures
-    """From the prober to the listener."""
+    """Figures of the packets from the prober to the listener."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,7 +1,7 @@
 """Near end of a measurement: sends probes on a time grid, and records the fate of each.
 
-    HELLO until WELCOME → probes for so many seconds → polls until all arrivals are known, and until
-    the last answers have had time to come
+    HELLO until WELCOME → probes for the requested time → polls until all arrivals are known, and
+    until the last answers have had time to come
 
 Sometimes a train of packets is sent at once, to measure the rate of the path. The train takes the
 place of twice as many probes as it has packets: a path that can carry the probes has then emptied
@@ -38,7 +38,7 @@ from skytether.shared.wire.protocol import PAYLOAD_BYTES_MAX
 BYTES_MIN = MESSAGE_BYTES_MIN + OVERHEAD_BYTES
 """Smallest size of a probe, encrypted or not [B]."""
 PROBES_MAX = 1_000_000
-"""Most probes: as many as a trace has rows."""
+"""Largest number of probes: as many as a trace has rows."""
 TRAIN = 16
 """Number of packets of a train."""
 TRAIN_SLOTS = 2 * TRAIN
@@ -76,9 +76,9 @@ class Way:
 @dataclass(frozen=True, slots=True)
 class MeasuredPath:
     downlink: Way
-    """From the prober to the listener, as from a vehicle to the server."""
+    """Packets from the prober to the listener, as from a vehicle to the server."""
     uplink: Way
-    """From the listener to the prober."""
+    """Packets from the listener to the prober."""
     size: int
     period_ns: int
     unreported: int

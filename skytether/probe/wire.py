@@ -112,7 +112,7 @@ def decode(payload: bytes) -> Message:
     """Message in a datagram, every field checked.
 
     Raises:
-        ProtocolError: the datagram is no such message.
+        ProtocolError: the datagram is not one of these messages.
     """
     if len(payload) > PAYLOAD_BYTES_MAX:
         raise ProtocolError(Drop.TOO_LONG)

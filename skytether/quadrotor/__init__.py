@@ -2,7 +2,7 @@
 
     velocity → acceleration → attitude → rates → rotors → forces
 
-No module of this room reads a clock or draws unseeded random numbers; the caller advances time.
+No module of this package reads a clock or draws unseeded random numbers; the caller advances time.
 """
 
 from skytether.shared.base import extras

@@ -1,8 +1,9 @@
 """Equations of motion of the rigid body and its rotors, compiled.
 
-    ṗ = v      v̇ = g + R F / m      q̇ = q ⊗ (0, Ω) / 2      J Ω̇ = M - Ω × J Ω      ω̇ = (ω* - ω) / τ
+    ṗ = v      v̇ = g + R F / m      q̇ = q ⊗ (0, Ω) / 2      J Ω̇ = M - Ω × J Ω      ω̇ = (ω* - ω)
+    / τ
 
-In this room, world vectors are north, east, down, and body vectors forward, right, down. R, the
+In this package, world vectors are north, east, down, and body vectors forward, right, down. R, the
 rotation matrix of the quaternion q, turns body vectors into world vectors.
 """
 

@@ -1,6 +1,6 @@
 """Quadrotor that flies a commanded velocity, in steps of 2 ms.
 
-Outside this room: x north, y east, altitude up.
+Outside this package: x north, y east, altitude up.
 """
 
 from collections.abc import Sequence
@@ -21,9 +21,9 @@ UP = np.array([1.0, 1.0, -1.0])
 
 class Attitude(NamedTuple):
     roll: float
-    """To the right [rad]."""
+    """Roll angle, positive to the right [rad]."""
     pitch: float
-    """Nose up [rad]."""
+    """Pitch angle, positive nose up [rad]."""
     yaw: float
     """Heading, from north to east [rad]."""
     rates: tuple[float, float, float]
@@ -32,11 +32,11 @@ class Attitude(NamedTuple):
 
 class Battery(NamedTuple):
     charge: float
-    """From 1 to 0."""
+    """Remaining charge, from 1 to 0."""
     voltage: float
-    """Unit: V."""
+    """Voltage [V]."""
     current: float
-    """Unit: A."""
+    """Current [A]."""
 
 
 class Quadrotor:
@@ -105,11 +105,11 @@ class Quadrotor:
         fly(self.frame, self.gains, self._quad, self._air, drawn, target, self._ground, self.on)
 
     def position(self) -> Array:
-        """Shape (3,) [m]."""
+        """Position [m]; shape (3,)."""
         return UP * self._quad.x[:3]
 
     def velocity(self) -> Array:
-        """Shape (3,) [m/s]."""
+        """Velocity [m/s]; shape (3,)."""
         return UP * self._quad.x[3:6]
 
     def wanted_position(self) -> Array:

@@ -30,7 +30,7 @@ NEAR_NS, READINGS = 5_000, 4
 SIZE_MAX = 2048
 """Largest payload that `DatagramBatch.send` takes [B]; packets of a flight have at most 1200."""
 SEGMENTS_MAX = 64
-"""Most datagrams sent as one; older kernels refuse more."""
+"""Largest number of datagrams sent as one; older kernels refuse more."""
 SEGMENTED_BYTES_MAX = 65_000
 """Largest total payload of the datagrams that are sent as one [B]; IP allows a little more."""
 SEGMENT_BYTES_MAX = SEGMENTED_BYTES_MAX // 2
@@ -119,7 +119,7 @@ class _Headers:
             _HEADER.pack_into(headers, i * _HEADER.size, *row)
         self.first = ctypes.c_void_p(_address(headers))
         self.sizes = memoryview(buffers).cast("Q")[1::2]
-        """Shape (BATCH_MAX,) [B]."""
+        """Sizes of the buffers, or of the payloads to be sent [B]; shape (BATCH_MAX,)."""
         self.done = memoryview(headers).cast("I")[_HEADER.size // 4 - 2 :: _HEADER.size // 4]
         """Sizes of received payloads; shape (BATCH_MAX,) [B]."""
         self.stamp_sizes = memoryview(headers).cast("Q")[5 :: _HEADER.size // 8]

@@ -164,7 +164,7 @@ def unsealed(*addresses: Address) -> CommandError:
 
 
 def check_sockets(flag: str, given: int) -> None:
-    """Raise this process's limit of open files for so many sockets, or refuse the number."""
+    """Raise this process's limit of open files for this number of sockets, or refuse the number."""
     most = sockets_max()
     if given > most:
         needed = f"got {given}, which takes {given + SPARE_FILES} open files"

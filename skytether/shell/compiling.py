@@ -13,7 +13,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING
 
-# for type checking only: the vehicle's client has no kernels
+# for type checking only: the client aboard is installed without numba
 if TYPE_CHECKING:
     from skytether.shared.base.kernel import Missing
 

@@ -42,13 +42,15 @@ from skytether.shell.udp import (
 )
 
 BURST_MAX = BATCH_MAX
-"""Most datagrams read from one socket before timers and other sockets have their turn."""
+"""Largest number of datagrams read from one socket before timers and other sockets have their
+turn."""
 TOGETHER_MIN = 4
 """Smallest number of datagrams worth a batch call: fewer are faster one by one."""
 CROWD_MIN = 2 * TOGETHER_MIN
 """Number of datagrams within `patience_ns` from which on a socket is read in batches."""
 BATCHES_MAX = 4
-"""Most batches read from one socket before timers and other sockets have their turn."""
+"""Largest number of batches read from one socket before timers and other sockets have their
+turn."""
 SOCKET = itemgetter(2)
 """Socket number of a datagram."""
 CAME = itemgetter(0)
@@ -89,7 +91,7 @@ class Shell:
         line: connection to an autopilot, which becomes socket 1.
         is_patient: whether to start although a peer's name cannot be resolved yet; the lookup is
             then repeated.
-        memory: file of what the endpoint keeps for the next run of its process.
+        memory: file for the state that the endpoint keeps for the next run of its process.
 
     Raises:
         AddressError: the address cannot be bound, or a name cannot be resolved.

@@ -33,7 +33,7 @@ from skytether.shell.udp import from_kernel, look_up
 from skytether.shell.web import HEADERS, host_name, is_ours
 
 CONNECTIONS_MAX = 8
-"""Most connections at once; a new connection closes the oldest."""
+"""Largest number of connections at once; a new connection closes the oldest."""
 PATIENCE_S = 5.0
 """Longest time for a request and its answer."""
 REQUEST_BYTES_MAX = 8192

@@ -33,15 +33,15 @@ from skytether.shared.telemetry.feed import (
 from skytether.shell.local import Local
 
 READERS_MAX = 8
-"""Most readers at once; further ones are refused and counted."""
+"""Largest number of readers at once; further ones are refused and counted."""
 WAITING_BYTES_MAX = 4 * 1024 * 1024
-"""Most bytes queued for a reader; a reader with more is dropped and counted."""
+"""Largest number of bytes queued for a reader; a reader with more is dropped and counted."""
 BACKLOG_BYTES_MAX = 1024 * 1024
-"""Most bytes of sent frames that are kept for readers that connect later."""
+"""Largest number of bytes of sent frames that are kept for readers that connect later."""
 ROWS_BYTES_MAX = 256 * 1024
 """Size of rows after which a frame is full."""
 SEND_BYTES_MAX = 64 * 1024
-"""Most bytes sent to a reader in one turn of the loop."""
+"""Largest number of bytes sent to a reader in one turn of the loop."""
 GATHER_S = 0.01
 """Time for which frames are collected before they are sent."""
 REST_S = 0.02

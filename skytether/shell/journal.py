@@ -114,7 +114,7 @@ class TakenUp(NamedTuple):
     """Scenario of a process that starts, with the values set in an earlier run."""
 
     journal: Journal | None
-    """None without a control socket."""
+    """Journal beside the control socket; None without a control socket."""
     scenario: Scenario
     news: list[Event]
 

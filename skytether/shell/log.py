@@ -20,9 +20,10 @@ from skytether.shell.limit import Limit
 from skytether.shell.writer import Writer
 
 ROOM_BYTES = 256 * 1024
-"""Most bytes of lines that wait to be written."""
+"""Largest number of bytes of lines that wait to be written."""
 TOGETHER_BYTES = 4096
-"""Most bytes in one write: PIPE_BUF, which a pipe takes whole even with several writers."""
+"""Largest number of bytes in one write: PIPE_BUF, which a pipe takes whole even with several
+writers."""
 PATIENCE_S = 0.5
 """Longest time to wait at the end until all lines are written."""
 
@@ -42,7 +43,9 @@ _UNDECODABLE = msgspec.DecodeError, UnicodeDecodeError, RecursionError
 
 
 def line_of(text: bytes) -> LogLine | None:
-    """Parse a printed line; None if it is no line of the log, such as one of a traceback."""
+    """Parse a printed line; None if it is not a line of the log, but for example one of a
+    traceback.
+    """
     try:
         return _DECODER.decode(text)
     except _UNDECODABLE:

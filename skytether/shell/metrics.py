@@ -234,8 +234,8 @@ LEFT_OUT = {
     "client": (
         "vehicles",  # constant
         "by_vehicle/{vehicle}/missed",  # covered by the other metrics
-        "by_vehicle/{vehicle}/began_s",  # from a clock that Prometheus does not know
-        "by_vehicle/{vehicle}/autopilot/mode",  # its number is exported
+        "by_vehicle/{vehicle}/began_s",  # a time on the client's own clock
+        "by_vehicle/{vehicle}/autopilot/mode",  # the number of the mode is exported
     ),
 }
 """Figures that are deliberately not exported."""

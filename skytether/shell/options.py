@@ -143,7 +143,7 @@ def _kinds(key: str) -> frozenset[Any]:
 
 
 def toml_value(text: str) -> Any:
-    """Value of a text as TOML if JSON can express it too; else the text itself."""
+    """Value of a text as TOML if JSON can express it too; otherwise the text itself."""
     try:
         table = toml.loads(f"value = {text}")
         return json.loads(json.dumps(table["value"], allow_nan=False)) if len(table) == 1 else text

@@ -10,11 +10,11 @@ from skytether.shared.telemetry.record import Recorder, Rows, parse
 from skytether.shell.writer import Writer
 
 ROOM_BYTES = 32 * 1024 * 1024
-"""Most bytes of rows that wait for the disk: 8 s of 1000 vehicles at 20 Hz; rows as short as
-netem's take three times as much memory.
+"""Largest number of bytes of rows that wait for the disk: 8 s of 1000 vehicles at 20 Hz; rows as
+short as netem's take three times as much memory.
 """
 TOGETHER_BYTES = 256 * 1024
-"""Most bytes of rows in one write."""
+"""Largest number of bytes of rows in one write."""
 PAUSE_S = 0.02
 """Time for which rows are collected before a write [s], and lost if the process is killed."""
 PATIENCE_S = 3.0
@@ -42,7 +42,7 @@ class RecordFile:
         self._told = False
 
     def news(self) -> RecordIncomplete | None:
-        """Event about lost rows: once, after the first was lost; else None."""
+        """Event about lost rows: once, after the first was lost; otherwise None."""
         reason = self._reason()
         if reason is None or self._told:
             return None

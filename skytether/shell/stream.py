@@ -81,7 +81,7 @@ class ByteStream:
 
         Raises:
             OSError: no peer listens, or there is no device.
-            termios.error: the file is no serial port.
+            termios.error: the file is not a serial port.
         """
         with contextlib.ExitStack() as failed:
             if self._line.kind == "serial":
@@ -105,7 +105,7 @@ def prepare(port: int, baud: int) -> None:
     """Configure a serial port, a file descriptor, for raw bytes at a rate that the system supports.
 
     Raises:
-        termios.error: the file is no serial port.
+        termios.error: the file is not a serial port.
     """
     rate = getattr(termios, f"B{baud}")
     tty.setraw(port)

@@ -1,7 +1,7 @@
 """Temporary folders; those that a killed process has left are removed by the next process.
 
 A folder contains a mark: a file that its owner keeps locked until it ends, however it ends. Only a
-folder of this user with an new_mark mark is removed. The mark is removed last, so that the next
+folder of this user whose mark is not locked is removed. The mark is removed last, so that the next
 process completes an interrupted removal.
 """
 
@@ -15,7 +15,7 @@ from pathlib import Path
 
 PREFIX = "skytether-"
 MARK = ".of-a-process"
-"""Name of the lock file that marks these folders and shows whether the owner lives."""
+"""Name of the lock file that marks these folders and shows whether the owner is still running."""
 
 
 @contextlib.contextmanager
@@ -54,10 +54,10 @@ def _clear(place: Path) -> None:
 
 
 def _clear_one(made: Path) -> None:
-    """Remove a folder, if it is this user's and its owner is dead.
+    """Remove a folder, if it is this user's and its owner has ended.
 
     Raises:
-        OSError: the folder has no mark, or its owner lives.
+        OSError: the folder has no mark, or its owner is still running.
     """
     if made.lstat().st_uid != os.getuid():
         return

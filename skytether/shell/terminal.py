@@ -43,7 +43,7 @@ def progress(title: str, total: float, unit: str = "s") -> Iterator[Bar]:
         TextColumn("{task.fields[text]}", markup=False),
         console=console,
         transient=True,
-        speed_estimate_period=600.0,  # a step may take minutes
+        speed_estimate_period=600.0,  # a step of the bar may take minutes
         disable=not console.is_interactive,
     ) as shown:
         row = shown.add_task(title, total=total, text="")

@@ -1,7 +1,7 @@
 """Time of day of this host, with the error bound that its kernel reports (`adjtimex`, Linux).
 
 The time daemon sets that bound. chrony and ntpd include half of the round-trip time to their
-source, so it holds whatever the network delay. systemd-timesyncd sets it to 0, which is no
+source, so it holds whatever the network delay. systemd-timesyncd sets it to 0, which is not an
 estimate: such a clock counts as unknown. So does the clock under chrony without `rtcsync`, which
 leaves it marked as not synchronised.
 """

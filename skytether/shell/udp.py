@@ -26,7 +26,8 @@ FLOODED_BYTES = 16 * 1024 * 1024
 """Receive buffer of a socket that may be flooded [B]: half a second of 50 000 packets/s."""
 
 ADDRESSES_MAX = 4096
-"""Most addresses whose other forms are cached, 360 B each: a flood of HELLOs may fill the cache."""
+"""Largest number of addresses whose other forms are cached, 360 B each: a flood of HELLOs may fill
+the cache."""
 
 SPARE_FILES = 48
 """Open files that a process may need beside its sockets: readers of its feed, metrics."""
@@ -39,7 +40,7 @@ _IP_RECVERR, _IPV6_RECVERR, _MSG_ERRQUEUE, _FROM_THIS_MACHINE = 11, 25, 0x2000, 
 _SO_ATTACH_FILTER, _UDP_HEADER_BYTES = 26, 8
 _BYTE, _LENGTH, _IF_EQUAL, _IF_AT_LEAST, _RETURN = 0x30, 0x80, 0x15, 0x35, 0x06
 """Instructions of classic BPF, Linux's packet filter: load a byte, load the length, jump if equal,
-jump if at least, accept so many bytes.
+jump if at least, accept this number of bytes.
 """
 
 
@@ -166,7 +167,9 @@ def sockets_max() -> int:
 
 
 def allow_sockets(count: int) -> None:
-    """Raise this process's limit of open files for so many sockets, as far as the system allows."""
+    """Raise this process's limit of open files for this number of sockets, as far as the system
+    allows.
+    """
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     wanted = min(count + SPARE_FILES, files_max())
     if soft != resource.RLIM_INFINITY and wanted > soft:
@@ -329,7 +332,9 @@ class Names:
         return peer
 
     def heard_all(self, raws: Sequence[RawAddress]) -> list[Address]:
-        """Peers, as by `heard`; raises the same."""
+        """Peers with addresses in the kernel's form, as the user has written them; raises as
+        `heard` does.
+        """
         peers = list(map(self._heard.get, raws))
         if None not in peers:
             return cast("list[Address]", peers)

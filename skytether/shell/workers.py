@@ -21,7 +21,7 @@ from skytether.shell.udp import from_kernel, open_socket
 FORK = multiprocessing.get_context("fork")
 """Start method of workers: fork shares imported and compiled code, in memory and start-up time."""
 PASSED_ON = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1)
-"""Signals passed on to every worker, SIGINT as SIGTERM, and each of both only once."""
+"""Signals passed on to every worker, SIGINT as SIGTERM, and each of these two only once."""
 
 
 def run(count: int, bind: Address, work: Callable[[int, socket], None]) -> int:
@@ -41,7 +41,8 @@ def run(count: int, bind: Address, work: Callable[[int, socket], None]) -> int:
         FORK.Process(target=_work, args=(work, number, sockets, os.getpid()))
         for number in range(1, count + 1)
     ]
-    # Blocked until children have set handlers of their own; else they would inherit this process's.
+    # Blocked until children have set handlers of their own; otherwise they would inherit this
+    # process's.
     signal.pthread_sigmask(signal.SIG_BLOCK, PASSED_ON)
     for child in children:
         child.start()

@@ -298,7 +298,7 @@ def make_keys(seed: int, vehicles: int) -> Keyring:
 def _link(keyring: Keyring | None, seed: int, vehicle: int) -> ClientLink | None:
     if keyring is None:
         return None
-    from skytether.client.secure import SecureLink  # imports ciphers, which takes a while
+    from skytether.client.secure import SecureLink  # slow: imports ciphers
 
     return SecureLink(keyring.of(vehicle), entropy=stream(seed, "entropy", vehicle).bytes)
 
@@ -306,7 +306,7 @@ def _link(keyring: Keyring | None, seed: int, vehicle: int) -> ClientLink | None
 def _gate(keyring: Keyring | None, entropy: Callable[[int], bytes]) -> Gate | None:
     if keyring is None:
         return None
-    from skytether.server.secure import SecureGate  # imports ciphers, which takes a while
+    from skytether.server.secure import SecureGate  # slow: imports ciphers
 
     return SecureGate(keyring, entropy=entropy)
 

@@ -136,7 +136,7 @@ class World:
             | tuple[int, int, int, None, Callable[[], None]]
         ] = []
         """Heap of future events: time, rank, order of entry, host, and the arriving datagram, or
-        None for a wake; an action has no host but a function.
+        None for a wake; an action has a function in place of the host.
         """
         self._scheduled = 0
         self._arriving: deque[tuple[Host, Datagram]] = deque()

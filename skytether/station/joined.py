@@ -33,8 +33,8 @@ def station_columns(axes: int) -> np.dtype[np.void]:
             ("time_ns", "<i8"),  # clock of the station
             ("step", "<i8"),
             ("input", "<f8", (axes,)),  # velocity of the set-point [m/s]
-            ("measured", "<f8", (axes,)),  # newest position received [m]; NaN for none
-            ("age_ns", "<i8"),  # age of that position; -1 for none
+            ("measured", "<f8", (axes,)),  # newest position received [m]; NaN before the first
+            ("age_ns", "<i8"),  # age of that position; -1 before the first
             # whether the station was in control of the autopilot, and so sent a set-point
             ("obeyed", "?"),
             ("late", "<i8"),  # number of positions so far that arrived after newer ones

@@ -92,14 +92,14 @@ class Heard(NamedTuple):
     time_s: float
     """Time of flight at the measurement [s]."""
     position: Array
-    """Shape (axes,) [m]."""
+    """Position [m]; shape (axes,)."""
 
 
 class Setpoint(NamedTuple):
     velocity: Array
-    """Shape (axes,) [m/s]."""
+    """Velocity [m/s]; shape (axes,)."""
     position: Array | None
-    """Shape (axes,) [m]; None if only the velocity is set."""
+    """Position [m]; shape (axes,); None if only the velocity is set."""
 
 
 def setpoint(law: Law, reference: Reference, time_s: float, heard: Heard | None) -> Setpoint:

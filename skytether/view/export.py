@@ -25,7 +25,7 @@ from skytether.view.rows import Columns, readable
 PASSES_NS = ("age_ns", "solve_ns", "delay_ns")
 """Columns of durations [ns]; negative where none was measured."""
 STEPS = ("in_force", "observed_step")
-"""Columns of a step that may be missing; negative for none."""
+"""Columns of steps; a negative value stands for a missing step."""
 
 
 def tables(recorded: Recorded) -> dict[str, Columns]:

@@ -285,7 +285,7 @@ class Plots:
         )
 
     def draw(self, looks: Sequence[Look]) -> None:
-        """The first flight determines the times."""
+        """Draw the plots of all flights; the first flight determines the times."""
         drawn = []
         for plot in self._plots:
             data = [plot.grid(looks[0])]

@@ -53,7 +53,7 @@ class Recorded:
 
     @cached_property
     def summary(self) -> Summary | None:
-        """None if no step was flown."""
+        """Summary of the first vehicle's flight; None if no step was flown."""
         return summary_of(self.scenario, self.about, self.parts, self.figures)
 
     @cached_property
@@ -96,7 +96,7 @@ def read(path: Path) -> Recorded:
 
     Raises:
         OSError: the file cannot be read.
-        RecordingError: the file is no recording, or is damaged.
+        RecordingError: the file is not a recording, or is damaged.
     """
     with closing(Container(path)) as file, reading(path):
         messages = file.messages()

@@ -52,7 +52,7 @@ OURS = "skytether"
 """Name of the metadata, and of the writing library."""
 SCENARIO, SUMMARY = "scenario.toml", "summary.json"
 VEHICLES_MAX = 64
-"""Most vehicles that are drawn; of further vehicles only rows are recorded."""
+"""Largest number of vehicles that are drawn; of further vehicles only rows are recorded."""
 CHUNK_BYTES = 256 * 1024
 POINTS_MAX = 400
 WARNINGS = RecordIncomplete, Fault, Degraded, ChangeRefused, *Failure.__args__

@@ -32,7 +32,7 @@ TRAIL_S = 20.0
 GOAL_S = 1.0
 """Age up to which a desired position is shown [s]; an older one is out of date."""
 TRAIL_POINTS = 240
-"""Most points of a vehicle's trail."""
+"""Largest number of points of a vehicle's trail."""
 TRAIL_POINTS_ALL = 2000
 ROUND_S = 600.0
 """Longest part of the desired trajectory that is drawn."""

@@ -42,7 +42,8 @@ from skytether.view.network import DIRECTIONS, SPAN_S, Network
 from skytether.view.rows import check_columns, check_values, planned
 
 SLOTS_MAX = 1200
-"""Most steps that are kept of a vehicle; with more steps per minute, only every n-th is kept."""
+"""Largest number of steps that are kept of a vehicle; with more steps per minute, only every n-th
+is kept."""
 VEHICLES_MAX = 64
 ZONED, GUIDED = "mission.zones", "mission.goals"
 """Keys of a mission's zones, and of its goals changed in flight."""
@@ -87,7 +88,7 @@ class Curves:
     threshold: Array
     """Threshold that the figure is compared with; shape (n,)."""
     age_s: Array
-    """Age of the observation behind the input in force [s]; shape (n,)."""
+    """Age of the observation from which the input in force was computed [s]; shape (n,)."""
     solve_ms: Array
     """Computing time of both MPC problems [ms]; shape (n,)."""
 
@@ -193,14 +194,16 @@ class VehicleTrack:
 
     @property
     def age_s(self) -> float:
-        """Age of the observation behind the newest input [s]; NaN for none."""
+        """Age of the observation from which the newest input was computed [s]; NaN if there is
+        none.
+        """
         if self.row is None or self.row["age_ns"] < 0:
             return np.nan
         return float(self.row["age_ns"]) / SECOND_NS
 
     @property
     def known_s(self) -> float:
-        """Age of the server's newest observation when it planned last [s]; NaN for none."""
+        """Age of the server's newest observation when it planned last [s]; NaN if there is none."""
         if self._seen is None or self._seen["observed_step"] < 0:
             return np.nan
         behind = int(self._seen["step"] - self._seen["observed_step"])

@@ -60,7 +60,7 @@ def pcap(packets: Rows, began_ns: int = 0) -> bytes:
 
 
 def _header(direction: int, flow: int, size: int) -> bytes:
-    """IP and UDP header of a packet of so many bytes, headers included."""
+    """IP and UDP header of a packet of this size [B], headers included."""
     client = bytes((10, 0, (flow + 1) >> 8 & 0xFF, flow + 1 & 0xFF)), CLIENT_PORT
     ends = [client, (SERVER, SERVER_PORT)]
     (source, source_port), (target, target_port) = ends if direction == DOWNLINK else ends[::-1]

@@ -109,7 +109,7 @@ def _gone(state: State) -> str:
 
 
 def _newest(state: State) -> str:
-    """The box has a fixed height, so that the page does not move."""
+    """Newest events, in a box of fixed height, so that the page does not move."""
     style = "white-space:nowrap;overflow:hidden;text-overflow:ellipsis"
     lines = "".join(
         f'<div style="{style}" title="{escape(text)}">{time_s:.1f} s {escape(text)}</div>'

@@ -43,7 +43,7 @@ class Delay(Impairment):
 
 @impairment(name="constant")
 class Constant(Delay):
-    """Delays every packet by so many seconds."""
+    """Delays every packet by a constant number of seconds."""
 
     def __init__(self, delay_s: Time) -> None:
         super().__init__()

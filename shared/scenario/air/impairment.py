@@ -2,7 +2,7 @@
 
 @impairment
 class Fading(Impairment):
-    '''Loses a share of the packets that rises and falls in so many seconds.'''
+    '''Loses a share of the packets that rises and falls with this period.'''
 
     def __init__(self, period_s: Annotated[float, Meta(ge=0.001)]) -> None:
         self.period_s, self.loss = period_s, 0.5

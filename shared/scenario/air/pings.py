@@ -73,7 +73,9 @@ class Run:
         return ahead if ahead > self.last else None
 
     def timed(self) -> tuple[Array, Array]:
-        """Times of sending [s] and round trips [s], NaN of lost packets, from first to last."""
+        """Times of sending [s] and round trips [s] of all packets in order,
+        NaN for a lost packet.
+        """
         low = self.low()
         numbers = np.arange(low, self.last + 1, dtype=np.float64)
         answered = sorted((n, *trip) for n, trip in self.trips.items() if isfinite(trip[1]))
@@ -302,8 +304,8 @@ def runs(text: str) -> list[Run]:
 
 
 def joined(found: Sequence[Run]) -> tuple[Array, Array]:
-    """Times of sending [s] and round trips [s], NaN of lost packets; the runs are appended to each
-    other.
+    """Times of sending [s] and round trips [s], NaN for a lost packet; the runs are appended to
+    each other.
 
     Raises:
         LogError: there are too many packets, or no answer.

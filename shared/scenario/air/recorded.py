@@ -299,7 +299,7 @@ def _checked(
 
     Args:
         time_s: times of sending [s]; shape (n,).
-        delay_s: one-way delays, NaN of lost packets [s]; shape (n,).
+        delay_s: one-way delays, NaN for a lost packet [s]; shape (n,).
 
     Raises:
         ValueError: with the first invalid row.

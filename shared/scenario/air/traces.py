@@ -24,7 +24,7 @@ DELIVERY_BYTES = 1504
 
 @impairment(name="trace")
 class Trace(Impairment):
-    """Delays and loses packets as a recorded path did at that time; round and round, or once."""
+    """Delays and loses packets as a recorded path did at that time; repeatedly, or once."""
 
     kind = "delay"
 
@@ -46,7 +46,9 @@ class Trace(Impairment):
         self.loss = float(recorded.lost.mean())
 
     def __call__(self, fate: Fate, draws: Draws) -> None:  # noqa: ARG002
-        """A packet between two of the file is lost if the nearer one was."""
+        """Apply the file: a packet sent between two packets of the file is lost if the nearer of
+        them was lost.
+        """
         time_s = fate.time_s % self._loop_s if self._loop_s else fate.time_s
         fate.delay_ns += seconds_to_ns(interpolated(time_s, self._times_s, self._delays_s))
         if self._loses and interpolated(time_s, self._times_s, self._lost) > 0.5:

@@ -98,7 +98,7 @@ def margins(argv: Sequence[str]) -> None:
             runs = min(options.runs, lab.LIMIT_RUNS)
             parts += [partial(lab.limit, scenario, each, trigger, runs) for each in lab.LIMITS]
             results = flyers.study(_fly, dict(enumerate(parts))).values()
-    except Interrupted as interrupted:  # results are not stored
+    except Interrupted as interrupted:  # no journal, so nothing to continue
         raise CommandError("interrupted", command.INTERRUPTED) from interrupted
     flown = [each for each in results if isinstance(each, Margin)]
     limits = [each for each in results if isinstance(each, MarginLimit)]

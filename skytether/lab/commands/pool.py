@@ -228,7 +228,7 @@ class Crew:
 
 @contextmanager
 def crew(flags: Flags, title: str, total: float, unit: str = "runs") -> Iterator[Crew]:
-    """Workers with a progress bar on stderr, which shows `total` in the unit. Ctrl-C ends them in
+    """Workers with a progress bar on stderr, which counts up to `total`; Ctrl-C ends the workers in
     order.
     """
     if not flags.scheduler:  # Compile now: otherwise every worker would compile all kernels.

@@ -93,7 +93,7 @@ def _trials(options: TortureOptions) -> tuple[list[Trial], str]:
 
     Raises:
         CommandError: the options are impossible, or exclude each other.
-        ConfigError: a text is no schedule.
+        ConfigError: a text is not a schedule.
     """
     asked = ("seed", "hours", "replay", "schedule")
     given_options = [name for name in asked if getattr(options, name) is not None]
@@ -124,7 +124,7 @@ def _read(path: Path) -> list[Trial]:
 
     Raises:
         CommandError: the file cannot be read.
-        ConfigError: a line is no schedule, or the file has none.
+        ConfigError: a line is not a schedule, or the file has none.
     """
     try:
         lines = files.read(path, SCHEDULES_BYTES_MAX).decode().splitlines()

@@ -27,7 +27,7 @@ DIGITS = 4
 class AxisOutcome(NamedTuple):
     speed: float
     cut: int
-    """Number of steps that the fence cut short, or for which the fence left no room."""
+    """Number of steps that the fence cut short, or for which the fence left no space."""
     responses: Sequence[StepResponse]
     fit: Fit | None
     """Fitted model; None with too few steps."""

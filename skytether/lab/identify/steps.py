@@ -110,7 +110,7 @@ class Experiment:
         self._input = [0.0] * len(plan.speeds)
         self.steps: list[FlownStep] = []
         self.cut = [0] * len(plan.speeds)
-        """Number of steps of each axis that the fence cut short, or for which it left no room."""
+        """Number of steps of each axis that the fence cut short, or for which it left no space."""
         self.is_over = False
 
     def choose(self, state: Sequence[tuple[float, float]], *, now_ns: int) -> list[float]:
@@ -171,7 +171,7 @@ class Experiment:
         return [min(max(HOMEWARD * (h - p), -most), most) for (p, _), h, most in axes]
 
     def _direction(self, axis: int) -> float:
-        """Direction in which the fence leaves room for a step; 0 if there is none.
+        """Direction in which the fence leaves space for a step; 0 if there is none.
 
         Up is tried first, and down only if the fence has a lower bound.
         """

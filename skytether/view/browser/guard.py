@@ -36,7 +36,8 @@ from skytether.view.browser.access import TurnedAway, Visitor, refusal
 
 BROWSERS_MAX = 16
 CONNECTIONS_MAX = 32
-"""Most connections at once, including those that only load the page or have sent no request yet."""
+"""Largest number of connections at once, including those that only load the page or have sent no
+request yet."""
 MESSAGE_BYTES_MAX = 64 * 1024
 PIECES_MAX = 64
 FRAMES_MAX = 1024
@@ -85,7 +86,7 @@ class Guard:
     """Check of connections and messages, with a count of refusals.
 
     Args:
-        token: secret that exempts a visitor from the other checks; empty for none.
+        token: secret that exempts a visitor from the other checks; empty if there is none.
     """
 
     def __init__(self, token: str) -> None:

@@ -55,8 +55,8 @@ class Page:
     Args:
         host, port: address that it listens at.
         now_ns: function that returns the time of the frames [ns]; by default this machine's clock.
-        token: secret that lets a visitor look and change the flight from any machine; empty for
-            none.
+        token: secret that lets a visitor look and change the flight from any machine; empty if
+            there is none.
         more: adds further controls to a browser.
     """
 

@@ -59,11 +59,11 @@ class Player:
 
     @property
     def at_ns(self) -> int:
-        """Since the first frame."""
+        """Present time since the first frame [ns]."""
         return self._at_ns
 
     def now_ns(self) -> int:
-        """On the clock of the first flight."""
+        """Present time on the clock of the first flight [ns]."""
         return self._begin_ns + self._at_ns
 
     def seek(self, at_ns: int) -> None:
