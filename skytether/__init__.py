@@ -13,6 +13,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from skytether.library.comparing import compare
     from skytether.library.flight import Column, Flight, table
     from skytether.library.flying import check, fly, fly_batch, load
     from skytether.library.sweeping import Swept, sweep
@@ -35,6 +36,7 @@ __all__ = [
     "Swept",
     "World",
     "check",
+    "compare",
     "fly",
     "fly_batch",
     "load",
@@ -43,6 +45,7 @@ __all__ = [
 ]
 
 _HOMES = {
+    "skytether.library.comparing": ("compare",),
     "skytether.library.flight": ("Column", "Flight", "table"),
     "skytether.library.flying": ("check", "fly", "fly_batch", "load"),
     "skytether.library.sweeping": ("Swept", "sweep"),

@@ -56,7 +56,7 @@ def names(file: str = "") -> list[str]:
         ConfigError: the file cannot be read.
     """
     if file:
-        return [f"{file}/{name}" for name in _toml(_path(file), file)]
+        return [f"{file}/{name}" for name in read_toml(_path(file), file)]
     files = (each.name for each in SCENARIOS.iterdir())
     known = {name.removesuffix(".toml") for name in files if name.endswith(".toml")}
     return sorted(known - {COMPARED})
@@ -165,7 +165,7 @@ def _read(name: str, seen: Mapping[tuple[Path, str], str] = MappingProxyType({})
     elif not (entry and (file == COMPARED or file.endswith(".toml"))):
         raise ConfigError(f"{name}: no such scenario; {hint(name, names())}")
     path = _path(file)
-    raw = _toml(path, file)
+    raw = read_toml(path, file)
     if entry:
         if not isinstance(raw.get(entry), dict):
             raise ConfigError(f"{name}: no such scenario; {hint(entry, raw)}")
@@ -290,7 +290,7 @@ def _path(file: str) -> Path:
         raise ConfigError(f"{file}: cannot be read: {error}") from None
 
 
-def _toml(path: Path, file: str) -> dict[str, Any]:
+def read_toml(path: Path, file: str) -> dict[str, Any]:
     try:
         return toml.loads(files.read(path, toml.BYTES_MAX).decode())
     except OSError as error:

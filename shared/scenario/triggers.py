@@ -23,6 +23,7 @@ from skytether.shared.scenario.grammar import Combination, Expression, Value
 from skytether.shared.scenario.registry import PERIOD_MAX, TRIGGERS
 from skytether.shared.scenario.schema import ControlConfig
 from skytether.shared.scenario.schemes import HELD, that_compute
+from skytether.shared.wire.protocol import AXES_MAX
 
 trigger = TRIGGERS
 """Decorator of a policy: a function of a `Situation` and its numbers, or a subclass of
@@ -354,6 +355,71 @@ def deviation(situation: Situation, metres: Amount = 0.05) -> Verdict:
     plan.
     """
     return above(situation, Compared.DEVIATION_M, metres)
+
+
+@trigger(name="send_on_delta")
+class SendOnDelta(Trigger):
+    """Sends if the reference is more than so many metres from where it was at the last packet.
+
+    Level crossings with a hysteresis of one level; no model predicts the reference. Source:
+    Miskowicz, Send-on-delta concept, Sensors 6 (2006).
+    """
+
+    def __init__(
+        self,
+        control: ControlConfig,  # noqa: ARG002
+        capacity: int,
+        metres: Amount = 0.5,
+    ) -> None:
+        self._metres = metres
+        self._latest, self._sent = np.zeros((2, capacity, AXES_MAX))
+
+    def forget(self, row: int) -> None:
+        self._latest[row] = self._sent[row] = 0.0
+
+    def test(self, situation: Situation) -> Verdict:
+        rows, desired_m = situation.rows, situation.desired[:, :, 0, 0]
+        axes = slice(desired_m.shape[1])
+        self._latest[rows, axes] = desired_m
+        moved_m = np.linalg.norm(desired_m - self._sent[rows, axes], axis=1)
+        return above(situation, moved_m, self._metres)
+
+    def sent(self, rows: Indices, figures: Figures) -> None:  # noqa: ARG002
+        self._sent[rows] = self._latest[rows]
+
+
+@trigger(name="self_triggered")
+class SelfTriggered(Trigger):
+    """Sends at a time fixed at the last packet: when the reference, at its velocity then, has moved
+    so many metres, but after so many seconds at the latest.
+
+    Source: Velasco, Fuertes, Marti, The self triggered task model for real-time control systems,
+    RTSS (2003).
+    """
+
+    def __init__(
+        self,
+        control: ControlConfig,  # noqa: ARG002
+        capacity: int,
+        metres: Amount = 0.5,
+        seconds: Annotated[float, Meta(ge=0.001, le=3600)] = 5.0,
+    ) -> None:
+        self._metres, self._most_s = metres, seconds
+        self._latest_s, self._wait_s = np.zeros((2, capacity))
+
+    def forget(self, row: int) -> None:
+        self._latest_s[row] = self._wait_s[row] = 0.0
+
+    def test(self, situation: Situation) -> Verdict:
+        rows = situation.rows
+        speed_mps = np.linalg.norm(situation.desired[:, :, 0, 1], axis=1)
+        self._latest_s[rows] = self._metres / np.maximum(speed_mps, self._metres / self._most_s)
+        # 1e-9: rounding errors of a time in steps.
+        due = situation.since_sent_s > self._wait_s[rows] - 1e-9
+        return _timed(situation.figures["fresh"] | due, situation.figures)
+
+    def sent(self, rows: Indices, figures: Figures) -> None:  # noqa: ARG002
+        self._wait_s[rows] = self._latest_s[rows]
 
 
 @trigger(name="silence")

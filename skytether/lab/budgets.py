@@ -21,12 +21,11 @@ from skytether.lab.contenders import (
     ComparisonSize,
     Contender,
     differences,
-    entry,
+    tuned,
 )
 from skytether.lab.sweep import GridAxis, Results, Sweep
-from skytether.shared.base.errors import ConfigError
 from skytether.shared.scenario import reading
-from skytether.shared.scenario.dotted import set_keys, value
+from skytether.shared.scenario.dotted import value
 from skytether.shared.scenario.schema import Scenario
 
 BUDGETS = (1.0, 2.0, 5.0, 10.0, 20.0, 40.0)
@@ -53,6 +52,8 @@ REPORTS: Mapping[str, Mapping[str, Any]] = {
 """Policies by which the vehicle reports its state, and the keys that each changes."""
 EVERY = "every step"
 """Reporting policy with which weights are searched for."""
+ITS_OWN = "its own"
+"""Reporting policy of a user's contender that sets it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +64,7 @@ class FlownContender:
     threshold: float | None
     """Threshold of the trigger; None if the contender has none."""
     report: str
-    """Reporting policy, a key of REPORTS."""
+    """Reporting policy, a key of REPORTS, or ITS_OWN."""
     tuned: bool
     """Whether the threshold is the result of the search for weights."""
     keys: Mapping[str, Any]
@@ -84,6 +85,7 @@ def flying(
     """Contender with every reporting policy at all its thresholds, in rising order."""
     keys, key = differences(tuned, case.plant), contender.threshold
     keys = {path: value for path, value in keys.items() if path not in case.keys}
+    keys |= contender.keys
     values: list[float | None] = [None]
     tuned_threshold = value(reading.to_table(tuned), f"control.{key}") if key else None
     if tuned_threshold is not None:
@@ -92,6 +94,7 @@ def flying(
         if isinstance(tuned_threshold, int):  # steps
             scaled = [max(1, round(value)) for value in scaled]
         values = sorted({*scaled})
+    reports = {ITS_OWN: {}} if contender.reports_by_itself else REPORTS
     return [
         FlownContender(
             contender,
@@ -101,7 +104,7 @@ def flying(
             {**keys, **({f"control.{key}": value} if key else {}), **changes},
         )
         for value in values
-        for report, changes in REPORTS.items()
+        for report, changes in reports.items()
     ]
 
 
@@ -140,25 +143,17 @@ class Plan:
         weights: COMPARED, or the path of a file made by `to_file`.
 
     Raises:
-        ConfigError: the file cannot be read, or a contender is missing or invalid in it.
+        ConfigError: the file cannot be read, or a contender is missing, unknown or invalid in it.
     """
 
     def __init__(self, case: Case, weights: str, scale: ComparisonSize) -> None:
         self.case = case
         self.points: list[FlownContender] = []
-        tables = reading.names(weights)
         for contender in scale.who(case):
-            name = entry(contender, case)
-            if f"{weights}/{name}" not in tables:
-                there_is = "expected every contender in every case, as --tune writes them"
-                raise ConfigError(f"{weights}: got no table {name!r}, {there_is}")
-            self.points += flying(contender, case, reading.load(f"{weights}/{name}"), scale)
+            self.points += flying(contender, case, tuned(contender, case, weights), scale)
         self.runs = -(-scale.runs // 2) if case.weights else scale.runs
         """Number of flights of each chosen point; half in a case with its own weights."""
-        plant = reading.to_table(reading.load(case.plant))
-        set_keys(case.keys, plant)
-        plant["duration"] = min(plant["duration"], scale.duration)
-        self._scenario = reading.check(plant, case.title)
+        self._scenario = scale.scenario(case)
         self._scouting = scale.scouts, replace(self._scenario, seed=SEARCH_SEED)
         self._scouted: list[Scouted] = []
 

@@ -10,7 +10,7 @@ import numpy as np
 from skytether.figures.page import Cell, Row, Table, as_text, lettered, table_of
 from skytether.figures.tables import rows_csv, to_csv
 from skytether.lab import plates
-from skytether.lab.budgets import BUDGETS, EVERY, SOUGHT, Chosen, FlownContender, Plan
+from skytether.lab.budgets import BUDGETS, EVERY, ITS_OWN, SOUGHT, Chosen, FlownContender, Plan
 from skytether.lab.contenders import ABOARD, CASES, CONTENDERS, Case, Contender
 from skytether.lab.floor import Baselines, Floor
 from skytether.lab.intervals import Estimate, interval, jackknife
@@ -100,8 +100,8 @@ class ComparedCase:
 
     @property
     def contenders(self) -> list[Contender]:
-        names = {name for name, _ in self.bought}
-        return [each for each in (*CONTENDERS, ABOARD) if each.name in names]
+        points = (*self.tuned, *(runs.what for runs in self.bought.values()))
+        return list({point.contender.name: point.contender for point in points}.values())
 
     def curve(self, contender: str) -> list[ContenderRuns]:
         """Chosen points of a contender with rising budget; each point once."""
@@ -126,7 +126,7 @@ def compared(
     if beside.aboard:
         alone = ContenderRuns(FlownContender(ABOARD, None, "", tuned=True, keys={}), beside.aboard)
         bought |= {(ABOARD.name, budget): alone for budget in BUDGETS}
-    tuned = [each for each in plan.points if each.tuned and each.report == EVERY]
+    tuned = [each for each in plan.points if each.tuned and each.report in (EVERY, ITS_OWN)]
     return ComparedCase(plan.case, bought, tuned, beside.floor)
 
 
@@ -243,8 +243,9 @@ def budgets_table(results: Sequence[ComparedCase]) -> Table:
         "Mean RMSE xy [m] with its 95 % interval, and median, @ packets a second. Within a budget "
         "each contender flies at the threshold and with the reporting policy that had the smallest "
         "error on other seeds. * marks the smallest mean, and means that do not differ from it "
-        "significantly: the interval of their ratio on the same seeds contains 1. The CSV has "
-        "bytes and all other figures."
+        "significantly: the interval of their ratio on the same seeds contains 1. – means that no "
+        "flown setting was within the budget and the case's limit on effort. The CSV has bytes and "
+        "all other figures."
     )
     flown = {id(runs): runs for each in results for runs in each.bought.values()}.values()
     failed = sum(run.rmse_xy is None for each in flown for run in each.runs)
@@ -277,6 +278,7 @@ def _best(compared: ComparedCase, budget: float) -> list[ContenderRuns]:
 
 def leaders_table(results: Sequence[ComparedCase]) -> Table:
     rows = []
+    titles = {one.name: one.title for each in results for one in each.contenders}
     for each in results:
         for budget in BUDGETS:
             ours = each.bought.get((OURS, budget))
@@ -300,7 +302,7 @@ def leaders_table(results: Sequence[ComparedCase]) -> Table:
         "case": lambda row: CASE_TITLES[row["case"]],
         "budget": lambda row: f"≤ {row['budget']:g}/s",
         "RMSE xy [m]": ("rmse_xy", ".4f"),
-        "best of the others": lambda row: TITLES[row["best_other"]],
+        "best of the others": lambda row: titles[row["best_other"]],
         "its RMSE xy [m]": ("rmse_xy_other", ".4f"),
         "ratio": ("ratio", ".3f"),
         "95 %": _ratio_span,
@@ -405,12 +407,17 @@ SPENT = {
 COLOURS = ("#c1272d", "0.5", "black", "#009e73")
 MARKERS = "sovD^P<*"
 """Markers of the triggers, in order; curves can be told apart without colour."""
+USER_COLOURS = ("#0072b2", "#e69f00", "#cc79a7", "#56b4e9")
+USER_MARKERS = "Xhdp>"
 
 
-def _style(contender: Contender) -> tuple[str, str]:
-    """Colour and marker of a contender, the same in every figure."""
+def _style(contender: Contender, users: Sequence[Contender]) -> tuple[str, str]:
+    """Colour and marker of a contender, the same in every figure; `users` are those of a user."""
     if contender is ABOARD:
         return "0.3", ""
+    if contender.keys:
+        index = users.index(contender)
+        return USER_COLOURS[index % len(USER_COLOURS)], USER_MARKERS[index % len(USER_MARKERS)]
     schemes = list(dict.fromkeys(each.scheme for each in CONTENDERS))
     triggers = list(dict.fromkeys(each.trigger for each in CONTENDERS))
     colour = COLOURS[schemes.index(contender.scheme)]
@@ -439,8 +446,10 @@ def curves(compared: ComparedCase) -> Plate:
         )
     with lettered(plates.PAGE, 5.0, plates.LETTERS) as figure:
         panes = figure.subplots(1, 3, sharey=True)
+        users = [each for each in compared.contenders if each.keys]
         for contender in compared.contenders:
-            _draw_curve(panes, contender, compared.curve(contender.name))
+            if points := compared.curve(contender.name):
+                _draw_curve(panes, contender, points, _style(contender, users))
         if floor:
             panes[0].plot(*zip(*floor, strict=True), color="0.3", linestyle=":", label="floor")
         for plane, (spent, label) in zip(panes, SPENT.items(), strict=True):
@@ -456,7 +465,10 @@ def curves(compared: ComparedCase) -> Plate:
 
 
 def _draw_curve(
-    panes: Sequence[Any], contender: Contender, points: Sequence[ContenderRuns]
+    panes: Sequence[Any],
+    contender: Contender,
+    points: Sequence[ContenderRuns],
+    style: tuple[str, str],
 ) -> None:
     """Draw the RMSE of a contender over each of SPENT, with 95 % bands.
 
@@ -467,16 +479,16 @@ def _draw_curve(
     half = np.nan_to_num(half)
     median = np.array([each.median() for each in flown], np.float64)
     low = np.maximum(rmse - half, 0.5 * rmse)  # a logarithmic axis cannot show 0
-    colour, marker = _style(contender)
+    colour, marker = style
     if flown and not flown[0].mean(PACKETS):
         for plane in panes:
             plane.axhline(rmse[0], color=colour, linestyle="--", label=contender.title)
         return
-    style: Any = {"color": colour, "linestyle": "none"}
+    dots: Any = {"color": colour, "linestyle": "none"}
     for plane, spent in zip(panes, SPENT, strict=True):
         cost = np.array([each.mean(spent) for each in flown], np.float64)
-        plane.plot(cost, rmse, **style, marker=marker, markersize=4, label=contender.title)
-        plane.plot(cost, median, **style, marker="_", markersize=7)
+        plane.plot(cost, rmse, **dots, marker=marker, markersize=4, label=contender.title)
+        plane.plot(cost, median, **dots, marker="_", markersize=7)
         if spent == EFFORT:
             continue  # effort may rise or fall with the threshold
         plane.plot(cost, rmse, color=colour, linewidth=0.8)

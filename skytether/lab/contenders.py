@@ -10,13 +10,16 @@ import json
 import math
 import textwrap
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.base.hint import hint
 from skytether.shared.scenario import reading
-from skytether.shared.scenario.dotted import flat, set_keys
+from skytether.shared.scenario.dotted import flat, set_keys, text_key, value
+from skytether.shared.scenario.grammar import GrammarError
 from skytether.shared.scenario.schema import Scenario
 
 SEARCH_SEED = 1001
@@ -46,10 +49,19 @@ class Contender:
     """Keys of `control` that define the contender, with the initial weights of its search."""
     threshold: str = ""
     """Key of `control` that determines the number of packets; empty if there is none."""
+    keys: Mapping[str, Any] = field(default_factory=dict)
+    """Keys of a user's contender, with dots, and their values; empty for a built-in one."""
+    base: "Contender | None" = None
+    """Built-in contender with whose weights a user's contender flies; None: those of the case."""
 
     @property
     def title(self) -> str:
-        return f"{self.scheme}, {self.trigger}"
+        return f"{self.scheme}, {self.trigger}" if self.trigger else self.scheme
+
+    @property
+    def reports_by_itself(self) -> bool:
+        """Whether it sets how the vehicle reports; other ways of reporting are not tried then."""
+        return any(key.startswith(("vehicle.", "link.")) for key in self.keys)
 
     @property
     def factors(self) -> Sequence[float]:
@@ -286,9 +298,18 @@ class ComparisonSize:
     duration: float = math.inf
     """Largest length of a flight [s]."""
 
+    def scenario(self, case: Case) -> Scenario:
+        """Scenario of a case, without the keys of a contender."""
+        table = reading.to_table(reading.load(case.plant))
+        set_keys(case.keys, table)
+        table["duration"] = min(table["duration"], self.duration)
+        return reading.check(table, case.title)
+
     def who(self, case: Case) -> list[Contender]:
         return [
-            each for each in self.contenders if not case.contenders or each.name in case.contenders
+            each
+            for each in self.contenders
+            if each.keys or not case.contenders or each.name in case.contenders
         ]
 
     @property
@@ -315,7 +336,7 @@ def quick(scale: ComparisonSize) -> ComparisonSize:
         search_runs=2,
         search_duration=12.0,
         cases=few or scale.cases[:1],
-        contenders=[each for each in CONTENDERS if each.name in QUICK],
+        contenders=[each for each in scale.contenders if each.keys or each.name in QUICK],
         scouts=2,
         rounds=1,
         every=3,
@@ -323,7 +344,109 @@ def quick(scale: ComparisonSize) -> ComparisonSize:
     )
 
 
+# -- contenders of a user ------------------------------------------------------------------------
+
+SETTABLE = ("control", "link", "vehicle.report")
+"""Sections and keys that a user's contender may set, without `control.dt`; the case has others."""
+
+
+def of_user(files: Sequence[Path]) -> list[Contender]:
+    """Contenders of a user, each named as its file.
+
+    Raises:
+        ConfigError: a file cannot be read, sets a key of the case, or has the name of another
+            contender.
+    """
+    found = {each.name: each for each in (*CONTENDERS, ABOARD)}
+    known = len(found)
+    for file in files:
+        if file.stem in found:
+            expected = f"expected another than {', '.join(found)}"
+            raise ConfigError(f"--contender: {file}: got the name {file.stem!r}, {expected}")
+        found[file.stem] = _of_user(file)
+    return list(found.values())[known:]
+
+
+def _of_user(file: Path) -> Contender:
+    raw = reading.read_toml(file, str(file))
+    texts = {key: raw.pop(key, "") for key in ("title", "extends", "threshold")}
+    keys, weighted = dict(flat(raw)), {each.name: each for each in CONTENDERS}
+    for key in keys:
+        if key == "control.dt" or not {key.partition(".")[0], text_key(key)} & {*SETTABLE}:
+            expected = (
+                f"{', '.join(texts)}, or keys of {', '.join(SETTABLE)}: others are the case's"
+            )
+            raise ConfigError(f"{file}: got {key}, expected {expected}")
+    if not keys:
+        raise ConfigError(f"{file}: got no keys, expected some of {', '.join(SETTABLE)}")
+    for key, text in texts.items():
+        if not isinstance(text, str):
+            raise ConfigError(f"{file}: {key}: got {text!r}, expected a text")
+    title, extends, threshold = texts.values()
+    if extends and extends not in weighted:
+        expected = f"the name of a built-in contender; {hint(extends, weighted)}"
+        raise ConfigError(f"{file}: extends: got {extends!r}, expected {expected}")
+    if threshold and not threshold.startswith("control."):
+        raise ConfigError(f"{file}: threshold: got {threshold!r}, expected {A_NUMBER}")
+    return Contender(
+        file.stem,
+        title or file.stem,
+        trigger="",
+        control={},
+        threshold=threshold.removeprefix("control."),
+        keys=keys,
+        base=weighted.get(extends),
+    )
+
+
+A_NUMBER = "the key of a number, as in control.trigger.cost_gap"
+
+
 # -- weights -------------------------------------------------------------------------------------
+
+
+def tuned(contender: Contender, case: Case, weights: str) -> Scenario:
+    """Scenario of a contender in a case, with its weights from a file and a user's keys.
+
+    Raises:
+        ConfigError: the file lacks the contender, or has unknown ones, or the keys cannot be flown.
+    """
+    base = contender.base or contender
+    if contender.keys and base is contender:
+        table = reading.to_table(reading.load(case.plant))
+        set_keys(case.keys, table)
+    else:
+        table = reading.to_table(_with_weights(base, case, weights))
+    set_keys(contender.keys, table)
+    where = f"{contender.name}, {case.name}"
+    scenario = reading.check(table, where)
+    if contender.threshold:
+        key, number = f"control.{contender.threshold}", None
+        with suppress(KeyError, TypeError, GrammarError):
+            number = value(reading.to_table(scenario), key)
+        if not isinstance(number, int | float):
+            raise ConfigError(f"{where}: threshold: got {key!r}, expected {A_NUMBER}")
+    return scenario
+
+
+def _with_weights(contender: Contender, case: Case, weights: str) -> Scenario:
+    known = {
+        entry(each, other)
+        for other in CASES
+        for each in CONTENDERS
+        if not other.contenders or each.name in other.contenders
+    }
+    tables = [each.removeprefix(f"{weights}/") for each in reading.names(weights)]
+    for table in tables:
+        if table not in known:
+            expected = "a built-in contender and its case, as --tune writes them (a contender of "
+            expected += f"your own is flown by --contender FILE); {hint(table, sorted(known))}"
+            raise ConfigError(f"{weights}: got the table {table!r}, expected {expected}")
+    name = entry(contender, case)
+    if name not in tables:
+        there_is = "expected every contender in every case, as --tune writes them"
+        raise ConfigError(f"{weights}: got no table {name!r}, {there_is}")
+    return reading.load(f"{weights}/{name}")
 
 
 def search_start(contender: Contender, case: Case, scale: ComparisonSize) -> Scenario:

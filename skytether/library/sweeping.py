@@ -24,10 +24,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Swept:
-    """One combination of a sweep's values, and its flights."""
+    """One combination of a sweep's values, or one point of a comparison, and its flights."""
 
     keys: Mapping[str, Any]
-    """Value of each key of the grid."""
+    """Value of each key of the grid; of a comparison, see `skytether.compare`."""
     scenario: Scenario
     """Scenario that was flown, with the first of the seeds."""
     runs: tuple[Summary, ...]

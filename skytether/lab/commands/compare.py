@@ -14,13 +14,16 @@ from skytether.lab.calibration import ONLY, Rmse, SearchLimits
 from skytether.lab.commands import report_folder, tables
 from skytether.lab.commands.pool import Crew, Flags, PoolFlags, crew, writing
 from skytether.lab.commands.report_folder import CommandCall
-from skytether.lab.contenders import CASES, PACKETS, ComparisonSize, TunedWeights
+from skytether.lab.comparison import ComparedCase
+from skytether.lab.contenders import CASES, CONTENDERS, PACKETS, ComparisonSize, TunedWeights
 from skytether.lab.floor import Baselines, Floor, Work, floor_of, summarise_aboard
+from skytether.lab.report import Drawn
 from skytether.lab.search import Search, best
 from skytether.shared.base import files
 from skytether.shared.scenario import reading
 from skytether.shared.telemetry.summary import Summary
 from skytether.shell import command
+from skytether.shell.command import CommandError
 from skytether.shell.options import read
 
 WEIGHTS = "weights.toml"
@@ -46,6 +49,11 @@ class CompareOptions:
     """Number of generations of each of these searches."""
     weights: Annotated[str, tyro.conf.arg(metavar="FILE")] = reading.COMPARED
     """File of the weights, as written by --tune; the included ones unless given."""
+    contender: Annotated[
+        tuple[Path, ...], tyro.conf.arg(metavar="FILE"), tyro.conf.UseAppendAction
+    ] = ()
+    """File with the keys of a contender of your own (see docs/compare.md), flown beside the
+    built-in ones; may be repeated."""
     pool: PoolFlags = Flags()
 
 
@@ -60,39 +68,60 @@ def compare(argv: Sequence[str]) -> None:
     command.check_count("--runs", options.runs, 100_000)
     command.check_count("--generations", options.generations, 10**6)
     options.pool.check()
-    cases = contenders.cases(options.cases)
-    scale = ComparisonSize(options.runs, options.generations, cases=cases)
-    if options.quick:
-        scale = contenders.quick(scale)
+    if options.tune and options.contender:
+        searches = "expected one of them: `skytether calibrate` searches weights of your own"
+        raise CommandError(f"--contender: got it with --tune, {searches}", command.CONFIGURATION)
+    scale = size(options)
     with writing(options.out):
         if options.tune:
             _tune(options, scale)
-        else:
-            _compare(options, scale, CommandCall.now("compare", argv))
-
-
-def _compare(options: CompareOptions, scale: ComparisonSize, call: CommandCall) -> None:
-    plans = [Plan(case, options.weights, scale) for case in scale.cases]
-    command.claim_folder("--out", options.out, report_folder.PAGE)
-    runs = sum(_scout(options, plans, number) for number in range(1 + scale.rounds))
-    chosen = [plan.chosen() for plan in plans]
-    sweeps = [plan.comparison(each.values()) for plan, each in zip(plans, chosen, strict=True)]
-    results = []
-    with crew(options.pool, "comparing", sum(each.flights for each in sweeps)) as flyers:
-        for plan, points, sweep in zip(plans, chosen, sweeps, strict=True):
-            done = flyers.sweep(sweep, options.out / "sweeps" / plan.case.name, plan.case.title)
-            beside = _beside(flyers, plan, options.out / "beside" / plan.case.name)
-            results.append(comparison.compared(plan, points, sweep, done, beside))
-        runs += flyers.runs
-    drawn = comparison.draw(results)
-    report_folder.write(options.out, drawn, reading.load(CASES[0].plant), call, runs)
+            return
+        call = CommandCall.now("compare", argv)
+        results, runs = fly(scale, options.weights, options.pool, options.out)
+        drawn = draw(options.out, results, call, runs)
     for table in drawn.tables:
         tables.show(table.title, table.heading, table.rows)
-    print(f"{options.out / report_folder.PAGE}: {len(drawn.pictures)} figures; {runs} runs flown")
+    page = options.out / report_folder.PAGE
+    print(f"{page}: {len(drawn.pictures)} figures; {runs} runs flown")
     print(drawn.verdict)
 
 
-def _scout(options: CompareOptions, plans: Sequence[Plan], number: int) -> int:
+def size(options: CompareOptions) -> ComparisonSize:
+    scale = ComparisonSize(
+        options.runs,
+        options.generations,
+        cases=contenders.cases(options.cases),
+        contenders=[*CONTENDERS, *contenders.of_user(options.contender)],
+    )
+    return contenders.quick(scale) if options.quick else scale
+
+
+def fly(
+    scale: ComparisonSize, weights: str, pool: Flags, out: Path
+) -> tuple[list[ComparedCase], int]:
+    """Results of all cases, and the number of flights flown, without those stored in the folder."""
+    plans = [Plan(case, weights, scale) for case in scale.cases]
+    command.claim_folder("--out", out, report_folder.PAGE)
+    runs = sum(_scout(pool, out, plans, number) for number in range(1 + scale.rounds))
+    chosen = [plan.chosen() for plan in plans]
+    sweeps = [plan.comparison(each.values()) for plan, each in zip(plans, chosen, strict=True)]
+    results = []
+    with crew(pool, "comparing", sum(each.flights for each in sweeps)) as flyers:
+        for plan, points, sweep in zip(plans, chosen, sweeps, strict=True):
+            done = flyers.sweep(sweep, out / "sweeps" / plan.case.name, plan.case.title)
+            beside = _beside(flyers, plan, out / "beside" / plan.case.name)
+            results.append(comparison.compared(plan, points, sweep, done, beside))
+        runs += flyers.runs
+    return results, runs
+
+
+def draw(out: Path, results: Sequence[ComparedCase], call: CommandCall, runs: int) -> Drawn:
+    drawn = comparison.draw(results)
+    report_folder.write(out, drawn, reading.load(CASES[0].plant), call, runs)
+    return drawn
+
+
+def _scout(pool: Flags, out: Path, plans: Sequence[Plan], number: int) -> int:
     """Fly the scouting flights of a round: all points first, later points near the budgets.
 
     Returns the number of flights flown by this call.
@@ -101,10 +130,10 @@ def _scout(options: CompareOptions, plans: Sequence[Plan], number: int) -> int:
     if not any(asked):
         return 0
     sweeps = [plan.scouts(points) for plan, points in zip(plans, asked, strict=True)]
-    with crew(options.pool, "choosing", sum(each.flights for each in sweeps)) as flyers:
+    with crew(pool, "choosing", sum(each.flights for each in sweeps)) as flyers:
         for plan, points, sweep in zip(plans, asked, sweeps, strict=True):
             if points:
-                folder = options.out / "scouts" / plan.case.name / f"round-{number}"
+                folder = out / "scouts" / plan.case.name / f"round-{number}"
                 plan.scouted(points, sweep, flyers.sweep(sweep, folder, plan.case.title))
         return flyers.runs
 

@@ -18,6 +18,7 @@ from concurrent.futures import (
     Executor,
     Future,
     ProcessPoolExecutor,
+    ThreadPoolExecutor,
     wait,
 )
 from contextlib import AbstractContextManager, closing, contextmanager
@@ -303,7 +304,19 @@ def _work(fly: Callable[[T], R], item: T) -> tuple[R, float]:
 def _executor(flags: Flags) -> AbstractContextManager[Executor]:
     if flags.scheduler:
         return _cluster(flags.scheduler)
+    if flags.workers == 0:
+        return _thread()
     return _processes(flags.workers or len(os.sched_getaffinity(0)))
+
+
+@contextmanager
+def _thread() -> Iterator[Executor]:
+    """A thread of this process, which has all that the user's program has registered."""
+    pool = ThreadPoolExecutor(1)
+    try:
+        yield pool
+    finally:
+        pool.shutdown(cancel_futures=True)
 
 
 @contextmanager

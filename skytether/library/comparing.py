@@ -1,0 +1,83 @@
+"""Comparisons from Python: `compare` flies contenders of one's own beside the built-in ones."""
+
+from collections.abc import Iterable
+from os import PathLike
+from pathlib import Path
+
+from skytether.lab.budgets import BUDGETS
+from skytether.lab.commands.compare import CompareOptions, draw, fly, size
+from skytether.lab.commands.pool import Flags
+from skytether.lab.commands.report_folder import CommandCall
+from skytether.lab.contenders import ABOARD
+from skytether.library.flying import prepare
+from skytether.library.sweeping import Swept
+from skytether.shared.base import extras, files
+from skytether.shared.base.errors import ConfigError, FlightError
+from skytether.shared.scenario import reading
+from skytether.shared.scenario.dotted import set_keys
+from skytether.shell import plugins
+from skytether.shell.command import CommandError
+
+
+@extras.named()
+def compare(
+    *contenders: str | PathLike[str],
+    cases: Iterable[str] = (),
+    runs: int = 100,
+    quick: bool = False,
+    weights: str | PathLike[str] = reading.COMPARED,
+    out: str | PathLike[str] = "compare",
+    workers: int = 1,
+) -> list[Swept]:
+    """Compare contenders with the built-in ones as `skytether compare` does, and write its report.
+
+        skytether.compare("mine.toml", cases=["target"], quick=True)
+
+    Args:
+        contenders: files of contenders, see docs/compare.md.
+        cases: names of the cases; all unless given.
+        runs: number of flights of each contender per case and budget.
+        quick: whether to fly only a first look.
+        weights: file of the weights of the built-in contenders.
+        out: folder for the report; stored flights are not flown again.
+        workers: see `skytether.sweep`.
+
+    Returns:
+        For each case, contender and budget of packets, the flights of the best point, without the
+        reference aboard. Its keys are `case`, `contender`, `budget` [1/s], `threshold`, `report`.
+
+    Raises:
+        ConfigError: a contender or an argument is impossible, or `out` has another comparison.
+        FlightError: the flights were interrupted, or a file could not be written.
+        TypeError: an argument is of another type.
+    """
+    for argument, value in (("runs", runs), ("workers", workers)):
+        if not isinstance(value, int) or value < 1:
+            raise ConfigError(f"{argument}: got {value!r}, expected a whole number from 1 on")
+    if isinstance(cases, str):
+        raise TypeError(f"cases: got {cases!r}, expected a list of names")
+    paths, folder = tuple(map(Path, contenders)), Path(out)
+    options = CompareOptions(
+        runs=runs, out=folder, quick=quick, cases=tuple(cases), contender=paths
+    )
+    plugins.load()
+    call = CommandCall.now("compare", [f"--contender={path}" for path in paths])
+    prepare()
+    try:
+        with files.apart():
+            scale = size(options)
+            flags = Flags(workers=0 if workers == 1 else workers)
+            results, flown = fly(scale, str(weights), flags, folder)
+            draw(folder, results, call, flown)
+    except CommandError as error:
+        raise FlightError(str(error)) from None
+    swept = []
+    for each in results:
+        for (contender, budget), chosen in each.bought.items():
+            if budget in BUDGETS and contender != ABOARD.name:
+                table = reading.to_table(scale.scenario(each.case))
+                set_keys(chosen.what.keys, table)
+                keys = {"case": each.case.name, "contender": contender, "budget": budget}
+                keys |= {"threshold": chosen.what.threshold, "report": chosen.what.report}
+                swept.append(Swept(keys, reading.check(table), tuple(chosen.runs)))
+    return swept
