@@ -57,9 +57,9 @@ IMPLAUSIBLE: dict[int, Drop] = {
 }
 
 CONTRADICTED = {
-    Contradiction.CLOCK: "a clock was set, or runs wrong: the offset is estimated anew",
+    Contradiction.CLOCK: "a clock was set, or runs wrong: the offset is estimated again",
     Contradiction.ASYMMETRY: "delays each way differ by more than link.asymmetry_s: it is ignored",
-    Contradiction.TIME_OF_DAY: "the time of day of one end is wrong: it is not relied on any more",
+    Contradiction.TIME_OF_DAY: "the time of day of one end is wrong: it is no longer used",
 }
 """Contradictions of the clock estimate, in words for the operator."""
 

@@ -368,7 +368,7 @@ class Launch:
         altitude = self._altitude
         if self._flavour.above_sea:
             if self._condition.home is None:
-                self._stated_reason = "it does not know where home is"
+                self._stated_reason = "its autopilot reports no home position"
                 return None
             # Home was set a while ago, and the height estimate has drifted since.
             ground = self._positions.origin[2] - self._condition.home_up

@@ -253,7 +253,7 @@ class MissionPlanner(SplineScheme):
     def _own_wait(self, row: int, vehicle: VehicleMotions) -> str:
         """Reason why this vehicle has to wait before it is sent a motion, in words; or empty."""
         if row in self._state.restarted:
-            return "its client, which has begun anew"
+            return "its restarted client"
         if vehicle.sent:
             return "an acknowledgement"  # before it, the motion flown is unknown
         has_motion = vehicle.in_force is not None and vehicle.in_force.step >= 0

@@ -184,7 +184,7 @@ def read(path: Path, most: int, *, private: bool = False) -> bytes:
     with os.fdopen(os.open(path, flags), "rb") as file:
         mode = os.fstat(file.fileno()).st_mode
         if not stat.S_ISREG(mode):
-            raise OSError(EINVAL, "it is no plain file")
+            raise OSError(EINVAL, "it is not a plain file")
         if private and stat.S_IMODE(mode) & 0o177:
             problem = f"its mode is {stat.S_IMODE(mode):04o}"
             raise OSError(EACCES, f"{problem}, expected 0600: nobody else may read or write it")

@@ -188,7 +188,7 @@ class ArmingAwaited(VehicleEvent, frozen=True, kw_only=True):
     why: str
 
     def __str__(self) -> str:
-        instruction = "arm it anew: skytether set SOCKET armed=true, or on the page"
+        instruction = "arm it again: skytether set SOCKET armed=true, or on the page"
         return f"vehicle {self.vehicle} is not armed: {self.why}; {instruction}"
 
 

@@ -349,7 +349,7 @@ class ServerHeard(VehicleEvent, frozen=True, kw_only=True):
     silent_s: float
 
     def __str__(self) -> str:
-        return f"vehicle {self.vehicle}: the server is heard again, after {self.silent_s:.1f} s"
+        return f"vehicle {self.vehicle}: its server answers again, after {self.silent_s:.1f} s"
 
 
 class Flying(VehicleEvent, frozen=True, kw_only=True):
@@ -402,7 +402,7 @@ class PlanningStopped(VehicleEvent, frozen=True, kw_only=True):
 
 class StateDoubted(VehicleEvent, frozen=True, kw_only=True):
     def __str__(self) -> str:
-        return f"vehicle {self.vehicle} reports a state that it cannot have reached: not believed"
+        return f"vehicle {self.vehicle} reports an impossible state: the observation is dropped"
 
 
 class InZone(VehicleEvent, frozen=True, kw_only=True):

@@ -94,7 +94,7 @@ REASON_TEXTS = {
     Reason.DISARMED: "its motors are disarmed",
     Reason.RETURNED: "its autopilot follows commands again",
     Reason.BATTERY: "its battery is low",
-    Reason.ASTRAY: "its autopilot does not know where it is",
+    Reason.ASTRAY: "its autopilot has no position estimate",
     Reason.MUTE: "its autopilot is silent",
     Reason.HOMEWARD: "the server has been silent for long",
     Reason.RIVAL: "somebody else commands its autopilot",

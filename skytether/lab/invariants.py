@@ -352,7 +352,7 @@ class WatchedLife(Recorder):
                 raise Violation("good link", f"a horizon is flown, the link is good since {since}")
         session, life, horizon = self._in_force
         if (session, life) != self._session:
-            origin = f"of life {life} and session {session}, not {self._session}"
+            origin = f"of run {life} and session {session}, not {self._session}"
             raise Violation("foreign", f"a horizon {origin}")
         if self._observed not in self._times_ns or self._observed > step:
             raise Violation("observed", f"a horizon from an observation of step {self._observed}")

@@ -74,7 +74,7 @@ class Container:
 
     Raises:
         OSError: the file cannot be read.
-        RecordingError: it is no MCAP file.
+        RecordingError: it is not an MCAP file.
     """
 
     def __init__(self, path: Path) -> None:
@@ -82,7 +82,9 @@ class Container:
         status = os.fstat(descriptor)
         if not stat.S_ISREG(status.st_mode):
             os.close(descriptor)
-            raise RecordingError(f"{path}: it is no plain file, expected a recording ({RECORDING})")
+            raise RecordingError(
+                f"{path}: it is not a plain file, expected a recording ({RECORDING})"
+            )
         self._file = os.fdopen(descriptor, "rb")
         self._size = status.st_size
         self.lost_bytes = 0
@@ -90,7 +92,7 @@ class Container:
         try:
             files.note(path, self._file)
             if self._file.read(len(MAGIC)) != MAGIC:
-                what = "it is no MCAP file" if self._size else "it is empty"
+                what = "it is not an MCAP file" if self._size else "it is empty"
                 raise RecordingError(f"{path}: {what}, expected a recording ({RECORDING})")
             self._file.seek(max(self._size - len(MAGIC), len(MAGIC)))
             self.is_whole = self._file.read() == MAGIC

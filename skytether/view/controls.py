@@ -169,7 +169,7 @@ THRESHOLDS = (
     ),
     Knob(
         "Rate: steps from packet to packet",
-        "One packet every so many steps",
+        "Number of steps from one packet to the next",
         "server",
         1.0,
         100.0,

@@ -188,7 +188,7 @@ def of_flight(axes: int, *, mission: bool = False) -> tuple[Plot, ...]:
 def of_network(*, solves: bool) -> tuple[Plot, ...]:
     packets = (
         Plot(
-            "Age of the observation flown by, and delays [s]",
+            "Age of the observation in use, and delays [s]",
             (
                 PlotLine("age", lambda look: look.curves.age_s),
                 PlotLine("delay up", _delays(UPLINK), UP, once=True, width=1.0),

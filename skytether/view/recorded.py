@@ -102,7 +102,7 @@ def read(path: Path) -> Recorded:
         messages = file.messages()
         topic, data = next(messages, ("", b""))
         if topic != BEGUN:
-            message = "it is no recording of Skytether, or its first message is damaged"
+            message = "it is not a recording of Skytether, or its first message is damaged"
             raise RecordingError(f"{path}: {message}")
         begun = msgspec.msgpack.decode(data, type=Begun)
         if abs(begun.about.offset_ns) > TIME_NS_MAX:

@@ -550,5 +550,5 @@ class State:
             if traffic.loss > LOSS_HIGH:
                 return Word("DEGRADED", f"{traffic.loss:.0%} of the packets {name} are lost", AMBER)
         if track.age_s > link.age_max_s / 2:
-            return Word("DEGRADED", f"the observation flown by is {track.age_s:.1f} s old", AMBER)
+            return Word("DEGRADED", f"the observation in use is {track.age_s:.1f} s old", AMBER)
         return Word("GOOD", "packets come through both ways", GREEN)

@@ -58,7 +58,7 @@ def status(state: State, vehicle: int, now_ns: int, title: str = "") -> str:
         return f'<div style="{_BODY}">{head}: no data of vehicle {vehicle} yet.</div>'
     rows = [("time of flight", f"{track.time_s:.0f} s of {state.duration_s:g} s")]
     rows.append(("distance to reference, last 10 s", number(track.error_m(10.0), ".3f", " m")))
-    rows.append(("age of observation flown by", number(track.age_s, ".2f", " s")))
+    rows.append(("age of the observation in use", number(track.age_s, ".2f", " s")))
     rows.append(("age of observation at server", number(track.known_s, ".2f", " s")))
     rows += _mission(state, vehicle) + _autopilot(state, vehicle)
     rows += _network(state, now_ns)

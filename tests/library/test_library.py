@@ -527,7 +527,7 @@ def test_a_flight_refuses_in_words(flown: skytether.Flight, tmp_path: Path) -> N
         (
             lambda: skytether.Flight.load(__file__),
             skytether.RecordingError,
-            f"{__file__}: it is no MCAP file, expected a recording (.mcap)",
+            f"{__file__}: it is not an MCAP file, expected a recording (.mcap)",
         ),
     ]
     for attempt, kind, said in refusals:

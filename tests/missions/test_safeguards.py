@@ -166,7 +166,7 @@ def test_nothing_is_planned_for_a_vehicle_whose_client_has_begun_anew() -> None:
     made.state.restart(0)
     made.decide(101)
     assert made.vehicles[0].next is None
-    assert made.waits(0) == "its client, which has begun anew"
+    assert made.waits(0) == "its restarted client"
 
 
 def test_others_keep_away_from_all_of_its_motions() -> None:

@@ -445,12 +445,12 @@ def test_only_a_plain_file_of_a_thought_of_size_is_read(tmp_path: Path) -> None:
     """A pipe would block, and a device would never end."""
     path, link = tmp_path / "mine.toml", tmp_path / "link.toml"
     os.mkfifo(path)
-    assert refusal(path) == f"{path}: cannot be read: it is no plain file"
+    assert refusal(path) == f"{path}: cannot be read: it is not a plain file"
     path.unlink()
     path.mkdir()
     assert refusal(path) == f"{path}: cannot be read: Is a directory"
     link.symlink_to("/dev/zero")
-    assert refusal(link) == f"{link}: cannot be read: it is no plain file"
+    assert refusal(link) == f"{link}: cannot be read: it is not a plain file"
     link.unlink()
     link.symlink_to(link)
     assert refusal(link).startswith(f"{link}: cannot be read: ")
@@ -613,7 +613,7 @@ def test_only_a_plain_table_of_a_thought_of_size_is_read(tmp_path: Path) -> None
     path = write(tmp_path, "mine.toml", '[reference]\nshape = "csv"\nfile = "path.csv"')
     before = f"{path}: reference.file: got {str(trajectory)!r}, expected a file that can be read"
     os.mkfifo(trajectory)
-    assert refusal(path) == f"{before} (it is no plain file)"
+    assert refusal(path) == f"{before} (it is not a plain file)"
     trajectory.unlink()
     with trajectory.open("wb") as file:
         file.truncate(10**10)  # takes no space

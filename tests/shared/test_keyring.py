@@ -148,8 +148,8 @@ def test_what_is_no_file_of_keys_is_refused_in_one_line(tmp_path: Path) -> None:
     long = put(tmp_path / "long", b"#" * 16_000_001)
     for path, message in (
         (tmp_path / "none", "cannot be read: No such file or directory"),
-        (tmp_path, "cannot be read: (it is no plain file|Is a directory)"),
-        (Path("/dev/zero"), "cannot be read: it is no plain file"),
+        (tmp_path, "cannot be read: (it is not a plain file|Is a directory)"),
+        (Path("/dev/zero"), "cannot be read: it is not a plain file"),
         (long, "cannot be read: it is larger than 16000000 bytes"),
         (Path("a\0b"), "cannot be read: embedded null byte"),
     ):

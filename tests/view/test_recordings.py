@@ -767,10 +767,10 @@ def other_mcap(path: Path) -> None:
 @pytest.mark.parametrize(
     ("made", "said"),
     [
-        (lambda path: path.mkdir(), "it is no plain file"),
+        (lambda path: path.mkdir(), "it is not a plain file"),
         (lambda path: path.write_bytes(b""), "it is empty"),
-        (lambda path: path.write_text("time,x\n"), "it is no MCAP file"),
-        (other_mcap, "it is no recording of Skytether"),
+        (lambda path: path.write_text("time,x\n"), "it is not an MCAP file"),
+        (other_mcap, "it is not a recording of Skytether"),
         (lambda path: path, "cannot be read: No such file or directory"),
     ],
     ids=["folder", "empty", "csv", "other", "missing"],

@@ -291,7 +291,7 @@ def runs(text: str) -> list[Run]:
     log = Log()
     for number, whole in enumerate(StringIO(text), 1):
         if number > LINES_MAX:
-            raise LogError(f"got more than {LINES_MAX} lines, expected at most so many")
+            raise LogError(f"got more than {LINES_MAX} lines, expected fewer")
         line = whole[:LINE_MAX].rstrip()
         for needle, pattern, act in LINES:
             if needle in line and (found := pattern.match(line)):
