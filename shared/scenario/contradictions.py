@@ -29,6 +29,8 @@ TINY = 1e-9
 """Rounding tolerance of a product such as 40 · 0.011."""
 
 FENCED_STEPS_MAX = 100_000
+PLACES_MAX = 1_000_000_000
+"""Largest number of places of a show, which takes two minutes to check."""
 LOSSY = 0.3
 """Share of lost packets to the vehicle above which horizons must be longer."""
 
@@ -232,7 +234,10 @@ def _no_places(scenario: Scenario) -> Iterator[Contradiction]:
         )
         yield "mission.allocate", "true", f"false, or {others}"
         return
-    yield from _too_fast(scenario, goals)
+    wrong = list(_too_fast(scenario, goals))
+    yield from wrong
+    if wrong:
+        return
     zones, clear_m = scenario.zones, scenario.clearances.planned_clear_m
     for vehicle in goals.vehicles if zones else ():
         places = goals.goals(vehicle)
@@ -268,6 +273,7 @@ def _no_places(scenario: Scenario) -> Iterator[Contradiction]:
 
 
 def _too_fast(scenario: Scenario, show: Mission) -> Iterator[Contradiction]:
+    """Contradictions of a show that is too fast for its vehicles, or too large to be checked."""
     most_mps = speed_bounds(scenario.u_max, scenario.model_gain, scenario.mission.speed_mps)
     if show.is_show and (found := show.too_fast(most_mps)):
         vehicle, at_s, axis, speed_mps = found
@@ -275,6 +281,9 @@ def _too_fast(scenario: Scenario, show: Mission) -> Iterator[Contradiction]:
         asked = f"vehicle {vehicle} to fly {speed_mps:.3g} m/s from {at_s:.6g} s on"
         expected = f"a show of at most {bound}; this asks {asked}"
         yield "reference.file", repr(scenario.reference.file), expected
+    if show.is_show and (places := show.count_places()) > PLACES_MAX:
+        most = f"at most {PLACES_MAX} different times of all points, times vehicles"
+        yield "reference.file", repr(scenario.reference.file), f"a show of {most}, got {places}"
 
 
 def _too_late(scenario: Scenario) -> Iterator[Contradiction]:

@@ -111,6 +111,11 @@ class Mission:
         one, other = sorted(stays.vehicles[list(pair)].tolist())
         return one, other, float(stays.begin_s[list(pair)].max()), stays.distance_m(*pair)
 
+    def count_places(self) -> int:
+        """Number of places that `nearest` compares in a show."""
+        times_s = np.concatenate([times_s for times_s, _ in self._goals.values()])
+        return len(np.unique(times_s)) * len(self._goals)
+
     def too_fast(self, most_mps: Array) -> tuple[int, float, int, float] | None:
         """First vehicle of a show that is faster than a vehicle can fly.
 

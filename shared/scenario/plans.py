@@ -11,7 +11,14 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from skytether.shared.law.model import Array
-from skytether.shared.scenario.geographic import METRES_MAX, Origin, check_origin, local, number
+from skytether.shared.scenario.geographic import (
+    METRES_MAX,
+    Origin,
+    check_origin,
+    local,
+    number,
+    within,
+)
 from skytether.shared.scenario.grammar import GrammarError
 from skytether.shared.scenario.registry import File
 from skytether.shared.scenario.zones import CORNERS_MAX, ROUND, Zone, around, ring
@@ -201,7 +208,7 @@ def _place(
         if frame == 0 and home.altitude_m is None:
             raise ValueError("an altitude above home, for the home's above the sea is not known")
         place[2] = number(params[6], "altitude") - ((home.altitude_m or 0.0) if frame == 0 else 0.0)
-    return place
+    return within(place, METRES_MAX)
 
 
 def _plan(content: bytes, origin: Origin) -> tuple[dict[str, Any], Home]:

@@ -252,7 +252,10 @@ def _zipped(folder: Path, most: int) -> bytes:
     content, left = io.BytesIO(), most
     with zipfile.ZipFile(content, "w") as archive:
         for path in sorted(folder.glob("*.[cC][sS][vV]")):
-            own = files.read(path, left)
+            try:
+                own = files.read(path, left)
+            except OSError as error:
+                raise ValueError(f"{path.name}: {error.strerror}") from None
             left -= len(own)
             archive.writestr(zipfile.ZipInfo(path.name), own)
     return content.getvalue()

@@ -17,6 +17,7 @@ import io
 import re
 import zipfile
 import zlib
+from array import array
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from functools import lru_cache
@@ -124,7 +125,13 @@ def lasts_s(content: bytes, axes: int) -> float:
 
 
 def axes_of(content: bytes) -> int:
-    """Number of axes of a file: 3 if its points have heights."""
+    """Number of axes of a file: 3 if its points have heights.
+
+    Raises:
+        ValueError: it is a zip that cannot be read.
+    """
+    if content.startswith(b"PK"):
+        return max(map(axes_of, _members(content).values()))
     head = content[:4096].partition(b"\n")[0].decode("utf-8-sig", "replace")
     names = {*_names(head.split(","))}
     flat = any(set(form.columns[:3]) <= names and form.columns[3] not in names for form in FORMS)
@@ -189,20 +196,7 @@ def _polynomials(content: bytes, axes: int) -> tuple[Array, Array]:
 
 def _zip(content: bytes, axes: int, origin: Origin | None) -> Tracks:
     """Tracks of the CSV files in a zip, one vehicle each, in the natural order of their names."""
-    try:
-        with zipfile.ZipFile(io.BytesIO(content)) as archive:
-            files = [each for each in archive.infolist() if _is_table(each.filename)]
-            if (
-                not 0 < len(files) <= VEHICLES_MAX
-                or sum(each.file_size for each in files) > ZIP_BYTES_MAX
-            ):
-                most = f"at most {VEHICLES_MAX} with {ZIP_BYTES_MAX / 1e6:g} MB together"
-                raise ValueError(f"expected CSV files, {most}, got {len(files)}")
-            named = {each.filename: _member(archive, each) for each in files}
-            if len(named) < len(files):
-                raise ValueError("expected a zip without two files of the same name")
-    except (zipfile.BadZipFile, zlib.error, RuntimeError, NotImplementedError, EOFError) as error:
-        raise ValueError(f"expected a zip that can be read ({error})") from None
+    named = _members(content)
     found: Tracks = {}
     for number, name in enumerate(sorted(named, key=_natural), start=1):
         try:
@@ -213,6 +207,25 @@ def _zip(content: bytes, axes: int, origin: Origin | None) -> Tracks:
             raise ValueError(f"{name[:80]}: {said}") from None
         found[number] = times_s, points_m
     return found
+
+
+def _members(content: bytes) -> dict[str, bytes]:
+    """CSV files in a zip, by name."""
+    try:
+        with zipfile.ZipFile(io.BytesIO(content)) as archive:
+            files = [each for each in archive.infolist() if _is_table(each.filename)]
+            if (
+                not 0 < len(files) <= VEHICLES_MAX
+                or sum(each.file_size for each in files) > ZIP_BYTES_MAX
+            ):
+                most = f"at most {VEHICLES_MAX} with {ZIP_BYTES_MAX / 1e6:g} MB together"
+                raise ValueError(f"expected CSV files, {most}, got {len(files)}")
+            members = {each.filename: _member(archive, each) for each in files}
+            if len(members) < len(files):
+                raise ValueError("expected a zip without two files of the same name")
+    except (zipfile.BadZipFile, zlib.error, RuntimeError, NotImplementedError, EOFError) as error:
+        raise ValueError(f"expected a zip that can be read ({error})") from None
+    return members
 
 
 def _is_table(name: str) -> bool:
@@ -271,8 +284,7 @@ def _read(content: bytes, names: list[str]) -> tuple[Array, Indices]:
         line = content.count(b"\n", 0, error.start) + 1
         raise ValueError(f"line {line}: expected text in UTF-8") from None
     table = csv.DictReader(text, skipinitialspace=True)
-    rows: list[list[float]] = []
-    lines: list[int] = []
+    rows, lines = array("d"), array("q")  # lists would take several times the memory
     try:
         table.fieldnames = header = _names(table.fieldnames or ())
         if len(header) > COLUMNS_MAX:
@@ -281,11 +293,11 @@ def _read(content: bytes, names: list[str]) -> tuple[Array, Indices]:
             got = ", ".join(map(repr, header))[:80] or "nothing"
             raise ValueError(f"line 1: expected the columns {', '.join(names)}, got {got}")
         for row in table:
-            rows.append(_numbers([row[name] for name in names], table.line_num))
+            rows.extend(_numbers([row[name] for name in names], table.line_num))
             lines.append(table.line_num)
     except csv.Error as error:
         raise ValueError(f"line {table.reader.line_num}: {error}") from None
-    return np.array(rows).reshape(-1, len(names)), np.array(lines, np.int64)
+    return np.array(rows).reshape(-1, len(names)), np.array(lines)
 
 
 def _numbers(words: list[str | None], line: int) -> list[float]:

@@ -9,7 +9,7 @@ import pytest
 
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.law.model import Array
-from skytether.shared.scenario import mission, reading
+from skytether.shared.scenario import contradictions, mission, reading
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Record
 from skytether.sim import flight
@@ -136,3 +136,11 @@ def test_the_nearest_paths_are_those_of_a_dense_grid(
     knots_s = np.unique(np.concatenate([times_s for times_s, _ in goals.values()]))
     first_s = dense_s[(away_m < apart_m).any(axis=0).argmax()]
     assert np.searchsorted(knots_s, first_s, "right") == np.searchsorted(knots_s, at_s, "right")
+
+
+def test_a_show_that_takes_too_long_to_check_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(contradictions, "PLACES_MAX", 700)
+    with pytest.raises(ConfigError, match=r"times vehicles, got 726$"):
+        scenario(tmp_path, ring())

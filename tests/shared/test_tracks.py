@@ -2,6 +2,7 @@
 
 import io
 import json
+import os
 import re
 import zipfile
 from pathlib import Path
@@ -10,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from skytether.shared.base.errors import ConfigError
 from skytether.shared.law.model import Array
 from skytether.shared.scenario import reading, tracks
 from skytether.shared.scenario.reference import Reference
@@ -270,6 +272,7 @@ def test_the_origin_of_the_scenario_counts_more_than_the_plans() -> None:
         (plan(item(16, 10**400)), "mission item 1: hold time a smaller number"),
         (plan(item(93, 1e999)), "mission item 1: a hold time from 0 to 1e+06 s, got inf"),
         (plan(item(93, -1, 12)), "mission item 1: a hold time from 0 to 1e+06 s, got -1"),
+        (plan(item(16, 0, 0, 0, 0, 47, 8, 1e999)), "mission item 1: coordinates of at most"),
         (plan(item(1e999)), "mission item 1: expected a command and its params"),
         (plan(item(178, 2, 5)), "mission item 1: expected a speed over ground or in the air"),
         (plan(item(177, 1, 3)), "mission item 1: expected a waypoint, "),
@@ -349,3 +352,15 @@ def test_the_homes_altitude_matters_only_for_altitudes_above_the_sea() -> None:
     above_sea = plan(item(22, 0, 0, 0, 0, 0, 0, 420, frame=0), plannedHomePosition=home)
     with pytest.raises(ValueError, match="mission item 1: an altitude above home"):
         tracks.tracks(above_sea, 3)
+
+
+def test_a_zip_of_flat_tables_has_two_axes() -> None:
+    flat, high = "t,x,y\n0,0,0\n", "t,x,y,z\n0,0,0,1\n"
+    assert tracks.axes_of(zipped(a=flat)) == 2
+    assert tracks.axes_of(zipped(a=high, b=high)) == 3
+
+
+def test_the_file_of_a_folder_that_cannot_be_read_is_named(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "cf1.csv")
+    with pytest.raises(ConfigError, match=r"cf1.csv: it is no plain file"):
+        reading.files_of("reference.file", str(tmp_path))
