@@ -1,6 +1,7 @@
 """Comparisons from Python: `compare` flies contenders of one's own beside the built-in ones."""
 
 from collections.abc import Iterable
+from itertools import product
 from os import PathLike
 from pathlib import Path
 
@@ -73,11 +74,12 @@ def compare(
         raise FlightError(str(error)) from None
     swept = []
     for each in results:
-        for (contender, budget), chosen in each.bought.items():
-            if budget in BUDGETS and contender != ABOARD.name:
+        for contender, budget in product(each.contenders, BUDGETS):
+            chosen = each.bought.get((contender.name, budget))
+            if chosen is not None and contender is not ABOARD:
                 table = reading.to_table(scale.scenario(each.case))
                 set_keys(chosen.what.keys, table)
-                keys = {"case": each.case.name, "contender": contender, "budget": budget}
+                keys = {"case": each.case.name, "contender": contender.name, "budget": budget}
                 keys |= {"threshold": chosen.what.threshold, "report": chosen.what.report}
                 swept.append(Swept(keys, reading.check(table), tuple(chosen.runs)))
     return swept

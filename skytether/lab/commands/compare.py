@@ -15,7 +15,7 @@ from skytether.lab.commands import report_folder, tables
 from skytether.lab.commands.pool import Crew, Flags, PoolFlags, crew, writing
 from skytether.lab.commands.report_folder import CommandCall
 from skytether.lab.comparison import ComparedCase
-from skytether.lab.contenders import CASES, CONTENDERS, PACKETS, ComparisonSize, TunedWeights
+from skytether.lab.contenders import CASES, PACKETS, ComparisonSize, TunedWeights
 from skytether.lab.floor import Baselines, Floor, Work, floor_of, summarise_aboard
 from skytether.lab.report import Drawn
 from skytether.lab.search import Search, best
@@ -91,7 +91,7 @@ def size(options: CompareOptions) -> ComparisonSize:
         options.runs,
         options.generations,
         cases=contenders.cases(options.cases),
-        contenders=[*CONTENDERS, *contenders.of_user(options.contender)],
+        contenders=[*contenders.CONTENDERS, *contenders.of_user(options.contender)],
     )
     return contenders.quick(scale) if options.quick else scale
 
