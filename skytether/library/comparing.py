@@ -6,11 +6,10 @@ from os import PathLike
 from pathlib import Path
 
 from skytether.lab.budgets import BUDGETS
-from skytether.lab.commands.compare import CompareOptions, draw, fly, size
-from skytether.lab.commands.pool import Flags
+from skytether.lab.commands.compare import CompareOptions, run, size
+from skytether.lab.commands.pool import Flags, writing
 from skytether.lab.commands.report_folder import CommandCall
 from skytether.lab.contenders import ABOARD
-from skytether.library.flying import prepare
 from skytether.library.sweeping import Swept
 from skytether.shared.base import extras, files
 from skytether.shared.base.errors import ConfigError, FlightError
@@ -57,19 +56,21 @@ def compare(
             raise ConfigError(f"{argument}: got {value!r}, expected a whole number from 1 on")
     if isinstance(cases, str):
         raise TypeError(f"cases: got {cases!r}, expected a list of names")
-    paths, folder = tuple(map(Path, contenders)), Path(out)
     options = CompareOptions(
-        runs=runs, out=folder, quick=quick, cases=tuple(cases), contender=paths
+        runs=runs,
+        out=Path(out),
+        quick=quick,
+        cases=tuple(cases),
+        weights=str(weights),
+        contender=tuple(map(Path, contenders)),
+        pool=Flags(workers=0 if workers == 1 else workers),
     )
-    plugins.load()
-    call = CommandCall.now("compare", [f"--contender={path}" for path in paths])
-    prepare()
+    plugins.load()  # plug-ins of installed packages, once per process
+    call = CommandCall.now("compare", [f"--contender={path}" for path in options.contender])
     try:
-        with files.apart():
+        with files.apart(), writing(options.out):
             scale = size(options)
-            flags = Flags(workers=0 if workers == 1 else workers)
-            results, flown = fly(scale, str(weights), flags, folder)
-            draw(folder, results, call, flown)
+            results, _, _ = run(options, scale, call)
     except CommandError as error:
         raise FlightError(str(error)) from None
     swept = []

@@ -4,6 +4,7 @@ import csv
 import dataclasses
 import json
 import math
+import re
 import shutil
 import signal
 import subprocess
@@ -664,6 +665,15 @@ def test_a_contender_of_a_user_keeps_its_reports_and_has_a_point_for_each_thresh
     assert fixed[0].keys == {"control.trigger": "periodic(9)", "vehicle.report": "silence(3)"}
 
 
+def test_the_documented_contender_can_be_flown() -> None:
+    page = (Path(__file__).parents[2] / "docs" / "compare.md").read_text()
+    (text,) = re.findall(r"```toml\n(.*?)```", page, re.DOTALL)
+    (own,) = contenders.of_user([written(text)])
+    found = contenders.tuned(own, TARGET, COMPARED)
+    weights = reading.load(f"{COMPARED}/{BY_NAME['trajectory-expected'].name}-target")
+    assert found.control == replace(weights.control, trigger="send_on_delta(0.5) | heartbeat")
+
+
 def test_a_contender_that_fits_no_budget_has_a_row_of_dashes() -> None:
     (own,) = contenders.of_user([written('title = "Loud"\ncontrol.trigger = "always"')])
     point = FlownContender(own, None, "every step", True, own.keys)
@@ -684,11 +694,11 @@ def test_a_contender_that_fits_no_budget_has_a_row_of_dashes() -> None:
         ("control.horizom = 9", "mine, target: control.horizom: no such key; did you mean"),
         (
             'threshold = "vehicle.report.silence"\ncontrol.horizon = 9',
-            "mine.toml: threshold: got 'vehicle.report.silence', expected the key of a number",
+            "mine, target: threshold: got vehicle.report.silence, expected the key of a number",
         ),
         (
             'threshold = "control.trigger.cost_gap"\ncontrol.trigger = "always"',
-            "mine, target: threshold: got 'control.trigger.cost_gap', expected the key of a",
+            "mine, target: threshold: got trigger.cost_gap, expected the key of a number",
         ),
     ],
 )
