@@ -365,12 +365,7 @@ class SendOnDelta(Trigger):
     Miskowicz, Send-on-delta concept, Sensors 6 (2006).
     """
 
-    def __init__(
-        self,
-        control: ControlConfig,  # noqa: ARG002
-        capacity: int,
-        metres: Amount = 0.5,
-    ) -> None:
+    def __init__(self, control: ControlConfig, capacity: int, metres: Amount = 0.5) -> None:  # noqa: ARG002
         self._metres = metres
         self._latest, self._sent = np.zeros((2, capacity, AXES_MAX))
 
@@ -406,9 +401,6 @@ class SelfTriggered(Trigger):
     ) -> None:
         self._metres, self._most_s = metres, seconds
         self._latest_s, self._wait_s = np.zeros((2, capacity))
-
-    def forget(self, row: int) -> None:
-        self._latest_s[row] = self._wait_s[row] = 0.0
 
     def test(self, situation: Situation) -> Verdict:
         rows = situation.rows

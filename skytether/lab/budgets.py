@@ -94,7 +94,8 @@ def flying(
         if isinstance(tuned_threshold, int):  # steps
             scaled = [max(1, round(value)) for value in scaled]
         values = sorted({*scaled})
-    reports = {ITS_OWN: {}} if contender.reports_by_itself else REPORTS
+    reports_by_itself = any(key.startswith(("vehicle.", "link.")) for key in contender.keys)
+    reports = {ITS_OWN: {}} if reports_by_itself else REPORTS
     return [
         FlownContender(
             contender,

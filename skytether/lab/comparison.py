@@ -101,7 +101,9 @@ class ComparedCase:
     @property
     def contenders(self) -> list[Contender]:
         points = (*self.tuned, *(runs.what for runs in self.bought.values()))
-        return list({point.contender.name: point.contender for point in points}.values())
+        found = {point.contender.name: point.contender for point in points}
+        first = [each.name for each in CONTENDERS if each.name in found]
+        return [found[name] for name in dict.fromkeys([*first, *found])]
 
     def curve(self, contender: str) -> list[ContenderRuns]:
         """Chosen points of a contender with rising budget; each point once."""

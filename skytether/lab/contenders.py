@@ -59,11 +59,6 @@ class Contender:
         return f"{self.scheme}, {self.trigger}" if self.trigger else self.scheme
 
     @property
-    def reports_by_itself(self) -> bool:
-        """Whether it sets how the vehicle reports; other ways of reporting are not tried then."""
-        return any(key.startswith(("vehicle.", "link.")) for key in self.keys)
-
-    @property
     def factors(self) -> Sequence[float]:
         """Factors on the threshold that the search found; each gives a point of the contender's
         curve.
@@ -386,8 +381,6 @@ def _of_user(file: Path) -> Contender:
     if extends and extends not in weighted:
         expected = f"the name of a built-in contender; {hint(extends, weighted)}"
         raise ConfigError(f"{file}: extends: got {extends!r}, expected {expected}")
-    if threshold and not threshold.startswith("control."):
-        raise ConfigError(f"{file}: threshold: got {threshold!r}, expected {A_NUMBER}")
     return Contender(
         file.stem,
         title or file.stem,
@@ -397,9 +390,6 @@ def _of_user(file: Path) -> Contender:
         keys=keys,
         base=weighted.get(extends),
     )
-
-
-A_NUMBER = "the key of a number, as in control.trigger.cost_gap"
 
 
 # -- weights -------------------------------------------------------------------------------------
@@ -421,11 +411,12 @@ def tuned(contender: Contender, case: Case, weights: str) -> Scenario:
     where = f"{contender.name}, {case.name}"
     scenario = reading.check(table, where)
     if contender.threshold:
-        key, number = f"control.{contender.threshold}", None
+        number = None
         with suppress(KeyError, TypeError, GrammarError):
-            number = value(reading.to_table(scenario), key)
+            number = value(reading.to_table(scenario), f"control.{contender.threshold}")
         if not isinstance(number, int | float):
-            raise ConfigError(f"{where}: threshold: got {key!r}, expected {A_NUMBER}")
+            expected = "the key of a number, as in control.trigger.cost_gap"
+            raise ConfigError(f"{where}: threshold: got {contender.threshold}, expected {expected}")
     return scenario
 
 

@@ -1,15 +1,15 @@
 """Comparisons from Python: `compare` flies contenders of one's own beside the built-in ones."""
 
 from collections.abc import Iterable
+from itertools import product
 from os import PathLike
 from pathlib import Path
 
 from skytether.lab.budgets import BUDGETS
-from skytether.lab.commands.compare import CompareOptions, draw, fly, size
-from skytether.lab.commands.pool import Flags
+from skytether.lab.commands.compare import CompareOptions, run, size
+from skytether.lab.commands.pool import Flags, writing
 from skytether.lab.commands.report_folder import CommandCall
 from skytether.lab.contenders import ABOARD
-from skytether.library.flying import prepare
 from skytether.library.sweeping import Swept
 from skytether.shared.base import extras, files
 from skytether.shared.base.errors import ConfigError, FlightError
@@ -56,28 +56,31 @@ def compare(
             raise ConfigError(f"{argument}: got {value!r}, expected a whole number from 1 on")
     if isinstance(cases, str):
         raise TypeError(f"cases: got {cases!r}, expected a list of names")
-    paths, folder = tuple(map(Path, contenders)), Path(out)
     options = CompareOptions(
-        runs=runs, out=folder, quick=quick, cases=tuple(cases), contender=paths
+        runs=runs,
+        out=Path(out),
+        quick=quick,
+        cases=tuple(cases),
+        weights=str(weights),
+        contender=tuple(map(Path, contenders)),
+        pool=Flags(workers=0 if workers == 1 else workers),
     )
-    plugins.load()
-    call = CommandCall.now("compare", [f"--contender={path}" for path in paths])
-    prepare()
+    plugins.load()  # plug-ins of installed packages, once per process
+    call = CommandCall.now("compare", [f"--contender={path}" for path in options.contender])
     try:
-        with files.apart():
+        with files.apart(), writing(options.out):
             scale = size(options)
-            flags = Flags(workers=0 if workers == 1 else workers)
-            results, flown = fly(scale, str(weights), flags, folder)
-            draw(folder, results, call, flown)
+            results, _, _ = run(options, scale, call)
     except CommandError as error:
         raise FlightError(str(error)) from None
     swept = []
     for each in results:
-        for (contender, budget), chosen in each.bought.items():
-            if budget in BUDGETS and contender != ABOARD.name:
+        for contender, budget in product(each.contenders, BUDGETS):
+            chosen = each.bought.get((contender.name, budget))
+            if chosen is not None and contender is not ABOARD:
                 table = reading.to_table(scale.scenario(each.case))
                 set_keys(chosen.what.keys, table)
-                keys = {"case": each.case.name, "contender": contender, "budget": budget}
+                keys = {"case": each.case.name, "contender": contender.name, "budget": budget}
                 keys |= {"threshold": chosen.what.threshold, "report": chosen.what.report}
                 swept.append(Swept(keys, reading.check(table), tuple(chosen.runs)))
     return swept

@@ -4,6 +4,7 @@ import csv
 import dataclasses
 import json
 import math
+import re
 import shutil
 import signal
 import subprocess
@@ -589,6 +590,134 @@ def test_weights_that_nobody_has_searched_for_are_refused(
         "expected every contender in every case, as --tune writes them"
     )
     assert capsys.readouterr().err.strip() == said
+
+
+def test_weights_of_an_unknown_contender_are_refused(
+    tuned: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "mine.toml"
+    weights = (tuned / "weights.toml").read_text()
+    file.write_text(f'{weights}\n["trajectory-expectd-target"]\nextends = "target"\n')
+    assert main(["compare", "--quick", "--weights", str(file), "--out", str(tmp_path)]) == 2
+    said = capsys.readouterr().err
+    assert said.startswith(f"compare: {file}: got the table 'trajectory-expectd-target', expected")
+    assert said.endswith("did you mean trajectory-expected-target?\n")
+
+
+# -- contenders of a user ------------------------------------------------------------------------
+
+MINE = """
+extends = "trajectory-expected"
+threshold = "control.trigger.deviation"
+[control]
+trigger = "deviation(0.05) | heartbeat"
+"""
+
+
+def written(text: str, name: str = "mine") -> Path:
+    file = Path(f"{name}.toml")
+    file.write_text(text)
+    return file
+
+
+def test_a_contender_of_a_user_is_flown_within_the_same_budgets_and_reported(
+    tuned: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """From the library; the command then finds every flight in the folder."""
+    mine = written(MINE)
+    weights = tuned / "weights.toml"
+    found = skytether.compare(mine, cases=["target"], quick=True, weights=weights, out="own")
+    own = [each for each in found if each.keys["contender"] == "mine"]
+    assert own
+    assert {each.keys["contender"] for each in found} <= {*QUICK, "mine"}
+    base = reading.load(f"{weights}/trajectory-expected-target")
+    for each in own:
+        keys = {
+            **REPORTS[each.keys["report"]],
+            "control.trigger": f"deviation({each.keys['threshold']}) | heartbeat",
+        }
+        flown = skytether.fly_batch(base, [1, 2, 3], duration=FLOWN_S, **keys)
+        assert [run.rmse_xy for run in each.runs] == [one.summary.rmse_xy for one in flown]
+        assert each.scenario.control.input_weight == base.control.input_weight
+    table = {(row["contender"], row["budget"]): row for row in rows(Path("own/budgets.csv"))}
+    for each in own:
+        row = table["mine", str(each.keys["budget"])]
+        assert float(row["rmse_xy"]) == pytest.approx(each.mean("rmse_xy")[0])
+    assert "mine" in {row["contender"] for row in rows(Path("own/trade-target.csv"))}
+    argv = ["--quick", "--cases", "target", "--weights", str(weights), "--contender", str(mine)]
+    assert main(["compare", *argv, "--out", "own"]) == 0
+    assert "1 figures; 0 runs flown" in capsys.readouterr().out
+
+
+def test_a_contender_of_a_user_keeps_its_reports_and_has_a_point_for_each_threshold() -> None:
+    def points(text: str) -> list[FlownContender]:
+        (own,) = contenders.of_user([written(text)])
+        scale = contenders.ComparisonSize(runs=1, generations=1, contenders=[own])
+        return Plan(BY_CASE["gusts"], COMPARED, scale).points
+
+    searched = points(MINE)
+    assert {point.report for point in searched} == {*REPORTS}
+    assert len(searched) == len(REPORTS) * len(contenders.NEAR)
+    fixed = points('[control]\ntrigger = "periodic(9)"\n[vehicle]\nreport = "silence(3)"\n')
+    assert [(point.threshold, point.report, point.tuned) for point in fixed] == [
+        (None, budgets.ITS_OWN, True)
+    ]
+    assert fixed[0].keys == {"control.trigger": "periodic(9)", "vehicle.report": "silence(3)"}
+
+
+def test_the_documented_contender_can_be_flown() -> None:
+    page = (Path(__file__).parents[2] / "docs" / "compare.md").read_text()
+    (text,) = re.findall(r"```toml\n(.*?)```", page, re.DOTALL)
+    (own,) = contenders.of_user([written(text)])
+    found = contenders.tuned(own, TARGET, COMPARED)
+    weights = reading.load(f"{COMPARED}/{BY_NAME['trajectory-expected'].name}-target")
+    assert found.control == replace(weights.control, trigger="send_on_delta(0.5) | heartbeat")
+
+
+def test_a_contender_that_fits_no_budget_has_a_row_of_dashes() -> None:
+    (own,) = contenders.of_user([written('title = "Loud"\ncontrol.trigger = "always"')])
+    point = FlownContender(own, None, "every step", True, own.keys)
+    row = budgets_table([ComparedCase(TARGET, {}, [point])]).rows[0]
+    assert row == (TARGET.title, "Loud", *["–"] * len(BUDGETS))
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("reference.speed_mps = 2", "mine.toml: got reference.speed_mps, expected title,"),
+        ("vehicle.wind = 0.0", "mine.toml: got vehicle.wind, expected title,"),
+        ("control.dt = 0.1", "mine.toml: got control.dt, expected title,"),
+        ('extends = "trajectory-expected"', "mine.toml: got no keys, expected some of control,"),
+        ('extends = "paper"\ncontrol.horizon = 9', "mine.toml: extends: got 'paper', expected"),
+        ("title = 3\ncontrol.horizon = 9", "mine.toml: title: got 3, expected a text"),
+        ('control.trigger = "cots_gap"', "mine, target: control.trigger: got 'cots_gap'"),
+        ("control.horizom = 9", "mine, target: control.horizom: no such key; did you mean"),
+        (
+            'threshold = "vehicle.report.silence"\ncontrol.horizon = 9',
+            "mine, target: threshold: got vehicle.report.silence, expected the key of a number",
+        ),
+        (
+            'threshold = "control.trigger.cost_gap"\ncontrol.trigger = "always"',
+            "mine, target: threshold: got trigger.cost_gap, expected the key of a number",
+        ),
+    ],
+)
+def test_an_impossible_contender_is_refused(text: str, said: str) -> None:
+    file = written(text)
+    with pytest.raises(ConfigError) as refused:
+        skytether.compare(file, cases=["target"], quick=True)
+    assert str(refused.value).startswith(said)
+    assert not Path("compare").exists()
+
+
+def test_two_contenders_have_two_names(capsys: pytest.CaptureFixture[str]) -> None:
+    mine, theirs = written(MINE), written(MINE, "paper-event")
+    for files in ([mine, mine], [theirs]):
+        flags = [word for file in files for word in ("--contender", str(file))]
+        assert main(["compare", "--quick", *flags]) == 2
+        assert f"got the name {files[0].stem!r}, expected another" in capsys.readouterr().err
+    assert main(["compare", "--tune", "--contender", str(mine)]) == 2
+    assert "got it with --tune" in capsys.readouterr().err
 
 
 @pytest.mark.long

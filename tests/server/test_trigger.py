@@ -419,6 +419,42 @@ def test_scenario_names_its_trigger() -> None:
             assert events(trigger, 0, 9) == [0, 4, 8]
 
 
+def along(x_m: float, speed_mps: float = 0.0, sent_step: int = 50) -> SituationArrays:
+    """Arrays of one vehicle whose reference is at x and flies along it."""
+    desired = np.zeros((1, 2, 4, 2))
+    desired[:, 0] = x_m, speed_mps
+    return KNOWN._replace(desired=lambda *_: desired, sent_step=np.array([sent_step]))
+
+
+def asked(trigger: Trigger, arrays: SituationArrays, *, step: int = 50) -> bool:
+    states = np.zeros((1, 2, 2))
+    verdict = trigger.test(Situation(ROW, figures_of(step=step), states, states, arrays))
+    return bool(verdict.event[0])
+
+
+def test_send_on_delta_sends_when_the_reference_has_left_its_place_at_the_last_packet() -> None:
+    trigger = trigger_of("send_on_delta(0.5)")
+    assert asked(trigger, along(3.0))
+    tell(trigger, 50)
+    assert [asked(trigger, along(x_m)) for x_m in (3.4, 2.6, 3.6)] == [False, False, True]
+    assert asked(trigger, along(3.6))  # not sent at the step before
+    tell(trigger, 52)
+    assert not asked(trigger, along(3.2))
+    trigger.forget(0)
+    assert not asked(trigger, along(0.4))
+
+
+def test_the_next_packet_of_a_self_triggered_vehicle_is_due_at_a_time_fixed_at_the_last() -> None:
+    """0.5 m at 1 m/s take five steps; at rest the longest wait counts."""
+    trigger = trigger_of("self_triggered(0.5, 2)")
+    for speed_mps, steps in ((1.0, 5), (0.0, 20)):
+        asked(trigger, along(0.0, speed_mps))
+        tell(trigger, 50)
+        due = [asked(trigger, along(0.0, 9.0), step=50 + k) for k in (1, steps - 1, steps)]
+        assert due == [False, False, True]
+    assert asked(trigger, along(0.0, sent_step=-1), step=51)
+
+
 LEAVES = (
     *("always", "periodic(3)", "state_gap(1, 1)", "cost_gap(1)"),
     *("deviation(1)", "silence(0.5)", "budget(2, 2)"),

@@ -15,7 +15,7 @@ from skytether.lab.commands import report_folder, tables
 from skytether.lab.commands.pool import Crew, Flags, PoolFlags, crew, writing
 from skytether.lab.commands.report_folder import CommandCall
 from skytether.lab.comparison import ComparedCase
-from skytether.lab.contenders import CASES, CONTENDERS, PACKETS, ComparisonSize, TunedWeights
+from skytether.lab.contenders import CASES, PACKETS, ComparisonSize, TunedWeights
 from skytether.lab.floor import Baselines, Floor, Work, floor_of, summarise_aboard
 from skytether.lab.report import Drawn
 from skytether.lab.search import Search, best
@@ -76,9 +76,7 @@ def compare(argv: Sequence[str]) -> None:
         if options.tune:
             _tune(options, scale)
             return
-        call = CommandCall.now("compare", argv)
-        results, runs = fly(scale, options.weights, options.pool, options.out)
-        drawn = draw(options.out, results, call, runs)
+        _, drawn, runs = run(options, scale, CommandCall.now("compare", argv))
     for table in drawn.tables:
         tables.show(table.title, table.heading, table.rows)
     page = options.out / report_folder.PAGE
@@ -87,41 +85,34 @@ def compare(argv: Sequence[str]) -> None:
 
 
 def size(options: CompareOptions) -> ComparisonSize:
-    scale = ComparisonSize(
-        options.runs,
-        options.generations,
-        cases=contenders.cases(options.cases),
-        contenders=[*CONTENDERS, *contenders.of_user(options.contender)],
-    )
+    cases = contenders.cases(options.cases)
+    all_ = [*contenders.CONTENDERS, *contenders.of_user(options.contender)]
+    scale = ComparisonSize(options.runs, options.generations, cases=cases, contenders=all_)
     return contenders.quick(scale) if options.quick else scale
 
 
-def fly(
-    scale: ComparisonSize, weights: str, pool: Flags, out: Path
-) -> tuple[list[ComparedCase], int]:
-    """Results of all cases, and the number of flights flown, without those stored in the folder."""
-    plans = [Plan(case, weights, scale) for case in scale.cases]
-    command.claim_folder("--out", out, report_folder.PAGE)
-    runs = sum(_scout(pool, out, plans, number) for number in range(1 + scale.rounds))
+def run(
+    options: CompareOptions, scale: ComparisonSize, call: CommandCall
+) -> tuple[list[ComparedCase], Drawn, int]:
+    """Results of all cases, their report, which it writes, and the number of flights flown now."""
+    plans = [Plan(case, options.weights, scale) for case in scale.cases]
+    command.claim_folder("--out", options.out, report_folder.PAGE)
+    runs = sum(_scout(options, plans, number) for number in range(1 + scale.rounds))
     chosen = [plan.chosen() for plan in plans]
     sweeps = [plan.comparison(each.values()) for plan, each in zip(plans, chosen, strict=True)]
     results = []
-    with crew(pool, "comparing", sum(each.flights for each in sweeps)) as flyers:
+    with crew(options.pool, "comparing", sum(each.flights for each in sweeps)) as flyers:
         for plan, points, sweep in zip(plans, chosen, sweeps, strict=True):
-            done = flyers.sweep(sweep, out / "sweeps" / plan.case.name, plan.case.title)
-            beside = _beside(flyers, plan, out / "beside" / plan.case.name)
+            done = flyers.sweep(sweep, options.out / "sweeps" / plan.case.name, plan.case.title)
+            beside = _beside(flyers, plan, options.out / "beside" / plan.case.name)
             results.append(comparison.compared(plan, points, sweep, done, beside))
         runs += flyers.runs
-    return results, runs
-
-
-def draw(out: Path, results: Sequence[ComparedCase], call: CommandCall, runs: int) -> Drawn:
     drawn = comparison.draw(results)
-    report_folder.write(out, drawn, reading.load(CASES[0].plant), call, runs)
-    return drawn
+    report_folder.write(options.out, drawn, reading.load(CASES[0].plant), call, runs)
+    return results, drawn, runs
 
 
-def _scout(pool: Flags, out: Path, plans: Sequence[Plan], number: int) -> int:
+def _scout(options: CompareOptions, plans: Sequence[Plan], number: int) -> int:
     """Fly the scouting flights of a round: all points first, later points near the budgets.
 
     Returns the number of flights flown by this call.
@@ -130,10 +121,10 @@ def _scout(pool: Flags, out: Path, plans: Sequence[Plan], number: int) -> int:
     if not any(asked):
         return 0
     sweeps = [plan.scouts(points) for plan, points in zip(plans, asked, strict=True)]
-    with crew(pool, "choosing", sum(each.flights for each in sweeps)) as flyers:
+    with crew(options.pool, "choosing", sum(each.flights for each in sweeps)) as flyers:
         for plan, points, sweep in zip(plans, asked, sweeps, strict=True):
             if points:
-                folder = out / "scouts" / plan.case.name / f"round-{number}"
+                folder = options.out / "scouts" / plan.case.name / f"round-{number}"
                 plan.scouted(points, sweep, flyers.sweep(sweep, folder, plan.case.title))
         return flyers.runs
 
