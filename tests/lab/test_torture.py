@@ -475,7 +475,7 @@ def run(*argv: str) -> "subprocess.CompletedProcess[str]":
 @pytest.mark.long
 def test_the_command_flies_seeds_in_processes_and_says_what_happened(tmp_path: Path) -> None:
     path = tmp_path / "counts.json"
-    done = run("--seed", "1", "--count", "3", "--jobs", "2", "--json", str(path))
+    done = run("--seed", "1", "--runs", "3", "--workers", "2", "--json", str(path))
     assert done.returncode == 0, done.stderr
     assert "torture from seed 1" in done.stdout
     said = json.loads(path.read_text())

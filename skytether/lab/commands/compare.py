@@ -5,8 +5,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-import tyro
-
 from skytether.figures.page import as_text
 from skytether.lab import comparison, contenders
 from skytether.lab.budgets import Plan
@@ -21,6 +19,7 @@ from skytether.shared.base import files
 from skytether.shared.scenario import reading
 from skytether.shared.telemetry.summary import Summary
 from skytether.shell import command
+from skytether.shell.argument import Argument
 from skytether.shell.options import read
 
 WEIGHTS = "weights.toml"
@@ -30,21 +29,21 @@ WEIGHTS = "weights.toml"
 class CompareOptions:
     """Options of `skytether compare`."""
 
-    runs: Annotated[int, tyro.conf.arg(metavar="N")] = 100
+    runs: Annotated[int, Argument(metavar="N")] = 100
     """Number of flights of each contender per case and budget, with seeds from 1 on."""
     out: Path = Path("compare")
     """Folder for the report, and for weights and their searches; the same command continues
     there."""
     quick: bool = False
     """Fly only a first look: few flights, cases and thresholds."""
-    cases: Annotated[tuple[str, ...], tyro.conf.arg(metavar="CASE")] = ()
+    cases: Annotated[tuple[str, ...], Argument(metavar="CASE")] = ()
     """Cases to fly; all unless given."""
     tune: bool = False
     """Only search for the weights of every contender in every case, each with the same effort, and
     write them to OUT/weights.toml."""
-    generations: Annotated[int, tyro.conf.arg(metavar="N")] = 16
+    generations: Annotated[int, Argument(metavar="N")] = 16
     """Number of generations of each of these searches."""
-    weights: Annotated[str, tyro.conf.arg(metavar="FILE")] = reading.COMPARED
+    weights: Annotated[str, Argument(metavar="FILE")] = reading.COMPARED
     """File of the weights, as written by --tune; the included ones unless given."""
     pool: PoolFlags = Flags()
 

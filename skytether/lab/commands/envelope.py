@@ -15,6 +15,7 @@ from skytether.lab.envelope import BAD, Envelope, EnvelopePoint, Outcome, worst_
 from skytether.shared.base import files
 from skytether.shared.scenario.schema import Scenario
 from skytether.shell import command
+from skytether.shell.argument import Argument
 from skytether.shell.command import CommandError, ScenarioFlags, ScenarioName
 
 TOLD_MAX = 10
@@ -28,8 +29,8 @@ class EnvelopeOptions:
     """Folder for the results; the same command continues there, also with more points."""
     scenario: ScenarioName = "demo-committed"
     """Name of a scenario (see `skytether scenarios`) or path of a .toml file."""
-    points: Annotated[int, tyro.conf.arg(metavar="N")] = 1000
-    """Number of points; point n depends only on --seed and n."""
+    runs: Annotated[int, Argument(metavar="N")] = 1000
+    """Number of points, flown once each; point n depends only on --seed and n."""
     pool: PoolFlags = Flags()
     config: ScenarioFlags = Scenario()
 
@@ -50,12 +51,12 @@ def envelope(argv: Sequence[str]) -> None:
     options = command.parse(
         EnvelopeOptions(tyro.MISSING), argv, "skytether envelope", envelope.__doc__
     )
-    command.check_count("--points", options.points, 10**6)
+    command.check_count("--runs", options.runs, 10**6)
     options.pool.check()
     plan = Envelope(options.scenario, options.config)
     command.claim_folder("--out", options.out, "points.csv", "envelope.png")
     title = f"flying points of {options.scenario}"
-    numbers, settings = range(options.points), plan.settings()
+    numbers, settings = range(options.runs), plan.settings()
     points = study(
         plan.fly, numbers, EnvelopePoint, settings, options.out, options.pool, title, "points"
     )

@@ -15,6 +15,7 @@ from skytether.lab.sweep import Results, Sweep, estimate, parse_axis
 from skytether.shared.base import files
 from skytether.shared.scenario.schema import Scenario
 from skytether.shell import command
+from skytether.shell.argument import Argument
 from skytether.shell.command import ScenarioFlags, ScenarioName
 
 DRAWN = {"rmse_xy": "RMSE xy [m]", "event_ratio": "event ratio"}
@@ -33,12 +34,10 @@ class SweepOptions:
     """Folder for the results; the same command continues there."""
     scenario: ScenarioName = "paper"
     """Name of a scenario (see `skytether scenarios`) or path of a .toml file."""
-    grid: Annotated[
-        tuple[str, ...], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="KEY=VALUES")
-    ] = ()
+    grid: Annotated[tuple[str, ...], Argument(append=True, metavar="KEY=VALUES")] = ()
     """Key of the scenario and its values: KEY=START:STOP:COUNT, evenly spaced, or KEY=A,B,C.
     Several grids give all combinations of their values."""
-    runs: Annotated[int, tyro.conf.arg(metavar="N")] = 50
+    runs: Annotated[int, Argument(metavar="N")] = 50
     """Number of flights of each combination, with seeds that count up from the scenario's."""
     pool: PoolFlags = Flags()
     config: ScenarioFlags = Scenario()
