@@ -89,7 +89,10 @@ def _circle(part: Any, home: Home) -> Array:
 
 def has_fence(content: bytes) -> bool:
     """Whether a plan has a geofence; raises ValueError if it is no plan."""
-    plan, _ = _plan(content, ())
+    try:
+        plan, _ = _plan(content, ())
+    except ValueError as error:
+        raise ValueError(f"expected {error}") from None
     fence = plan.get("geoFence") or {}
     return bool(fence.get("polygons") or fence.get("circles"))
 

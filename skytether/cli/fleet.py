@@ -155,7 +155,7 @@ def fleet(argv: Sequence[str]) -> None:
         figures.check(options.figure, film.SUFFIX)
     where = "in virtual time" if options.virtual else "over UDP on loopback"
     name = Path(options.config.reference.file).name or options.scenario
-    count = f"{vehicles} vehicle{'s' * (vehicles != 1)}"
+    count = terminal.counted(vehicles, "vehicle")
     title = f"{count}, {name}, {where}, seed {options.config.seed}"
     terminal.prepare(kernel.missing())
     with (
@@ -201,6 +201,10 @@ def _with_mission(argv: Sequence[str]) -> list[str]:
         raise CommandError(message, command.CONFIGURATION)
     is_file = Path(file).suffix in TRACKS or (Path(file).is_dir() and file not in reading.names())
     if not (shows or is_file):
+        if file not in reading.names() and not file.endswith(".toml"):
+            expected = "swap, sphere, rings, corridor, warehouse, a folder, or a file that ends in"
+            message = f"{flag}: got {file!r}, expected {expected} .csv, .zip, .plan or .toml"
+            raise CommandError(message, command.CONFIGURATION)
         return [file, *rest]
     try:
         (read,) = reading.files_of(flag, file)

@@ -487,7 +487,7 @@ def test_the_command_flies_seeds_in_processes_and_says_what_happened(tmp_path: P
 @pytest.mark.parametrize(
     ("argv", "said"),
     [
-        (["--schedule", "{"], "schedule of faults: "),
+        (["--schedule", "{"], "expected a schedule of faults"),
         (["--schedule", "{}", "--seed", "1"], "got --seed and --schedule, expected one of them"),
         (["--hours", "-1"], "--hours: got -1, expected more than 0, at most 10000"),
         (["--seed", "-1"], "--seed: got -1, expected 0 to 4294967295"),
@@ -510,7 +510,7 @@ def test_a_failure_is_printed_with_its_schedule_and_flies_again(
     frozen = Trial(1, (fault(FaultKind.FREEZE, "client", 5, 0.6),))
     file.write_text(f"# two\n{dumps(Trial(1, ()))}\n{dumps(frozen)}\n")
     for argv in (["--replay", str(file)], ["--schedule", dumps(frozen)]):
-        with pytest.raises(CommandError, match=r"1 of [12] flights failed") as refused:
+        with pytest.raises(CommandError, match=r"1 of (1 flight|2 flights) failed") as refused:
             skytether.lab.commands.torture.torture(argv)
         assert refused.value.code == 1
         printed = capsys.readouterr().out

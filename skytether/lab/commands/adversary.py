@@ -168,7 +168,7 @@ def _moves(text: str) -> Moves:
     except OSError as error:
         raise CommandError(f"--attack: {text}: {error.strerror}", command.CONFIGURATION) from None
     except msgspec.DecodeError as error:
-        raise ConfigError(f"--attack: {text}: {error}") from None
+        raise ConfigError(f"--attack: {text}: expected a file of --json ({error})") from None
 
 
 def _kinds(text: str) -> tuple[MoveKind, ...]:
@@ -193,11 +193,11 @@ def _finish(
     asked_m = options.config.mission.separation_m
     rows: list[tuple[str, object]] = []
     if spares_m:
-        rows.append(("flights", f"{len(spares_m)}, {options.kinds}"))
+        rows.append(("flights", f"{len(spares_m)}, with {options.kinds}"))
         rows.append(("with a violated distance", failed))
-    # All digits, so that a repeated flight can be compared exactly.
-    rows.append(("least separation, required [m]", f"{apart.away_m!r}, {asked_m:g}"))
-    rows.append(("  at [s], of vehicles", f"{apart.at_s:.2f}, {apart.vehicles}"))
+    rows.append(("least separation, required [m]", f"{apart.away_m:.3f}, {asked_m:g}"))
+    pair = " and ".join(map(str, apart.vehicles))
+    rows.append(("  at [s], of vehicles", f"{apart.at_s:.2f}, {pair}"))
     if clear.vehicles:
         rows.append(("least distance from a zone [m]", clear.distance_m))
         rows.append(("  at [s], of vehicle", f"{clear.at_s:.2f}, {clear.vehicles[0]}"))
@@ -208,7 +208,7 @@ def _finish(
         if spares_m:
             fewest = shrunk(options.config, found)
             again = shlex.join(["adversary", *_of_flight(argv), "--attack", dumps(fewest.moves)])
-            print(f"fewest moves, {fewest.apart.distance_m!r} m:\n    skytether {again}")
+            print(f"fewest moves, {fewest.apart.distance_m:.3f} m:\n    skytether {again}")
         raise CommandError("a required distance was violated")
 
 

@@ -16,7 +16,7 @@ from skytether.lab.search import SIGMA, Free, Search, SearchPoint, Values, best,
 from skytether.shared.base import files
 from skytether.shared.scenario.reading import to_toml
 from skytether.shared.scenario.schema import Scenario
-from skytether.shell import command
+from skytether.shell import command, terminal
 from skytether.shell.argument import Argument
 from skytether.shell.command import CommandError, ScenarioFlags, ScenarioName
 
@@ -120,7 +120,7 @@ def _print_rmse(points: Sequence[SearchPoint]) -> None:
         ("effort [m/s]", as_text(means["effort_mps"], ".4f")),
     ]
     rows += [(key, f"{value:g}") for key, value in found.keys.items()]
-    tables.show(f"the best of {len(points)} points", (), rows)
+    tables.show(f"the best of {terminal.counted(len(points), 'point')}", (), rows)
 
 
 def _print_table_1(points: Sequence[SearchPoint]) -> None:
@@ -131,7 +131,9 @@ def _print_table_1(points: Sequence[SearchPoint]) -> None:
         span = [point.keys[key] for point in near]
         ends = [f"{min(span):g}", f"{max(span):g}"] if span else []
         rows.append((key, f"{value:g}", *ends))
-    title = f"{len(near)} of {len(points)} points have every entry within tolerance"
+    title = (
+        f"{len(near)} of {terminal.counted(len(points), 'point')} have every entry within tolerance"
+    )
     tables.show(title, ("key", "best", "least of these", "most of these"), rows)
 
 

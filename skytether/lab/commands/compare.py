@@ -18,7 +18,7 @@ from skytether.lab.search import Search, best
 from skytether.shared.base import files
 from skytether.shared.scenario import reading
 from skytether.shared.telemetry.summary import Summary
-from skytether.shell import command
+from skytether.shell import command, terminal
 from skytether.shell.argument import Argument
 from skytether.shell.options import read
 
@@ -87,7 +87,8 @@ def _compare(options: CompareOptions, scale: ComparisonSize, call: CommandCall) 
     report_folder.write(options.out, drawn, reading.load(CASES[0].plant), call, runs)
     for table in drawn.tables:
         tables.show(table.title, table.heading, table.rows)
-    print(f"{options.out / report_folder.PAGE}: {len(drawn.pictures)} figures; {runs} runs flown")
+    flown = terminal.counted(runs, "run")
+    print(f"{options.out / report_folder.PAGE}: {len(drawn.pictures)} figures; {flown} flown")
     print(drawn.verdict)
 
 

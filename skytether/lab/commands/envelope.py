@@ -14,7 +14,7 @@ from skytether.lab.commands.pool import Flags, PoolFlags, study, writing
 from skytether.lab.envelope import BAD, Envelope, EnvelopePoint, Outcome, worst_first
 from skytether.shared.base import files
 from skytether.shared.scenario.schema import Scenario
-from skytether.shell import command
+from skytether.shell import command, terminal
 from skytether.shell.argument import Argument
 from skytether.shell.command import CommandError, ScenarioFlags, ScenarioName
 
@@ -66,7 +66,8 @@ def envelope(argv: Sequence[str]) -> None:
 
 def _finish(options: EnvelopeOptions, plan: Envelope, points: Sequence[EnvelopePoint]) -> None:
     """Write and print all outcomes; raises CommandError if some points flew away or crashed."""
-    title = f"{options.scenario}, {len(points)} points, in virtual time, seed {plan.scenario.seed}"
+    flown = terminal.counted(len(points), "point")
+    title = f"{options.scenario}, {flown}, in virtual time, seed {plan.scenario.seed}"
     files.write(options.out / "points.csv", plan.csv(points).encode())
     figures.envelope(options.out / "envelope.png", title, plan, points)
     counts = Counter(point.outcome for point in points)
@@ -79,4 +80,4 @@ def _finish(options: EnvelopeOptions, plan: Envelope, points: Sequence[EnvelopeP
         print(f"{point.outcome}{detail}\n    {plan.command(number)}")
     print(f"{options.out}: points.csv, envelope.png")
     if bad := sum(counts[outcome] for outcome in BAD):
-        raise CommandError(f"{bad} of {len(points)} points flew away or crashed")
+        raise CommandError(f"{bad} of {flown} flew away or crashed")

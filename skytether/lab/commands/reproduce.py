@@ -69,7 +69,8 @@ def reproduce(argv: Sequence[str]) -> None:
         report_folder.write(options.out, drawn, scenario, call, runs)
     table = drawn.tables[0]
     tables.show(table.title, table.heading, table.rows)
-    print(f"{options.out / report_folder.PAGE}: {len(drawn.pictures)} figures; {runs} runs flown")
+    flown = terminal.counted(runs, "run")
+    print(f"{options.out / report_folder.PAGE}: {len(drawn.pictures)} figures; {flown} flown")
     print(drawn.verdict)
 
 

@@ -17,7 +17,7 @@ from skytether.lab.faults import Trial, dumps, loads
 from skytether.lab.torture import TrialOutcome, fly, long_trial, short_trial, shrunk
 from skytether.shared.base import files
 from skytether.shared.base.errors import ConfigError
-from skytether.shell import command
+from skytether.shell import command, terminal
 from skytether.shell.argument import Argument
 from skytether.shell.command import CommandError
 from skytether.shell.options import read
@@ -73,11 +73,13 @@ def torture(argv: Sequence[str]) -> None:
             failed[:TOLD_MAX] = flyers.map(shrunk, failed[:TOLD_MAX])
     except Interrupted as early:
         done = done or early.results.values()
-        interrupted = f"interrupted with {len(done)} of {len(trials)} flights done"
+        interrupted = (
+            f"interrupted with {len(done)} of {terminal.counted(len(trials), 'flight')} done"
+        )
         failed = [each for each in done if each.failure]
     _finish(options, title, done, failed)
     if failed:
-        message = f"{len(failed)} of {len(done)} flights failed"
+        message = f"{len(failed)} of {terminal.counted(len(done), 'flight')} failed"
         raise CommandError(f"{interrupted}, and {message}" if interrupted else message)
     if interrupted:
         raise CommandError(interrupted, command.INTERRUPTED)
@@ -130,7 +132,13 @@ def _read(path: Path) -> list[Trial]:
         lines = files.read(path, SCHEDULES_BYTES_MAX).decode().splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise CommandError(f"--replay: {path}: {error}", command.CONFIGURATION) from None
-    trials = [loads(line) for line in lines if line.strip() and not line.startswith("#")]
+    trials = []
+    for number, line in enumerate(lines, 1):
+        if line.strip() and not line.startswith("#"):
+            try:
+                trials.append(loads(line))
+            except ConfigError as error:
+                raise ConfigError(f"--replay: {path}: line {number}: {error}") from None
     if not trials:
         raise ConfigError(f"{path}: no schedules, expected one a line")
     return trials
