@@ -89,10 +89,7 @@ def _circle(part: Any, home: Home) -> Array:
 
 def has_fence(content: bytes) -> bool:
     """Whether a plan has a geofence; raises ValueError if it is no plan."""
-    try:
-        plan, _ = _plan(content, ())
-    except ValueError as error:
-        raise ValueError(f"expected {error}") from None
+    plan, _ = _expected(content, ())
     fence = plan.get("geoFence") or {}
     return bool(fence.get("polygons") or fence.get("circles"))
 
@@ -106,10 +103,10 @@ def route(content: bytes, axes: int, origin: Origin) -> tuple[Array, Array]:
     Raises:
         ValueError: it is no plan, or an item cannot be flown; the message names it.
     """
-    plan, home = _plan(content, origin)
+    plan, home = _expected(content, origin)
     mission = plan.get("mission")
     if not (isinstance(mission, dict) and mission.get("items")):
-        raise ValueError("a plan with mission items")
+        raise ValueError("expected a plan with mission items")
     speed_mps = number(mission.get("hoverSpeed", 0.0), "hoverSpeed")
     start = np.zeros(3)
     start[:2] = home.local(*mission["plannedHomePosition"][:2])
@@ -117,7 +114,7 @@ def route(content: bytes, axes: int, origin: Origin) -> tuple[Array, Array]:
     for count, item in enumerate(_items(mission["items"]), start=1):
         try:
             if count > ITEMS_MAX:
-                raise ValueError(f"at most {ITEMS_MAX} items")
+                raise ValueError(f"expected at most {ITEMS_MAX} items")
             command, params = int(item["command"]), [*item["params"], *[None] * 7][:7]
             if command in STILL:
                 continue
@@ -134,7 +131,9 @@ def route(content: bytes, axes: int, origin: Origin) -> tuple[Array, Array]:
             raise ValueError(f"mission item {count}: expected a command and its params") from None
         away_m = float(np.linalg.norm(place - places[-1]))
         if away_m and not 0.0 < speed_mps <= 1e3:
-            raise ValueError(f"mission item {count}: hoverSpeed above 0, got {speed_mps:g}")
+            raise ValueError(
+                f"mission item {count}: expected hoverSpeed above 0, got {speed_mps:g}"
+            )
         for wait_s, at in ((away_m / speed_mps if away_m else 0.0, place), (hold_s, place)):
             if wait_s > 0.0:
                 times.append(times[-1] + wait_s)
@@ -176,6 +175,14 @@ def _place(
             raise ValueError(f"expected an altitude {known}, got one of frame {frame}")
         place[2] = number(params[6], "altitude") - (home.altitude_m if frame == 0 else 0.0)
     return place
+
+
+def _expected(content: bytes, origin: Origin) -> tuple[dict[str, Any], Home]:
+    """A plan as `_plan` reads it; the message of its ValueError is a sentence of its own."""
+    try:
+        return _plan(content, origin)
+    except ValueError as error:
+        raise ValueError(f"expected {error}") from None
 
 
 def _plan(content: bytes, origin: Origin) -> tuple[dict[str, Any], Home]:
