@@ -40,9 +40,9 @@ from skytether.shared.telemetry.summary import summarise
 from skytether.shared.wire import keys
 from skytether.shared.wire.keys import Keyring
 from skytether.shell import command, process, terminal
+from skytether.shell.argument import Argument
 from skytether.shell.command import CommandError, ScenarioName
 from skytether.shell.memory import MemoryFile, folder
-from skytether.shell.options import Argument
 from skytether.shell.process import ProcessOptions
 
 

@@ -19,7 +19,7 @@ from skytether.shared.core.events import address_text
 from skytether.shared.scenario import reading
 from skytether.shared.telemetry.record import PACKET_COLUMNS
 from skytether.shell import command, process
-from skytether.shell.options import Argument
+from skytether.shell.argument import Argument
 from skytether.shell.process import ProcessOptions
 from skytether.shell.udp import files_max, leads_back, sockets_max
 

@@ -28,8 +28,8 @@ from skytether.shared.telemetry.record import RECORDING, plan_columns, server_co
 from skytether.shared.wire import keys
 from skytether.shared.wire.keys import Keyring
 from skytether.shell import command, process, terminal, workers
+from skytether.shell.argument import Argument
 from skytether.shell.command import CommandError
-from skytether.shell.options import Argument
 from skytether.shell.process import ProcessOptions
 from skytether.shell.udp import AddressError
 

@@ -28,7 +28,7 @@ reorders and loses their packets.
   page FOLDER...        the page of flights in a browser; `fly` has its own
   report FILE           a recording as an HTML page with figures
   export FILE           a recording as tables, CSV or Parquet
-  join FILE... --out F  recordings of server, netem and client, as one
+  join FILE...          recordings of server, netem and client, as one
   set PATH KEY=VALUE    change keys in flight, at a process with --control
   probe HOST:PORT       delay and loss of a real path, each way; with --listen, its far end
   scenarios             scenarios that come with Skytether

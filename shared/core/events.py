@@ -315,10 +315,9 @@ class NoAnswer(PeerEvent, frozen=True, kw_only=True):
     """Whether the vehicle has a key, so that only answers with that key count."""
 
     def __str__(self) -> str:
-        if self.secure:
-            no_answer = f"no answer with this key from {self.peer} in {self.waited_s:.0f} s"
-            return f"vehicle {self.vehicle}: {no_answer}"
-        return f"vehicle {self.vehicle}: no answer from {self.peer} in {self.waited_s:.0f} s"
+        key, and_key = (" with this key", ", with this key") if self.secure else ("", "")
+        no_answer = f"no answer{key} from {self.peer} in {self.waited_s:.0f} s"
+        return f"vehicle {self.vehicle}: {no_answer}: is a server running there{and_key}?"
 
 
 class Unanswered(PeerEvent, frozen=True, kw_only=True):

@@ -96,7 +96,7 @@ def _circle(part: Any, home: Home) -> Array:
 
 def has_fence(content: bytes) -> bool:
     """Whether a plan has a geofence; raises ValueError if the file is not a plan."""
-    plan, _ = _plan(content, ())
+    plan, _ = _expected(content, ())
     return any(_fence(plan).values())
 
 
@@ -120,12 +120,12 @@ def route(content: bytes, axes: int, origin: Origin) -> tuple[Array, Array]:
     Raises:
         ValueError: the file is not a plan, or an item cannot be flown; the message names it.
     """
-    plan, home = _plan(content, origin)
+    plan, home = _expected(content, origin)
     mission = plan.get("mission")
     if not (
         isinstance(mission, dict) and isinstance(items := mission.get("items"), list) and items
     ):
-        raise ValueError("a plan with mission items")
+        raise ValueError("expected a plan with mission items")
     speed_mps = number(mission.get("hoverSpeed", 0.0), "hoverSpeed")
     start = np.zeros(3)
     start[:2] = home.local(*mission["plannedHomePosition"][:2])
@@ -133,7 +133,7 @@ def route(content: bytes, axes: int, origin: Origin) -> tuple[Array, Array]:
     for count, item in enumerate(_items(items), start=1):
         try:
             if count > ITEMS_MAX:
-                raise ValueError(f"at most {ITEMS_MAX} items")
+                raise ValueError(f"expected at most {ITEMS_MAX} items")
             command, params = int(item["command"]), [*item["params"], *[None] * 7][:7]
             if command in STILL:
                 continue
@@ -153,7 +153,9 @@ def route(content: bytes, axes: int, origin: Origin) -> tuple[Array, Array]:
         for at in (above, place) if command == TAKEOFF else (place,):
             away_m = float(np.linalg.norm(at - places[-1]))
             if away_m and not 0.0 < speed_mps <= 1e3:
-                raise ValueError(f"mission item {count}: hoverSpeed above 0, got {speed_mps:g}")
+                raise ValueError(
+                    f"mission item {count}: expected hoverSpeed above 0, got {speed_mps:g}"
+                )
             if away_m:
                 times.append(times[-1] + away_m / speed_mps)
                 places.append(at)
@@ -209,6 +211,14 @@ def _place(
             raise ValueError("an altitude above home, for the home's above the sea is not known")
         place[2] = number(params[6], "altitude") - ((home.altitude_m or 0.0) if frame == 0 else 0.0)
     return within(place, METRES_MAX)
+
+
+def _expected(content: bytes, origin: Origin) -> tuple[dict[str, Any], Home]:
+    """A plan as `_plan` reads it; the message of its ValueError is a sentence of its own."""
+    try:
+        return _plan(content, origin)
+    except ValueError as error:
+        raise ValueError(f"expected {error}") from None
 
 
 def _plan(content: bytes, origin: Origin) -> tuple[dict[str, Any], Home]:

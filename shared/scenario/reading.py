@@ -163,6 +163,10 @@ def _read(name: str, seen: Mapping[tuple[Path, str], str] = MappingProxyType({})
     if name.endswith(".toml") or name in names():
         file, entry = name, ""
     elif not (entry and (file == COMPARED or file.endswith(".toml"))):
+        with suppress(OSError):  # a name that is too long for a file
+            if Path(name).exists():
+                expected = "expected the name of a scenario, or a file that ends in .toml"
+                raise ConfigError(f"{name}: {expected}")
         raise ConfigError(f"{name}: no such scenario; {hint(name, names())}")
     path = _path(file)
     raw = read_toml(path, file)

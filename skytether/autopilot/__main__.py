@@ -17,8 +17,8 @@ from skytether.autopilot.flavours import FlavourName
 from skytether.shared.base import kernel
 from skytether.shared.telemetry.record import TRUTH_COLUMNS
 from skytether.shell import command, process, terminal
+from skytether.shell.argument import Argument
 from skytether.shell.command import CommandError, ScenarioName
-from skytether.shell.options import Argument
 from skytether.shell.process import ProcessOptions
 from skytether.shell.udp import is_loopback, look_up
 

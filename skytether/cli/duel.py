@@ -18,6 +18,7 @@ from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Record
 from skytether.shared.telemetry.summary import summarise
 from skytether.shell import command, temporary, terminal
+from skytether.shell.argument import Argument
 from skytether.shell.command import CommandError
 from skytether.shell.options import read
 from skytether.sim import flight
@@ -30,7 +31,7 @@ from skytether.view.frames import of_flight
 
 @dataclass(frozen=True)
 class DuelOptions:
-    scenarios: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="SCENARIO")]
+    scenarios: Annotated[tuple[str, ...], Argument(positional=True, metavar="SCENARIO")]
     """Two or more names of scenarios (see `skytether scenarios`) or .toml files; the others take
     the network, duration and seed of the first.
     """

@@ -10,6 +10,7 @@ import tyro
 from skytether.cli import recordings
 from skytether.shared.base import files
 from skytether.shell import command
+from skytether.shell.argument import Argument
 from skytether.shell.command import CONFIGURATION, CommandError
 from skytether.shell.options import read
 from skytether.view import export as view
@@ -19,7 +20,7 @@ from skytether.view.recorded import Recorded
 
 @dataclass(frozen=True)
 class ExportOptions:
-    file: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FILE")]
+    file: Annotated[Path, Argument(positional=True, metavar="FILE")]
     """The recording (.mcap)."""
     csv: Path | None = None
     """Folder for the tables as CSV."""

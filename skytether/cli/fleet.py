@@ -11,7 +11,6 @@ from typing import Annotated
 
 import msgspec
 import numpy as np
-import tyro
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
@@ -30,6 +29,7 @@ from skytether.shared.telemetry.drops import drops
 from skytether.shared.telemetry.record import Record
 from skytether.shared.telemetry.summary import separations, summarise
 from skytether.shell import command, plugins, terminal
+from skytether.shell.argument import Argument
 from skytether.shell.command import CommandError, ScenarioName, ScenarioOptions
 from skytether.sim import flight as sim
 
@@ -46,22 +46,22 @@ STAGES = ("receive", "open", "decode", "observe", "estimate", "plan", "trigger",
 class FleetOptions(ScenarioOptions):
     scenario: ScenarioName = "fleet"
     """A scenario's name (see `skytether scenarios`) or a .toml file; every vehicle flies it."""
-    mission: Annotated[str | None, tyro.conf.arg(metavar="NAME|FILE")] = None
+    mission: Annotated[str | None, Argument(metavar="NAME|FILE")] = None
     """Mission in place of a scenario: swap, sphere, rings, corridor, warehouse, or a file of timed
     goals: CSV with the columns vehicle, t, x, y (and z), or a .plan of QGroundControl."""
-    show: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    show: Annotated[Path | None, Argument(metavar="FILE")] = None
     """Show in place of a scenario: timed paths in a CSV file, or one file a vehicle in a folder or
     zip, as of Skybrush, Crazyswarm or MAVSDK."""
-    vehicles: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
+    vehicles: Annotated[int | None, Argument(metavar="N")] = None
     """Number of vehicles; by default 20, or as many as the mission has."""
-    workers: Annotated[int, tyro.conf.arg(metavar="N")] = 1
+    workers: Annotated[int, Argument(metavar="N")] = 1
     """Number of server processes, which share the vehicles."""
     secure: bool = False
     """Encrypt and authenticate the link, with keys made for this flight. Without --secure, packets
     on loopback are plaintext."""
     virtual: bool = False
     """Fly in virtual time: everything in one process, as fast as possible."""
-    page: Annotated[str | None, tyro.conf.arg(metavar="HOST:PORT")] = None
+    page: Annotated[str | None, Argument(metavar="HOST:PORT")] = None
     """HOST:PORT of a page with all vehicles, as in `skytether fly`; by default none, because
     `fleet` measures CPU time and a page costs some. Not in virtual time.
     """
@@ -155,7 +155,7 @@ def fleet(argv: Sequence[str]) -> None:
         figures.check(options.figure, film.SUFFIX)
     where = "in virtual time" if options.virtual else "over UDP on loopback"
     name = Path(options.config.reference.file).name or options.scenario
-    count = f"{vehicles} vehicle{'s' * (vehicles != 1)}"
+    count = terminal.counted(vehicles, "vehicle")
     title = f"{count}, {name}, {where}, seed {options.config.seed}"
     terminal.prepare(kernel.missing())
     with (
@@ -201,6 +201,10 @@ def _with_mission(argv: Sequence[str]) -> list[str]:
         raise CommandError(message, command.CONFIGURATION)
     is_file = Path(file).suffix in TRACKS or (Path(file).is_dir() and file not in reading.names())
     if not (shows or is_file):
+        if file not in reading.names() and not file.endswith(".toml"):
+            expected = "swap, sphere, rings, corridor, warehouse, a folder, or a file that ends in"
+            message = f"{flag}: got {file!r}, expected {expected} .csv, .zip, .plan or .toml"
+            raise CommandError(message, command.CONFIGURATION)
         return [file, *rest]
     try:
         (read,) = reading.files_of(flag, file)

@@ -33,8 +33,8 @@ from skytether.shared.telemetry.record import Record
 from skytether.shared.telemetry.summary import Summary, summarise
 from skytether.shared.wire.protocol import Mode
 from skytether.shell import command, temporary, terminal
+from skytether.shell.argument import Argument
 from skytether.shell.command import CommandError, ScenarioOptions
-from skytether.shell.options import Argument
 from skytether.sim import flight
 from skytether.view.browser.access import HOST_PORT
 

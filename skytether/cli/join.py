@@ -10,17 +10,18 @@ import tyro
 from skytether.cli import recorder, recordings
 from skytether.shared.base import files
 from skytether.shell import command
+from skytether.shell.argument import Argument
 from skytether.shell.options import read
 from skytether.view.joining import join as joined
 
 
 @dataclass(frozen=True)
 class JoinOptions:
-    files: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="FILE...")]
+    files: Annotated[tuple[Path, ...], Argument(positional=True, metavar="FILE")]
     """Recordings (.mcap), one from each process; or a single one of a killed flight, which then
     gets the end that other programs expect.
     """
-    out: Path
+    record: Path
     """File for the recording of the flight (.mcap)."""
     plugin: command.Plugins = ()
 
@@ -32,9 +33,9 @@ def join(argv: Sequence[str]) -> None:
     summary is that of the first vehicle.
     """
     options = read(JoinOptions((), tyro.MISSING), argv, "skytether join", join.__doc__)
-    recorder.check(options.out, "--out")
-    command.claim_output("--out", options.out)
+    recorder.check(options.record, "--record")
+    command.claim_output("--record", options.record)
     opened = [recordings.opened(path) for path in options.files]
-    with files.replacing(options.out) as file:
+    with files.replacing(options.record) as file:
         joined(opened, file)
-    print(options.out)
+    print(options.record)

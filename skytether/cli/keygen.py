@@ -12,6 +12,7 @@ from skytether.shared.base import files
 from skytether.shared.wire import keys
 from skytether.shared.wire.keys import KEYS_MAX, NUMBERS, SECRET_BYTES, VEHICLES
 from skytether.shell import command
+from skytether.shell.argument import Argument
 from skytether.shell.command import CONFIGURATION, CommandError
 from skytether.shell.options import read
 
@@ -20,13 +21,13 @@ HEAD = "# VEHICLE KEY SECRET. Whoever reads a vehicle's secret can fly the vehic
 
 @dataclass(frozen=True)
 class KeygenOptions:
-    file: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FILE")]
+    file: Annotated[Path, Argument(positional=True, metavar="FILE")]
     """File for the keys."""
-    vehicles: Annotated[int, tyro.conf.arg(metavar="N")] = 1
+    vehicles: Annotated[int, Argument(metavar="N")] = 1
     """Number of vehicles, one key each."""
-    first: Annotated[int, tyro.conf.arg(metavar="ID")] = 1
+    number: Annotated[int, Argument(name="id", metavar="ID")] = 1
     """Number of the first vehicle (0 to 65535); the others follow."""
-    key_id: Annotated[int | None, tyro.conf.arg(metavar="K")] = None
+    key_id: Annotated[int | None, Argument(metavar="K")] = None
     """Number of the new keys (0 to 255); by default one more than the vehicle's highest, and 1 for
     its first key.
     """
@@ -44,10 +45,10 @@ def keygen(argv: Sequence[str]) -> None:
     """
     options = read(KeygenOptions(tyro.MISSING), argv, "skytether keygen", keygen.__doc__)
     command.check_count("--vehicles", options.vehicles, len(VEHICLES))
-    vehicles = range(options.first, options.first + options.vehicles)
+    vehicles = range(options.number, options.number + options.vehicles)
     if not (vehicles[0] in VEHICLES and vehicles[-1] in VEHICLES):
         numbers = f"{vehicles[0]} to {vehicles[-1]}" if len(vehicles) > 1 else vehicles[0]
-        raise CommandError(f"--first: got {numbers}, expected 0 to {VEHICLES[-1]}", CONFIGURATION)
+        raise CommandError(f"--id: got {numbers}, expected 0 to {VEHICLES[-1]}", CONFIGURATION)
     if options.key_id is not None and options.key_id not in NUMBERS:
         raise CommandError(
             f"--key-id: got {options.key_id}, expected 0 to {NUMBERS[-1]}", CONFIGURATION

@@ -38,9 +38,10 @@ from skytether.shared.telemetry.record import PACKET_COLUMNS, RECORDING, Recorde
 from skytether.shared.wire import keys
 from skytether.shared.wire.protocol import PAYLOAD_BYTES_MAX
 from skytether.shell import command, driver, terminal
+from skytether.shell.argument import Argument
 from skytether.shell.command import CONFIGURATION, INTERRUPTED, CommandError
 from skytether.shell.log import Log
-from skytether.shell.options import Argument, read
+from skytether.shell.options import read
 from skytether.shell.udp import AddressError
 
 if TYPE_CHECKING:
@@ -62,7 +63,7 @@ class ProbeOptions:
     """Read a log instead of measuring: of ping, fping or irtt, or a table. Or two captures of one
     UDP flow (pcap), that of the vehicle's end first: --from NEAR --from FAR.
     """
-    seconds: float = 60.0
+    duration: float = 60.0
     """Length of the measurement [s]."""
     rate: float = 20.0
     """Packets per second, each way."""
@@ -171,7 +172,7 @@ def _probe(options: ProbeOptions, listener: Address) -> None:
         link,
         listener,
         secrets.token_bytes(NONCE_BYTES),
-        probes=max(1, round(options.seconds * options.rate)),
+        probes=max(1, round(options.duration * options.rate)),
         period_ns=round(SECOND_NS / options.rate),
         size=options.bytes,
     )
@@ -179,7 +180,7 @@ def _probe(options: ProbeOptions, listener: Address) -> None:
         shell = driver.Shell(prober, None, [listener])
     except AddressError as error:
         raise CommandError(str(error)) from None
-    with terminal.progress(f"probing {options.target}", options.seconds) as bar:
+    with terminal.progress(f"probing {options.target}", options.duration) as bar:
         driver.run([shell], on_event=_say, on_second=lambda: bar(prober.probed_s))
     if prober.refused:
         raise CommandError(f"{options.target} serves too many measurements already")
@@ -252,17 +253,17 @@ def _say(event: Event) -> None:
 def _check(options: ProbeOptions) -> None:
     """Refuse impossible measurements, and files that cannot be written."""
     for flag, value, least, most in (
-        ("--seconds", options.seconds, 1.0, SECONDS_MAX),
+        ("--duration", options.duration, 1.0, SECONDS_MAX),
         ("--rate", options.rate, 0.1, RATE_MAX),
         ("--bytes", options.bytes, BYTES_MIN, PAYLOAD_BYTES_MAX),
         ("--id", options.number, 0, 65_535),
     ):
         if not least <= value <= most:
             raise CommandError(f"{flag}: got {value:g}, expected {least:g} to {most:g}", 2)
-    probes = options.seconds * options.rate
+    probes = options.duration * options.rate
     if probes > PROBES_MAX:
         message = f"got {probes:.0f} packets, expected at most {PROBES_MAX}"
-        raise CommandError(f"--seconds and --rate: {message}", CONFIGURATION)
+        raise CommandError(f"--duration and --rate: {message}", CONFIGURATION)
     if options.record and options.record.suffix == RECORDING:
         message = f"got {options.record}, expected another suffix: one row per packet is no flight"
         raise CommandError(f"--record: {message}", CONFIGURATION)

@@ -10,6 +10,7 @@ import tyro
 
 from skytether.cli import recordings
 from skytether.shell import command
+from skytether.shell.argument import Argument
 from skytether.shell.options import read
 from skytether.view.browser.access import HOST_PORT
 from skytether.view.browser.flight import PageFlight
@@ -19,7 +20,7 @@ from skytether.view.browser.serve import until_told
 
 @dataclass(frozen=True)
 class ReplayOptions:
-    file: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FILE")]
+    file: Annotated[Path, Argument(positional=True, metavar="FILE")]
     """The recording, as `fly --record FILE.mcap` makes it."""
     page: str = HOST_PORT
     """HOST:PORT to serve the page on; if the port is taken, the next free one."""

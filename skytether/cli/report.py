@@ -10,6 +10,7 @@ import tyro
 from skytether.cli import recordings
 from skytether.shared.base import files
 from skytether.shell import command, terminal
+from skytether.shell.argument import Argument
 from skytether.shell.command import CommandError
 from skytether.shell.options import read
 from skytether.view.report import page
@@ -17,9 +18,9 @@ from skytether.view.report import page
 
 @dataclass(frozen=True)
 class ReportOptions:
-    file: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FILE")]
+    file: Annotated[Path, Argument(positional=True, metavar="FILE")]
     """The recording (.mcap)."""
-    out: Path = Path("report.html")
+    html: Path = Path("report.html")
     """File for the HTML page."""
     plugin: command.Plugins = ()
 
@@ -30,12 +31,12 @@ def report(argv: Sequence[str]) -> None:
     The page shows the path, plots over time, the summary, the events and the scenario.
     """
     options = read(ReportOptions(tyro.MISSING), argv, "skytether report", report.__doc__)
-    command.claim_output("--out", options.out)
+    command.claim_output("--html", options.html)
     recorded = recordings.opened(options.file)
     figures = terminal.summary_rows(recorded.summary) if recorded.summary else []
     html = page(recorded, figures)
     try:
-        files.write(options.out, html.encode())
+        files.write(options.html, html.encode())
     except OSError as error:
-        raise CommandError(f"{options.out}: cannot be written: {error.strerror}") from None
-    print(options.out)
+        raise CommandError(f"{options.html}: cannot be written: {error.strerror}") from None
+    print(options.html)

@@ -9,6 +9,7 @@ import msgspec
 import tyro
 
 from skytether.shared.core.change import REQUEST_BYTES_MAX
+from skytether.shell.argument import Argument
 from skytether.shell.command import CONFIGURATION, CommandError
 from skytether.shell.control import Caller, ControlError
 from skytether.shell.options import read, toml_value
@@ -16,9 +17,9 @@ from skytether.shell.options import read, toml_value
 
 @dataclass(frozen=True)
 class SetOptions:
-    path: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="PATH")]
+    path: Annotated[Path, Argument(positional=True, metavar="PATH")]
     """Control socket: the path given to server, netem or client as --control."""
-    changes: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="KEY=VALUE")]
+    changes: Annotated[tuple[str, ...], Argument(positional=True, metavar="KEY=VALUE")]
     """Keys and values, as in network.uplink.loss=0.3; a value is TOML, or else a string."""
 
 

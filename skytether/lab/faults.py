@@ -241,7 +241,9 @@ def loads(line: str) -> Trial:
     try:
         trial = msgspec.json.decode(line, type=Trial)
     except msgspec.DecodeError as error:
-        raise ConfigError(f"schedule of faults: {error}") from None
+        raise ConfigError(
+            f"expected a schedule of faults, as torture prints one ({error})"
+        ) from None
     for fault in trial.faults:
         where = RANGES[fault.kind].where
         if fault.where not in where:

@@ -29,7 +29,8 @@ from skytether.shared.scenario import reading
 from skytether.shared.scenario.dotted import set_keys
 from skytether.shared.scenario.schema import Scenario
 from skytether.shell import plugins
-from skytether.shell.options import HELP_KEYS, Argument, key_values, read
+from skytether.shell.argument import HELP_KEYS, Argument
+from skytether.shell.options import key_values, read
 from skytether.shell.udp import (
     SPARE_FILES,
     allow_sockets,
@@ -106,7 +107,7 @@ def parse(
     Raises:
         CommandError: an output file cannot be written, is an input, or is locked.
         ConfigError: the scenario cannot be flown, or a plug-in cannot be imported.
-        SystemExit: tyro has shown the help, or an error in a flag.
+        SystemExit: the help or an error in a flag has been printed.
     """
     plugins.load(plugins.named(argv))
     argv, values = key_values(argv, type(defaults))

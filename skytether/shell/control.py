@@ -168,8 +168,13 @@ class Caller:
         self._folder.cleanup()
 
     def _failed(self, error: OSError) -> ControlError:
-        late = f"no answer in {PATIENCE_S:g} s" if isinstance(error, TimeoutError) else None
-        return ControlError(f"{self._path}: {late or error.strerror or error}")
+        reason = error.strerror or str(error)
+        if isinstance(error, TimeoutError):
+            reason = f"no answer in {PATIENCE_S:g} s"
+        elif isinstance(error, FileNotFoundError | ConnectionRefusedError):
+            expected = "expected the --control socket of a server, netem or client that runs"
+            reason = f"no process listens there ({reason}), {expected}"
+        return ControlError(f"{self._path}: {reason}")
 
 
 def _answers(sock: socket.socket, path: Path) -> "tempfile.TemporaryDirectory[str]":

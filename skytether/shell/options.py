@@ -1,9 +1,8 @@
 """Command-line options: a dataclass, and a scenario whose keys are flags.
 
 Flags of keys, as in `--control.trigger always`, are parsed here and checked with the scenario. tyro
-parses the other options, shows the help and reports wrong flags. Importing tyro takes 0.2 s and 9
-MB at each start of a process; so simple flags, which commands pass to processes, are parsed here,
-and tyro gets a scenario's keys only for `--help-keys`.
+parses the other options and reports wrong flags. Importing tyro takes 0.2 s and 9 MB at each start
+of a process; so simple flags, which commands pass to processes, are parsed here.
 """
 
 import dataclasses
@@ -11,36 +10,18 @@ import json
 from collections import deque
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass
 from functools import cache
-from inspect import cleandoc
 from pathlib import Path
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from skytether.shared.base import toml
 from skytether.shared.base.errors import ConfigError
-from skytether.shared.base.meanings import meanings
 from skytether.shared.scenario.schema import Scenario
 from skytether.shell import plugins
+from skytether.shell.argument import HELP_KEYS, argument_of, hints_of
 
 T = TypeVar("T")
-
-HELP_KEYS = "--help-keys"
-
-
-@dataclass(frozen=True, slots=True)
-class Argument:
-    """Annotation of a field: its form on the command line."""
-
-    name: str | None = None
-    """Name of the flag, if different from the field's; "": its value's fields are flags."""
-    metavar: str | None = None
-    help: str | None = None
-    """Text of the help, if different from the field's docstring."""
-    positional: bool = False
-    append: bool = False
-    """Whether the flag may be repeated, with a value each."""
 
 
 def read(default: T, argv: Sequence[str], prog: str, help_: str | None) -> T:
@@ -48,25 +29,27 @@ def read(default: T, argv: Sequence[str], prog: str, help_: str | None) -> T:
 
     Raises:
         ConfigError: a plug-in cannot be imported.
-        SystemExit: tyro has shown the help, or an error in a flag.
+        SystemExit: the help or an error in a flag has been printed.
     """
     plugins.load(plugins.named(argv))
     options = plain(default, argv)
     if options is not None:
         return options
+    if asked := {"-h", "--help", HELP_KEYS}.intersection(argv):
+        from skytether.shell.help_text import help_text, keys_text
+
+        scenario = getattr(default, "config", None)
+        if scenario and HELP_KEYS in asked:
+            print(keys_text(scenario, prog))
+        else:
+            print(help_text(default, prog, help_ or ""))
+        raise SystemExit(0)
     import tyro
 
     kind: Any = type(default)
-    about = cleandoc(help_ or "")
-    if "" in _flags(kind)[0]:
-        about += (
-            f"\n\nEvery key of a scenario is a flag, as in --duration 20; {HELP_KEYS} lists all."
-        )
-    keys = HELP_KEYS in argv
-    argv = ["--help" if word == HELP_KEYS else word for word in argv]
     with ExitStack() as undo:
-        _tell_tyro(kind, undo, keys=keys)
-        return tyro.cli(kind, args=argv, default=default, prog=prog, description=about)
+        _tell_tyro(kind, undo)
+        return tyro.cli(kind, args=argv, default=default, prog=prog)
 
 
 def key_values(argv: Sequence[str], options: type) -> tuple[list[str], dict[str, Any]]:
@@ -186,17 +169,13 @@ def plain(default: T, argv: Sequence[str]) -> T | None:
 
 def _flags(options: type) -> tuple[Mapping[str, str], Sequence[str]]:
     flags, positional = {}, []
-    for name, hint in _hints(options).items():
-        argument = _argument(hint) or Argument()
+    for name, hint in hints_of(options).items():
+        argument = argument_of(hint)
         if argument.positional:
             positional.append(name)
         else:
             flags[name if argument.name is None else argument.name] = name
     return flags, positional
-
-
-def _argument(hint: Any) -> Argument | None:
-    return next((a for a in getattr(hint, "__metadata__", ()) if isinstance(a, Argument)), None)
 
 
 def _value(hint: Any, text: str, *, given: bool) -> Any:
@@ -216,37 +195,26 @@ def _value(hint: Any, text: str, *, given: bool) -> Any:
     raise ValueError(text)
 
 
-def _tell_tyro(options: type, undo: ExitStack, *, keys: bool) -> None:
-    """Replace annotations of options by tyro's, with a scenario's keys or without.
+def _tell_tyro(options: type, undo: ExitStack) -> None:
+    """Replace annotations of options by tyro's, without a scenario's keys.
 
     Args:
         undo: restores the options' own annotations.
     """
     from tyro import conf
 
-    help_texts = meanings(options)
-
-    def annotated(name: str, hint: Any) -> Any:
-        argument = _argument(hint) or Argument()
-        if argument.name == "" and not keys:
-            return Annotated[hint, conf.Fixed, conf.Suppress]
+    def annotated(hint: Any) -> Any:
+        argument = argument_of(hint)
         within = hint if isinstance(hint, type) else get_args(hint)[0]
-        if dataclasses.is_dataclass(within) or hasattr(within, "__struct_fields__"):
-            _tell_tyro(within, undo, keys=keys)
-        # As one line: tyro would keep the source's line breaks, and wrap between them.
-        text = argument.help or help_texts.get(name)
-        words = [conf.arg(name=argument.name, metavar=argument.metavar, help=text)]
+        if within is Scenario:
+            return Annotated[hint, conf.Fixed, conf.Suppress]
+        if dataclasses.is_dataclass(within):
+            _tell_tyro(within, undo)
+        words = [conf.arg(name=argument.name, metavar=argument.metavar)]
         words += [conf.FlagCreatePairsOff] * (hint is bool)  # no --no-no-page
         words += [conf.Positional] * argument.positional
         words += [conf.UseAppendAction] * argument.append
         return Annotated[(hint, *words)]
 
     undo.callback(setattr, options, "__annotations__", options.__annotations__)
-    options.__annotations__ = {
-        name: annotated(name, hint) for name, hint in _hints(options).items()
-    }
-
-
-@cache
-def _hints(options: type) -> Mapping[str, Any]:
-    return get_type_hints(options, include_extras=True)
+    options.__annotations__ = {name: annotated(hint) for name, hint in hints_of(options).items()}

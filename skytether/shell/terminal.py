@@ -67,6 +67,10 @@ def prepare(kernels: Sequence["Missing"]) -> None:
         compile_kernels(kernels, lambda: bar(next(done)))
 
 
+def counted(number: int, noun: str) -> str:
+    return f"{number} {noun}{'s' * (number != 1)}"
+
+
 def show(table: "Table") -> None:
     """Print a table in full width: a number cut off would be worse than a long line."""
     from rich.console import Console

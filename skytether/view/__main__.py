@@ -17,6 +17,7 @@ from typing import Annotated
 import tyro
 
 from skytether.shell import command
+from skytether.shell.argument import Argument
 from skytether.shell.command import CONFIGURATION, CommandError
 from skytether.shell.log import LogFormat
 from skytether.shell.options import read
@@ -29,7 +30,7 @@ NICE = 5
 
 @dataclass(frozen=True)
 class PageOptions:
-    folders: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="FOLDER")]
+    folders: Annotated[tuple[Path, ...], Argument(positional=True, metavar="FOLDER")]
     """Folders of flights, each with the feeds and control sockets of its processes."""
     page: str = HOST_PORT
     """HOST:PORT to serve the page on; if the port is taken, the next free one. Visitors from other

@@ -79,6 +79,8 @@ QUICK = [
         ("fleet --virtual --workers 2", "fleet: --workers: got --virtual as well, expected 1 in"),
         ("fleet --virtual --page 127.0.0.1:0", "fleet: --page: got --virtual as well, expected a"),
         ("fleet demo --mission swap", "fleet: --mission: got demo as well, expected"),
+        ("fleet --mission x.txt", "fleet: --mission: got 'x.txt', expected swap, "),
+        (f"fly {__file__}", f"fly: {__file__}: expected the name of a scenario, or a file"),
         ("fleet --mission swap --vehicles 3", "fleet: --vehicles: got 3, expected 16 on this"),
         ("server --vehicles -1", "server: --vehicles: got -1, expected 1 to 65536"),
         ("netem --flows 0", "netem: --flows: got 0, expected 1 to 65536"),
@@ -131,7 +133,7 @@ def test_a_port_in_use_is_named(capfd: pytest.CaptureFixture[str]) -> None:
 def test_an_unreachable_server_is_named() -> None:
     run = skytether("client", "demo", "--server", "127.0.0.1:9", "--link.connect-s", "0.5")
     assert run.returncode == 1
-    assert run.stderr == "client: vehicle 1: no answer from 127.0.0.1:9 in 1 s\n"
+    assert run.stderr.startswith("client: vehicle 1: no answer from 127.0.0.1:9 in 1 s")
 
 
 def test_a_reader_that_has_seen_enough_is_no_error() -> None:
@@ -166,9 +168,9 @@ def test_help_shows_the_scenario_that_was_named(
     with pytest.raises(SystemExit) as exit_:
         main([name, "paper", "--help-keys"])
     assert exit_.value.code == 0
-    said = " ".join(re.sub(r"[│\n]", " ", capfd.readouterr().out).split())
+    said = " ".join(capfd.readouterr().out.split())
     assert f"usage: skytether {name}" in said
-    assert "--control.change-weight FLOAT" in said
+    assert "--control.change-weight NUMBER" in said
     assert "(default: 60.0)" in said
 
 

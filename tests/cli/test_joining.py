@@ -60,7 +60,7 @@ def moved(frame: Frame, late_ns: int) -> Frame:
 
 
 def together(paths: Sequence[Path], out: Path) -> int:
-    return command.main(join, [*map(str, paths), "--out", str(out)], "join")
+    return command.main(join, [*map(str, paths), "--record", str(out)], "join")
 
 
 def test_three_recordings_become_the_flight(flown: Record, tmp_path: Path) -> None:
@@ -126,9 +126,9 @@ def test_a_flight_by_hand_is_recorded_and_joined(
     out = tmp_path / "flight.mcap"
     for path in files.values():
         assert command.main(export, [str(path), "--csv", str(tmp_path / path.stem)], "it") == 0
-    assert command.main(report, [str(files["client"]), "--out", str(tmp_path / "c.html")], "") == 0
+    assert command.main(report, [str(files["client"]), "--html", str(tmp_path / "c.html")], "") == 0
     assert together(list(files.values()), out) == 0
-    assert command.main(report, [str(out), "--out", str(tmp_path / "page.html")], "it") == 0
+    assert command.main(report, [str(out), "--html", str(tmp_path / "page.html")], "it") == 0
     parts, summary = read(out).parts, read(out).summary
     assert set(parts) == {"client", "server", "plan", "netem"}
     # On a busy machine the vehicle may miss steps, but no recorded row may be missing.

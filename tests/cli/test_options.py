@@ -1,5 +1,6 @@
 """Options: plain flags are read without tyro, and as tyro reads them."""
 
+import re
 import shlex
 from collections.abc import Sequence
 from typing import Any
@@ -8,11 +9,12 @@ import pytest
 
 import skytether.client.__main__ as client
 import skytether.netem.__main__ as netem
+from skytether.__main__ import COMMANDS, main
 from skytether.cli import fly, keygen
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.base.meanings import meanings
 from skytether.shared.scenario.schema import LinkConfig
-from skytether.shell import command, options
+from skytether.shell import command, help_text, options
 
 CLIENT = client.ClientOptions()
 PLAIN: list[tuple[Any, str]] = [
@@ -52,21 +54,45 @@ def test_any_other_line_is_for_tyro(line: str) -> None:
     assert options.plain(CLIENT, shlex.split(line)) is None
 
 
-def test_the_help_has_options_and_another_one_has_keys(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("COLUMNS", "1000")
-    shown = []
-    for flag in ("--nonsense", "--help", "--help-keys"):
-        with pytest.raises(SystemExit):
-            command.parse(client.ClientOptions(), [flag], "x", None)
-        shown.append(capsys.readouterr().out)
-    for said in shown[1:]:
-        for name, text in meanings(client.ClientOptions).items():
-            assert name == "config" or text in said
+def shown(argv: list[str], capfd: pytest.CaptureFixture[str]) -> str:
+    with pytest.raises(SystemExit) as exit_:
+        main(argv)
+    assert exit_.value.code == 0
+    return capfd.readouterr().out
+
+
+def test_the_help_has_options_and_another_one_has_keys(capfd: pytest.CaptureFixture[str]) -> None:
+    options_shown, keys_shown = (shown(["client", it], capfd) for it in ("--help", "--help-keys"))
+    for name in (each for each in meanings(client.ClientOptions) if each not in ("config", "page")):
+        flag = {"scenario": "  SCENARIO ", "number": "  --id "}.get(name)
+        assert (flag or f"  --{name.replace('_', '-')}") in options_shown
     for name in LinkConfig.__struct_fields__:
         flag = f"--link.{name.replace('_', '-')} "
-        assert [flag in said for said in shown] == [False, False, True]
+        assert flag in keys_shown
+        assert flag not in options_shown
+
+
+@pytest.mark.parametrize("width", [60, 80, 200])
+@pytest.mark.parametrize("name", [name for name in COMMANDS if name != "scenarios"])
+def test_the_help_of_a_command_is_as_wide_as_the_terminal(
+    name: str, width: int, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", str(width))
+    for line in shown([name, "--help"], capfd).splitlines():
+        assert len(line) <= width or line.startswith("  ")
+        assert "MISSING" not in line
+
+
+def test_a_flag_has_one_group_over_all_commands(capfd: pytest.CaptureFixture[str]) -> None:
+    used = {
+        word
+        for name in COMMANDS
+        if name != "scenarios"
+        for word in re.findall(r"^  --([a-z-]+)", shown([name, "--help"], capfd), re.MULTILINE)
+    }
+    grouped = [flag for flags in help_text.GROUPS.values() for flag in flags]
+    assert len(grouped) == len(set(grouped))
+    assert set(grouped) <= used
 
 
 def test_a_command_with_a_required_option_is_for_tyro() -> None:

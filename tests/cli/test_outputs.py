@@ -39,7 +39,7 @@ LINES = {
     "fleet --figure": "fleet SCENARIO --virtual --vehicles 1 OUT.png",
     "crowd --out": "crowd SCENARIO OUT/crowd.csv",
     "sweep --out": "sweep SCENARIO --runs 1 OUT/runs.csv",
-    "envelope --out": "envelope SCENARIO --points 1 OUT/points.csv",
+    "envelope --out": "envelope SCENARIO --runs 1 OUT/points.csv",
     "margins --json": "margins SCENARIO --runs 1 OUT",
     "margins --maps": "margins SCENARIO --runs 1 OUT/points.csv",
     "identify --out": "identify --scenario SCENARIO OUT/scenario.toml",
@@ -51,16 +51,16 @@ LINES = {
     "reproduce --out": "reproduce --quick --plugin PLUGIN OUT/report.html",
     "compare --out": "compare --quick --weights WEIGHTS OUT/report.html",
     "calibrate --out": "calibrate SCENARIO --objective rmse OUT/best.toml",
-    "report --out": "report RECORDING OUT",
+    "report --html": "report RECORDING OUT",
     "export --csv": "export RECORDING OUT/client.csv",
     "export --parquet": "export RECORDING OUT/client.parquet",
     "export --traces": "export RECORDING OUT/uplink-0.csv",
     "export --pcap": "export RECORDING OUT",
-    "join --out": "join RECORDING OTHER OUT.mcap",
-    "probe --out": "probe 127.0.0.1:9 --keys KEYS --seconds 1 OUT/uplink.csv",
-    "probe --json": "probe 127.0.0.1:9 --keys KEYS --seconds 1 OUT",
-    "probe --figure": "probe 127.0.0.1:9 --keys KEYS --seconds 1 OUT.png",
-    "probe --record": "probe 127.0.0.1:9 --keys KEYS --seconds 1 OUT",
+    "join --record": "join RECORDING OTHER OUT.mcap",
+    "probe --out": "probe 127.0.0.1:9 --keys KEYS --duration 1 OUT/uplink.csv",
+    "probe --json": "probe 127.0.0.1:9 --keys KEYS --duration 1 OUT",
+    "probe --figure": "probe 127.0.0.1:9 --keys KEYS --duration 1 OUT.png",
+    "probe --record": "probe 127.0.0.1:9 --keys KEYS --duration 1 OUT",
     "server --json": "server demo --keys KEYS OUT",
     "server --record": "server SCENARIO OUT",
     "netem --json": "netem SCENARIO OUT",
@@ -174,7 +174,9 @@ def test_no_output_is_an_input(
     assert {each.name for each in out.iterdir()} == {target.name}
 
 
-@pytest.mark.parametrize("option", ["fly --json", "report --out", "join --out", "torture --json"])
+@pytest.mark.parametrize(
+    "option", ["fly --json", "report --html", "join --record", "torture --json"]
+)
 def test_nor_by_its_own_name(
     option: str, inputs: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -310,8 +312,8 @@ def room_for(size: int) -> Iterator[None]:
     [
         (("fly", "demo", *SHORT, "--record"), "it.mcap"),
         (("fly", "demo", *SHORT, "--figure"), "it.png"),
-        (("report", "FLIGHT", "--out"), "it.html"),
-        (("join", "FLIGHT", "FLIGHT", "--out"), "it.mcap"),
+        (("report", "FLIGHT", "--html"), "it.html"),
+        (("join", "FLIGHT", "FLIGHT", "--record"), "it.mcap"),
         (("export", "FLIGHT", "--pcap"), "it.pcap"),
     ],
     ids=lambda each: each if isinstance(each, str) else " ".join((each[0], each[-1])),

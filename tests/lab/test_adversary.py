@@ -258,7 +258,7 @@ def test_the_command_prints_what_flies_it_again(
     heedless(monkeypatch)
     monkeypatch.setattr(commands, "shrunk", lambda _, found: found)
     kept = tmp_path / "found.json"
-    search = (*SHORT, "--with", "zones", "--tries", "4", "--json", str(kept))
+    search = (*SHORT, "--with", "zones", "--runs", "4", "--json", str(kept))
     assert main(["adversary", *search]) == 1
     printed = capsys.readouterr().out
     (again,) = (line for line in printed.splitlines() if line.startswith("    skytether "))
@@ -279,7 +279,7 @@ def test_the_command_prints_what_flies_it_again(
 def test_the_command_ends_well_where_all_distances_are_kept(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    assert main(["adversary", *SHORT, "--with", "losses,copies", "--tries", "2", "--random"]) == 0
+    assert main(["adversary", *SHORT, "--with", "losses,copies", "--runs", "2", "--random"]) == 0
     assert "2, losses,copies" in capsys.readouterr().out
 
 
@@ -298,7 +298,7 @@ def test_a_search_that_is_interrupted_shows_what_was_flown_and_goes_on(
         return climb(task)
 
     monkeypatch.setattr(commands, "climb", interrupt)
-    search = (*SHORT, "--with", "losses", "--tries", "2", "--json", str(kept))
+    search = (*SHORT, "--with", "losses", "--runs", "2", "--json", str(kept))
     search += ("--out", str(tmp_path / "climbs"))
     assert main(["adversary", *search]) == command.INTERRUPTED
     one = msgspec.json.decode(kept.read_bytes(), type=Kept)
@@ -314,7 +314,7 @@ def test_a_search_that_is_interrupted_shows_what_was_flown_and_goes_on(
     [
         (("demo",), "demo: expected a mission, such as swap"),
         (("swap", "--with", "rain"), "--with: got rain, expected some of delays,losses"),
-        (("swap", "--tries", "0"), "--tries: got 0, expected 1 to"),
+        (("swap", "--runs", "0"), "--runs: got 0, expected 1 to"),
         (("swap", "--attack", "nowhere.json"), "--attack: nowhere.json: No such file"),
     ],
 )

@@ -424,12 +424,12 @@ def test_more_points_go_on_where_fewer_ended(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     once, twice = tmp_path / "once", tmp_path / "twice"
-    main([*SHORT, "--points", "8", "--out", str(once)])
-    main([*SHORT, "--points", "3", "--out", str(twice)])
+    main([*SHORT, "--runs", "8", "--out", str(once)])
+    main([*SHORT, "--runs", "3", "--out", str(twice)])
     kept = (twice / "journal.jsonl").read_bytes()
     assert len((twice / "points.csv").read_text().splitlines()) == 4
     capsys.readouterr()
-    main([*SHORT, "--points", "8", "--out", str(twice)])
+    main([*SHORT, "--runs", "8", "--out", str(twice)])
     assert (twice / "journal.jsonl").read_bytes().startswith(kept)
     assert (twice / "points.csv").read_bytes() == (once / "points.csv").read_bytes()
     assert (twice / "envelope.png").read_bytes().startswith(b"\x89PNG")
@@ -450,7 +450,7 @@ def test_a_flyaway_ends_the_command_with_one_and_a_command_line(
     with closing(StudyJournal(tmp_path, plan.settings(), EnvelopePoint)) as journal:
         journal.add("1", EnvelopePoint("astray", 1.25, 1.0, 0.0))
         journal.add("0", lost)
-    assert main([*SHORT, "--points", "2", "--out", str(tmp_path)]) == 1
+    assert main([*SHORT, "--runs", "2", "--out", str(tmp_path)]) == 1
     said = capsys.readouterr()
     assert f"flyaway: {lost.line}\n    {plan.command(0)}\nastray: 1.25 m from the" in said.out
     assert said.err == "envelope: 1 of 2 points flew away or crashed\n"
@@ -461,7 +461,7 @@ def test_another_seed_does_not_go_on_in_the_folder(
 ) -> None:
     StudyJournal(tmp_path, DEMO.settings(), EnvelopePoint).close()
     assert (
-        main(["envelope", "demo-committed", "--seed", "2", "--points", "1", "--out", str(tmp_path)])
+        main(["envelope", "demo-committed", "--seed", "2", "--runs", "1", "--out", str(tmp_path)])
         == 2
     )
     said = "seed: got 2, expected 1 to continue there; or choose another --out"
@@ -471,7 +471,7 @@ def test_another_seed_does_not_go_on_in_the_folder(
 @pytest.mark.parametrize(
     ("argv", "line"),
     [
-        (["--points", "0"], "--points: got 0, expected 1 to 1000000"),
+        (["--runs", "0"], "--runs: got 0, expected 1 to 1000000"),
         (["--workers", "0"], "--workers: got 0, expected 1 to 1024"),
     ],
 )

@@ -225,7 +225,9 @@ def test_the_command_says_which_vehicles_are_stable(
     ):
         monkeypatch.setattr(margins, table, {name: getattr(margins, table)[name] for name in few})
     file, folder = tmp_path / "margins.json", tmp_path / "maps"
-    flags = "--runs 1 --control.trigger always --tau 1 --gain 1 --dead-time 0 --burst 0"
+    flags = (
+        "--runs 1 --control.trigger always --box-tau 1 --box-gain 1 --box-dead-time 0 --box-burst 0"
+    )
     flags += " --control.input-weight 0.01 --control.horizon 40"
     argv = ["margins", "demo", *flags.split(), "--duration", "5", "--settle", "1"]
     assert main([*argv, "--json", str(file), "--maps", str(folder), "--workers", "1"]) == 0
@@ -247,6 +249,6 @@ def test_the_command_says_which_vehicles_are_stable(
 def test_an_empty_box_is_refused_in_a_line(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    argv = ["margins", "demo", "--maps", str(tmp_path / "maps"), "--gain", "0", "1"]
+    argv = ["margins", "demo", "--maps", str(tmp_path / "maps"), "--box-gain", "0", "1"]
     assert main(argv) == 2
     assert "vehicle.gain[0]: got 0.0" in capsys.readouterr().err

@@ -488,7 +488,7 @@ def run(*argv: str) -> "subprocess.CompletedProcess[str]":
 @pytest.mark.long
 def test_the_command_flies_seeds_in_processes_and_says_what_happened(tmp_path: Path) -> None:
     path = tmp_path / "counts.json"
-    done = run("--seed", "1", "--count", "3", "--jobs", "2", "--json", str(path))
+    done = run("--seed", "1", "--runs", "3", "--workers", "2", "--json", str(path))
     assert done.returncode == 0, done.stderr
     assert "torture from seed 1" in done.stdout
     said = json.loads(path.read_text())
@@ -500,7 +500,7 @@ def test_the_command_flies_seeds_in_processes_and_says_what_happened(tmp_path: P
 @pytest.mark.parametrize(
     ("argv", "said"),
     [
-        (["--schedule", "{"], "schedule of faults: "),
+        (["--schedule", "{"], "expected a schedule of faults"),
         (["--schedule", "{}", "--seed", "1"], "got --seed and --schedule, expected one of them"),
         (["--hours", "-1"], "--hours: got -1, expected more than 0, at most 10000"),
         (["--seed", "-1"], "--seed: got -1, expected 0 to 4294967295"),
@@ -523,7 +523,7 @@ def test_a_failure_is_printed_with_its_schedule_and_flies_again(
     frozen = Trial(1, (fault(FaultKind.FREEZE, "client", 5, 0.6),))
     file.write_text(f"# two\n{dumps(Trial(1, ()))}\n{dumps(frozen)}\n")
     for argv in (["--replay", str(file)], ["--schedule", dumps(frozen)]):
-        with pytest.raises(CommandError, match=r"1 of [12] flights failed") as refused:
+        with pytest.raises(CommandError, match=r"1 of (1 flight|2 flights) failed") as refused:
             skytether.lab.commands.torture.torture(argv)
         assert refused.value.code == 1
         printed = capsys.readouterr().out

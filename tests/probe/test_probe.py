@@ -476,10 +476,10 @@ def test_strangers_and_forgers_change_nothing() -> None:
     [
         ((), "got neither, expected either HOST:PORT"),
         (("127.0.0.1:1", "--listen", "127.0.0.1:2"), "got both, expected either HOST:PORT"),
-        (("127.0.0.1:1", "--seconds", "0"), "--seconds: got 0, expected 1 to"),
+        (("127.0.0.1:1", "--duration", "0"), "--duration: got 0, expected 1 to"),
         (("127.0.0.1:1", "--rate", "1e9"), "--rate: got 1e+09, expected 0.1 to 1000"),
         (("127.0.0.1:1", "--bytes", "10"), f"--bytes: got 10, expected {BYTES_MIN} to 1200"),
-        (("127.0.0.1:1", "--seconds", "86400", "--rate", "1000"), "packets, expected at most"),
+        (("127.0.0.1:1", "--duration", "86400", "--rate", "1000"), "packets, expected at most"),
         (("192.0.2.1:1",), "there are no keys"),
         (("nonsense",), "HOST:PORT"),
     ],
@@ -523,7 +523,7 @@ def test_a_path_over_loopback_is_measured_sealed_or_not(
         out = [f"--{name}" for name in ("out", "json", "figure", "record")]
         files = [str(tmp_path / name) for name in ("probed", "p.json", "p.png", "p.rows")]
         flags = [each for pair in zip(out, files, strict=True) for each in pair]
-        limits = ["--seconds", "4", "--rate", "100"]
+        limits = ["--duration", "4", "--rate", "100"]
         assert main(["probe", address, *limits, *flags, *keys]) == 0
     told = json.loads((tmp_path / "p.json").read_text())
     assert told["secure"] == sealed

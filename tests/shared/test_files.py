@@ -29,13 +29,13 @@ CALLS: list[tuple[Any, tuple[str, ...], str]] = [
     (fly, ("demo", *SHORT, "--figure"), ".png"),
     (fleet, ("fleet", "--virtual", "--json"), ""),
     (margins, ("demo", "--json"), ""),
-    (torture, ("--count", "1", "--json"), ""),
+    (torture, ("--runs", "1", "--json"), ""),
     (client, ("demo", "--record"), ""),
     (client, ("demo", "--json"), ""),
     (serve, ("demo", "--record"), ""),
     (emulate, ("demo", "--record"), ""),
-    (report, ("FLIGHT", "--out"), ""),
-    (join, ("FLIGHT", "--out"), ".mcap"),
+    (report, ("FLIGHT", "--html"), ""),
+    (join, ("FLIGHT", "--record"), ".mcap"),
 ]
 
 

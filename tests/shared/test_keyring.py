@@ -167,7 +167,7 @@ def test_no_secret_is_shown_by_a_repr() -> None:
 
 
 def test_keygen_writes_a_file_for_its_owner_alone(tmp_path: Path) -> None:
-    run = keygen("fleet.keys", "--vehicles", "3", "--first", "5", cwd=tmp_path)
+    run = keygen("fleet.keys", "--vehicles", "3", "--id", "5", cwd=tmp_path)
     assert run.returncode == 0, run.stderr
     assert "fleet.keys: wrote 3 keys, of vehicles 5 to 7." in run.stdout
     assert "--keys" in run.stdout
@@ -182,12 +182,12 @@ def test_keygen_writes_a_file_for_its_owner_alone(tmp_path: Path) -> None:
 
 def test_keygen_adds_the_next_key_and_no_third(tmp_path: Path) -> None:
     path = put(tmp_path / "k", write(4, 1, A).encode().rstrip())  # without an end of line
-    assert keygen("k", "--add", "--first", "4", cwd=tmp_path).returncode == 0
+    assert keygen("k", "--add", "--id", "4", cwd=tmp_path).returncode == 0
     keys = load(path)
     assert keys.numbers(4) == [1, 2]
     assert keys.of(4, 1) == VehicleKey.of(4, 1, A)
     content = path.read_bytes()
-    run = keygen("k", "--add", "--first", "4", cwd=tmp_path)
+    run = keygen("k", "--add", "--id", "4", cwd=tmp_path)
     assert run.returncode == 2
     assert run.stderr == (
         "keygen: k: vehicle 4 has 2 keys, expected 1: delete the line of the old one first\n"
@@ -203,16 +203,16 @@ def test_keygen_adds_the_next_key_and_no_third(tmp_path: Path) -> None:
         (["no/k"], "no/k: cannot be written: No such file or directory"),
         (["new", "--vehicles", "0"], "--vehicles: got 0, expected 1 to 65536"),
         (
-            ["new", "--first", "65535", "--vehicles", "2"],
-            "--first: got 65535 to 65536, expected 0 to 65535",
+            ["new", "--id", "65535", "--vehicles", "2"],
+            "--id: got 65535 to 65536, expected 0 to 65535",
         ),
         (["new", "--key-id", "256"], "--key-id: got 256, expected 0 to 255"),
         (
-            ["k", "--add", "--first", "4", "--key-id", "255"],
+            ["k", "--add", "--id", "4", "--key-id", "255"],
             "--key-id: got 255, expected another: k: vehicle 4 has it",
         ),
         (
-            ["k", "--add", "--first", "4"],
+            ["k", "--add", "--id", "4"],
             "k: vehicle 4 has the last key, 255: choose another with --key-id",
         ),
     ],

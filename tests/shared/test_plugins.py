@@ -676,7 +676,7 @@ def test_a_journal_knows_the_plugins_that_its_results_follow_from(tmp_path: Path
         (["sweep", "paper", "--out", "out", "--runs", "0"], "--runs: got 0"),
         (["calibrate", "paper", "--runs", "0"], "--runs: got 0"),
         (["compare", "--runs", "0"], "--runs: got 0"),
-        (["envelope", "demo-committed", "--out", "out", "--points", "0"], "--points: got 0"),
+        (["envelope", "demo-committed", "--out", "out", "--runs", "0"], "--runs: got 0"),
         (["margins", "demo", "--runs", "0"], "--runs: got 0"),
     ],
     ids=lambda argv: argv[0],

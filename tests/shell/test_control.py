@@ -291,11 +291,11 @@ def test_where_nobody_listens_is_said_in_a_line(
 ) -> None:
     path = tmp_path / "netem"
     assert command.main(set_keys, [str(path)], "set") == 1
-    assert capsys.readouterr().err == f"set: {path}: No such file or directory\n"
+    assert capsys.readouterr().err.startswith(f"set: {path}: no process listens there (No such")
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as dead:
         dead.bind(str(path))
     assert command.main(set_keys, [str(path)], "set") == 1
-    assert capsys.readouterr().err == f"set: {path}: Connection refused\n"
+    assert capsys.readouterr().err.startswith(f"set: {path}: no process listens there (Conn")
 
 
 def test_answers_come_to_beside_the_socket_that_was_asked(

@@ -122,7 +122,7 @@ def refused(path: Path, folder: Path, capsys: pytest.CaptureFixture[str]) -> lis
     tables, page = str(folder / "tables"), str(folder / "page.html")
     told = [
         refusal([str(path), "--csv", tables], export, capsys),
-        refusal([str(path), "--out", page], report, capsys),
+        refusal([str(path), "--html", page], report, capsys),
     ]
     assert [code for code, _ in told] == [2, 2]
     return [line for _, line in told]
@@ -384,7 +384,7 @@ def test_joined_alone_a_torn_recording_has_an_end_for_other_programs(
     torn: Path, tmp_path: Path
 ) -> None:
     out = tmp_path / "whole.mcap"
-    assert command.main(join, [str(torn), "--out", str(out)], "join") == 0
+    assert command.main(join, [str(torn), "--record", str(out)], "join") == 0
     assert read(out).lost_bytes is None
     assert read(out).frames == read(torn).frames
     with out.open("rb") as file:
@@ -744,7 +744,7 @@ def test_no_text_of_a_table_or_a_line_is_obeyed_by_a_terminal(
 
 def test_a_report_is_one_page_that_needs_nothing_else(recording: Path, tmp_path: Path) -> None:
     out = tmp_path / "report.html"
-    assert command.main(report, [str(recording), "--out", str(out)], "report") == 0
+    assert command.main(report, [str(recording), "--html", str(out)], "report") == 0
     page = out.read_text()
     assert page.count("data:image/png;base64,") == 2
     assert "://" not in page.replace("data:", "")

@@ -34,8 +34,8 @@ from skytether.shared.scenario import reading
 from skytether.shared.scenario.mission import Mission
 from skytether.shared.scenario.schema import Scenario
 from skytether.shell import command
+from skytether.shell.argument import Argument
 from skytether.shell.command import CommandError, ScenarioFlags, ScenarioName
-from skytether.shell.options import Argument
 
 TRIES_MAX = 10**6
 
@@ -49,7 +49,7 @@ class Kept(msgspec.Struct, frozen=True):
 
 
 ATTACK_BYTES_MAX = 16_000_000
-OWN = ("with", "tries", "moves", "first", "workers", "out", "json")
+OWN = ("with", "runs", "moves", "climb", "workers", "out", "json")
 """Options of the search, which are left out of the command line of a single flight."""
 
 
@@ -61,18 +61,18 @@ class AdversaryOptions:
     """Name of a mission (swap, sphere, rings, corridor, warehouse) or a .toml file."""
     kinds: Annotated[str, Argument(name="with", metavar="KINDS")] = "delays,losses,cuts,copies"
     """Kinds of moves, with commas: delays, losses, cuts, copies, server, client, goals, zones."""
-    tries: Annotated[int, Argument(metavar="N")] = 200
+    runs: Annotated[int, Argument(metavar="N")] = 200
     """Number of flights."""
     moves: Annotated[int, Argument(metavar="N")] = MOVES_MAX
     """Largest number of moves of a flight."""
     random: bool = False
     """Draw the moves of each flight at random, without a search."""
-    first: Annotated[int, Argument(metavar="N")] = 0
+    climb: Annotated[int, Argument(metavar="N")] = 0
     """Number of the first climb, which seeds its random moves."""
     workers: Annotated[int | None, Argument(metavar="N")] = None
     """Number of worker processes; one per core unless given."""
     out: Path | None = None
-    """Folder for the results of the search: after Ctrl-C, or with more tries, the same command
+    """Folder for the results of the search: after Ctrl-C, or with more flights, the same command
     continues there."""
     attack: Annotated[str | None, Argument(metavar="JSON|FILE")] = None
     """Moves to fly once: as printed by a search, or the file of its --json."""
@@ -102,8 +102,8 @@ def adversary(argv: Sequence[str]) -> None:
     else:
         found, spares_m = _search(options, title)
     _finish(options, argv, title, found, spares_m)
-    if spares_m and len(spares_m) < options.tries:
-        message = f"interrupted with {len(spares_m)} of {options.tries} flights done"
+    if spares_m and len(spares_m) < options.runs:
+        message = f"interrupted with {len(spares_m)} of {options.runs} flights done"
         raise CommandError(message, command.INTERRUPTED)
 
 
@@ -112,16 +112,16 @@ def _search(options: AdversaryOptions, title: str) -> tuple[Approach, list[float
 
     Raises CommandError if interrupted before any climb was done.
     """
-    command.check_count("--tries", options.tries, TRIES_MAX)
+    command.check_count("--runs", options.runs, TRIES_MAX)
     command.claim_folder("--out", options.out, ENTRIES)
     command.check_count("--moves", options.moves, MOVES_MAX)
     pool, patience = Flags(workers=options.workers), 0 if options.random else PATIENCE
     pool.check()
     kinds = _kinds(options.kinds)
-    sizes = [min(CLIMB, options.tries - begun) for begun in range(0, options.tries, CLIMB)]
+    sizes = [min(CLIMB, options.runs - begun) for begun in range(0, options.runs, CLIMB)]
     tasks = {
         (number, tries): Climb(options.config, kinds, number, tries, options.moves, patience)
-        for number, tries in enumerate(sizes, start=options.first)
+        for number, tries in enumerate(sizes, start=options.climb)
     }
     settings = {
         "kinds": [*kinds],
@@ -138,7 +138,7 @@ def _search(options: AdversaryOptions, title: str) -> tuple[Approach, list[float
     try:
         with (
             writing(options.out),
-            crew(pool, f"against {title}", options.tries, "flights") as flyers,
+            crew(pool, f"against {title}", options.runs, "flights") as flyers,
         ):
             results = flyers.study(
                 climb, tasks, Climbed, settings, options.out, size=lambda t: t.tries, tell=least
@@ -168,7 +168,7 @@ def _moves(text: str) -> Moves:
     except OSError as error:
         raise CommandError(f"--attack: {text}: {error.strerror}", command.CONFIGURATION) from None
     except msgspec.DecodeError as error:
-        raise ConfigError(f"--attack: {text}: {error}") from None
+        raise ConfigError(f"--attack: {text}: expected a file of --json ({error})") from None
 
 
 def _kinds(text: str) -> tuple[MoveKind, ...]:
@@ -193,11 +193,11 @@ def _finish(
     asked_m = options.config.mission.separation_m
     rows: list[tuple[str, object]] = []
     if spares_m:
-        rows.append(("flights", f"{len(spares_m)}, {options.kinds}"))
+        rows.append(("flights", f"{len(spares_m)}, with {options.kinds}"))
         rows.append(("with a violated distance", failed))
-    # All digits, so that a repeated flight can be compared exactly.
-    rows.append(("least separation, required [m]", f"{apart.away_m!r}, {asked_m:g}"))
-    rows.append(("  at [s], of vehicles", f"{apart.at_s:.2f}, {apart.vehicles}"))
+    rows.append(("least separation, required [m]", f"{apart.away_m:.3f}, {asked_m:g}"))
+    pair = " and ".join(map(str, apart.vehicles))
+    rows.append(("  at [s], of vehicles", f"{apart.at_s:.2f}, {pair}"))
     if clear.vehicles:
         rows.append(("least distance from a zone [m]", clear.distance_m))
         rows.append(("  at [s], of vehicle", f"{clear.at_s:.2f}, {clear.vehicles[0]}"))
@@ -208,7 +208,7 @@ def _finish(
         if spares_m:
             fewest = shrunk(options.config, found)
             again = shlex.join(["adversary", *_of_flight(argv), "--attack", dumps(fewest.moves)])
-            print(f"fewest moves, {fewest.apart.distance_m!r} m:\n    skytether {again}")
+            print(f"fewest moves, {fewest.apart.distance_m:.3f} m:\n    skytether {again}")
         raise CommandError("a required distance was violated")
 
 

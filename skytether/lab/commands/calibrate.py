@@ -7,8 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
-import tyro
-
 from skytether.figures.page import as_text
 from skytether.lab import calibration
 from skytether.lab.calibration import ONLY, Rmse, SearchLimits, Table1
@@ -18,7 +16,8 @@ from skytether.lab.search import SIGMA, Free, Search, SearchPoint, Values, best,
 from skytether.shared.base import files
 from skytether.shared.scenario.reading import to_toml
 from skytether.shared.scenario.schema import Scenario
-from skytether.shell import command
+from skytether.shell import command, terminal
+from skytether.shell.argument import Argument
 from skytether.shell.command import CommandError, ScenarioFlags, ScenarioName
 
 BEST = "best.toml"
@@ -36,10 +35,10 @@ class CalibrateOptions:
     xy."""
     packets: float = 0.1
     """Largest event ratio, for the objective rmse with a trigger that uses the state."""
-    effort: Annotated[float, tyro.conf.arg(metavar="MPS")] = math.inf
+    effort: Annotated[float, Argument(metavar="MPS")] = math.inf
     """Largest effort with the objective rmse, the RMS change of the command from step to step
     [m/s]; no limit unless given."""
-    free: Annotated[tuple[str, ...], tyro.conf.arg(metavar="KEY=LOW:HIGH")] = ()
+    free: Annotated[tuple[str, ...], Argument(metavar="KEY=LOW:HIGH")] = ()
     """Keys that may change, each within its bounds, on a logarithmic scale. Unless given, table1
     changes weights and plant, and rmse the weights (except the position's, as only ratios matter)
     and the keys of scheme and trigger."""
@@ -121,7 +120,7 @@ def _print_rmse(points: Sequence[SearchPoint]) -> None:
         ("effort [m/s]", as_text(means["effort_mps"], ".4f")),
     ]
     rows += [(key, f"{value:g}") for key, value in found.keys.items()]
-    tables.show(f"the best of {len(points)} points", (), rows)
+    tables.show(f"the best of {terminal.counted(len(points), 'point')}", (), rows)
 
 
 def _print_table_1(points: Sequence[SearchPoint]) -> None:
@@ -132,7 +131,9 @@ def _print_table_1(points: Sequence[SearchPoint]) -> None:
         span = [point.keys[key] for point in near]
         ends = [f"{min(span):g}", f"{max(span):g}"] if span else []
         rows.append((key, f"{value:g}", *ends))
-    title = f"{len(near)} of {len(points)} points have every entry within tolerance"
+    title = (
+        f"{len(near)} of {terminal.counted(len(points), 'point')} have every entry within tolerance"
+    )
     tables.show(title, ("key", "best", "least of these", "most of these"), rows)
 
 

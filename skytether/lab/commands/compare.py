@@ -5,8 +5,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-import tyro
-
 from skytether.figures.page import as_text
 from skytether.lab import comparison, contenders
 from skytether.lab.budgets import Plan
@@ -22,7 +20,8 @@ from skytether.lab.search import Search, best
 from skytether.shared.base import files
 from skytether.shared.scenario import reading
 from skytether.shared.telemetry.summary import Summary
-from skytether.shell import command
+from skytether.shell import command, terminal
+from skytether.shell.argument import Argument
 from skytether.shell.command import CommandError
 from skytether.shell.options import read
 
@@ -33,25 +32,23 @@ WEIGHTS = "weights.toml"
 class CompareOptions:
     """Options of `skytether compare`."""
 
-    runs: Annotated[int, tyro.conf.arg(metavar="N")] = 100
+    runs: Annotated[int, Argument(metavar="N")] = 100
     """Number of flights of each contender per case and budget, with seeds from 1 on."""
     out: Path = Path("compare")
     """Folder for the report, and for weights and their searches; the same command continues
     there."""
     quick: bool = False
     """Fly only a first look: few flights, cases and thresholds."""
-    cases: Annotated[tuple[str, ...], tyro.conf.arg(metavar="CASE")] = ()
+    cases: Annotated[tuple[str, ...], Argument(metavar="CASE")] = ()
     """Cases to fly; all unless given."""
     tune: bool = False
     """Only search for the weights of every contender in every case, each with the same effort, and
     write them to OUT/weights.toml."""
-    generations: Annotated[int, tyro.conf.arg(metavar="N")] = 16
+    generations: Annotated[int, Argument(metavar="N")] = 16
     """Number of generations of each of these searches."""
-    weights: Annotated[str, tyro.conf.arg(metavar="FILE")] = reading.COMPARED
+    weights: Annotated[str, Argument(metavar="FILE")] = reading.COMPARED
     """File of the weights, as written by --tune; the included ones unless given."""
-    contender: Annotated[
-        tuple[Path, ...], tyro.conf.arg(metavar="FILE"), tyro.conf.UseAppendAction
-    ] = ()
+    contender: Annotated[tuple[Path, ...], Argument(metavar="FILE", append=True)] = ()
     """File with the keys of a contender of your own (see docs/compare.md), flown beside the
     built-in ones; may be repeated."""
     pool: PoolFlags = Flags()
@@ -80,7 +77,7 @@ def compare(argv: Sequence[str]) -> None:
     for table in drawn.tables:
         tables.show(table.title, table.heading, table.rows)
     page = options.out / report_folder.PAGE
-    print(f"{page}: {len(drawn.pictures)} figures; {runs} runs flown")
+    print(f"{page}: {len(drawn.pictures)} figures; {terminal.counted(runs, 'run')} flown")
     print(drawn.verdict)
 
 

@@ -8,8 +8,6 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated, get_args
 
-import tyro
-
 from skytether.cli import processes
 from skytether.lab import figures
 from skytether.lab.commands import tables
@@ -20,6 +18,7 @@ from skytether.shared.base import files
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry import record
 from skytether.shell import command, temporary
+from skytether.shell.argument import Argument
 from skytether.shell.command import CommandError, ScenarioFlags, ScenarioName
 from skytether.sim import flight
 
@@ -34,15 +33,15 @@ class CrowdOptions:
     """Folder for the results; the same command continues there."""
     scenario: ScenarioName = "crowd"
     """A scenario's name (see `skytether scenarios`) or a .toml file; every vehicle flies it."""
-    schemes: Annotated[tuple[Scheme, ...], tyro.conf.arg(metavar="SCHEME")] = get_args(Scheme)
+    schemes: Annotated[tuple[Scheme, ...], Argument(metavar="SCHEME")] = get_args(Scheme)
     """Schemes to compare: paper (a packet at every step), threshold (the scenario's trigger for
     each vehicle) and budget (the same trigger, with control.shared_bytes_per_s)."""
-    vehicles: Annotated[tuple[int, ...], tyro.conf.arg(metavar="N")] = ()
+    vehicles: Annotated[tuple[int, ...], Argument(metavar="N")] = ()
     """Numbers of vehicles to fly; unless given, increasing numbers until they fail, then between
     the largest that flies and the smallest that fails."""
-    most: Annotated[int, tyro.conf.arg(metavar="N")] = 256
+    most: Annotated[int, Argument(metavar="N")] = 256
     """Largest number of vehicles that is tried, unless numbers are given."""
-    limit: Annotated[float, tyro.conf.arg(metavar="M")] = 1.0
+    limit: Annotated[float, Argument(metavar="M")] = 1.0
     """Root mean square error above which vehicles count as failed [m]."""
     udp: bool = False
     """Fly over real UDP on loopback, in real time, instead of virtual time."""

@@ -14,7 +14,8 @@ from skytether.lab.commands.pool import Flags, PoolFlags, study, writing
 from skytether.lab.envelope import BAD, Envelope, EnvelopePoint, Outcome, worst_first
 from skytether.shared.base import files
 from skytether.shared.scenario.schema import Scenario
-from skytether.shell import command
+from skytether.shell import command, terminal
+from skytether.shell.argument import Argument
 from skytether.shell.command import CommandError, ScenarioFlags, ScenarioName
 
 TOLD_MAX = 10
@@ -28,8 +29,8 @@ class EnvelopeOptions:
     """Folder for the results; the same command continues there, also with more points."""
     scenario: ScenarioName = "demo-committed"
     """Name of a scenario (see `skytether scenarios`) or path of a .toml file."""
-    points: Annotated[int, tyro.conf.arg(metavar="N")] = 1000
-    """Number of points; point n depends only on --seed and n."""
+    runs: Annotated[int, Argument(metavar="N")] = 1000
+    """Number of points, flown once each; point n depends only on --seed and n."""
     pool: PoolFlags = Flags()
     config: ScenarioFlags = Scenario()
 
@@ -50,12 +51,12 @@ def envelope(argv: Sequence[str]) -> None:
     options = command.parse(
         EnvelopeOptions(tyro.MISSING), argv, "skytether envelope", envelope.__doc__
     )
-    command.check_count("--points", options.points, 10**6)
+    command.check_count("--runs", options.runs, 10**6)
     options.pool.check()
     plan = Envelope(options.scenario, options.config)
     command.claim_folder("--out", options.out, "points.csv", "envelope.png")
     title = f"flying points of {options.scenario}"
-    numbers, settings = range(options.points), plan.settings()
+    numbers, settings = range(options.runs), plan.settings()
     points = study(
         plan.fly, numbers, EnvelopePoint, settings, options.out, options.pool, title, "points"
     )
@@ -65,7 +66,8 @@ def envelope(argv: Sequence[str]) -> None:
 
 def _finish(options: EnvelopeOptions, plan: Envelope, points: Sequence[EnvelopePoint]) -> None:
     """Write and print all outcomes; raises CommandError if some points flew away or crashed."""
-    title = f"{options.scenario}, {len(points)} points, in virtual time, seed {plan.scenario.seed}"
+    flown = terminal.counted(len(points), "point")
+    title = f"{options.scenario}, {flown}, in virtual time, seed {plan.scenario.seed}"
     files.write(options.out / "points.csv", plan.csv(points).encode())
     figures.envelope(options.out / "envelope.png", title, plan, points)
     counts = Counter(point.outcome for point in points)
@@ -78,4 +80,4 @@ def _finish(options: EnvelopeOptions, plan: Envelope, points: Sequence[EnvelopeP
         print(f"{point.outcome}{detail}\n    {plan.command(number)}")
     print(f"{options.out}: points.csv, envelope.png")
     if bad := sum(counts[outcome] for outcome in BAD):
-        raise CommandError(f"{bad} of {len(points)} points flew away or crashed")
+        raise CommandError(f"{bad} of {flown} flew away or crashed")

@@ -36,8 +36,8 @@ from skytether.shared.core.steady import Steady
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.schema import Scenario
 from skytether.shell import command, driver, terminal
+from skytether.shell.argument import Argument
 from skytether.shell.command import CommandError, ScenarioFlags
-from skytether.shell.options import Argument
 from skytether.shell.udp import AddressError
 from skytether.sim.world import World
 

@@ -9,7 +9,6 @@ from typing import Annotated
 
 import msgspec
 import numpy as np
-import tyro
 
 from skytether.lab import maps
 from skytether.lab import margins as lab
@@ -21,6 +20,7 @@ from skytether.shared.base import files
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.schema import Scenario
 from skytether.shell import command
+from skytether.shell.argument import Argument
 from skytether.shell.command import CommandError, ScenarioFlags, ScenarioName
 
 POINTS_MAX = 100_000
@@ -32,20 +32,20 @@ class MarginsOptions:
 
     scenario: ScenarioName = "demo"
     """Name of a scenario (see `skytether scenarios`) or path of a .toml file."""
-    runs: Annotated[int, tyro.conf.arg(metavar="N")] = 16
+    runs: Annotated[int, Argument(metavar="N")] = 16
     """Number of seeds that each vehicle is flown with, which count up from the scenario's."""
     json: Path | None = None
     """File for the figures."""
-    maps: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
+    maps: Annotated[Path | None, Argument(metavar="FOLDER")] = None
     """Folder for maps, made by flights: for each vehicle of a box, whether it comes to rest without
     wind. The same command continues with the folder's results."""
-    tau: tuple[float, ...] = (0.5, 1.0, 2.0)
+    box_tau: tuple[float, ...] = (0.5, 1.0, 2.0)
     """Time constants of the box, relative to the model's."""
-    gain: tuple[float, ...] = (0.7, 1.0, 1.3)
+    box_gain: tuple[float, ...] = (0.7, 1.0, 1.3)
     """Gains of the box, relative to the model's."""
-    dead_time: tuple[float, ...] = (0.0, 0.1, 0.2, 0.3)
+    box_dead_time: tuple[float, ...] = (0.0, 0.1, 0.2, 0.3)
     """Dead times of the box, minus the model's [s]."""
-    burst: tuple[float, ...] = (0.0, 2.0)
+    box_burst: tuple[float, ...] = (0.0, 2.0)
     """Mean burst lengths of loss in the box, both ways [s]."""
     pool: PoolFlags = Flags()
     config: ScenarioFlags = Scenario()
@@ -71,7 +71,8 @@ def margins(argv: Sequence[str]) -> None:
 
     With --maps FOLDER every vehicle of a box is flown as well, without wind: FOLDER/points.csv has
     a row for each, FOLDER/maps.png shows where the flight ends in a limit cycle, and the RMSE. The
-    box of 72 vehicles takes some minutes; --tau, --gain, --dead-time and --burst change it.
+    box of 72 vehicles takes some minutes; --box-tau, --box-gain, --box-dead-time and --box-burst
+    change it.
     """
     options = command.parse(MarginsOptions(), argv, "skytether margins", margins.__doc__)
     command.check_count("--runs", options.runs, 1000)
@@ -127,13 +128,15 @@ def _box(options: MarginsOptions, trigger: str) -> Box:
         options.scenario,
         options.config,
         trigger,
-        options.tau,
-        options.gain,
-        options.dead_time,
-        options.burst,
+        options.box_tau,
+        options.box_gain,
+        options.box_dead_time,
+        options.box_burst,
     )
     count = len(box.places)
-    command.check_count("--tau, --gain, --dead-time and --burst, all in all", count, POINTS_MAX)
+    command.check_count(
+        "--box-tau, --box-gain, --box-dead-time and --box-burst, all in all", count, POINTS_MAX
+    )
     for number in range(count):
         reading.check(reading.to_table(box.scenario_of(number)), options.scenario)
     return box

@@ -30,8 +30,6 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Annotated, Any, TypeVar
 
-import tyro
-
 import skytether.lab.sweep
 from skytether.lab.journal import StudyJournal, name_of
 from skytether.lab.search import Point, Search, SearchPoint, Values, best
@@ -39,6 +37,7 @@ from skytether.lab.sweep import Results, Runs, Sweep
 from skytether.shared.base import kernel
 from skytether.shared.scenario.schema import Scenario
 from skytether.shell import command, plugins, terminal
+from skytether.shell.argument import Argument
 from skytether.shell.command import CommandError
 from skytether.shell.plugins import Plugin
 from skytether.shell.terminal import Bar
@@ -58,18 +57,11 @@ R = TypeVar("R")
 class Flags:
     """Options of every command that has a pool."""
 
-    workers: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
+    workers: Annotated[int | None, Argument(metavar="N")] = None
     """Number of worker processes; one per core unless given."""
-    scheduler: Annotated[str | None, tyro.conf.arg(metavar="tcp://HOST:PORT")] = None
+    scheduler: Annotated[str | None, Argument(metavar="tcp://HOST:PORT")] = None
     """Address of a Dask scheduler, whose workers fly instead of processes of this machine."""
-    plugin: Annotated[
-        command.Plugins,
-        tyro.conf.arg(
-            metavar="FILE",
-            help="Python file with own triggers or references; may be repeated.",
-        ),
-        tyro.conf.UseAppendAction,  # tyro reads annotations of the outermost dataclass only
-    ] = ()
+    plugin: command.Plugins = ()
 
     def check(self) -> None:
         """Raise CommandError if the options are impossible, with the values that are accepted."""
@@ -79,7 +71,7 @@ class Flags:
                 raise CommandError("--workers: got --scheduler as well, which has its own", 2)
 
 
-PoolFlags = Annotated[Flags, tyro.conf.arg(name="")]
+PoolFlags = Annotated[Flags, Argument(name="")]
 
 
 class Interrupted(CommandError):

@@ -9,7 +9,6 @@ from typing import Annotated
 
 import msgspec
 import numpy as np
-import tyro
 
 from skytether.cli import processes
 from skytether.lab import report, studies
@@ -28,6 +27,7 @@ from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry import record
 from skytether.shared.telemetry.record import Record
 from skytether.shell import command, terminal
+from skytether.shell.argument import Argument
 from skytether.shell.command import CommandError
 from skytether.shell.options import read
 from skytether.sim.flight import fly_batch
@@ -37,7 +37,7 @@ from skytether.sim.flight import fly_batch
 class ReproduceOptions:
     """Options of `skytether reproduce`."""
 
-    runs: Annotated[int, tyro.conf.arg(metavar="N")] = 100
+    runs: Annotated[int, Argument(metavar="N")] = 100
     """Number of flights of each column of Table 1; each point of a curve has half as many, each
     cell of Fig. 5 a quarter."""
     out: Path = Path("results")
@@ -69,7 +69,8 @@ def reproduce(argv: Sequence[str]) -> None:
         report_folder.write(options.out, drawn, scenario, call, runs)
     table = drawn.tables[0]
     tables.show(table.title, table.heading, table.rows)
-    print(f"{options.out / report_folder.PAGE}: {len(drawn.pictures)} figures; {runs} runs flown")
+    flown = terminal.counted(runs, "run")
+    print(f"{options.out / report_folder.PAGE}: {len(drawn.pictures)} figures; {flown} flown")
     print(drawn.verdict)
 
 

@@ -14,7 +14,8 @@ from skytether.lab.commands.pool import Crew, Flags, PoolFlags, crew, writing
 from skytether.lab.sweep import Results, Sweep, estimate, parse_axis
 from skytether.shared.base import files
 from skytether.shared.scenario.schema import Scenario
-from skytether.shell import command
+from skytether.shell import command, terminal
+from skytether.shell.argument import Argument
 from skytether.shell.command import ScenarioFlags, ScenarioName
 
 DRAWN = {"rmse_xy": "RMSE xy [m]", "event_ratio": "event ratio"}
@@ -33,12 +34,10 @@ class SweepOptions:
     """Folder for the results; the same command continues there."""
     scenario: ScenarioName = "paper"
     """Name of a scenario (see `skytether scenarios`) or path of a .toml file."""
-    grid: Annotated[
-        tuple[str, ...], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="KEY=VALUES")
-    ] = ()
+    grid: Annotated[tuple[str, ...], Argument(append=True, metavar="KEY=VALUES")] = ()
     """Key of the scenario and its values: KEY=START:STOP:COUNT, evenly spaced, or KEY=A,B,C.
     Several grids give all combinations of their values."""
-    runs: Annotated[int, tyro.conf.arg(metavar="N")] = 50
+    runs: Annotated[int, Argument(metavar="N")] = 50
     """Number of flights of each combination, with seeds that count up from the scenario's."""
     pool: PoolFlags = Flags()
     config: ScenarioFlags = Scenario()
@@ -60,7 +59,7 @@ def sweep(argv: Sequence[str]) -> None:
     axes = [parse_axis(text) for text in options.grid]
     plan = Sweep(options.scenario, options.config, axes, options.runs)
     command.claim_folder("--out", options.out, "runs.csv", "cells.csv")
-    title = f"sweeping {options.scenario}, {len(plan.cells)} cells"
+    title = f"sweeping {options.scenario}, {terminal.counted(len(plan.cells), 'cell')}"
     with writing(options.out):
         with crew(options.pool, title, plan.flights) as flyers:
             done = flyers.sweep(plan, options.out)
@@ -72,7 +71,7 @@ def _finish(options: SweepOptions, plan: Sweep, done: Results, flyers: Crew) -> 
     files.write(options.out / "runs.csv", plan.runs_csv(done).encode())
     files.write(options.out / "cells.csv", plan.cells_csv(done).encode())
     cells = [plan.of_cell(done, cell) for cell in range(len(plan.cells))]
-    title = f"{options.scenario}, {plan.runs} runs each, in virtual time"
+    title = f"{options.scenario}, {terminal.counted(plan.runs, 'run')} each, in virtual time"
     for figure, name in DRAWN.items():
         pairs = [estimate(runs, figure) for runs in cells]
         means, halves = np.array(pairs, dtype=np.float64).T  # None becomes NaN
@@ -99,7 +98,7 @@ def _finish(options: SweepOptions, plan: Sweep, done: Results, flyers: Crew) -> 
     tables.show(title, headings, rows)
     failed = sum(not run.steps for runs in cells for run in runs)
     if failed:
-        print(f"{failed} runs found no server, and are left out of the mean errors")
+        print(f"{terminal.counted(failed, 'run')} found no server, left out of the mean errors")
     if flyers.cpu_s:
         steps = sum(run.steps for runs in flyers.fresh for run in runs)
         print(f"{steps} vehicle-steps, {steps / flyers.cpu_s:.0f} per core-second")

@@ -23,5 +23,6 @@ def show(title: str, headings: Sequence[str], rows: Iterable[Sequence[object]]) 
         is_right = headings and number
         table.add_column(Text(heading), justify="right" if is_right else "left", no_wrap=True)
     for row in rows:
-        table.add_row(*(Text(str(cell)) for cell in row))
+        cells = (f"{cell:.3f}" if isinstance(cell, float) else str(cell) for cell in row)
+        table.add_row(*map(Text, cells))
     terminal.show(table)

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Annotated
 
 import msgspec
-import tyro
 
 from skytether.lab.commands import tables
 from skytether.lab.commands.pool import Flags, Interrupted, crew
@@ -18,7 +17,8 @@ from skytether.lab.faults import Trial, dumps, loads
 from skytether.lab.torture import TrialOutcome, fly, long_trial, short_trial, shrunk
 from skytether.shared.base import files
 from skytether.shared.base.errors import ConfigError
-from skytether.shell import command
+from skytether.shell import command, terminal
+from skytether.shell.argument import Argument
 from skytether.shell.command import CommandError
 from skytether.shell.options import read
 
@@ -32,13 +32,13 @@ TOLD_MAX = 10
 class TortureOptions:
     """Options of `skytether torture`."""
 
-    seed: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
+    seed: Annotated[int | None, Argument(metavar="N")] = None
     """First seed; random unless given."""
-    count: Annotated[int, tyro.conf.arg(metavar="N")] = 100
+    runs: Annotated[int, Argument(metavar="N")] = 100
     """Number of flights, with seeds that count up."""
-    hours: Annotated[float | None, tyro.conf.arg(metavar="H")] = None
+    hours: Annotated[float | None, Argument(metavar="H")] = None
     """Number of hours to fly instead, in flights of an hour with faults throughout."""
-    jobs: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
+    workers: Annotated[int | None, Argument(metavar="N")] = None
     """Number of worker processes; one per core unless given."""
     replay: Path | None = None
     """File with one schedule per line, flown instead of random ones."""
@@ -59,9 +59,9 @@ def torture(argv: Sequence[str]) -> None:
     again.
     """
     options = read(TortureOptions(), argv, "skytether torture", torture.__doc__)
-    command.check_count("--count", options.count, 10**6)
+    command.check_count("--runs", options.runs, 10**6)
     command.claim_output("--json", options.json)
-    pool = Flags(workers=options.jobs)
+    pool = Flags(workers=options.workers)
     pool.check()
     trials, title = _trials(options)
     done: Collection[TrialOutcome] = ()
@@ -73,11 +73,13 @@ def torture(argv: Sequence[str]) -> None:
             failed[:TOLD_MAX] = flyers.map(shrunk, failed[:TOLD_MAX])
     except Interrupted as early:
         done = done or early.results.values()
-        interrupted = f"interrupted with {len(done)} of {len(trials)} flights done"
+        interrupted = (
+            f"interrupted with {len(done)} of {terminal.counted(len(trials), 'flight')} done"
+        )
         failed = [each for each in done if each.failure]
     _finish(options, title, done, failed)
     if failed:
-        message = f"{len(failed)} of {len(done)} flights failed"
+        message = f"{len(failed)} of {terminal.counted(len(done), 'flight')} failed"
         raise CommandError(f"{interrupted}, and {message}" if interrupted else message)
     if interrupted:
         raise CommandError(interrupted, command.INTERRUPTED)
@@ -109,7 +111,7 @@ def _trials(options: TortureOptions) -> tuple[list[Trial], str]:
         expected = f"expected 0 to {SEEDS - 1}"
         raise CommandError(f"--seed: got {seed}, {expected}", command.CONFIGURATION)
     if options.hours is None:
-        seeds = [(seed + number) % SEEDS for number in range(options.count)]
+        seeds = [(seed + number) % SEEDS for number in range(options.runs)]
         return list(map(short_trial, seeds)), f"torture from seed {seed}"
     if not 0.0 < options.hours <= HOURS_MAX:
         expected = f"expected more than 0, at most {HOURS_MAX}"
@@ -130,7 +132,13 @@ def _read(path: Path) -> list[Trial]:
         lines = files.read(path, SCHEDULES_BYTES_MAX).decode().splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise CommandError(f"--replay: {path}: {error}", command.CONFIGURATION) from None
-    trials = [loads(line) for line in lines if line.strip() and not line.startswith("#")]
+    trials = []
+    for number, line in enumerate(lines, 1):
+        if line.strip() and not line.startswith("#"):
+            try:
+                trials.append(loads(line))
+            except ConfigError as error:
+                raise ConfigError(f"--replay: {path}: line {number}: {error}") from None
     if not trials:
         raise ConfigError(f"{path}: no schedules, expected one a line")
     return trials

@@ -1,0 +1,32 @@
+"""Annotation of a command's options."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
+from typing import Any, get_type_hints
+
+HELP_KEYS = "--help-keys"
+
+
+@dataclass(frozen=True, slots=True)
+class Argument:
+    """Annotation of a field: its form on the command line."""
+
+    name: str | None = None
+    """Name of the flag, if different from the field's; "": its value's fields are flags."""
+    metavar: str | None = None
+    help: str | None = None
+    """Text of the help, if different from the field's docstring."""
+    positional: bool = False
+    append: bool = False
+    """Whether the flag may be repeated, with a value each."""
+
+
+def argument_of(hint: Any) -> Argument:
+    found = (each for each in getattr(hint, "__metadata__", ()) if isinstance(each, Argument))
+    return next(found, Argument())
+
+
+@cache
+def hints_of(options: type) -> Mapping[str, Any]:
+    return get_type_hints(options, include_extras=True)
