@@ -401,14 +401,16 @@ def tuned(contender: Contender, case: Case, weights: str) -> Scenario:
     Raises:
         ConfigError: the file lacks the contender, or has unknown ones, or the keys cannot be flown.
     """
-    base = contender.base or contender
+    base, where = contender.base or contender, f"{contender.name}, {case.name}"
+    if case.contenders and contender.base and base.name not in case.contenders:
+        there = ", ".join(case.contenders)
+        raise ConfigError(f"{where}: extends: got {base.name!r}, expected one of {there}")
     if contender.keys and base is contender:
         table = reading.to_table(reading.load(case.plant))
         set_keys(case.keys, table)
     else:
         table = reading.to_table(_with_weights(base, case, weights))
     set_keys(contender.keys, table)
-    where = f"{contender.name}, {case.name}"
     scenario = reading.check(table, where)
     if contender.threshold:
         number = None

@@ -710,6 +710,13 @@ def test_an_impossible_contender_is_refused(text: str, said: str) -> None:
     assert not Path("compare").exists()
 
 
+def test_a_contender_cannot_have_weights_that_its_case_lacks() -> None:
+    (own,) = contenders.of_user([written('extends = "trajectory-gap"\ncontrol.horizon = 60')])
+    assert contenders.tuned(own, TARGET, COMPARED).control.horizon == 60
+    with pytest.raises(ConfigError, match="mine, gusts: extends: got 'trajectory-gap', expected"):
+        contenders.tuned(own, BY_CASE["gusts"], COMPARED)
+
+
 def test_two_contenders_have_two_names(capsys: pytest.CaptureFixture[str]) -> None:
     mine, theirs = written(MINE), written(MINE, "paper-event")
     for files in ([mine, mine], [theirs]):
