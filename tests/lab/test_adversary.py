@@ -263,12 +263,12 @@ def test_the_command_prints_what_flies_it_again(
     printed = capsys.readouterr().out
     (again,) = (line for line in printed.splitlines() if line.startswith("    skytether "))
     nearest = msgspec.json.decode(kept.read_bytes(), type=Kept).nearest
-    assert repr(nearest.apart.distance_m) in printed
+    assert f"{nearest.apart.distance_m:.3f}" in printed
     for attack, shown in (
         (again, "zones"),
         (
             f"skytether adversary {shlex.join(SHORT)} --attack {kept}",
-            repr(nearest.apart.distance_m),
+            f"{nearest.apart.distance_m:.3f}",
         ),
     ):
         assert main(shlex.split(attack)[1:]) == 1
@@ -280,7 +280,7 @@ def test_the_command_ends_well_where_all_distances_are_kept(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     assert main(["adversary", *SHORT, "--with", "losses,copies", "--runs", "2", "--random"]) == 0
-    assert "2, losses,copies" in capsys.readouterr().out
+    assert "2, with losses,copies" in capsys.readouterr().out
 
 
 @pytest.mark.usefixtures("here")

@@ -362,5 +362,5 @@ def test_a_zip_of_flat_tables_has_two_axes() -> None:
 
 def test_the_file_of_a_folder_that_cannot_be_read_is_named(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "cf1.csv")
-    with pytest.raises(ConfigError, match=r"cf1.csv: it is no plain file"):
+    with pytest.raises(ConfigError, match=r"cf1.csv: it is not a plain file"):
         reading.files_of("reference.file", str(tmp_path))
