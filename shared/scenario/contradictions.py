@@ -11,6 +11,7 @@ from skytether.shared.law.motion import INTERVALS, JOIN_MAX, SPACING, speed_boun
 from skytether.shared.scenario import reference as shapes
 from skytether.shared.scenario import schemes
 from skytether.shared.scenario.fence import inner_bounds, is_home_inside, margins
+from skytether.shared.scenario.geographic import NORTH_MAX
 from skytether.shared.scenario.grammar import GrammarError, leaves
 from skytether.shared.scenario.mission import Mission, format_goals, parse_goals
 from skytether.shared.scenario.registry import REFERENCES, REPORTS, TRIGGERS, PluginTable
@@ -29,8 +30,8 @@ TINY = 1e-9
 """Rounding tolerance of a product such as 40 · 0.011."""
 
 FENCED_STEPS_MAX = 100_000
-PLACES_MAX = 1_000_000_000
-"""Largest number of places of a show, which takes two minutes to check."""
+PLACES_MAX = 100_000_000
+"""Largest number of places of a show, which takes about ten seconds to check."""
 LOSSY = 0.3
 """Share of lost packets to the vehicle above which horizons must be longer."""
 
@@ -88,7 +89,7 @@ def contradictions(
             repr(sensor.filter),
             "'kalman' with sensor.velocity_every_s = 'never'",
         )
-    wrong = list(_no_scheme(scenario))
+    wrong = [*_no_scheme(scenario), *_no_origin(scenario)]
     yield from wrong
     if wrong:
         return
@@ -99,6 +100,13 @@ def contradictions(
     yield from _no_way(scenario, known)
     if scenario.fence.is_there:
         yield from list(_no_room(scenario)) or _outside(scenario)
+
+
+def _no_origin(scenario: Scenario) -> Iterator[Contradiction]:
+    origin = scenario.reference.origin
+    if origin and (len(origin) != 2 or abs(origin[0]) > NORTH_MAX):
+        expected = f"latitude and longitude, up to {NORTH_MAX:g} degrees north or south"
+        yield "reference.origin", list(origin), expected
 
 
 def _no_way(scenario: Scenario, known: Scenario | None) -> Iterator[Contradiction]:

@@ -28,14 +28,20 @@ def each_with_each(goals: Goals, apart_m: float, height: float) -> tuple[float, 
     return None
 
 
+def drawn(rng: np.random.Generator, below: int) -> Goals:
+    """Goals of fewer than so many vehicles, one to four each, in whole seconds."""
+    goals: Goals = {}
+    for number in range(1, int(rng.integers(2, below))):
+        times_s = np.append(0.0, np.sort(rng.choice(10, rng.integers(0, 4), replace=False) + 1))
+        goals[number] = times_s, rng.uniform(-3.0, 3.0, (len(times_s), 3))
+    return goals
+
+
 @pytest.mark.parametrize("seed", range(20))
 def test_the_first_two_that_are_too_near_are_found(seed: int) -> None:
     rng = np.random.default_rng(seed)
     for _ in range(20):
-        goals: Goals = {}
-        for number in range(1, int(rng.integers(2, 9))):
-            times_s = np.append(0.0, np.sort(rng.choice(10, rng.integers(0, 4), replace=False) + 1))
-            goals[number] = times_s, rng.uniform(-3.0, 3.0, (len(times_s), 3))
+        goals = drawn(rng, 9)
         apart_m, height = rng.uniform(0.1, 1.5), rng.choice([1.0, 0.5, 0.0])
         found = Mission(goals, 3, 1).nearest(apart_m, height)
         assert (found and found[2:]) == pytest.approx(each_with_each(goals, apart_m, height))
@@ -55,10 +61,7 @@ def test_vehicles_that_take_turns_at_a_place_are_not_too_near() -> None:
 def test_paths_that_come_too_near_are_found_between_their_points(seed: int) -> None:
     rng, grid_s = np.random.default_rng(seed), np.linspace(0.0, 12.0, 2401)
     for _ in range(10):
-        goals: Goals = {}
-        for number in range(1, int(rng.integers(2, 6))):
-            times_s = np.append(0.0, np.sort(rng.choice(10, rng.integers(0, 4), replace=False) + 1))
-            goals[number] = times_s, rng.uniform(-3.0, 3.0, (len(times_s), 3))
+        goals = drawn(rng, 6)
         apart_m, height = rng.uniform(0.1, 1.5), rng.choice([1.0, 0.5, 0.0])
         show = Mission(goals, 3, 1, is_show=True)
         places = [show.of(n)(grid_s)[..., 0] * [1.0, 1.0, height] for n in goals]

@@ -227,6 +227,12 @@ def plan(*items: Any, **mission: Any) -> bytes:
     return json.dumps({"fileType": "Plan", "mission": own}).encode()
 
 
+@pytest.mark.parametrize("origin", [[47.0], [47.0, 8.0, 4.0], [120.0, 8.0]])
+def test_an_origin_that_is_no_place_is_refused_by_its_key(origin: list[float]) -> None:
+    with pytest.raises(ConfigError, match=r"reference\.origin: got .* expected latitude and long"):
+        reading.check({"reference": {"origin": origin}}, "it")
+
+
 NORTH = 47.0 + 100.0 / DEGREE_M
 """Latitude 100 m north of the origin [degrees]."""
 
