@@ -614,6 +614,12 @@ trigger = "deviation(0.05) | heartbeat"
 """
 
 
+@pytest.fixture(autouse=True)
+def _elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Files without a folder are written outside of the checkout."""
+    monkeypatch.chdir(tmp_path)
+
+
 def written(text: str, name: str = "mine") -> Path:
     file = Path(f"{name}.toml")
     file.write_text(text)
