@@ -82,7 +82,7 @@ class Server(Endpoint):
         self.patience_ns = terms.dt_ns // 4
         own = scenario.is_mission or scenario.reference.shape == "target"
         if references is None and own:
-            references = lru_cache(capacity)(scenario.make_reference)
+            references = lru_cache(capacity)(scenario.measured_reference)
         self._guided: Guided | None = None
         """Goals of a mission; None without one."""
         if scenario.is_mission and references:

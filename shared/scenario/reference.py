@@ -22,6 +22,8 @@ TURN_S = 3600.0
 """Time after which a target's path is run backwards, then forwards again, to bound the memory for
 the random walk."""
 GRID_BLOCK = 1024
+GAINS_MAX = 10_000
+"""Largest number of steps until the gains of a filter are taken as steady."""
 SAMPLED_S = np.concatenate([0.2347 * np.arange(512), np.geomspace(121.0, 86_400.0, 64)])
 """Times at which a plug-in's trajectory is checked before a flight [s]: dense for two minutes, then
 increasingly sparse up to a day. No round numbers, since a trajectory may be special at those."""
@@ -209,6 +211,73 @@ class _Walk:
             self._velocities = np.concatenate([self._velocities, v[1:]])
             self._positions = np.concatenate([self._positions, p])
         return self._velocities, self._positions
+
+
+class Measured:
+    """States of a target as estimated from its positions, measured with noise at every step.
+
+    A Kalman filter with the steady gains K for white acceleration: prediction at constant velocity
+    over a step, then x ← x + K (z - p). A state between two steps is predicted from the last one.
+    At time 0 the target is known to be at rest.
+
+    Args:
+        target: true states.
+        rng: generator used by this noise only.
+        dt_s: length of a step [s].
+        noise_m: standard deviation of the noise of each coordinate [m], above 0.
+        agility: strength of the white acceleration [m/s per √s].
+    """
+
+    def __init__(
+        self,
+        target: Reference,
+        rng: np.random.Generator,
+        *,
+        dt_s: float,
+        noise_m: float,
+        agility: float,
+    ) -> None:
+        self._target, self._rng = target, rng
+        self._dt_s, self._noise_m = dt_s, noise_m
+        self._gains = _steady_gains(dt_s, noise_m, agility)
+        self._states = target(np.zeros(1))
+
+    def __call__(self, t: Array) -> Array:
+        t = np.maximum(np.asarray(t, dtype=np.float64), 0.0)
+        # 1e-9: rounding errors of a time in steps.
+        steps = np.floor(t / self._dt_s + 1e-9).astype(np.int64)
+        self._estimate_until(int(steps.max(initial=0)))
+        states = self._states[steps]
+        states[..., 0] += states[..., 1] * (t - steps * self._dt_s)[..., None]
+        return states
+
+    def _estimate_until(self, last: int) -> None:
+        first = len(self._states)
+        if last < first:
+            return
+        steps = np.arange(first, first + max(last + 1 - first, GRID_BLOCK))
+        positions = self._target(steps * self._dt_s)[..., 0]
+        noisy = positions + self._noise_m * self._rng.standard_normal(positions.shape)
+        estimated, (k_p, k_v) = np.empty((*noisy.shape, 2)), self._gains
+        p, v = self._states[-1, :, 0], self._states[-1, :, 1]
+        for i, z in enumerate(noisy):
+            p = p + v * self._dt_s
+            p, v = p + k_p * (z - p), v + k_v * (z - p)
+            estimated[i, :, 0], estimated[i, :, 1] = p, v
+        self._states = np.concatenate([self._states, estimated])
+
+
+def _steady_gains(dt_s: float, noise_m: float, agility: float) -> tuple[float, float]:
+    """Gains of position and velocity [1, 1/s] in the steady state of the filter of `Measured`."""
+    F = np.array([[1.0, dt_s], [0.0, 1.0]])
+    Q = agility**2 * np.array([[dt_s**3 / 3.0, dt_s**2 / 2.0], [dt_s**2 / 2.0, dt_s]])
+    P, gain = Q, np.zeros(2)
+    for _ in range(GAINS_MAX):
+        before, gain = gain, P[:, 0] / (P[0, 0] + noise_m**2)
+        if np.abs(gain - before).max() <= 1e-12:
+            break
+        P = F @ (P - np.outer(gain, P[0])) @ F.T + Q
+    return float(gain[0]), float(gain[1])
 
 
 def reflected(free: Any, bound: float) -> tuple[Any, Any]:

@@ -163,6 +163,9 @@ class ReferenceConfig(Section, frozen=True):
     """Strength of the white acceleration of a target [m/s per √s]."""
     turn_every_s: OfServer[Duration] = 0.0
     """Mean time between turns of a target [s]; 0: its velocity changes all the time."""
+    noise_m: OfServer[Annotated[float, Meta(ge=0, le=1e3)]] = 0.0
+    """Noise of a target's position as the server measures it at every step [m]; it filters
+    position and velocity. 0: it knows both."""
     radius_m: Term[Annotated[float, Meta(ge=1e-3, le=shapes.FAR_M)]] = 1.55
     """Half the width of the shape, or of a target's area [m]."""
     period_s: Term[Annotated[float, Meta(ge=0.1, le=86400)]] = 27.5
@@ -545,6 +548,19 @@ class Scenario(Section, frozen=True):
         if isinstance(reference, Mission) and self.mission.allocate:
             return reference.allocated().of(vehicle)
         return reference
+
+    def measured_reference(self, vehicle: int = 1) -> shapes.Reference:
+        """Desired trajectory of a vehicle as the server sees it; see `reference.noise_m`."""
+        reference, config = self.make_reference(vehicle), self.reference
+        if config.shape != "target" or not config.noise_m:
+            return reference
+        return shapes.Measured(
+            reference,
+            stream(self.seed, "target noise", vehicle),
+            dt_s=self.control.dt,
+            noise_m=config.noise_m,
+            agility=config.agility,
+        )
 
     def unallocated_reference(self, vehicle: int = 1) -> shapes.Reference:
         """Desired trajectory of a vehicle; on a mission, before goals are allocated."""

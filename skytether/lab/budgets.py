@@ -48,6 +48,12 @@ REPORTS: Mapping[str, Mapping[str, Any]] = {
         "link.timeout_s": 20.0,
         "link.age_max_s": 10.0,
     },
+    "every 12 s": {
+        "vehicle.report": "silence(12)",
+        "link.heartbeat_s": 12.0,
+        "link.timeout_s": 60.0,
+        "link.age_max_s": 30.0,
+    },
 }
 """Policies by which the vehicle reports its state, and the keys that each changes."""
 EVERY = "every step"

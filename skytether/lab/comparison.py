@@ -225,7 +225,7 @@ ABOUT = (
 def budgets_table(results: Sequence[ComparedCase]) -> Table:
     rows, lines = [], []
     for each in results:
-        best = {budget: _best(each, budget) for budget in BUDGETS}
+        best = {budget: leading(each, budget) for budget in BUDGETS}
         for contender in each.contenders:
             cells = []
             for budget in BUDGETS:
@@ -265,7 +265,7 @@ def _ranked(compared: ComparedCase, budget: float) -> list[ContenderRuns]:
     return sorted(flown, key=lambda each: (math.isnan(each.mean(RMSE)), each.mean(RMSE)))
 
 
-def _best(compared: ComparedCase, budget: float) -> list[ContenderRuns]:
+def leading(compared: ComparedCase, budget: float) -> list[ContenderRuns]:
     """Runs within a budget with the least mean RMSE xy, and those without a significant difference
     from it.
     """

@@ -239,6 +239,11 @@ CASES = (
         _network("", BURSTS),
     ),
     _unsearched("noise-10", "noise of 10 cm", _noise(0.1)),
+    _unsearched(
+        "measured",
+        "a target that the server measures with noise of 20 cm",
+        {"reference.noise_m": 0.2},
+    ),
     Case(
         "route",
         "a route that only the server knows, for 4 s",

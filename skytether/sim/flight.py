@@ -342,7 +342,7 @@ def _fly(
     @cache
     def target(vehicle: int) -> Reference:
         run, number = divmod(vehicle - 1, vehicles)
-        return each[run].make_reference(number + 1)
+        return each[run].measured_reference(number + 1)
 
     has_own = scenario.is_mission or scenario.reference.shape == "target"
     recorder = Recorder(server_columns(scenario.model.axes, scenario.control.scheme), sink)
