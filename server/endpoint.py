@@ -4,6 +4,7 @@ It combines `reception` (messages of vehicles), `sessions`, and `tick` with `con
 for all vehicles).
 """
 
+import math
 from collections import Counter
 from collections.abc import Callable
 from functools import lru_cache, partial
@@ -105,6 +106,7 @@ class Server(Endpoint):
         self._grid = Grid(terms.dt_ns, self._events)
         self._reception = Reception(
             terms,
+            seconds_to_ns(scenario.link.timeout_s),
             boot_id,
             gate or PlainGate(),
             self.sessions,
@@ -151,10 +153,11 @@ class Server(Endpoint):
         else:
             self._grid.rest()
 
-    def close(self, *, now_ns: int) -> None:  # noqa: ARG002 - see `Endpoint`
+    def close(self, *, now_ns: int) -> None:
         for _ in range(CLOSES):
             for session in self.sessions:
-                self._out += session.sealed(encode(Close(session.vehicle, session.number)))
+                close = Close(session.vehicle, session.number)
+                self._out += session.sealed(encode(close), now_ns, worth=math.inf)
 
     def learn_time(self, utc_ns: int, error_ns: int, *, now_ns: int) -> None:
         """See `Endpoint`; narrows the clock offsets of vehicles that report the time of day."""
