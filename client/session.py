@@ -301,7 +301,7 @@ class ServerSession:
         """Send the newest packet again if it was lost, and try paths that were not used for long."""
         if self.paths is None:
             return
-        if resent := self.paths.again(now_ns, range(len(self._addresses))):
+        if resent := self.paths.again(self.hearing.silence_ns, now_ns, range(len(self._addresses))):
             datagram, path = resent
             self._put(datagram, (path,))
         for path in self.paths.looks(now_ns):

@@ -68,13 +68,13 @@ class ServerPaths:
         return self._put(payload, line, self.paths.choose(worth, now_ns, among), now_ns)
 
     def watched(
-        self, vehicle: int, session: int, line: ReplyPath, now_ns: int
+        self, vehicle: int, session: int, line: ReplyPath, silence_ns: int, now_ns: int
     ) -> list[Datagram]:
         """Datagrams that are due: the newest one again if it was lost, and one on each path that
         was not used for long.
         """
         due = []
-        if resent := self.paths.again(now_ns, sorted(self._places)):
+        if resent := self.paths.again(silence_ns, now_ns, sorted(self._places)):
             datagram, path = resent
             due.append(Datagram(datagram, *self._places[path]))
         for path in self.paths.looks(now_ns):

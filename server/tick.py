@@ -149,7 +149,11 @@ class Ticker:
         for session in self._sessions.with_paths.values():
             if session.paths:
                 self._out += session.paths.watched(
-                    session.vehicle, session.number, session.line, now_ns
+                    session.vehicle,
+                    session.number,
+                    session.line,
+                    session.hearing.silence_ns,
+                    now_ns,
                 )
         self._stopwatch.lap("encode")
         self.durations.add(self._stopwatch.total_ns - before_ns)

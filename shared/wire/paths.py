@@ -50,10 +50,11 @@ OUTAGE = 3
 DELAYS = 16
 """Number of newest delays of acknowledgements that are kept."""
 WAIT_NS, WAIT_MIN_NS, WAIT_MAX_NS = 600 * MILLISECOND_NS, 150 * MILLISECOND_NS, 1500 * MILLISECOND_NS
-"""Time for which an acknowledgement is awaited: before the first, at least, at most [ns]."""
+"""Time after which a packet that a report does not name is lost: before the first acknowledgement,
+at least, at most [ns]."""
 SPARE_NS = 50 * MILLISECOND_NS
-"""Delay of an acknowledgement beyond those known that is still awaited [ns]."""
-LOOK_NS, AGAIN_NS, DEAR_MAX = 2 * SECOND_NS, SECOND_NS // 2, 8.0
+"""Delay beyond those known that is still awaited [ns]."""
+LOOK_NS, AGAIN_NS, DEAR_MAX = 2 * SECOND_NS, SECOND_NS, 8.0
 """Time after which an unused path of the least price is tried, and a doubted one again [ns]; largest
 factor by which a dearer path is tried more rarely."""
 ALIKE = 1.25
@@ -99,6 +100,12 @@ def _ahead(sequence: int, of: int) -> int:
     return (sequence - of + half) % SEQUENCES - half
 
 
+def _names(report: Report, arrived: int, sequence: int) -> bool:
+    """Whether a report's mask of a path contains a sequence number."""
+    back = _ahead(report.newest, sequence)
+    return 0 <= back < WINDOW and bool(arrived >> back & 1)
+
+
 @dataclass(slots=True)
 class Path:
     """What is known of one path in the direction in which this end sends."""
@@ -141,26 +148,26 @@ class Path:
             return WAIT_NS
         return _within(min(self.delays_ns) * 3 // 2 + 2 * SPARE_NS)
 
-    @property
-    def wait_ns(self) -> int:
-        """Time after which a packet of which nothing was heard has not arrived."""
-        return _within(max(self.delays_ns) + SPARE_NS) if self.delays_ns else WAIT_NS
-
     def acknowledge(self, report: Report, arrived: int, now_ns: int) -> None:
         waiting = list(self.in_flight)
         self.in_flight.clear()
         for sequence, sent_ns in waiting:
-            back = _ahead(report.newest, sequence)
-            if 0 <= back < WINDOW and arrived >> back & 1:
+            if _names(report, arrived, sequence):
                 self.delays_ns.append(now_ns - sent_ns)
                 self._arrived(sent_ns)
-            elif back >= WINDOW or now_ns - sent_ns > self.quick_ns:
+            elif _ahead(report.newest, sequence) >= WINDOW or now_ns - sent_ns > self.quick_ns:
                 self.missing += 1
             else:
                 self.in_flight.append((sequence, sent_ns))
 
-    def expire(self, now_ns: int) -> None:
-        while self.in_flight and now_ns - self.in_flight[0][1] > self.wait_ns:
+    def expire(self, silence_ns: int, now_ns: int) -> None:
+        """Count packets as lost of which nothing was heard although a report was due.
+
+        Args:
+            silence_ns: longest silence of the other end.
+        """
+        wait_ns = self.quick_ns + silence_ns + SPARE_NS
+        while self.in_flight and now_ns - self.in_flight[0][1] > wait_ns:
             self.in_flight.popleft()
             self.missing += 1
 
@@ -245,10 +252,17 @@ class Paths:
             path.packets += 1
             path.bytes += len(datagram)
 
-    def again(self, now_ns: int, among: Sequence[int]) -> tuple[bytes, int] | None:
-        """Newest datagram, and another path on which it is sent now; None if it may still arrive."""
+    def again(
+        self, silence_ns: int, now_ns: int, among: Sequence[int]
+    ) -> tuple[bytes, int] | None:
+        """Newest datagram, and another path on which it is sent now; None if it may still arrive.
+
+        Args:
+            silence_ns: longest silence of the other end.
+            among: paths that may be used.
+        """
         for path in self.each:
-            path.expire(now_ns)
+            path.expire(silence_ns, now_ns)
         newest = self._newest
         if newest is None:
             return None
@@ -313,9 +327,12 @@ class Paths:
         if path is not None:
             self.each[path].first += 1
             self._mark(report.sequence, path)
+        if not any(report.arrived):  # before the first packet there is nothing to report
+            return
         for one, arrived in zip(self.each, report.arrived, strict=True):
-            if any(report.arrived):  # before the first packet there is nothing to report
-                one.acknowledge(report, arrived, now_ns)
+            one.acknowledge(report, arrived, now_ns)
+        if self._newest and any(_names(report, each, self._newest.sequence) for each in report.arrived):
+            self._newest = None
 
     def _mark(self, sequence: int, path: int) -> None:
         back = _ahead(self._heard if self._heard is not None else sequence, sequence)
