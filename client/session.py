@@ -21,7 +21,7 @@ from skytether.shared.law.terms import Terms
 from skytether.shared.scenario.catalogue import differences
 from skytether.shared.telemetry.record import Reason
 from skytether.shared.wire.drop import Drop, ProtocolError
-from skytether.shared.wire.paths import Paths, split
+from skytether.shared.wire.paths import EVERYWHERE, Paths, split
 from skytether.shared.wire.protocol import (
     Close,
     Heartbeat,
@@ -140,9 +140,7 @@ class ServerSession:
 
     # -- receiving ---------------------------------------------------------------------------
 
-    def hear(
-        self, datagram: bytes, *, path: int = 0, now_ns: int
-    ) -> Horizon | Trajectory | None:
+    def hear(self, datagram: bytes, *, path: int = 0, now_ns: int) -> Horizon | Trajectory | None:
         """Process a datagram of this session; return its horizon or trajectory, if it contains one.
 
         Args:
@@ -298,7 +296,7 @@ class ServerSession:
         self._post(Time(self._vehicle, self.number, step, epoch_us, error_us), now_ns)
 
     def watch_paths(self, now_ns: int) -> None:
-        """Send the newest packet again if it was lost, and try paths that were not used for long."""
+        """Send the newest packet again if it was lost, and try paths that are not known well."""
         if self.paths is None:
             return
         if resent := self.paths.again(self.hearing.silence_ns, now_ns, range(len(self._addresses))):
@@ -312,9 +310,7 @@ class ServerSession:
         if self.number is not None:
             least, proof = min(self._prices), self._proofs.get(path, 0)
             prices = tuple(round(1000 * price / least) for price in self._prices)
-            self._post(
-                PathProof(self._vehicle, self.number, path, proof, prices), now_ns, (path,)
-            )
+            self._post(PathProof(self._vehicle, self.number, path, proof, prices), now_ns, (path,))
 
     def _post(
         self,
@@ -327,10 +323,9 @@ class ServerSession:
         if self.paths is None:
             self._put(self.link.seal(payload), (0,))
             return
-        if isinstance(message, Close):
-            on = range(len(self._addresses))
         if not on:
-            worth = self.paths.alive_worth(self._timeout_ns, now_ns)
+            closes = isinstance(message, Close)
+            worth = EVERYWHERE if closes else self.paths.alive_worth(self._timeout_ns, now_ns)
             on = self.paths.choose(worth, now_ns, range(len(self._addresses)))
         datagram = self.link.seal(self.paths.report() + payload)
         self.paths.sent(datagram, on, now_ns)

@@ -4,7 +4,6 @@ It combines `reception` (messages of vehicles), `sessions`, and `tick` with `con
 for all vehicles).
 """
 
-import math
 from collections import Counter
 from collections.abc import Callable
 from functools import lru_cache, partial
@@ -32,6 +31,7 @@ from skytether.shared.scenario.reference import Reference
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Recorder
 from skytether.shared.wire.drop import Drop
+from skytether.shared.wire.paths import EVERYWHERE
 from skytether.shared.wire.protocol import CLOSES, Close, Refusal, encode
 
 VEHICLES_MAX = 64
@@ -157,7 +157,7 @@ class Server(Endpoint):
         for _ in range(CLOSES):
             for session in self.sessions:
                 close = Close(session.vehicle, session.number)
-                self._out += session.sealed(encode(close), now_ns, worth=math.inf)
+                self._out += session.sealed(encode(close), now_ns, worth=EVERYWHERE)
 
     def learn_time(self, utc_ns: int, error_ns: int, *, now_ns: int) -> None:
         """See `Endpoint`; narrows the clock offsets of vehicles that report the time of day."""

@@ -60,9 +60,7 @@ class ServerPaths:
             self._asked[path] = asked
         return message._replace(proof=asked.proof)
 
-    def sealed(
-        self, payload: bytes, line: ReplyPath, now_ns: int, worth: float
-    ) -> list[Datagram]:
+    def sealed(self, payload: bytes, line: ReplyPath, now_ns: int, worth: float) -> list[Datagram]:
         among = sorted(self._places)
         worth = max(worth, self.paths.alive_worth(self._timeout_ns, now_ns))
         return self._put(payload, line, self.paths.choose(worth, now_ns, among), now_ns)

@@ -196,9 +196,7 @@ class Reception:
             path = session.paths.number(Place(datagram.peer, datagram.socket))
             session.paths.paths.heard(report, datagram.payload, path, now_ns)
 
-    def _prove(
-        self, message: PathProof, call: GateCall, datagram: Datagram, now_ns: int
-    ) -> None:
+    def _prove(self, message: PathProof, call: GateCall, datagram: Datagram, now_ns: int) -> None:
         """Note the address of a path once it is proven; until then ask for the proof there."""
         session = self._sessions.find(message)
         if session is None:

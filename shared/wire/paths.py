@@ -49,18 +49,24 @@ OUTAGE = 3
 """Number of packets lost in a row that count as an outage, and not as lost one by one."""
 DELAYS = 16
 """Number of newest delays of acknowledgements that are kept."""
-WAIT_NS, WAIT_MIN_NS, WAIT_MAX_NS = 600 * MILLISECOND_NS, 150 * MILLISECOND_NS, 1500 * MILLISECOND_NS
+WAIT_NS, WAIT_MIN_NS, WAIT_MAX_NS = (
+    600 * MILLISECOND_NS,
+    150 * MILLISECOND_NS,
+    1500 * MILLISECOND_NS,
+)
 """Time after which a packet that a report does not name is lost: before the first acknowledgement,
 at least, at most [ns]."""
 SPARE_NS = 50 * MILLISECOND_NS
 """Delay beyond those known that is still awaited [ns]."""
 LOOK_NS, AGAIN_NS, DEAR_MAX = 2 * SECOND_NS, SECOND_NS, 8.0
-"""Time after which an unused path of the least price is tried, and a doubted one again [ns]; largest
-factor by which a dearer path is tried more rarely."""
+"""Times after which an unused path of the least price is tried, and a doubted one again [ns], and
+the largest factor by which a dearer path is tried more rarely."""
 ALIKE = 1.25
 """Paths whose expected cost is within this factor of the least take turns."""
 ALIVE_WORTH = 40.0
 """What it costs, in packets, if the other end takes a working link for lost."""
+EVERYWHERE = 1e9
+"""Worth of a message that goes over every path."""
 
 _HEAD, _BIN8 = Struct("<BB"), 0xC4
 _SETS = {
@@ -252,9 +258,7 @@ class Paths:
             path.packets += 1
             path.bytes += len(datagram)
 
-    def again(
-        self, silence_ns: int, now_ns: int, among: Sequence[int]
-    ) -> tuple[bytes, int] | None:
+    def again(self, silence_ns: int, now_ns: int, among: Sequence[int]) -> tuple[bytes, int] | None:
         """Newest datagram, and another path on which it is sent now; None if it may still arrive.
 
         Args:
@@ -331,7 +335,9 @@ class Paths:
             return
         for one, arrived in zip(self.each, report.arrived, strict=True):
             one.acknowledge(report, arrived, now_ns)
-        if self._newest and any(_names(report, each, self._newest.sequence) for each in report.arrived):
+        if self._newest and any(
+            _names(report, each, self._newest.sequence) for each in report.arrived
+        ):
             self._newest = None
 
     def _mark(self, sequence: int, path: int) -> None:
