@@ -391,8 +391,8 @@ async def _fly(
             begun = []
             for *argv, last in stage:
                 flags = [last.format(address) for address in before] or [last]
-                child = started(*argv, *flags, on_event=hear)
-                begun.append(await stack.enter_async_context(child))
+                starting = started(*argv, *flags, on_event=hear)
+                begun.append(await stack.enter_async_context(starting))
             children += begun
             before = [address_text(*child.address) for child in begun]
         began_s = loop.time()
