@@ -18,7 +18,7 @@ from skytether.shell.argument import HELP_KEYS, argument_of, hints_of
 
 ARGUMENTS, OPTIONS = "arguments", "options"
 GROUPS = {
-    "link": ("bind", "server", "to", "secure", "keys", "key-id", "insecure"),
+    "link": ("bind", "server", "path", "to", "secure", "keys", "key-id", "insecure"),
     "page, and control in flight": ("page", "no-page", "linger", "control", "feed", "new-flight"),
     "results and logs": (
         *("out", "json", "figure", "record", "csv", "parquet", "traces", "pcap", "html"),
