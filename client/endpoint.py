@@ -129,6 +129,7 @@ class Client(Endpoint):
             boot_id=self._memory.boot_id,
             paths=paths,
             prices=prices or (1.0,) * len(paths),
+            spread=scenario.link.spread,
             timeout_ns=self._timeout_ns,
             connect_s=scenario.link.connect_s,
             link=link or PlainLink(),

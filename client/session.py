@@ -78,6 +78,7 @@ class ServerSession:
         boot_id: number unique to this run of the client.
         paths: address of the server, or of the netem in front of it, on each path.
         prices: price of a packet on each path.
+        spread: `link.spread`.
         timeout_ns: time without a packet after which an end takes the link for lost [ns].
         connect_s: time after which a vehicle that was never answered gives up [s].
         hearing: measures losses, and chooses the longest silence to allow the server.
@@ -93,6 +94,7 @@ class ServerSession:
         boot_id: int,
         paths: Sequence[Address],
         prices: Sequence[float],
+        spread: str,
         timeout_ns: int,
         connect_s: float,
         link: ClientLink,
@@ -104,7 +106,7 @@ class ServerSession:
         self._terms = terms
         self._vehicle = vehicle
         self._boot_id = boot_id
-        self._addresses, self._prices = paths, prices
+        self._addresses, self._prices, self._spread = paths, prices, spread
         self._server, self._timeout_ns = paths[0], timeout_ns
         self.paths: Paths | None = None
         """Knowledge of the paths of the present session; None with a single path."""
@@ -219,7 +221,7 @@ class ServerSession:
             self.sent = 0
             self.hearing.begin()
             self._proofs.clear()
-            self.paths = Paths(self._prices) if len(self._addresses) > 1 else None
+            self.paths = Paths(self._prices, self._spread) if len(self._addresses) > 1 else None
         self.number, self._server_boot_id = welcome.session, welcome.server_boot_id
         self._is_open = True
         self.link.adopt(now_ns=now_ns)

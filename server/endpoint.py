@@ -15,7 +15,7 @@ from skytether.server.common.clock import ClockMap
 from skytether.server.controller import Controller
 from skytether.server.gate import Gate, PlainGate
 from skytether.server.reception import Reception
-from skytether.server.sessions import Sessions
+from skytether.server.sessions import Session, Sessions
 from skytether.server.tick import Grid, Ticker
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS, seconds_to_ns
 from skytether.shared.core.endpoint import VEHICLES_TOLD_MAX, Datagram, Endpoint, by_name
@@ -106,7 +106,7 @@ class Server(Endpoint):
         self._grid = Grid(terms.dt_ns, self._events)
         self._reception = Reception(
             terms,
-            seconds_to_ns(scenario.link.timeout_s),
+            scenario.link,
             boot_id,
             gate or PlainGate(),
             self.sessions,
@@ -128,6 +128,7 @@ class Server(Endpoint):
             recorder=recorder,
             plans=plans,
         )
+        self._ticked_ns = 0
         self._expire_ns = 0
         """Time of the next search for silent vehicles."""
 
@@ -149,6 +150,7 @@ class Server(Endpoint):
             for session in self.sessions.expire(now_ns):
                 self._events.append(SessionEnded(vehicle=session.vehicle))
         if len(self.sessions):
+            self._ticked_ns = now_ns
             self._ticker.tick(tick_ns, now_ns)
         else:
             self._grid.rest()
@@ -194,12 +196,15 @@ class Server(Endpoint):
     def refused(self) -> Counter[Refusal]:
         return self._reception.refused
 
-    def _of_vehicle(self, row: int) -> dict[str, Any]:
+    def _of_vehicle(self, session: Session) -> dict[str, Any]:
+        row = session.row
         bound_ms = self._clock.bound_ns(row) / MILLISECOND_NS
-        vehicle_figures = {
+        vehicle_figures: dict[str, Any] = {
             "step": int(self.controller.last_step[row]),
             "clock_bound_ms": round(bound_ms, 3),
         }
+        if session.paths:
+            vehicle_figures["paths"] = session.paths.paths.figures(self._ticked_ns)
         scheme = self.controller.scheme
         clock_m, waits = scheme.clock_m(row), scheme.waits(row)
         mission_figures = {"clock_m": clock_m and round(clock_m, 3), "waits": waits or None}
@@ -210,7 +215,7 @@ class Server(Endpoint):
     def figures(self) -> dict[str, Any]:
         ticks = self._ticker.durations
         shown = self.sessions.first(VEHICLES_TOLD_MAX)
-        vehicle_figures = {str(session.vehicle): self._of_vehicle(session.row) for session in shown}
+        vehicle_figures = {str(session.vehicle): self._of_vehicle(session) for session in shown}
         return {
             "vehicles": len(self.sessions),
             "degraded": self._grid.degraded,

@@ -28,14 +28,19 @@ class ServerPaths:
     copies its packets from elsewhere cannot.
 
     Args:
+        spread: `link.spread`.
         entropy: returns this many random bytes.
         timeout_ns: time without a packet after which the vehicle takes the link for lost [ns].
     """
 
     def __init__(
-        self, prices: tuple[int, ...], entropy: Callable[[int], bytes], timeout_ns: int
+        self,
+        prices: tuple[int, ...],
+        spread: str,
+        entropy: Callable[[int], bytes],
+        timeout_ns: int,
     ) -> None:
-        self.paths, self._prices = Paths(prices), prices
+        self.paths, self._prices = Paths(prices, spread), prices
         self._entropy, self._timeout_ns = entropy, timeout_ns
         self._places: dict[int, Place] = {}
         self._asked: dict[int, _Asked] = {}

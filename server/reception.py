@@ -14,7 +14,7 @@ from skytether.server.paths import Place, ServerPaths
 from skytether.server.plausibility import ANEW, BELIEVED, Belief, Plausibility
 from skytether.server.sessions import Session, Sessions
 from skytether.server.tick import Grid
-from skytether.shared.base.units import MICROSECOND_NS, SECOND_NS
+from skytether.shared.base.units import MICROSECOND_NS, SECOND_NS, seconds_to_ns
 from skytether.shared.core.endpoint import Address, Datagram, Events
 from skytether.shared.core.events import (
     BegunAnew,
@@ -33,6 +33,7 @@ from skytether.shared.core.stopwatch import Stopwatch
 from skytether.shared.core.time_of_day import DRIFT, TimeOfDay
 from skytether.shared.law.terms import Terms
 from skytether.shared.scenario.catalogue import differences
+from skytether.shared.scenario.schema import LinkConfig
 from skytether.shared.wire.drop import Drop, ProtocolError
 from skytether.shared.wire.paths import Report, split
 from skytether.shared.wire.protocol import (
@@ -74,7 +75,7 @@ class Reception:
     def __init__(
         self,
         terms: Terms,
-        timeout_ns: int,
+        link: LinkConfig,
         boot_id: int,
         gate: Gate,
         sessions: Sessions,
@@ -86,7 +87,8 @@ class Reception:
         out: list[Datagram],
         events: Events,
     ) -> None:
-        self._terms, self._timeout_ns = terms, timeout_ns
+        self._terms, self._spread = terms, link.spread
+        self._timeout_ns = seconds_to_ns(link.timeout_s)
         self._boot_id = boot_id
         self._gate = gate
         self._sessions = sessions
@@ -203,7 +205,9 @@ class Reception:
             raise ProtocolError(Drop.UNKNOWN_SESSION)
         session.heard_ns = now_ns
         if session.paths is None:
-            session.paths = ServerPaths(message.prices, self._sessions.entropy, self._timeout_ns)
+            session.paths = ServerPaths(
+                message.prices, self._spread, self._sessions.entropy, self._timeout_ns
+            )
         place = Place(datagram.peer, datagram.socket)
         question = session.paths.prove(message, place)
         if question:

@@ -53,6 +53,7 @@ from skytether.shared.scenario.registry import (
 )
 from skytether.shared.scenario.schemes import SchemeProperties
 from skytether.shared.scenario.zones import Zones
+from skytether.shared.wire.paths import PATHS_MAX
 from skytether.shared.wire.protocol import INPUTS_MAX, PAYLOAD_BYTES_MAX
 
 # Bounds of numbers are far beyond any vehicle, and low enough that no time overflows 63 bits of
@@ -74,8 +75,6 @@ Text = Annotated[str, Meta(max_length=TEXT_MAX)]
 Direction = Annotated[str, Meta(max_length=air.TEXT_MAX)]
 
 
-PATHS_MAX = 4
-"""Largest number of paths of a session."""
 SHAPE_CHARS = 15
 """Number of characters of a plug-in's shape in the terms, before its digest."""
 
@@ -403,6 +402,9 @@ class LinkConfig(Section, frozen=True):
     timeout_s: OfEach[Interval] = 1.5
     """Silence after which the vehicle brakes and asks for a new session [s]. The server frees the
     vehicle's number after the same time, or twice this time with heartbeats "auto"."""
+    spread: OfEach[Literal["auto", "best", "all"]] = "auto"
+    """Paths that a message takes, of several: auto: those with the least expected cost, see
+    docs/protocol.md; best: the best one; all: every path."""
     connect_s: OfVehicle[Interval] = 120.0
     """Longest wait of the vehicle for its first session [s]; a new server compiles for up to a
     minute."""

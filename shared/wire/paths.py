@@ -198,10 +198,15 @@ class _Newest:
 
 
 class Paths:
-    """One end of a session with several paths."""
+    """One end of a session with several paths.
 
-    def __init__(self, prices: Sequence[float]) -> None:
-        cheapest = min(prices)
+    Args:
+        prices: price of a packet on each path.
+        spread: `link.spread`.
+    """
+
+    def __init__(self, prices: Sequence[float], spread: str = "auto") -> None:
+        cheapest, self._spread = min(prices), spread
         self.each = [Path(price / cheapest) for price in prices]
         self._sets = _SETS[len(prices)]
         self._sequence = 0
@@ -229,10 +234,12 @@ class Paths:
             worth: what its loss costs, in packets on the cheapest path.
             among: paths that may be used, at least one.
         """
+        if self._spread == "all":
+            return tuple(among)
         failure = [path.failure(now_ns) for path in self.each]
-        costs = []
+        costs, best = [], self._spread == "best"
         for chosen in self._sets:
-            if all(one in among for one in chosen):
+            if all(one in among for one in chosen) and not (best and len(chosen) > 1):
                 missing = math.prod(failure[one] for one in chosen)
                 price = sum(self.each[one].price for one in chosen)
                 costs.append((price + max(worth, 1.0) * missing, chosen))

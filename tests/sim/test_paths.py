@@ -1,6 +1,5 @@
 """Several paths of a session in virtual time, each with a netem of its own."""
 
-import inspect
 from collections.abc import Sequence
 from typing import Any
 
@@ -24,9 +23,6 @@ from skytether.sim.flight import fly, fly_batch
 SLOTS_PER_S = SECOND_NS // SLOT_NS
 BLACK_HOLE = {"uplink": "loss(1)", "downlink": "loss(1)"}
 GOOD = {"uplink": "constant(0.1) & loss(0.2)", "downlink": "constant(0.05)", "price": 3.0}
-NEEDS_CLIENT = pytest.mark.skipif(
-    "paths" not in inspect.signature(Client).parameters, reason="the client has one path"
-)
 
 
 def two_paths(*paths: dict[str, Any], **changes: Any) -> Scenario:
@@ -122,7 +118,6 @@ def test_a_changed_network_of_a_run_in_a_batch_has_the_runs_own_seed() -> None:
         assert record.trace_hash() == alone.trace_hash()
 
 
-@NEEDS_CLIENT
 def test_the_demo_with_two_links_flies_over_both() -> None:
     record = fly(packaged("demo-two-links", duration=10.0, settle=0.0))
     assert np.unique(record.netem["path"]).tolist() == [0, 1]
