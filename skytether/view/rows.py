@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.law.model import Array
-from skytether.shared.scenario.schema import PATHS_MAX, Scenario
+from skytether.shared.scenario.schema import Scenario
 from skytether.shared.scenario.triggers import Compared
 from skytether.shared.telemetry.record import (
     DOWNLINK,
@@ -25,6 +25,7 @@ from skytether.shared.telemetry.record import (
     plan_columns,
     server_columns,
 )
+from skytether.shared.wire.paths import PATHS_MAX
 from skytether.shared.wire.protocol import Mode
 
 AXES = "xyz"
