@@ -92,9 +92,7 @@ def test_each_process_says_what_is_its_own(flown: Record, tmp_path: Path) -> Non
     assert joined.vehicle == SCENARIO.vehicle
 
 
-def test_the_netem_of_a_path_leaves_the_paths_of_the_vehicle(
-    flown: Record, tmp_path: Path
-) -> None:
+def test_the_netem_of_a_path_leaves_the_paths_of_the_vehicle(flown: Record, tmp_path: Path) -> None:
     table = reading.to_table(SCENARIO)
     table["network"]["paths"] = [{"uplink": "loss(0.1)"}, {"uplink": "loss(0.2)"}]
     two = reading.check(table)
