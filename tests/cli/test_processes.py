@@ -13,7 +13,7 @@ import msgspec
 import pytest
 
 from skytether.cli.fly import _tell
-from skytether.cli.processes import Child, _read, record_of, started
+from skytether.cli.processes import Child, _read, feeds_in, record_of, started
 from skytether.shared.core.events import (
     Counted,
     Finished,
@@ -28,6 +28,7 @@ from skytether.shared.core.events import (
     SessionEnded,
 )
 from skytether.shared.scenario.reading import load
+from skytether.shared.telemetry.record import PACKET_COLUMNS, Recorder
 from skytether.shell.command import CommandError
 from skytether.shell.log import LogLine
 from warm import Process
