@@ -1,8 +1,8 @@
 """Two links with outages: what a second link buys, and what its packets cost.
 
-Each flight takes a minute, with delays of 50 to 150 ms each way. The outages of a link, both ways at
-once, have a mean length and cover a share of the time: independently on each link, or half of them,
-or all of them, on both links at the same time.
+Each flight takes a minute, with delays of 50 to 150 ms each way. In an outage a link is out both
+ways. Outages have a mean length and cover a share of the time: independently on each link, or half
+of them, or all of them, on both links at the same time.
 """
 
 import sys
@@ -95,11 +95,14 @@ def fly_cell(cell: Cell) -> FlownCell:
 
 
 def cells(seeds: int) -> list[Cell]:
-    numbers, without = range(1, seeds + 1), [(2.0, 0.0, "none")]
-    kinds = [*without, *product(LENGTHS_S, SHARES, get_args(Common))]
+    numbers = range(1, seeds + 1)
+    without: tuple[float, float, Common] = (2.0, 0.0, "none")
+    kinds = [without, *product(LENGTHS_S, SHARES, get_args(Common))]
     return [
-        Cell(task, *kind, links, seed)
-        for task, kind, links, seed in product(TASKS, kinds, get_args(Links), numbers)
+        Cell(task, length_s, share, common, links, seed)
+        for task, (length_s, share, common), links, seed in product(
+            TASKS, kinds, get_args(Links), numbers
+        )
     ]
 
 
