@@ -14,7 +14,7 @@ from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, replace
 from hashlib import blake2b
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import msgspec
 
@@ -31,6 +31,7 @@ from skytether.shared.core.events import (
     NotRecalled,
     Recalled,
     SessionRefused,
+    address_text,
 )
 from skytether.shared.core.line import parse_line
 from skytether.shared.core.steady import Steady
@@ -43,6 +44,7 @@ from skytether.shell import command, process, terminal
 from skytether.shell.argument import Argument
 from skytether.shell.command import CommandError, ScenarioName
 from skytether.shell.memory import MemoryFile, folder
+from skytether.shell.paths import NetworkPath
 from skytether.shell.process import ProcessOptions
 
 
@@ -52,6 +54,17 @@ class ClientOptions(ProcessOptions):
     """A scenario's name (see `skytether scenarios`) or a .toml file; the same as the server's."""
     server: str = "127.0.0.1:47000"
     """HOST:PORT of netem, or of the server itself; an IPv6 host in brackets, as in [::1]:47000."""
+    path: Annotated[
+        tuple[str, ...],
+        Argument(
+            metavar="LOCAL=HOST:PORT",
+            append=True,
+            help="Path to the server, in place of --server; may be repeated, for one to four paths "
+            "at once. LOCAL is an interface, as in wwan0=ground:47000, or an address of this "
+            "machine, as in 192.0.2.7=ground:47000 or [2001:db8::7]=ground:47000, or empty for "
+            "any. Of several paths, any may be missing for a time.",
+        ),
+    ] = ()
     number: Annotated[int, Argument(name="id")] = 1
     """Number of this vehicle (0 to 65535), unique among the vehicles of a server."""
     vehicles: Annotated[int, Argument(metavar="N")] = 1
@@ -83,7 +96,7 @@ def fly(argv: Sequence[str]) -> None:
     another scenario, is full, or has another client with this number.
     """
     options = command.parse(ClientOptions(), argv, "skytether client", fly.__doc__)
-    server = command.address("--server", options.server)
+    paths = _paths(options)
     command.check_count("--vehicles", options.vehicles, 65_536)
     numbers = range(options.number, options.number + options.vehicles)
     if not (numbers[0] >= 0 and numbers[-1] < 2**16):
@@ -128,17 +141,21 @@ def fly(argv: Sequence[str]) -> None:
         if options.set_parameters and not flying[0].set_parameters():
             kind = f"got vehicle.kind = {scenario.vehicle.kind!r}, expected one with parameters"
             raise CommandError(f"--set-parameters: {kind}", command.CONFIGURATION)
+        peers = [path.peer for path in paths]
+        several: dict[str, Any] = {"paths": peers} if len(peers) > 1 else {}
+        servers = " and ".join(dict.fromkeys(address_text(*peer) for peer in peers))
         clients = [
             Client(
                 scenario,
                 flies,
-                server=server,
+                server=paths[0].peer,
                 vehicle=number,
                 boot_id=secrets.randbits(64),
                 link=link(number),
                 recorder=running.recorder,
                 keeps=memory is not None,
                 before=before,
+                **several,
             )
             for number, flies in zip(numbers, flying, strict=True)
         ]
@@ -148,11 +165,11 @@ def fly(argv: Sequence[str]) -> None:
         running.drive(
             Steady(endpoint),
             bind=None,
-            peers=[server],
+            paths=paths,
             waiting_for=(
                 f"its autopilot at {scenario.vehicle.address}"
                 if line
-                else f"the server at {options.server}"
+                else f"the server at {servers}"
             ),
             insecure=options.insecure,
             line=line,
@@ -172,6 +189,16 @@ def fly(argv: Sequence[str]) -> None:
             refused = isinstance(failure, SessionRefused | NoSession | ParametersUnsafe)
             message = failure.brief if isinstance(failure, ParametersUnsafe) else str(failure)
             raise CommandError(message, command.CONFIGURATION if refused else command.RUN)
+
+
+def _paths(options: ClientOptions) -> Sequence[NetworkPath]:
+    if not options.path:
+        return [NetworkPath("", command.address("--server", options.server))]
+    if options.server != ClientOptions.server:
+        raise CommandError("--path: got --server as well, expected one of them", 2)
+    if options.vehicles > 1:
+        raise CommandError(f"--vehicles: got {options.vehicles} with --path, expected 1", 2)
+    return command.paths("--path", options.path)
 
 
 @contextmanager

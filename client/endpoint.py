@@ -21,7 +21,14 @@ from skytether.client.session import ServerSession
 from skytether.client.vehicle import Vehicle
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.base.units import MICROSECOND_NS, MILLISECOND_NS, SECOND_NS, seconds_to_ns
-from skytether.shared.core.endpoint import VEHICLES_TOLD_MAX, Address, Datagram, Endpoint, by_name
+from skytether.shared.core.endpoint import (
+    PATH_SOCKETS,
+    VEHICLES_TOLD_MAX,
+    Address,
+    Datagram,
+    Endpoint,
+    by_name,
+)
 from skytether.shared.core.events import (
     Failure,
     FenceHolds,
@@ -43,6 +50,7 @@ from skytether.shared.telemetry.record import Reason, Recorder
 from skytether.shared.wire.drop import Drop, ProtocolError
 from skytether.shared.wire.protocol import CLOSES, NO_HORIZON, Close, Mode, stamp_us
 
+NOWHERE: Address = ("", 0)
 VEHICLE_SOCKET = 1
 """Socket used by the vehicle's own port; the server's is 0."""
 ARMED = keys_of(InFlight.ARMED)
@@ -65,6 +73,8 @@ class Client(Endpoint):
     Args:
         scenario: scenario of the vehicle; its terms must equal the server's.
         server: address of the server, or of the netem in front of it.
+        paths: the same on each path, if there are several; `server` is then not used.
+        prices: price of a packet on each path; default: all alike.
         vehicle: number of the vehicle, unique among the vehicles of the server.
         boot_id: number unique to this run of the client.
         keeps: whether the state needed after a restart of the client is saved, see `client.memory`.
@@ -76,7 +86,9 @@ class Client(Endpoint):
         scenario: Scenario,
         flies: Vehicle,
         *,
-        server: Address,
+        server: Address = NOWHERE,
+        paths: Sequence[Address] = (),
+        prices: Sequence[float] = (),
         vehicle: int,
         boot_id: int,
         link: ClientLink | None = None,
@@ -89,7 +101,10 @@ class Client(Endpoint):
         self.keeps = keeps or before is not None
         self._memory = ClientMemory(terms, boot_id, before)
         self._is_mission, self._axes = scenario.is_mission, terms.axes
-        self.vehicle, self._server = vehicle, server
+        paths = paths or (server,)
+        self.vehicle, self._server = vehicle, paths[0]
+        self._path_of = {(PATH_SOCKETS[i], path): i for i, path in enumerate(paths)}
+        """Number of the path, by the socket and the peer of its datagrams."""
         self._timeout_ns = seconds_to_ns(scenario.link.timeout_s)
         self._flies, self._port = flies, flies.port
         if before is not None:
@@ -112,7 +127,10 @@ class Client(Endpoint):
             terms,
             vehicle=vehicle,
             boot_id=self._memory.boot_id,
-            server=server,
+            paths=paths,
+            prices=prices or (1.0,) * len(paths),
+            spread=scenario.link.spread,
+            timeout_ns=self._timeout_ns,
             connect_s=scenario.link.connect_s,
             link=link or PlainLink(),
             hearing=Hearing(self._timeout_ns, terms.dt_ns, scenario.link.fixed_ns),
@@ -124,7 +142,7 @@ class Client(Endpoint):
         self._not_flown: NotFlown | None = None
         self._land_after_s = scenario.vehicle.land_after_s
         self._reported_leap: tuple[float, ...] | None = None
-        self._ground = GroundReports(vehicle, server, self._timeout_ns, self._events)
+        self._ground = GroundReports(vehicle, paths[0], self._timeout_ns, self._events)
         self._fence_report_ns = 0
         """Time before which the fence is not reported again."""
         self._time: TimeOfDay | None = None
@@ -165,11 +183,12 @@ class Client(Endpoint):
             self._attend(self._port, now_ns)
             return
         # Before decryption: a packet from another address costs one comparison.
-        if datagram.peer != self._server:
+        path = self._path_of.get((datagram.socket, datagram.peer))
+        if path is None:
             self.dropped[Drop.ELSEWHERE] += 1
             return
         try:
-            horizon = self._session.hear(datagram.payload, now_ns=now_ns)
+            horizon = self._session.hear(datagram.payload, path=path, now_ns=now_ns)
             if self._pilot.next_ns is None:
                 self._begin(now_ns)
             elif self._failsafe.mode is Mode.INIT:  # the flight went on before there was a session
@@ -299,8 +318,9 @@ class Client(Endpoint):
             return
         observation = pilot.observation(session)
         if observation is not None:
-            session.send(observation)
+            session.send(observation, now_ns=now_ns)
             self._tell_time(now_ns)
+        session.watch_paths(now_ns)
 
     def _tell_leap(self, leap_m: tuple[float, ...] | None) -> None:
         self._reported_leap = leap_m
@@ -347,7 +367,7 @@ class Client(Endpoint):
         self._time_due_ns = now_ns + TIME_NS
         epoch_us = stamp_us(self._pilot.began_ns + self._time.ahead_ns)
         error_us = min(-(-error_ns // MICROSECOND_NS) + 1, TIME_ERROR_MAX_US)
-        self._session.tell_time(self._pilot.flown, epoch_us, error_us)
+        self._session.tell_time(self._pilot.flown, epoch_us, error_us, now_ns=now_ns)
 
     def change(self, scenario: Scenario, keys: frozenset[str], *, now_ns: int) -> None:  # noqa: ARG002
         self._failsafe.armed = scenario.armed
@@ -370,7 +390,7 @@ class Client(Endpoint):
         if self._session.number is not None:
             # A CLOSE is not acknowledged, so it is sent several times.
             for _ in range(CLOSES):
-                self._session.send(Close(self.vehicle, self._session.number))
+                self._session.send(Close(self.vehicle, self._session.number), now_ns=now_ns)
 
     def _mode_changed(self, before: Mode, was: Reason, cause: Reason, now_ns: int) -> None:
         """Act on a change of mode or reason, and report it.
@@ -418,6 +438,8 @@ class Client(Endpoint):
             observed_ns = pilot.starts_ns(compensator.observed)
             vehicle_figures["age_ms"] = (now_ns - observed_ns) / MILLISECOND_NS
             vehicle_figures["plan_age_ms"] = (now_ns - planned_ns) / MILLISECOND_NS
+        if self._session.paths:
+            vehicle_figures["paths"] = self._session.paths.figures(pilot.starts_ns(pilot.flown))
         if self._port is not None:
             vehicle_figures["autopilot"] = self._port.figures()
         return vehicle_figures

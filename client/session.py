@@ -7,12 +7,13 @@ The client echoes the time stamp of every packet of the session, from which the 
 delays. `client.failsafe` decides how packets and silence change the vehicle's mode.
 """
 
+from collections.abc import Sequence
 from typing import Literal, NamedTuple
 
 from skytether.client.failsafe import Failsafe
 from skytether.client.link import AGAIN_NS, ClientLink
 from skytether.shared.base.units import SECOND_NS, seconds_to_ns
-from skytether.shared.core.endpoint import Address, Datagram, Events
+from skytether.shared.core.endpoint import PATH_SOCKETS, Address, Datagram, Events
 from skytether.shared.core.events import Failure, NoAnswer, NoSession, SessionRefused, Unanswered
 from skytether.shared.core.steady import JUMP_NS
 from skytether.shared.law.heartbeat import NUMBERS, Hearing
@@ -20,6 +21,7 @@ from skytether.shared.law.terms import Terms
 from skytether.shared.scenario.catalogue import differences
 from skytether.shared.telemetry.record import Reason
 from skytether.shared.wire.drop import Drop, ProtocolError
+from skytether.shared.wire.paths import EVERYWHERE, Paths, split
 from skytether.shared.wire.protocol import (
     Close,
     Heartbeat,
@@ -28,6 +30,7 @@ from skytether.shared.wire.protocol import (
     Idle,
     Message,
     Observation,
+    PathProof,
     Refusal,
     Time,
     Trajectory,
@@ -73,7 +76,10 @@ class ServerSession:
     Args:
         terms: terms that the server has to agree to.
         boot_id: number unique to this run of the client.
-        server: address of the server, or of the netem in front of it.
+        paths: address of the server, or of the netem in front of it, on each path.
+        prices: price of a packet on each path.
+        spread: `link.spread`.
+        timeout_ns: time without a packet after which an end takes the link for lost [ns].
         connect_s: time after which a vehicle that was never answered gives up [s].
         hearing: measures losses, and chooses the longest silence to allow the server.
         out: list to which datagrams are appended.
@@ -86,7 +92,10 @@ class ServerSession:
         *,
         vehicle: int,
         boot_id: int,
-        server: Address,
+        paths: Sequence[Address],
+        prices: Sequence[float],
+        spread: str,
+        timeout_ns: int,
         connect_s: float,
         link: ClientLink,
         hearing: Hearing,
@@ -97,7 +106,14 @@ class ServerSession:
         self._terms = terms
         self._vehicle = vehicle
         self._boot_id = boot_id
-        self._server = server
+        self._addresses, self._prices, self._spread = paths, prices, spread
+        self._server, self._timeout_ns = paths[0], timeout_ns
+        self.paths: Paths | None = None
+        """Knowledge of the paths of the present session; None with a single path."""
+        self._proofs: dict[int, int] = {}
+        """Number with which the server asked for a proof of each path."""
+        self._greeted = 0
+        """Path of the next HELLO."""
         self._connect_ns = seconds_to_ns(connect_s)
         self.link = link
         self.hearing = hearing
@@ -126,19 +142,29 @@ class ServerSession:
 
     # -- receiving ---------------------------------------------------------------------------
 
-    def hear(self, datagram: bytes, *, now_ns: int) -> Horizon | Trajectory | None:
+    def hear(self, datagram: bytes, *, path: int = 0, now_ns: int) -> Horizon | Trajectory | None:
         """Process a datagram of this session; return its horizon or trajectory, if it contains one.
+
+        Args:
+            path: number of the path over which it came.
 
         Raises:
             ProtocolError: the datagram must be dropped.
         """
+        if self.paths and self.paths.is_copy(datagram, path):
+            raise ProtocolError(Drop.COPY)
         payload = self.link.open(datagram, now_ns=now_ns)
         if payload is None:
-            self._out += [Datagram(answer, self._server) for answer in self.link.outbox()]
+            for answer in self.link.outbox():
+                self._put(answer, (path,))
             # The answer to a CHALLENGE carries the HELLO, so none is due for a while.
             self.hello_ns = now_ns + AGAIN_NS
             return None
-        match self._decode(payload, now_ns):
+        report, payload = split(payload)
+        message = self._decode(payload, now_ns)
+        if report and self.paths and message.vehicle == self._vehicle:
+            self.paths.heard(report, datagram, path, now_ns)
+        match message:
             case Welcome() as welcome:
                 self._welcome(welcome, now_ns)
             case Horizon() | Trajectory() as horizon:
@@ -153,6 +179,12 @@ class ServerSession:
             case Close() as close:
                 self._check(close)
                 self._failsafe.meet(Reason.CLOSED, now_ns=now_ns)
+            case PathProof() as asked:
+                self._check(asked)
+                self._failsafe.heard(now_ns=now_ns)
+                if asked.proof:
+                    self._proofs[path] = asked.proof
+                    self._name(path, now_ns)
             case _:
                 raise ProtocolError(Drop.NOT_FOR_A_CLIENT)
         return None
@@ -188,6 +220,8 @@ class ServerSession:
         if self.number != welcome.session:
             self.sent = 0
             self.hearing.begin()
+            self._proofs.clear()
+            self.paths = Paths(self._prices, self._spread) if len(self._addresses) > 1 else None
         self.number, self._server_boot_id = welcome.session, welcome.server_boot_id
         self._is_open = True
         self.link.adopt(now_ns=now_ns)
@@ -206,7 +240,9 @@ class ServerSession:
             self._refusal = sent
             self._events.append(sent)
 
-    def _check(self, message: Welcome | Horizon | Trajectory | Heartbeat | Close) -> None:
+    def _check(
+        self, message: Welcome | Horizon | Trajectory | Heartbeat | Close | PathProof
+    ) -> None:
         named = message.vehicle, message.session
         if not self._is_open or named != (self._vehicle, self.number):
             raise ProtocolError(Drop.UNKNOWN_SESSION)
@@ -244,22 +280,62 @@ class ServerSession:
             unheard = self.number is None and self._refusal is None
             self.hello_ns = now_ns + (self.link.hello_ns if unheard else AGAIN_NS)
             hello = encode(Hello(self._vehicle, self._boot_id, self._terms))
-            self._out.append(Datagram(self.link.hello(hello, now_ns=now_ns), self._server))
+            self._put(self.link.hello(hello, now_ns=now_ns), (self._greeted,))
+            self._greeted = (self._greeted + 1) % len(self._addresses)
 
     def rest(self, *, now_ns: int) -> None:
         """Delay the next HELLO of a session that waits for its vehicle to take off."""
         if self.number is not None:
             self.hello_ns = now_ns + AGAIN_NS
 
-    def send(self, message: Observation | Close) -> None:
+    def send(self, message: Observation | Close, *, now_ns: int) -> None:
         self.sent = (self.sent + 1) % NUMBERS
-        self._out.append(Datagram(self.link.seal(encode(message)), self._server))
+        self._post(message, now_ns)
 
-    def tell_time(self, step: int, epoch_us: int, error_us: int) -> None:
+    def tell_time(self, step: int, epoch_us: int, error_us: int, *, now_ns: int) -> None:
         """Send the time of day of step 0; this packet does not count in the loss statistics."""
         assert self.number is not None
-        sent = Time(self._vehicle, self.number, step, epoch_us, error_us)
-        self._out.append(Datagram(self.link.seal(encode(sent)), self._server))
+        self._post(Time(self._vehicle, self.number, step, epoch_us, error_us), now_ns)
+
+    def watch_paths(self, now_ns: int) -> None:
+        """Send the newest packet again if it was lost, and try paths that are not known well."""
+        if self.paths is None:
+            return
+        if resent := self.paths.again(self.hearing.silence_ns, now_ns, range(len(self._addresses))):
+            datagram, path = resent
+            self._put(datagram, (path,))
+        for path in self.paths.looks(now_ns):
+            self._name(path, now_ns)
+
+    def _name(self, path: int, now_ns: int) -> None:
+        """Tell the server which path this is."""
+        if self.number is not None:
+            least, proof = min(self._prices), self._proofs.get(path, 0)
+            prices = tuple(round(1000 * price / least) for price in self._prices)
+            self._post(PathProof(self._vehicle, self.number, path, proof, prices), now_ns, (path,))
+
+    def _post(
+        self,
+        message: Observation | Close | Time | PathProof,
+        now_ns: int,
+        on: Sequence[int] = (),
+    ) -> None:
+        """Seal a message and send it on some paths; default: where its arrival costs least."""
+        payload = encode(message)
+        if self.paths is None:
+            self._put(self.link.seal(payload), (0,))
+            return
+        if not on:
+            closes = isinstance(message, Close)
+            worth = EVERYWHERE if closes else self.paths.alive_worth(self._timeout_ns, now_ns)
+            on = self.paths.choose(worth, now_ns, range(len(self._addresses)))
+        datagram = self.link.seal(self.paths.report() + payload)
+        self.paths.sent(datagram, on, now_ns)
+        self._put(datagram, on)
+
+    def _put(self, datagram: bytes, on: Sequence[int]) -> None:
+        for path in on:
+            self._out.append(Datagram(datagram, self._addresses[path], PATH_SOCKETS[path]))
 
     def close(self) -> None:
         """Close the session; only another WELCOME opens one."""

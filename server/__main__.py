@@ -19,7 +19,7 @@ from skytether.server.controller import other_schemes
 from skytether.server.endpoint import VEHICLES_MAX, Server
 from skytether.server.gate import Gate, PlainGate
 from skytether.shared.base import kernel
-from skytether.shared.core.endpoint import Address, Form
+from skytether.shared.core.endpoint import PATH_SOCKETS, Address, Form
 from skytether.shared.core.events import address_text
 from skytether.shared.core.steady import Steady
 from skytether.shared.core.stopwatch import Stopwatch
@@ -38,10 +38,17 @@ from skytether.shell.udp import AddressError
 class ServerOptions(ProcessOptions):
     """Options of `skytether server`."""
 
-    bind: str = "127.0.0.1:47001"
-    """HOST:PORT to listen on; port 0 takes a free one. An IPv6 host is written in brackets, as in
-    [::1]:47001; its socket receives IPv6 only, even for [::]. A name means its IPv4 address if it
-    has one."""
+    bind: Annotated[
+        tuple[str, ...],
+        Argument(
+            metavar="HOST:PORT",
+            append=True,
+            help="HOST:PORT to listen on, by default 127.0.0.1:47001; may be repeated, for one to "
+            "four addresses. Port 0 takes a free one. An IPv6 host is written in brackets, as in "
+            "[::1]:47001; its socket receives IPv6 only, even for [::]. A name means its IPv4 "
+            "address if it has one.",
+        ),
+    ] = ()
     vehicles: Annotated[int, Argument(metavar="N")] = VEHICLES_MAX
     """Largest number of vehicles at once, per worker."""
     workers: Annotated[int, Argument(metavar="N")] = 1
@@ -65,23 +72,27 @@ def serve(argv: Sequence[str]) -> None:
     command.check_count("--vehicles", options.vehicles, 65_536)
     command.check_count("--workers", options.workers, 64)
     command.check_sockets("--workers", options.workers)
-    bind = command.address("--bind", options.bind)
+    bind = [command.address("--bind", text) for text in options.bind or ("127.0.0.1:47001",)]
+    command.check_count("--bind", len(bind), len(PATH_SOCKETS))
+    if options.workers > 1:
+        command.check_count("--bind with --workers", len(bind), 1)
     command.optional_address("--metrics", options.metrics)
     keyring = keys.load(options.keys) if options.keys else None
-    command.check_sealed(bind, secure=bool(keyring) or options.insecure)
+    for each in bind:
+        command.check_sealed(each, secure=bool(keyring) or options.insecure)
     if options.workers == 1:
-        _work(options, keyring, bind)
+        _work(options, keyring, [*bind])
         return
 
     def work(number: int, sock: socket) -> None:
         def run(_: Sequence[str]) -> None:
-            _work(_numbered(options, number), keyring, sock, number)
+            _work(_numbered(options, number), keyring, [sock], number)
 
         sys.exit(command.main(run, (), f"server.{number}"))
 
     _ready(options.config)
     try:
-        worst = workers.run(options.workers, bind, work)
+        worst = workers.run(options.workers, bind[0], work)
     except AddressError as error:
         raise CommandError(str(error)) from None
     if worst:
@@ -116,7 +127,10 @@ def _numbered(options: ServerOptions, number: int) -> ServerOptions:
 
 
 def _work(
-    options: ServerOptions, keyring: Keyring | None, bind: Address | socket, number: int = 0
+    options: ServerOptions,
+    keyring: Keyring | None,
+    bind: list[Address | socket],
+    number: int = 0,
 ) -> None:
     gate: Gate = PlainGate()
     forms: tuple[Form, ...] = ()

@@ -15,7 +15,7 @@ from skytether.server.common.clock import ClockMap
 from skytether.server.controller import Controller
 from skytether.server.gate import Gate, PlainGate
 from skytether.server.reception import Reception
-from skytether.server.sessions import Sessions
+from skytether.server.sessions import Session, Sessions
 from skytether.server.tick import Grid, Ticker
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS, seconds_to_ns
 from skytether.shared.core.endpoint import VEHICLES_TOLD_MAX, Datagram, Endpoint, by_name
@@ -31,6 +31,7 @@ from skytether.shared.scenario.reference import Reference
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Recorder
 from skytether.shared.wire.drop import Drop
+from skytether.shared.wire.paths import EVERYWHERE
 from skytether.shared.wire.protocol import CLOSES, Close, Refusal, encode
 
 VEHICLES_MAX = 64
@@ -105,6 +106,7 @@ class Server(Endpoint):
         self._grid = Grid(terms.dt_ns, self._events)
         self._reception = Reception(
             terms,
+            scenario.link,
             boot_id,
             gate or PlainGate(),
             self.sessions,
@@ -126,6 +128,7 @@ class Server(Endpoint):
             recorder=recorder,
             plans=plans,
         )
+        self._ticked_ns = 0
         self._expire_ns = 0
         """Time of the next search for silent vehicles."""
 
@@ -147,14 +150,16 @@ class Server(Endpoint):
             for session in self.sessions.expire(now_ns):
                 self._events.append(SessionEnded(vehicle=session.vehicle))
         if len(self.sessions):
+            self._ticked_ns = now_ns
             self._ticker.tick(tick_ns, now_ns)
         else:
             self._grid.rest()
 
-    def close(self, *, now_ns: int) -> None:  # noqa: ARG002 - see `Endpoint`
+    def close(self, *, now_ns: int) -> None:
         for _ in range(CLOSES):
             for session in self.sessions:
-                self._out += session.sealed(encode(Close(session.vehicle, session.number)))
+                close = Close(session.vehicle, session.number)
+                self._out += session.sealed(encode(close), now_ns, worth=EVERYWHERE)
 
     def learn_time(self, utc_ns: int, error_ns: int, *, now_ns: int) -> None:
         """See `Endpoint`; narrows the clock offsets of vehicles that report the time of day."""
@@ -191,12 +196,15 @@ class Server(Endpoint):
     def refused(self) -> Counter[Refusal]:
         return self._reception.refused
 
-    def _of_vehicle(self, row: int) -> dict[str, Any]:
+    def _of_vehicle(self, session: Session) -> dict[str, Any]:
+        row = session.row
         bound_ms = self._clock.bound_ns(row) / MILLISECOND_NS
-        vehicle_figures = {
+        vehicle_figures: dict[str, Any] = {
             "step": int(self.controller.last_step[row]),
             "clock_bound_ms": round(bound_ms, 3),
         }
+        if session.paths:
+            vehicle_figures["paths"] = session.paths.paths.figures(self._ticked_ns)
         scheme = self.controller.scheme
         clock_m, waits = scheme.clock_m(row), scheme.waits(row)
         mission_figures = {"clock_m": clock_m and round(clock_m, 3), "waits": waits or None}
@@ -207,7 +215,7 @@ class Server(Endpoint):
     def figures(self) -> dict[str, Any]:
         ticks = self._ticker.durations
         shown = self.sessions.first(VEHICLES_TOLD_MAX)
-        vehicle_figures = {str(session.vehicle): self._of_vehicle(session.row) for session in shown}
+        vehicle_figures = {str(session.vehicle): self._of_vehicle(session) for session in shown}
         return {
             "vehicles": len(self.sessions),
             "degraded": self._grid.degraded,

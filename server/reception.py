@@ -10,10 +10,11 @@ from collections import Counter, deque
 from skytether.server.common.clock import ClockMap, Contradiction
 from skytether.server.controller import Controller
 from skytether.server.gate import Gate, GateCall
+from skytether.server.paths import Place, ServerPaths
 from skytether.server.plausibility import ANEW, BELIEVED, Belief, Plausibility
 from skytether.server.sessions import Session, Sessions
 from skytether.server.tick import Grid
-from skytether.shared.base.units import MICROSECOND_NS, SECOND_NS
+from skytether.shared.base.units import MICROSECOND_NS, SECOND_NS, seconds_to_ns
 from skytether.shared.core.endpoint import Address, Datagram, Events
 from skytether.shared.core.events import (
     BegunAnew,
@@ -32,12 +33,16 @@ from skytether.shared.core.stopwatch import Stopwatch
 from skytether.shared.core.time_of_day import DRIFT, TimeOfDay
 from skytether.shared.law.terms import Terms
 from skytether.shared.scenario.catalogue import differences
+from skytether.shared.scenario.schema import LinkConfig
 from skytether.shared.wire.drop import Drop, ProtocolError
+from skytether.shared.wire.paths import Report, split
 from skytether.shared.wire.protocol import (
     Close,
     Hello,
     Idle,
+    Message,
     Observation,
+    PathProof,
     Refusal,
     Time,
     Welcome,
@@ -70,6 +75,7 @@ class Reception:
     def __init__(
         self,
         terms: Terms,
+        link: LinkConfig,
         boot_id: int,
         gate: Gate,
         sessions: Sessions,
@@ -81,7 +87,8 @@ class Reception:
         out: list[Datagram],
         events: Events,
     ) -> None:
-        self._terms = terms
+        self._terms, self._spread = terms, link.spread
+        self._timeout_ns = seconds_to_ns(link.timeout_s)
         self._boot_id = boot_id
         self._gate = gate
         self._sessions = sessions
@@ -106,6 +113,9 @@ class Reception:
 
     def hear(self, datagram: Datagram, *, now_ns: int) -> Drop | None:
         self._stopwatch.start()
+        if self._sessions.at_place and self._is_copy(datagram):
+            self.dropped[Drop.COPY] += 1
+            return Drop.COPY
         try:
             call = self._gate.open(datagram, now_ns=now_ns)
         except ProtocolError as error:
@@ -123,7 +133,7 @@ class Reception:
             return None
         dropped = None
         try:
-            self._take(call, datagram.peer, now_ns)
+            self._take(call, datagram, now_ns)
         except ProtocolError as error:
             dropped = error.reason
             self.dropped[dropped] += 1
@@ -137,26 +147,39 @@ class Reception:
         if session and datagram.peer not in (session.address, session.home):
             session.other, session.other_ns = datagram.peer, now_ns
 
-    def _take(self, call: GateCall, address: Address, now_ns: int) -> None:
+    def _is_copy(self, datagram: Datagram) -> bool:
+        """Whether a datagram of a vehicle with several paths has come before."""
+        place = Place(datagram.peer, datagram.socket)
+        session = self._sessions.at_place.get(place)
+        if session is None or session.paths is None:
+            return False
+        return session.paths.paths.is_copy(datagram.payload, session.paths.number(place))
+
+    def _take(self, call: GateCall, datagram: Datagram, now_ns: int) -> None:
         """Process one message.
 
         Raises:
             ProtocolError: it is not a vehicle's message, or contains another vehicle's number.
         """
-        message = decode(call.payload, self._terms)
+        report, payload = split(call.payload)
+        message = decode(payload, self._terms)
         self._stopwatch.lap("decode")
         if call.vehicle not in (None, message.vehicle):
             raise ProtocolError(Drop.OF_ANOTHER_VEHICLE)
+        if report and not isinstance(message, Hello):
+            self._hear_report(report, message, datagram, now_ns)
         match message:
             case Observation():
-                self._observe(message, call, address, now_ns)
+                self._observe(message, call, datagram, now_ns)
             case Hello():
-                self._hello(message, call, address, now_ns)
+                self._hello(message, call, datagram, now_ns)
             case Close():
                 self._sessions.end(message.vehicle, message.session)
                 self._events.append(SessionEnded(vehicle=message.vehicle))
             case Time():
                 self._hear_time(message, now_ns)
+            case PathProof():
+                self._prove(message, call, datagram, now_ns)
             case _:
                 raise ProtocolError(Drop.NOT_FOR_A_SERVER)
 
@@ -166,17 +189,46 @@ class Reception:
         self._events.append(event)
         self._report_ns = now_ns + REPORT_NS
 
-    def _hello(self, hello: Hello, call: GateCall, address: Address, now_ns: int) -> None:
+    def _hear_report(
+        self, report: Report, message: Message, datagram: Datagram, now_ns: int
+    ) -> None:
+        session = self._sessions.live(message.vehicle)
+        number = getattr(message, "session", None)
+        if session and session.paths and session.number == number:
+            path = session.paths.number(Place(datagram.peer, datagram.socket))
+            session.paths.paths.heard(report, datagram.payload, path, now_ns)
+
+    def _prove(self, message: PathProof, call: GateCall, datagram: Datagram, now_ns: int) -> None:
+        """Note the address of a path once it is proven; until then ask for the proof there."""
+        session = self._sessions.find(message)
+        if session is None:
+            raise ProtocolError(Drop.UNKNOWN_SESSION)
+        session.heard_ns = now_ns
+        if session.paths is None:
+            session.paths = ServerPaths(
+                message.prices, self._spread, self._sessions.entropy, self._timeout_ns
+            )
+        place = Place(datagram.peer, datagram.socket)
+        question = session.paths.prove(message, place)
+        if question:
+            sealed = call.line.seal(encode(question))
+            self._out.append(Datagram(sealed, datagram.peer, datagram.socket))
+        elif session.paths.number(place) is not None:
+            self._sessions.note_path(session, place)
+
+    def _hello(self, hello: Hello, call: GateCall, datagram: Datagram, now_ns: int) -> None:
+        address = datagram.peer
         row = self._sessions.row_of_other_life(hello)
         if row is not None and self._controller.scheme.restart(row):
             self._events.append(BegunAnew(vehicle=hello.vehicle))
         refusal, number = self._refusal(hello, address, now_ns), 0
         if refusal is Refusal.ACCEPTED:
-            number = self._sessions.welcome(hello, address, call.line, now_ns).number
+            session = self._sessions.welcome(hello, address, call.line, now_ns, datagram.socket)
+            number = session.number
         welcome = Welcome(
             hello.vehicle, number, hello.boot_id, self._boot_id, now_ns, refusal, self._terms
         )
-        self._out.append(Datagram(call.line.seal(encode(welcome)), address))
+        self._out.append(Datagram(call.line.seal(encode(welcome)), address, datagram.socket))
         # After sealing the answer, which creates the channel.
         if refusal is Refusal.ACCEPTED:
             self._gate.admit(call, now_ns=now_ns)
@@ -204,7 +256,7 @@ class Reception:
         return refusal
 
     def _observe(
-        self, observation: Observation, call: GateCall, address: Address, now_ns: int
+        self, observation: Observation, call: GateCall, datagram: Datagram, now_ns: int
     ) -> None:
         session = self._sessions.find(observation) or self._begin(observation, call, now_ns)
         row, forward_ns = session.row, now_ns - observation.step * self._terms.dt_ns
@@ -240,7 +292,7 @@ class Reception:
         # Only the packet with the highest counter may change the address: a copy sent from
         # elsewhere does not, once the original has arrived.
         if call.moves:
-            session.move(address, call.line, now_ns)
+            session.move(datagram.peer, call.line, now_ns, datagram.socket)
         self._grid.arm(now_ns)
 
     def _hear_time(self, message: Time, now_ns: int) -> None:

@@ -253,7 +253,7 @@ class SecureGate:
             # address.
             fresh = self._cookie(peer, now_ns // COOKIE_NS)
             challenge = write_challenge(key, fresh, message[:KEY_BYTES])
-            self._out.append(Datagram(challenge, peer))
+            self._out.append(Datagram(challenge, peer, datagram.socket))
             return None
         keyed = self._vehicles.get(vehicle)
         if keyed is None:
@@ -267,7 +267,7 @@ class SecureGate:
             if not keyed.attempts.grant(now_ns):
                 raise ProtocolError(Drop.TOO_MANY_HANDSHAKES)
         elif not keyed.repeats.grant(now_ns):
-            self._out.append(Datagram(response, peer))
+            self._out.append(Datagram(response, peer, datagram.socket))
             return None
         try:
             noise = Responder(key.psk, prologue(key), message)

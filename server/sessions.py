@@ -16,12 +16,13 @@ from itertools import islice
 import numpy as np
 
 from skytether.server.gate import ReplyPath
+from skytether.server.paths import Place, ServerPaths
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.core.endpoint import Address, Datagram
 from skytether.shared.law.heartbeat import NUMBERS, SESSION_NS, Hearing
 from skytether.shared.law.model import Indices
 from skytether.shared.wire.drop import Drop, ProtocolError
-from skytether.shared.wire.protocol import Hello, Observation, Time
+from skytether.shared.wire.protocol import Hello, Observation, PathProof, Time
 
 OTHER_NS = 2 * SECOND_NS
 """Time for which packets are also sent where a repeat of a recent one has come from [ns]."""
@@ -65,6 +66,10 @@ class Session:
     copies, and the other one is then the vehicle."""
     other_ns: int = 0
     """Time of the newest such repeat."""
+    socket: int = 0
+    """Number of the server's socket at which the vehicle was heard."""
+    paths: ServerPaths | None = None
+    """Paths to the vehicle; None with a single one."""
 
     def number_next(self, now_ns: int) -> int:
         number = self.sent
@@ -75,24 +80,29 @@ class Session:
         """Whether the longest silence that the vehicle allows has passed since the last packet."""
         return 0 < self.asked_ns <= now_ns - self.sent_ns
 
-    def sealed(self, payload: bytes) -> Sequence[Datagram]:
-        """Datagram that carries a message to the vehicle; several if it may be at several
-        addresses.
+    def sealed(self, payload: bytes, now_ns: int, worth: float = 0.0) -> Sequence[Datagram]:
+        """Datagrams that carry a message to the vehicle: one, or copies for several addresses or
+        paths.
 
         Its address may have changed since its HELLO, or somebody may forward copies of its packets
         that arrive first; in that case it must still be reached at its home address, or where the
         repeats come from.
+
+        Args:
+            worth: what the loss of the message costs, in packets.
         """
+        if self.paths and self.paths.is_ready:
+            return self.paths.sealed(payload, self.line, now_ns, worth)
         # Sealed once: with keys the vehicle opens the first copy, and drops others as repeats.
         packet = self.line.seal(payload)
         if self.address == self.home and self.other is None:
-            return (Datagram(packet, self.home),)
+            return (Datagram(packet, self.home, self.socket),)
         places = dict.fromkeys((self.address, self.home, self.other or self.home))
-        return [Datagram(packet, place) for place in places]
+        return [Datagram(packet, place, self.socket) for place in places]
 
-    def move(self, address: Address, line: ReplyPath, now_ns: int) -> None:
-        """Note the address of a newest packet."""
-        self.address, self.line = address, line
+    def move(self, address: Address, line: ReplyPath, now_ns: int, socket: int = 0) -> None:
+        """Note the address of a newest packet, and the server's socket that it came to."""
+        self.address, self.line, self.socket = address, line, socket
         if self.other is not None and now_ns - self.other_ns > OTHER_NS:
             self.other = None
 
@@ -118,7 +128,7 @@ class Sessions:
         keeps_rows: bool = False,
     ) -> None:
         self._hearing = hearing
-        self._entropy = entropy
+        self.entropy = entropy
         self._silence_ns = silence_ns
         self._live: dict[int, Session] = {}
         """Sessions by vehicle."""
@@ -136,6 +146,10 @@ class Sessions:
         """Rows in use, ascending; shape (n,)."""
         self.vehicle = np.zeros(capacity, dtype=np.int64)
         """Number of the vehicle in each row; shape (capacity,)."""
+        self.with_paths: dict[int, Session] = {}
+        """Live sessions with several paths, by vehicle."""
+        self.at_place: dict[Place, Session] = {}
+        """The same sessions, by the proven address of each path."""
         self.idle = np.zeros(capacity, dtype=np.int64)
         """`Idle` reason of the vehicle in each row, as last reported; shape (capacity,)."""
 
@@ -188,7 +202,9 @@ class Sessions:
         oldest = next(iter(self.welcomed_vehicles.values()), None)
         return oldest is None or _is_expected(oldest, now_ns)
 
-    def welcome(self, hello: Hello, address: Address, line: ReplyPath, now_ns: int) -> Session:
+    def welcome(
+        self, hello: Hello, address: Address, line: ReplyPath, now_ns: int, socket: int = 0
+    ) -> Session:
         """Session of the sender of a HELLO, present or new; `is_full` must be False."""
         live = self._live.get(hello.vehicle)
         if live is not None and live.boot_id == hello.boot_id:
@@ -199,7 +215,7 @@ class Sessions:
         if session is None or session.boot_id != hello.boot_id:
             number, hearing = self._number(), self._hearing()
             session = Session(hello.vehicle, number, hello.boot_id, address, address, line, hearing)
-        session.home, session.heard_ns = address, now_ns
+        session.home, session.heard_ns, session.socket = address, now_ns, socket
         # The oldest welcomed vehicle loses its row: `is_full` has found that it is not expected any
         # more.
         if waiting is self.welcomed_vehicles and len(waiting) == len(self._free_rows):
@@ -210,7 +226,7 @@ class Sessions:
     def _number(self) -> int:
         """Random number of a new session, always of the same length on the wire."""
         # The highest bit is set, so that msgpack uses five bytes for every number.
-        return int.from_bytes(self._entropy(4)) | 2**31
+        return int.from_bytes(self.entropy(4)) | 2**31
 
     def _waiting(self, vehicle: int) -> dict[int, Session]:
         return self._successors if self._has_row(vehicle) else self.welcomed_vehicles
@@ -221,7 +237,7 @@ class Sessions:
     def _is_heard(self, live: Session, now_ns: int) -> bool:
         return now_ns - live.heard_ns <= self._silence_ns
 
-    def find(self, message: Observation | Time) -> Session | None:
+    def find(self, message: Observation | Time | PathProof) -> Session | None:
         session = self._live.get(message.vehicle)
         return session if session and session.number == message.session else None
 
@@ -241,6 +257,7 @@ class Sessions:
             raise ProtocolError(Drop.TAKEN)
         del waiting[session.vehicle]
         if before is not None:
+            self._forget_paths(before)
             session.row = before.row
         elif session.vehicle in self._reserved:
             session.row = self._reserved.pop(session.vehicle)
@@ -269,6 +286,7 @@ class Sessions:
 
     def _forget(self, session: Session) -> None:
         del self._live[session.vehicle], self._by_row[session.row]
+        self._forget_paths(session)
         if self._keeps_rows:
             self._reserved[session.vehicle] = session.row
         else:
@@ -278,6 +296,15 @@ class Sessions:
             if successor is not None:
                 self.welcomed_vehicles[session.vehicle] = successor
         self._note_rows()
+
+    def note_path(self, session: Session, place: Place) -> None:
+        self.with_paths[session.vehicle] = self.at_place[place] = session
+
+    def _forget_paths(self, session: Session) -> None:
+        if self.with_paths.pop(session.vehicle, None):
+            gone = [place for place, each in self.at_place.items() if each is session]
+            for place in gone:
+                del self.at_place[place]
 
     def _note_rows(self) -> None:
         self.rows = np.array(sorted(self._by_row), dtype=np.int64)

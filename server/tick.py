@@ -127,7 +127,7 @@ class Ticker:
             block = slice(first, first + BLOCK)
             decisions = controller.decide(rows[block], step[block])
             if len(decisions.batch.sent):
-                self._send_plans(decisions.batch, now_ns)
+                self._send_plans(decisions, now_ns)
             self._stopwatch.lap("encode")
             if self._records:
                 self._record(decisions)
@@ -146,6 +146,15 @@ class Ticker:
         # Last, since a horizon sent at this tick replaces a heartbeat.
         if heartbeats:
             self._send_heartbeats(heartbeats, now_ns)
+        for session in self._sessions.with_paths.values():
+            if session.paths:
+                self._out += session.paths.watched(
+                    session.vehicle,
+                    session.number,
+                    session.line,
+                    session.hearing.silence_ns,
+                    now_ns,
+                )
         self._stopwatch.lap("encode")
         self.durations.add(self._stopwatch.total_ns - before_ns)
 
@@ -159,10 +168,11 @@ class Ticker:
             else:
                 self._events.append(PlanningStopped(vehicle=vehicle, why=str(why)))
 
-    def _send_plans(self, batch: Batch, now_ns: int) -> None:
+    def _send_plans(self, decisions: Decisions, now_ns: int) -> None:
         # The time of sending, not the tick's due time: the vehicle measures the delay by this
         # stamp.
-        sessions, sent_us = self._sessions, stamp_us(now_ns)
+        batch, sessions, sent_us = decisions.batch, self._sessions, stamp_us(now_ns)
+        worths = _worths(decisions) if sessions.with_paths else {}
 
         def header(row: int) -> Header:
             session = sessions.at(row)
@@ -170,7 +180,7 @@ class Ticker:
             return make_header((session.vehicle, session.number, sent_us, number, silence))
 
         for row, payload in self._controller.scheme.encode(batch, header):
-            self._send(sessions.at(row), payload, is_plan=True)
+            self._send(sessions.at(row), payload, now_ns, worths.get(row, 0.0), is_plan=True)
 
     def _send_heartbeats(self, due: Sequence[Session], now_ns: int) -> None:
         for session in due:
@@ -185,10 +195,19 @@ class Ticker:
                     session.number_next(now_ns),
                     session.hearing.silence,
                 )
-                self._send(session, encode(beat), is_plan=False)
+                self._send(session, encode(beat), now_ns, is_plan=False)
 
-    def _send(self, session: Session, payload: bytes, *, is_plan: bool) -> None:
-        datagrams, budget = session.sealed(payload), self._controller.budget
+    def _send(
+        self,
+        session: Session,
+        payload: bytes,
+        now_ns: int,
+        worth: float = 0.0,
+        *,
+        is_plan: bool,
+    ) -> None:
+        datagrams = session.sealed(payload, now_ns, worth)
+        budget = self._controller.budget
         self._out += datagrams
         if budget:
             # The network also carries headers of IP and UDP: 28 bytes, more than a whole heartbeat.
@@ -245,3 +264,17 @@ class Ticker:
             **sent_plans._asdict(),
             disturbance=batch.foresight.disturbance[batch.sent],
         )
+
+
+def _worths(decisions: Decisions) -> dict[int, float]:
+    """What the loss of each vehicle's plan costs, in packets, by its row.
+
+    A trigger sends if the cost of flying on exceeds its threshold, so the threshold is the price of
+    a packet.
+    """
+    rows, verdict = decisions.batch.rows, decisions.verdict
+    if not verdict.compares:
+        return {}
+    with np.errstate(divide="ignore", invalid="ignore"):
+        worths = np.nan_to_num(verdict.figure / verdict.threshold, nan=0.0)
+    return dict(zip(rows.tolist(), worths.tolist(), strict=False))

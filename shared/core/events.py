@@ -45,6 +45,22 @@ class HostFound(msgspec.Struct, frozen=True, tag=True, kw_only=True):
         return f"found {self.host}: it is {self.address}"
 
 
+class PathMissing(msgspec.Struct, frozen=True, tag=True, kw_only=True):
+    path: str
+    """LOCAL=HOST:PORT, as the user has written it."""
+    reason: str
+
+    def __str__(self) -> str:
+        return f"the path {self.path} is down: {self.reason}; it is tried again every second"
+
+
+class PathFound(msgspec.Struct, frozen=True, tag=True, kw_only=True):
+    path: str
+
+    def __str__(self) -> str:
+        return f"the path {self.path} is up"
+
+
 class PageServed(msgspec.Struct, frozen=True, tag=True, kw_only=True):
     address: str
     """Address for a browser; includes a token if the page may change the flight."""
@@ -566,6 +582,8 @@ Event = (
     | Unanswered
     | HostMissing
     | HostFound
+    | PathMissing
+    | PathFound
     | Welcomed
     | ServerSilent
     | ServerHeard

@@ -47,6 +47,9 @@ class Drop(StrEnum):
     OUT_OF_PLACE = "out of place"
     TOO_MANY_HANDSHAKES = "too many handshakes"
 
+    COPY = "copy"
+    """The message has come over another path before."""
+
     # Impossible observations, see `server.plausibility`.
     IMPLAUSIBLE_CLOCK = "implausible: clock"
     IMPLAUSIBLE_HORIZON = "implausible: horizon"

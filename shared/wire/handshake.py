@@ -22,6 +22,7 @@ from skytether.shared.wire.channel import VERSION
 from skytether.shared.wire.drop import Drop, ProtocolError
 from skytether.shared.wire.keys import VehicleKey
 from skytether.shared.wire.noise_nnpsk0 import MESSAGE_BYTES
+from skytether.shared.wire.paths import split
 from skytether.shared.wire.protocol import kind_of
 
 INITIATION, CHALLENGE, RESPONSE = 1, 2, 3
@@ -64,7 +65,7 @@ def check_place(message: bytes, *, in_handshake: bool) -> None:
     Raises:
         ProtocolError: the message is in the wrong place, even if its sender has the key.
     """
-    kind = kind_of(message)
+    kind = kind_of(split(message)[1])
     if kind is None or (kind in _GREETINGS) != in_handshake:
         raise ProtocolError(Drop.OUT_OF_PLACE)
 

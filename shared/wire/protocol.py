@@ -1,4 +1,4 @@
-"""The wire: eight messages, each one msgpack array in one UDP datagram, sealed or plain.
+"""The wire: nine messages, each one msgpack array in one UDP datagram, sealed or plain.
 
     [version, type, vehicle, ...]
 
@@ -16,6 +16,7 @@
 | 7    | TRAJECTORY  | server  | session, step, server_us, age, spacing, knots, number,     |
 |      |             |         | silence                                                    |
 | 8    | TIME        | client  | session, step, epoch_us, error_us                          |
+| 9    | PATH        | both    | session, path, proof, prices                               |
 
 With the scheme "trajectory", TRAJECTORY replaces HORIZON. `docs/protocol.md` describes the bytes.
 
@@ -43,6 +44,7 @@ from skytether.shared.law.heartbeat import NUMBERS
 from skytether.shared.law.model import Array
 from skytether.shared.law.terms import Terms
 from skytether.shared.wire.drop import Drop, ProtocolError
+from skytether.shared.wire.paths import PATHS_MAX
 
 # Below 0x80, so that msgpack writes it in one byte: `kind_of` and the quick decoder rely on that.
 VERSION = 1
@@ -274,6 +276,21 @@ class Time(NamedTuple):
     """Largest error of `epoch_us` [µs]."""
 
 
+class PathProof(NamedTuple):
+    """PATH: names the path that it takes. The server answers with a proof, and sends on the path
+    once the client has returned the proof on it.
+    """
+
+    vehicle: int
+    session: int
+    path: int
+    """Number of the path, from 0."""
+    proof: int
+    """Random number of the server; 0 from a client that has not heard it."""
+    prices: tuple[int, ...]
+    """Price of a packet on each path of the session, in thousandths of the least."""
+
+
 # With 10 % loss, all three are lost once in a thousand times.
 CLOSES = 3
 
@@ -295,7 +312,9 @@ def stamped_ns(stamp: int, near_ns: int) -> int:
     return (near + (stamp - near + half) % STAMPS - half) * MICROSECOND_NS
 
 
-Message = Hello | Welcome | Observation | Horizon | Heartbeat | Close | Trajectory | Time
+Message = (
+    Hello | Welcome | Observation | Horizon | Heartbeat | Close | Trajectory | Time | PathProof
+)
 
 
 class _OrNone(NamedTuple):
@@ -399,6 +418,14 @@ def _knots(value: object, ours: Terms) -> NDArray[np.float32]:
     return numbers.reshape(ours.axes, -1, 2)
 
 
+def _prices(value: object, ours: Terms) -> tuple[int, ...]:  # noqa: ARG001
+    if type(value) is not tuple or not 2 <= len(value) <= PATHS_MAX:
+        raise ProtocolError(Drop.FIELD)
+    if not all(type(price) is int and price in PRICE for price in value):
+        raise ProtocolError(Drop.FIELD)
+    return value
+
+
 def committed_max(terms: Terms) -> int:
     """Largest number of committed steps that fit in a horizon beside its plan; 1 or more."""
     return max(1, min(INPUTS_MAX // terms.axes - terms.horizon, terms.age_max))
@@ -421,6 +448,7 @@ _FLAG = range(2)
 _U16 = range(2**16)
 _U32 = range(2**32)
 _U64 = range(2**64)
+PRICE = range(1, 10**9)
 _CLOCK = range(2**63)
 _STAMP = range(STAMPS)
 _NUMBER = range(NUMBERS)
@@ -444,6 +472,7 @@ _TYPES: tuple[tuple[type[Message], tuple[_Check, ...]], ...] = (
     (Close, (_U16, _U32)),
     (Trajectory, (_U16, _U32, _U32, _STAMP, _AGE, _SPACING, _knots, _NUMBER, _U16)),
     (Time, (_U16, _U32, _U32, _STAMP, _U32)),
+    (PathProof, (_U16, _U32, range(PATHS_MAX), _U64, _prices)),
 )
 """Message of each type number (from 1) and the check of each of its fields on the wire."""
 

@@ -42,6 +42,7 @@ from skytether.shell.argument import Argument
 from skytether.shell.command import CONFIGURATION, INTERRUPTED, CommandError
 from skytether.shell.log import Log
 from skytether.shell.options import read
+from skytether.shell.paths import NetworkPath
 from skytether.shell.udp import AddressError
 
 if TYPE_CHECKING:
@@ -177,7 +178,7 @@ def _probe(options: ProbeOptions, listener: Address) -> None:
         size=options.bytes,
     )
     try:
-        shell = driver.Shell(prober, None, [listener])
+        shell = driver.Shell(prober, None, paths=[NetworkPath("", listener)])
     except AddressError as error:
         raise CommandError(str(error)) from None
     with terminal.progress(f"probing {options.target}", options.duration) as bar:

@@ -222,6 +222,8 @@ class Trial:
 
     seed: Annotated[int, msgspec.Meta(ge=0, le=2**32 - 1)]
     faults: tuple[ScheduledFault, ...]
+    two_paths: bool = False
+    """Whether the vehicles have a second path, on which there is no saboteur."""
 
     @property
     def end_ns(self) -> int:

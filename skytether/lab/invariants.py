@@ -28,6 +28,7 @@ from skytether.shared.law.terms import Terms
 from skytether.shared.scenario.gain import regulator
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Recorder, client_columns
+from skytether.shared.wire.paths import split
 from skytether.shared.wire.protocol import (
     NO_HORIZON,
     Horizon,
@@ -110,7 +111,7 @@ class Gatekeeper:
         if call is None:
             return None
         assert call.vehicle is not None
-        self._down.believe(call.vehicle, call.payload, kind_of(call.payload))
+        self._down.believe(call.vehicle, call.payload, kind_of(split(call.payload)[1]))
         return call._replace(line=_Noted(call.line, call.vehicle, self._life, self._up))
 
     def repeated(self, datagram: Datagram) -> int | None:
@@ -236,7 +237,7 @@ class WatchedLife(Recorder):
         payload = self._link.open(datagram, now_ns=now_ns)
         if payload is None:
             return None
-        kind = kind_of(payload)
+        kind = kind_of(split(payload)[1])
         self._up.believe(self.vehicle, payload, kind)
         life, session = self._up.life(self.vehicle, payload), _session(payload)
         if kind == WELCOME:
@@ -367,7 +368,7 @@ class WatchedLife(Recorder):
         """Horizon in force, identified by its step and its observation."""
         # The step alone is ambiguous: two runs of the server may have planned for the same step.
         for session, life, payload in reversed(self._horizons):
-            horizon = decode(payload, self._terms)
+            horizon = decode(split(payload)[1], self._terms)
             assert isinstance(horizon, Horizon | Trajectory)
             if horizon.step == made_for and horizon.step - horizon.age == self._observed:
                 return session, life, horizon
@@ -473,7 +474,7 @@ REACHED = {mode: _reached(mode) for mode in Mode}
 
 
 def _session(payload: bytes) -> int:
-    session: int = msgpack.unpackb(payload)[3]
+    session: int = msgpack.unpackb(split(payload)[1])[3]
     return session
 
 

@@ -68,6 +68,9 @@ TRAJECTORIES = 0.5
 REKEYING = 0.3
 """Share of the trials in which vehicles renew their keys every REKEY_NS."""
 REKEY_NS = 4 * SECOND_NS
+TWO_PATHS = 0.3
+"""Share of the trials in which vehicles have a second path."""
+SECOND_PATH = ("second netem", 0)
 STEP_FOUND_NS = (BUCKETS + RECENT) * BUCKET_NS
 """Time after a clock step by which the server holds no older clock measurements [ns]."""
 FLOWS = 128
@@ -165,7 +168,8 @@ def _follow_trajectories(table: dict[str, Any], rng: np.random.Generator) -> Non
 
 def short_trial(seed: int) -> Trial:
     rng = stream(seed, "torture", "faults")
-    return Trial(seed, schedule(rng, seconds_to_ns(rng.uniform(*SHORT_S))))
+    two_paths = stream(seed, "torture", "paths").random() < TWO_PATHS
+    return Trial(seed, schedule(rng, seconds_to_ns(rng.uniform(*SHORT_S))), two_paths)
 
 
 def long_trial(seed: int, hours: float = 1.0) -> Trial:
@@ -245,6 +249,9 @@ class Torture:
         self.observer = Observer(stream(trial.seed, "torture", "observer"), self.saboteur)
         self.world.add(OBSERVER, self.observer)
         self.world.add(NETEM[0], self._new_netem(), clock=Clock(CLOCK_NS))
+        if trial.two_paths:
+            second = msgspec.structs.replace(self.scenario, seed=trial.seed + 2**31)
+            self.world.add(SECOND_PATH[0], Proxy(second, server=SERVER, flows=FLOWS))
         self.vehicles: list[TorturedVehicle] = []
         for number, name in enumerate(names, start=1):
             weather = Weather(self.scenario, stream(trial.seed, "wind", number))
@@ -330,7 +337,7 @@ class Torture:
         client = Client(
             self.scenario,
             SimulatedVehicle(self.scenario.dt_ns, plant, sensor),
-            server=SABOTEUR,
+            paths=(SABOTEUR, SECOND_PATH) if self.trial.two_paths else (SABOTEUR,),
             vehicle=vehicle,
             boot_id=self._boot_id(),
             link=life,

@@ -22,7 +22,7 @@ from skytether.shared.base import extras, files
 from skytether.shared.base.errors import ConfigError, RecordingError
 from skytether.shared.base.extras import ExtraMissing
 from skytether.shared.base.printable import printable
-from skytether.shared.core.endpoint import Address
+from skytether.shared.core.endpoint import PATH_SOCKETS, Address
 from skytether.shared.core.events import Event, NoFailsafe, address_text
 from skytether.shared.core.line import HOST_PORT, parse_address
 from skytether.shared.scenario import reading
@@ -31,6 +31,7 @@ from skytether.shared.scenario.schema import Scenario
 from skytether.shell import plugins
 from skytether.shell.argument import HELP_KEYS, Argument
 from skytether.shell.options import key_values, read
+from skytether.shell.paths import PATH_FORM, NetworkPath, parse_path
 from skytether.shell.udp import (
     SPARE_FILES,
     allow_sockets,
@@ -133,6 +134,20 @@ def address(flag: str, text: str) -> Address:
     parsed = parse_address(text)
     if parsed is None:
         raise CommandError(f"{flag}: got {text!r}, expected {HOST_PORT}", CONFIGURATION)
+    return parsed
+
+
+def paths(flag: str, texts: Sequence[str]) -> list[NetworkPath]:
+    """Paths given to a flag, each as LOCAL=HOST:PORT."""
+    check_count(flag, len(texts), len(PATH_SOCKETS))
+    parsed: list[NetworkPath] = []
+    for text in texts:
+        path = parse_path(text)
+        if path is None:
+            raise CommandError(f"{flag}: got {text!r}, expected {PATH_FORM}", CONFIGURATION)
+        if path in parsed:
+            raise CommandError(f"{flag}: got {text!r} twice, expected it once", CONFIGURATION)
+        parsed.append(path)
     return parsed
 
 

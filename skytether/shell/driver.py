@@ -19,17 +19,33 @@ from operator import itemgetter
 from socket import socket
 from typing import Any
 
-from skytether.shared.core.endpoint import Address, Datagram, Endpoint, Form, make_datagram
-from skytether.shared.core.events import Event, Fault, HostFound, HostMissing
+from skytether.shared.core.endpoint import (
+    PATH_SOCKETS,
+    Address,
+    Datagram,
+    Endpoint,
+    Form,
+    make_datagram,
+)
+from skytether.shared.core.events import (
+    Event,
+    Fault,
+    HostFound,
+    HostMissing,
+    PathFound,
+    PathMissing,
+)
 from skytether.shared.core.line import LINE, Line
 from skytether.shared.core.stopwatch import Stopwatch
 from skytether.shell.batch import BATCH_MAX, DatagramBatch, Segments
 from skytether.shell.control import Control
 from skytether.shell.feed import Feed
 from skytether.shell.memory import MemoryFile
+from skytether.shell.paths import NetworkPath, PathSockets
 from skytether.shell.stream import ByteStream
 from skytether.shell.timer import make_timer
 from skytether.shell.udp import (
+    AddressError,
     Names,
     admit_only,
     from_kernel,
@@ -58,6 +74,9 @@ CAME = itemgetter(0)
 DATAGRAM_BYTES_MAX = 65535
 RESOLVE_EVERY_S = 2.0
 """Interval at which names are looked up again [s]: a restarted host may have a new address."""
+CHECK_PATHS_EVERY_S = 1.0
+Numbers = dict[Address, Address]
+"""Numeric addresses by the peers' names."""
 
 
 @dataclass(slots=True)
@@ -79,28 +98,29 @@ class Shell:
     """Drives one endpoint.
 
     Args:
-        bind: address of socket 0, where port 0 takes a free one, or a bound socket; None takes a
-            free port from which the peers can be reached. Further sockets open when the endpoint
-            sends from them.
+        bind: address of socket 0, where port 0 takes a free one, or a bound socket; a list is of
+            sockets 0, 1 and so on. Further sockets open when the endpoint sends from them.
         peers: addresses the endpoint will send to, names or numbers; the endpoint sees them as
             written here and not in the kernel's form.
         stopwatch: measures receiving and sending.
-        forms: forms of the datagrams accepted at socket 0; empty accepts all.
+        forms: forms of the datagrams accepted at the bound sockets; empty accepts all.
         control: control socket for changes of keys in flight.
         feed: socket that sends rows and events to readers.
         line: connection to an autopilot, which becomes socket 1.
-        is_patient: whether to start although a peer's name cannot be resolved yet; the lookup is
-            then repeated.
+        paths: paths to the endpoint's peer; their sockets are PATH_SOCKETS. Of several, any may be
+            unusable; it is then opened later.
+        is_patient: whether to start although the name of a path's peer cannot be resolved yet; the
+            lookup is then repeated.
         memory: file for the state that the endpoint keeps for the next run of its process.
 
     Raises:
-        AddressError: the address cannot be bound, or a name cannot be resolved.
+        AddressError: an address cannot be bound, or a name cannot be resolved.
     """
 
     def __init__(
         self,
         endpoint: Endpoint,
-        bind: Address | socket | None,
+        bind: Address | socket | list[Address | socket] | None,
         peers: Sequence[Address] = (),
         stopwatch: Stopwatch | None = None,
         forms: Sequence[Form] = (),
@@ -108,6 +128,7 @@ class Shell:
         feed: Feed | None = None,
         line: Line | None = None,
         *,
+        paths: Sequence[NetworkPath] = (),
         is_patient: bool = False,
         memory: MemoryFile | None = None,
     ) -> None:
@@ -118,19 +139,32 @@ class Shell:
         self.send_errors = 0
         self._drops = 0
         """Datagrams that the kernel dropped at sockets closed since."""
-        self._names = Names(peers, is_patient=is_patient)
+        self._names = Names(peers)
         self._elsewhere = within_reach_of(self._names.numbers())
-        bound = bind if isinstance(bind, socket) else open_socket(bind or self._elsewhere)
-        assert bind is None or not self._names.missing
-        if forms:
-            admit_only(bound, forms)
-        self._sockets = {0: bound}
+        self._paths = {
+            number: PathSockets(path, is_patient=is_patient)
+            for number, path in zip(PATH_SOCKETS, paths, strict=False)
+        }
+        self._watches_paths = any(path.local for path in paths) or len(paths) > 1
+        self._sockets: dict[int, socket] = {}
+        self.addresses: dict[int, Address] = {}
+        """Addresses of the bound sockets and of the paths' by number."""
         self._stream: ByteStream | None = None
-        if line is not None:
-            with contextlib.ExitStack() as failed:
-                failed.enter_context(bound)
+        bound = bind if isinstance(bind, list) else [bind] if bind else []
+        excused = (AddressError,) if len(paths) > 1 else ()
+        with contextlib.ExitStack() as failed:
+            failed.callback(self._close_sockets)
+            for number, each in enumerate(bound):
+                sock = each if isinstance(each, socket) else open_socket(each)
+                self._put(number, sock)
+                if forms:
+                    admit_only(sock, forms)
+            for number, path in self._paths.items():
+                with contextlib.suppress(*excused):
+                    self._put(number, path.open())
+            if line is not None:
                 self._add(line)
-                failed.pop_all()
+            failed.pop_all()
         self._room = memoryview(bytearray(DATAGRAM_BYTES_MAX))
         """One buffer for all datagrams: copying out of it is faster than allocating many."""
         self._batches: dict[int, DatagramBatch | None] = {}
@@ -142,14 +176,31 @@ class Shell:
         """Newest time passed to the endpoint [ns]; times must not decrease."""
         self._woken_ns = 0
         self._segments = Segments()
-        self.address = from_kernel(bound.getsockname())
+
+    @property
+    def address(self) -> Address:
+        return self.addresses[0]
 
     @property
     def is_local(self) -> bool:
-        """Whether socket 0 and all peers are on this machine."""
-        if self._names.missing:
-            return False
-        return is_loopback(self.address) and is_loopback(self._elsewhere)
+        """Whether the bound sockets, the paths and all peers are on this machine."""
+        addresses = [*self.addresses.values(), self._elsewhere]
+        are_local = [path.is_local for path in self._paths.values()]
+        return all(are_local) and all(map(is_loopback, addresses))
+
+    def _put(self, number: int, sock: socket) -> None:
+        self.addresses[number] = from_kernel(sock.getsockname())
+        self._sockets[number] = sock
+
+    def _close_sockets(self) -> None:
+        for sock in self._sockets.values():
+            sock.close()
+        self._sockets.clear()
+
+    def _names_at(self, number: int) -> Names:
+        """Names of the peers of a socket."""
+        path = self._paths.get(number)
+        return path.names if path else self._names
 
     def _add(self, line: Line) -> None:
         if line.kind in ("tcp", "serial"):
@@ -181,7 +232,10 @@ class Shell:
             self._feed.begin(self._loop)
         if self._memory:
             self._memory.begin(self.endpoint, self._loop)
-        beside = [self._loop.create_task(self._keep_resolving())]
+        beside = [
+            self._loop.create_task(self._keep_resolving()),
+            self._loop.create_task(self._watch_paths()),
+        ]
         if self._stream:
             beside.append(self._loop.create_task(self._stream.run()))
         try:
@@ -202,8 +256,7 @@ class Shell:
             self._drops = self.kernel_drops()
             for sock in self._sockets.values():
                 self._loop.remove_reader(sock)
-                sock.close()
-            self._sockets.clear()
+            self._close_sockets()
             for task in beside:
                 task.cancel()
 
@@ -215,7 +268,7 @@ class Shell:
 
     def _hear(self, number: int) -> None:
         """Hand the datagrams at a socket to the endpoint, one by one, at most BURST_MAX."""
-        receive, name = self._sockets[number].recvfrom_into, self._names.name
+        receive, name = self._sockets[number].recvfrom_into, self._names_at(number).name
         buffer, hear, clock_ns = self._room, self.endpoint.receive, time.monotonic_ns
         stopwatch, is_refused = self._stopwatch, False
         try:
@@ -328,9 +381,9 @@ class Shell:
         now_ns, last_ns = time.monotonic_ns(), self._heard_ns
         stamps_ns = [min(max(stamp_ns, last_ns), now_ns) for stamp_ns in came_ns]
         try:
-            peers = self._names.heard_all(raws)
+            peers = self._names_at(number).heard_all(raws)
         except OSError:  # a network interface is gone
-            payloads, peers, stamps_ns = self._still_here(payloads, raws, stamps_ns)
+            payloads, peers, stamps_ns = self._still_here(number, payloads, raws, stamps_ns)
         self._stopwatch.lap("receive")
         return [
             (came_ns, make_datagram((payload, peer, number)))
@@ -338,7 +391,11 @@ class Shell:
         ]
 
     def _still_here(
-        self, payloads: Sequence[bytes], raws: Sequence[bytes], stamps_ns: Sequence[int]
+        self,
+        number: int,
+        payloads: Sequence[bytes],
+        raws: Sequence[bytes],
+        stamps_ns: Sequence[int],
     ) -> tuple[list[bytes], list[Address], list[int]]:
         """Datagrams that came over an interface which still exists."""
         received: list[bytes] = []
@@ -346,7 +403,7 @@ class Shell:
         kept_ns: list[int] = []
         for payload, raw, came_ns in zip(payloads, raws, stamps_ns, strict=True):
             with contextlib.suppress(OSError):
-                peers.append(self._names.heard(raw))
+                peers.append(self._names_at(number).heard(raw))
                 received.append(payload)
                 kept_ns.append(came_ns)
         return received, peers, kept_ns
@@ -410,11 +467,12 @@ class Shell:
         if sock is None:
             return 0
         payloads, peers, _ = zip(*row, strict=True)
+        names = self._names_at(row[0].socket)
         try:
             if peers.count(peers[0]) == len(peers) and self._segments.suits(payloads):
-                return self._segments.send(sock, payloads, self._names.kernel(peers[0]))
+                return self._segments.send(sock, payloads, names.kernel(peers[0]))
             batch = self._batch(sock) if len(row) >= TOGETHER_MIN else None
-            return batch.send(sock, payloads, list(map(self._names.raw, peers))) if batch else 0
+            return batch.send(sock, payloads, list(map(names.raw, peers))) if batch else 0
         except OSError:  # an invalid address
             return 0
 
@@ -426,48 +484,70 @@ class Shell:
         try:
             sock = self._sockets.get(number)
             if sock is None:
+                if number in self._paths:
+                    raise AddressError(self._paths[number].problem or "the path is not open yet")
                 sock = self._sockets[number] = open_socket(self._elsewhere)
                 heed_refusals(sock)
                 self._listen(number)
-            sock.sendto(payload, self._names.kernel(peer))
+            sock.sendto(payload, self._names_at(number).kernel(peer))
         except OSError as error:  # buffer full, port closed, network down
             self.send_errors += 1
             self.endpoint.undelivered(number, error.strerror or str(error))
 
     async def _keep_resolving(self) -> None:
-        for (host, _), reason in self._names.missing.items():
+        all_names = [self._names, *(path.names for path in self._paths.values())]
+        missing = {peer: why for names in all_names for peer, why in names.missing.items()}
+        for (host, _), reason in missing.items():
             self._on_event(HostMissing(host=host, reason=reason))
-        while self._names.may_change:
+        while any(names.may_change for names in all_names):
             await asyncio.sleep(RESOLVE_EVERY_S)
-            addresses: asyncio.Future[dict[Address, Address]] = self._loop.create_future()
+            addresses: asyncio.Future[list[Numbers]] = self._loop.create_future()
             # A thread and no executor: the loop waits for executors at its end, and a lookup may
             # take 20 s.
-            threading.Thread(target=self._look_up, args=(addresses,), daemon=True).start()
-            self._learn(await addresses)
+            work = all_names, addresses
+            threading.Thread(target=self._look_up, args=work, daemon=True).start()
+            self._learn(all_names, await addresses)
 
-    def _learn(self, addresses: dict[Address, Address]) -> None:
-        late = [
-            (host, addresses[host, port][0])
-            for host, port in self._names.missing.keys() & addresses
-        ]
-        self._names.learn(addresses)
-        if not late:
-            return
-        for host, number in late:
-            self._on_event(HostFound(host=host, address=number))
-        elsewhere = within_reach_of(self._names.numbers())
-        if elsewhere != self._elsewhere:
-            # Socket 0 was bound before the peer's address family was known.
-            self._elsewhere = elsewhere
-            self._drops += kernel_drops(self._sockets[0])
-            self._loop.remove_reader(self._sockets[0])
-            self._sockets[0].close()
-            self._sockets[0] = open_socket(elsewhere)
-            self.address = from_kernel(self._sockets[0].getsockname())
-            self._listen(0)
+    def _learn(self, all_names: Sequence[Names], found: Sequence[Numbers]) -> None:
+        waiting = [number for number, path in self._paths.items() if path.names.missing]
+        late: Numbers = {}
+        for names, addresses in zip(all_names, found, strict=True):
+            late |= {peer: addresses[peer] for peer in names.missing.keys() & addresses}
+            names.learn(addresses)
+        for (host, _), (address, _) in late.items():
+            self._on_event(HostFound(host=host, address=address))
+        for number in waiting:
+            # The socket was bound before the peer's address family was known.
+            path = self._paths[number]
+            if not path.names.missing and path.choose_address():
+                self._open_again(number)
 
-    def _look_up(self, found: "asyncio.Future[dict[Address, Address]]") -> None:
-        numbers = self._names.look_up()
+    def _open_again(self, number: int) -> None:
+        """Open the socket of a path, in place of the one before."""
+        with contextlib.suppress(OSError):  # it is down again
+            before = self._sockets.get(number)
+            self._put(number, self._paths[number].open())
+            if before:
+                self._drops += kernel_drops(before)
+                self._loop.remove_reader(before)
+                before.close()
+            self._listen(number)
+
+    async def _watch_paths(self) -> None:
+        while self._watches_paths:
+            for number, path in self._paths.items():
+                was_up = not path.problem
+                is_up = path.check()
+                if is_up and path.is_outdated:
+                    self._open_again(number)
+                if was_up and not is_up:
+                    self._on_event(PathMissing(path=str(path.path), reason=path.problem))
+                elif is_up and not was_up:
+                    self._on_event(PathFound(path=str(path.path)))
+            await asyncio.sleep(CHECK_PATHS_EVERY_S)
+
+    def _look_up(self, all_names: Sequence[Names], found: "asyncio.Future[list[Numbers]]") -> None:
+        numbers = [names.look_up() for names in all_names]
 
         def tell() -> None:
             if not found.done():

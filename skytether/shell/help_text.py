@@ -18,7 +18,7 @@ from skytether.shell.argument import HELP_KEYS, argument_of, hints_of
 
 ARGUMENTS, OPTIONS = "arguments", "options"
 GROUPS = {
-    "link": ("bind", "server", "to", "secure", "keys", "key-id", "insecure"),
+    "link": ("bind", "server", "path", "to", "secure", "keys", "key-id", "insecure"),
     "page, and control in flight": ("page", "no-page", "linger", "control", "feed", "new-flight"),
     "results and logs": (
         *("out", "json", "figure", "record", "csv", "parquet", "traces", "pcap", "html"),
@@ -115,7 +115,7 @@ def _metavar(hint: Any, text: str) -> str:
     if hint is Path:
         first = text.partition(" ")[0].upper()
         return first if first in ("FILE", "FOLDER") else "PATH"
-    return "HOST:PORT" if hint is str and "HOST:PORT" in text else SHORT[hint]
+    return "HOST:PORT" if hint is str and "HOST:PORT" in text else SHORT.get(hint, "TABLE")
 
 
 def _told(text: str, value: Any, *, required: bool = False) -> str:

@@ -139,14 +139,16 @@ def plain(default: T, argv: Sequence[str]) -> T | None:
 
     Simple flags are `--flag VALUE`, `--flag=VALUE` and the bare `--flag` of a boolean, after at
     most one positional value. A value is a text, a path, a number or a literal, without a leading
-    hyphen.
+    hyphen. A flag that may be repeated takes one value each time.
     """
     fields = dataclasses.fields(default)  # type: ignore[arg-type]
     empty = dataclasses.MISSING
     if any(field.default is empty and field.default_factory is empty for field in fields):
         return None  # a required option may be missing: tyro reports it
-    names, positional = _flags(type(default))
-    hints, words = get_type_hints(type(default)), deque(argv)
+    kind: Any = type(default)
+    names, positional = _flags(kind)
+    hints, words = get_type_hints(kind), deque(argv)
+    repeated = {name for name, hint in hints_of(kind).items() if argument_of(hint).append}
     given: dict[str, Any] = {}
     try:
         if words and not words[0].startswith("-"):
@@ -161,7 +163,12 @@ def plain(default: T, argv: Sequence[str]) -> T | None:
                 given[name] = True
             else:
                 text = value if equals else words.popleft()
-                given[name] = _value(hints[name], text, given=bool(equals))
+                hint = get_args(hints[name])[0] if name in repeated else hints[name]
+                read_value = _value(hint, text, given=bool(equals))
+                if name in repeated:
+                    given[name] = (*given.get(name, ()), read_value)
+                else:
+                    given[name] = read_value
     except (LookupError, ValueError):
         return None
     return dataclasses.replace(default, **given)  # type: ignore[type-var]

@@ -45,6 +45,7 @@ from skytether.shell.journal import Journal, take_up
 from skytether.shell.local import LocalError
 from skytether.shell.log import Log, LogFormat
 from skytether.shell.memory import MemoryFile
+from skytether.shell.paths import NetworkPath
 from skytether.shell.recording import RecordFile
 from skytether.shell.time_of_day import TimeTeller
 from skytether.shell.udp import AddressError, is_loopback
@@ -133,8 +134,9 @@ class Process:
         self,
         endpoint: Endpoint,
         *,
-        bind: Address | socket | None,
+        bind: list[Address | socket] | Address | None,
         waiting_for: str,
+        paths: Sequence[NetworkPath] = (),
         peers: Sequence[Address] = (),
         forms: Sequence[Form] = (),
         insecure: bool = False,
@@ -147,7 +149,7 @@ class Process:
         """Run an endpoint until it has finished or is stopped.
 
         Args:
-            bind, peers, forms, stopwatch, line, is_patient, memory: see `Shell`.
+            bind, paths, peers, forms, stopwatch, line, is_patient, memory: see `Shell`.
             waiting_for: name of the peer whose datagrams the endpoint waits for, for the operator.
             insecure: whether it may run without keys where other machines can reach it.
             ready: called once all checks have passed, before the first datagram is received.
@@ -170,6 +172,7 @@ class Process:
                     heeds,
                     feed,
                     line,
+                    paths=paths,
                     is_patient=is_patient,
                     memory=memory,
                 )
@@ -178,13 +181,14 @@ class Process:
             except AddressError as error:
                 raise CommandError(str(error)) from None
             if self.secure is False and not (shell.is_local or insecure):
-                raise unsealed(*peers or (shell.address,))
+                to = dict.fromkeys(path.peer for path in paths) or shell.addresses.values()
+                raise unsealed(*to)
             ready()
             began_s = time.process_time()
 
             def start() -> None:
-                host, port = shell.address
-                out.say(Listening(host=host, port=port, waiting_for=waiting_for))
+                for host, port in shell.addresses.values():
+                    out.say(Listening(host=host, port=port, waiting_for=waiting_for))
                 if self.secure is False:
                     out.say(Plaintext(local=shell.is_local))
                 if served:
@@ -256,17 +260,18 @@ def begin(
         CommandError: a file or a socket cannot be created; at the end, the record is incomplete.
     """
     taken_up = take_up(options.control, options.config, new_flight=options.new_flight)
-    part = None if options.record and options.record.suffix == RECORDING else options.record
+    file = None if options.record and options.record.suffix == RECORDING else options.record
     with ExitStack() as stack:
         recording = None
-        if part:
-            recording = stack.enter_context(recorded(part, columns))
+        if file:
+            recording = stack.enter_context(recorded(file, columns))
         elif keeps_rows:
             recording = stack.enter_context(recorded_meanwhile(columns))
         feed = stack.enter_context(_fed(name, options, secure=bool(secure)))
         recorder = recording.recorder if recording else None
         if feed:
-            recorder = _followed(recorder or Recorder(columns), feed, name, columns)
+            part = name.partition(" ")[0]
+            recorder = _followed(recorder or Recorder(columns), feed, part, columns)
         news = [*warnings, *taken_up.news]
         yield Process(
             f"{name}.{number}" if number else name,

@@ -35,6 +35,7 @@ SPARE_FILES = 48
 FIND_S = 2.0
 """Longest time for which the start of a patient process waits for a name's address [s]."""
 
+_SO_BINDTODEVICE = 25
 _SO_SNDBUFFORCE, _SO_RCVBUFFORCE, _SO_MEMINFO, _MEMINFO_DROPS = 32, 33, 55, 8
 _IP_RECVERR, _IPV6_RECVERR, _MSG_ERRQUEUE, _FROM_THIS_MACHINE = 11, 25, 0x2000, 1
 _SO_ATTACH_FILTER, _UDP_HEADER_BYTES = 26, 8
@@ -61,7 +62,7 @@ def within_reach_of(peers: Iterable[Address]) -> Address:
 
 
 def is_loopback(address: Address) -> bool:
-    return _is_numeric(address[0]) and ipaddress.ip_address(address[0]).is_loopback
+    return is_numeric(address[0]) and ipaddress.ip_address(address[0]).is_loopback
 
 
 def leads_back(address: Address, bound: Address) -> bool:
@@ -95,32 +96,45 @@ def _is_own(host: str) -> bool:
     return True
 
 
-def open_socket(address: Address, *, shared: bool = False) -> socket.socket:
+def open_socket(address: Address, *, shared: bool = False, interface: str = "") -> socket.socket:
     """Non-blocking UDP socket with large buffers; an IPv6 socket receives IPv6 only.
 
     Args:
         address: a name or a number, of either family.
         shared: whether several sockets may have this address; the kernel then distributes the
             peers.
+        interface: network interface for all its datagrams; empty for any.
 
     Raises:
-        AddressError: the address cannot be bound.
+        AddressError: the address cannot be bound, or the interface not used.
     """
     try:
-        if not _is_numeric(address[0]):
+        if not is_numeric(address[0]):
             address = look_up(address)
         six = ":" in address[0]
         sock = socket.socket(socket.AF_INET6 if six else socket.AF_INET, socket.SOCK_DGRAM)
         try:
             _prepare(sock, shared=shared)
+            if interface:
+                _bind_to_interface(sock, interface)
             sock.bind(to_kernel(address))
         except OSError:
             sock.close()
             raise
     except OSError as error:
-        reason = error.strerror or error
-        raise AddressError(f"cannot listen on {address_text(*address)}: {reason}") from None
+        at, reason = interface or address_text(*address), error.strerror or error
+        raise AddressError(f"cannot listen on {at}: {reason}") from None
     return sock
+
+
+def _bind_to_interface(sock: socket.socket, interface: str) -> None:
+    if sys.platform != "linux":
+        raise OSError("only Linux binds a socket to an interface; give a local address instead")
+    try:
+        sock.setsockopt(socket.SOL_SOCKET, _SO_BINDTODEVICE, interface.encode())
+    except PermissionError as error:
+        expected = "Linux before 5.7 requires CAP_NET_RAW; give a local address instead"
+        raise OSError(f"{error.strerror}; {expected}") from None
 
 
 def _prepare(sock: socket.socket, *, shared: bool) -> None:
@@ -250,12 +264,20 @@ class Names:
         peers: names or numbers.
         is_patient: whether a name that cannot be resolved now may be resolved by `look_up` later;
             until then nothing can be sent there.
+        family: address family of all numbers.
 
     Raises:
         AddressError: a name cannot be resolved, and `is_patient` is false.
     """
 
-    def __init__(self, peers: Iterable[Address], *, is_patient: bool = False) -> None:
+    def __init__(
+        self,
+        peers: Iterable[Address],
+        *,
+        is_patient: bool = False,
+        family: int = socket.AF_UNSPEC,
+    ) -> None:
+        self._family = family
         self.missing: dict[Address, str] = {}
         self._numbers: dict[Address, Address] = {}
         self._by_number: dict[Address, Address] = {}
@@ -263,7 +285,7 @@ class Names:
         self._heard: dict[RawAddress, Address] = {}
         self._reached: dict[Address, tuple[tuple[Any, ...], RawAddress]] = {}
         for peer in peers:
-            if is_patient and not _is_numeric(peer[0]):
+            if is_patient and not is_numeric(peer[0]):
                 self._add_patiently(peer)
             else:
                 self.add(peer)
@@ -276,7 +298,7 @@ class Names:
 
         def find() -> None:
             try:
-                addresses[peer] = look_up(peer)
+                addresses[peer] = look_up(peer, self._family)
             except OSError as error:
                 self.missing[peer] = error.strerror or str(error)
 
@@ -294,10 +316,10 @@ class Names:
             AddressError: its name cannot be resolved.
         """
         try:
-            self.learn({peer: look_up(peer)})
+            self.learn({peer: look_up(peer, self._family)})
         except OSError as error:
             raise AddressError(f"cannot find {peer[0]}: {error.strerror or error}") from None
-        if not _is_numeric(peer[0]):
+        if not is_numeric(peer[0]):
             self._names.append(peer)
 
     @property
@@ -377,7 +399,7 @@ class Names:
         addresses = {}
         for name in self._names:
             with contextlib.suppress(OSError):
-                addresses[name] = look_up(name)
+                addresses[name] = look_up(name, self._family)
         return addresses
 
     def learn(self, found: dict[Address, Address]) -> None:
@@ -389,18 +411,18 @@ class Names:
         self._reached.clear()
 
 
-def look_up(peer: Address) -> Address:
-    """Numeric address of a name or number, IPv4 where a name has both; blocks.
+def look_up(peer: Address, family: int = socket.AF_UNSPEC) -> Address:
+    """Numeric address of a name or number, of either family, IPv4 where a name has both; blocks.
 
     Raises:
         OSError: it cannot be resolved.
     """
-    entries = socket.getaddrinfo(*peer, type=socket.SOCK_DGRAM)
+    entries = socket.getaddrinfo(*peer, family=family, type=socket.SOCK_DGRAM)
     four = [entry for entry in entries if entry[0] == socket.AF_INET]
     return from_kernel((four or entries)[0][4])
 
 
-def _is_numeric(host: str) -> bool:
+def is_numeric(host: str) -> bool:
     try:
         ipaddress.ip_address(host)
     except ValueError:

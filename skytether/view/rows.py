@@ -25,6 +25,7 @@ from skytether.shared.telemetry.record import (
     plan_columns,
     server_columns,
 )
+from skytether.shared.wire.paths import PATHS_MAX
 from skytether.shared.wire.protocol import Mode
 
 AXES = "xyz"
@@ -153,6 +154,7 @@ def check_values(part: str, rows: Rows, scenario: Scenario) -> None:
     most = {
         "step": int(FLOWN_S_MAX / scenario.control.dt),
         "begins": int(FLOWN_S_MAX / scenario.control.dt),
+        "path": PATHS_MAX - 1,
         "delay_ns": DELAY_NS_MAX,
         "arrived_ns": 2**62,
         "age_ns": 2**62,

@@ -71,6 +71,27 @@ QUICK = [
         ("netem --server [name]:1", "netem: --server: got '[name]:1', expected HOST:PORT"),
         ("client --server [1::2::3]:4", "client: --server: got '[1::2::3]:4', expected HOST:PORT"),
         ("client --server [::1]:65536", "client: --server: got '[::1]:65536', expected HOST:PORT"),
+        ("client --path ground:1", "client: --path: got 'ground:1', expected LOCAL=HOST:PORT"),
+        ("client --path ::1=g:1", "client: --path: got '::1=g:1', expected LOCAL=HOST:PORT"),
+        ("client --path =g:1 --path =g:1", "client: --path: got '=g:1' twice, expected it once"),
+        (
+            "client " + " ".join(f"--path =g:{port}" for port in range(5)),
+            "client: --path: got 5, expected 1 to 4",
+        ),
+        ("client --path =g:1 --server g:2", "client: --path: got --server as well, expected"),
+        ("client --path =g:1 --vehicles 2", "client: --vehicles: got 2 with --path, expected 1"),
+        (
+            "server " + " ".join(f"--bind 127.0.0.1:{port}" for port in range(5)),
+            "server: --bind: got 5, expected 1 to 4",
+        ),
+        (
+            "server --workers 2 --bind 127.0.0.1:0 --bind 127.0.0.2:0",
+            "server: --bind with --workers: got 2, expected 1 to 1",
+        ),
+        (
+            "server --bind 127.0.0.1:0 --bind 0.0.0.0:0",
+            "server: 0.0.0.0:0: other machines can reach it and there are no keys",
+        ),
         ("client --id -1", "client: --id: got -1, expected 0 to 65535"),
         ("netem --server nobody.invalid:1", "netem: cannot find nobody.invalid: "),
         ("scenarios paper", "scenarios: got 'paper', expected nothing"),

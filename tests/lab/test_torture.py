@@ -280,7 +280,7 @@ def no_latch(patch: pytest.MonkeyPatch) -> None:
 def no_home(patch: pytest.MonkeyPatch) -> None:
     """Packets go only to the address of the newest observation."""
 
-    def sealed(self: Session, payload: bytes) -> tuple[Datagram]:
+    def sealed(self: Session, payload: bytes, *_: float) -> tuple[Datagram]:
         return (Datagram(self.line.seal(payload), self.address),)
 
     patch.setattr(Session, "sealed", sealed)

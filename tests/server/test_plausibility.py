@@ -317,10 +317,10 @@ def oddly(
     """Flight with a changed field in one observation, by its number from 0."""
     send, said = ServerSession.send, iter(range(10**9))
 
-    def lie(self: ServerSession, message: Any) -> None:
+    def lie(self: ServerSession, message: Any, *, now_ns: int) -> None:
         if isinstance(message, Observation) and next(said) == number:
             message = message._replace(**{field: getattr(message, field) + value})
-        send(self, message)
+        send(self, message, now_ns=now_ns)
 
     monkeypatch.setattr(ServerSession, "send", lie)
     return fly(scenario(control={"feedback": feedback}, network=LOSSLESS))

@@ -363,7 +363,7 @@ def terms_with(**wrong: object) -> list[object]:
         (OBSERVATION, 0, 2, "version"),
         (OBSERVATION, 0, True, "version"),
         (OBSERVATION, 1, 0, "type"),
-        (OBSERVATION, 1, 9, "type"),
+        (OBSERVATION, 1, 10, "type"),
         (OBSERVATION, 1, "3", "type"),
         (OBSERVATION, 2, 2**16, "field"),
         (OBSERVATION, 2, True, "field"),

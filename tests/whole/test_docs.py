@@ -1,10 +1,12 @@
 """Documents: their commands run, their links have targets, their names exist."""
 
+import inspect
 import re
 import shlex
 import signal
 import subprocess
 import time
+from contextlib import ExitStack
 from importlib import metadata
 from pathlib import Path
 
@@ -14,6 +16,7 @@ import warm
 from helpers import SKYTETHER, ran
 from skytether.__main__ import main
 from skytether.cli.set import set_keys
+from skytether.client.endpoint import Client
 from skytether.shell import command
 
 pytestmark = pytest.mark.long
@@ -125,22 +128,36 @@ def terminals() -> list[list[str]]:
     ]
 
 
+@pytest.mark.skipif(
+    "paths" not in inspect.signature(Client).parameters, reason="Client has one path only"
+)
+@pytest.mark.usefixtures("documented_ports")
+def test_the_documented_links_carry_one_flight(tmp_path: Path) -> None:
+    *_, (keygen, *processes), _ = blocks(ROOT / "docs" / "operating.md")
+    assert ran(*skytether(keygen), cwd=tmp_path).returncode == 0
+    for there, here in (("wwan.", "lo"), ("192.0.2.1", "127.0.0.1"), ("198.51.100.1", "127.0.0.2")):
+        processes = [re.sub(there, here, line) for line in processes]
+    said = fly_together(processes, tmp_path)
+    assert said.count("listening on ") == 2
+
+
 def fly_together(lines: list[str], folder: Path) -> str:
-    """Output of a client that flies with a server and a netem."""
-    server, netem, client = (skytether(line) for line in lines)
+    """Output of the last command, a client, that flies with the others, a server and netem."""
+    *others, client = (skytether(line) for line in lines)
     client += ["--settle", "0", "--duration", "6"]  # with keys the first plan comes after 3 s
-    with (
-        subprocess.Popen(server, cwd=folder, stdout=subprocess.DEVNULL) as one,
-        subprocess.Popen(netem, cwd=folder, stdout=subprocess.DEVNULL) as two,
-    ):
+    with ExitStack() as stack:
+        started = [
+            stack.enter_context(subprocess.Popen(other, cwd=folder, stdout=subprocess.DEVNULL))
+            for other in others
+        ]
         try:
             run = ran(*client, cwd=folder, timeout=60)
         finally:
-            one.terminate()
-            two.terminate()
+            for process in started:
+                process.terminate()
     assert run.returncode == 0, run.stderr
     assert "session open, flying" in run.stdout
-    assert (one.returncode, two.returncode) == (0, 0)
+    assert [process.returncode for process in started] == [0] * len(started)
     return run.stdout
 
 

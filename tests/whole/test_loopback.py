@@ -32,6 +32,7 @@ from skytether.shared.telemetry.record import (
 )
 from skytether.shell import timer, udp
 from skytether.shell.driver import Shell, new_event_loop
+from skytether.shell.paths import NetworkPath
 from skytether.shell.udp import AddressError, open_socket
 from skytether.sim.flight import fly as fly_virtually
 
@@ -221,7 +222,7 @@ async def test_a_peer_is_seen_as_it_was_written_whatever_the_kernel_calls_it(
     answerer = Shell(Echo(), loopback)
     peer = (name, answerer.address[1])
     asker = Asker(peer)
-    driver = Shell(asker, None, [peer])
+    driver = Shell(asker, None, paths=[NetworkPath("", peer)])
     assert driver.address[0] == loopback[0]
     async with driven(answerer):
         await asyncio.wait_for(driver.run(), 5)
@@ -233,7 +234,7 @@ async def test_a_host_with_a_new_address_is_found_again(monkeypatch: pytest.Monk
     addresses = {"first": ("127.0.0.1", 1), "then": ("127.0.0.2", 1)}
     looked_up: list[Address] = []
 
-    def look_up(peer: Address) -> Address:
+    def look_up(peer: Address, _family: int) -> Address:
         looked_up.append(peer)
         return addresses["first" if len(looked_up) == 1 else "then"]
 
@@ -336,7 +337,7 @@ async def test_a_patient_endpoint_is_driven_before_its_peer_is_found(
         port = server.getsockname()[1]
         peer, found = ("ground.example", port), list[str]()
 
-        def look_up(asked: Address) -> Address:
+        def look_up(asked: Address, _family: int) -> Address:
             assert asked == peer
             if not found:
                 raise OSError(-3, "Temporary failure in name resolution")
@@ -344,7 +345,7 @@ async def test_a_patient_endpoint_is_driven_before_its_peer_is_found(
 
         monkeypatch.setattr(udp, "look_up", look_up)
         asking, events = Asking(peer), list[Event]()
-        driver = Shell(asking, None, [peer], is_patient=True)
+        driver = Shell(asking, None, paths=[NetworkPath("", peer)], is_patient=True)
         assert not driver.is_local  # as far as is known
         loop = asyncio.get_running_loop()
         task = asyncio.create_task(driver.run(events.append))
@@ -368,7 +369,7 @@ def test_a_look_up_that_takes_long_does_not_keep_a_patient_process(
     """Its vehicle may be in the air: a resolver without a network takes 20 s to give up."""
     answered = threading.Event()
 
-    def look_up(peer: Address) -> Address:
+    def look_up(peer: Address, _family: int) -> Address:
         answered.wait(20.0)
         return peer
 

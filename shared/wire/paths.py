@@ -1,0 +1,369 @@
+"""Several paths between a vehicle and its server: what each path does to packets, and over which of
+them the next message is sent.
+
+A message has one sequence number and one seal, and travels over any set of paths. The first copy
+counts; later copies are equal byte for byte, so they are recognised before anything is opened. In
+front of each message stands a report, sealed with it:
+
+    report = bin [sequence u8 | newest u8 | arrived u16, for each path]
+
+`newest` is the newest sequence number that has come from the other end, and bit i of `arrived` says
+whether the number `newest` - i has come over that path. So each end knows the loss, delay and
+silence of each path in its own direction, and finds out within a round trip that a path is dead.
+
+A message goes over the set S of paths with the least expected cost,
+
+    Σ price_p + worth · Π q_p      over p in S          q_p: probability that it does not arrive
+
+where `worth` is what its loss costs, in packets of price 1. q_p follows from the share of packets
+that path p loses, and from the probability that p is down: each packet in a row that has not
+arrived makes that likelier by Bayes' rule, and so does time without news of the path.
+"""
+
+import math
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from itertools import chain, combinations
+from struct import Struct
+from typing import NamedTuple
+
+from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
+from skytether.shared.wire.drop import Drop, ProtocolError
+
+PATHS_MAX = 4
+SEQUENCES = 256
+"""Modulus of sequence numbers."""
+WINDOW = 16
+"""Number of newest packets whose arrival is reported for each path."""
+COPIES = 32
+"""Number of newest packets whose copies are recognised."""
+IN_FLIGHT_MAX = 64
+"""Largest number of packets on a path of which the end still waits to hear."""
+DOWN, DOWN_EVERY_S = 0.05, 30.0
+"""Share of the time for which a path is assumed to be down, and mean time between two outages [s].
+"""
+LOSS, LOSS_MIN, LOSS_WEIGHT = 0.05, 0.02, 1 / 32
+"""Share of lost packets assumed at first, least share, and weight of a new packet."""
+OUTAGE = 3
+"""Number of packets lost in a row that count as an outage, and not as lost one by one."""
+DELAYS = 16
+"""Number of newest delays of acknowledgements that are kept."""
+WAIT_NS, WAIT_MIN_NS, WAIT_MAX_NS = (
+    600 * MILLISECOND_NS,
+    150 * MILLISECOND_NS,
+    1500 * MILLISECOND_NS,
+)
+"""Time after which a packet that a report does not name is lost: before the first acknowledgement,
+at least, at most [ns]."""
+SPARE_NS = 50 * MILLISECOND_NS
+"""Delay beyond those known that is still awaited [ns]."""
+LOOK_NS, AGAIN_NS, DEAR_MAX = 2 * SECOND_NS, SECOND_NS, 8.0
+"""Times after which an unused path of the least price is tried, and a doubted one again [ns], and
+the largest factor by which a dearer path is tried more rarely."""
+ALIKE = 1.25
+"""Paths whose expected cost is within this factor of the least take turns."""
+ALIVE_WORTH = 40.0
+"""What it costs, in packets, if the other end takes a working link for lost."""
+EVERYWHERE = 1e9
+"""Worth of a message that goes over every path."""
+
+_HEAD, _BIN8 = Struct("<BB"), 0xC4
+_SETS = {
+    count: [*chain.from_iterable(combinations(range(count), size) for size in range(1, count + 1))]
+    for count in range(1, PATHS_MAX + 1)
+}
+
+
+class Report(NamedTuple):
+    """Report in front of a message."""
+
+    sequence: int
+    newest: int
+    arrived: tuple[int, ...]
+
+
+def split(payload: bytes) -> tuple[Report | None, bytes]:
+    """Report in front of a message, if there is one, and the message.
+
+    Raises:
+        ProtocolError: the report is cut off, or not one of 2 to PATHS_MAX paths.
+    """
+    if not payload or payload[0] != _BIN8:
+        return None, payload
+    count, odd = divmod(payload[1] - _HEAD.size, 2) if len(payload) > 1 else (0, 0)
+    end = 2 + _HEAD.size + 2 * count
+    if odd or not 2 <= count <= PATHS_MAX or len(payload) < end:
+        raise ProtocolError(Drop.FIELD)
+    sequence, newest = _HEAD.unpack_from(payload, 2)
+    masks = Struct(f"<{count}H").unpack_from(payload, 2 + _HEAD.size)
+    return Report(sequence, newest, masks), payload[end:]
+
+
+def _ahead(sequence: int, of: int) -> int:
+    """Number of packets by which a sequence number is ahead of another, from -128 to 127."""
+    half = SEQUENCES // 2
+    return (sequence - of + half) % SEQUENCES - half
+
+
+def _names(report: Report, arrived: int, sequence: int) -> bool:
+    """Whether a report's mask of a path contains a sequence number."""
+    back = _ahead(report.newest, sequence)
+    return 0 <= back < WINDOW and bool(arrived >> back & 1)
+
+
+@dataclass(slots=True)
+class Path:
+    """What is known of one path in the direction in which this end sends."""
+
+    price: float
+    in_flight: deque[tuple[int, int]] = field(default_factory=lambda: deque(maxlen=IN_FLIGHT_MAX))
+    """Sequence number and time of sending of packets of which nothing was heard yet."""
+    delays_ns: deque[int] = field(default_factory=lambda: deque(maxlen=DELAYS))
+    """Times from sending to the acknowledgement."""
+    loss: float = LOSS
+    missing: int = 0
+    """Number of packets in a row, up to the newest, that have not arrived."""
+    arrived_ns: int | None = None
+    """Time at which the newest packet that is known to have arrived was sent."""
+    used_ns: int | None = None
+    """Time of the newest packet."""
+    looked_ns: int | None = None
+    """Time at which the path was last tried."""
+    packets: int = 0
+    bytes: int = 0
+    first: int = 0
+    """Number of packets from the other end of which this path brought the first copy."""
+    copies: int = 0
+    """Number of later copies that this path brought."""
+
+    def failure(self, now_ns: int) -> float:
+        """Probability q that a packet sent now does not arrive."""
+        down = DOWN
+        if self.arrived_ns is not None:
+            away_s = max(now_ns - self.arrived_ns, 0) / SECOND_NS
+            down *= 1.0 - math.exp(-away_s / (DOWN * DOWN_EVERY_S))
+            down = max(down, 1.0 - math.exp(-0.2 / DOWN_EVERY_S))
+        up = (1.0 - down) * self.loss**self.missing
+        return 1.0 - (1.0 - self.loss) * up / (up + down)
+
+    @property
+    def quick_ns(self) -> int:
+        """Time after which a packet that a report does not name has not arrived."""
+        if not self.delays_ns:
+            return WAIT_NS
+        return _within(min(self.delays_ns) * 3 // 2 + 2 * SPARE_NS)
+
+    def acknowledge(self, report: Report, arrived: int, now_ns: int) -> None:
+        waiting = list(self.in_flight)
+        self.in_flight.clear()
+        for sequence, sent_ns in waiting:
+            if _names(report, arrived, sequence):
+                self.delays_ns.append(now_ns - sent_ns)
+                self._arrived(sent_ns)
+            elif _ahead(report.newest, sequence) >= WINDOW or now_ns - sent_ns > self.quick_ns:
+                self.missing += 1
+            else:
+                self.in_flight.append((sequence, sent_ns))
+
+    def expire(self, silence_ns: int, now_ns: int) -> None:
+        """Count packets as lost of which nothing was heard although a report was due.
+
+        Args:
+            silence_ns: longest silence of the other end.
+        """
+        wait_ns = self.quick_ns + silence_ns + SPARE_NS
+        while self.in_flight and now_ns - self.in_flight[0][1] > wait_ns:
+            self.in_flight.popleft()
+            self.missing += 1
+
+    def _arrived(self, sent_ns: int) -> None:
+        lost = self.missing if self.missing < OUTAGE else 0
+        self.loss += LOSS_WEIGHT * (lost - self.loss) / max(lost, 1)
+        self.loss, self.missing = max(self.loss, LOSS_MIN), 0
+        self.arrived_ns = max(sent_ns, self.arrived_ns or sent_ns)
+
+
+def _within(time_ns: int) -> int:
+    return min(max(time_ns, WAIT_MIN_NS), WAIT_MAX_NS)
+
+
+@dataclass(slots=True)
+class _Newest:
+    """Newest packet that was sent: if it does not arrive, it is sent again."""
+
+    sequence: int
+    datagram: bytes
+    sent_on: set[int]
+
+
+class Paths:
+    """One end of a session with several paths.
+
+    Args:
+        prices: price of a packet on each path.
+        spread: `link.spread`.
+    """
+
+    def __init__(self, prices: Sequence[float], spread: str = "auto") -> None:
+        cheapest, self._spread = min(prices), spread
+        self.each = [Path(price / cheapest) for price in prices]
+        self._sets = _SETS[len(prices)]
+        self._sequence = 0
+        self._newest: _Newest | None = None
+        self._heard: int | None = None
+        """Newest sequence number of the other end; None before the first."""
+        self._masks = [0] * len(prices)
+        self._copies: dict[bytes, int] = {}
+        """Sequence numbers of the newest datagrams of the other end, oldest first."""
+
+    # -- sending -----------------------------------------------------------------------------
+
+    def report(self) -> bytes:
+        """Report to put in front of the next message, which gets the next sequence number."""
+        self._sequence = (self._sequence + 1) % SEQUENCES
+        masks = Struct(f"<{len(self._masks)}H").pack(*self._masks)
+        head = _HEAD.pack(self._sequence, self._heard or 0)
+        return bytes((_BIN8, len(head) + len(masks))) + head + masks
+
+    def choose(self, worth: float, now_ns: int, among: Sequence[int]) -> tuple[int, ...]:
+        """Paths for the next message; of sets that cost about the same, the one that has rested
+        longest.
+
+        Args:
+            worth: what its loss costs, in packets on the cheapest path.
+            among: paths that may be used, at least one.
+        """
+        if self._spread == "all":
+            return tuple(among)
+        failure = [path.failure(now_ns) for path in self.each]
+        costs, best = [], self._spread == "best"
+        for chosen in self._sets:
+            if all(one in among for one in chosen) and not (best and len(chosen) > 1):
+                missing = math.prod(failure[one] for one in chosen)
+                price = sum(self.each[one].price for one in chosen)
+                costs.append((price + max(worth, 1.0) * missing, chosen))
+        least = min(costs)[0]
+        alike = [chosen for cost, chosen in costs if cost <= ALIKE * least]
+        few = min(map(len, alike))
+        return min(
+            (chosen for chosen in alike if len(chosen) == few),
+            key=lambda chosen: max(self.each[one].used_ns or 0 for one in chosen),
+        )
+
+    def sent(self, datagram: bytes, on: Sequence[int], now_ns: int) -> None:
+        """Note that a datagram with the newest report was sent."""
+        self._newest = _Newest(self._sequence, datagram, set(on))
+        self._note(datagram, on, now_ns)
+
+    def _note(self, datagram: bytes, on: Sequence[int], now_ns: int) -> None:
+        assert self._newest is not None
+        for one in on:
+            path = self.each[one]
+            path.in_flight.append((self._newest.sequence, now_ns))
+            path.used_ns = now_ns
+            path.packets += 1
+            path.bytes += len(datagram)
+
+    def again(self, silence_ns: int, now_ns: int, among: Sequence[int]) -> tuple[bytes, int] | None:
+        """Newest datagram, and another path on which it is sent now; None if it may still arrive.
+
+        Args:
+            silence_ns: longest silence of the other end.
+            among: paths that may be used.
+        """
+        for path in self.each:
+            path.expire(silence_ns, now_ns)
+        newest = self._newest
+        if newest is None:
+            return None
+        waits = any(newest.sequence == each for path in self.each for each, _ in path.in_flight)
+        others = [one for one in among if one not in newest.sent_on]
+        if waits or not others:
+            return None
+        best = min(others, key=lambda one: self.each[one].failure(now_ns))
+        newest.sent_on.add(best)
+        self._note(newest.datagram, (best,), now_ns)
+        return newest.datagram, best
+
+    def looks(self, now_ns: int) -> list[int]:
+        """Paths to try now: those that have not been used for long, and those that may be down or
+        are not known yet.
+        """
+        due = []
+        for one, path in enumerate(self.each):
+            dear = min(path.price, DEAR_MAX)
+            doubted = path.arrived_ns is None or path.missing >= OUTAGE
+            since_ns = path.looked_ns if doubted else path.used_ns
+            if since_ns is None or now_ns - since_ns >= (AGAIN_NS if doubted else LOOK_NS) * dear:
+                path.looked_ns = now_ns
+                due.append(one)
+        return due
+
+    def alive_worth(self, timeout_ns: int, now_ns: int) -> float:
+        """What the loss of any message costs: the other end takes the link for lost if nothing
+        arrives within its time-out.
+        """
+        arrived = [path.arrived_ns for path in self.each if path.arrived_ns is not None]
+        share = (now_ns - max(arrived)) / timeout_ns if arrived else 1.0
+        return ALIVE_WORTH * min(share, 1.0) ** 2
+
+    # -- receiving ---------------------------------------------------------------------------
+
+    def is_copy(self, datagram: bytes, path: int | None) -> bool:
+        """Whether a datagram has come before; notes the path that brought the copy."""
+        sequence = self._copies.get(datagram)
+        if sequence is None:
+            return False
+        if path is not None:
+            self.each[path].copies += 1
+            self._mark(sequence, path)
+        return True
+
+    def heard(self, report: Report, datagram: bytes, path: int | None, now_ns: int) -> None:
+        """Note an authentic datagram and its report, and what it says of packets sent.
+
+        Raises:
+            ProtocolError: it reports other paths than this session has.
+        """
+        if len(report.arrived) != len(self.each):
+            raise ProtocolError(Drop.FIELD)
+        self._copies[datagram] = report.sequence
+        if len(self._copies) > COPIES:
+            del self._copies[next(iter(self._copies))]
+        ahead = WINDOW if self._heard is None else _ahead(report.sequence, self._heard)
+        if ahead > 0:
+            self._masks = [mask << min(ahead, WINDOW) & 0xFFFF for mask in self._masks]
+            self._heard = report.sequence
+        if path is not None:
+            self.each[path].first += 1
+            self._mark(report.sequence, path)
+        if not any(report.arrived):  # before the first packet there is nothing to report
+            return
+        for one, arrived in zip(self.each, report.arrived, strict=True):
+            one.acknowledge(report, arrived, now_ns)
+        if self._newest and any(
+            _names(report, each, self._newest.sequence) for each in report.arrived
+        ):
+            self._newest = None
+
+    def _mark(self, sequence: int, path: int) -> None:
+        back = _ahead(self._heard if self._heard is not None else sequence, sequence)
+        if 0 <= back < WINDOW:
+            self._masks[path] |= 1 << back
+
+    # -- figures -----------------------------------------------------------------------------
+
+    def figures(self, now_ns: int) -> list[dict[str, float | int | None]]:
+        return [
+            {
+                "packets": path.packets,
+                "bytes": path.bytes,
+                "loss": round(path.loss, 3),
+                "failure": round(path.failure(now_ns), 3),
+                "delay_ms": min(path.delays_ns) / MILLISECOND_NS if path.delays_ns else None,
+                "first": path.first,
+                "copies": path.copies,
+            }
+            for path in self.each
+        ]

@@ -1,0 +1,220 @@
+"""Several paths: reports, copies, what is learned of each path, and which are chosen."""
+
+from collections.abc import Sequence
+from itertools import count
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
+from skytether.shared.wire.drop import ProtocolError
+from skytether.shared.wire.paths import AGAIN_NS, EVERYWHERE, LOOK_NS, WINDOW, Paths, split
+
+DELAY_NS, STEP_NS, SILENCE_NS = 50 * MILLISECOND_NS, 100 * MILLISECOND_NS, SECOND_NS // 2
+BOTH = (0, 1)
+
+
+class Ends:
+    """Two ends that send in turn, every step; `dead` are paths that lose everything."""
+
+    def __init__(self, prices: Sequence[float] = (1.0, 1.0)) -> None:
+        self.near, self.far = Paths(prices), Paths(prices)
+        self.now_ns, self.dead = 0, set[int]()
+        self._payloads = count()
+
+    def send(self, worth: float = 1.0, on: Sequence[int] = (), *, back: bool = False) -> list[int]:
+        sender, receiver = (self.far, self.near) if back else (self.near, self.far)
+        among = range(len(sender.each))
+        on = on or sender.choose(worth, self.now_ns, among)
+        datagram = sender.report() + b"\x93" + next(self._payloads).to_bytes(4)
+        sender.sent(datagram, on, self.now_ns)
+        for path in on:
+            if path not in self.dead:
+                self.arrive(receiver, datagram, path)
+        return list(on)
+
+    def arrive(self, receiver: Paths, datagram: bytes, path: int) -> None:
+        if not receiver.is_copy(datagram, path):
+            report, _ = split(datagram)
+            assert report
+            receiver.heard(report, datagram, path, self.now_ns + DELAY_NS)
+
+    def exchange(self, steps: int, worth: float = 1.0) -> list[list[int]]:
+        chosen = []
+        for _ in range(steps):
+            self.now_ns += STEP_NS
+            chosen.append(self.send(worth))
+            self.send(on=BOTH, back=True)
+        return chosen
+
+
+def test_report_is_read_as_it_was_written() -> None:
+    ends = Ends()
+    ends.exchange(3)
+    report, message = split(ends.near.report() + b"\x93abc")
+    assert message == b"\x93abc"
+    assert report
+    assert report.sequence == 4
+    assert report.newest == 3
+    assert report.arrived == (7, 7)
+
+
+def test_message_without_a_report_is_as_it_is() -> None:
+    assert split(b"\x93abc") == (None, b"\x93abc")
+    assert split(b"") == (None, b"")
+
+
+@given(st.binary(max_size=20).map(lambda tail: b"\xc4" + tail))
+def test_any_other_beginning_is_refused_or_read(payload: bytes) -> None:
+    try:
+        report, message = split(payload)
+    except ProtocolError:
+        return
+    assert report
+    assert payload.endswith(message)
+
+
+def test_report_of_other_paths_is_refused() -> None:
+    ends, three = Ends(), Paths((1.0, 1.0, 1.0))
+    report, _ = split(three.report() + b"x")
+    assert report
+    with pytest.raises(ProtocolError):
+        ends.near.heard(report, b"x", 0, 0)
+
+
+def test_copies_are_recognised_and_counted_by_path() -> None:
+    ends = Ends()
+    ends.send(on=BOTH)
+    first, second = ends.far.each
+    assert (first.first, first.copies) == (1, 0)
+    assert (second.first, second.copies) == (0, 1)
+
+
+def test_paths_of_equal_price_take_turns() -> None:
+    chosen = Ends().exchange(40)[10:]
+    assert {tuple(each) for each in chosen} == {(0,), (1,)}
+    assert abs(sum(each == [0] for each in chosen) - 15) <= 1
+
+
+def test_dear_path_is_not_used_while_the_cheap_one_is_well() -> None:
+    assert Ends((1.0, 10.0)).exchange(40)[10:] == 30 * [[0]]
+
+
+def test_dear_path_is_used_when_the_cheap_one_is_dead() -> None:
+    ends = Ends((1.0, 10.0))
+    ends.exchange(20, worth=20.0)
+    ends.dead = {0}
+    ends.exchange(20, worth=20.0)
+    assert ends.exchange(5, worth=20.0) == 5 * [[1]]
+
+
+def test_valuable_message_goes_over_all_paths() -> None:
+    ends = Ends((1.0, 3.0))
+    ends.exchange(20)
+    assert ends.send(EVERYWHERE) == [0, 1]
+
+
+def test_dead_path_is_left_within_a_second_and_used_again_when_it_answers() -> None:
+    ends = Ends()
+    ends.exchange(20)
+    ends.dead = {0}
+    ends.exchange(10)
+    assert ends.exchange(5) == 5 * [[1]]
+    assert ends.near.each[0].failure(ends.now_ns) > 0.8
+    ends.dead = set()
+    ends.send(on=(0,))
+    ends.exchange(3)
+    assert ends.near.each[0].failure(ends.now_ns) < 0.2
+
+
+def test_lost_packet_is_sent_again_once_on_another_path() -> None:
+    ends = Ends()
+    ends.exchange(20)
+    ends.dead = {0}
+    ends.send(on=(0,))
+    assert ends.near.again(SILENCE_NS, ends.now_ns + DELAY_NS, BOTH) is None
+    later_ns = ends.now_ns + 3 * SECOND_NS
+    resent = ends.near.again(SILENCE_NS, later_ns, BOTH)
+    assert resent
+    assert resent[1] == 1
+    assert ends.near.again(SILENCE_NS, later_ns, BOTH) is None
+
+
+def test_packet_that_has_arrived_is_not_sent_again() -> None:
+    ends = Ends()
+    ends.exchange(20)
+    assert ends.near.again(SILENCE_NS, ends.now_ns + 3 * SECOND_NS, BOTH) is None
+
+
+def test_losses_one_by_one_are_no_outage() -> None:
+    ends = Ends()
+    for step in range(200):
+        ends.dead = {0} if step % 5 == 0 else set()
+        ends.now_ns += STEP_NS
+        ends.send(on=BOTH)
+        ends.send(on=BOTH, back=True)
+    ends.dead = set()
+    ends.exchange(5)
+    assert ends.near.each[0].loss == pytest.approx(0.2, abs=0.08)
+    assert ends.near.each[1].loss < 0.06
+
+
+def test_late_and_doubled_reports_change_nothing() -> None:
+    ends = Ends()
+    ends.exchange(20)
+    datagram = ends.far.report() + b"\x93old"
+    ends.exchange(5)
+    before = ends.near.figures(ends.now_ns)
+    report, _ = split(datagram)
+    assert report
+    ends.near.heard(report, datagram, None, ends.now_ns)
+    assert ends.near.is_copy(datagram, None)
+    assert ends.near.figures(ends.now_ns) == before
+
+
+def test_sequence_numbers_go_round() -> None:
+    ends = Ends()
+    ends.exchange(600)
+    assert all(path.missing == 0 for path in ends.near.each)
+    assert all(path.loss == pytest.approx(0.02) for path in ends.near.each)
+
+
+def test_silence_of_longer_than_the_window_counts_as_lost() -> None:
+    ends = Ends()
+    ends.exchange(20)
+    ends.dead = {0}
+    ends.send(on=(0,))
+    ends.dead = set()
+    for _ in range(WINDOW + 2):
+        ends.send(on=(1,))
+    ends.send(on=(1,), back=True)
+    assert ends.near.each[0].missing == 1
+
+
+def test_unused_path_is_tried_now_and_then_and_a_doubted_one_more_often() -> None:
+    ends = Ends((1.0, 4.0))
+    ends.exchange(20)
+    ends.send(on=BOTH)
+    ends.send(on=BOTH, back=True)
+    assert ends.near.looks(ends.now_ns) == []
+    assert ends.near.looks(ends.now_ns + LOOK_NS) == [0]
+    assert ends.near.looks(ends.now_ns + 4 * LOOK_NS) == [0, 1]
+    new = Paths((1.0, 1.0))
+    assert new.looks(0) == [0, 1]
+    assert new.looks(AGAIN_NS - 1) == []
+    assert new.looks(AGAIN_NS) == [0, 1]
+
+
+@given(
+    st.lists(st.floats(1.0, 100.0), min_size=2, max_size=4),
+    st.floats(0.0, 1e9),
+    st.data(),
+)
+def test_some_of_the_allowed_paths_are_always_chosen(
+    prices: list[float], worth: float, data: st.DataObject
+) -> None:
+    among = data.draw(st.sets(st.sampled_from(range(len(prices))), min_size=1))
+    chosen = Paths(prices).choose(worth, 0, sorted(among))
+    assert chosen
+    assert {*chosen} <= among
