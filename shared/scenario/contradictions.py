@@ -94,7 +94,12 @@ def contradictions(
     if wrong:
         return
     yield from _no_mission(scenario)
-    yield from list(_no_impairments(scenario)) or (() if any_network else _too_late(scenario))
+    no_network = list(_no_impairments(scenario))
+    yield from no_network
+    if not (no_network or any_network):
+        # One path suffices to fly over.
+        each = [list(_too_late(scenario.on_path(i))) for i in range(len(scenario.paths))]
+        yield from min(each, key=len)
     yield from _no_trigger(control)
     yield from _no_policies("vehicle.report", vehicle.report, REPORTS, control)
     yield from _no_way(scenario, known)
@@ -344,14 +349,16 @@ def _too_short(scenario: Scenario) -> Iterator[Contradiction]:
 
 
 def _no_impairments(scenario: Scenario) -> Iterator[Contradiction]:
-    for way in ("uplink", "downlink"):
-        try:
-            getattr(scenario, way)
-        except GrammarError as error:
-            yield f"network.{way}", repr(error.given), error.expected
-        except Exception as error:
-            expected = f"impairments that can be made ({type(error).__name__}: {error})"
-            yield f"network.{way}", repr(getattr(scenario.network, way)), expected
+    for i, path in enumerate(scenario.paths):
+        at = f"network.paths[{i}]" if scenario.network.paths else "network"
+        for way in ("uplink", "downlink"):
+            try:
+                getattr(scenario.on_path(i), way)
+            except GrammarError as error:
+                yield f"{at}.{way}", repr(error.given), error.expected
+            except Exception as error:
+                expected = f"impairments that can be made ({type(error).__name__}: {error})"
+                yield f"{at}.{way}", repr(getattr(path, way)), expected
 
 
 def _no_trigger(control: ControlConfig) -> Iterator[Contradiction]:

@@ -43,9 +43,14 @@ def set_keys(changes: Mapping[str, Any], table: dict[str, Any]) -> None:
     """Set values by dotted key in a nested table, in place.
 
     Raises:
-        ConfigError: a key is unknown, or a text has no such argument.
+        ConfigError: a key is unknown, a text has no such argument, or the network is that of one
+            path and there are several.
     """
     for path, value in changes.items():
+        network = table.get("network")
+        paths = network.get("paths") if isinstance(network, dict) else None
+        if paths and text_key(path) in ("network.uplink", "network.downlink"):
+            raise ConfigError(f"{path}: got {value!r}, expected network.paths: there are several")
         *sections, key = path.split(".")
         section: Any = table
         for depth, name in enumerate(sections):

@@ -23,10 +23,10 @@ from skytether.shared.base import files, toml
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.base.hint import hint
 from skytether.shared.scenario.contradictions import Contradiction, contradictions
-from skytether.shared.scenario.dotted import TEXTS, flat, set_keys, with_argument
+from skytether.shared.scenario.dotted import TEXTS, flat, with_argument
 from skytether.shared.scenario.grammar import GrammarError
 from skytether.shared.scenario.registry import IMPAIRMENTS, ZONES, File, Files, PluginTable
-from skytether.shared.scenario.schema import TABLES, Scenario, WithFiles
+from skytether.shared.scenario.schema import TABLES, NetworkConfig, Scenario, WithFiles
 
 SCENARIOS = Path(scenarios.__file__).parent
 EXTENDS_MAX = 20
@@ -42,6 +42,7 @@ FILES: Mapping[str, tuple[PluginTable, int]] = MappingProxyType(
 )
 """Keys whose text may name files: table of the text's entries, and largest size of a file [B]."""
 TABLE_BYTES_MAX = 16_000_000
+WAYS = ("uplink", "downlink")
 COMPARED = "compare"
 """Name of the file with the scenarios of `skytether compare`."""
 
@@ -114,13 +115,15 @@ def convert(raw: Mapping[str, Any], source: str = "") -> Scenario:
     Raises:
         ConfigError: the first invalid value.
     """
-    raw = _with_texts(raw, source)
+    raw = _with_paths(_with_texts(raw, source), source)
     try:
         scenario = msgspec.convert(raw, Scenario)
     except msgspec.ValidationError as error:
         raise ConfigError(f"{_where(source)}{_explain(str(error), raw)}") from None
     _refuse_first(_infinite(to_table(scenario)), source)
-    return scenario
+    several = scenario.network.paths if len(scenario.network.paths) > 1 else ()
+    network = msgspec.structs.replace(scenario.on_path(0).network, paths=several)
+    return msgspec.structs.replace(scenario, network=network)
 
 
 def _without_contradictions(
@@ -190,34 +193,48 @@ def _read(name: str, seen: Mapping[tuple[Path, str], str] = MappingProxyType({})
     return _overlay(_read(base, {**seen, (path, entry): name}), raw, name)
 
 
-def _relative_to(folder: Path, raw: dict[str, Any]) -> None:
+def _relative_to(folder: Path, raw: dict[str, Any], prefix: str = "") -> None:
     """Replace file names in a raw table, which are relative to a folder, by full paths."""
-    for key, value in flat(raw):
-        if key == "reference.file" and isinstance(value, str) and value:
-            set_keys({key: str(folder / value)}, raw)
+    for name, value in raw.items():
+        key = f"{prefix}{name}"
+        if isinstance(value, dict):
+            _relative_to(folder, value, f"{key}.")
+        elif key == "network.paths" and isinstance(value, list):
+            for path in value:
+                if isinstance(path, dict):
+                    _relative_to(folder, path, prefix)
+        elif key == "reference.file" and isinstance(value, str) and value:
+            raw[name] = str(folder / value)
         elif key in FILES and isinstance(value, str):
             with suppress(GrammarError):  # reported by `check`
-                set_keys(
-                    {key: FILES[key][0].with_files(value, lambda file: str(folder / file))}, raw
-                )
+                raw[name] = FILES[key][0].with_files(value, lambda file: str(folder / file))
 
 
 def _with_files(scenario: Scenario, source: str, known: Scenario | None) -> Scenario:
     """Scenario with the contents of the files that it names; raises ConfigError if one cannot be
     read.
     """
-    now, before = (dict(flat(to_table(each))) if each else {} for each in (scenario, known))
+    before = _naming_files(known) if known else ()
     contents: dict[str, File] = {}
-    for key in ("reference.file", *FILES):
+    for key, text in _naming_files(scenario):
         if key == "reference.file" and scenario.reference.shape not in TABLES:
             continue
         with suppress(GrammarError):  # reported by `contradictions`
-            own = known.files if known and before[key] == now[key] else ()
-            contents |= {file.name: file for file in files_of(key, now[key], source, own)}
+            own = known.files if known and (key, text) in before else ()
+            contents |= {file.name: file for file in files_of(key, text, source, own)}
     if not contents:
         return scenario
     keys = {name: getattr(scenario, name) for name in Scenario.__struct_fields__}
     return WithFiles(**keys, contents=tuple(contents.values()))
+
+
+def _naming_files(scenario: Scenario) -> list[tuple[str, str]]:
+    """Keys whose values may name files, and these values: those of the network for each path."""
+    return [
+        ("reference.file", scenario.reference.file),
+        *((f"network.{way}", getattr(path, way)) for path in scenario.paths for way in WAYS),
+        ("mission.zones", scenario.mission.zones),
+    ]
 
 
 def files_of(key: str, text: str, source: str = "", known: Files = ()) -> Files:
@@ -277,6 +294,18 @@ def _with_texts(raw: Mapping[str, Any], source: str) -> dict[str, Any]:
             text = _with_arguments(key, default[section][name], below[name], source)
             raw = {**raw, section: {**below, name: text}}
     return dict(raw)
+
+
+def _with_paths(raw: dict[str, Any], source: str) -> dict[str, Any]:
+    """Raw table in which every path has both directions, by default those of the network."""
+    network: Any = raw.get("network")
+    paths = network.get("paths") if isinstance(network, Mapping) else None
+    if not (isinstance(paths, list | tuple) and all(isinstance(each, Mapping) for each in paths)):
+        return raw  # there are none, or they are refused with their type
+    both = {way: getattr(NetworkConfig(), way) for way in WAYS}
+    both |= {way: network[way] for way in WAYS if way in network}
+    whole = [_overlay(both, dict(each), source, "network.") for each in paths]
+    return {**raw, "network": {**network, "paths": whole}}
 
 
 def _with_arguments(key: str, text: str, arguments: Mapping[str, Any], source: str) -> str:
@@ -353,6 +382,8 @@ def _explain(message: str, raw: Mapping[str, Any]) -> str:
         for digits in index:
             given = given[int(digits)] if digits.isdigit() else given
         section = typing.get_type_hints(section).get(key, section)
+        if index and hasattr(typing.get_args(section)[0], "__struct_fields__"):
+            section = typing.get_args(section)[0]
     if what.startswith("Invalid enum value") or " | " in what:
         return f"{path}: got {_represented(given)}, expected {_choices(section)}"
     expected = what.removeprefix("Expected ").split(", got ")[0].replace("`", "")
@@ -363,6 +394,10 @@ def _explain(message: str, raw: Mapping[str, Any]) -> str:
 
 def _unknown_key(table: object, section: Any, at: str = "") -> str | None:
     """Message about the first unknown key of a table; None if all are known."""
+    if isinstance(table, list | tuple) and typing.get_origin(section) is tuple:
+        section = typing.get_args(section)[0]
+        each = (_unknown_key(one, section, f"{at[:-1]}[{i}].") for i, one in enumerate(table))
+        return next(filter(None, each), None)
     if not (isinstance(table, Mapping) and hasattr(section, "__struct_fields__")):
         return None
     kinds = typing.get_type_hints(section)

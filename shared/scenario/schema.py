@@ -10,8 +10,8 @@ valid, but not together.
 """
 
 import hashlib
-from collections.abc import Iterator
-from typing import Annotated, Literal
+from collections.abc import Callable, Iterator
+from typing import Annotated, Literal, Self, TypeVar
 
 import msgspec
 import numpy as np
@@ -74,6 +74,8 @@ Text = Annotated[str, Meta(max_length=TEXT_MAX)]
 Direction = Annotated[str, Meta(max_length=air.TEXT_MAX)]
 
 
+PATHS_MAX = 4
+"""Largest number of paths of a session."""
 SHAPE_CHARS = 15
 """Number of characters of a plug-in's shape in the terms, before its digest."""
 
@@ -358,6 +360,14 @@ class MavlinkConfig(Section, frozen=True):
     """Longest wait for the first heartbeat, and for each step of take-off [s]."""
 
 
+class PathConfig(Section, frozen=True):
+    """Path of a session: a network of its own between vehicle and server."""
+
+    uplink: Direction
+    downlink: Direction
+    price: Annotated[float, Meta(gt=0, le=1e6)] = 1.0
+
+
 class NetworkConfig(Section, frozen=True):
     uplink: OfImpairment[Direction] = "paper(0.4, 0.02, 2.0) & loss(0.1)"
     """Impairments from server to vehicle, combined with &, see `skytether impairments`. An argument
@@ -366,6 +376,10 @@ class NetworkConfig(Section, frozen=True):
     """Impairments from vehicle to server."""
     mtu: OfNetem[Annotated[int, Meta(ge=PAYLOAD_BYTES_MAX, le=65_507)]] = 1472
     """Largest UDP payload that passes [B]; 1472 fills an Ethernet frame."""
+    paths: OfEach[Annotated[tuple[PathConfig, ...], Meta(max_length=PATHS_MAX)]] = ()
+    """Paths of the session, each a network of its own, see docs/network.md: tables with `uplink`,
+    `downlink` (by default those above) and `price`, that of a packet relative to the other paths
+    (more than 0, by default 1). They replace `uplink` and `downlink`."""
 
 
 class LinkConfig(Section, frozen=True):
@@ -422,6 +436,9 @@ class SimulationConfig(Section, frozen=True):
     and even ones; 0: no time of day."""
 
 
+T = TypeVar("T", NetworkConfig, PathConfig)
+
+
 class Scenario(Section, frozen=True):
     """Scenario: all keys of a flight."""
 
@@ -463,8 +480,41 @@ class Scenario(Section, frozen=True):
         return file_of(self.files, file).content if self.reference.shape in TABLES else b""
 
     @property
+    def paths(self) -> tuple[PathConfig, ...]:
+        """Paths of the session, at least one."""
+        network = self.network
+        return network.paths or (PathConfig(uplink=network.uplink, downlink=network.downlink),)
+
+    def on_path(self, index: int) -> Self:
+        """Scenario of one path alone; the first has the scenario's seed, others one of their own.
+
+        Args:
+            index: number of the path, from 0.
+        """
+        path = self.paths[index]
+        network = msgspec.structs.replace(
+            self.network, uplink=path.uplink, downlink=path.downlink, paths=()
+        )
+        seed = int(stream(self.seed, "path", index).integers(2**32)) if index else self.seed
+        return msgspec.structs.replace(self, seed=seed, network=network)
+
+    def impaired(self, change: Callable[[str], str]) -> Self:
+        """Scenario with the text of each direction changed, on every path."""
+
+        def changed(each: T) -> T:
+            up, down = change(each.uplink), change(each.downlink)
+            return msgspec.structs.replace(each, uplink=up, downlink=down)
+
+        network = msgspec.structs.replace(
+            changed(self.network), paths=tuple(map(changed, self.network.paths))
+        )
+        return msgspec.structs.replace(self, network=network)
+
+    @property
     def uplink(self) -> air.Path:
-        """Impairments from server to vehicle; raises GrammarError if the text is invalid."""
+        """Impairments from server to vehicle, of the first path; raises GrammarError if the text
+        is invalid.
+        """
         return air.path(self.network.uplink, self.files)
 
     @property

@@ -94,6 +94,8 @@ def _either(kinds: list[str]) -> str:
 def _bounded(kind: type, meta: msgspec.Meta) -> str:
     if kind is str:
         return "text"
+    if get_origin(kind) is tuple:
+        return f"list of at most {meta.max_length} tables"
     low = _number(meta.ge) if meta.gt is None else f"more than {_number(meta.gt)}"
     return f"{'whole number, ' * (kind is int)}{low} to {_number(meta.le)}"
 

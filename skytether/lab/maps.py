@@ -97,15 +97,10 @@ class Box:
 
     def scenario_of(self, number: int) -> Scenario:
         burst_s, dead_time_s, gain, tau = self.places[number]
-        network = self.scenario.network
+        scenario = windless(self.scenario)
         if burst_s:
-            uplink, downlink = (
-                _in_bursts(each, burst_s) for each in (network.uplink, network.downlink)
-            )
-            network = replace(network, uplink=uplink, downlink=downlink)
-        return Differing(tau, gain, dead_time_s).of(
-            replace(windless(self.scenario), network=network)
-        )
+            scenario = scenario.impaired(lambda each: _in_bursts(each, burst_s))
+        return Differing(tau, gain, dead_time_s).of(scenario)
 
     def fly(self, number: int) -> MapPoint:
         """Fly a point in virtual time and evaluate it; called in a worker."""

@@ -77,7 +77,7 @@ class Differing(NamedTuple):
         return min(scenario.terms().dead_time_s) + self.dead_time_s >= 0.0
 
     def of(self, scenario: Scenario) -> Scenario:
-        terms, network = scenario.terms(), scenario.network
+        terms = scenario.terms()
         vehicle = replace(
             scenario.vehicle,
             tau_s=tuple(self.tau * tau_s for tau_s in scenario.model.tau_s),
@@ -85,13 +85,9 @@ class Differing(NamedTuple):
             dead_time_s=tuple(self.dead_time_s + late_s for late_s in terms.dead_time_s),
         )
         if self.delay_s:
-            uplink, downlink = (
-                " & ".join(filter(None, (each, later)))
-                for later in [f"constant({self.delay_s!r})"]
-                for each in (network.uplink, network.downlink)
-            )
-            network = replace(network, uplink=uplink, downlink=downlink)
-        return replace(scenario, vehicle=vehicle, network=network)
+            later = f"constant({self.delay_s!r})"
+            scenario = scenario.impaired(lambda each: " & ".join(filter(None, (each, later))))
+        return replace(scenario, vehicle=vehicle)
 
 
 AS_IT_IS = "as the scenario has it"

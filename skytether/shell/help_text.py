@@ -115,7 +115,7 @@ def _metavar(hint: Any, text: str) -> str:
     if hint is Path:
         first = text.partition(" ")[0].upper()
         return first if first in ("FILE", "FOLDER") else "PATH"
-    return "HOST:PORT" if hint is str and "HOST:PORT" in text else SHORT[hint]
+    return "HOST:PORT" if hint is str and "HOST:PORT" in text else SHORT.get(hint, "TABLE")
 
 
 def _told(text: str, value: Any, *, required: bool = False) -> str:

@@ -16,9 +16,9 @@ import numpy as np
 
 from skytether.shared.base.errors import RecordingError
 from skytether.shared.scenario import catalogue
-from skytether.shared.scenario.catalogue import KEYS
+from skytether.shared.scenario.catalogue import KEYS, keys_of
 from skytether.shared.scenario.dotted import flat, set_keys
-from skytether.shared.scenario.owners import Owner
+from skytether.shared.scenario.owners import InFlight, Owner
 from skytether.shared.scenario.reading import check, to_table
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.feed import Frame, Rows
@@ -49,6 +49,8 @@ def join(recordings: Sequence[Recorded], file: BinaryIO) -> None:
 
 def _scenario(first: Recorded, recordings: Sequence[Recorded]) -> Scenario:
     table = to_table(first.scenario)
+    # The netem of one path has the network of that path alone.
+    impaired = keys_of(InFlight.IMPAIRMENT) if first.scenario.network.paths else ()
     for recorded in recordings:
         terms = first.scenario.terms(), recorded.scenario.terms()
         if different := catalogue.differences(*terms):
@@ -56,7 +58,8 @@ def _scenario(first: Recorded, recordings: Sequence[Recorded]) -> Scenario:
             raise RecordingError(f"{recorded.path}: {message}")
         owners = {OWNERS.get(part) for part in recorded.parts}
         values = flat(to_table(recorded.scenario))
-        set_keys({key: value for key, value in values if KEYS[key].owner in owners}, table)
+        owned = {key: value for key, value in values if KEYS[key].owner in owners}
+        set_keys({key: value for key, value in owned.items() if key not in impaired}, table)
     return check(table, "the scenarios together")
 
 

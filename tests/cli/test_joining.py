@@ -92,6 +92,16 @@ def test_each_process_says_what_is_its_own(flown: Record, tmp_path: Path) -> Non
     assert joined.vehicle == SCENARIO.vehicle
 
 
+def test_the_netem_of_a_path_leaves_the_paths_of_the_vehicle(flown: Record, tmp_path: Path) -> None:
+    table = reading.to_table(SCENARIO)
+    table["network"]["paths"] = [{"uplink": "loss(0.1)"}, {"uplink": "loss(0.2)"}]
+    two = reading.check(table)
+    scenarios = {"client": two, "server": two, "netem": two.on_path(1)}
+    paths = [recorded_by(name, tmp_path, flown, own) for name, own in scenarios.items()]
+    assert together(paths, tmp_path / "flight.mcap") == 0
+    assert read(tmp_path / "flight.mcap").scenario == two
+
+
 def test_what_is_not_of_one_flight_is_refused(
     flown: Record, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
