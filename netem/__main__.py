@@ -45,6 +45,8 @@ class NetemOptions(ProcessOptions):
     loss(10%)", see `skytether impairments`; the key network.uplink of a scenario."""
     to_server: str | None = None
     """Impairments of packets from clients to the server; the key network.downlink."""
+    path: Annotated[int, Argument(metavar="N")] = 1
+    """Path of the scenario to emulate, from 1, see network.paths."""
     flows: Annotated[int | None, Argument(metavar="N")] = None
     """Largest number of clients at once, each of which takes a socket; by default 512, or as many
     as the system allows."""
@@ -69,19 +71,28 @@ def emulate(argv: Sequence[str]) -> None:
     server = command.address("--server", options.server)
     bind = command.address("--bind", options.bind)
     _check_server(server, bind)
-    with process.begin("netem", options, PACKET_COLUMNS, secure=None) as running:
-        endpoint = Proxy(running.scenario, server=server, flows=flows, recorder=running.recorder)
+    name = f"netem {options.path}" if options.path > 1 else "netem"
+    with process.begin(name, options, PACKET_COLUMNS, secure=None) as running:
+        endpoint = Proxy(
+            running.scenario,
+            server=server,
+            flows=flows,
+            recorder=running.recorder,
+            path=options.path - 1,
+        )
         waiting_for = f"clients of {options.server}"
         running.drive(endpoint, bind=bind, peers=[server], waiting_for=waiting_for)
 
 
 def _with_directions(options: NetemOptions) -> NetemOptions:
-    """Options with the network of --to-client and --to-server put into the scenario.
+    """Options with the scenario of --path alone, and --to-client and --to-server in its network.
 
     Raises:
+        CommandError: the scenario has no such path.
         ConfigError: the network is invalid.
     """
-    table = reading.to_table(options.config)
+    command.check_count("--path", options.path, len(options.config.paths))
+    table = reading.to_table(options.config.on_path(options.path - 1))
     directions = {"uplink": options.to_client, "downlink": options.to_server}
     table["network"] |= {key: text for key, text in directions.items() if text is not None}
     source = f"{options.scenario} and the command line"

@@ -155,12 +155,21 @@ class Queue:
 
 
 class Link:
-    """Delays, loses and reorders packets of one direction; drops UDP payloads above `mtu` [B]."""
+    """Delays, loses and reorders packets of one direction; drops UDP payloads above `mtu` [B].
+
+    `number` is that of the session's path, from 0, in the record.
+    """
 
     def __init__(
-        self, direction: int, mtu: int, recorder: Recorder | None, path: Path | None = None
+        self,
+        direction: int,
+        mtu: int,
+        recorder: Recorder | None,
+        path: Path | None = None,
+        number: int = 0,
     ) -> None:
         self._direction = direction
+        self._number = number
         self._mtu = mtu
         self._recorder = recorder
         self._queue = Queue()
@@ -275,9 +284,8 @@ class Link:
         self, lane: Lane, number: int, size: int, entered_ns: int, delay_ns: int
     ) -> None:
         if self._recorder is not None:
-            self._recorder.append_row(
-                self._direction, lane.flow, number, size, entered_ns, delay_ns, True, False
-            )
+            at = self._direction, self._number, lane.flow
+            self._recorder.append_row(*at, number, size, entered_ns, delay_ns, True, False)
 
     def release(self, *, now_ns: int) -> list[Datagram]:
         self._pass(now_ns)
@@ -286,7 +294,8 @@ class Link:
         delays_ns: list[int] = []
         errors_ns: list[int] = []
         rows: list[bytes] = []
-        direction, pack = self._direction, recorder.pack if recorder else None
+        direction, path = self._direction, self._number
+        pack = recorder.pack if recorder else None
         for queued in queue.take_due(now_ns):
             due_ns, _, datagram, size, lane, number, delay_ns, is_copy = queued
             self._bytes -= size
@@ -299,9 +308,8 @@ class Link:
             errors_ns.append(now_ns - due_ns)
             if pack is not None and not is_copy:
                 flow, entered_ns = lane.flow, due_ns - delay_ns
-                rows.append(
-                    pack(direction, flow, number, size, entered_ns, delay_ns, False, overtaken)
-                )
+                at = direction, path, flow
+                rows.append(pack(*at, number, size, entered_ns, delay_ns, False, overtaken))
             out.append(datagram)
         # All packets in one call: a call per packet would take longer than the work itself.
         counts.forwarded += len(out)

@@ -12,6 +12,7 @@ long, and the first that does not reach the server, are reported.
 
 import hashlib
 from collections import OrderedDict
+from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
 from skytether.netem.fate import Fates
@@ -38,7 +39,11 @@ LAPS_MAX = 16
 
 
 class Proxy(Endpoint):
-    """Delays, reorders and loses datagrams between one server and at most `flows` clients."""
+    """Delays, reorders and loses datagrams between one server and at most `flows` clients.
+
+    Args:
+        path: number of the session's path, from 0, in the record.
+    """
 
     changeable = keys_of(InFlight.IMPAIRMENT)
     patience_ns = MILLISECOND_NS // 4
@@ -50,14 +55,15 @@ class Proxy(Endpoint):
         server: Address,
         flows: int = FLOWS_MAX,
         recorder: Recorder | None = None,
+        path: int = 0,
     ) -> None:
         super().__init__()
         self._flows_max = flows
         self._scenario = scenario
         self._server = server
         self._mtu = mtu = scenario.network.mtu
-        self.uplink = Link(UPLINK, mtu, recorder, scenario.uplink)
-        self.downlink = Link(DOWNLINK, mtu, recorder, scenario.downlink)
+        self.uplink = Link(UPLINK, mtu, recorder, scenario.uplink, path)
+        self.downlink = Link(DOWNLINK, mtu, recorder, scenario.downlink, path)
         self._places = Places(flows)
         self._by_socket: dict[int, Flow] = {}
         self._opened = 0
@@ -217,6 +223,28 @@ class Proxy(Endpoint):
             "uplink": self.uplink.figures(),
             "downlink": self.downlink.figures(),
         }
+
+
+def of_paths(each: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Figures of the netems of a session's paths together, as those of one netem.
+
+    Counts of several paths are added up, and `by_path` has the figures of each, from 1.
+    """
+    if len(each) == 1:
+        return dict(each[0])
+    return _added(each) | {"by_path": {str(i): dict(one) for i, one in enumerate(each, start=1)}}
+
+
+def _added(each: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Sums of the counts with one name, in groups too; no quantiles and no maxima."""
+    total: dict[str, Any] = {}
+    for name in dict.fromkeys(name for one in each for name in one):
+        values = [one[name] for one in each if name in one]
+        if isinstance(values[0], Mapping):
+            total[name] = _added(values)
+        elif isinstance(values[0], int) and not name.endswith("_max"):
+            total[name] = sum(values)
+    return total
 
 
 def _digest(payload: bytes) -> bytes:

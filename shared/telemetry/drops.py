@@ -54,13 +54,14 @@ def drops(
     """Number of packets that each process dropped, by reason; only reasons that occurred.
 
     Args:
-        figures: figures of each process, by its name; those of a server's workers are added up.
+        figures: figures of each process, by its name; those of a server's workers, and of the
+            netems of several paths, are added up.
         vehicle: number of the vehicle to count in a client; None: all of its vehicles.
     """
     totals: dict[str, Counter[str]] = {}
     for name, each in figures.items():
         process = counted(each)
-        total = totals.setdefault(name.partition(".")[0], Counter())
+        total = totals.setdefault(name.partition(" ")[0].partition(".")[0], Counter())
         total.update(process.dropped)
         for number, counts in process.by_vehicle.items():
             total.update(counts.dropped if vehicle in (None, int(number)) else {})

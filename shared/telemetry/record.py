@@ -197,6 +197,7 @@ UPLINK, DOWNLINK = 0, 1
 PACKET_COLUMNS: np.dtype[np.void] = np.dtype(
     [
         ("direction", "<u1"),  # UPLINK or DOWNLINK
+        ("path", "<u1"),  # number of the session's path, from 0
         ("flow", "<u4"),  # number of the client
         ("number", "<u4"),  # number of the packet in its flow and direction
         ("bytes", "<u2"),  # UDP payload
@@ -322,8 +323,8 @@ class FlightEvent(NamedTuple):
     time_ns: int
     """Time in the flight [ns]: of the world, or over real UDP since the first event."""
     host: str
-    """Host of the event: "server", "netem SEED" or "client SEED.VEHICLE"; over real UDP the name of
-    the process."""
+    """Host of the event: "server", "netem SEED", "netem SEED/PATH" or "client SEED.VEHICLE"; over
+    real UDP the name of the process."""
     event: Event
 
     @property

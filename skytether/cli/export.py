@@ -27,7 +27,7 @@ class ExportOptions:
     parquet: Path | None = None
     """Folder for the tables as Parquet; needs pyarrow."""
     traces: Path | None = None
-    """Folder for traces of netem's effect on packets, one file per direction and flow, which
+    """Folder for traces of netem's effect on packets, one file per direction, flow and path, which
     `trace(FILE)` replays; see docs/network.md.
     """
     pcap: Path | None = None

@@ -54,12 +54,13 @@ class Collected(Collector):
     """Collector of the newest figures of a process.
 
     Args:
-        process: server, netem or client; `server.N` is worker N of a server.
+        process: server, netem or client; `server.N` is worker N of a server, `netem N` that of
+            path N.
     """
 
     def __init__(self, process: str, scenario: str, step_s: float) -> None:
         self._process = process
-        self._kind = process.partition(".")[0]
+        self._kind = process.partition(" ")[0].partition(".")[0]
         self._scenario, self._step_s = scenario, step_s
         # Replaced as a whole, so that threads see either the old or the new figures.
         self._snapshot: tuple[Mapping[str, Any], float] | None = None

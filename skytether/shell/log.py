@@ -32,7 +32,7 @@ LogFormat = Literal["text", "json"]
 
 class LogLine(msgspec.Struct, frozen=True, kw_only=True):
     process: str
-    """Server, netem or client; `server.N` is worker N of a server."""
+    """Server, netem or client; `server.N` is worker N of a server, `netem N` that of path N."""
     time_ns: int
     """Time of the event [ns; CLOCK_MONOTONIC]."""
     event: Event

@@ -256,17 +256,18 @@ def begin(
         CommandError: a file or a socket cannot be created; at the end, the record is incomplete.
     """
     taken_up = take_up(options.control, options.config, new_flight=options.new_flight)
-    part = None if options.record and options.record.suffix == RECORDING else options.record
+    file = None if options.record and options.record.suffix == RECORDING else options.record
     with ExitStack() as stack:
         recording = None
-        if part:
-            recording = stack.enter_context(recorded(part, columns))
+        if file:
+            recording = stack.enter_context(recorded(file, columns))
         elif keeps_rows:
             recording = stack.enter_context(recorded_meanwhile(columns))
         feed = stack.enter_context(_fed(name, options, secure=bool(secure)))
         recorder = recording.recorder if recording else None
         if feed:
-            recorder = _followed(recorder or Recorder(columns), feed, name, columns)
+            part = name.partition(" ")[0]
+            recorder = _followed(recorder or Recorder(columns), feed, part, columns)
         news = [*warnings, *taken_up.news]
         yield Process(
             f"{name}.{number}" if number else name,

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.law.model import Array
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.schema import PATHS_MAX, Scenario
 from skytether.shared.scenario.triggers import Compared
 from skytether.shared.telemetry.record import (
     DOWNLINK,
@@ -153,6 +153,7 @@ def check_values(part: str, rows: Rows, scenario: Scenario) -> None:
     most = {
         "step": int(FLOWN_S_MAX / scenario.control.dt),
         "begins": int(FLOWN_S_MAX / scenario.control.dt),
+        "path": PATHS_MAX - 1,
         "delay_ns": DELAY_NS_MAX,
         "arrived_ns": 2**62,
         "age_ns": 2**62,

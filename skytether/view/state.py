@@ -456,7 +456,7 @@ class State:
     @property
     def flies(self) -> bool:
         """Whether a vehicle or a server is known; netem alone may carry any protocol."""
-        return any(name != "netem" for name in self._processes)
+        return any(name.partition(" ")[0] != "netem" for name in self._processes)
 
     def time_s(self, time_ns: int) -> float:
         """Time of flight [s] at a time [ns], 0 before it; of netem alone, its running time."""

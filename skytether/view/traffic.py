@@ -1,7 +1,7 @@
 """Packets that passed netem, for other programs: delay traces, and a capture in pcap format.
 
 A recording of netem has each packet's time of entry, delay, size and fate, but not its content. So
-the capture has made-up headers (clients are 10.0.x.y, the server is 10.255.255.254) and true
+the capture has made-up headers (clients are 10.path.x.y, the server is 10.255.255.254) and true
 lengths: enough to see rates, bursts and gaps.
 """
 
@@ -23,11 +23,12 @@ _UDP = 17
 
 
 def traces(packets: Rows) -> Mapping[str, str]:
-    """Delay traces that the impairment `trace` replays, as CSV, by direction and flow."""
+    """Delay traces that the impairment `trace` replays, as CSV, by direction, flow and path."""
     csv = {}
     for way, direction in WAYS.items():
-        for flow in np.unique(packets["flow"]):
-            rows = packets[(packets["direction"] == direction) & (packets["flow"] == flow)]
+        for path, flow in np.unique(packets[["path", "flow"]]).tolist():
+            of_flow = (packets["path"] == path) & (packets["flow"] == flow)
+            rows = packets[of_flow & (packets["direction"] == direction)]
             rows = rows[np.argsort(rows["arrived_ns"], kind="stable")]
             # a trace has one packet per time
             rows = rows[np.diff(rows["arrived_ns"], prepend=-1) > 0]
@@ -36,7 +37,8 @@ def traces(packets: Rows) -> Mapping[str, str]:
             time_s = (rows["arrived_ns"] - rows["arrived_ns"][0]) / SECOND_NS
             columns = time_s, rows["delay_ns"] / SECOND_NS, rows["lost"].astype(int)
             lines = zip(*(column.tolist() for column in columns), strict=True)
-            csv[f"{way}-{flow}"] = to_csv(("time_s", "delay_s", "lost"), lines)
+            at = f"-path-{path + 1}" if path else ""
+            csv[f"{way}-{flow}{at}"] = to_csv(("time_s", "delay_s", "lost"), lines)
     return csv
 
 
@@ -55,13 +57,13 @@ def pcap(packets: Rows, began_ns: int = 0) -> bytes:
         size = int(row["bytes"]) + HEADER_BYTES
         seconds, rest_ns = divmod(time_ns, SECOND_NS)
         pieces.append(struct.pack("<IIII", seconds, rest_ns, HEADER_BYTES, size))
-        pieces.append(_header(int(row["direction"]), int(row["flow"]), size))
+        pieces.append(_header(int(row["direction"]), int(row["path"]), int(row["flow"]), size))
     return b"".join(pieces)
 
 
-def _header(direction: int, flow: int, size: int) -> bytes:
+def _header(direction: int, path: int, flow: int, size: int) -> bytes:
     """IP and UDP header of a packet of this size [B], headers included."""
-    client = bytes((10, 0, (flow + 1) >> 8 & 0xFF, flow + 1 & 0xFF)), CLIENT_PORT
+    client = bytes((10, path, (flow + 1) >> 8 & 0xFF, flow + 1 & 0xFF)), CLIENT_PORT
     ends = [client, (SERVER, SERVER_PORT)]
     (source, source_port), (target, target_port) = ends if direction == DOWNLINK else ends[::-1]
     length = min(size, 0xFFFF)

@@ -13,6 +13,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from queue import Empty, Queue
 from threading import Thread
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -204,7 +205,7 @@ def test_a_wrong_direction_is_told_in_a_line(
     assert told.count("\n") == 1
 
 
-def directed(**given: str) -> Scenario:
+def directed(**given: Any) -> Scenario:
     return _with_directions(parse(NetemOptions(**given), [], "netem", None, is_final=False)).config
 
 
@@ -220,6 +221,29 @@ def test_each_flag_changes_its_own_direction_of_the_scenario() -> None:
     network, demo = directed(scenario="demo", to_client="loss(10%)").network, load("demo").network
     assert (network.uplink, network.downlink) == ("loss(10%)", demo.downlink)
     assert directed(to_server="loss(0.2)").downlink.loss == 0.2
+
+
+def test_netem_emulates_the_path_that_it_is_told() -> None:
+    flown = load("demo-two-links")
+    assert directed(scenario="demo-two-links") == flown.on_path(0)
+    second = directed(scenario="demo-two-links", path=2, to_server="loss(0.5)")
+    assert (second.seed, second.uplink.mean_s) == (flown.on_path(1).seed, pytest.approx(0.1))
+    assert (second.downlink.loss, second.downlink.mean_s) == (0.5, 0.0)
+
+
+@pytest.mark.parametrize(("scenario", "path"), [("demo", 2), ("demo-two-links", 3), ("demo", 0)])
+def test_a_path_that_the_scenario_lacks_is_refused(
+    scenario: str, path: int, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["netem", scenario, "--bind", "127.0.0.1:0", "--path", str(path)]) == 2
+    assert f"--path: got {path}," in capsys.readouterr().err
+
+
+def test_the_impairments_of_one_path_change_while_netem_runs() -> None:
+    scenario = load("demo-two-links").on_path(1)
+    proxy = Proxy(scenario, server=("server", 1), path=1)
+    (changed,) = Running(proxy, scenario).change({"network.uplink": "loss(1)"}, now_ns=0)
+    assert (changed.key, changed.after) == ("network.uplink", '"loss(1)"')
 
 
 @pytest.mark.parametrize("text", ["constant(100)", "loss(1)"])
@@ -285,6 +309,14 @@ def test_a_capture_has_what_came_out() -> None:
     assert [size for *_, size in packets] == [1400, 100, 7]
     assert packets[0][1] == bytes((10, 0, 1, 45))
     assert packets[1][1:3] == (traffic.SERVER, bytes((10, 0, 0, 1)))
+
+
+def test_packets_of_another_path_are_apart_in_captures_and_traces() -> None:
+    rows = np.zeros(2, PACKET_COLUMNS)
+    rows["direction"], rows["path"] = DOWNLINK, [0, 1]
+    assert set(traffic.traces(rows)) == {"downlink-0", "downlink-0-path-2"}
+    clients = [client for _, client, *_ in captured(traffic.pcap(rows))]
+    assert clients == [bytes((10, 0, 0, 1)), bytes((10, 1, 0, 1))]
 
 
 def test_a_recording_becomes_the_trace_of_each_flow(tmp_path: Path) -> None:

@@ -60,10 +60,10 @@ def test_one_row_is_written_as_many_are(columns: Columns) -> None:
     assert sink.getvalue() == written(columns, 1)
 
 
-@pytest.mark.parametrize("count", [0, 7, 9])
+@pytest.mark.parametrize("count", [0, 8, 10])
 def test_a_row_with_too_few_or_too_many_numbers_is_our_own_mistake(count: int) -> None:
     """Such a row would displace all others."""
-    with pytest.raises(struct.error, match="expected 8 items"):
+    with pytest.raises(struct.error, match="expected 9 items"):
         Recorder(PACKET_COLUMNS, io.BytesIO()).append_row(*[0] * count)
 
 
@@ -94,7 +94,7 @@ def test_what_is_no_part_is_a_value_error(header: bytes) -> None:
 def test_a_part_begins_with_its_columns_in_a_line() -> None:
     """So a part can be read with numpy alone."""
     header, _, _ = written(PACKET_COLUMNS).partition(b"\n")
-    assert header.startswith(b'[["direction", "|u1"], ["flow", "<u4"], ["number", "<u4"]')
+    assert header.startswith(b'[["direction", "|u1"], ["path", "|u1"], ["flow", "<u4"], ')
 
 
 def test_one_value_is_broadcast_to_all_rows() -> None:
