@@ -25,7 +25,7 @@ from skytether.client import vehicles as kinds
 from skytether.client.endpoint import Client
 from skytether.client.fleet import apart_ns
 from skytether.client.link import ClientLink
-from skytether.netem.proxy import Proxy
+from skytether.netem.proxy import Proxy, of_paths
 from skytether.server.endpoint import Server
 from skytether.server.gate import Gate
 from skytether.shared.base.chance import stream
@@ -175,6 +175,9 @@ class SharedServer(Server):
         if dropped is not None:
             self.dropped_by_host[datagram.peer[0]][dropped] += 1
 
+    def dropped_of(self, hosts: Sequence[str]) -> Counter[Drop]:
+        return sum((self.dropped_by_host[host] for host in hosts), Counter[Drop]())
+
 
 class Run:
     """Vehicles of one seed and their network, in a world shared with other runs.
@@ -182,7 +185,7 @@ class Run:
     Args:
         scenario: scenario to fly, with the run's seed.
         server_rows: returns the number of rows that the server has recorded so far.
-        server_figures: returns the server's figures so far for the datagrams of a host.
+        server_figures: returns the server's figures so far for the datagrams of hosts.
         number: number of the run, from 0; its vehicles are numbered after those of earlier runs.
         vehicles: number of vehicles.
         keyring: keys of the vehicles; None without encryption.
@@ -193,7 +196,7 @@ class Run:
         world: World,
         scenario: Scenario,
         server_rows: Callable[[], int],
-        server_figures: Callable[[str], Mapping[str, Any]],
+        server_figures: Callable[[Sequence[str]], Mapping[str, Any]],
         number: int,
         vehicles: int,
         keyring: Keyring | None,
@@ -202,15 +205,22 @@ class Run:
         self._before = number * vehicles
         self._sinks = io.BytesIO(), io.BytesIO()
         recorder = Recorder(client_columns(scenario.model.axes), self._sinks[0])
-        self.netem = Proxy(
-            scenario,
-            server=SERVER,
-            flows=vehicles,
-            recorder=Recorder(PACKET_COLUMNS, self._sinks[1]),
-        )
-        netem_at = world.add(f"netem {scenario.seed}", self.netem)
-        self.netem_host = netem_at[0]
-        self.hosts: dict[str, Endpoint] = {self.netem_host: self.netem}
+        packets = Recorder(PACKET_COLUMNS, self._sinks[1])
+        self._netems: dict[str, Proxy] = {}
+        self.running: dict[str, Running] = {}
+        """Scenario of each host, and its changes."""
+        for i in range(len(scenario.paths)):
+            host = f"netem {scenario.seed}/{i + 1}" if i else f"netem {scenario.seed}"
+            own = scenario.on_path(i)
+            netem = Proxy(own, server=SERVER, flows=vehicles, recorder=packets, path=i)
+            self._netems[host], self.running[host] = netem, Running(netem, own)
+            world.add(host, netem)
+        addresses: list[Address] = [(host, 0) for host in self._netems]
+        reached: dict[str, Any] = {"server": addresses[0]}
+        if len(addresses) > 1:
+            reached = {"paths": addresses, "prices": [each.price for each in scenario.paths]}
+        self.hosts: dict[str, Endpoint] = dict([*self._netems.items()][:1])
+        """Endpoints of netem, of the first path, and of the vehicles, in this order."""
         self._events: deque[FlightEvent] = deque(maxlen=EVENTS_MAX)
         simulation = scenario.simulation
         clock = Clock(
@@ -222,11 +232,11 @@ class Run:
             Client(
                 scenario,
                 kinds.make(scenario, vehicle),
-                server=netem_at,
                 vehicle=self._before + vehicle,
                 boot_id=BOOT_ID,
                 link=_link(keyring, scenario.seed, self._before + vehicle),
                 recorder=recorder,
+                **reached,
             )
             for vehicle in range(1, vehicles + 1)
         ]
@@ -239,6 +249,7 @@ class Run:
                 on_finished=self._one_has_finished,
             )
             self.hosts[host] = client
+            self.running[host] = Running(client, scenario)
         self.flying = vehicles
         self._ends: tuple[int | None, int | None] = None, None
         """Rows of the server and bytes of netem when the last vehicle finished."""
@@ -264,8 +275,8 @@ class Run:
     def _figures_now(self) -> dict[str, Any]:
         each = {str(one.vehicle - self._before): one.vehicle_figures() for one in self._clients}
         return {
-            "server": self._server_figures(self.netem_host),
-            "netem": self.netem.figures(),
+            "server": self._server_figures([*self._netems]),
+            "netem": of_paths([netem.figures() for netem in self._netems.values()]),
             "client": {"by_vehicle": each},
         }
 
@@ -363,23 +374,25 @@ def _fly(
     def server_rows() -> int:
         return (sink.tell() - header_bytes) // row_bytes
 
-    def server_figures(host: str) -> Mapping[str, Any]:
+    def server_figures(hosts: Sequence[str]) -> Mapping[str, Any]:
         if isinstance(server, SharedServer):
-            return {"dropped": by_name(server.dropped_by_host[host])}
+            return {"dropped": by_name(server.dropped_of(hosts))}
         return server.figures()
 
     runs = [
         Run(world, run, server_rows, server_figures, number, vehicles, keyring)
         for number, run in enumerate(each)
     ]
-    run_of = {host: run for run in runs for host in run.hosts} | dict.fromkeys(beside, runs[0])
+    run_of = {host: run for run in runs for host in run.running} | dict.fromkeys(beside, runs[0])
     for name, endpoint in beside.items():
         world.add(name, endpoint)
     # Added last, the server is woken last at an instant, when all datagrams due have arrived.
     compute_ns = seconds_to_ns(scenario.simulation.compute_s)
     world.add(SERVER[0], server, clock=Clock(MIDNIGHT_NS), compute_ns=compute_ns)
-    hosts = {host: endpoint for run in runs for host, endpoint in run.hosts.items()}
-    plan_changes(world, scenario, {SERVER[0]: server, **hosts, **beside}, changes)
+    running = {SERVER[0]: Running(server, scenario)}
+    running |= {host: each for run in runs for host, each in run.running.items()}
+    running |= {host: Running(endpoint, scenario) for host, endpoint in beside.items()}
+    plan_changes(world, running, changes)
     for time_s, act in actions:
         world.at(seconds_to_ns(time_s), partial(act, world))
     ask_ns, second_ns, flying = 0, SECOND_NS, runs.copy()
@@ -415,14 +428,12 @@ def _fly(
 
 def plan_changes(
     world: World,
-    scenario: Scenario,
-    endpoints: Mapping[str, Endpoint],
+    running: Mapping[str, Running],
     changes: Sequence[tuple[float, Mapping[str, Any]]],
 ) -> None:
     """Schedule changes of keys at each host that accepts the key; the first host refuses unknown
     keys.
     """
-    running = {host: Running(endpoint, scenario) for host, endpoint in endpoints.items()}
     changeable = frozenset[str]().union(*(each.changeable for each in running.values()))
 
     def change(values: Mapping[str, Any]) -> None:

@@ -13,6 +13,7 @@ from skytether.autopilot.flavours import FlavourName
 from skytether.netem.proxy import Proxy
 from skytether.shared.base.chance import stream
 from skytether.shared.base.units import SECOND_NS, seconds_to_ns
+from skytether.shared.core.change import Running
 from skytether.shared.core.events import Event
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import (
@@ -75,7 +76,8 @@ def fly(
     start_ns = int(stream(scenario.seed, "phase").integers(scenario.dt_ns))
     world.add("autopilot", autopilot, clock=clock, start_ns=start_ns)
     world.add("station", station)
-    plan_changes(world, scenario, {"netem": netem, "autopilot": autopilot}, changes)
+    running = {"netem": Running(netem, scenario), "autopilot": Running(autopilot, scenario)}
+    plan_changes(world, running, changes)
     told_s = 0
 
     def over() -> bool:

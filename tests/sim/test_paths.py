@@ -1,0 +1,129 @@
+"""Several paths of a session in virtual time, each with a netem of its own."""
+
+import inspect
+from collections.abc import Sequence
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+
+from helpers import packaged
+from skytether.client.endpoint import Client
+from skytether.netem.fate import Fates
+from skytether.shared.base.units import SECOND_NS
+from skytether.shared.core.endpoint import Address
+from skytether.shared.core.events import FlowOpened
+from skytether.shared.scenario.air.draws import SLOT_NS
+from skytether.shared.scenario.schema import Scenario
+from skytether.shared.telemetry.record import DOWNLINK, UPLINK, Record
+from skytether.shared.telemetry.summary import summarise
+from skytether.sim import flight
+from skytether.sim.flight import fly, fly_batch
+
+SLOTS_PER_S = SECOND_NS // SLOT_NS
+BLACK_HOLE = {"uplink": "loss(1)", "downlink": "loss(1)"}
+GOOD = {"uplink": "constant(0.1) & loss(0.2)", "downlink": "constant(0.05)", "price": 3.0}
+NEEDS_CLIENT = pytest.mark.skipif(
+    "paths" not in inspect.signature(Client).parameters, reason="the client has one path"
+)
+
+
+def two_paths(*paths: dict[str, Any], **changes: Any) -> Scenario:
+    network = {"network": {"paths": list(paths or (BLACK_HOLE, GOOD))}}
+    return packaged("paper", network, {"duration": 3.0, "settle": 0.0}, changes)
+
+
+class OnSecondPath(Client):
+    """Client that uses its second path alone."""
+
+    given: tuple[Sequence[Address], Sequence[float]] = (), ()
+
+    def __init__(
+        self, *args: Any, paths: Sequence[Address], prices: Sequence[float], **options: Any
+    ) -> None:
+        OnSecondPath.given = paths, prices
+        super().__init__(*args, server=paths[1], **options)
+
+
+@pytest.fixture
+def flown(monkeypatch: pytest.MonkeyPatch) -> Record:
+    monkeypatch.setattr(flight, "Client", OnSecondPath)
+    return fly(two_paths())
+
+
+def test_a_client_gets_the_address_and_the_price_of_each_path(flown: Record) -> None:
+    assert len(flown.client)
+    assert OnSecondPath.given == ([("netem 1", 0), ("netem 1/2", 0)], [1.0, 3.0])
+    opened = [each for each in flown.events if isinstance(each.event, FlowOpened)]
+    assert [(each.host, each.process) for each in opened] == [("netem 1/2", "netem")]
+
+
+def test_packets_of_a_path_meet_its_network(flown: Record) -> None:
+    rows = flown.netem
+    assert set(rows["path"].tolist()) == {1}
+    up, down = (rows[rows["direction"] == each] for each in (UPLINK, DOWNLINK))
+    assert set(up["delay_ns"].tolist()) == {100_000_000}
+    assert set(down["delay_ns"].tolist()) == {50_000_000}
+    assert 0.05 < up["lost"].mean() < 0.5
+
+
+def test_the_links_of_the_demo_are_out_a_tenth_of_the_time_and_independently() -> None:
+    scenario = packaged("demo-two-links")
+    out = []
+    for each in (scenario.on_path(0), scenario.on_path(1)):
+        fates = Fates(each.uplink, each.seed, "uplink", 0)
+        out.append([fates.at(slot).lost for slot in range(0, 40_000 * SLOTS_PER_S, SLOTS_PER_S)])
+    one, other = np.array(out)
+    assert (one.mean(), other.mean()) == (pytest.approx(0.1, abs=0.015),) * 2
+    assert (one & other).mean() == pytest.approx(0.01, abs=0.005)
+
+
+def test_figures_count_all_paths_together_and_each_alone(flown: Record) -> None:
+    netem, rows = flown.figures["netem"], flown.netem
+    assert set(netem["by_path"]) == {"1", "2"}
+    assert netem["by_path"]["1"]["uplink"]["packets"] == 0
+    for way, direction in (("uplink", UPLINK), ("downlink", DOWNLINK)):
+        own = netem["by_path"]["2"][way]
+        assert netem[way]["bytes"] == own["bytes"]
+        assert netem[way]["packets"] == own["packets"] >= (rows["direction"] == direction).sum()
+        assert netem[way]["delays_ms"] == own["delays_ms"]
+    summary = summarise(two_paths(), "two", flown.client, flown.server, rows, figures=flown.figures)
+    assert summary.uplink_packets == (rows["direction"] == UPLINK).sum()
+    assert summary.drops is not None
+    assert summary.drops["netem"]["uplink lost"] == netem["uplink"]["lost"]
+
+
+def test_a_change_of_impairments_reaches_every_path(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(flight, "Client", OnSecondPath)
+    record = fly(two_paths(), changes=[(1.0, {"network.downlink": "constant(0.2)"})])
+    down = record.netem[record.netem["direction"] == DOWNLINK]
+    later = down["arrived_ns"] > 1_000_000_000
+    assert set(down["delay_ns"][later].tolist()) == {200_000_000}
+
+
+def test_a_run_of_a_batch_with_paths_equals_the_same_run_alone(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(flight, "Client", OnSecondPath)
+    scenario = two_paths()
+    together = fly_batch(scenario, (1, 2))
+    for seed, record in zip((1, 2), together, strict=True):
+        alone = fly(msgspec.structs.replace(scenario, seed=seed))
+        assert record.trace_hash() == alone.trace_hash()
+
+
+def test_a_changed_network_of_a_run_in_a_batch_has_the_runs_own_seed() -> None:
+    scenario = packaged("paper", {"duration": 3.0, "settle": 0.0})
+    changes = [(1.0, {"network.uplink": "constant(0.2) & loss(0.3)"})]
+    together = fly_batch(scenario, (1, 2), changes=changes)
+    for seed, record in zip((1, 2), together, strict=True):
+        alone = fly(msgspec.structs.replace(scenario, seed=seed), changes=changes)
+        assert record.trace_hash() == alone.trace_hash()
+
+
+@NEEDS_CLIENT
+def test_the_demo_with_two_links_flies_over_both() -> None:
+    record = fly(packaged("demo-two-links", duration=10.0, settle=0.0))
+    assert np.unique(record.netem["path"]).tolist() == [0, 1]
+    assert record.client["covered"][-1]
