@@ -224,7 +224,7 @@ def _really(
             from skytether.cli import recorder
 
             sockets = sockets or stack.enter_context(temporary.folder())
-            feeds = processes.feeds_in(sockets)
+            feeds = processes.feeds_in(sockets, scenario)
             live = recorder.Live(options.record, feeds, scenario, name, secure=secure, tell=_tell)
             stack.callback(live.finish)
         run = partial(

@@ -19,6 +19,7 @@ from pathlib import Path
 
 import numpy as np
 
+from skytether.netem.proxy import of_paths
 from skytether.shared.base import files
 from skytether.shared.core.endpoint import Address
 from skytether.shared.core.events import (
@@ -49,7 +50,7 @@ from skytether.shell.workers import die_with_parent
 
 ANYWHERE = ("--bind", "127.0.0.1:0")
 NAMES = ("client", "server", "netem")
-"""Names of the processes, and of their parts of the record."""
+"""Names of the processes, and of their parts of the record; further paths have `netem 2`, …"""
 
 START_S = 120.0
 """Longest time until a process listens [s]; it may have to compile first."""
@@ -62,6 +63,9 @@ POLL_S = 0.2
 LINES_MAX = 20
 """Number of a process's last lines that are kept, to be printed if it fails."""
 
+Chain = Sequence[Sequence[Sequence[str]]]
+"""Stages of processes, each with its name and arguments. The last argument is repeated for each
+address of the stage before, which takes the place of `{}`."""
 OnEvent = Callable[[LogLine], None]
 Shortfall = RecordIncomplete | NotFlown
 """Events after which a flight goes on, and which its command reports at the end."""
@@ -106,7 +110,8 @@ async def started(
     """Start a process that listens; at the end of the block it gets SIGTERM, then SIGKILL.
 
     Args:
-        name: process to run: server, netem, client, station or autopilot.
+        name: process to run: server, netem, client, station or autopilot; `netem N` is that of
+            path N.
         arguments: its command line, beside `--log json`.
         on_event: called with each line of its log.
 
@@ -117,7 +122,7 @@ async def started(
         sys.executable,
         "-P",  # -P: a folder in the user's working directory must not shadow our package.
         "-m",
-        f"skytether.{name}",
+        f"skytether.{name.partition(' ')[0]}",
         *arguments,
         "--log",
         "json",
@@ -180,8 +185,13 @@ async def _read(child: Child, stream: asyncio.StreamReader, on_event: OnEvent) -
         on_event(logged)
 
 
-def feeds_in(folder: Path) -> dict[str, Path]:
-    return {name: folder / f"{name}.feed" for name in NAMES}
+def netems(scenario: Scenario) -> list[str]:
+    """Names of the netems of a scenario's paths."""
+    return ["netem", *(f"netem {number}" for number in range(2, len(scenario.paths) + 1))]
+
+
+def feeds_in(folder: Path, scenario: Scenario) -> dict[str, Path]:
+    return {name: folder / f"{name}.feed" for name in ("client", "server", *netems(scenario))}
 
 
 def run(
@@ -239,12 +249,16 @@ def run(
         if recorded:
             arguments += ["--record", str(parts / name)]
         if sockets:
-            arguments += ["--control", str(sockets / name), "--feed", str(feeds_in(sockets)[name])]
+            feed = feeds_in(sockets, scenario)[name]
+            arguments += ["--control", str(sockets / name), "--feed", str(feed)]
         return [name, str(file), *arguments, *plugins.flags()]
 
     fleet = ["--vehicles", str(vehicles)]
     server = [*common("server", recorded=watched), *fleet, *keys, "--workers", str(workers)]
-    netem = [*common("netem", recorded=watched), "--flows", str(vehicles)]
+    paths = [
+        [*common(name, recorded=watched), "--path", str(number), "--flows", str(vehicles)]
+        for number, name in enumerate(netems(scenario), start=1)
+    ]
     client = [*common("client", recorded=True), *fleet, *keys]
     client += ["--set-parameters"] * set_parameters
 
@@ -254,7 +268,11 @@ def run(
         on_event(line)
 
     fly_chain(
-        [[*server, *ANYWHERE], [*netem, *ANYWHERE, "--server"], [*client, "--server"]],
+        [
+            [[*server, *ANYWHERE]],
+            [[*netem, *ANYWHERE, "--server={}"] for netem in paths],
+            [[*client, "--server={}" if len(paths) == 1 else "--path=127.0.0.1={}"]],
+        ],
         flies="client",
         timeout_s=timeout_s,
         on_second=on_second,
@@ -268,7 +286,7 @@ def run(
 
 
 def fly_chain(
-    chain: Sequence[Sequence[str]],
+    chain: Chain,
     *,
     flies: str,
     timeout_s: float,
@@ -276,11 +294,10 @@ def fly_chain(
     interrupted: Callable[[], bool],
     on_event: OnEvent,
 ) -> None:
-    """Run processes, each connected to the one before, until one of them ends, or Ctrl-C.
+    """Run processes, each connected to those before, until one of them ends, or Ctrl-C.
 
     Args:
-        chain: name and arguments of each process; the last argument of each except the first is the
-            flag for the address of the process before.
+        chain: see `Chain`.
         flies: name of the process whose end is the flight's.
         timeout_s: longest time that they run [s].
         on_second, interrupted, on_event: see `run`.
@@ -320,16 +337,20 @@ def record_of(
     """
     axes = scenario.model.axes
     said = sorted(said, key=attrgetter("time_ns"))
-    netem = _rows(parts / "netem", PACKET_COLUMNS).copy()
+    names = netems(scenario)
+    netem = np.concatenate([_rows(parts / name, PACKET_COLUMNS) for name in names])
     zero_ns = said[0].time_ns if said else 0
     netem["arrived_ns"] -= zero_ns
     counted = {path.name.replace(".json", ""): path.read_bytes() for path in parts.glob("*.json*")}
+    figures = {name: json.loads(text) for name, text in counted.items() if text}
+    if paths := [figures.pop(name) for name in names if name in figures]:
+        figures["netem"] = of_paths(paths)
     return Record(
         client=_rows(parts / "client", client_columns(axes)),
         server=_rows(parts / "server", server_columns(axes, scenario.control.scheme)),
         netem=netem,
         failure=next((each for each in shortfalls if isinstance(each, NotFlown)), None),
-        figures={name: json.loads(text) for name, text in counted.items() if text},
+        figures=figures,
         events=tuple(
             FlightEvent(each.time_ns - zero_ns, each.process, each.event) for each in said
         ),
@@ -347,7 +368,7 @@ def _rows(part: Path, columns: np.dtype[np.void]) -> Rows:
 
 
 async def _fly(
-    chain: Sequence[Sequence[str]],
+    chain: Chain,
     flies: str,
     *,
     timeout_s: float,
@@ -365,10 +386,15 @@ async def _fly(
 
     async with contextlib.AsyncExitStack() as stack:
         children: list[Child] = []
-        for argv in chain:
-            before = [address_text(*children[-1].address)] if children else []
-            child = await stack.enter_async_context(started(*argv, *before, on_event=hear))
-            children.append(child)
+        before: list[str] = []
+        for stage in chain:
+            begun = []
+            for *argv, last in stage:
+                flags = [last.format(address) for address in before] or [last]
+                starting = started(*argv, *flags, on_event=hear)
+                begun.append(await stack.enter_async_context(starting))
+            children += begun
+            before = [address_text(*child.address) for child in begun]
         began_s = loop.time()
         ended = [asyncio.create_task(child.end()) for child in children]
         try:

@@ -108,11 +108,16 @@ def _really(
 
         processes.fly_chain(
             [
-                process("station", *laws.flags(law), *processes.ANYWHERE),
-                process("netem", "--flows", "1", *processes.ANYWHERE, "--server"),
-                process(
-                    "autopilot", "--flavour", options.flavour, f"--ready={virtual.READY_S}", "--to"
-                ),
+                [process("station", *laws.flags(law), *processes.ANYWHERE)],
+                [process("netem", "--flows", "1", *processes.ANYWHERE, "--server={}")],
+                [
+                    process(
+                        "autopilot",
+                        *("--flavour", options.flavour),
+                        f"--ready={virtual.READY_S}",
+                        "--to={}",
+                    )
+                ],
             ],
             flies="station",
             timeout_s=scenario.duration + virtual.AROUND_S,

@@ -13,7 +13,7 @@ import msgspec
 import pytest
 
 from skytether.cli.fly import _tell
-from skytether.cli.processes import Child, _read, record_of, started
+from skytether.cli.processes import Child, _read, feeds_in, record_of, started
 from skytether.shared.core.events import (
     Counted,
     Finished,
@@ -28,6 +28,7 @@ from skytether.shared.core.events import (
     SessionEnded,
 )
 from skytether.shared.scenario.reading import load
+from skytether.shared.telemetry.record import PACKET_COLUMNS, Recorder
 from skytether.shell.command import CommandError
 from skytether.shell.log import LogLine
 from warm import Process
@@ -123,6 +124,24 @@ def test_events_of_a_flight_stand_in_the_order_of_their_times(tmp_path: Path) ->
         (2, "server"),
         (2, "netem"),
     ]
+
+
+def test_the_record_has_the_packets_and_figures_of_every_path(tmp_path: Path) -> None:
+    scenario = load("demo-two-links")
+    for part in ("client", "server"):
+        (tmp_path / part).touch()
+    for path, (name, packets) in enumerate({"netem": 3, "netem 2": 5}.items()):
+        with (tmp_path / name).open("wb") as file:
+            Recorder(PACKET_COLUMNS, file).append(packets, path=path, arrived_ns=7)
+        figures = {"uplink": {"packets": packets}, "refused": 1}
+        (tmp_path / f"{name}.json").write_bytes(msgspec.json.encode(figures))
+    record = record_of(tmp_path, scenario, ())
+    assert record.netem["path"].tolist() == [0] * 3 + [1] * 5
+    netem = record.figures["netem"]
+    assert (netem["uplink"]["packets"], netem["refused"]) == (8, 2)
+    assert netem["by_path"]["2"]["uplink"]["packets"] == 5
+    assert feeds_in(tmp_path, scenario)["netem 2"] == tmp_path / "netem 2.feed"
+    assert set(feeds_in(tmp_path, load("demo"))) == {"client", "server", "netem"}
 
 
 DEEP = b'{"process":"client","event":' + b"[" * 50_000
