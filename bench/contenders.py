@@ -22,7 +22,7 @@ README = (
     "feedback-gap",
     "trajectory-expected",
 )
-RUNS, SCOUTS, ROUNDS = 40, 8, 3
+RUNS, SCOUTS, ROUNDS = 30, 8, 3
 UNSHOWN = "committed-gap"
 """Contender without feedback aboard, which only the report has."""
 
@@ -35,6 +35,7 @@ def document_tables(folder: Path | None, flags: Flags) -> dict[str, TextTable]:
         contenders=[each for each in contenders.CONTENDERS if each.name != UNSHOWN],
         scouts=SCOUTS,
         rounds=ROUNDS,
+        budgets=BUDGETS,
     )
     options = compare.CompareOptions(RUNS, folder or Path("compare/document"), pool=flags)
     results, _, _ = compare.run(options, size, CommandCall.now("compare", []))

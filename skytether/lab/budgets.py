@@ -163,6 +163,7 @@ class Plan:
         self._scenario = scale.scenario(case)
         self._scouting = scale.scouts, replace(self._scenario, seed=SEARCH_SEED)
         self._scouted: list[Scouted] = []
+        self._budgets = scale.budgets or SOUGHT
 
     def scouts(self, points: Sequence[FlownContender]) -> Sweep:
         runs, scenario = self._scouting
@@ -229,7 +230,8 @@ class Plan:
         A contender has no entry for a budget in which every point failed or exceeded the effort
         limit.
         """
-        return {name: each.point for name, each in self._best().items()}
+        best = self._best().items()
+        return {name: each.point for name, each in best if name[1] in self._budgets}
 
     def tuned(self, name: str) -> Scenario:
         """Scenario of a contender that reports at every step, at the threshold of the search."""

@@ -293,6 +293,8 @@ class ComparisonSize:
     scouts: int = SCOUTS
     rounds: int = ROUNDS
     """Number of rounds in which more thresholds are tried near the budgets."""
+    budgets: Sequence[float] = ()
+    """Budgets for which points are chosen and flown; all unless given."""
     every: int = 1
     """Stride over a contender's factors; the factor 1 is always among them."""
     duration: float = math.inf
