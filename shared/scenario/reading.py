@@ -42,11 +42,7 @@ FILES: Mapping[str, tuple[PluginTable, int]] = MappingProxyType(
 )
 """Keys whose text may name files: table of the text's entries, and largest size of a file [B]."""
 TABLE_BYTES_MAX = 16_000_000
-<<<<<<< HEAD
-PATHS, WAYS = "network.paths", ("uplink", "downlink")
-=======
 WAYS = ("uplink", "downlink")
->>>>>>> net8
 COMPARED = "compare"
 """Name of the file with the scenarios of `skytether compare`."""
 
@@ -203,11 +199,7 @@ def _relative_to(folder: Path, raw: dict[str, Any], prefix: str = "") -> None:
         key = f"{prefix}{name}"
         if isinstance(value, dict):
             _relative_to(folder, value, f"{key}.")
-<<<<<<< HEAD
-        elif key == PATHS and isinstance(value, list):
-=======
         elif key == "network.paths" and isinstance(value, list):
->>>>>>> net8
             for path in value:
                 if isinstance(path, dict):
                     _relative_to(folder, path, prefix)
