@@ -162,7 +162,9 @@ class ServerSession:
             return None
         report, payload = split(payload)
         message = self._decode(payload, now_ns)
-        if report and self.paths and message.vehicle == self._vehicle:
+        # A slow path may still bring reports of an earlier session.
+        of = message.vehicle, getattr(message, "session", None)
+        if report and self.paths and of == (self._vehicle, self.number):
             self.paths.heard(report, datagram, path, now_ns)
         match message:
             case Welcome() as welcome:

@@ -1,6 +1,7 @@
 """Paths from the server to a vehicle: the proven addresses, and what is sent to each."""
 
-from collections.abc import Callable, Sequence
+import hashlib
+from collections.abc import Callable, Collection, Sequence
 from typing import NamedTuple
 
 from skytether.server.gate import ReplyPath
@@ -16,16 +17,12 @@ class Place(NamedTuple):
     socket: int
 
 
-class _Asked(NamedTuple):
-    place: Place
-    proof: int
-
-
 class ServerPaths:
     """Paths of one session.
 
-    A path is used once the vehicle has returned a random number from its address: somebody who
-    copies its packets from elsewhere cannot.
+    A path is used once the vehicle has returned a number from its address that was sent only there:
+    somebody who copies its packets from elsewhere cannot. As with a cookie, the number is computed
+    from the address and a secret, so questions are not stored.
 
     Args:
         spread: `link.spread`.
@@ -41,29 +38,38 @@ class ServerPaths:
         timeout_ns: int,
     ) -> None:
         self.paths, self._prices = Paths(prices, spread), prices
-        self._entropy, self._timeout_ns = entropy, timeout_ns
+        self._secret, self._timeout_ns = entropy(hashlib.blake2s.MAX_KEY_SIZE), timeout_ns
         self._places: dict[int, Place] = {}
-        self._asked: dict[int, _Asked] = {}
 
     def number(self, place: Place) -> int | None:
         """Number of the path with a proven address; None if there is none."""
         return next((path for path, each in self._places.items() if each == place), None)
+
+    @property
+    def places(self) -> Collection[Place]:
+        """Proven addresses."""
+        return self._places.values()
 
     def prove(self, message: PathProof, place: Place) -> PathProof | None:
         """Question to send to an address that names a path; None if it is proven."""
         path = message.path
         if path >= len(self.paths.each) or self._places.get(path) == place:
             return None
-        asked = self._asked.get(path)
-        if asked and asked == (place, message.proof):
-            self._places[path] = place
-            del self._asked[path]
-            return None
-        if asked is None or asked.place != place:
-            # The highest bit is set, so that msgpack uses nine bytes for every number.
-            asked = _Asked(place, int.from_bytes(self._entropy(8)) | 2**63)
-            self._asked[path] = asked
-        return message._replace(proof=asked.proof)
+        if message.proof != self._proof(place):
+            return self.question(message.vehicle, message.session, place, path)
+        self._places[path] = place
+        return None
+
+    def question(self, vehicle: int, session: int, place: Place, path: int = 0) -> PathProof:
+        """Question to an address; the vehicle knows which path it is."""
+        return PathProof(vehicle, session, path, self._proof(place), self._prices)
+
+    def _proof(self, place: Place) -> int:
+        (host, port), socket = place
+        text = f"{host} {port} {socket}".encode()
+        digest = hashlib.blake2s(text, key=self._secret, digest_size=8).digest()
+        # The highest bit is set, so that msgpack uses nine bytes for every number.
+        return int.from_bytes(digest) | 2**63
 
     def sealed(self, payload: bytes, line: ReplyPath, now_ns: int, worth: float) -> list[Datagram]:
         among = sorted(self._places)

@@ -167,7 +167,7 @@ class Reception:
         if call.vehicle not in (None, message.vehicle):
             raise ProtocolError(Drop.OF_ANOTHER_VEHICLE)
         if report and not isinstance(message, Hello):
-            self._hear_report(report, message, datagram, now_ns)
+            self._hear_report(report, message, call, datagram, now_ns)
         match message:
             case Observation():
                 self._observe(message, call, datagram, now_ns)
@@ -190,13 +190,19 @@ class Reception:
         self._report_ns = now_ns + REPORT_NS
 
     def _hear_report(
-        self, report: Report, message: Message, datagram: Datagram, now_ns: int
+        self, report: Report, message: Message, call: GateCall, datagram: Datagram, now_ns: int
     ) -> None:
+        """Note a report; ask for a proof where the vehicle has not been heard before."""
         session = self._sessions.live(message.vehicle)
         number = getattr(message, "session", None)
-        if session and session.paths and session.number == number:
-            path = session.paths.number(Place(datagram.peer, datagram.socket))
-            session.paths.paths.heard(report, datagram.payload, path, now_ns)
+        if session is None or session.paths is None or session.number != number:
+            return
+        place = Place(datagram.peer, datagram.socket)
+        path = session.paths.number(place)
+        session.paths.paths.heard(report, datagram.payload, path, now_ns)
+        if path is None and call.moves and isinstance(message, Observation):
+            question = session.paths.question(session.vehicle, session.number, place)
+            self._answer(question, call, datagram)
 
     def _prove(self, message: PathProof, call: GateCall, datagram: Datagram, now_ns: int) -> None:
         """Note the address of a path once it is proven; until then ask for the proof there."""
@@ -211,10 +217,13 @@ class Reception:
         place = Place(datagram.peer, datagram.socket)
         question = session.paths.prove(message, place)
         if question:
-            sealed = call.line.seal(encode(question))
-            self._out.append(Datagram(sealed, datagram.peer, datagram.socket))
-        elif session.paths.number(place) is not None:
-            self._sessions.note_path(session, place)
+            self._answer(question, call, datagram)
+        elif place in session.paths.places and self._sessions.at_place.get(place) is not session:
+            self._sessions.note_paths(session)
+
+    def _answer(self, message: Message, call: GateCall, datagram: Datagram) -> None:
+        sealed = call.line.seal(encode(message))
+        self._out.append(Datagram(sealed, datagram.peer, datagram.socket))
 
     def _hello(self, hello: Hello, call: GateCall, datagram: Datagram, now_ns: int) -> None:
         address = datagram.peer
@@ -225,10 +234,12 @@ class Reception:
         if refusal is Refusal.ACCEPTED:
             session = self._sessions.welcome(hello, address, call.line, now_ns, datagram.socket)
             number = session.number
+            if session.paths:  # a client that was started again keeps its session
+                session.paths.paths.peer_may_restart = True
         welcome = Welcome(
             hello.vehicle, number, hello.boot_id, self._boot_id, now_ns, refusal, self._terms
         )
-        self._out.append(Datagram(call.line.seal(encode(welcome)), address, datagram.socket))
+        self._answer(welcome, call, datagram)
         # After sealing the answer, which creates the channel.
         if refusal is Refusal.ACCEPTED:
             self._gate.admit(call, now_ns=now_ns)

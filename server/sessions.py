@@ -297,8 +297,12 @@ class Sessions:
                 self.welcomed_vehicles[session.vehicle] = successor
         self._note_rows()
 
-    def note_path(self, session: Session, place: Place) -> None:
-        self.with_paths[session.vehicle] = self.at_place[place] = session
+    def note_paths(self, session: Session) -> None:
+        """Note the proven addresses of a session, in place of its earlier ones."""
+        self._forget_paths(session)
+        if session.paths:
+            self.with_paths[session.vehicle] = session
+            self.at_place |= dict.fromkeys(session.paths.places, session)
 
     def _forget_paths(self, session: Session) -> None:
         if self.with_paths.pop(session.vehicle, None):

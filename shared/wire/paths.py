@@ -39,7 +39,7 @@ WINDOW = 16
 COPIES = 32
 """Number of newest packets whose copies are recognised."""
 IN_FLIGHT_MAX = 64
-"""Largest number of packets on a path of which the end still waits to hear."""
+"""Largest number of packets on a path of which an acknowledgement is still accepted."""
 DOWN, DOWN_EVERY_S = 0.05, 30.0
 """Share of the time for which a path is assumed to be down, and mean time between two outages [s].
 """
@@ -52,7 +52,7 @@ DELAYS = 16
 WAIT_NS, WAIT_MIN_NS, WAIT_MAX_NS = (
     600 * MILLISECOND_NS,
     150 * MILLISECOND_NS,
-    1500 * MILLISECOND_NS,
+    5 * SECOND_NS,
 )
 """Time after which a packet that a report does not name is lost: before the first acknowledgement,
 at least, at most [ns]."""
@@ -113,12 +113,21 @@ def _names(report: Report, arrived: int, sequence: int) -> bool:
 
 
 @dataclass(slots=True)
+class _InFlight:
+    """Packet on a path that is not acknowledged."""
+
+    sequence: int
+    sent_ns: int
+    is_lost: bool = False
+    """Whether it is taken for lost; a late acknowledgement corrects that."""
+
+
+@dataclass(slots=True)
 class Path:
     """What is known of one path in the direction in which this end sends."""
 
     price: float
-    in_flight: deque[tuple[int, int]] = field(default_factory=lambda: deque(maxlen=IN_FLIGHT_MAX))
-    """Sequence number and time of sending of packets of which nothing was heard yet."""
+    in_flight: deque[_InFlight] = field(default_factory=lambda: deque(maxlen=IN_FLIGHT_MAX))
     delays_ns: deque[int] = field(default_factory=lambda: deque(maxlen=DELAYS))
     """Times from sending to the acknowledgement."""
     loss: float = LOSS
@@ -154,17 +163,29 @@ class Path:
             return WAIT_NS
         return _within(min(self.delays_ns) * 3 // 2 + 2 * SPARE_NS)
 
-    def acknowledge(self, report: Report, arrived: int, now_ns: int) -> None:
-        waiting = list(self.in_flight)
+    def acknowledge(self, report: Report, arrived: int, now_ns: int, *, is_newest: bool) -> None:
+        """Note which packets a report names.
+
+        Args:
+            arrived: the report's mask of this path.
+            is_newest: whether no newer report has come; an older one does not show what was lost.
+        """
+        waiting, has_arrived = list(self.in_flight), False
         self.in_flight.clear()
-        for sequence, sent_ns in waiting:
-            if _names(report, arrived, sequence):
-                self.delays_ns.append(now_ns - sent_ns)
-                self._arrived(sent_ns)
-            elif _ahead(report.newest, sequence) >= WINDOW or now_ns - sent_ns > self.quick_ns:
+        for packet in waiting:
+            if _names(report, arrived, packet.sequence):
+                if packet.is_lost:  # the path has become slower
+                    self.delays_ns.clear()
+                self.delays_ns.append(now_ns - packet.sent_ns)
+                self._arrived(packet)
+                has_arrived = True
+                continue
+            was_lost, is_past = packet.is_lost, _ahead(report.newest, packet.sequence) >= WINDOW
+            packet.is_lost |= is_past or (is_newest and now_ns - packet.sent_ns > self.quick_ns)
+            if packet.is_lost and (has_arrived or not was_lost):
                 self.missing += 1
-            else:
-                self.in_flight.append((sequence, sent_ns))
+            if not is_past:
+                self.in_flight.append(packet)
 
     def expire(self, silence_ns: int, now_ns: int) -> None:
         """Count packets as lost of which nothing was heard although a report was due.
@@ -173,15 +194,21 @@ class Path:
             silence_ns: longest silence of the other end.
         """
         wait_ns = self.quick_ns + silence_ns + SPARE_NS
-        while self.in_flight and now_ns - self.in_flight[0][1] > wait_ns:
+        for packet in self.in_flight:
+            if now_ns - packet.sent_ns <= wait_ns:
+                break
+            if not packet.is_lost:
+                packet.is_lost = True
+                self.missing += 1
+        while self.in_flight and now_ns - self.in_flight[0].sent_ns > wait_ns + WAIT_MAX_NS:
             self.in_flight.popleft()
-            self.missing += 1
 
-    def _arrived(self, sent_ns: int) -> None:
-        lost = self.missing if self.missing < OUTAGE else 0
+    def _arrived(self, packet: _InFlight) -> None:
+        missing = self.missing - packet.is_lost
+        lost = missing if 0 <= missing < OUTAGE else 0
         self.loss += LOSS_WEIGHT * (lost - self.loss) / max(lost, 1)
         self.loss, self.missing = max(self.loss, LOSS_MIN), 0
-        self.arrived_ns = max(sent_ns, self.arrived_ns or sent_ns)
+        self.arrived_ns = max(packet.sent_ns, self.arrived_ns or packet.sent_ns)
 
 
 def _within(time_ns: int) -> int:
@@ -214,6 +241,8 @@ class Paths:
         self._heard: int | None = None
         """Newest sequence number of the other end; None before the first."""
         self._masks = [0] * len(prices)
+        self.peer_may_restart = False
+        """Whether the other end may begin its sequence numbers anew."""
         self._copies: dict[bytes, int] = {}
         """Sequence numbers of the newest datagrams of the other end, oldest first."""
 
@@ -260,7 +289,7 @@ class Paths:
         assert self._newest is not None
         for one in on:
             path = self.each[one]
-            path.in_flight.append((self._newest.sequence, now_ns))
+            path.in_flight.append(_InFlight(self._newest.sequence, now_ns))
             path.used_ns = now_ns
             path.packets += 1
             path.bytes += len(datagram)
@@ -277,7 +306,11 @@ class Paths:
         newest = self._newest
         if newest is None:
             return None
-        waits = any(newest.sequence == each for path in self.each for each, _ in path.in_flight)
+        waits = any(
+            packet.sequence == newest.sequence and not packet.is_lost
+            for path in self.each
+            for packet in path.in_flight
+        )
         others = [one for one in among if one not in newest.sent_on]
         if waits or not others:
             return None
@@ -305,7 +338,7 @@ class Paths:
         arrives within its time-out.
         """
         arrived = [path.arrived_ns for path in self.each if path.arrived_ns is not None]
-        share = (now_ns - max(arrived)) / timeout_ns if arrived else 1.0
+        share = max(now_ns - max(arrived), 0) / timeout_ns if arrived else 1.0
         return ALIVE_WORTH * min(share, 1.0) ** 2
 
     # -- receiving ---------------------------------------------------------------------------
@@ -332,6 +365,8 @@ class Paths:
         if len(self._copies) > COPIES:
             del self._copies[next(iter(self._copies))]
         ahead = WINDOW if self._heard is None else _ahead(report.sequence, self._heard)
+        if self.peer_may_restart and ahead <= -WINDOW:
+            self.peer_may_restart, ahead = False, WINDOW
         if ahead > 0:
             self._masks = [mask << min(ahead, WINDOW) & 0xFFFF for mask in self._masks]
             self._heard = report.sequence
@@ -341,7 +376,7 @@ class Paths:
         if not any(report.arrived):  # before the first packet there is nothing to report
             return
         for one, arrived in zip(self.each, report.arrived, strict=True):
-            one.acknowledge(report, arrived, now_ns)
+            one.acknowledge(report, arrived, now_ns, is_newest=ahead > 0)
         if self._newest and any(
             _names(report, each, self._newest.sequence) for each in report.arrived
         ):

@@ -218,3 +218,49 @@ def test_some_of_the_allowed_paths_are_always_chosen(
     chosen = Paths(prices).choose(worth, 0, sorted(among))
     assert chosen
     assert {*chosen} <= among
+
+
+def test_path_that_became_slower_is_known_to_be_well() -> None:
+    ends = Ends()
+    ends.exchange(20)
+    reports = list[tuple[int, bytes]]()
+    for _ in range(40):
+        ends.now_ns += STEP_NS
+        ends.send(on=(0,))
+        datagram = ends.far.report() + b"\x93" + len(reports).to_bytes(4)
+        reports.append((ends.now_ns + 6 * STEP_NS, datagram))
+        for due_ns, each in reports:
+            if due_ns == ends.now_ns:
+                ends.arrive(ends.near, each, 0)
+        ends.near.again(SILENCE_NS, ends.now_ns, BOTH)
+    assert ends.near.each[0].failure(ends.now_ns) < 0.2
+
+
+def test_report_that_a_slow_path_brings_late_does_not_tell_what_was_lost_since() -> None:
+    ends = Ends()
+    ends.exchange(20)
+    late = ends.far.report() + b"\x93late"
+    ends.exchange(1)
+    ends.now_ns += STEP_NS
+    ends.send(on=(0,))
+    ends.now_ns += SECOND_NS // 2
+    before = ends.near.each[0].failure(ends.now_ns)
+    ends.arrive(ends.near, late, 1)
+    assert ends.near.each[0].failure(ends.now_ns) == before
+    assert ends.near.again(SILENCE_NS, ends.now_ns, BOTH) is None
+
+
+def test_end_that_begins_its_numbers_anew_is_understood_at_once() -> None:
+    ends = Ends()
+    ends.exchange(60)
+    ends.near = Paths((1.0, 1.0))
+    ends.far.peer_may_restart = True
+    ends.exchange(10)
+    assert max(path.failure(ends.now_ns) for path in ends.near.each) < 0.2
+
+
+def test_clock_set_back_makes_no_message_precious() -> None:
+    ends = Ends()
+    ends.exchange(20)
+    earlier_ns = ends.now_ns - 3600 * SECOND_NS
+    assert ends.near.alive_worth(SECOND_NS, earlier_ns) == 0.0

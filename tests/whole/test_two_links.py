@@ -7,6 +7,7 @@ import pytest
 
 from helpers import packaged
 from skytether.server.endpoint import Server
+from skytether.shared.base.units import SECOND_NS
 from skytether.shared.core.endpoint import Datagram
 from skytether.shared.core.events import ModeChanged
 from skytether.shared.telemetry.record import DOWNLINK, UPLINK, Record
@@ -68,6 +69,50 @@ def test_a_link_that_dies_in_one_direction_only_is_left_in_that_direction(way: s
     dead, well = (UPLINK, DOWNLINK) if way == "up" else (DOWNLINK, UPLINK)
     assert share[dead] < 0.4
     assert share[well] > 0.3
+
+
+@pytest.mark.parametrize("secure", [False, True])
+@pytest.mark.parametrize("renumbered", [("/2",), ("", "/2")])
+def test_nat_gives_paths_new_ports_and_the_flight_goes_on(
+    renumbered: tuple[str, ...], monkeypatch: pytest.MonkeyPatch, *, secure: bool
+) -> None:
+    """Every 5 s the server hears these paths at another port, and reaches them only there."""
+    hear, outbox, now_port = Server.receive, Server.outbox, 0
+    scenario = two((GOOD, GOOD, 1.0), (GOOD, GOOD, 1.0))
+    hosts = [f"netem {scenario.seed}{each}" for each in renumbered]
+
+    def receive(self: Server, datagram: Datagram, *, now_ns: int) -> None:
+        nonlocal now_port
+        now_port = 1000 * (now_ns // (5 * SECOND_NS))
+        host, port = datagram.peer
+        peer = (host, port + now_port * (host in hosts))
+        hear(self, datagram._replace(peer=peer), now_ns=now_ns)
+
+    def translated(self: Server) -> list[Datagram]:
+        out = []
+        for each in outbox(self):
+            host, port = each.peer
+            if host not in hosts:
+                out.append(each)
+            elif port >= now_port:
+                out.append(each._replace(peer=(host, port - now_port)))
+        return out
+
+    monkeypatch.setattr(Server, "receive", receive)
+    monkeypatch.setattr(Server, "outbox", translated)
+    record = fly(scenario, secure=secure)
+    assert brakes(record) == 0
+    assert rmse_m(scenario, record) < 0.05
+    late = record.netem[record.netem["direction"] == UPLINK]
+    assert 0.3 < (late["path"] == 1).mean() < 0.7
+
+
+def test_slow_link_beside_a_fast_one_is_known_to_be_well() -> None:
+    slow = "uniform(0.9, 1.0)"
+    record = fly(two((GOOD, GOOD, 1.0), (slow, slow, 1.0)))
+    assert brakes(record) == 0
+    for end in (record.figures["client"], record.figures["server"]):
+        assert max(path["failure"] for path in end["by_vehicle"]["1"]["paths"]) < 0.5
 
 
 def test_both_links_die_and_the_vehicle_brakes() -> None:

@@ -1,0 +1,153 @@
+"""Paths from the server to a vehicle: how an address is proven, forgotten and found anew."""
+
+import numpy as np
+
+from helpers import packaged
+from skytether.server.endpoint import Server
+from skytether.server.paths import Place, ServerPaths
+from skytether.shared.base.chance import stream
+from skytether.shared.base.units import SECOND_NS
+from skytether.shared.core.endpoint import Address, Datagram
+from skytether.shared.wire.paths import Paths, split
+from skytether.shared.wire.protocol import (
+    NO_HORIZON,
+    Hello,
+    Message,
+    Mode,
+    Observation,
+    PathProof,
+    Welcome,
+    decode,
+    encode,
+)
+
+PRICES = (1000, 1000)
+FIRST, SECOND, MOVED = Place(("first", 1), 0), Place(("second", 1), 0), Place(("moved", 1), 0)
+
+
+def made() -> ServerPaths:
+    return ServerPaths(PRICES, "auto", stream(1, "entropy").bytes, SECOND_NS)
+
+
+def test_an_address_is_proven_by_the_number_sent_to_it_and_by_no_other() -> None:
+    paths = made()
+    message = PathProof(1, 7, 0, 0, PRICES)
+    question, other = paths.prove(message, FIRST), paths.prove(message, MOVED)
+    assert question
+    assert other
+    assert question.proof != other.proof
+    assert paths.prove(other, FIRST)
+    assert not paths.is_ready
+    assert paths.prove(question, FIRST) is None
+    assert [*paths.places] == [FIRST]
+
+
+def test_questions_to_many_addresses_leave_that_to_the_vehicle_valid() -> None:
+    paths = made()
+    message = PathProof(1, 7, 0, 0, PRICES)
+    question = paths.prove(message, FIRST)
+    assert question
+    for port in range(100):
+        assert paths.prove(message, Place(("stranger", port), 0))
+    assert paths.prove(question, FIRST) is None
+
+
+class Vehicle:
+    """Vehicle with two paths whose messages the test writes."""
+
+    def __init__(self) -> None:
+        flown = packaged("paper-every-step")
+        self.terms, self.dt_ns = flown.terms(), flown.dt_ns
+        self.server = Server(flown, boot_id=77, entropy=stream(1, "entropy").bytes)
+        self.now_ns = 10 * SECOND_NS
+        self.paths = Paths(PRICES)
+        self.step = self.number = 0
+        self.session = 0
+        self.open()
+
+    def open(self) -> None:
+        (answer,) = self.send(encode(Hello(1, 5, self.terms)), FIRST)
+        welcome = decode(answer.payload, self.terms)
+        assert isinstance(welcome, Welcome)
+        self.session = welcome.session
+
+    def send(self, payload: bytes, place: Place) -> list[Datagram]:
+        """Answers to a datagram."""
+        peer, socket = place
+        self.server.receive(Datagram(payload, peer, socket), now_ns=self.now_ns)
+        return self.server.outbox()
+
+    def say(self, message: Message, place: Place) -> list[tuple[Message, Address]]:
+        answers = self.send(self.paths.report() + encode(message), place)
+        return [(decode(split(each.payload)[1], self.terms), each.peer) for each in answers]
+
+    def observe(self, place: Place) -> list[tuple[Message, Address]]:
+        self.step += 1
+        self.number += 1
+        self.now_ns += self.dt_ns
+        axes, backward_us = self.terms.axes, (self.step * self.dt_ns - self.now_ns) // 1000 % 2**32
+        observation = Observation(
+            1,
+            self.session,
+            self.step,
+            NO_HORIZON,
+            self.step,
+            backward_us,
+            0,
+            Mode.HOVER,
+            True,
+            np.zeros((axes, 2)),
+            np.zeros(axes),
+            self.number % 128,
+            0,
+        )
+        return self.say(observation, place)
+
+    def prove(self, path: int, place: Place) -> None:
+        message = PathProof(1, self.session, path, 0, PRICES)
+        ((question, peer),) = self.say(message, place)
+        assert isinstance(question, PathProof)
+        assert peer == place.peer
+        assert self.say(message._replace(proof=question.proof), place) == []
+
+
+def test_addresses_that_a_path_has_left_are_forgotten() -> None:
+    vehicle = Vehicle()
+    vehicle.observe(FIRST)
+    for port in range(20):
+        vehicle.prove(0, Place(("vehicle", port), 0))
+    vehicle.prove(1, SECOND)
+    assert {*vehicle.server.sessions.at_place} == {Place(("vehicle", 19), 0), SECOND}
+
+
+def test_path_is_asked_for_a_proof_as_soon_as_it_is_heard_at_another_address() -> None:
+    vehicle = Vehicle()
+    vehicle.observe(FIRST)
+    vehicle.prove(0, FIRST)
+    vehicle.prove(1, SECOND)
+    assert vehicle.observe(FIRST) == []
+    ((question, peer),) = vehicle.observe(MOVED)
+    assert peer == MOVED.peer
+    assert isinstance(question, PathProof)
+    assert vehicle.say(question._replace(path=0), MOVED) == []
+    assert {*vehicle.server.sessions.at_place} == {MOVED, SECOND}
+
+
+def test_client_that_was_started_again_in_its_session_is_acknowledged_at_once() -> None:
+    vehicle = Vehicle()
+    vehicle.observe(FIRST)
+    vehicle.prove(0, FIRST)
+    vehicle.prove(1, SECOND)
+    for _ in range(60):
+        vehicle.observe(FIRST)
+    vehicle.paths = Paths(PRICES)
+    before = vehicle.session
+    vehicle.open()
+    assert vehicle.session == before
+    vehicle.observe(FIRST)
+    session = vehicle.server.sessions.live(1)
+    assert session
+    assert session.paths
+    report, _ = split(session.paths.paths.report())
+    assert report
+    assert (report.newest, report.arrived) == (1, (1, 0))
