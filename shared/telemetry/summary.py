@@ -58,6 +58,8 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
     """UDP payload of all uplink packets [B]."""
     downlink_packets: int | None
     downlink_bytes: int | None
+    paths: list[tuple[int, int]] | None = None
+    """Number of packets on each path, up and down; None with a single path."""
     uplink_packets_per_s: float | None = None
     """Rate of packets from the server, including heartbeats and lost ones [1/s]."""
     uplink_bytes_per_s: float | None = None
@@ -178,6 +180,7 @@ def summarise(
         uplink_bytes=_bytes(netem, UPLINK),
         downlink_packets=_count(netem, DOWNLINK),
         downlink_bytes=_bytes(netem, DOWNLINK),
+        paths=_paths(scenario, netem),
         **_rates(netem, duration_s),
         lost=None if netem is None else int(netem["lost"].sum()),
         reordered=None if netem is None else int(netem["overtaken"].sum()),
@@ -268,6 +271,15 @@ def _count(netem: Rows | None, direction: int) -> int | None:
 
 def _bytes(netem: Rows | None, direction: int) -> int | None:
     return None if netem is None else int(netem["bytes"][netem["direction"] == direction].sum())
+
+
+def _paths(scenario: Scenario, netem: Rows | None) -> list[tuple[int, int]] | None:
+    count = len(scenario.paths)
+    if netem is None or count == 1:
+        return None
+    ways = (netem["path"][netem["direction"] == each] for each in (UPLINK, DOWNLINK))
+    up, down = (np.bincount(way, minlength=count).tolist() for way in ways)
+    return list(zip(up, down, strict=True))
 
 
 def _rates(netem: Rows | None, duration_s: float) -> dict[str, float]:

@@ -396,7 +396,9 @@ class Paths:
                 "bytes": path.bytes,
                 "loss": round(path.loss, 3),
                 "failure": round(path.failure(now_ns), 3),
-                "delay_ms": min(path.delays_ns) / MILLISECOND_NS if path.delays_ns else None,
+                "delay_ms": round(min(path.delays_ns) / MILLISECOND_NS, 1)
+                if path.delays_ns
+                else None,
                 "first": path.first,
                 "copies": path.copies,
             }

@@ -47,6 +47,7 @@ from skytether.shell import plugins, temporary
 from skytether.shell.command import INTERRUPTED, CommandError
 from skytether.shell.log import LogLine, line_of
 from skytether.shell.workers import die_with_parent
+from skytether.view.browser.play import NETEMS
 
 ANYWHERE = ("--bind", "127.0.0.1:0")
 NAMES = ("client", "server", "netem")
@@ -187,7 +188,7 @@ async def _read(child: Child, stream: asyncio.StreamReader, on_event: OnEvent) -
 
 def netems(scenario: Scenario) -> list[str]:
     """Names of the netems of a scenario's paths."""
-    return ["netem", *(f"netem {number}" for number in range(2, len(scenario.paths) + 1))]
+    return list(NETEMS[: len(scenario.paths)])
 
 
 def feeds_in(folder: Path, scenario: Scenario) -> dict[str, Path]:

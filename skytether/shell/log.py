@@ -131,11 +131,18 @@ def rendered(figures: Mapping[str, Any], *, indent: int = 0) -> list[str]:
 
 
 def _for_people(figures: Mapping[str, Any]) -> dict[str, Any]:
-    return {
-        name: _for_people(value) if isinstance(value, Mapping) else value
-        for name, value in figures.items()
-        if not name.endswith("_within_ms")
-    }
+    shown: dict[str, Any] = {}
+    for name, value in figures.items():
+        if name.endswith("_within_ms"):
+            continue
+        if isinstance(value, list):  # the paths of a session
+            numbered = {str(number): each for number, each in enumerate(value, start=1)}
+            shown[name] = _for_people(numbered)
+        elif isinstance(value, Mapping):
+            shown[name] = _for_people(value)
+        else:
+            shown[name] = value
+    return shown
 
 
 def _columns(groups: Mapping[str, Mapping[str, Any]], indent: int) -> list[str]:
@@ -162,4 +169,6 @@ def _flat(group: Mapping[str, Any], before: str = "") -> dict[str, Any]:
 
 
 def _shown(value: Any) -> str:
+    if value is None:
+        return "none"
     return f"{value:g}" if isinstance(value, float) else str(value)

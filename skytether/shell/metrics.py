@@ -72,6 +72,33 @@ def _table(text: str) -> tuple[Metric, ...]:
     return tuple(metrics)
 
 
+def _paths(process: str) -> tuple[Metric, ...]:
+    """Metrics of each path of a session, in the direction in which the process sends."""
+    return tuple(
+        each._replace(
+            figure=f"by_vehicle/{{vehicle}}/paths/{{path}}/{each.figure}",
+            name=f"{process}_path_{each.name}",
+        )
+        for each in _PATH
+    )
+
+
+_PATH = _table("""
+packets packets_total
+    Packets that were sent on the path, copies included.
+bytes bytes_total
+    UDP payload of the packets sent on the path.
+loss loss_ratio
+    Share of the packets on the path that are lost one by one.
+failure failure_ratio
+    Probability that a packet sent now on the path does not arrive.
+delay_ms acknowledgement_seconds
+    Shortest recent time from sending on the path to the acknowledgement.
+first first_copies_total
+    Packets from the other end of which the path brought the first copy.
+copies later_copies_total
+    Later copies of packets from the other end that the path brought.
+""")
 _SERVER = _table("""
 vehicles server_vehicles
     Vehicles in session.
@@ -105,7 +132,7 @@ by_vehicle/{vehicle}/clock_bound_ms server_vehicle_clock_bound_seconds
     Uncertainty of the offset between the server's and the vehicle's clock, plus or minus.
 by_vehicle/{vehicle}/clock_m server_vehicle_clock_metres
     Uncertainty of the vehicle's position along its motion that follows from its clock's offset.
-""")
+""") + _paths("server")
 _NETEM = _table("""
 flows netem_flows
     Clients whose packets are forwarded.
@@ -193,7 +220,7 @@ by_vehicle/{vehicle}/autopilot/round_trip_ms autopilot_round_trip_seconds
     Smallest recent round-trip time to the autopilot.
 by_vehicle/{vehicle}/autopilot/drift_ppm autopilot_clock_drift_ppm
     Rate at which the client's clock runs faster than the autopilot's.
-""")
+""") + _paths("client")
 _PROCESS = _table("""
 cpu_s cpu_seconds_total
     CPU time of the process.
@@ -287,11 +314,16 @@ HEALTHY = {str(mode) for mode in (Mode.READY, Mode.TRACK, Mode.COAST)}
 def flat(
     figures: Mapping[str, Any], groups: tuple[str, ...] = ()
 ) -> Iterator[tuple[tuple[str, ...], Any]]:
-    """Figures by path: the names of their groups, and their own."""
+    """Figures by path: the names of their groups, and their own; items of a list are groups that
+    are numbered from 1, and None is no figure.
+    """
     for name, value in figures.items():
-        if isinstance(value, Mapping):
+        if isinstance(value, list):
+            numbered = {str(number): each for number, each in enumerate(value, start=1)}
+            yield from flat(numbered, (*groups, name))
+        elif isinstance(value, Mapping):
             yield from flat(value, (*groups, name))
-        else:
+        elif value is not None:
             yield (*groups, name), value
 
 

@@ -113,6 +113,7 @@ def summary_rows(summary: Summary) -> list[tuple[str, str]]:
         ("uplink horizons, other packets", _values("d", *_uplink(s))),
         ("uplink packets, bytes", _values("d", s.uplink_packets, s.uplink_bytes)),
         ("downlink packets, bytes", _values("d", s.downlink_packets, s.downlink_bytes)),
+        ("paths: packets up, down", "; ".join(_values("d", *each) for each in s.paths or ())),
         (
             "packets/s up, down, both",
             _values(".2f", s.uplink_packets_per_s, s.downlink_packets_per_s, s.packets_per_s),

@@ -9,6 +9,7 @@ are those of the frames; the drawing code passes the present time.
 from collections import deque
 from contextlib import suppress
 from dataclasses import dataclass, field
+from itertools import zip_longest
 from typing import Any
 
 import msgspec
@@ -37,6 +38,7 @@ from skytether.shared.telemetry.feed import (
 )
 from skytether.shared.telemetry.record import DOWNLINK, UPLINK, Reason, compared
 from skytether.shared.telemetry.record import Rows as Table
+from skytether.shared.wire.paths import PATHS_MAX
 from skytether.shared.wire.protocol import Mode
 from skytether.view.network import DIRECTIONS, SPAN_S, Network
 from skytether.view.rows import check_columns, check_values, planned
@@ -314,6 +316,11 @@ def told(figures: dict[str, Any], *names: str) -> float:
     return float(value) if isinstance(value, int | float) else np.nan
 
 
+def _is_netem(process: str) -> bool:
+    """Whether a process is the netem of a path: `netem`, or `netem 2` and so on."""
+    return process.partition(" ")[0] == "netem"
+
+
 @dataclass(slots=True)
 class _Process:
     opened: Opened
@@ -371,9 +378,13 @@ class State:
             self._said(frame.event, frame.time_ns)
         elif isinstance(frame, Figures):
             known.figures = frame.figures
-            if process == "netem":
-                waiting = [told(frame.figures, way, "queue") for way in ("uplink", "downlink")]
-                self.network.wait(np.nan_to_num(waiting), time_ns=frame.time_ns)
+            if _is_netem(process):
+                queues = [
+                    [told(each.figures, way, "queue") for way in ("uplink", "downlink")]
+                    for name, each in self._processes.items()
+                    if _is_netem(name)
+                ]
+                self.network.wait(np.nan_to_num(queues).sum(axis=0), time_ns=frame.time_ns)
 
     def lose(self, process: str) -> None:
         self._lost.add(process)
@@ -456,7 +467,7 @@ class State:
     @property
     def flies(self) -> bool:
         """Whether a vehicle or a server is known; netem alone may carry any protocol."""
-        return any(name.partition(" ")[0] != "netem" for name in self._processes)
+        return not all(map(_is_netem, self._processes))
 
     def time_s(self, time_ns: int) -> float:
         """Time of flight [s] at a time [ns], 0 before it; of netem alone, its running time."""
@@ -501,6 +512,20 @@ class State:
         """
         figures = group(self.figures("server"), "by_vehicle", str(number))
         return told(figures, "clock_bound_ms"), told(figures, "clock_m")
+
+    def paths(self, number: int) -> list[tuple[dict[str, Any], dict[str, Any]]]:
+        """Figures of each path of a vehicle's session, of the server and of the vehicle; empty for
+        a single path.
+        """
+        ends = (
+            group(self.figures(process), "by_vehicle", str(number)).get("paths")
+            for process in ("server", "client")
+        )
+        known = [
+            [each for each in paths if isinstance(each, dict)] if isinstance(paths, list) else []
+            for paths in ends
+        ]
+        return [*zip_longest(*known, fillvalue={})][:PATHS_MAX]
 
     def nearest_m(self, number: int, points: int = 1) -> Array:
         """Distance from a vehicle to the nearest other one in the last minute [m].

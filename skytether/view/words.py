@@ -1,8 +1,9 @@
 """Status of a flight on a page, in words, as HTML."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from html import escape
 from itertools import cycle
+from typing import Any
 
 import numpy as np
 
@@ -27,11 +28,25 @@ SAID_SHOWN = 50
 FATES = ("packets", "lost", "dropped", "reordered", "duplicated", "corrupted")
 """Counters of netem for a direction, and their titles."""
 
+SILENT = 0.5
+"""Probability that a packet does not arrive above which a path counts as silent."""
+PATH = (
+    "",
+    "state",
+    "fails up, down [%]",
+    "round trip [ms]",
+    "lost up, down [%]",
+    "packets up, down",
+    "came first up, down",
+)
+"""Names of what is shown of each path."""
+
 FLOWN_S = "data-flown-s"
 """HTML attribute with the time of flight [s], for programs."""
 
 _BODY = "font-size:0.85em;line-height:1.45;padding:0 0.6em;color:var(--mantine-color-text)"
 _DIM = "color:var(--mantine-color-dimmed)"
+_GAP = ' style="padding-left:1.2em"'
 
 
 def badge(word: Word) -> str:
@@ -72,7 +87,7 @@ def status(state: State, vehicle: int, now_ns: int, title: str = "") -> str:
         f'<div style="{_BODY}" class="skytether-status" {FLOWN_S}="{track.time_s:.0f}">{head}'
         f"<div>{badge(track.does)}</div>"
         f'<div style="margin:0.3em 0">{badge(_link(state, vehicle, now_ns))}</div>'
-        f"{_gone(state)}{_table(rows)}"
+        f"{_gone(state)}{_table(rows)}{_table(_paths(state, vehicle))}"
         f'<div style="{_DIM};margin-top:0.3em">{_newest(state)}</div></div>'
     )
 
@@ -94,13 +109,15 @@ def _carried(state: State, now_ns: int, title: str) -> str:
     )
 
 
-def _table(rows: Sequence[tuple[str, str]]) -> str:
+def _table(rows: Sequence[Sequence[str]]) -> str:
+    """Table with a name at the left of each row; empty without rows."""
     lines = "".join(
         f'<tr><td style="{_DIM};padding-right:0.8em;vertical-align:top">{escape(name)}</td>'
-        f"<td>{escape(value)}</td></tr>"
-        for name, value in rows
+        + "".join(f"<td{_GAP if i else ''}>{escape(value)}</td>" for i, value in enumerate(values))
+        + "</tr>"
+        for name, *values in rows
     )
-    return f'<table style="border-spacing:0">{lines}</table>'
+    return f'<table style="border-spacing:0">{lines}</table>' if rows else ""
 
 
 def _gone(state: State) -> str:
@@ -155,6 +172,32 @@ def _autopilot(state: State, vehicle: int) -> list[tuple[str, str]]:
         ("battery", f"{number(charge, '.0f', ' %')}, {number(volts, '.1f', ' V')}"),
         ("home", ", ".join(home)),
     ]
+
+
+def _paths(state: State, vehicle: int) -> list[tuple[str, ...]]:
+    """Rows with a column for each path, if there are several."""
+    columns = [_path(*each) for each in enumerate(state.paths(vehicle), start=1)]
+    return list(zip(PATH, *columns, strict=True)) if columns else []
+
+
+def _path(path: int, ends: tuple[dict[str, Any], dict[str, Any]]) -> tuple[str, ...]:
+    """Texts in the order of PATH, from the figures of the server and of the vehicle."""
+    fails_up, fails_down = (told(end, "failure") for end in ends)
+    silent = [way for way, fails in (("up", fails_up), ("down", fails_down)) if fails > SILENT]
+    is_known = not np.isnan([fails_up, fails_down]).all()
+
+    def both(name: str, ends: Iterable[dict[str, Any]] = ends, scale: float = 1.0) -> str:
+        return ", ".join(number(scale * told(end, name), ".0f") for end in ends)
+
+    return (
+        f"path {path}",
+        f"silent {' and '.join(silent)}" if silent else "alive" if is_known else "–",
+        both("failure", scale=100.0),
+        number(float(np.fmin(*(told(end, "delay_ms") for end in ends))), ".0f"),
+        both("loss", scale=100.0),
+        both("packets"),
+        both("first", ends[::-1]),
+    )
 
 
 def _network(state: State, now_ns: int) -> list[tuple[str, str]]:

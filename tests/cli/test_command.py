@@ -211,7 +211,8 @@ def test_a_virtual_flight_writes_the_same_summary_twice(tmp_path: Path) -> None:
         *("scenario", "seed", "duration_s", "steps", "rmse_x", "rmse_y", "rmse_z", "rmse_xy"),
         *("error_max", "covered", "modes", "mode", "reason"),
         *("event_ratio", "uplink_horizons", "uplink_packets", "uplink_bytes"),
-        *("downlink_packets", "downlink_bytes", "uplink_packets_per_s", "uplink_bytes_per_s"),
+        *("downlink_packets", "downlink_bytes", "paths"),
+        *("uplink_packets_per_s", "uplink_bytes_per_s"),
         *("downlink_packets_per_s", "downlink_bytes_per_s", "packets_per_s", "bytes_per_s"),
         *(
             "lost",

@@ -18,6 +18,7 @@ from prometheus_client.parser import text_string_to_metric_families
 
 import skytether.shell.exporter
 from airborne import Air
+from helpers import packaged
 from skytether.client.endpoint import Client
 from skytether.client.fleet import ClientFleet
 from skytether.client.simulated.vehicle import simulated
@@ -80,6 +81,10 @@ def figures() -> dict[str, dict[str, Any]]:
     }
     for client in ("client", "alone"):
         each[client]["by_vehicle"]["0"]["autopilot"] = air.figures()
+    two_links = flight.fly(packaged("demo-two-links", duration=12.0, settle=0.0))
+    for end in ("server", "client"):
+        paths = two_links.figures[end]["by_vehicle"]["1"]["paths"]
+        each[end]["by_vehicle"]["1"]["paths"] = paths
     each["server"] |= {"dropped": {"forged": 3}, "refused": {"full": 1}}
     return {process: told | PROCESS for process, told in each.items()}
 
@@ -169,6 +174,29 @@ def test_numbers_are_the_figures_in_base_units(figures: dict[str, dict[str, Any]
     half = len(buckets) // 2
     assert buckets[:half] == sorted(buckets[:half])
     assert buckets[half - 1] == netem["uplink"]["forwarded"]
+
+
+@pytest.mark.parametrize("end", ["server", "client"])
+def test_paths_have_numbers_of_their_own(end: str, figures: dict[str, dict[str, Any]]) -> None:
+    told, paths = numbers(end, figures[end]), figures[end]["by_vehicle"]["1"]["paths"]
+    for path, each in enumerate(paths, start=1):
+        of_path = f"path={path}", "vehicle=1"
+        assert told[f"skytether_{end}_path_packets_total", of_path] == each["packets"] > 10
+        assert told[f"skytether_{end}_path_bytes_total", of_path] == each["bytes"]
+        assert told[f"skytether_{end}_path_loss_ratio", of_path] == each["loss"]
+        assert told[f"skytether_{end}_path_failure_ratio", of_path] == each["failure"]
+        assert told[f"skytether_{end}_path_later_copies_total", of_path] == each["copies"]
+        acknowledged_s = told[f"skytether_{end}_path_acknowledgement_seconds", of_path]
+        assert acknowledged_s == pytest.approx(each["delay_ms"] / 1e3)
+    with_paths = {labels for name, labels in told if "_path_" in name}
+    assert with_paths == {("path=1", "vehicle=1"), ("path=2", "vehicle=1")}
+
+
+def test_a_path_without_an_acknowledgement_has_no_time_of_one() -> None:
+    told = numbers("server", {"by_vehicle": {"1": {"paths": [{"packets": 3, "delay_ms": None}]}}})
+    of_path = "path=1", "vehicle=1"
+    assert told["skytether_server_path_packets_total", of_path] == 3.0
+    assert ("skytether_server_path_acknowledgement_seconds", of_path) not in told
 
 
 def test_a_vehicle_is_in_one_mode(figures: dict[str, dict[str, Any]]) -> None:

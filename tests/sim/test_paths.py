@@ -17,6 +17,7 @@ from skytether.shared.scenario.air.draws import SLOT_NS
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import DOWNLINK, UPLINK, Record
 from skytether.shared.telemetry.summary import summarise
+from skytether.shell.terminal import summary_rows
 from skytether.sim import flight
 from skytether.sim.flight import fly, fly_batch
 
@@ -86,8 +87,18 @@ def test_figures_count_all_paths_together_and_each_alone(flown: Record) -> None:
         assert netem[way]["delays_ms"] == own["delays_ms"]
     summary = summarise(two_paths(), "two", flown.client, flown.server, rows, figures=flown.figures)
     assert summary.uplink_packets == (rows["direction"] == UPLINK).sum()
+    assert summary.paths == [(0, 0), (summary.uplink_packets, summary.downlink_packets)]
     assert summary.drops is not None
     assert summary.drops["netem"]["uplink lost"] == netem["uplink"]["lost"]
+
+
+def test_a_summary_counts_the_packets_of_each_path_if_there_are_several(flown: Record) -> None:
+    summary = summarise(two_paths(), "two", flown.client, flown.server, flown.netem)
+    up, down = summary.uplink_packets, summary.downlink_packets
+    assert ("paths: packets up, down", f"0, 0; {up}, {down}") in summary_rows(summary)
+    one = summarise(two_paths(GOOD), "one", flown.client, flown.server, flown.netem)
+    assert one.paths is None
+    assert not any("paths" in name for name, _ in summary_rows(one))
 
 
 def test_a_change_of_impairments_reaches_every_path(monkeypatch: pytest.MonkeyPatch) -> None:

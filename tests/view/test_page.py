@@ -176,11 +176,30 @@ def test_healing_brings_back_what_was_before_the_link_was_cut(tmp_path: Path) ->
     flight.values["netem"] = before
     flight.cut()
     flight.values["netem"] = asked[0][1]
-    assert flight.is_cut
+    assert flight.cuts == ["netem"]
     flight.cut()
     flight.heal()
     cuts = {"network.uplink": f"{PAPER} & loss(1)", "network.downlink": "loss(1)"}
     assert asked == [("netem", cuts), ("netem", before)]
+    flight.close()
+
+
+def test_a_path_is_cut_and_healed_alone(tmp_path: Path) -> None:
+    asked: list[tuple[str, Any]] = []
+    flight = PageFlight("", tmp_path)
+    flight.ask = lambda process, values: asked.append((process, dict(values)))  # type: ignore[method-assign]
+    flight.values |= {"netem": NETWORK, "netem 2": NETWORK, "server": {}}
+    flight.cut(("netem 2",))
+    lost = dict.fromkeys(NETWORK, f"{PAPER} & loss(1)")
+    assert asked == [("netem 2", lost)]
+    flight.values["netem 2"] = lost
+    assert (flight.netems, flight.cuts) == (["netem", "netem 2"], ["netem 2"])
+    flight.cut()
+    assert asked[1:] == [("netem", lost)], "one that is cut is not cut again"
+    flight.heal(("netem",))
+    assert len(asked) == 2, "it is not cut yet"
+    flight.heal()
+    assert asked[2:] == [("netem 2", NETWORK)]
     flight.close()
 
 

@@ -1,7 +1,9 @@
 """State of a page: values of a flight in virtual time, and bounds."""
 
+import re
 from dataclasses import dataclass
 from functools import cache
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -449,6 +451,80 @@ def test_netem_alone_is_a_network_and_no_flight() -> None:
     for plot in plots.of_link():
         look = plots.Look(state, demo().state.vehicles[1].curves(plots.POINTS), now_ns)
         assert {len(line.values(look)) for line in plot.lines} == {len(plot.grid(look))}
+
+
+PATHS = {
+    "server": [
+        {"failure": 0.03, "delay_ms": 101.6, "loss": 0.02, "packets": 40, "first": 33, "copies": 1},
+        {"failure": 0.21, "delay_ms": None, "loss": 0.05, "packets": 7, "first": 0, "copies": 0},
+    ],
+    "client": [
+        {"failure": 0.04, "delay_ms": 99.2, "loss": 0.1, "packets": 38, "first": 31, "copies": 2},
+        {"failure": 0.97, "delay_ms": None, "loss": 0.05, "packets": 12, "first": 4, "copies": 0},
+    ],
+}
+PATHS_SHOWN = [
+    ["", "path 1", "path 2"],
+    ["state", "alive", "silent down"],
+    ["fails up, down [%]", "3, 4", "21, 97"],
+    ["round trip [ms]", "99", "–"],
+    ["lost up, down [%]", "2, 10", "5, 5"],
+    ["packets up, down", "40, 38", "7, 12"],
+    ["came first up, down", "31, 33", "4, 0"],
+]
+
+
+def cells(html: str) -> list[list[str]]:
+    rows = (re.findall("<td[^>]*>(.*?)</td>", row) for row in re.findall("<tr>(.*?)</tr>", html))
+    return list(rows)
+
+
+def with_paths(paths: dict[str, Any]) -> State:
+    state = state_of(demo().frames)
+    for process, told in paths.items():
+        figures = {"by_vehicle": {"1": {"paths": told}}}
+        state.take(process, Figures(time_ns=state.newest_ns + 1, figures=figures))
+    return state
+
+
+def test_each_path_of_several_has_a_column() -> None:
+    shown = words.status(with_paths(PATHS), 1, demo().now_ns)
+    assert cells(shown)[-len(PATHS_SHOWN) :] == PATHS_SHOWN
+    alone = words.status(demo().state, 1, demo().now_ns)
+    assert alone.count("<table") == 1
+    assert "path 1" not in alone
+
+
+@pytest.mark.parametrize("told", [None, "two", ["one", "two"], {"1": {}}, [{}] * 9])
+def test_what_one_end_does_not_tell_of_a_path_is_a_dash(told: Any) -> None:
+    shown = cells(words.status(with_paths(PATHS | {"server": told}), 1, demo().now_ns))
+    row = {name: values for name, *values in shown}
+    assert row["packets up, down"][:2] == ["–, 38", "–, 12"]
+    assert row["came first up, down"][:2] == ["31, –", "4, –"]
+    assert len(row["state"]) <= 4
+
+
+def test_packets_of_all_netems_are_those_of_the_network() -> None:
+    """Over UDP each path has a netem of its own."""
+    frames = [
+        (at_ns, f"netem{' 2' * (number % 2)}" if isinstance(frame, Rows) else process, frame)
+        for number, (at_ns, process, frame) in enumerate(demo().frames)
+        if process == "netem"
+    ]
+    state = State()
+    for process in ("netem", "netem 2"):
+        state.take(process, next(each for _, _, each in frames if isinstance(each, Opened)))
+    for _, process, frame in frames:
+        if not isinstance(frame, Opened):
+            state.take(process, frame)
+    for process, waiting in (("netem", 3), ("netem 2", 4)):
+        figures = {way: {"queue": waiting} for way in ("uplink", "downlink")}
+        state.take(process, Figures(time_ns=state.newest_ns, figures=figures))
+    assert not state.flies
+    for direction in (UPLINK, DOWNLINK):
+        rates = state.network.rates(direction, demo().now_ns)
+        assert np.array_equal(rates, demo().state.network.rates(direction, demo().now_ns))
+        assert state.network.waiting(direction, demo().now_ns)[-1] == 7
 
 
 def test_every_mode_has_a_colour() -> None:

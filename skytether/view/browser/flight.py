@@ -2,7 +2,7 @@
 
 import contextlib
 import threading
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +10,7 @@ from skytether.shared.core.change import Answer
 from skytether.shared.core.events import Changed
 from skytether.shared.telemetry.feed import Frame, Opened, Said
 from skytether.view import controls
-from skytether.view.browser.play import PROCESSES, Operator
+from skytether.view.browser.play import NETEMS, PROCESSES, Operator
 from skytether.view.state import LED, State
 
 
@@ -30,8 +30,8 @@ class PageFlight:
         """Keys that may change and their known values, by process."""
         self.answer = ""
         self.refused = False
-        self._before: dict[str, Any] = {}
-        """Values to restore when the link is healed."""
+        self._before: dict[str, dict[str, Any]] = {}
+        """Values to restore when a link is healed, by its netem."""
         self.operator = Operator(folder, self._answered) if folder else None
 
     def take(self, process: str, frame: Frame) -> None:
@@ -65,20 +65,28 @@ class PageFlight:
             self.answer = f"{process} does not answer: the flight is over, or accepts no changes"
 
     @property
-    def is_cut(self) -> bool:
-        return controls.is_cut(self.values.get("netem", {}))
+    def netems(self) -> list[str]:
+        """Netems that have answered: one for each path."""
+        return [each for each in NETEMS if each in self.values]
 
-    def cut(self) -> None:
-        values = self.values.get("netem")
-        if values and not self.is_cut:
-            changed = controls.cut(values)
-            self._before = {key: values[key] for key in changed}
-            self.ask("netem", changed)
+    @property
+    def cuts(self) -> list[str]:
+        """Netems that lose every packet."""
+        return [each for each in self.netems if controls.is_cut(self.values[each])]
 
-    def heal(self) -> None:
-        """Restore the loss from before the link was cut, or no loss if that is unknown."""
-        if self.is_cut:
-            self.ask("netem", self._before or controls.healed(self.values["netem"]))
+    def cut(self, netems: Collection[str] = NETEMS) -> None:
+        for netem in self.netems:
+            if netem in netems and netem not in self.cuts:
+                values = self.values[netem]
+                changed = controls.cut(values)
+                self._before[netem] = {key: values[key] for key in changed}
+                self.ask(netem, changed)
+
+    def heal(self, netems: Collection[str] = NETEMS) -> None:
+        """Restore the loss from before a link was cut, or no loss if that is unknown."""
+        for netem in self.cuts:
+            if netem in netems:
+                self.ask(netem, self._before.get(netem) or controls.healed(self.values[netem]))
 
     def close(self) -> None:
         if self.operator:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from skytether.shared.scenario.mission import format_goals, parse_goals
 from skytether.view import words
 from skytether.view.browser.flight import PageFlight
+from skytether.view.browser.play import NETEMS
 from skytether.view.controls import (
     THRESHOLDS,
     WAYS,
@@ -307,9 +308,24 @@ class _Question:
 
 
 class _Network:
+    """Impairments of one path, which may be cut alone if there are several.
+
+    Args:
+        number: number of the path, from 1.
+        ask, cut, heal: change, cut and heal this path.
+    """
+
     def __init__(
-        self, gui: viser.GuiApi, ask: Callable[[dict[str, Any]], None], *, flies: bool
+        self,
+        gui: viser.GuiApi,
+        number: int,
+        ask: Callable[[dict[str, Any]], None],
+        cut: Callable[[], None],
+        heal: Callable[[], None],
+        *,
+        flies: bool,
     ) -> None:
+        self._number = number
         to = ("To the vehicle" if flies else "To clients", "To the server")
         self._known: dict[str, str] = {}
         self._folder = gui.add_folder("Network", expand_by_default=not flies, visible=False)
@@ -319,14 +335,21 @@ class _Network:
                 for way, label in zip(WAYS, to, strict=True)
             }
             apply = gui.add_button("Change the network")
+            self._alone = gui.add_button_group("This path", ("cut", "heal"), visible=False)
+
+        @self._alone.on_click
+        async def _(_: Any) -> None:
+            (cut if self._alone.value == "cut" else heal)()
 
         @apply.on_click
         async def _(_: Any) -> None:
             ask({way: text.value for way, text in self._texts.items()})
 
-    def show(self, values: Values) -> None:
+    def show(self, values: Values, *, is_alone: bool) -> None:
         known = texts(values)
         self._folder.visible = bool(known)
+        self._folder.label = "Network" if is_alone else f"Network of path {self._number}"
+        self._alone.visible = not is_alone
         if known != self._known:
             self._known = known
             for way, text in known.items():
@@ -356,7 +379,17 @@ class Controls:
         self._heal = gui.add_button("Heal it", color="green", icon=viser.Icon.PLUG_CONNECTED)
         self._answer = gui.add_html("")
         self._sliders = [_Slider(gui, knob, self._ask) for knob in knobs(scenario.model.axes)]
-        self._network = _Network(gui, partial(self._all, "netem"), flies=flies)
+        self._networks = {
+            netem: _Network(
+                gui,
+                number,
+                partial(self._all, netem),
+                partial(self._cut_alone, netem),
+                partial(self._heal_all, (netem,)),
+                flies=flies,
+            )
+            for number, netem in enumerate(NETEMS, start=1)
+        }
         self._thresholds: list[_Slider] = []
         self._lead: _Lead | None = None
         self._mission: _Mission | None = None
@@ -369,8 +402,7 @@ class Controls:
 
         @self._heal.on_click
         def _(_: Any) -> None:
-            for flight in self._flights:
-                flight.heal()
+            self._heal_all()
 
     def _let_fly(self) -> None:
         gui, scenario = self._client.gui, self._flights[0].state.scenario
@@ -412,9 +444,21 @@ class Controls:
                 rearm = partial(assign, self._armed, True)
                 self._question.ask("Disarm the vehicle?", "Yes, disarm", arm, rearm)
 
-    def _cut_all(self) -> None:
+    def _cut_all(self, netems: Sequence[str] = NETEMS) -> None:
         for flight in self._flights:
-            flight.cut()
+            flight.cut(netems)
+
+    def _cut_alone(self, netem: str) -> None:
+        """Cut a path; ask first if it is the last one that carries packets."""
+        cut = partial(self._cut_all, (netem,))
+        if any({*each.netems} <= {netem, *each.cuts} for each in self._flights):
+            self._question.ask("Cut the last path?", "Yes, cut it", cut)
+        else:
+            cut()
+
+    def _heal_all(self, netems: Sequence[str] = NETEMS) -> None:
+        for flight in self._flights:
+            flight.heal(netems)
 
     def _all(self, process: str, values: dict[str, Any]) -> None:
         for flight in self._flights:
@@ -422,26 +466,27 @@ class Controls:
 
     def _ask(self, knob: Knob, number: float) -> None:
         for flight in self._flights:
-            values = flight.values.get(knob.process, {})
-            if knob.read(values) is None:
-                continue
-            changed = knob.write(values, number)
-            if knob.process == "netem" and is_cut({**values, **changed}):
-                self._question.ask("Cut the link?", "Yes, cut it", self._cut_all)
-                return
-            flight.ask(knob.process, changed)
+            for process in flight.netems if knob.process == "netem" else (knob.process,):
+                values = flight.values.get(process, {})
+                if knob.read(values) is None:
+                    continue
+                changed = knob.write(values, number)
+                if process in NETEMS and is_cut({**values, **changed}):
+                    self._question.ask("Cut the link?", "Yes, cut it", self._cut_all)
+                    return
+                flight.ask(process, changed)
 
     def show(self) -> None:
         flight = self._flights[0]
         if self._flights[0].state.flies:
             self._show_flight(flight)
-        netem = flight.values.get("netem", {})
-        self._network.show(netem)
+        for netem, network in self._networks.items():
+            network.show(flight.values.get(netem, {}), is_alone=len(flight.netems) < 2)
         for slider in self._sliders:
             values = flight.values.get(slider.knob.process, {})
             slider.show(values)
-        self._cut.disabled = flight.is_cut or "netem" not in flight.values
-        self._heal.disabled = not flight.is_cut
+        self._cut.disabled = flight.cuts == flight.netems
+        self._heal.disabled = not flight.cuts
         self._answer.content = words.answers(
             [(each.answer, each.refused) for each in self._flights]
         )
