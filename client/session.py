@@ -332,7 +332,8 @@ class ServerSession:
             worth = EVERYWHERE if closes else self.paths.alive_worth(self._timeout_ns, now_ns)
             on = self.paths.choose(worth, now_ns, range(len(self._addresses)))
         datagram = self.link.seal(self.paths.report() + payload)
-        self.paths.sent(datagram, on, now_ns)
+        is_probe = isinstance(message, PathProof)
+        self.paths.sent(datagram, on, now_ns, is_probe=is_probe)
         self._put(datagram, on)
 
     def _put(self, datagram: bytes, on: Sequence[int]) -> None:

@@ -89,14 +89,20 @@ class ServerPaths:
         for path in self.paths.looks(now_ns):
             if path in self._places:
                 payload = encode(PathProof(vehicle, session, path, 0, self._prices))
-                due += self._put(payload, line, (path,), now_ns)
+                due += self._put(payload, line, (path,), now_ns, is_probe=True)
         return due
 
     def _put(
-        self, payload: bytes, line: ReplyPath, on: Sequence[int], now_ns: int
+        self,
+        payload: bytes,
+        line: ReplyPath,
+        on: Sequence[int],
+        now_ns: int,
+        *,
+        is_probe: bool = False,
     ) -> list[Datagram]:
         datagram = line.seal(self.paths.report() + payload)
-        self.paths.sent(datagram, on, now_ns)
+        self.paths.sent(datagram, on, now_ns, is_probe=is_probe)
         return [Datagram(datagram, *self._places[path]) for path in on]
 
     @property

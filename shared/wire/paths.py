@@ -49,6 +49,8 @@ OUTAGE = 3
 """Number of packets lost in a row that count as an outage, and not as lost one by one."""
 DELAYS = 16
 """Number of newest delays of acknowledgements that are kept."""
+GAPS = 16
+"""Number of newest times between messages of the other end that are kept."""
 WAIT_NS, WAIT_MIN_NS, WAIT_MAX_NS = (
     600 * MILLISECOND_NS,
     150 * MILLISECOND_NS,
@@ -241,6 +243,9 @@ class Paths:
         self._heard: int | None = None
         """Newest sequence number of the other end; None before the first."""
         self._masks = [0] * len(prices)
+        self._heard_ns: int | None = None
+        self._gaps_ns: deque[int] = deque(maxlen=GAPS)
+        """Newest times from one message of the other end to the next."""
         self.peer_may_restart = False
         """Whether the other end may begin its sequence numbers anew."""
         self._copies: dict[bytes, int] = {}
@@ -280,16 +285,22 @@ class Paths:
             key=lambda chosen: max(self.each[one].used_ns or 0 for one in chosen),
         )
 
-    def sent(self, datagram: bytes, on: Sequence[int], now_ns: int) -> None:
-        """Note that a datagram with the newest report was sent."""
-        self._newest = _Newest(self._sequence, datagram, set(on))
-        self._note(datagram, on, now_ns)
+    def sent(
+        self, datagram: bytes, on: Sequence[int], now_ns: int, *, is_probe: bool = False
+    ) -> None:
+        """Note that a datagram with the newest report was sent.
 
-    def _note(self, datagram: bytes, on: Sequence[int], now_ns: int) -> None:
-        assert self._newest is not None
+        Args:
+            is_probe: whether it only tries a path, so that it is not sent again.
+        """
+        if not is_probe:
+            self._newest = _Newest(self._sequence, datagram, set(on))
+        self._note(self._sequence, datagram, on, now_ns)
+
+    def _note(self, sequence: int, datagram: bytes, on: Sequence[int], now_ns: int) -> None:
         for one in on:
             path = self.each[one]
-            path.in_flight.append(_InFlight(self._newest.sequence, now_ns))
+            path.in_flight.append(_InFlight(sequence, now_ns))
             path.used_ns = now_ns
             path.packets += 1
             path.bytes += len(datagram)
@@ -301,6 +312,8 @@ class Paths:
             silence_ns: longest silence of the other end.
             among: paths that may be used.
         """
+        if self._gaps_ns:  # the other end is seldom silent for as long as it may be
+            silence_ns = min(silence_ns, sum(self._gaps_ns) // len(self._gaps_ns))
         for path in self.each:
             path.expire(silence_ns, now_ns)
         newest = self._newest
@@ -316,7 +329,7 @@ class Paths:
             return None
         best = min(others, key=lambda one: self.each[one].failure(now_ns))
         newest.sent_on.add(best)
-        self._note(newest.datagram, (best,), now_ns)
+        self._note(newest.sequence, newest.datagram, (best,), now_ns)
         return newest.datagram, best
 
     def looks(self, now_ns: int) -> list[int]:
@@ -370,6 +383,9 @@ class Paths:
         if ahead > 0:
             self._masks = [mask << min(ahead, WINDOW) & 0xFFFF for mask in self._masks]
             self._heard = report.sequence
+        if self._heard_ns is not None:
+            self._gaps_ns.append(now_ns - self._heard_ns)
+        self._heard_ns = now_ns
         if path is not None:
             self.each[path].first += 1
             self._mark(report.sequence, path)

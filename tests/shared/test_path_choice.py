@@ -264,3 +264,24 @@ def test_clock_set_back_makes_no_message_precious() -> None:
     ends.exchange(20)
     earlier_ns = ends.now_ns - 3600 * SECOND_NS
     assert ends.near.alive_worth(SECOND_NS, earlier_ns) == 0.0
+
+
+def test_a_probe_is_not_sent_again_and_displaces_no_message() -> None:
+    ends = Ends()
+    ends.exchange(20)
+    ends.dead = {0}
+    ends.send(on=(0,))
+    probe = ends.near.report() + b"\x93probe"
+    ends.near.sent(probe, (0,), ends.now_ns, is_probe=True)
+    resent = ends.near.again(SILENCE_NS, ends.now_ns + 3 * SECOND_NS, BOTH)
+    assert resent
+    assert resent[0] != probe
+
+
+def test_a_lost_packet_is_noticed_after_the_usual_silence_and_not_the_longest() -> None:
+    ends = Ends()
+    ends.exchange(40)
+    ends.dead = {0}
+    ends.send(on=(0,))
+    soon_ns = ends.now_ns + 2 * STEP_NS + 2 * ends.near.each[0].quick_ns
+    assert ends.near.again(10 * SECOND_NS, soon_ns, BOTH)
