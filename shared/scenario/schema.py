@@ -75,8 +75,6 @@ Text = Annotated[str, Meta(max_length=TEXT_MAX)]
 Direction = Annotated[str, Meta(max_length=air.TEXT_MAX)]
 
 
-PATHS_MAX = 4
-"""Largest number of paths of a session."""
 SHAPE_CHARS = 15
 """Number of characters of a plug-in's shape in the terms, before its digest."""
 

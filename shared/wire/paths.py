@@ -63,6 +63,8 @@ SPARE_NS = 50 * MILLISECOND_NS
 LOOK_NS, AGAIN_NS, DEAR_MAX = 2 * SECOND_NS, SECOND_NS, 8.0
 """Times after which an unused path of the least price is tried, and a doubted one again [ns], and
 the largest factor by which a dearer path is tried more rarely."""
+PATIENCE = 3
+"""Largest factor by which a path that stays down is tried more rarely."""
 ALIKE = 1.25
 """Paths whose expected cost is within this factor of the least take turns."""
 ALIVE_WORTH = 40.0
@@ -340,6 +342,8 @@ class Paths:
         for one, path in enumerate(self.each):
             dear = min(path.price, DEAR_MAX)
             doubted = path.arrived_ns is None or path.missing >= OUTAGE
+            if doubted:  # longer each time
+                dear *= min(max(path.missing - OUTAGE, 1), PATIENCE)
             since_ns = path.looked_ns if doubted else path.used_ns
             if since_ns is None or now_ns - since_ns >= (AGAIN_NS if doubted else LOOK_NS) * dear:
                 path.looked_ns = now_ns

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.law.model import Array
-from skytether.shared.scenario.schema import PATHS_MAX, Scenario
+from skytether.shared.scenario.schema import Scenario
 from skytether.shared.scenario.triggers import Compared
 from skytether.shared.telemetry.record import (
     DOWNLINK,

@@ -243,7 +243,7 @@ def test_report_that_a_slow_path_brings_late_does_not_tell_what_was_lost_since()
     ends.exchange(1)
     ends.now_ns += STEP_NS
     ends.send(on=(0,))
-    ends.now_ns += SECOND_NS // 2
+    ends.now_ns += 2 * STEP_NS
     before = ends.near.each[0].failure(ends.now_ns)
     ends.arrive(ends.near, late, 1)
     assert ends.near.each[0].failure(ends.now_ns) == before
