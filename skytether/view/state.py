@@ -310,6 +310,11 @@ def group(figures: dict[str, Any], *names: str) -> dict[str, Any]:
     return figures
 
 
+def _groups(value: Any) -> list[dict[str, Any]]:
+    """Groups of a list of figures; none if it is no list."""
+    return [each for each in value if isinstance(each, dict)] if isinstance(value, list) else []
+
+
 def told(figures: dict[str, Any], *names: str) -> float:
     """Figure within nested groups; NaN if missing."""
     value = group(figures, *names[:-1]).get(names[-1])
@@ -517,15 +522,13 @@ class State:
         """Figures of each path of a vehicle's session, of the server and of the vehicle; empty for
         a single path.
         """
-        ends = (
+        nothing: dict[str, Any] = {}
+        up, down = (
             group(self.figures(process), "by_vehicle", str(number)).get("paths")
             for process in ("server", "client")
         )
-        known = [
-            [each for each in paths if isinstance(each, dict)] if isinstance(paths, list) else []
-            for paths in ends
-        ]
-        return [*zip_longest(*known, fillvalue={})][:PATHS_MAX]
+        known = zip_longest(_groups(up), _groups(down), fillvalue=nothing)
+        return list(known)[:PATHS_MAX]
 
     def nearest_m(self, number: int, points: int = 1) -> Array:
         """Distance from a vehicle to the nearest other one in the last minute [m].

@@ -45,6 +45,14 @@ RANGES = """() => Object.values(window.__viserTestpoints.uplots).slice(0, 2).map
 WIDTHS = (("narrow", 2), ("wide", 9))
 """Tables of a report and their numbers of columns."""
 
+TWO_LINKS = """extends = "demo"
+[network]
+uplink = "constant(0.08)"
+downlink = "constant(0.08)"
+[[network.paths]]
+[[network.paths]]
+"""
+
 pytestmark = [
     pytest.mark.browser,
     pytest.mark.skipif(not CHROMIUM, reason="no Chromium: neither CHROMIUM nor PATH names one"),
@@ -230,6 +238,26 @@ def test_a_network_is_written_and_measured_on_a_page_of_its_own(
         finally:
             process.send_signal(signal.SIGINT)
             process.wait(timeout=30)
+
+
+def test_one_of_two_links_is_cut_alone_and_the_vehicle_flies_on(
+    browser: "sync_api.Browser", tmp_path: Path
+) -> None:
+    scenario = tmp_path / "two.toml"
+    scenario.write_text(TWO_LINKS)
+    with (
+        served("fly", str(scenario), "--duration", "600", "--page", "127.0.0.1:0") as at,
+        opened(browser, at) as page,
+    ):
+        until(lambda: "TRACK" in status(page), "it flies a plan")
+        until(lambda: "alive\talive" in status(page), "both paths are known")
+        page.get_by_text("Network of path 2").dispatch_event("click")
+        page.get_by_role("button", name="cut", exact=True).last.dispatch_event("click")
+        until(lambda: "alive\tsilent up and down" in status(page), "the second one is silent")
+        assert "TRACK" in status(page)
+        picture(page, PICTURES / "path-cut-dark-wide.png")
+        page.get_by_role("button", name="heal", exact=True).last.dispatch_event("click")
+        until(lambda: "alive\talive" in status(page), "the second one is back")
 
 
 def arrow(page: "sync_api.Page") -> tuple[float, float] | None:
