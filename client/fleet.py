@@ -48,7 +48,8 @@ class ClientFleet(Endpoint):
         return next((client.failure for client in self._clients if client.failure), None)
 
     def receive(self, datagram: Datagram, *, now_ns: int) -> None:
-        self._clients[datagram.socket].receive(datagram, now_ns=now_ns)
+        own = datagram._replace(socket=0)
+        self._clients[datagram.socket].receive(own, now_ns=now_ns)
         self._after(datagram.socket)
 
     def next_wake_ns(self) -> int | None:
