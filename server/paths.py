@@ -37,7 +37,7 @@ class ServerPaths:
         entropy: Callable[[int], bytes],
         timeout_ns: int,
     ) -> None:
-        self.paths, self._prices = Paths(prices, spread), prices
+        self.paths, self.prices = Paths(prices, spread), prices
         self._secret, self._timeout_ns = entropy(hashlib.blake2s.MAX_KEY_SIZE), timeout_ns
         self._places: dict[int, Place] = {}
 
@@ -49,6 +49,11 @@ class ServerPaths:
     def places(self) -> Collection[Place]:
         """Proven addresses."""
         return self._places.values()
+
+    def set_prices(self, prices: tuple[int, ...]) -> None:
+        if prices != self.prices and len(prices) == len(self.prices):
+            self.prices = prices
+            self.paths.set_prices(prices)
 
     def prove(self, message: PathProof, place: Place) -> PathProof | None:
         """Question to send to an address that names a path; None if it is proven."""
@@ -62,7 +67,7 @@ class ServerPaths:
 
     def question(self, vehicle: int, session: int, place: Place, path: int = 0) -> PathProof:
         """Question to an address; the vehicle knows which path it is."""
-        return PathProof(vehicle, session, path, self._proof(place), self._prices)
+        return PathProof(vehicle, session, path, self._proof(place), self.prices)
 
     def _proof(self, place: Place) -> int:
         (host, port), socket = place
@@ -88,7 +93,7 @@ class ServerPaths:
             due.append(Datagram(datagram, *self._places[path]))
         for path in self.paths.looks(now_ns):
             if path in self._places:
-                payload = encode(PathProof(vehicle, session, path, 0, self._prices))
+                payload = encode(PathProof(vehicle, session, path, 0, self.prices))
                 due += self._put(payload, line, (path,), now_ns, is_probe=True)
         return due
 

@@ -119,9 +119,10 @@ class Reception:
         try:
             call = self._gate.open(datagram, now_ns=now_ns)
         except ProtocolError as error:
+            if error.reason is Drop.REPLAYED and self._note_repeat(datagram, now_ns):
+                self.dropped[Drop.COPY] += 1
+                return Drop.COPY
             self.dropped[error.reason] += 1
-            if error.reason is Drop.REPLAYED:
-                self._note_repeat(datagram, now_ns)
             self._unauthenticated += 1
             if now_ns >= self._report_ns:
                 self._report_unauthenticated(datagram.peer, error.reason, now_ns)
@@ -140,12 +141,17 @@ class Reception:
         self._stopwatch.lap("observe")
         return dropped
 
-    def _note_repeat(self, datagram: Datagram, now_ns: int) -> None:
-        """Note where else a recent packet of a vehicle has come from."""
+    def _note_repeat(self, datagram: Datagram, now_ns: int) -> bool:
+        """Note where else a recent packet of a vehicle has come from; returns whether it is the
+        copy of a packet of a vehicle with several paths, over one that is not proven.
+        """
         vehicle = self._gate.repeated(datagram)
         session = None if vehicle is None else self._sessions.live(vehicle)
-        if session and datagram.peer not in (session.address, session.home):
+        if session is None:
+            return False
+        if datagram.peer not in (session.address, session.home):
             session.other, session.other_ns = datagram.peer, now_ns
+        return session.paths is not None and session.paths.paths.is_copy(datagram.payload, None)
 
     def _is_copy(self, datagram: Datagram) -> bool:
         """Whether a datagram of a vehicle with several paths has come before."""
@@ -168,6 +174,10 @@ class Reception:
             raise ProtocolError(Drop.OF_ANOTHER_VEHICLE)
         if report and not isinstance(message, Hello):
             self._hear_report(report, message, call, datagram, now_ns)
+        elif self._sessions.with_paths and call.moves and isinstance(message, Observation):
+            session = self._sessions.find(message)
+            if session:  # its client was started again with a single path
+                self._sessions.set_paths(session, None)
         match message:
             case Observation():
                 self._observe(message, call, datagram, now_ns)
@@ -193,10 +203,15 @@ class Reception:
         self, report: Report, message: Message, call: GateCall, datagram: Datagram, now_ns: int
     ) -> None:
         """Note a report; ask for a proof where the vehicle has not been heard before."""
+        if isinstance(message, Observation) and self._sessions.find(message) is None:
+            self._begin(message, call, now_ns)
         session = self._sessions.live(message.vehicle)
-        number = getattr(message, "session", None)
-        if session is None or session.paths is None or session.number != number:
+        if session is None or session.number != getattr(message, "session", None):
             return
+        count = len(report.arrived)
+        if session.paths is None or len(session.paths.prices) != count:
+            prices = message.prices if isinstance(message, PathProof) else (1,) * count
+            session.paths = self._make_paths(session, prices)
         place = Place(datagram.peer, datagram.socket)
         path = session.paths.number(place)
         session.paths.paths.heard(report, datagram.payload, path, now_ns)
@@ -211,15 +226,19 @@ class Reception:
             raise ProtocolError(Drop.UNKNOWN_SESSION)
         session.heard_ns = now_ns
         if session.paths is None:
-            session.paths = ServerPaths(
-                message.prices, self._spread, self._sessions.entropy, self._timeout_ns
-            )
+            session.paths = self._make_paths(session, message.prices)
+        session.paths.set_prices(message.prices)
         place = Place(datagram.peer, datagram.socket)
         question = session.paths.prove(message, place)
         if question:
             self._answer(question, call, datagram)
         elif place in session.paths.places and self._sessions.at_place.get(place) is not session:
-            self._sessions.note_paths(session)
+            self._sessions.set_paths(session, session.paths)
+
+    def _make_paths(self, session: Session, prices: tuple[int, ...]) -> ServerPaths:
+        paths = ServerPaths(prices, self._spread, self._sessions.entropy, self._timeout_ns)
+        self._sessions.set_paths(session, paths)
+        return paths
 
     def _answer(self, message: Message, call: GateCall, datagram: Datagram) -> None:
         sealed = call.line.seal(encode(message))

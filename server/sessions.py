@@ -297,12 +297,13 @@ class Sessions:
                 self.welcomed_vehicles[session.vehicle] = successor
         self._note_rows()
 
-    def note_paths(self, session: Session) -> None:
-        """Note the proven addresses of a session, in place of its earlier ones."""
+    def set_paths(self, session: Session, paths: ServerPaths | None) -> None:
+        """Note the paths of a session and their proven addresses, in place of earlier ones."""
         self._forget_paths(session)
-        if session.paths:
+        session.paths = paths
+        if paths:
             self.with_paths[session.vehicle] = session
-            self.at_place |= dict.fromkeys(session.paths.places, session)
+            self.at_place |= dict.fromkeys(paths.places, session)
 
     def _forget_paths(self, session: Session) -> None:
         if self.with_paths.pop(session.vehicle, None):

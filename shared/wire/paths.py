@@ -237,8 +237,8 @@ class Paths:
     """
 
     def __init__(self, prices: Sequence[float], spread: str = "auto") -> None:
-        cheapest, self._spread = min(prices), spread
-        self.each = [Path(price / cheapest) for price in prices]
+        self._spread = spread
+        self.each = [Path(price / min(prices)) for price in prices]
         self._sets = _SETS[len(prices)]
         self._sequence = 0
         self._newest: _Newest | None = None
@@ -252,6 +252,10 @@ class Paths:
         """Whether the other end may begin its sequence numbers anew."""
         self._copies: dict[bytes, int] = {}
         """Sequence numbers of the newest datagrams of the other end, oldest first."""
+
+    def set_prices(self, prices: Sequence[float]) -> None:
+        for path, price in zip(self.each, prices, strict=True):
+            path.price = price / min(prices)
 
     # -- sending -----------------------------------------------------------------------------
 

@@ -286,7 +286,7 @@ class PathProof(NamedTuple):
     path: int
     """Number of the path, from 0."""
     proof: int
-    """Random number of the server; 0 from a client that has not heard it."""
+    """Number of the server for an address; 0 from a client that has not heard it."""
     prices: tuple[int, ...]
     """Price of a packet on each path of the session, in thousandths of the least."""
 

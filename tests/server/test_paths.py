@@ -60,13 +60,13 @@ class Vehicle:
         self.terms, self.dt_ns = flown.terms(), flown.dt_ns
         self.server = Server(flown, boot_id=77, entropy=stream(1, "entropy").bytes)
         self.now_ns = 10 * SECOND_NS
-        self.paths = Paths(PRICES)
+        self.paths: Paths | None = Paths(PRICES)
         self.step = self.number = 0
         self.session = 0
         self.open()
 
-    def open(self) -> None:
-        (answer,) = self.send(encode(Hello(1, 5, self.terms)), FIRST)
+    def open(self, place: Place = FIRST) -> None:
+        (answer,) = self.send(encode(Hello(1, 5, self.terms)), place)
         welcome = decode(answer.payload, self.terms)
         assert isinstance(welcome, Welcome)
         self.session = welcome.session
@@ -78,7 +78,8 @@ class Vehicle:
         return self.server.outbox()
 
     def say(self, message: Message, place: Place) -> list[tuple[Message, Address]]:
-        answers = self.send(self.paths.report() + encode(message), place)
+        report = self.paths.report() if self.paths else b""
+        answers = self.send(report + encode(message), place)
         return [(decode(split(each.payload)[1], self.terms), each.peer) for each in answers]
 
     def observe(self, place: Place) -> list[tuple[Message, Address]]:
@@ -131,6 +132,43 @@ def test_path_is_asked_for_a_proof_as_soon_as_it_is_heard_at_another_address() -
     assert isinstance(question, PathProof)
     assert vehicle.say(question._replace(path=0), MOVED) == []
     assert {*vehicle.server.sessions.at_place} == {MOVED, SECOND}
+
+
+def test_client_that_was_started_again_with_a_single_path_is_answered_there() -> None:
+    vehicle = Vehicle()
+    vehicle.observe(FIRST)
+    vehicle.prove(0, FIRST)
+    vehicle.prove(1, SECOND)
+    vehicle.paths = None
+    vehicle.open(MOVED)
+    vehicle.observe(MOVED)
+    vehicle.server.close(now_ns=vehicle.now_ns)
+    assert {each.peer for each in vehicle.server.outbox()} == {MOVED.peer}
+
+
+def test_client_that_was_started_again_with_more_paths_is_heard() -> None:
+    vehicle = Vehicle()
+    vehicle.observe(FIRST)
+    vehicle.prove(0, FIRST)
+    vehicle.paths = Paths((1000, 1000, 1000))
+    vehicle.open()
+    vehicle.observe(FIRST)
+    session = vehicle.server.sessions.live(1)
+    assert session
+    assert session.paths
+    assert len(session.paths.prices) == 3
+    assert not vehicle.server.dropped
+
+
+def test_prices_are_those_that_the_vehicle_named_last() -> None:
+    vehicle = Vehicle()
+    vehicle.observe(FIRST)
+    vehicle.prove(0, FIRST)
+    vehicle.say(PathProof(1, vehicle.session, 1, 0, (1000, 7000)), SECOND)
+    session = vehicle.server.sessions.live(1)
+    assert session
+    assert session.paths
+    assert [path.price for path in session.paths.paths.each] == [1.0, 7.0]
 
 
 def test_client_that_was_started_again_in_its_session_is_acknowledged_at_once() -> None:
