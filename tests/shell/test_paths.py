@@ -91,7 +91,7 @@ async def running(*shells: Shell) -> AsyncIterator[list[Event]]:
     events: list[Event] = []
     tasks = [asyncio.create_task(each.run(events.append)) for each in shells]
     try:
-        async with asyncio.timeout(20):
+        async with asyncio.timeout(60):
             yield events
     finally:
         for task in tasks:
