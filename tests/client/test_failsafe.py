@@ -755,7 +755,7 @@ def test_no_mistake_of_the_compensator_reaches_the_plant(
         monkeypatch.setattr(skytether.client.pilot, "clamped", lambda wanted, *_, **__: wanted)
     monkeypatch.setattr(Compensator, "choose", lambda *_: ([100.0, -100.0],) * 2)
     # An observation above u_max cannot be encoded, so the record is checked instead.
-    monkeypatch.setattr(skytether.client.session.ServerSession, "send", lambda *_: None)
+    monkeypatch.setattr(skytether.client.session.ServerSession, "send", lambda *_, **__: None)
     hand.fly(0.4, plans=True)
     flown = hand.rows()["input"]
     bounded = np.abs(flown).max() <= hand.terms.u_max[0]
