@@ -18,6 +18,7 @@ from skytether.shared.wire.protocol import (
     Horizon,
     Message,
     Observation,
+    PathProof,
     Time,
     Trajectory,
     Welcome,
@@ -89,6 +90,7 @@ def seeds(terms: Terms) -> list[bytes]:
             Heartbeat(1, 7, 10, 0, 0),
             Close(1, 7),
             Time(1, 7, 5, 10, 1000),
+            PathProof(1, 7, 1, 2**63, (1000, 10_000)),
         )
     ]
 

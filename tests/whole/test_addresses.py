@@ -1,12 +1,10 @@
 """Addresses of a session: a server at several of them, and a client with a local one."""
 
-import inspect
 from collections.abc import Callable
 
 import pytest
 
 import warm
-from skytether.client.endpoint import Client
 from skytether.shared.core.events import SessionOpened
 from warm import Process
 
@@ -32,9 +30,6 @@ def test_a_client_flies_over_the_path_that_it_is_given(
     assert opened.host == (local if local.startswith("127") else "127.0.0.1")
 
 
-@pytest.mark.skipif(
-    "paths" not in inspect.signature(Client).parameters, reason="Client has one path only"
-)
 def test_a_client_flies_over_two_paths_to_two_addresses(start: Callable[..., Process]) -> None:
     """One of the paths is absent: nobody has its interface."""
     server = start("server", "demo", "--bind", "127.0.0.1:0", "--bind", "127.0.0.2:0", *QUICK)

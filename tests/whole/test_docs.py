@@ -1,6 +1,5 @@
 """Documents: their commands run, their links have targets, their names exist."""
 
-import inspect
 import re
 import shlex
 import signal
@@ -16,7 +15,6 @@ import warm
 from helpers import SKYTETHER, ran
 from skytether.__main__ import main
 from skytether.cli.set import set_keys
-from skytether.client.endpoint import Client
 from skytether.shell import command
 
 pytestmark = pytest.mark.long
@@ -128,9 +126,6 @@ def terminals() -> list[list[str]]:
     ]
 
 
-@pytest.mark.skipif(
-    "paths" not in inspect.signature(Client).parameters, reason="Client has one path only"
-)
 @pytest.mark.usefixtures("documented_ports")
 def test_the_documented_links_carry_one_flight(tmp_path: Path) -> None:
     *_, (keygen, *processes), _ = blocks(ROOT / "docs" / "operating.md")
