@@ -19,6 +19,7 @@ from skytether.shared.telemetry.record import TRUTH_COLUMNS
 from skytether.shell import command, process, terminal
 from skytether.shell.argument import Argument
 from skytether.shell.command import CommandError, ScenarioName
+from skytether.shell.paths import NetworkPath
 from skytether.shell.process import ProcessOptions
 from skytether.shell.udp import is_loopback, look_up
 
@@ -88,7 +89,10 @@ def pilot(argv: Sequence[str]) -> None:
             faults=[faults.parse(each) for each in options.fault],
             recorder=running.recorder,
         )
-        running.drive(endpoint, bind=bind, peers=peers, waiting_for="MAVLink", ready=_ready)
+        paths = [NetworkPath("", to)] if to and not bind else []
+        running.drive(
+            endpoint, bind=bind, paths=paths, peers=peers, waiting_for="MAVLink", ready=_ready
+        )
 
 
 def _ready() -> None:

@@ -31,6 +31,9 @@ def values(kind: Any) -> st.SearchStrategy[Any]:
         return st.lists(items[0], max_size=3) if Ellipsis in arguments else st.tuples(*items)
     if arguments:
         return st.one_of(*map(values, arguments))
+    if issubclass(kind, msgspec.Struct):
+        hints = typing.get_type_hints(kind, include_extras=True)
+        return st.fixed_dictionaries({key: values(each) for key, each in hints.items()})
     return {bool: st.booleans(), str: st.just("")}[kind]
 
 
@@ -38,6 +41,8 @@ def bounded(base: type, meta: msgspec.Meta) -> st.SearchStrategy[Any]:
     """Values of an annotated type; for a text, triggers."""
     if base is str:
         return st.sampled_from(TRIGGERS)
+    if typing.get_origin(base) is tuple:
+        return values(base)
     low, high = meta.gt if meta.ge is None else meta.ge, meta.le
     assert low is not None
     assert high is not None

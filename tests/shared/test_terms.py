@@ -33,6 +33,8 @@ HERE = reading.check(
 """Scenario of the server, with as few restrictions on single changes as possible."""
 OTHER: dict[str, Any] = {
     "model.axes": 3,
+    "link.spread": "all",
+    "network.paths": [{"uplink": "none"}, {"uplink": "none"}],
     "control.scheme": "predictive",
     "control.feedback": False,
     "reference.origin": [47.0, 8.0],

@@ -150,7 +150,7 @@ def test_columns_survive_the_round_trip() -> None:
     row = np.zeros(2, PACKET_COLUMNS)
     row["bytes"] = 7, 9
     assert table(row.tobytes(), PACKET_COLUMNS)["bytes"].tolist() == [7, 9]
-    with pytest.raises(FeedError, match="got 1 B, expected rows of 29 B"):
+    with pytest.raises(FeedError, match="got 1 B, expected rows of 30 B"):
         table(b"x", PACKET_COLUMNS)
 
 
