@@ -148,13 +148,14 @@ class Ticker:
             self._send_heartbeats(heartbeats, now_ns)
         for session in self._sessions.with_paths.values():
             if session.paths:
-                self._out += session.paths.watched(
+                due = session.paths.watched(
                     session.vehicle,
                     session.number,
                     session.line,
                     session.hearing.silence_ns,
                     now_ns,
                 )
+                self._put(session.row, due, is_plan=False)
         self._stopwatch.lap("encode")
         self.durations.add(self._stopwatch.total_ns - before_ns)
 
@@ -206,13 +207,14 @@ class Ticker:
         *,
         is_plan: bool,
     ) -> None:
-        datagrams = session.sealed(payload, now_ns, worth)
-        budget = self._controller.budget
+        self._put(session.row, session.sealed(payload, now_ns, worth), is_plan=is_plan)
+
+    def _put(self, row: int, datagrams: Sequence[Datagram], *, is_plan: bool) -> None:
         self._out += datagrams
-        if budget:
+        if budget := self._controller.budget:
             # The network also carries headers of IP and UDP: 28 bytes, more than a whole heartbeat.
             size = sum(len(each.payload) + HEADER_BYTES for each in datagrams)
-            budget.charge(session.row, size, is_plan=is_plan)
+            budget.charge(row, size, is_plan=is_plan)
 
     def _record(self, decisions: Decisions) -> None:
         batch, figures = decisions.batch, decisions.figures

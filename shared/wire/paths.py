@@ -127,7 +127,7 @@ class _InFlight:
 
 
 @dataclass(slots=True)
-class Path:
+class PathState:
     """What is known of one path in the direction in which this end sends."""
 
     price: float
@@ -195,7 +195,7 @@ class Path:
         """Count packets as lost of which nothing was heard although a report was due.
 
         Args:
-            silence_ns: longest silence of the other end.
+            silence_ns: silence of the other end after which a report is due.
         """
         wait_ns = self.quick_ns + silence_ns + SPARE_NS
         for packet in self.in_flight:
@@ -238,7 +238,7 @@ class Paths:
 
     def __init__(self, prices: Sequence[float], spread: str = "auto") -> None:
         self._spread = spread
-        self.each = [Path(price / min(prices)) for price in prices]
+        self.each = [PathState(price / min(prices)) for price in prices]
         self._sets = _SETS[len(prices)]
         self._sequence = 0
         self._newest: _Newest | None = None

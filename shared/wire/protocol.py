@@ -286,7 +286,8 @@ class PathProof(NamedTuple):
     path: int
     """Number of the path, from 0."""
     proof: int
-    """Number of the server for an address; 0 from a client that has not heard it."""
+    """Number that the server sends only to the address to be proven; 0 from a client that has not
+    received it."""
     prices: tuple[int, ...]
     """Price of a packet on each path of the session, in thousandths of the least."""
 

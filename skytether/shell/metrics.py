@@ -314,8 +314,8 @@ HEALTHY = {str(mode) for mode in (Mode.READY, Mode.TRACK, Mode.COAST)}
 def flat(
     figures: Mapping[str, Any], groups: tuple[str, ...] = ()
 ) -> Iterator[tuple[tuple[str, ...], Any]]:
-    """Figures by path: the names of their groups, and their own; items of a list are groups that
-    are numbered from 1, and None is no figure.
+    """Figures, each with the names of its groups and its own; items of a list are groups that are
+    numbered from 1, and None is no figure.
     """
     for name, value in figures.items():
         if isinstance(value, list):
