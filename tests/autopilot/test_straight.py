@@ -123,15 +123,20 @@ def test_it_flies_as_an_arducopter_was_measured_to(law: str, measured_m: float) 
     summary = summary_of(scenario(duration=40.0, settle=10.0), "autopilot", whole)
     assert summary.rmse_xy == pytest.approx(measured_m, rel=0.1)
     _is_counted_as_flown(summary)
+    assert summary.deadline_misses == 0
 
 
 def _is_counted_as_flown(summary: Summary) -> None:
-    """A set-point per step and 20 positions per second, and little else."""
+    """A set-point per step and 20 positions per second, and little else.
+
+    Positions keep coming while a busy machine makes the station miss steps.
+    """
+    due = summary.steps + summary.deadline_misses
     assert summary.uplink_packets is not None
     assert summary.downlink_packets is not None
-    assert summary.steps <= summary.uplink_packets < 1.1 * summary.steps
-    assert summary.steps <= summary.downlink_packets < 1.2 * summary.steps
-    assert (summary.covered, summary.deadline_misses, summary.event_ratio) == (1.0, 0, None)
+    assert summary.steps <= summary.uplink_packets < 1.1 * due
+    assert summary.steps <= summary.downlink_packets < 1.2 * due
+    assert (summary.covered, summary.event_ratio) == (1.0, None)
 
 
 def test_px4_is_flown_as_well_and_the_same_seed_flies_the_same() -> None:
@@ -328,7 +333,7 @@ def test_it_flies_over_udp(tmp_path: Path) -> None:
     argv = ["--udp", "--duration", "12", "--settle", "6", "--json", str(file)]
     assert main(["straight", *argv, "--figure", str(figure)]) == 0
     summary = msgspec.json.decode(file.read_bytes(), type=Summary)
-    _is_counted_as_flown(msgspec.structs.replace(summary, deadline_misses=0))
+    _is_counted_as_flown(summary)
     scene = scenario(duration=12.0, settle=6.0)
     virtual = summary_of(scene, "autopilot", flown(duration=12.0, settle=6.0))
     assert summary.rmse_xy == pytest.approx(virtual.rmse_xy, abs=0.05)
