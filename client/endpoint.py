@@ -14,15 +14,17 @@ import msgspec
 from skytether.client.failsafe import CLOSING, GOOD_NS, HOLD, TABLE, Failsafe, brake_ns
 from skytether.client.followers import SplineFollower
 from skytether.client.ground import GroundReports
+from skytether.client.leadership import Leadership
 from skytether.client.link import ClientLink, PlainLink
 from skytether.client.memory import ClientMemory, FlownMotion, SavedState
 from skytether.client.pilot import Pilot
-from skytether.client.session import ServerSession
+from skytether.client.session import ServerSession, Watch
 from skytether.client.vehicle import Vehicle
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.base.units import MICROSECOND_NS, MILLISECOND_NS, SECOND_NS, seconds_to_ns
 from skytether.shared.core.endpoint import (
     PATH_SOCKETS,
+    STANDBY_SOCKETS,
     VEHICLES_TOLD_MAX,
     Address,
     Datagram,
@@ -34,6 +36,7 @@ from skytether.shared.core.events import (
     FenceHolds,
     Finished,
     Flying,
+    LeaderChanged,
     ModeChanged,
     NotFlown,
     StateLeapt,
@@ -48,7 +51,7 @@ from skytether.shared.scenario.owners import InFlight
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Reason, Recorder
 from skytether.shared.wire.drop import Drop, ProtocolError
-from skytether.shared.wire.protocol import CLOSES, NO_HORIZON, Close, Mode, stamp_us
+from skytether.shared.wire.protocol import CLOSES, NO_HORIZON, Close, Lead, Mode, stamp_us
 
 NOWHERE: Address = ("", 0)
 VEHICLE_SOCKET = 1
@@ -63,6 +66,12 @@ LEAP = keys_of(InFlight.LEAP)
 TIME_NS, TIME_ERROR_MAX_US = 2 * SECOND_NS, 2**32 - 1
 """Interval between two reports of the time of day [ns], and the largest error that fits in one
 [µs]."""
+SOON_NS = 200 * MILLISECOND_NS
+"""Time after which a server that has to lead is told again that it does [ns]."""
+NEVER_NS, START_NS = -(2**63), 3 * SECOND_NS
+"""A time before all others, and the time that the first leader has for its first answer [ns]."""
+DEPARTURES = frozenset({Reason.CLOSED, Reason.RESTARTED})
+"""Causes after which a server leads no more if another is heard."""
 PLANLESS = frozenset({Reason.OPENED, Reason.GOOD, Reason.HORIZON, Reason.OLD, Reason.ENDED})
 """Reasons for a mode that do not explain why there is no newer horizon."""
 
@@ -75,6 +84,7 @@ class Client(Endpoint):
         server: address of the server, or of the netem in front of it.
         paths: the same on each path, if there are several; `server` is then not used.
         prices: price of a packet on each path; default: all alike.
+        standby: the same as `paths` for a second server, which leads when the first does not.
         vehicle: number of the vehicle, unique among the vehicles of the server.
         boot_id: number unique to this run of the client.
         keeps: whether the state needed after a restart of the client is saved, see `client.memory`.
@@ -89,9 +99,11 @@ class Client(Endpoint):
         server: Address = NOWHERE,
         paths: Sequence[Address] = (),
         prices: Sequence[float] = (),
+        standby: Sequence[Address] = (),
         vehicle: int,
         boot_id: int,
         link: ClientLink | None = None,
+        standby_link: ClientLink | None = None,
         recorder: Recorder | None = None,
         keeps: bool = False,
         before: SavedState | None = None,
@@ -101,10 +113,10 @@ class Client(Endpoint):
         self.keeps = keeps or before is not None
         self._memory = ClientMemory(terms, boot_id, before)
         self._is_mission, self._axes = scenario.is_mission, terms.axes
-        paths = paths or (server,)
-        self.vehicle, self._server = vehicle, paths[0]
-        self._path_of = {(PATH_SOCKETS[i], path): i for i, path in enumerate(paths)}
-        """Number of the path, by the socket and the peer of its datagrams."""
+        servers = [paths or (server,), standby] if standby else [paths or (server,)]
+        self.vehicle = vehicle
+        self._at: dict[tuple[int, Address], tuple[int, int]] = {}
+        """Numbers of the server and of its path, by the socket and the peer of its datagrams."""
         self._timeout_ns = seconds_to_ns(scenario.link.timeout_s)
         self._flies, self._port = flies, flies.port
         if before is not None:
@@ -123,32 +135,57 @@ class Client(Endpoint):
             returns=scenario.vehicle.on_loss == "return",
             changed=self._mode_changed,
         )
-        self._session = ServerSession(
-            terms,
-            vehicle=vehicle,
-            boot_id=self._memory.boot_id,
-            paths=paths,
-            prices=prices or (1.0,) * len(paths),
-            spread=scenario.link.spread,
-            timeout_ns=self._timeout_ns,
-            connect_s=scenario.link.connect_s,
-            link=link or PlainLink(),
-            hearing=Hearing(self._timeout_ns, terms.dt_ns, scenario.link.fixed_ns),
-            failsafe=self._failsafe,
-            out=self._out,
-            events=self._events,
-        )
+        number = self._memory.before.leadership
+        self._leadership = Leadership(len(servers), number, self._timeout_ns)
+        self._led_by, self._began_ns = self._leadership.number, NEVER_NS
+        """Number of the leadership last reported, and time of the first wake."""
+        self._doubted_ns = NEVER_NS
+        """When the leader that is, or was last, doubted had been heard last."""
+        self._sessions: list[ServerSession] = []
+        for i, (addresses, sockets) in enumerate(
+            zip(servers, (PATH_SOCKETS, STANDBY_SOCKETS), strict=False)
+        ):
+            at = zip(sockets, addresses, strict=False)
+            self._at |= {each: (i, path) for path, each in enumerate(at)}
+            self._sessions.append(
+                ServerSession(
+                    terms,
+                    vehicle=vehicle,
+                    boot_id=self._memory.boot_id,
+                    server=i,
+                    sockets=sockets,
+                    leadership=self._leadership,
+                    paths=addresses,
+                    prices=prices if len(prices) == len(addresses) else (1.0,) * len(addresses),
+                    spread=scenario.link.spread,
+                    timeout_ns=self._timeout_ns,
+                    connect_s=scenario.link.connect_s,
+                    link=(link, standby_link)[i] or PlainLink(),
+                    hearing=Hearing(self._timeout_ns, terms.dt_ns, scenario.link.fixed_ns),
+                    watch=self._failsafe if len(servers) == 1 else _OfLeader(self, i),
+                    out=self._out,
+                    events=self._events,
+                )
+            )
         self._pilot = Pilot(scenario, vehicle, flies, self._failsafe, recorder)
         self._not_flown: NotFlown | None = None
         self._land_after_s = scenario.vehicle.land_after_s
         self._reported_leap: tuple[float, ...] | None = None
-        self._ground = GroundReports(vehicle, paths[0], self._timeout_ns, self._events)
+        self._ground = [
+            GroundReports(vehicle, each.address, self._timeout_ns, self._events)
+            for each in self._sessions
+        ]
         self._fence_report_ns = 0
         """Time before which the fence is not reported again."""
         self._time: TimeOfDay | None = None
         self._time_due_ns = 0
         self.horizons = 0
         self.dropped: Counter[Drop] = Counter()
+
+    @property
+    def _session(self) -> ServerSession:
+        """Session with the server that leads."""
+        return self._sessions[self._leadership.leader]
 
     @property
     def failure(self) -> Failure | None:
@@ -183,12 +220,13 @@ class Client(Endpoint):
             self._attend(self._port, now_ns)
             return
         # Before decryption: a packet from another address costs one comparison.
-        path = self._path_of.get((datagram.socket, datagram.peer))
-        if path is None:
+        at = self._at.get((datagram.socket, datagram.peer))
+        if at is None:
             self.dropped[Drop.ELSEWHERE] += 1
             return
+        server, path = at
         try:
-            horizon = self._session.hear(datagram.payload, path=path, now_ns=now_ns)
+            horizon = self._sessions[server].hear(datagram.payload, path=path, now_ns=now_ns)
             if self._pilot.next_ns is None:
                 self._begin(now_ns)
             elif self._failsafe.mode is Mode.INIT:  # the flight went on before there was a session
@@ -220,30 +258,41 @@ class Client(Endpoint):
             knots = motion.knots(self._axes)
             self._pilot.compensator.go_on_along(motion.step, motion.observed, motion.spacing, knots)
         cause = Reason.RESUMED if motion else Reason.LOST
+        for session in self._sessions:
+            session.heard_ns = before.heard_ns
         self._failsafe.resume(cause, heard_ns=before.heard_ns, now_ns=now_ns)
 
     # -- saved state -------------------------------------------------------------------------
 
     def _to_keep(self) -> SavedState:
-        pilot, compensator = self._pilot, self._pilot.compensator
+        pilot = self._pilot
         if pilot.next_ns is None:  # the flight of the previous run may still continue
-            return msgspec.structs.replace(self._memory.before, frame=self._flies.frame)
-        motion = None
-        flown = compensator.follower
-        in_force = self._is_mission and compensator.in_force != NO_HORIZON
-        if in_force and isinstance(flown, SplineFollower):
-            motion = FlownMotion(
-                step=compensator.in_force,
-                observed=compensator.observed,
-                spacing=flown.spacing,
-                numbers=flown.sent.tobytes(),
+            return msgspec.structs.replace(
+                self._memory.before,
+                frame=self._flies.frame,
+                leadership=self._leadership.number,
             )
         return SavedState(
             boot_id=self._memory.boot_id,
             began_ns=pilot.began_ns,
             heard_ns=self._failsafe.heard_ns or pilot.began_ns,
-            motion=motion,
+            motion=self._flown_motion(),
             frame=self._flies.frame,
+            leadership=self._leadership.number,
+        )
+
+    def _flown_motion(self) -> FlownMotion | None:
+        """Motion in force; None without one, or without a mission."""
+        compensator = self._pilot.compensator
+        flown = compensator.follower
+        if not self._is_mission or compensator.in_force == NO_HORIZON:
+            return None
+        assert isinstance(flown, SplineFollower)
+        return FlownMotion(
+            step=compensator.in_force,
+            observed=compensator.observed,
+            spacing=flown.spacing,
+            numbers=flown.sent.tobytes(),
         )
 
     def keep(self, *, now_ns: int) -> bytes | None:
@@ -280,9 +329,12 @@ class Client(Endpoint):
                 self._fly(now_ns)
             elif not self._session.wait(now_ns=now_ns):
                 return
-            self._session.ask(now_ns=now_ns)
-            if self._pilot.next_ns is None:
-                self._session.rest(now_ns=now_ns)
+            else:
+                self._follow_leader(now_ns)
+            for session in self._sessions:
+                session.ask(now_ns=now_ns)
+                if self._pilot.next_ns is None:
+                    session.rest(now_ns=now_ns)
         if self._port is not None:
             self._attend(self._port, now_ns)
 
@@ -296,14 +348,15 @@ class Client(Endpoint):
 
     def _watch_ground(self, now_ns: int) -> None:
         session, waits_for = self._session, self._flies.waits_for
+        ground = self._ground[self._leadership.leader]
         if session.number is not None:
-            self._ground.hear(session.number, session.echo.received_ns, now_ns=now_ns)
+            ground.hear(session.number, session.echo.received_ns, now_ns=now_ns)
         elif self._flies.is_ready:
-            waits_for = f"an answer of the server at {address_text(*self._server)}"
-        self._ground.wait(waits_for, now_ns=now_ns)
+            waits_for = f"an answer of the server at {address_text(*session.address)}"
+        ground.wait(waits_for, now_ns=now_ns)
 
     def _fly(self, now_ns: int) -> None:
-        session, pilot = self._session, self._pilot
+        pilot = self._pilot
         pilot.fly(now_ns=now_ns)
         if pilot.is_held and now_ns >= self._fence_report_ns:
             self._fence_report_ns = now_ns + HELD_AGAIN_NS
@@ -316,11 +369,93 @@ class Client(Endpoint):
         # motion the next run flies.
         if self.keeps and not self._memory.may_tell(self._to_keep(), now_ns=now_ns):
             return
-        observation = pilot.observation(session)
-        if observation is not None:
-            session.send(observation, now_ns=now_ns)
-            self._tell_time(now_ns)
-        session.watch_paths(now_ns)
+        self._follow_leader(now_ns)
+        for session in self._sessions:
+            observation = None
+            if session.leads:
+                observation = pilot.observation(session)
+            elif session.is_observation_due(pilot.flown):
+                observation = pilot.observe(session)
+            # A server that does not know who leads would take itself for the leader.
+            if observation is not None and (len(self._sessions) == 1 or session.told is not None):
+                session.send(observation, now_ns=now_ns)
+                self._tell_time(session, now_ns)
+            session.watch_paths(now_ns)
+
+    # -- leadership --------------------------------------------------------------------------
+
+    def _follow_leader(self, now_ns: int) -> None:
+        """Let another server lead if the leader is silent, and tell all servers who leads."""
+        if len(self._sessions) == 1:
+            return
+        lead = self._leadership
+        if self._began_ns == NEVER_NS:
+            self._began_ns = now_ns
+        # The first leader gets time for its handshake.
+        floor_ns = self._began_ns + (START_NS if self._session.number is None else 0)
+        heard_ns = [
+            each.heard_ns or (floor_ns if each.leads else NEVER_NS) for each in self._sessions
+        ]
+        successor = lead.successor(heard_ns, now_ns)
+        if successor is not None:
+            lead.hand_over(successor)
+        self._report_leader()
+        doubts = lead.doubts(heard_ns, now_ns)
+        leader_ns = heard_ns[lead.leader]
+        if doubts and leader_ns != self._doubted_ns and not self._is_alone(now_ns):
+            self._doubted_ns = leader_ns
+            self._failsafe.heard(now_ns=now_ns)  # the other server gets a time-out to answer
+        for session in self._sessions:
+            if session.number is None or now_ns < session.lead_ns:
+                continue
+            asks = doubts and not session.leads
+            if asks or (session.told != lead.number and not session.is_lost(now_ns)):
+                self._tell_leader(session, now_ns, is_urgent=asks or session.leads)
+
+    def _is_alone(self, now_ns: int) -> bool:
+        """Whether no server is heard that could lead in place of the leader."""
+        return all(each.leads or each.is_lost(now_ns) for each in self._sessions)
+
+    def _tell_leader(self, session: ServerSession, now_ns: int, *, is_urgent: bool) -> None:
+        assert session.number is not None
+        number, leads, motion = self._leadership.number, session.leads, None
+        if leads and self._pilot.next_ns is not None:
+            motion = self._flown_motion()
+        message = Lead(self.vehicle, session.number, number, int(leads), step=self._pilot.flown)
+        if motion is not None:
+            message = message._replace(
+                in_force=motion.step, spacing=motion.spacing, knots=motion.numbers
+            )
+        session.tell_leader(message, SOON_NS if is_urgent else SECOND_NS, now_ns=now_ns)
+
+    def _report_leader(self) -> None:
+        """Report that another server leads; its packets count as the link's from now on."""
+        if self._led_by == self._leadership.number:
+            return
+        self._led_by, session = self._leadership.number, self._session
+        if session.heard_ns is not None:
+            self._failsafe.heard(now_ns=max(session.heard_ns, self._failsafe.heard_ns or 0))
+        (host, port), number = session.address, self._led_by
+        self._events.append(
+            LeaderChanged(vehicle=self.vehicle, host=host, port=port, number=number)
+        )
+
+    def _depart(self, server: int, cause: Reason, now_ns: int) -> bool:
+        """Whether a cause on the side of a server is none for the vehicle, since another leads."""
+        session = self._sessions[server]
+        if not session.leads:
+            if cause in CLOSING:
+                session.close()
+            return True
+        others = [i for i, each in enumerate(self._sessions) if i != server]
+        ready = [i for i in others if not self._sessions[i].is_lost(now_ns)]
+        if cause not in DEPARTURES or not ready:
+            return False
+        self._leadership.hand_over(ready[0])
+        self._report_leader()
+        if cause in CLOSING:
+            session.close()
+        return True
 
     def _tell_leap(self, leap_m: tuple[float, ...] | None) -> None:
         self._reported_leap = leap_m
@@ -358,16 +493,16 @@ class Client(Endpoint):
     def learn_time(self, utc_ns: int, error_ns: int, *, now_ns: int) -> None:
         self._time = TimeOfDay(utc_ns - now_ns, error_ns, now_ns)
 
-    def _tell_time(self, now_ns: int) -> None:
+    def _tell_time(self, session: ServerSession, now_ns: int) -> None:
         if self._time is None or not self._is_mission or now_ns < self._time_due_ns:
             return
         error_ns = self._time.error_at(now_ns)
         if error_ns is None:
             return
-        self._time_due_ns = now_ns + TIME_NS
+        self._time_due_ns = now_ns + (TIME_NS if session.leads else 0)
         epoch_us = stamp_us(self._pilot.began_ns + self._time.ahead_ns)
         error_us = min(-(-error_ns // MICROSECOND_NS) + 1, TIME_ERROR_MAX_US)
-        self._session.tell_time(self._pilot.flown, epoch_us, error_us, now_ns=now_ns)
+        session.tell_time(self._pilot.flown, epoch_us, error_us, now_ns=now_ns)
 
     def change(self, scenario: Scenario, keys: frozenset[str], *, now_ns: int) -> None:  # noqa: ARG002
         self._failsafe.armed = scenario.armed
@@ -387,10 +522,11 @@ class Client(Endpoint):
         if self._port is not None:
             self._port.close(now_ns=now_ns)
             self._attend(self._port, now_ns)
-        if self._session.number is not None:
-            # A CLOSE is not acknowledged, so it is sent several times.
-            for _ in range(CLOSES):
-                self._session.send(Close(self.vehicle, self._session.number), now_ns=now_ns)
+        for session in self._sessions:
+            if session.number is not None:
+                # A CLOSE is not acknowledged, so it is sent several times.
+                for _ in range(CLOSES):
+                    session.send(Close(self.vehicle, session.number), now_ns=now_ns)
 
     def _mode_changed(self, before: Mode, was: Reason, cause: Reason, now_ns: int) -> None:
         """Act on a change of mode or reason, and report it.
@@ -438,11 +574,35 @@ class Client(Endpoint):
             observed_ns = pilot.starts_ns(compensator.observed)
             vehicle_figures["age_ms"] = (now_ns - observed_ns) / MILLISECOND_NS
             vehicle_figures["plan_age_ms"] = (now_ns - planned_ns) / MILLISECOND_NS
+        if len(self._sessions) > 1:
+            vehicle_figures["leadership"] = {
+                "number": self._leadership.number,
+                "server": address_text(*self._session.address),
+            }
         if self._session.paths:
             vehicle_figures["paths"] = self._session.paths.figures(pilot.starts_ns(pilot.flown))
         if self._port is not None:
             vehicle_figures["autopilot"] = self._port.figures()
         return vehicle_figures
+
+
+class _OfLeader(Watch):
+    """Packets and faults of one of several servers: those of the leader reach the failsafe."""
+
+    def __init__(self, client: Client, server: int) -> None:
+        self._client, self._server = client, server
+
+    def heard(self, *, now_ns: int) -> None:
+        if self._client._leadership.leader == self._server:
+            self._client._failsafe.heard(now_ns=now_ns)
+
+    def malformed(self, *, now_ns: int) -> None:
+        if self._client._leadership.leader == self._server:
+            self._client._failsafe.malformed(now_ns=now_ns)
+
+    def meet(self, cause: Reason, *, now_ns: int) -> None:
+        if not self._client._depart(self._server, cause, now_ns):
+            self._client._failsafe.meet(cause, now_ns=now_ns)
 
 
 def figures(clients: Sequence[Client]) -> dict[str, Any]:

@@ -7,6 +7,7 @@ saves, outside the process:
     step 0, on the clock of the host      steps continue to count from it
     the boot id of the conversation       the server recognizes the same client
     the origin of the vehicle's frame     otherwise the flight would be shifted
+    the number of the leadership          plans of an earlier one are not flown
     whether the vehicle was armed         starting a process must not arm it
 
 A core opens no file: `Client.keep` returns bytes when they have changed, the shell writes them
@@ -20,6 +21,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from skytether.client.leadership import NUMBER_MAX
 from skytether.client.vehicle import VehicleMemory
 from skytether.shared.law.terms import Terms
 from skytether.shared.wire.protocol import KNOTS_MAX
@@ -65,6 +67,8 @@ class SavedState(msgspec.Struct, frozen=True, kw_only=True):
     heard_ns: Time = 0
     motion: FlownMotion | None = None
     frame: VehicleMemory = VehicleMemory()
+    leadership: Annotated[int, msgspec.Meta(ge=0, le=NUMBER_MAX)] = 0
+    """Number of the leadership, see `client.leadership`."""
 
     def after(self, time_ns: int) -> "SavedState":
         began_ns = None if self.began_ns is None else self.began_ns + time_ns
@@ -112,9 +116,10 @@ def recall(content: bytes, written_ns: int | None, now_ns: int, terms: Terms) ->
     """
     saved = SavedState.decode(content, written_ns or 0, terms.axes)
     if written_ns is None:
-        return SavedState(frame=VehicleMemory(armed=saved.frame.armed))
+        frame = VehicleMemory(armed=saved.frame.armed)
+        return SavedState(frame=frame, leadership=saved.leadership)
     if not 0 <= now_ns - written_ns <= age_max_ns(terms):
-        return SavedState(frame=saved.frame)
+        return SavedState(frame=saved.frame, leadership=saved.leadership)
     return saved
 
 
@@ -178,4 +183,4 @@ def _is_same(one: SavedState, other: SavedState) -> bool:
 
 def _compared_part(state: SavedState) -> tuple[object, ...]:
     frame = msgspec.structs.replace(state.frame, boot_ms=0, at_ns=0)
-    return state.boot_id, state.began_ns, state.motion, frame
+    return state.boot_id, state.began_ns, state.motion, frame, state.leadership

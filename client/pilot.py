@@ -310,18 +310,22 @@ class Pilot:
 
     def observation(self, session: ServerSession) -> Observation | None:
         """Observation of the present step; None if none is due or the state is unknown."""
-        failsafe, compensator = self._failsafe, self.compensator
-        states = self._navigation.predicted
         if session.number is None or not self._navigation.is_known:
             return None
-        if not self._reporter.is_due(
+        due = self._reporter.is_due(
             session.number,
             self.flown,
-            failsafe.mode,
-            states,
+            self._failsafe.mode,
+            self._navigation.predicted,
             self._input,
             session.silence_asked,
-        ):
+        )
+        return self.observe(session) if due else None
+
+    def observe(self, session: ServerSession) -> Observation | None:
+        """Observation of the present step; None without a session or if the state is unknown."""
+        failsafe, compensator = self._failsafe, self.compensator
+        if session.number is None or not self._navigation.is_known:
             return None
         echo = session.echo
         backward_ns = echo.received_ns - self.starts_ns(0) - echo.server_ns
@@ -337,10 +341,10 @@ class Pilot:
             echo.heard,
             failsafe.mode,
             int(failsafe.takes),
-            states,
+            self._navigation.predicted,
             NO_INPUT if self._terms.splines else self._input,
             session.sent,
-            session.hearing.silence,
+            session.silence,
         )
 
     def _record(self) -> None:

@@ -8,15 +8,15 @@ delays. `client.failsafe` decides how packets and silence change the vehicle's m
 """
 
 from collections.abc import Sequence
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, Protocol
 
-from skytether.client.failsafe import Failsafe
+from skytether.client.leadership import Leadership
 from skytether.client.link import AGAIN_NS, ClientLink
 from skytether.shared.base.units import SECOND_NS, seconds_to_ns
 from skytether.shared.core.endpoint import PATH_SOCKETS, Address, Datagram, Events
 from skytether.shared.core.events import Failure, NoAnswer, NoSession, SessionRefused, Unanswered
 from skytether.shared.core.steady import JUMP_NS
-from skytether.shared.law.heartbeat import NUMBERS, Hearing
+from skytether.shared.law.heartbeat import NUMBERS, STANDBY_TIMES, Hearing
 from skytether.shared.law.terms import Terms
 from skytether.shared.scenario.catalogue import differences
 from skytether.shared.telemetry.record import Reason
@@ -28,6 +28,7 @@ from skytether.shared.wire.protocol import (
     Hello,
     Horizon,
     Idle,
+    Lead,
     Message,
     Observation,
     PathProof,
@@ -70,12 +71,28 @@ NEVER = Echo(0, 0, 0)
 """Echo before the first packet of the server."""
 
 
+class Watch(Protocol):
+    """What has to know of a server's packets and faults: the failsafe, or nobody."""
+
+    def heard(self, *, now_ns: int) -> None:
+        """Note a packet of the session."""
+
+    def malformed(self, *, now_ns: int) -> None:
+        """Note a malformed message that was sent by the server itself."""
+
+    def meet(self, cause: Reason, *, now_ns: int) -> None:
+        """Act on a cause on the server's side."""
+
+
 class ServerSession:
-    """Conversation between one vehicle and its server, over all sessions.
+    """Conversation between one vehicle and one of its servers, over all sessions.
 
     Args:
         terms: terms that the server has to agree to.
         boot_id: number unique to this run of the client.
+        server: which of the vehicle's servers this is, from 0.
+        sockets: number of the socket of each path.
+        leadership: which server leads.
         paths: address of the server, or of the netem in front of it, on each path.
         prices: price of a packet on each path.
         spread: `link.spread`.
@@ -92,6 +109,9 @@ class ServerSession:
         *,
         vehicle: int,
         boot_id: int,
+        server: int = 0,
+        sockets: Sequence[int] = PATH_SOCKETS,
+        leadership: Leadership,
         paths: Sequence[Address],
         prices: Sequence[float],
         spread: str,
@@ -99,11 +119,12 @@ class ServerSession:
         connect_s: float,
         link: ClientLink,
         hearing: Hearing,
-        failsafe: Failsafe,
+        watch: Watch,
         out: list[Datagram],
         events: Events,
     ) -> None:
         self._terms = terms
+        self._index, self._sockets, self._leadership = server, sockets, leadership
         self._vehicle = vehicle
         self._boot_id = boot_id
         self._addresses, self._prices, self._spread = paths, prices, spread
@@ -122,7 +143,16 @@ class ServerSession:
         """Longest silence that the server allows the vehicle [half steps]; 0 for no bound."""
         self.sent = 0
         """Number of packets sent in the session, modulo NUMBERS."""
-        self._failsafe = failsafe
+        self._watch = watch
+        self.heard_ns: int | None = None
+        """Time of the newest packet of the session; None before the first, and once it is closed.
+        """
+        self.sent_step = -1
+        """Step of the newest observation; -1 before the first of the session."""
+        self.told: int | None = None
+        """Number of the leadership that the server knows; None before it knows one."""
+        self.lead_ns = 0
+        """Time before which it is not told again."""
         self._out = out
         self._events = events
         self.hello_ns = 0
@@ -139,6 +169,23 @@ class ServerSession:
         self._refusal: NoSession | None = None
         """Newest refusal of a session by the server; None after a session was opened."""
         self.failure: Failure | None = None
+
+    @property
+    def address(self) -> Address:
+        return self._server
+
+    @property
+    def leads(self) -> bool:
+        return self._leadership.leader == self._index
+
+    def is_lost(self, now_ns: int) -> bool:
+        timeout_ns = self._timeout_ns * (1 if self.leads else STANDBY_TIMES)
+        return self.heard_ns is None or now_ns - self.heard_ns > timeout_ns
+
+    @property
+    def silence(self) -> int:
+        """Longest silence that the vehicle allows the server [half steps]."""
+        return self.hearing.silence if self.leads else self.hearing.rare
 
     # -- receiving ---------------------------------------------------------------------------
 
@@ -166,13 +213,19 @@ class ServerSession:
         of = message.vehicle, getattr(message, "session", None)
         if report and self.paths and of == (self._vehicle, self.number):
             self.paths.heard(report, datagram, path, now_ns)
+        if isinstance(message, Horizon | Trajectory):
+            self._heard(message, now_ns)
+            if not self.leads or message.leadership != self._leadership.number:
+                raise ProtocolError(Drop.NOT_THE_LEADER)
+            self.idle = str(Idle.PLANS)
+            return message
+        self._take(message, path, now_ns)
+        return None
+
+    def _take(self, message: Message, path: int, now_ns: int) -> None:
         match message:
             case Welcome() as welcome:
                 self._welcome(welcome, now_ns)
-            case Horizon() | Trajectory() as horizon:
-                self._heard(horizon, now_ns)
-                self.idle = str(Idle.PLANS)
-                return horizon
             case Heartbeat() as heartbeat:
                 self._heard(heartbeat, now_ns)
                 planning = heartbeat.idle == Idle.PLANS
@@ -180,16 +233,20 @@ class ServerSession:
                 self.idle = DEGRADED if missing else str(Idle(heartbeat.idle))
             case Close() as close:
                 self._check(close)
-                self._failsafe.meet(Reason.CLOSED, now_ns=now_ns)
+                self._watch.meet(Reason.CLOSED, now_ns=now_ns)
             case PathProof() as asked:
                 self._check(asked)
-                self._failsafe.heard(now_ns=now_ns)
+                self._note_heard(now_ns)
                 if asked.proof:
                     self._proofs[path] = asked.proof
                     self._name(path, now_ns)
+            case Lead() as lead:
+                self._check(lead)
+                self.told = lead.number
+                self._leadership.learn(lead.known, self._index)
+                self._note_heard(now_ns)
             case _:
                 raise ProtocolError(Drop.NOT_FOR_A_CLIENT)
-        return None
 
     def _decode(self, payload: bytes, now_ns: int) -> Message:
         try:
@@ -197,7 +254,7 @@ class ServerSession:
         except ProtocolError:
             # In plaintext anybody could make the vehicle brake with five packets.
             if self.link.secure:
-                self._failsafe.malformed(now_ns=now_ns)
+                self._watch.malformed(now_ns=now_ns)
             raise
 
     def _welcome(self, welcome: Welcome, now_ns: int) -> None:
@@ -220,7 +277,7 @@ class ServerSession:
             # A restarted server has another clock: its time stamps cannot be compared.
             self.echo = NEVER
         if self.number != welcome.session:
-            self.sent = 0
+            self.sent, self.sent_step, self.told = 0, -1, None
             self.hearing.begin()
             self._proofs.clear()
             self.paths = Paths(self._prices, self._spread) if len(self._addresses) > 1 else None
@@ -229,11 +286,11 @@ class ServerSession:
         self.link.adopt(now_ns=now_ns)
         self._heard(welcome, now_ns)
         if restarted:
-            self._failsafe.meet(Reason.RESTARTED, now_ns=now_ns)
+            self._watch.meet(Reason.RESTARTED, now_ns=now_ns)
 
     def _note_refusal(self, refusal: Refusal, now_ns: int) -> None:
         """Report why there is no session, once per reason; a late refusal is ignored."""
-        if not self._failsafe.is_lost(now_ns) or refusal not in (Refusal.FULL, Refusal.TAKEN):
+        if not self.is_lost(now_ns) or refusal not in (Refusal.FULL, Refusal.TAKEN):
             return
         host, port = self._server
         reason: Literal["full", "taken"] = "full" if refusal is Refusal.FULL else "taken"
@@ -243,7 +300,7 @@ class ServerSession:
             self._events.append(sent)
 
     def _check(
-        self, message: Welcome | Horizon | Trajectory | Heartbeat | Close | PathProof
+        self, message: Welcome | Horizon | Trajectory | Heartbeat | Close | PathProof | Lead
     ) -> None:
         named = message.vehicle, message.session
         if not self._is_open or named != (self._vehicle, self.number):
@@ -264,23 +321,28 @@ class ServerSession:
         else:
             server_ns = stamped_ns(message.server_us, expected_ns)
         if server_ns - expected_ns > SLEPT_NS and self.echo != NEVER:
-            self._failsafe.meet(Reason.STALLED, now_ns=now_ns)
-        self._failsafe.heard(now_ns=now_ns)
+            self._watch.meet(Reason.STALLED, now_ns=now_ns)
+        self._note_heard(now_ns)
         self.echo = Echo(server_ns, now_ns, (self.echo.heard + 1) % NUMBERS)
         if not isinstance(message, Welcome):
             self.silence_asked = message.silence
             self.hearing.hear(message.number, server_ns)
+
+    def _note_heard(self, now_ns: int) -> None:
+        self.heard_ns = now_ns
+        self._watch.heard(now_ns=now_ns)
 
     # -- sending -----------------------------------------------------------------------------
 
     def ask(self, *, now_ns: int) -> None:
         """Send HELLO if the server is silent, or the link needs new keys."""
         # The motion of an earlier run is flown before there is a session.
-        silent = self.number is None or self._failsafe.is_lost(now_ns)
+        silent = self.number is None or self.is_lost(now_ns)
         wanted = silent or self.link.wants_hello(now_ns)
         if wanted and now_ns >= self.hello_ns:
             unheard = self.number is None and self._refusal is None
-            self.hello_ns = now_ns + (self.link.hello_ns if unheard else AGAIN_NS)
+            again_ns = self.link.hello_ns if unheard else AGAIN_NS
+            self.hello_ns = now_ns + again_ns * (1 if self.leads else STANDBY_TIMES)
             hello = encode(Hello(self._vehicle, self._boot_id, self._terms))
             self._put(self.link.hello(hello, now_ns=now_ns), (self._greeted,))
             self._greeted = (self._greeted + 1) % len(self._addresses)
@@ -292,12 +354,23 @@ class ServerSession:
 
     def send(self, message: Observation | Close, *, now_ns: int) -> None:
         self.sent = (self.sent + 1) % NUMBERS
+        if isinstance(message, Observation):
+            self.sent_step = message.step
         self._post(message, now_ns)
 
     def tell_time(self, step: int, epoch_us: int, error_us: int, *, now_ns: int) -> None:
         """Send the time of day of step 0; this packet does not count in the loss statistics."""
         assert self.number is not None
         self._post(Time(self._vehicle, self.number, step, epoch_us, error_us), now_ns)
+
+    def tell_leader(self, flown: Lead, again_ns: int, *, now_ns: int) -> None:
+        """Tell the server who leads, and in which motion the vehicle is; again after `again_ns`."""
+        self.lead_ns = now_ns + again_ns
+        self._post(flown, now_ns)
+
+    def is_observation_due(self, step: int) -> bool:
+        """Whether a server that does not lead is to be sent an observation."""
+        return self.sent_step < 0 or 2 * (step - self.sent_step) >= self.hearing.rare
 
     def watch_paths(self, now_ns: int) -> None:
         """Send the newest packet again if it was lost, and try paths that are not known well."""
@@ -318,7 +391,7 @@ class ServerSession:
 
     def _post(
         self,
-        message: Observation | Close | Time | PathProof,
+        message: Observation | Close | Time | PathProof | Lead,
         now_ns: int,
         on: Sequence[int] = (),
     ) -> None:
@@ -338,11 +411,11 @@ class ServerSession:
 
     def _put(self, datagram: bytes, on: Sequence[int]) -> None:
         for path in on:
-            self._out.append(Datagram(datagram, self._addresses[path], PATH_SOCKETS[path]))
+            self._out.append(Datagram(datagram, self._addresses[path], self._sockets[path]))
 
     def close(self) -> None:
         """Close the session; only another WELCOME opens one."""
-        self._is_open = False
+        self._is_open, self.heard_ns = False, None
 
     def wait(self, *, now_ns: int) -> bool:
         """Whether to go on waiting for the flight; fails after too long without a session."""

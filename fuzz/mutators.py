@@ -16,6 +16,7 @@ from skytether.shared.wire.protocol import (
     Heartbeat,
     Hello,
     Horizon,
+    Lead,
     Message,
     Observation,
     PathProof,
@@ -91,6 +92,7 @@ def seeds(terms: Terms) -> list[bytes]:
             Close(1, 7),
             Time(1, 7, 5, 10, 1000),
             PathProof(1, 7, 1, 2**63, (1000, 10_000)),
+            Lead(1, 7, 3, 1, 3),
         )
     ]
 

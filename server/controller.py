@@ -37,9 +37,9 @@ from skytether.shared.law.terms import Terms
 from skytether.shared.scenario.reference import Reference
 from skytether.shared.scenario.schema import ControlConfig, Scenario
 from skytether.shared.scenario.triggers import Situation, SituationArrays, Verdict, make_trigger
-from skytether.shared.wire.protocol import Idle, Observation, committed_max
+from skytether.shared.wire.protocol import Idle, Lead, Observation, committed_max
 
-PLANS, OBSERVATION, DELAY, UNSOLVED = map(int, Idle)
+PLANS, OBSERVATION, DELAY, UNSOLVED, STANDBY = map(int, Idle)
 BLOCK = 128
 """Number of vehicles planned for together: their data stay in the cache, and no array is so large
 (128 KiB) that the C library would get new memory from the kernel for it each time."""
@@ -122,8 +122,8 @@ class Controller:
             stopwatch,
             self.faults.append,
         )
-        is_mission = scenario.is_mission and references is not None
-        self.scheme = _mission(fleet) if is_mission else table.make(fleet)
+        self._is_mission = scenario.is_mission and references is not None
+        self.scheme = _mission(fleet) if self._is_mission else table.make(fleet)
         self.columns = control.properties.figures
         """Names of the recorded figures of plans."""
         self._terms, self._capacity, self._block = terms, capacity, block
@@ -143,6 +143,10 @@ class Controller:
         """Step of the newest observation of each vehicle, or -1; shape (capacity,)."""
         self.idle = np.zeros(capacity, dtype=np.int64)
         """Reason for the missing plan of each vehicle, one of `Idle`; shape (capacity,)."""
+        self._led = np.ones(capacity, dtype=np.bool_)
+        """Whether this server leads each vehicle; shape (capacity,)."""
+        self._known = 0
+        """Largest number of a leadership that a vehicle has told."""
         self._takes = np.ones(capacity, dtype=np.bool_)
         """Whether each vehicle accepts horizons, by its newest observation; shape (capacity,)."""
         self._counts: Counter[str] = Counter()
@@ -187,6 +191,24 @@ class Controller:
         if self.budget:
             self.budget.forget(row)
 
+    def follow(self, row: int, told: Lead | None) -> None:
+        """Note who leads a vehicle; None if it has no other server.
+
+        A server that begins to lead sends a plan at once, whatever it sent before.
+        """
+        self._led[row] = told is None or bool(told.leads)
+        self._known = max(self._known, told.number if told else 0)
+        if self._led[row]:
+            self._sent_step[row] = -1
+            self._trigger.forget(row)
+        self.scheme.follow(row, told)
+
+    def known(self, number: int) -> int:
+        """Number of the leadership that a vehicle of a leadership `number` should follow: on a
+        mission all follow one server.
+        """
+        return self._known if self._is_mission else number
+
     def observe(self, row: int, observation: Observation) -> bool:
         """Store an observation unless a newer one is stored (E11); True if stored."""
         is_stored = self.scheme.observe(row, observation)
@@ -212,6 +234,7 @@ class Controller:
             self._age_max,
             self._clock.seen,
             self._uplink_max_ns,
+            self._led,
             self.idle,
             able,
         ):
@@ -280,6 +303,7 @@ def _able(
     age_max: int,
     seen: Seen,
     uplink_max: int,
+    led: B1,
     idle: I1,
     able: B1,
 ) -> int:
@@ -291,7 +315,9 @@ def _able(
         if step <= last_step[row] or observed_step[row] < 0:
             continue
         idle[row] = PLANS
-        if step - observed_step[row] > age_max:
+        if not led[row]:
+            idle[row] = STANDBY
+        elif step - observed_step[row] > age_max:
             idle[row] = OBSERVATION
         elif shortest_ns(seen, row) > uplink_max:
             # The horizon would have ended, or would be refused as too late, on arrival.

@@ -32,7 +32,7 @@ from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Recorder
 from skytether.shared.wire.drop import Drop
 from skytether.shared.wire.paths import EVERYWHERE
-from skytether.shared.wire.protocol import CLOSES, Close, Refusal, encode
+from skytether.shared.wire.protocol import CLOSES, Close, Lead, Refusal, encode
 
 VEHICLES_MAX = 64
 """Default largest number of vehicles at once."""
@@ -149,11 +149,20 @@ class Server(Endpoint):
             self._expire_ns = (now_ns // SECOND_NS + 1) * SECOND_NS
             for session in self.sessions.expire(now_ns):
                 self._events.append(SessionEnded(vehicle=session.vehicle))
+            self._spread_leadership(now_ns)
         if len(self.sessions):
             self._ticked_ns = now_ns
             self._ticker.tick(tick_ns, now_ns)
         else:
             self._grid.rest()
+
+    def _spread_leadership(self, now_ns: int) -> None:
+        """Tell vehicles of a mission that follow a smaller number of the largest one."""
+        for session in self.sessions:
+            number = session.leadership
+            if number is not None and (known := self.controller.known(number)) > number:
+                told = Lead(session.vehicle, session.number, number, int(session.leads), known)
+                self._out += session.sealed(encode(told), now_ns)
 
     def close(self, *, now_ns: int) -> None:
         for _ in range(CLOSES):

@@ -40,6 +40,7 @@ from skytether.shared.wire.protocol import (
     Close,
     Hello,
     Idle,
+    Lead,
     Message,
     Observation,
     PathProof,
@@ -190,6 +191,8 @@ class Reception:
                 self._hear_time(message, now_ns)
             case PathProof():
                 self._prove(message, call, datagram, now_ns)
+            case Lead():
+                self._note_leader(message, call, datagram, now_ns)
             case _:
                 raise ProtocolError(Drop.NOT_FOR_A_SERVER)
 
@@ -234,6 +237,22 @@ class Reception:
             self._answer(question, call, datagram)
         elif place in session.paths.places and self._sessions.at_place.get(place) is not session:
             self._sessions.set_paths(session, session.paths)
+
+    def _note_leader(self, message: Lead, call: GateCall, datagram: Datagram, now_ns: int) -> None:
+        """Note who leads a vehicle; a number counts once, for the vehicle repeats it."""
+        session = self._sessions.welcomed(message)
+        if session is None:
+            raise ProtocolError(Drop.UNKNOWN_SESSION)
+        session.heard_ns = now_ns
+        if session.leadership is None or message.number > session.leadership:
+            session.leadership, session.leads = message.number, bool(message.leads)
+            if session.row >= 0:
+                self._controller.follow(session.row, message)
+            else:
+                session.first = message
+        leads = int(session.leads)
+        number, known = session.leadership, self._controller.known(session.leadership)
+        self._answer(Lead(session.vehicle, session.number, number, leads, known), call, datagram)
 
     def _make_paths(self, session: Session, prices: tuple[int, ...]) -> ServerPaths:
         paths = ServerPaths(prices, self._spread, self._sessions.entropy, self._timeout_ns)
@@ -359,6 +378,7 @@ class Reception:
         session.line = call.line
         self._plausibility.forget(session.row)
         self._anew(session.row, (session.vehicle, session.boot_id))
+        self._controller.follow(session.row, session.first)
         self._controller.desired.assign(session.row, session.vehicle)
         host, port = session.address
         self._events.append(SessionOpened(vehicle=session.vehicle, host=host, port=port))

@@ -22,7 +22,7 @@ from skytether.shared.core.endpoint import Address, Datagram
 from skytether.shared.law.heartbeat import NUMBERS, SESSION_NS, Hearing
 from skytether.shared.law.model import Indices
 from skytether.shared.wire.drop import Drop, ProtocolError
-from skytether.shared.wire.protocol import Hello, Observation, PathProof, Time
+from skytether.shared.wire.protocol import Hello, Lead, Observation, PathProof, Time
 
 OTHER_NS = 2 * SECOND_NS
 """Time for which packets are also sent where a repeat of a recent one has come from [ns]."""
@@ -70,6 +70,12 @@ class Session:
     """Number of the server's socket at which the vehicle was heard."""
     paths: ServerPaths | None = None
     """Paths to the vehicle; None with a single one."""
+    leadership: int | None = None
+    """Number of the leadership, as last told by the vehicle; None if it has no other server."""
+    leads: bool = True
+    """Whether this server leads the vehicle with that number."""
+    first: Lead | None = None
+    """What the vehicle has told before its first observation."""
 
     def number_next(self, now_ns: int) -> int:
         number = self.sent
@@ -236,6 +242,14 @@ class Sessions:
 
     def _is_heard(self, live: Session, now_ns: int) -> bool:
         return now_ns - live.heard_ns <= self._silence_ns
+
+    def welcomed(self, message: Lead) -> Session | None:
+        """Session of a message, whether its vehicle has a row yet or not."""
+        waiting = self._waiting(message.vehicle).get(message.vehicle)
+        for session in (self._live.get(message.vehicle), waiting):
+            if session and session.number == message.session:
+                return session
+        return None
 
     def find(self, message: Observation | Time | PathProof) -> Session | None:
         session = self._live.get(message.vehicle)

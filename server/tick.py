@@ -27,7 +27,7 @@ from skytether.shared.law.model import Array
 from skytether.shared.scenario.triggers import Compared
 from skytether.shared.telemetry.histogram import Histogram
 from skytether.shared.telemetry.record import Recorder
-from skytether.shared.wire.protocol import Heartbeat, Idle, encode, stamp_us
+from skytether.shared.wire.protocol import Heartbeat, Idle, encode, led, stamp_us
 
 MISSES_MAX = 5
 """Number of ticks that may be missed in a second before the server reports itself as degraded."""
@@ -181,7 +181,9 @@ class Ticker:
             return make_header((session.vehicle, session.number, sent_us, number, silence))
 
         for row, payload in self._controller.scheme.encode(batch, header):
-            self._send(sessions.at(row), payload, now_ns, worths.get(row, 0.0), is_plan=True)
+            session = sessions.at(row)
+            plan = led(session.leadership or 0, payload)
+            self._send(session, plan, now_ns, worths.get(row, 0.0), is_plan=True)
 
     def _send_heartbeats(self, due: Sequence[Session], now_ns: int) -> None:
         for session in due:

@@ -23,7 +23,7 @@ from skytether.shared.scenario.reference import Reference
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.scenario.schemes import SchemeProperties
 from skytether.shared.scenario.zones import Zones
-from skytether.shared.wire.protocol import FEEDBACK, KNOTS_MAX, Observation
+from skytether.shared.wire.protocol import FEEDBACK, KNOTS_MAX, Lead, Observation
 
 
 class Splines(NamedTuple):
@@ -289,6 +289,9 @@ class Scheme(ABC):
     def objection(self, zones: Zones) -> str:  # noqa: ARG002
         """Reason why the zones cannot be replaced by these now; empty if they can."""
         return ""
+
+    def follow(self, row: int, told: Lead | None) -> None:  # noqa: B027
+        """Note who leads a vehicle, and its motion in force; None if it has no other server."""
 
     def waits(self, row: int) -> str:  # noqa: ARG002
         """Reason why a vehicle waits; empty if it does not."""

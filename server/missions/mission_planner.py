@@ -51,7 +51,7 @@ from skytether.shared.base.chance import stream
 from skytether.shared.law.model import ALTITUDE, Array, Flags, Indices
 from skytether.shared.law.motion import INTERVALS, SPACING, Motion
 from skytether.shared.scenario.zones import Zones
-from skytether.shared.wire.protocol import KNOTS_MAX, Observation
+from skytether.shared.wire.protocol import KNOTS_MAX, Lead, Observation
 
 RESTS_MPS = 0.2
 """Measured speed below which a vehicle counts as at rest [m/s]."""
@@ -123,6 +123,9 @@ class MissionPlanner(SplineScheme):
 
     def restart(self, row: int) -> bool:
         return self._state.restart(row)
+
+    def follow(self, row: int, told: Lead | None) -> None:
+        self._state.follow(row, told)
 
     def observe(self, row: int, observation: Observation) -> bool:
         return self._state.observe(row, observation)
@@ -261,6 +264,8 @@ class MissionPlanner(SplineScheme):
 
     def _common_wait(self) -> str:
         """Reason why no motion is planned for any vehicle, in words; empty if there is none."""
+        if self._state.unled is not None:
+            return f"vehicle {self._state.number_of(self._state.unled)} to follow this server"
         if self._state.absent:
             return f"vehicle {min(self._state.absent)} to begin"
         if self._state.foreign is not None:

@@ -21,7 +21,7 @@ from skytether.shared.law.terms import Terms
 from skytether.shared.scenario.mission import Mission
 from skytether.shared.scenario.reference import Reference
 from skytether.shared.scenario.schema import Scenario
-from skytether.shared.wire.protocol import NO_HORIZON, Mode, Observation
+from skytether.shared.wire.protocol import NO_HORIZON, Lead, Mode, Observation
 
 LONGEST = (INTERVALS + JOIN_MAX) * SPACING
 """Largest duration of a motion [steps]."""
@@ -138,6 +138,14 @@ class MissionState:
         its motions until it is observed after the restart."""
         self.foreign: int | None = None
         """Row of a vehicle that may still fly a motion of another server; None if there is none."""
+        self._leaderships: dict[int, int | None] = {}
+        """Number of the leadership with which each row is led by this server; None if another
+        server leads it."""
+        self._awaited: set[int] = set()
+        """Rows without an observation since this server began to lead them."""
+        self.unled: int | None = None
+        """Row because of which no motion may be planned: not all vehicles follow this server with
+        one number, or this one was not observed since. None if there is none."""
 
     def forget(self, row: int) -> None:
         """End a session; motions stay, since the vehicle continues on them."""
@@ -156,6 +164,44 @@ class MissionState:
         vehicle.outside_m = max(vehicle.outside_m, self._stopping_m(vehicle))
         self._changed.add(row)
         return True
+
+    def follow(self, row: int, told: Lead | None) -> None:
+        """Note who leads a vehicle.
+
+        A vehicle that this server leads has told its motion in force, and flies no plan of an
+        earlier leadership any more, so it may fly nothing else.
+        """
+        leads = told is None or bool(told.leads)
+        self._leaderships[row] = (told.number if told else 0) if leads else None
+        if told is not None and leads:
+            self._take_over(row, told)
+        self._find_unled()
+
+    def _take_over(self, row: int, told: Lead) -> None:
+        vehicle = self.vehicles.setdefault(row, VehicleMotions())
+        self.rows.number[row] = self.number_of(row)
+        vehicle.sent.clear()
+        vehicle.next = None
+        self._awaited.add(row)
+        self.observed_step[row] = told.step - 1  # older observations show an earlier motion
+        knots = np.asarray(told.knots, dtype=np.float64)
+        if told.in_force is not None and told.spacing == SPACING and knots.size:
+            position, velocity = np.ascontiguousarray(knots.transpose(2, 1, 0))
+            motion = Motion(told.in_force, position, velocity)
+            vehicle.in_force, vehicle.is_foreign = SentMotion(told.in_force, motion), False
+            self.rows.unknown_until[row] = -1
+        self._mark_changed(row, vehicle)
+
+    def _find_unled(self) -> None:
+        newest = max((each or 0 for each in self._leaderships.values()), default=0)
+        self.unled = next(
+            (
+                row
+                for row, number in self._leaderships.items()
+                if number != newest or row in self._awaited
+            ),
+            None,
+        )
 
     def brakes_m(self, vehicle: VehicleMotions) -> float:
         """Braking distance from the observed position, without a motion [m]; 0 with a motion."""
@@ -250,6 +296,9 @@ class MissionState:
             vehicle.adapt_copies(oldest.step == newest and k <= observation.since + 1)
         self.rows.heard[row] = True
         self._mark_changed(row, vehicle)
+        if row in self._awaited:
+            self._awaited.discard(row)
+            self._find_unled()
         return True
 
     def _mark_changed(self, row: int, vehicle: VehicleMotions) -> None:

@@ -372,6 +372,17 @@ class Flying(VehicleEvent, frozen=True, kw_only=True):
         return f"vehicle {self.vehicle}: session open, flying"
 
 
+class LeaderChanged(PeerEvent, frozen=True, kw_only=True):
+    """Another server leads a vehicle."""
+
+    number: int
+    """Number of the leadership."""
+
+    def __str__(self) -> str:
+        at = address_text(self.host, self.port)
+        return f"vehicle {self.vehicle}: the server at {at} leads it now (leadership {self.number})"
+
+
 class ModeChanged(VehicleEvent, frozen=True, kw_only=True):
     """A vehicle has changed its mode, or the reason for it.
 
@@ -588,6 +599,7 @@ Event = (
     | ServerSilent
     | ServerHeard
     | Flying
+    | LeaderChanged
     | ModeChanged
     | PlanningStopped
     | StateDoubted

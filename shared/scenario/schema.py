@@ -491,9 +491,10 @@ class Scenario(Section, frozen=True):
         """Scenario of one path alone; the first has the scenario's seed, others one of their own.
 
         Args:
-            index: number of the path, from 0.
+            index: number of the path, from 0; one more than there are is that to a standby server,
+                which is impaired like the first.
         """
-        path = self.paths[index]
+        path = (*self.paths, self.paths[0])[index]
         network = msgspec.structs.replace(
             self.network, uplink=path.uplink, downlink=path.downlink, paths=()
         )

@@ -64,6 +64,8 @@ class Drop(StrEnum):
     """A mission's motion begins at a step that is in the future of the vehicle."""
     TOO_LATE = "too late"
     NOT_TAKEN = "not taken"
+    NOT_THE_LEADER = "not the leader"
+    """The plan is of a server that does not lead the vehicle, or of an earlier leadership."""
 
 
 class ProtocolError(Exception):

@@ -1,4 +1,4 @@
-"""The wire: nine messages, each one msgpack array in one UDP datagram, sealed or plain.
+"""The wire: ten messages, each one msgpack array in one UDP datagram, sealed or plain.
 
     [version, type, vehicle, ...]
 
@@ -10,13 +10,15 @@
 | 3    | OBSERVATION | client  | session, step, flown, delay, backward_us, heard, mode,     |
 |      |             |         | motion, number, silence                                    |
 | 4    | HORIZON     | server  | session, step, server_us, age, inputs, feedback, number,   |
-|      |             |         | silence                                                    |
+|      |             |         | silence [, leadership]                                     |
 | 5    | HEARTBEAT   | server  | session, server_us, idle, degraded, number, silence        |
 | 6    | CLOSE       | both    | session                                                    |
 | 7    | TRAJECTORY  | server  | session, step, server_us, age, spacing, knots, number,     |
-|      |             |         | silence                                                    |
+|      |             |         | silence [, leadership]                                     |
 | 8    | TIME        | client  | session, step, epoch_us, error_us                          |
 | 9    | PATH        | both    | session, path, proof, prices                               |
+| 10   | LEAD        | both    | session, number, leads, known, step, in_force, spacing,    |
+|      |             |         | knots                                                      |
 
 With the scheme "trajectory", TRAJECTORY replaces HORIZON. `docs/protocol.md` describes the bytes.
 
@@ -199,6 +201,8 @@ class Horizon(NamedTuple):
     """Number of packets that the server has sent in the session before, modulo NUMBERS."""
     silence: int = 0
     """Longest silence that the server allows the vehicle [half steps]; 0 for no bound."""
+    leadership: int = 0
+    """Number of the leadership, see `Lead`; 0 is not sent."""
 
 
 class Trajectory(NamedTuple):
@@ -219,6 +223,8 @@ class Trajectory(NamedTuple):
     """Number of packets that the server has sent in the session before, modulo NUMBERS."""
     silence: int = 0
     """Longest silence that the server allows the vehicle [half steps]; 0 for no bound."""
+    leadership: int = 0
+    """Number of the leadership, see `Lead`; 0 is not sent."""
 
 
 class Idle(IntEnum):
@@ -229,6 +235,7 @@ class Idle(IntEnum):
     DELAY = 2
     """The delay to the vehicle is longer than a horizon can cover."""
     UNSOLVED = 3
+    STANDBY = 4
 
     def __str__(self) -> str:
         return IDLE_TEXTS[self]
@@ -239,6 +246,7 @@ IDLE_TEXTS = {
     Idle.OBSERVATION: "its newest observation at the server is older than link.age_max_s",
     Idle.DELAY: "the delay to it is longer than a horizon can cover",
     Idle.UNSOLVED: "the solver has found no plan",
+    Idle.STANDBY: "another server leads it",
 }
 
 
@@ -292,6 +300,29 @@ class PathProof(NamedTuple):
     """Price of a packet on each path of the session, in thousandths of the least."""
 
 
+class Lead(NamedTuple):
+    """LEAD: which of its servers leads a vehicle. The server answers with the same number, and with
+    the largest that any vehicle of its mission has told it.
+    """
+
+    vehicle: int
+    session: int
+    number: int
+    """Number of the leadership, which only rises; a plan of another number is not flown."""
+    leads: int
+    """1 if the server of this session leads the vehicle with that number, else 0."""
+    known: int = 0
+    """Largest number that the server has been told; 0 from a vehicle."""
+    step: int = 0
+    """Step k in which the vehicle sends, on its grid; 0 from a server, as are the fields below."""
+    in_force: int | None = None
+    """Step that the motion in force was made for; None without one."""
+    spacing: int = 0
+    """Steps from one knot of that motion to the next."""
+    knots: NDArray[np.float32] | bytes = b""
+    """Position [m] and velocity [m/s] of each knot; shape (axes, knots, 2)."""
+
+
 # With 10 % loss, all three are lost once in a thousand times.
 CLOSES = 3
 
@@ -314,7 +345,16 @@ def stamped_ns(stamp: int, near_ns: int) -> int:
 
 
 Message = (
-    Hello | Welcome | Observation | Horizon | Heartbeat | Close | Trajectory | Time | PathProof
+    Hello
+    | Welcome
+    | Observation
+    | Horizon
+    | Heartbeat
+    | Close
+    | Trajectory
+    | Time
+    | PathProof
+    | Lead
 )
 
 
@@ -419,6 +459,10 @@ def _knots(value: object, ours: Terms) -> NDArray[np.float32]:
     return numbers.reshape(ours.axes, -1, 2)
 
 
+def _knots_or_none(value: object, ours: Terms) -> NDArray[np.float32]:
+    return _knots(value, ours) if value != b"" else np.empty((ours.axes, 0, 2), np.float32)
+
+
 def _prices(value: object, ours: Terms) -> tuple[int, ...]:  # noqa: ARG001
     if type(value) is not tuple or not 2 <= len(value) <= PATHS_MAX:
         raise ProtocolError(Drop.FIELD)
@@ -468,12 +512,16 @@ _TYPES: tuple[tuple[type[Message], tuple[_Check, ...]], ...] = (
             *(range(2 * len(Mode)), _motion, _NUMBER, _U16),
         ),
     ),
-    (Horizon, (_U16, _U32, _U32, _STAMP, _AGE, _inputs, _feedback, _NUMBER, _U16)),
+    (Horizon, (_U16, _U32, _U32, _STAMP, _AGE, _inputs, _feedback, _NUMBER, _U16, _U32)),
     (Heartbeat, (_U16, _U32, _STAMP, range(len(Idle)), _FLAG, _NUMBER, _U16)),
     (Close, (_U16, _U32)),
-    (Trajectory, (_U16, _U32, _U32, _STAMP, _AGE, _SPACING, _knots, _NUMBER, _U16)),
+    (Trajectory, (_U16, _U32, _U32, _STAMP, _AGE, _SPACING, _knots, _NUMBER, _U16, _U32)),
     (Time, (_U16, _U32, _U32, _STAMP, _U32)),
     (PathProof, (_U16, _U32, range(PATHS_MAX), _U64, _prices)),
+    (
+        Lead,
+        (_U16, _U32, _U32, _FLAG, _U32, _U32, _OrNone(_U32), range(2**16), _knots_or_none),
+    ),
 )
 """Message of each type number (from 1) and the check of each of its fields on the wire."""
 
@@ -535,14 +583,26 @@ def _observation(fields: Iterable[Any]) -> Observation:
     )
 
 
+def _is_plain_plan(message: Message) -> bool:
+    return isinstance(message, Horizon | Trajectory) and not message.leadership
+
+
 def encode(message: Message) -> bytes:
     """Datagram of a message; arrays are sent as little-endian bytes."""
     if type(message) is Observation:
         payload: bytes = _PACKER.pack(_observation_fields(message))
     else:
-        payload = _PACKER.pack([VERSION, _NUMBERS[type(message)], *message])
+        fields = message[: -1 if _is_plain_plan(message) else None]
+        payload = _PACKER.pack([VERSION, _NUMBERS[type(message)], *fields])
     assert len(payload) <= PAYLOAD_BYTES_MAX
     return payload
+
+
+def led(number: int, plan: bytes) -> bytes:
+    """Encoded plan with the number of its leadership as a last field; 0 is left out."""
+    if not number:
+        return plan
+    return bytes([plan[0] + 1]) + plan[1:] + msgpack.packb(number)  # an array of one element more
 
 
 def encode_horizon(
@@ -604,6 +664,8 @@ def decode(payload: bytes, terms: Terms) -> Message:
     if type(number) is not int or not 1 <= number <= len(_TYPES):
         raise ProtocolError(Drop.TYPE)
     message, checks = _TYPES[number - 1]
+    if message in (Horizon, Trajectory) and len(body) == len(checks) - 1:
+        body.append(0)
     if len(body) != len(checks):
         raise ProtocolError(Drop.NOT_A_MESSAGE)
     fields = _checked(body, checks, terms)

@@ -63,6 +63,7 @@ MIDNIGHT_NS = 86_400 * SECOND_NS
 BOOT_ID = 2**63 + 2**31
 """Boot id of every endpoint. It takes as many bytes as a random one, and so do session numbers."""
 SERVER: Address = ("server", 0)
+STANDBY: Address = ("standby", 0)
 COMPANY_MAX = 100
 """Largest number of runs that share a server. More would be no faster, and vehicle numbers must fit
 one byte.
@@ -79,6 +80,7 @@ def fly(
     vehicles: int = 1,
     secure: bool = False,
     server: Endpoint | None = None,
+    standby: Endpoint | bool = False,
     beside: Mapping[str, Endpoint] = MappingProxyType({}),
     changes: Sequence[tuple[float, Mapping[str, Any]]] = (),
     actions: Sequence[tuple[float, Callable[[World], None]]] = (),
@@ -96,6 +98,8 @@ def fly(
             winds.
         secure: whether the link is encrypted, with keys from the seed.
         server: endpoint in place of `Server`; it is not recorded.
+        standby: whether there is a second server, on the host `standby`, behind a network of its
+            own; or an endpoint in its place, which is not recorded.
         beside: endpoints of further hosts by name, such as an autopilot at `vehicle.address`.
         changes: times [s, counted as in `Record.events`], and the keys and values that change then,
             as in `shared.core.change`; a refused change is an event, and the flight continues.
@@ -120,6 +124,7 @@ def fly(
         server,
         beside,
         actions,
+        standby=standby,
     )
     return replace(flight, plan=parse(sink.getvalue()))
 
@@ -200,6 +205,8 @@ class Run:
         number: int,
         vehicles: int,
         keyring: Keyring | None,
+        *,
+        has_standby: bool = False,
     ) -> None:
         self._server_rows, self._server_figures = server_rows, server_figures
         self._before = number * vehicles
@@ -209,13 +216,15 @@ class Run:
         self._netems: dict[str, Proxy] = {}
         self.running: dict[str, Running] = {}
         """Scenario of each host, and its changes."""
-        for i in range(len(scenario.paths)):
+        servers = [SERVER] * len(scenario.paths) + [STANDBY] * has_standby
+        for i, server in enumerate(servers):
             host = f"netem {scenario.seed}/{i + 1}" if i else f"netem {scenario.seed}"
             own = scenario.on_path(i)
-            netem = Proxy(own, server=SERVER, flows=vehicles, recorder=packets, path=i)
+            netem = Proxy(own, server=server, flows=vehicles, recorder=packets, path=i)
             self._netems[host], self.running[host] = netem, Running(netem, own)
             world.add(host, netem)
         addresses: list[Address] = [(host, 0) for host in self._netems]
+        standby = [addresses.pop()] if has_standby else []
         reached: dict[str, Any] = {"server": addresses[0]}
         if len(addresses) > 1:
             reached = {"paths": addresses, "prices": [each.price for each in scenario.paths]}
@@ -235,6 +244,8 @@ class Run:
                 vehicle=self._before + vehicle,
                 boot_id=BOOT_ID,
                 link=_link(keyring, scenario.seed, self._before + vehicle),
+                standby=standby,
+                standby_link=_link(keyring, scenario.seed, self._before + vehicle, "standby"),
                 recorder=recorder,
                 **reached,
             )
@@ -306,12 +317,14 @@ def make_keys(seed: int, vehicles: int) -> Keyring:
     return keys.parse("keys", "".join(lines).encode())
 
 
-def _link(keyring: Keyring | None, seed: int, vehicle: int) -> ClientLink | None:
+def _link(
+    keyring: Keyring | None, seed: int, vehicle: int, purpose: str = "entropy"
+) -> ClientLink | None:
     if keyring is None:
         return None
     from skytether.client.secure import SecureLink  # slow: imports ciphers
 
-    return SecureLink(keyring.of(vehicle), entropy=stream(seed, "entropy", vehicle).bytes)
+    return SecureLink(keyring.of(vehicle), entropy=stream(seed, purpose, vehicle).bytes)
 
 
 def _gate(keyring: Keyring | None, entropy: Callable[[int], bytes]) -> Gate | None:
@@ -335,9 +348,11 @@ def _fly(
     own_server: Endpoint | None = None,
     beside: Mapping[str, Endpoint] = MappingProxyType({}),
     actions: Sequence[tuple[float, Callable[[World], None]]] = (),
+    *,
+    standby: Endpoint | bool = False,
 ) -> list[Record]:
     def on_event(time_ns: int, host: str, event: Event) -> None:
-        if host == SERVER[0]:
+        if host in (SERVER[0], STANDBY[0]):
             if not isinstance(event, VehicleEvent):
                 for run in runs:
                     run.hear(time_ns, host, event)
@@ -349,6 +364,7 @@ def _fly(
     world, sink = World(on_event), io.BytesIO()
     entropy = stream(scenario.seed, "entropy").bytes
     each = [msgspec.structs.replace(scenario, seed=seed) for seed in seeds]
+    error_ns = seconds_to_ns(scenario.simulation.time_error_s)
 
     @cache
     def target(vehicle: int) -> Reference:
@@ -358,18 +374,25 @@ def _fly(
     has_own = scenario.is_mission or scenario.reference.shape == "target"
     recorder = Recorder(server_columns(scenario.model.axes, scenario.control.scheme), sink)
     header_bytes, row_bytes = sink.tell(), recorder.columns.itemsize
-    make_server = SharedServer if len(seeds) > 1 else Server
-    server = own_server or make_server(
-        scenario,
-        boot_id=BOOT_ID,
-        entropy=entropy,
-        gate=_gate(keyring, entropy),
-        capacity=len(seeds) * vehicles,
-        recorder=recorder,
-        plans=plans,
-        stopwatch=stopwatch,
-        references=target if has_own else None,
-    )
+
+    def started(entropy: Callable[[int], bytes]) -> Server:
+        return (SharedServer if len(seeds) > 1 else Server)(
+            scenario,
+            boot_id=BOOT_ID,
+            entropy=entropy,
+            gate=_gate(keyring, entropy),
+            capacity=len(seeds) * vehicles,
+            recorder=recorder,
+            plans=plans,
+            stopwatch=stopwatch,
+            references=target if has_own else None,
+        )
+
+    server = own_server or started(entropy)
+    servers = {SERVER[0]: server}
+    if standby:
+        of_standby = stream(scenario.seed, "standby").bytes
+        servers[STANDBY[0]] = started(of_standby) if standby is True else standby
 
     def server_rows() -> int:
         return (sink.tell() - header_bytes) // row_bytes
@@ -380,7 +403,16 @@ def _fly(
         return server.figures()
 
     runs = [
-        Run(world, run, server_rows, server_figures, number, vehicles, keyring)
+        Run(
+            world,
+            run,
+            server_rows,
+            server_figures,
+            number,
+            vehicles,
+            keyring,
+            has_standby=bool(standby),
+        )
         for number, run in enumerate(each)
     ]
     run_of = {host: run for run in runs for host in run.running} | dict.fromkeys(beside, runs[0])
@@ -388,23 +420,15 @@ def _fly(
         world.add(name, endpoint)
     # Added last, the server is woken last at an instant, when all datagrams due have arrived.
     compute_ns = seconds_to_ns(scenario.simulation.compute_s)
-    world.add(SERVER[0], server, clock=Clock(MIDNIGHT_NS), compute_ns=compute_ns)
-    running = {SERVER[0]: Running(server, scenario)}
+    for number, (name, endpoint) in enumerate(servers.items(), start=1):
+        world.add(name, endpoint, clock=Clock(number * MIDNIGHT_NS), compute_ns=compute_ns)
+    running = {name: Running(endpoint, scenario) for name, endpoint in servers.items()}
     running |= {host: each for run in runs for host, each in run.running.items()}
     running |= {host: Running(endpoint, scenario) for host, endpoint in beside.items()}
     plan_changes(world, running, changes)
     for time_s, act in actions:
         world.at(seconds_to_ns(time_s), partial(act, world))
     ask_ns, second_ns, flying = 0, SECOND_NS, runs.copy()
-
-    error_ns = seconds_to_ns(scenario.simulation.time_error_s)
-
-    def tell_time() -> None:
-        if not error_ns:
-            return
-        for number, (host, each) in enumerate({SERVER[0]: server, **runs[0].hosts}.items()):
-            wrong_ns = error_ns if number % 2 else -error_ns
-            world.act(host, partial(each.learn_time, world.now_ns + wrong_ns, error_ns))
 
     def over() -> bool:
         nonlocal ask_ns, second_ns
@@ -415,7 +439,7 @@ def _fly(
             flown_s = world.now_ns // SECOND_NS
             second_ns = (flown_s + 1) * SECOND_NS
             on_second(flown_s)
-            tell_time()
+            _tell_time(world, {SERVER[0]: server, **runs[0].hosts}, error_ns)
         while flying and not flying[-1].flying:
             flying.pop()
         return not flying or stopped()
@@ -424,6 +448,13 @@ def _fly(
     world.run(over, limit_ns=seconds_to_ns(longest_s))
     recorded = parse(sink.getvalue())
     return [run.flight(recorded) for run in runs]
+
+
+def _tell_time(world: World, hosts: Mapping[str, Endpoint], error_ns: int) -> None:
+    """Tell each host the time of day, wrong by `error_ns` one way or the other; 0 tells nothing."""
+    for number, (host, each) in enumerate(hosts.items() if error_ns else ()):
+        wrong_ns = error_ns if number % 2 else -error_ns
+        world.act(host, partial(each.learn_time, world.now_ns + wrong_ns, error_ns))
 
 
 def plan_changes(

@@ -31,6 +31,7 @@ from skytether.shared.wire.protocol import (
     Hello,
     Horizon,
     Idle,
+    Lead,
     Message,
     Mode,
     Observation,
@@ -40,6 +41,7 @@ from skytether.shared.wire.protocol import (
     decode,
     encode,
     encode_horizon,
+    led,
     stamp_us,
     stamped_ns,
 )
@@ -139,7 +141,13 @@ messages: st.SearchStrategy[Message] = st.one_of(
     st.builds(Heartbeat, u16, u32, u32, st.sampled_from(Idle), st.integers(0, 1), number, u16),
     st.builds(Close, u16, u32),
     st.builds(Time, u16, u32, u32, u32, u32),
+    st.builds(
+        Lead,
+        *(u16, u32, u32, st.integers(0, 1), u32, u32, st.none() | u32, u16),
+        knots=st.just(np.empty((2, 0, 2))),
+    ),
 )
+knots = arrays("<f4", st.tuples(st.just(2), st.integers(1, 16), st.just(2)), elements=finite)
 trajectories = st.builds(
     Trajectory,
     u16,
@@ -148,10 +156,12 @@ trajectories = st.builds(
     u32,
     age,
     st.integers(1, 2**16 - 1),
-    arrays("<f4", st.tuples(st.just(2), st.integers(1, 16), st.just(2)), elements=finite),
+    knots,
     number,
     u16,
+    u32,
 )
+leads = st.builds(Lead, u16, u32, u32, st.just(1), u32, u32, st.none() | u32, u16, knots)
 along_splines = TERMS._replace(scheme="trajectory")
 
 
@@ -167,7 +177,7 @@ def test_every_message_is_read_as_it_was_written(message: Message) -> None:
     assert same(decode(encode(message), TERMS), message)
 
 
-@given(st.one_of(trajectories, observed(splines=True)))
+@given(st.one_of(trajectories, leads, observed(splines=True)))
 def test_a_trajectory_and_what_is_told_of_it_are_read_as_they_were_written(
     message: Message,
 ) -> None:
@@ -335,9 +345,13 @@ def test_a_horizon_made_of_bytes_is_the_message() -> None:
     for count in (0, FEEDBACK):
         feedback = np.ones((2, count), np.float32)
         horizon = Horizon(1, 2**31, 500, 2**32 - 1, 9, inputs, feedback, 7, 300)
-        *fields, _, _, number, silence = horizon
+        *fields, _, _, number, silence, _ = horizon
         bytes_of = (array.ravel().data.cast("B") for array in (inputs, feedback))
-        assert encode_horizon(*fields, *bytes_of, number, silence) == encode(horizon)
+        plan = encode_horizon(*fields, *bytes_of, number, silence)
+        assert plan == encode(horizon)
+        for leadership in (1, 127, 128, 2**32 - 1):
+            assert led(leadership, plan) == encode(horizon._replace(leadership=leadership))
+        assert led(0, plan) == plan
 
 
 def body(message: Message) -> list[object]:
@@ -363,7 +377,7 @@ def terms_with(**wrong: object) -> list[object]:
         (OBSERVATION, 0, 2, "version"),
         (OBSERVATION, 0, True, "version"),
         (OBSERVATION, 1, 0, "type"),
-        (OBSERVATION, 1, 10, "type"),
+        (OBSERVATION, 1, 11, "type"),
         (OBSERVATION, 1, "3", "type"),
         (OBSERVATION, 2, 2**16, "field"),
         (OBSERVATION, 2, True, "field"),

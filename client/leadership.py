@@ -1,0 +1,64 @@
+"""Leadership: which of its servers plans for a vehicle.
+
+The vehicle decides, by a number that only rises: with s servers, number n means that server n mod s
+leads, and what was planned under another number is not flown. The vehicle raises it when the leader
+is silent and another server is heard; when an operator says so; and on a mission when a server that
+it hears has been told a larger number by another vehicle, so that all come to follow one server.
+"""
+
+from collections.abc import Sequence
+
+NUMBER_MAX = 2**32 - 1
+ASK_SHARE, CHANGE_SHARE = 0.5, 0.75
+"""Shares of the time-out for which the leader has to be silent before another server is asked
+whether it is there, and before it leads."""
+
+
+class Leadership:
+    """Number of the leadership.
+
+    Args:
+        servers: number of servers, 1 or more.
+        number: number of an earlier run of the client.
+        timeout_ns: silence after which the vehicle takes a server for lost [ns].
+    """
+
+    def __init__(self, servers: int, number: int, timeout_ns: int) -> None:
+        self._servers, self.number = servers, number
+        self._ask_ns = round(ASK_SHARE * timeout_ns)
+        self._change_ns = round(CHANGE_SHARE * timeout_ns)
+
+    @property
+    def leader(self) -> int:
+        """Which server leads, from 0."""
+        return self.number % self._servers
+
+    def doubts(self, heard_ns: Sequence[int], now_ns: int) -> bool:
+        """Whether the leader is silent for so long that other servers are to be asked.
+
+        Args:
+            heard_ns: when each server was last heard.
+        """
+        return now_ns - heard_ns[self.leader] >= self._ask_ns
+
+    def successor(self, heard_ns: Sequence[int], now_ns: int) -> int | None:
+        """The server to lead instead of a silent leader; None if it leads on, or none is heard."""
+        last_ns = heard_ns[self.leader]
+        if now_ns - last_ns < self._change_ns:
+            return None
+        newest = max(range(self._servers), key=heard_ns.__getitem__)
+        # Only one that was heard since the leader was doubted: both may be out of reach.
+        return newest if heard_ns[newest] >= last_ns + self._ask_ns else None
+
+    def hand_over(self, server: int) -> None:
+        """Let a server lead from now on; no effect if it leads, or once no number is left."""
+        raised = self.number + (server - self.number) % self._servers
+        if raised <= NUMBER_MAX:
+            self.number = raised
+
+    def learn(self, known: int, server: int) -> bool:
+        """Take over a larger number that `server` knows, if that server leads with it."""
+        if not self.number < known <= NUMBER_MAX or known % self._servers != server:
+            return False
+        self.number = known
+        return True
