@@ -137,6 +137,7 @@ messages: st.SearchStrategy[Message] = st.one_of(
         ),
         number,
         u16,
+        u32,
     ),
     st.builds(Heartbeat, u16, u32, u32, st.sampled_from(Idle), st.integers(0, 1), number, u16),
     st.builds(Close, u16, u32),
