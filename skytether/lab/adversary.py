@@ -21,17 +21,17 @@ import msgspec
 import numpy as np
 
 from skytether.lab.faults import shrink
-from skytether.lab.lives import CLOCK, Lives, world_s
+from skytether.lab.lives import CLOCK, STANDBY_FLOWS, Lives, world_s
 from skytether.shared.base.chance import stream
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS, seconds_to_ns
-from skytether.shared.core.endpoint import Datagram, Endpoint
+from skytether.shared.core.endpoint import STANDBY_SOCKETS, Datagram, Endpoint
 from skytether.shared.scenario import mission
 from skytether.shared.scenario.mission import Mission
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.scenario.zones import Zones
 from skytether.shared.telemetry.summary import Track, nearest
-from skytether.sim.flight import SERVER
+from skytether.sim.flight import SERVER, STANDBY
 
 BASE_NS = 50 * MILLISECOND_NS
 """Delay of every packet before any move [ns]."""
@@ -60,6 +60,14 @@ class MoveKind(StrEnum):
     """A copy of each packet arrives later by the amount [s]."""
     SERVER = "server"
     """The server is down, and restarts with only the keys that the operator has set."""
+    STANDBY = "standby"
+    """There is a standby server, which is down and restarts."""
+    FREEZES = "freezes"
+    """There is a standby server; it is frozen, or the first one if the amount is below 0.5, and
+    then goes on with the packets that it has missed."""
+    PARTITIONS = "partitions"
+    """There is a standby server; all packets between the vehicle and it are lost, or the first one
+    if the amount is below 0.5."""
     CLIENT = "client"
     """The client of a vehicle is down, and restarts with its saved state; with
     `vehicle.memory = "none"` it has none."""
@@ -69,11 +77,21 @@ class MoveKind(StrEnum):
     """Additional zone, a cylinder with x, y and radius in the amounts [m]."""
 
 
-NETWORK = (MoveKind.DELAYS, MoveKind.LOSSES, MoveKind.CUTS, MoveKind.COPIES)
+NETWORK = (
+    *(MoveKind.DELAYS, MoveKind.LOSSES, MoveKind.CUTS, MoveKind.COPIES),
+    MoveKind.PARTITIONS,
+)
+LED = frozenset({MoveKind.STANDBY, MoveKind.FREEZES, MoveKind.PARTITIONS})
+"""Moves for which there is a standby server."""
+OF_ALL = (MoveKind.SERVER, MoveKind.STANDBY, MoveKind.FREEZES)
+"""Moves that concern no single vehicle."""
 OPERATOR = (MoveKind.GOALS, MoveKind.ZONES)
 LENGTHS_S = {
     MoveKind.CUTS: (0.2, 40.0),
     MoveKind.SERVER: (0.2, 20.0),
+    MoveKind.STANDBY: (0.2, 20.0),
+    MoveKind.FREEZES: (0.2, 20.0),
+    MoveKind.PARTITIONS: (0.2, 40.0),
     MoveKind.CLIENT: (0.2, 3.0),
 }
 """Shortest and longest move of a kind [s]."""
@@ -83,6 +101,8 @@ AMOUNTS = {
     MoveKind.DELAYS: ((0.0, 1.2), (0.0, 1.2)),
     MoveKind.LOSSES: ((0.1, 1.0),),
     MoveKind.COPIES: ((0.0, 1.5),),
+    MoveKind.FREEZES: ((0.0, 1.0),),
+    MoveKind.PARTITIONS: ((0.0, 1.0),),
 }
 """Smallest and largest value of each amount of a kind. Places are anywhere in the mission's box."""
 SLOW = ("uplink", "downlink", "")
@@ -145,7 +165,7 @@ class Approach(msgspec.Struct, frozen=True, kw_only=True):
     clear: Near
     """Smallest distance of a vehicle from a zone; negative inside."""
     left: int
-    """Number of observations outside a tube, since the last restart of the server."""
+    """Number of observations outside a tube."""
 
 
 class AdversaryNetwork(Endpoint):
@@ -159,11 +179,14 @@ class AdversaryNetwork(Endpoint):
 
     def receive(self, datagram: Datagram, *, now_ns: int) -> None:
         """Delay, lose or copy a packet. Towards the server, vehicle n uses socket n; socket 0 is
-        the server's.
+        the server's. For the standby server it is STANDBY_FLOWS more.
         """
         payload, (host, _), socket = datagram
-        way, vehicle = ("uplink", socket) if socket else ("downlink", int(host.split()[1]))
-        onward = Datagram(payload, (f"client {vehicle}", 0) if socket else SERVER, vehicle - socket)
+        standby, flow = divmod(socket, STANDBY_FLOWS)
+        way, vehicle = ("uplink", flow) if flow else ("downlink", int(host.split()[1]))
+        server = STANDBY if standby else SERVER
+        to = (f"client {vehicle}", STANDBY_SOCKETS[0] if standby else 0) if flow else server
+        onward = Datagram(payload, to, vehicle - flow + standby * STANDBY_FLOWS)
         self.packets.append(Packet(now_ns, way, vehicle))
         # Drawn for every packet: a packet's number does not depend on the other moves.
         drawn = self._draw(way, vehicle)
@@ -180,6 +203,8 @@ class AdversaryNetwork(Endpoint):
                 case MoveKind.COPIES:
                     copies_s.append(move.amounts[0])
                 case MoveKind.CUTS:
+                    return
+                case MoveKind.PARTITIONS if round(move.amounts[0]) == standby:
                     return
                 case MoveKind.LOSSES if drawn < move.amounts[0]:
                     return
@@ -210,7 +235,12 @@ class Raid:
             AdversaryNetwork(moves, scenario.seed),
         )
         mortal = {move.vehicle for move in moves if move.kind is MoveKind.CLIENT}
-        self._lives = Lives(scenario, self._air, None if 0 in mortal else mortal)
+        self._lives = Lives(
+            scenario,
+            self._air,
+            None if 0 in mortal else mortal,
+            has_standby=any(move.kind in LED for move in moves),
+        )
         self._world, self._vehicles = self._lives.world, self._lives.mission.vehicles
         self._zones: list[tuple[float, Zones]] = [(0.0, scenario.zones)]
         """Zones set by the operator, and the time of each change on the hosts' clocks [s]."""
@@ -226,6 +256,12 @@ class Raid:
         match move.kind:
             case MoveKind.SERVER:
                 begin, end = [lives.stop_server], [partial(lives.start_server, {})]
+            case MoveKind.STANDBY:
+                begin = [partial(lives.stop_server, STANDBY[0])]
+                end = [partial(lives.start_server, {}, name=STANDBY[0])]
+            case MoveKind.FREEZES:
+                name, _ = (SERVER, STANDBY)[round(move.amounts[0])]
+                begin, end = [partial(self._world.freeze, name)], [partial(self._world.thaw, name)]
             case MoveKind.CLIENT:
                 begin = [partial(lives.stop_client, number) for number in hit]
                 end = [partial(lives.start_client, number) for number in hit]
@@ -271,7 +307,8 @@ class Raid:
 
         self._world.run(over, limit_ns=seconds_to_ns(scenario.duration + scenario.link.connect_s))
         tracks = self._lives.tracks()
-        left = self._lives.server.figures()["counts"].get("left_tube", 0)
+        counts = (server.figures()["counts"] for server in self._lives.servers)
+        left = sum(each.get("left_tube", 0) for each in counts)
         apart, clear = self._apart(tracks), self._clear(tracks)
         return Approach(moves=self._moves, apart=apart, clear=clear, left=left)
 
@@ -411,9 +448,21 @@ class MoveSampler:
                 for vehicle, way in zip(self._vehicles, ways.tolist(), strict=True)
                 if way < len(SLOW)
             ]
+        if MoveKind.PARTITIONS in self._kinds and rng.random() < 0.5:
+            moves += self._split()
         if kinds:
             moves += [self._one(kinds) for _ in range(1 + rng.poisson(2.0))]
         return tuple(moves[-self._most :])
+
+    def _split(self) -> Moves:
+        """For some time some vehicles hear the one server only, and the others the other."""
+        rng, kind = self._rng, MoveKind.PARTITIONS
+        move = self._one([kind])
+        lost = rng.choice((0.0, 1.0), len(self._vehicles)).tolist()
+        return tuple(
+            replace(move, vehicle=number, way="", amounts=(each,))
+            for number, each in zip(self._vehicles, lost, strict=True)
+        )
 
     def _one(self, kinds: Sequence[MoveKind]) -> Move:
         rng, kind = self._rng, kinds[int(self._rng.integers(len(kinds)))]
@@ -421,7 +470,7 @@ class MoveSampler:
         length_ns = seconds_to_ns(low_s * (high_s / low_s) ** rng.random())
         start_ns = int(rng.integers(self._last_ns))
         vehicle, way = int(rng.choice(self._vehicles)), ""
-        if kind is MoveKind.SERVER or (kind in NETWORK and rng.random() < 0.2):
+        if kind in OF_ALL or (kind in NETWORK and rng.random() < 0.2):
             vehicle = 0
         if kind in NETWORK:
             way = ("uplink", "downlink", "")[rng.integers(3)]

@@ -32,10 +32,13 @@ from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Recorder, client_columns, parse
 from skytether.shared.telemetry.summary import Track, track
 from skytether.shared.wire.protocol import Mode
-from skytether.sim.flight import SERVER
+from skytether.sim.flight import SERVER, STANDBY
 from skytether.sim.world import Clock, World
 
 NETWORK: Address = ("netem", 0)
+STANDBY_FLOWS = 1000
+"""Number of the network's socket to which vehicles send for the standby server; vehicle n is heard
+there from socket STANDBY_FLOWS + n."""
 CLOCK = Clock(10**6 * SECOND_NS)
 """Clock of all hosts. Its offset has no effect, because the server estimates clock offsets."""
 HOLD_NS = SECOND_NS
@@ -82,6 +85,7 @@ class Lives:
     Args:
         network: endpoint between clients and server; the scenario's network unless given.
         mortal: numbers of vehicles whose clients may stop; only these save their state.
+        has_standby: whether there is a second server, which `network` has to reach.
     """
 
     def __init__(
@@ -89,6 +93,8 @@ class Lives:
         scenario: Scenario,
         network: Endpoint | None = None,
         mortal: Collection[int] | None = None,
+        *,
+        has_standby: bool = False,
     ) -> None:
         mission = scenario.make_reference()
         assert isinstance(mission, Mission)
@@ -99,29 +105,38 @@ class Lives:
         flows = 2 * len(mission.vehicles)
         self.world.add(NETWORK[0], network or Proxy(scenario, server=SERVER, flows=flows))
         self._mortal = mission.vehicles if mortal is None else mortal
+        self._standby = [(NETWORK[0], STANDBY_FLOWS)] if has_standby else []
         self._lives: dict[int, list[Life]] = {number: [] for number in mission.vehicles}
         self.bodies = {number: Body(scenario, number) for number in mission.vehicles}
         for number in mission.vehicles:
             start_ns = int(stream(scenario.seed, "phase", number).integers(scenario.dt_ns))
             client = self._client(number, remembers=False)
             self.world.add(f"client {number}", client, clock=CLOCK, start_ns=start_ns)
-        self._servers = 0
-        self.running: Running | None = None
-        """Server and its scenario; None while the server is down."""
-        self._settings: Mapping[str, Any] = {}
-        """Keys set in flight, as the server's journal stores them."""
-        self.world.add(SERVER[0], self._server(scenario), clock=CLOCK)
+        self.servers: list[Server] = []
+        """All runs of all servers."""
+        self._running: dict[str, Running] = {}
+        """Each server that is up, and its scenario."""
+        self._settings: dict[str, Mapping[str, Any]] = {}
+        """Keys set in flight, as the journal of each server stores them."""
+        for name, _ in (SERVER, STANDBY)[: 1 + has_standby]:
+            self.world.add(name, self._server(scenario, name), clock=CLOCK)
 
     def _on_event(self, time_ns: int, host: str, event: Event) -> None:
         self.events.append((time_ns / SECOND_NS, host, event))
 
-    def _server(self, scenario: Scenario) -> Server:
-        self._servers += 1
-        entropy = stream(scenario.seed, "entropy", self._servers).bytes
+    @property
+    def running(self) -> Running | None:
+        """Server and its scenario; None while the server is down."""
+        return self._running.get(SERVER[0])
+
+    def _server(self, scenario: Scenario, name: str) -> Server:
+        number = len(self.servers) + 1
+        entropy = stream(scenario.seed, "entropy", number).bytes
         count = len(self.mission.vehicles)
-        self.server = Server(scenario, boot_id=self._servers, entropy=entropy, capacity=count)
-        self.running = Running(self.server, scenario, self._settings)
-        return self.server
+        server = Server(scenario, boot_id=number, entropy=entropy, capacity=count)
+        self.servers.append(server)
+        self._running[name] = Running(server, scenario, self._settings.get(name, {}))
+        return server
 
     def _client(self, number: int, *, remembers: bool) -> Client:
         lives, before, sink = self._lives[number], None, io.BytesIO()
@@ -131,6 +146,7 @@ class Lives:
             self.scenario,
             self.bodies[number],
             server=NETWORK,
+            standby=self._standby,
             vehicle=number,
             boot_id=number * 1000 + len(lives),
             recorder=Recorder(client_columns(self.scenario.model.axes), sink),
@@ -158,28 +174,30 @@ class Lives:
             body.reset(_sensor(self.scenario, number, len(self._lives[number])))
         self.world.restart(f"client {number}", self._client(number, remembers=remembers))
 
-    def stop_server(self) -> None:
-        if self.running is not None:
-            self._settings, self.running = self.running.settings, None
-        self.world.stop(SERVER[0])
+    def stop_server(self, name: str = SERVER[0]) -> None:
+        if running := self._running.pop(name, None):
+            self._settings[name] = running.settings
+        self.world.stop(name)
 
-    def start_server(self, changes: Mapping[str, Any], *, remembers: bool = True) -> None:
-        """Start the next run of the server.
+    def start_server(
+        self, changes: Mapping[str, Any], *, remembers: bool = True, name: str = SERVER[0]
+    ) -> None:
+        """Start the next run of a server.
 
         Args:
             changes: keys that differ from the scenario, and their values.
             remembers: whether keys that were set in flight are kept.
         """
         if not remembers:
-            self._settings = {}
-        scenario = with_values(with_values(self.scenario, changes), self._settings)
-        self.world.restart(SERVER[0], self._server(scenario))
+            self._settings.pop(name, None)
+        scenario = with_values(with_values(self.scenario, changes), self._settings.get(name, {}))
+        self.world.restart(name, self._server(scenario, name))
 
     def set(self, values: Mapping[str, Any]) -> None:
-        """Set keys at the server, as an operator; the server may refuse them."""
-        if self.running is not None:
+        """Set keys at each server, as an operator; it may refuse them."""
+        for name, running in self._running.items():
             with suppress(ConfigError):  # a refusal is logged as an event
-                self.world.act(SERVER[0], partial(self.running.change, values))
+                self.world.act(name, partial(running.change, values))
 
     # -- the flight --------------------------------------------------------------------------------
 
