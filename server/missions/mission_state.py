@@ -141,8 +141,9 @@ class MissionState:
         self._leaderships: dict[int, int | None] = {}
         """Number of the leadership with which each row is led by this server; None if another
         server leads it."""
-        self._awaited: set[int] = set()
-        """Rows without an observation since this server began to lead them."""
+        self._awaited: dict[int, int] = {}
+        """Rows of which this server has not yet planned with an observation since it began to lead
+        them, and the step from which on one counts."""
         self.unled: int | None = None
         """Row because of which no motion may be planned: not all vehicles follow this server with
         one number, or this one was not observed since. None if there is none."""
@@ -182,7 +183,7 @@ class MissionState:
         self.rows.number[row] = self.number_of(row)
         vehicle.sent.clear()
         vehicle.next = None
-        self._awaited.add(row)
+        self._awaited[row] = told.step
         self.observed_step[row] = told.step - 1  # older observations show an earlier motion
         knots = np.asarray(told.knots, dtype=np.float64)
         if told.in_force is not None and told.spacing == SPACING and knots.size:
@@ -296,9 +297,6 @@ class MissionState:
             vehicle.adapt_copies(oldest.step == newest and k <= observation.since + 1)
         self.rows.heard[row] = True
         self._mark_changed(row, vehicle)
-        if row in self._awaited:
-            self._awaited.discard(row)
-            self._find_unled()
         return True
 
     def _mark_changed(self, row: int, vehicle: VehicleMotions) -> None:
@@ -360,6 +358,11 @@ class MissionState:
             self.rows.late[row] = max(self.rows.late[row], float(LONGEST))
         if moved:
             self._changed.update(rows[self._moved_by[:n] != 0].tolist())
+        if self._awaited:
+            for row in self._awaited.keys() & set(rows.tolist()):
+                if self.observed_step[row] >= self._awaited[row]:
+                    del self._awaited[row]
+            self._find_unled()
         if self.decided:
             for row in self.decided.intersection(rows.tolist()):
                 self.vehicles[row].next = None
