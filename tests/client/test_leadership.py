@@ -1,0 +1,220 @@
+"""Which of its servers leads a vehicle: the number, and what a client does with it."""
+
+import msgpack
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from helpers import packaged
+from skytether.client.endpoint import Client
+from skytether.client.leadership import NUMBER_MAX, Leadership
+from skytether.client.memory import SavedState, recall
+from skytether.client.simulated.vehicle import simulated
+from skytether.shared.base.units import SECOND_NS, seconds_to_ns
+from skytether.shared.core.endpoint import STANDBY_SOCKETS, Address, Datagram
+from skytether.shared.core.events import LeaderChanged
+from skytether.shared.scenario.schema import Scenario
+from skytether.shared.wire.drop import Drop
+from skytether.shared.wire.protocol import (
+    Close,
+    Heartbeat,
+    Horizon,
+    Lead,
+    Message,
+    Observation,
+    Refusal,
+    Welcome,
+    decode,
+    encode,
+)
+
+TIMEOUT_NS = SECOND_NS
+SERVERS: tuple[Address, Address] = (("one", 0), ("other", 0))
+SOCKETS = 0, STANDBY_SOCKETS[0]
+
+numbers = st.integers(0, NUMBER_MAX)
+times = st.integers(0, 10 * SECOND_NS)
+
+
+@given(st.integers(1, 4), numbers, st.lists(st.tuples(st.booleans(), numbers, st.integers(0, 3))))
+def test_the_number_only_rises(
+    servers: int, number: int, acts: list[tuple[bool, int, int]]
+) -> None:
+    lead = Leadership(servers, number, TIMEOUT_NS)
+    for learns, known, server in acts:
+        before = lead.number
+        if learns:
+            assert lead.learn(known, server % servers) == (lead.number != before)
+        else:
+            lead.hand_over(server % servers)
+        assert before <= lead.number <= NUMBER_MAX
+        assert lead.number == before or lead.leader == server % servers
+
+
+@given(numbers, times, times, st.integers(0, 10 * SECOND_NS))
+def test_another_leads_only_if_it_was_heard_since_the_leader_was_doubted(
+    number: int, heard_ns: int, other_ns: int, now_ns: int
+) -> None:
+    lead = Leadership(2, number, TIMEOUT_NS)
+    times_ns = [heard_ns, other_ns] if lead.leader == 0 else [other_ns, heard_ns]
+    successor = lead.successor(times_ns, now_ns)
+    if successor is not None:
+        assert successor != lead.leader
+        assert lead.doubts(times_ns, now_ns)
+        assert other_ns - heard_ns >= TIMEOUT_NS // 2
+        assert now_ns - heard_ns >= 3 * TIMEOUT_NS // 4
+
+
+class Vehicle:
+    """A client and what its two servers say to it."""
+
+    def __init__(self, scenario: Scenario, before: SavedState | None = None) -> None:
+        self.scenario, self.now_ns = scenario, SECOND_NS
+        self.client = Client(
+            scenario,
+            simulated(scenario, 1),
+            server=SERVERS[0],
+            standby=[SERVERS[1]],
+            vehicle=4,
+            boot_id=99,
+            keeps=True,
+            before=before,
+        )
+        self.sent: list[tuple[int, Message]] = []
+        """Server, and message to it."""
+        self.step()
+        for server in (0, 1):
+            welcome = Welcome(4, 7 + server, 99, server, 1234, Refusal.ACCEPTED, scenario.terms())
+            self.hear(server, welcome)
+
+    def hear(self, server: int, message: Message) -> None:
+        datagram = Datagram(encode(message), SERVERS[server], SOCKETS[server])
+        self.client.receive(datagram, now_ns=self.now_ns)
+        self._take()
+
+    def beat(self, server: int) -> None:
+        self.hear(server, Heartbeat(4, 7 + server, self.now_ns // 1000 % 2**32, 0, 0))
+
+    def step(self, seconds: float = 0.0) -> None:
+        """Wake the client until a time has passed, at least once."""
+        end_ns = self.now_ns + seconds_to_ns(seconds)
+        while True:
+            due_ns = self.client.next_wake_ns()
+            assert due_ns is not None
+            self.now_ns = max(self.now_ns, due_ns)
+            self.client.wake(now_ns=self.now_ns)
+            self._take()
+            if self.now_ns >= end_ns:
+                return
+
+    def _take(self) -> None:
+        if self.client.keep(now_ns=self.now_ns) is not None:
+            self.client.kept()
+        for payload, _, socket in self.client.outbox():
+            message = decode(payload, self.scenario.terms())
+            self.sent.append((SOCKETS.index(socket), message))
+
+    def told(self, server: int, kind: type[Message]) -> list[Message]:
+        return [each for to, each in self.sent if to == server and isinstance(each, kind)]
+
+    def answer(self, server: int, known: int = 0) -> None:
+        """Acknowledge the newest LEAD to a server."""
+        newest = self.told(server, Lead)[-1]
+        assert isinstance(newest, Lead)
+        self.hear(server, Lead(4, 7 + server, newest.number, newest.leads, known or newest.number))
+
+
+@pytest.fixture
+def vehicle() -> Vehicle:
+    return Vehicle(packaged("demo"))
+
+
+def test_nothing_is_reported_to_a_server_that_does_not_know_who_leads(vehicle: Vehicle) -> None:
+    """It would take itself for the leader."""
+    vehicle.step(1.0)
+    for server in (0, 1):
+        assert not vehicle.told(server, Observation)
+        leads = vehicle.told(server, Lead)
+        assert leads
+        assert {(each.number, each.leads) for each in leads} == {(0, 1 - server)}  # type: ignore[union-attr]
+        vehicle.answer(server)
+    vehicle.step(0.2)
+    assert vehicle.told(0, Observation)
+    assert len(vehicle.told(1, Observation)) == 1
+
+
+def test_the_leader_falls_silent_and_the_other_is_asked_and_leads(vehicle: Vehicle) -> None:
+    for server in (0, 1):
+        vehicle.step(0.1)
+        vehicle.answer(server)
+    asked = len(vehicle.told(1, Lead))
+    vehicle.step(0.8)
+    assert len(vehicle.told(1, Lead)) > asked
+    vehicle.answer(1)
+    vehicle.step(0.6)
+    newest = vehicle.told(1, Lead)[-1]
+    assert isinstance(newest, Lead)
+    assert (newest.number, newest.leads) == (1, 1)
+    assert any(isinstance(each, LeaderChanged) for each in vehicle.client.events())
+
+
+def test_nobody_leads_instead_if_nobody_is_heard(vehicle: Vehicle) -> None:
+    for server in (0, 1):
+        vehicle.step(0.1)
+        vehicle.answer(server)
+    vehicle.step(5.0)
+    assert vehicle.client.vehicle_figures()["leadership"]["number"] == 0
+
+
+@pytest.mark.parametrize("server", [0, 1])
+def test_a_server_that_leaves_leads_no_more(server: int, vehicle: Vehicle) -> None:
+    for each in (0, 1):
+        vehicle.step(0.1)
+        vehicle.answer(each)
+    vehicle.hear(server, Close(4, 7 + server))
+    vehicle.step()
+    assert vehicle.client.vehicle_figures()["leadership"]["number"] == 1 - server
+    assert vehicle.client.vehicle_figures()["mode"] == "sync"
+
+
+def plan(scenario: Scenario, step: int, server: int, leadership: int) -> bytes:
+    terms = scenario.terms()
+    inputs = np.zeros((terms.axes, terms.horizon), np.float32)
+    fields = 4, 7 + server, step, 1_000_000, 1, inputs, np.empty((0, 0), np.float32), 0, 0
+    return encode(Horizon(*fields, leadership))
+
+
+def test_a_plan_of_another_leadership_is_not_flown() -> None:
+    """Whichever server sends it: of three, only that of the present leader is taken."""
+    scenario = packaged("paper-every-step")
+    vehicle = Vehicle(scenario, SavedState(leadership=2))
+    vehicle.step(0.2)
+    for server, leadership, dropped in ((0, 0, 1), (1, 1, 2), (1, 2, 3), (0, 2, 3)):
+        payload = plan(scenario, 3, server, leadership)
+        datagram = Datagram(payload, SERVERS[server], SOCKETS[server])
+        vehicle.client.receive(datagram, now_ns=vehicle.now_ns)
+        assert vehicle.client.dropped[Drop.NOT_THE_LEADER] == dropped
+
+
+def test_a_larger_number_is_followed_only_from_the_server_that_it_names(vehicle: Vehicle) -> None:
+    for server, known, number in ((1, 2, 0), (0, 1, 0), (1, 3, 3), (0, 2, 3), (0, 4, 4)):
+        vehicle.step(0.1)
+        vehicle.answer(server, known)
+        assert vehicle.client.vehicle_figures()["leadership"]["number"] == number
+
+
+def test_the_number_survives_a_restart_of_the_client() -> None:
+    scenario = packaged("demo")
+    content = SavedState(boot_id=99, began_ns=1, leadership=5).encode(SECOND_NS)
+    for written_ns, now_ns in ((SECOND_NS, SECOND_NS), (SECOND_NS, 900 * SECOND_NS), (None, 0)):
+        assert recall(content, written_ns, now_ns, scenario.terms()).leadership == 5
+
+
+def test_a_number_out_of_range_is_refused_by_the_codec() -> None:
+    terms = packaged("demo").terms()
+    fields = msgpack.unpackb(encode(Lead(4, 7, 1, 1)))
+    assert isinstance(decode(msgpack.packb(fields), terms), Lead)
+    for index, value in ((4, 2**32), (5, 2), (6, -1), (8, -2), (9, 2**16), (10, b"\0")):
+        with pytest.raises(Exception, match=r"field|shape"):
+            decode(msgpack.packb([*fields[:index], value, *fields[index + 1 :]]), terms)

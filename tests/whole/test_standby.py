@@ -1,0 +1,106 @@
+"""A flight with a standby server: servers die, and the vehicle flies on."""
+
+from collections.abc import Callable
+from typing import Any
+
+import msgspec
+import pytest
+
+from helpers import packaged
+from skytether.client.endpoint import Client
+from skytether.client.leadership import Leadership
+from skytether.shared.core.events import LeaderChanged, ModeChanged
+from skytether.shared.scenario.schema import Scenario
+from skytether.shared.telemetry.record import Record
+from skytether.shared.telemetry.summary import summarise
+from skytether.sim.flight import SERVER, STANDBY, fly
+from skytether.sim.world import World
+
+SECONDS, DIES_S = 24.0, 11.3
+
+
+def scenario(name: str = "demo", **changes: Any) -> Scenario:
+    layer = {"duration": SECONDS, "settle": 6.0}
+    return packaged(name, layer, changes)
+
+
+def stops(name: str) -> Callable[[World], None]:
+    return lambda world: world.stop(name)
+
+
+def brakes(record: Record) -> int:
+    events = (each.event for each in record.events)
+    return sum(isinstance(each, ModeChanged) and each.after == "brake" for each in events)
+
+
+def changes(record: Record) -> list[float]:
+    """Times at which another server came to lead [s]."""
+    return [each.time_ns / 1e9 for each in record.events if isinstance(each.event, LeaderChanged)]
+
+
+def rmse_m(flown: Scenario, record: Record) -> float:
+    found = summarise(flown, "standby", record.client, record.server, record.netem)
+    assert found.rmse_xy is not None
+    return found.rmse_xy
+
+
+@pytest.mark.parametrize("secure", [False, True])
+@pytest.mark.parametrize("name", ["demo", "demo-committed", "demo-paper", "target"])
+def test_the_server_dies_and_the_flight_goes_on(name: str, *, secure: bool) -> None:
+    flown = scenario(name)
+    record = fly(flown, standby=True, secure=secure, actions=[(DIES_S, stops(SERVER[0]))])
+    (changed_s,) = changes(record)
+    assert DIES_S < changed_s < DIES_S + 2.0 * flown.link.timeout_s
+    assert brakes(record) == 0
+    assert record.failure is None
+    assert rmse_m(flown, record) < max(2.0 * rmse_m(flown, fly(flown)), 0.05)
+
+
+def test_without_a_standby_it_brakes() -> None:
+    assert brakes(fly(scenario(), actions=[(DIES_S, stops(SERVER[0]))])) == 1
+
+
+def test_both_die_and_it_brakes() -> None:
+    record = fly(
+        scenario(), standby=True, actions=[(DIES_S, stops(SERVER[0])), (DIES_S, stops(STANDBY[0]))]
+    )
+    assert brakes(record) == 1
+    assert changes(record) == []
+
+
+def test_the_standby_dies_and_nothing_happens() -> None:
+    record = fly(scenario(), standby=True, actions=[(DIES_S, stops(STANDBY[0]))])
+    assert (brakes(record), changes(record)) == (0, [])
+
+
+def test_a_vehicle_that_does_not_wait_for_the_answer_brakes(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The delay there and back is almost a time-out: the question alone comes too late."""
+    slow = {"network": {"uplink": "constant(0.45)", "downlink": "constant(0.45)"}}
+    flown = scenario(**slow)
+    dies = [(DIES_S, stops(SERVER[0]))]
+    assert brakes(fly(flown, standby=True, actions=dies)) == 0
+    monkeypatch.setattr(Client, "_is_alone", lambda *_: True)
+    assert brakes(fly(flown, standby=True, actions=dies)) == 1
+
+
+def test_a_server_that_was_frozen_is_the_standby(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What it sends on, believing that it leads, is not flown."""
+    freezes = [
+        (DIES_S, lambda world: world.freeze(SERVER[0])),
+        (DIES_S + 6.0, lambda world: world.thaw(SERVER[0])),
+    ]
+    flown = scenario()
+    record = fly(flown, standby=True, actions=freezes)
+    assert (brakes(record), len(changes(record))) == (0, 1)
+    assert rmse_m(flown, record) < 0.05
+    monkeypatch.setattr(Leadership, "successor", lambda *_: None)
+    assert brakes(fly(flown, standby=True, actions=freezes)) == 1
+
+
+def test_a_flight_with_a_standby_that_leads_never_costs_little() -> None:
+    flown = msgspec.structs.replace(scenario(), duration=60.0)
+    alone, with_standby = fly(flown), fly(flown, standby=True)
+    assert len(with_standby.netem) < 1.25 * len(alone.netem)
+    assert changes(with_standby) == []
