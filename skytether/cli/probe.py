@@ -16,9 +16,11 @@ from skytether.client.link import ClientLink, PlainLink
 from skytether.probe import recorded
 from skytether.probe.analysis import Delays
 from skytether.probe.listener import Listener
+from skytether.probe.outages import CommonOutages, RoundTrips, common_time, compare
 from skytether.probe.outcome import (
     DirectionFigures,
     PathFigures,
+    PathsFigures,
     ProbeOutcome,
     outcome,
     rows,
@@ -36,6 +38,7 @@ from skytether.shared.scenario.air.recorded import recorded_in
 from skytether.shared.scenario.registry import File
 from skytether.shared.telemetry.record import PACKET_COLUMNS, RECORDING, Recorder, Rows
 from skytether.shared.wire import keys
+from skytether.shared.wire.paths import PATHS_MAX
 from skytether.shared.wire.protocol import PAYLOAD_BYTES_MAX
 from skytether.shell import command, driver, terminal
 from skytether.shell.argument import Argument
@@ -50,6 +53,7 @@ if TYPE_CHECKING:
 
 SECONDS_MAX, RATE_MAX = 86_400.0, 1000.0
 SECRET_BYTES = 32
+SCENARIO = "paths.toml"
 MODELS_SHOWN = 3
 """Number of printed models, for delays and for losses of each direction."""
 
@@ -58,11 +62,21 @@ MODELS_SHOWN = 3
 class ProbeOptions:
     target: Annotated[str, Argument(metavar="HOST:PORT", positional=True)] = ""
     """Address of the other end, where `skytether probe --listen` runs; an IPv6 host in brackets."""
+    path: Annotated[
+        tuple[str, ...],
+        Argument(
+            metavar="LOCAL=HOST:PORT",
+            append=True,
+            help="Path to the other end, in place of HOST:PORT, as in `skytether client`; may be "
+            "repeated, to measure up to four paths at once, and how often all are out together.",
+        ),
+    ] = ()
     listen: Annotated[str | None, Argument(metavar="HOST:PORT")] = None
     """Run as the listening end: answer probes at this address until Ctrl-C."""
     files: Annotated[tuple[Path, ...], Argument(name="from", metavar="FILE", append=True)] = ()
-    """Read a log instead of measuring: of ping, fping or irtt, or a table. Or two captures of one
-    UDP flow (pcap), that of the vehicle's end first: --from NEAR --from FAR.
+    """Read a log instead of measuring: of ping, fping or irtt, or a table; or up to four, of paths
+    at the same time. Or two captures of one UDP flow (pcap), that of the vehicle's end first:
+    --from NEAR --from FAR.
     """
     duration: float = 60.0
     """Length of the measurement [s]."""
@@ -76,11 +90,13 @@ class ProbeOptions:
     machine.
     """
     number: Annotated[int, Argument(name="id")] = 1
-    """Number of the vehicle whose key is used."""
+    """Number of the vehicle whose key is used; each further --path uses the next one's."""
     insecure: bool = False
     """Allow plaintext beyond this machine: anybody on the path can alter the measurement."""
     out: Path = Path("probed")
-    """Folder for the traces, uplink.csv and downlink.csv."""
+    """Folder for the traces, uplink.csv and downlink.csv; of several paths also uplink-path-2.csv
+    and so on, and a scenario over all, paths.toml.
+    """
     json: Path | None = None
     """File for all figures, as JSON."""
     figure: Path | None = None
@@ -95,22 +111,31 @@ def probe(argv: Sequence[str]) -> None:
     One end listens; the other sends numbered packets, which are answered, and prints the results.
     Run it at the vehicle's place, and the listener at the server's: then its packets take the
     downlink, and the answers the uplink. Ctrl-C ends the measurement and prints the results so far.
-    With --from it analyses a log or captures of another program.
+    With --from it analyses logs or captures of other programs. Of several paths it also tells how
+    often they were out, and how often all at once.
     """
     options = read(ProbeOptions(), argv, "skytether probe", probe.__doc__)
-    sources = bool(options.target) + (options.listen is not None) + bool(options.files)
+    listens = options.listen is not None
+    sources = bool(options.target) + bool(options.path) + listens + bool(options.files)
     if sources != 1:
         message = (
             f"got {'both' if sources else 'neither'}, expected either HOST:PORT to measure the "
-            "path to, or --listen HOST:PORT, or --from FILE"
+            "path to, or --path LOCAL=HOST:PORT, or --listen HOST:PORT, or --from FILE"
         )
         raise CommandError(message, CONFIGURATION)
     if options.files:
         _read(options)
     elif options.listen is not None:
         _listen(options, command.address("--listen", options.listen))
+    elif options.path:
+        _probe(options, options.path, command.paths("--path", options.path))
     else:
-        _probe(options, command.address("HOST:PORT", options.target))
+        listener = command.address("HOST:PORT", options.target)
+        _probe(options, (options.target,), [NetworkPath("", listener)])
+
+
+Measured = tuple[MeasuredPath, ProbeOutcome]
+"""Measurement of one path, and its results."""
 
 
 @contextmanager
@@ -160,80 +185,128 @@ def _listen(options: ProbeOptions, bind: Address) -> None:
 # -- the near end ---------------------------------------------------------------------------------
 
 
-def _probe(options: ProbeOptions, listener: Address) -> None:
-    link: ClientLink = PlainLink()
-    if options.keys:
-        from skytether.client.secure import SecureLink
-
-        key = keys.load(options.keys).of(options.number)
-        link = SecureLink(key, entropy=secrets.token_bytes)
-    _check(options)
-    command.check_sealed(listener, secure=link.secure or options.insecure)
-    prober = Prober(
-        link,
-        listener,
-        secrets.token_bytes(NONCE_BYTES),
-        probes=max(1, round(options.duration * options.rate)),
-        period_ns=round(SECOND_NS / options.rate),
-        size=options.bytes,
-    )
+def _probe(options: ProbeOptions, names: Sequence[str], paths: Sequence[NetworkPath]) -> None:
+    links = _links(options, len(paths))
+    _check(options, len(paths))
+    probers = []
+    for link, path in zip(links, paths, strict=True):
+        command.check_sealed(path.peer, secure=link.secure or options.insecure)
+        prober = Prober(
+            link,
+            path.peer,
+            secrets.token_bytes(NONCE_BYTES),
+            probes=max(1, round(options.duration * options.rate)),
+            period_ns=round(SECOND_NS / options.rate),
+            size=options.bytes,
+        )
+        probers.append(prober)
     try:
-        shell = driver.Shell(prober, None, paths=[NetworkPath("", listener)])
+        pairs = zip(probers, paths, strict=True)
+        shells = [driver.Shell(prober, None, paths=[path]) for prober, path in pairs]
     except AddressError as error:
         raise CommandError(str(error)) from None
-    with terminal.progress(f"probing {options.target}", options.duration) as bar:
-        driver.run([shell], on_event=_say, on_second=lambda: bar(prober.probed_s))
-    if prober.refused:
-        raise CommandError(f"{options.target} serves too many measurements already")
-    if prober.failed:
-        raise CommandError(
-            f"no answer from {options.target}: is `skytether probe --listen` running there?"
-        )
-    measured = prober.measured()
-    try:
-        result = outcome(measured, options.target, secure=link.secure)
-    except ValueError as error:
-        raise CommandError(f"too little was measured: {error}") from None
-    _conclude(options, measured, result)
-    if not prober.finished:
-        seconds = result.told.seconds
+    with terminal.progress(f"probing {' and '.join(names)}", options.duration) as bar:
+
+        def each_second() -> None:
+            bar(min(prober.probed_s for prober in probers))
+            if any(prober.refused or prober.failed for prober in probers):
+                for prober in probers:
+                    prober.stop()
+
+        driver.run(shells, on_event=_say, on_second=each_second)
+    for name, prober in zip(names, probers, strict=True):
+        if prober.refused:
+            raise CommandError(f"{name} serves too many measurements already")
+        if prober.failed:
+            message = f"no answer from {name}: is `skytether probe --listen` running there?"
+            raise CommandError(message)
+    results: list[Measured] = []
+    for name, link, prober in zip(names, links, probers, strict=True):
+        measured = prober.measured()
+        try:
+            results.append((measured, outcome(measured, name, secure=link.secure)))
+        except ValueError as error:
+            where = f"{name}: " if len(names) > 1 else ""
+            raise CommandError(f"{where}too little was measured: {error}") from None
+    _conclude(options, results, [prober.round_trips() for prober in probers])
+    if not all(prober.finished for prober in probers):
+        seconds = min(outcome.told.seconds for _, outcome in results)
         raise CommandError(
             f"ended early, after {seconds:.3g} s: all figures are of this time", INTERRUPTED
         )
 
 
-def _conclude(options: ProbeOptions, measured: MeasuredPath, outcome: ProbeOutcome) -> None:
-    _write(options, outcome)
+def _links(options: ProbeOptions, count: int) -> Sequence[ClientLink]:
+    """Links of the paths, each with the key of another vehicle: the gate keeps one channel of
+    each.
+    """
+    if not options.keys:
+        return [PlainLink() for _ in range(count)]
+    from skytether.client.secure import SecureLink
+
+    keyring = keys.load(options.keys)
+    numbers = range(options.number, options.number + count)
+    return [SecureLink(keyring.of(number), entropy=secrets.token_bytes) for number in numbers]
+
+
+def _conclude(
+    options: ProbeOptions, results: Sequence[Measured], trips: Sequence[RoundTrips]
+) -> None:
+    """Write and print results.
+
+    Args:
+        trips: round trips of each path; ignored for a single one.
+    """
+    outcomes = [outcome for _, outcome in results]
+    try:
+        common = compare(trips) if len(results) > 1 else None
+    except ValueError as error:
+        raise CommandError(str(error), CONFIGURATION) from None
+    _write(options, outcomes, trips, common)
     if options.record:
-        _record(options.record, rows(measured, outcome.clocks))
-    _tell(options, outcome)
+        packets = [
+            rows(measured, outcome.clocks, path) for path, (measured, outcome) in enumerate(results)
+        ]
+        _record(options.record, np.concatenate(packets))
+    _tell(options, outcomes, common)
 
 
 # -- files ----------------------------------------------------------------------------------------
 
 
 def _read(options: ProbeOptions) -> None:
-    _check(options)
+    _check(options, len(options.files))
     read = [File(str(path), _content(path)) for path in options.files]
     captures = sum(recorded.is_capture(file.content) for file in read)
     names = " and ".join(file.name for file in read)
-    if (len(read), captures) not in ((1, 0), (2, 2)):
+    if (len(read), captures) not in ((2, 2), *((count, 0) for count in range(1, PATHS_MAX + 1))):
         message = f"got {len(read)} files, of which {captures} are captures"
-        expected = "one log, or two captures of one flow, that of the vehicle's end first"
+        expected = (
+            "one log, or two captures of one flow, that of the vehicle's end first, or logs of up "
+            f"to {PATHS_MAX} paths"
+        )
         raise CommandError(f"--from: {message}, expected {expected}", CONFIGURATION)
+    if not captures and len({*options.files}) < len(read):
+        raise CommandError(f"--from: got {names}, expected each file once", CONFIGURATION)
+    trips: list[RoundTrips] = []
     try:
         if captures:
-            log: Literal["", "round trips", "one way"] = ""
             measured = recorded.of_captures(read[0].content, read[1].content)
+            results = [(measured, outcome(measured, names, secure=False))]
         else:
-            path = recorded_in(read[0])
-            log = "round trips" if path.halved else "one way"
-            measured = recorded.of_log(path)
-        result = outcome(measured, names, secure=False, log=log)
+            results = [_of_file(file) for file in read]
+            trips = [recorded.round_trips(recorded_in(file)) for file in read]
     except ValueError as error:
         where = f"{names}: " if captures else ""
         raise CommandError(f"--from: {where}{error}", CONFIGURATION) from None
-    _conclude(options, measured, result)
+    _conclude(options, results, trips)
+
+
+def _of_file(file: File) -> Measured:
+    path = recorded_in(file)
+    log: Literal["round trips", "one way"] = "round trips" if path.halved else "one way"
+    measured = recorded.of_log(path)
+    return measured, outcome(measured, file.name, secure=False, log=log)
 
 
 def _content(path: Path) -> bytes:
@@ -251,13 +324,13 @@ def _say(event: Event) -> None:
     print(event, file=sys.stderr)
 
 
-def _check(options: ProbeOptions) -> None:
-    """Refuse impossible measurements, and files that cannot be written."""
+def _check(options: ProbeOptions, paths: int) -> None:
+    """Refuse impossible measurements of this number of paths, and files that cannot be written."""
     for flag, value, least, most in (
         ("--duration", options.duration, 1.0, SECONDS_MAX),
         ("--rate", options.rate, 0.1, RATE_MAX),
         ("--bytes", options.bytes, BYTES_MIN, PAYLOAD_BYTES_MAX),
-        ("--id", options.number, 0, 65_535),
+        ("--id", options.number, 0, 65_536 - paths),
     ):
         if not least <= value <= most:
             raise CommandError(f"{flag}: got {value:g}, expected {least:g} to {most:g}", 2)
@@ -274,20 +347,41 @@ def _check(options: ProbeOptions) -> None:
         from skytether.figures import flights
 
         flights.check(options.figure)
-    command.claim_folder("--out", options.out, "uplink.csv", "downlink.csv")
+    names = [_trace_name(way, path) for path in range(paths) for way in ("uplink", "downlink")]
+    command.claim_folder("--out", options.out, *names, *[SCENARIO] * (paths > 1))
 
 
-def _write(options: ProbeOptions, outcome: ProbeOutcome) -> None:
-    for name, delays in outcome.delays.items():
-        with _writing(file := options.out / f"{name}.csv"):
-            files.write(file, trace(delays).encode())
+def _trace_name(way: str, path: int) -> str:
+    """File of a direction of a path, from 0, named as by `skytether export`."""
+    return f"{way}-path-{path + 1}.csv" if path else f"{way}.csv"
+
+
+def _write(
+    options: ProbeOptions,
+    outcomes: Sequence[ProbeOutcome],
+    trips: Sequence[RoundTrips],
+    common: CommonOutages | None,
+) -> None:
+    within_s = common_time(trips) if common else [None]
+    lines = ['title = "paths that were measured at the same time"', 'extends = "demo"']
+    for path, (found, within) in enumerate(zip(outcomes, within_s, strict=True)):
+        lines += ["", "[[network.paths]]"]
+        for way, delays in found.delays.items():
+            with _writing(file := options.out / _trace_name(way, path)):
+                files.write(file, trace(delays, within).encode())
+            lines.append(f'{way} = "trace({file.name})"')
+    if common:
+        with _writing(file := options.out / SCENARIO):
+            files.write(file, "\n".join([*lines, ""]).encode())
     if options.json:
-        command.write(options.json, msgspec.json.encode(outcome.told))
+        told = [each.told for each in outcomes]
+        figures = PathsFigures(told, common) if common else told[0]
+        command.write(options.json, msgspec.json.encode(figures))
     if options.figure:
         from skytether.figures import flights, probing
 
         with _writing(options.figure):
-            flights.save(probing.drawn(outcome), options.figure, dpi=130)
+            flights.save(probing.drawn(*outcomes), options.figure, dpi=130)
 
 
 def _record(path: Path, packets: Rows) -> None:
@@ -298,14 +392,30 @@ def _record(path: Path, packets: Rows) -> None:
         files.write(path, content.getvalue())
 
 
-def _tell(options: ProbeOptions, outcome: ProbeOutcome) -> None:
+def _tell(
+    options: ProbeOptions, outcomes: Sequence[ProbeOutcome], common: CommonOutages | None
+) -> None:
     """Print tables of both directions, their accuracy, and network texts for a scenario."""
-    path = outcome.told
-    ways = {"downlink": path.downlink, "uplink": path.uplink}
-    shown = {"each way": path.downlink} if path.log else ways
+    shown: dict[str, DirectionFigures] = {}
+    for path in (each.told for each in outcomes):
+        ways = {"downlink": path.downlink, "uplink": path.uplink}
+        named = {"each way": path.downlink} if path.log else ways
+        of_path = f"{path.listener}\n" if common else ""
+        shown |= {f"{of_path}{name}": way for name, way in named.items()}
     terminal.show(_table(shown))
     terminal.show(_models(shown))
-    print(_of_log(path) if path.log else _of_clocks(path))
+    for each in outcomes:
+        _tell_accuracy(each, f"{each.told.listener}: " if common else "")
+    if common:
+        terminal.show(_outages([each.told.listener for each in outcomes], common))
+    print("To fly over the models, or over what was measured:")
+    for line in _flights(options, outcomes):
+        print(f"skytether fly {line}")
+
+
+def _tell_accuracy(outcome: ProbeOutcome, of_path: str) -> None:
+    path = outcome.told
+    print(of_path + (_of_log(path) if path.log else _of_clocks(path)))
     if path.log and not path.uplink.bursts and (missing := _missing(outcome.delays["uplink"])):
         print(
             f"The file has no row for {missing} packets between even ones {path.every_s:.3g} s "
@@ -313,12 +423,23 @@ def _tell(options: ProbeOptions, outcome: ProbeOutcome) -> None:
         )
     if path.unreported:
         print(f"{path.unreported} packets are left out: forgotten by the other end, or not unique.")
-    print("To fly over the models, or over what was measured:")
-    texts = [f'--network.{name} "{way.text}"' for name, way in ways.items() if way.text]
-    if texts:
-        print(f"skytether fly demo --virtual {' '.join(texts)}")
-    traces = [f'--network.{name} "trace({options.out / name}.csv)"' for name in ways]
-    print(f"skytether fly demo --virtual {' '.join(traces)}")
+
+
+def _flights(options: ProbeOptions, outcomes: Sequence[ProbeOutcome]) -> Sequence[str]:
+    """Flights over the models, and over the traces."""
+    paths = [{"downlink": each.told.downlink, "uplink": each.told.uplink} for each in outcomes]
+    texts = [{name: way.text for name, way in ways.items() if way.text} for ways in paths]
+    if len(paths) > 1:
+        tables = (", ".join(f'{name} = "{text}"' for name, text in each.items()) for each in texts)
+        models = ", ".join(f"{{{table}}}" for table in tables)
+        of_models = f"demo --virtual --network.paths '[{models}]'"
+        return of_models, f"{options.out / SCENARIO} --virtual"
+    traces = {name: f"trace({options.out / name}.csv)" for name in paths[0]}
+    flags = (
+        " ".join(f'--network.{name} "{text}"' for name, text in each.items())
+        for each in (texts[0], traces)
+    )
+    return [f"demo --virtual {each}" for each in flags if each]
 
 
 def _missing(delays: Delays) -> int:
@@ -391,6 +512,25 @@ def _models(ways: dict[str, DirectionFigures]) -> "Table":
             for model in models[:MODELS_SHOWN]:
                 behind = f"{model.bic - models[0].bic:.0f}"
                 table.add_row(Text(f"{name}, {what}"), Text(model.text), Text(behind))
+    return table
+
+
+def _outages(names: Sequence[str], found: CommonOutages) -> "Table":
+    from rich.table import Table
+    from rich.text import Text
+
+    title = f"outages: no answer within {found.threshold_s:.3g} s, for as long or longer"
+    table = Table(title=title, title_justify="left")
+    for heading in ("", *names, "all at once", "if independent"):
+        table.add_column(Text(heading))
+    each = [*found.paths, found.common]
+    shares = [*(one.share for one in each), found.product]
+    for name, values in (
+        ("share of the time [%]", [f"{100 * share:.3g}" for share in shares]),
+        ("number", [str(one.count) for one in each]),
+        ("longest [s]", [f"{one.longest_s:.3g}" for one in each]),
+    ):
+        table.add_row(Text(name), *values)
     return table
 
 

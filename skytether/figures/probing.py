@@ -17,15 +17,18 @@ if TYPE_CHECKING:
 DOTS_MAX = 20_000
 
 
-def drawn(outcome: ProbeOutcome) -> "Figure":
-    """Delays of both directions over time, lost packets marked, and their distributions.
+def drawn(*outcomes: ProbeOutcome) -> "Figure":
+    """Delays of both directions over time, lost packets marked, and their distributions, path by
+    path.
 
     The best model is drawn over each distribution.
     """
-    figure = blank(10.0, 5.6)
-    grid = figure.subplots(2, 2, width_ratios=(5, 3))
-    for (name, delays), (over_time, shares) in zip(outcome.delays.items(), grid, strict=True):
-        figures = getattr(outcome.told, name)
+    figure = blank(10.0, 5.6 * len(outcomes))
+    grid = figure.subplots(2 * len(outcomes), 2, width_ratios=(5, 3))
+    ways = [(outcome, name) for outcome in outcomes for name in outcome.delays]
+    for (outcome, name), (over_time, shares) in zip(ways, grid, strict=True):
+        delays, figures = outcome.delays[name], getattr(outcome.told, name)
+        path_name = f"{outcome.told.listener} " if len(outcomes) > 1 else ""
         every = max(1, len(delays.time_s) // DOTS_MAX)
         time_s, delay_ms = delays.time_s[::every], 1e3 * delays.delay_s[::every]
         came = np.isfinite(delay_ms)
@@ -36,7 +39,7 @@ def drawn(outcome: ProbeOutcome) -> "Figure":
         for end in ends.tolist():
             over_time.axvspan(*delays.time_s[end : end + 2], color="0.9", linewidth=0)
         over_time.set_title(
-            f"{name}: {figures.sent} packets, {figures.loss:.2%} lost (red)"
+            f"{path_name}{name}: {figures.sent} packets, {figures.loss:.2%} lost (red)"
             f"{f'; grey: {TRAIN} at once, to measure the rate' if len(ends) else ''}",
             fontsize=10,
             loc="left",
@@ -63,6 +66,6 @@ def drawn(outcome: ProbeOutcome) -> "Figure":
         shares.legend(loc="lower right", fontsize=8)
         for axes in (over_time, shares):
             axes.grid(alpha=0.3)
-    grid[1, 0].set_xlabel("time [s]")
-    grid[1, 1].set_xlabel("delay [ms]")
+    grid[-1, 0].set_xlabel("time [s]")
+    grid[-1, 1].set_xlabel("delay [ms]")
     return figure

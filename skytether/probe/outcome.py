@@ -10,6 +10,7 @@ import numpy as np
 
 from skytether.probe import analysis, fits
 from skytether.probe.analysis import QUANTILES, Clocks, Delays
+from skytether.probe.outages import CommonOutages
 from skytether.probe.prober import TRAIN, Longs, MeasuredPath, Way
 from skytether.shared.base.units import HEADER_BYTES, SECOND_NS
 from skytether.shared.law.model import Array
@@ -71,7 +72,7 @@ class PathFigures(msgspec.Struct, frozen=True, kw_only=True):
     """Figures of a path, as written with --json."""
 
     listener: str
-    """Address of the other end, or the files that were read."""
+    """Address of the other end, or LOCAL=HOST:PORT, or the files that were read."""
     secure: bool
     log: Literal["", "round trips", "one way"]
     """Content of a log, "" for a measurement; round-trip times are halved for each direction."""
@@ -96,6 +97,13 @@ class PathFigures(msgspec.Struct, frozen=True, kw_only=True):
     """Figures of the packets from the listener to the prober."""
     downlink: DirectionFigures
     """Figures of the packets from the prober to the listener."""
+
+
+class PathsFigures(msgspec.Struct, frozen=True):
+    """Figures of several paths, as written with --json."""
+
+    paths: list[PathFigures]
+    outages: CommonOutages
 
 
 @dataclass(frozen=True, slots=True)
@@ -205,11 +213,22 @@ def _would_reorder(delays: Delays) -> float:
     return float((order < np.maximum.accumulate(order)).mean())
 
 
-def trace(delays: Delays) -> str:
-    """Packets of a direction as CSV text for `trace`, one row per packet."""
+def trace(delays: Delays, within_s: tuple[float, float] | None = None) -> str:
+    """Packets of a direction as CSV text for `trace`, one row per packet.
+
+    Args:
+        within_s: time at which the trace begins, and at which it ends, by default those of the
+            first and the last packet; the packets next to these are moved there [s].
+    """
     lines, last = ["time_s,delay_s,lost"], -np.inf
-    begin = float(delays.time_s[0])
-    for time_s, delay_s in zip(delays.time_s.tolist(), delays.delay_s.tolist(), strict=True):
+    times_s, delays_s = delays.time_s, delays.delay_s
+    if within_s:
+        first = max(int(np.searchsorted(times_s, within_s[0], side="right")) - 1, 0)
+        end = int(np.searchsorted(times_s, within_s[1])) + 1
+        times_s, delays_s = times_s[first:end].copy(), delays_s[first:end]
+        times_s[0], times_s[-1] = within_s
+    begin = float(times_s[0])
+    for time_s, delay_s in zip(times_s.tolist(), delays_s.tolist(), strict=True):
         at = round(time_s - begin, 6)
         if at > last:  # a trace has at most one packet per time: the first
             last = at
@@ -219,17 +238,17 @@ def trace(delays: Delays) -> str:
     return "\n".join(lines) + "\n"
 
 
-def rows(measured: MeasuredPath, clocks: Clocks) -> Rows:
+def rows(measured: MeasuredPath, clocks: Clocks, path: int = 0) -> Rows:
     """Packets in netem's format, one row each, those of trains included.
 
-    Times are on the prober's clock; `delay_ns` of a lost packet is 0.
+    Times are on the prober's clock; `delay_ns` of a lost packet is 0. `path` counts from 0.
     """
     parts = []
     for direction, way in ((DOWNLINK, measured.downlink), (UPLINK, measured.uplink)):
         ahead_ns = _ahead_ns(way, measured, clocks)
         part = np.zeros(len(way.sent_ns), PACKET_COLUMNS)
         sign = -1 if direction == DOWNLINK else 1
-        part["direction"], part["bytes"] = direction, measured.size
+        part["direction"], part["bytes"], part["path"] = direction, measured.size, path
         part["number"] = np.arange(len(part))
         part["arrived_ns"] = way.sent_ns - (ahead_ns if direction == UPLINK else 0)
         delay_ns = way.came_ns - way.sent_ns + sign * ahead_ns

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skytether.client.link import ClientLink
+from skytether.probe.outages import RoundTrips
 from skytether.probe.wire import (
     MESSAGE_BYTES_MIN,
     NO_NUMBER,
@@ -278,6 +279,10 @@ class Prober(Endpoint):
     def finished(self) -> bool:
         return self._done
 
+    def stop(self) -> None:
+        """End the measurement at the next wake, as another path's has failed."""
+        self._done = True
+
     # -- results -------------------------------------------------------------------------------
 
     @property
@@ -309,6 +314,19 @@ class Prober(Endpoint):
             self._period_ns,
             int((number < 0).sum()),
         )
+
+    def round_trips(self) -> RoundTrips:
+        """Round trips of the probes that were sent alone, on the prober's clock."""
+        downlink = self.measured().downlink
+        number, answered = np.array(self._logged_number), np.array(self._answer_number)
+        at = np.flatnonzero(answered < len(number))
+        at = at[number[answered[at]] >= 0][::-1]  # the first of several answers is written last
+        probe = number[answered[at]]
+        trip_s = np.full(len(self._sent_ns), np.nan)
+        came_ns, sent_ns = np.array(self._answer_came_ns)[at], np.array(self._sent_ns)[probe]
+        trip_s[probe] = (came_ns - sent_ns) / SECOND_NS
+        alone = np.flatnonzero(downlink.train < 0)
+        return RoundTrips(downlink.sent_ns[alone] / SECOND_NS, trip_s[alone])
 
     def _downlink(self, number: Longs, logged_ns: Longs) -> Way:
         sent_ns, train = np.array(self._sent_ns, np.int64), np.array(self._train, np.int64)

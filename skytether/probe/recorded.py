@@ -16,6 +16,7 @@ from collections.abc import Iterator, Mapping
 
 import numpy as np
 
+from skytether.probe.outages import RoundTrips
 from skytether.probe.prober import PROBES_MAX, MeasuredPath, Way
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.scenario.air.recorded import CAPTURES, CAPTURES_NEW, RecordedPath
@@ -43,6 +44,12 @@ def of_log(path: RecordedPath) -> MeasuredPath:
     alone = np.full(len(sent_ns), -1, np.int64)
     way = Way(sent_ns, np.where(came, sent_ns + delay_ns, 0), came, alone, path.copies)
     return MeasuredPath(way, way, 0, _period_ns(way), 0)
+
+
+def round_trips(path: RecordedPath) -> RoundTrips:
+    """Round trips of a log, on the clock of the file."""
+    trip_s = np.where(path.lost, np.nan, 2.0 * path.delay_s)
+    return RoundTrips(path.begin_s + path.time_s, trip_s)
 
 
 def _period_ns(way: Way) -> int:

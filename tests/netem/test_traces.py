@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 
 from skytether.netem.fate import Fates
+from skytether.probe.outages import compare
+from skytether.probe.recorded import round_trips
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.scenario import reading
@@ -420,3 +422,24 @@ def test_the_recorded_links_are_scenarios(name: str) -> None:
     assert scenario.network.uplink == scenario.network.downlink
     assert scenario.uplink.mean_s == pytest.approx(table[:, 1].mean() / 2e3)
     assert scenario.uplink.is_ordered
+
+
+@pytest.mark.parametrize(("name", "together"), [("apart", 0), ("together", 1)])
+def test_the_recorded_pairs_are_scenarios_of_two_paths(name: str, together: int) -> None:
+    """Outages of both networks, and the number of those in common."""
+    scenario, trips = reading.load(f"two-networks-{name}"), []
+    assert len(scenario.paths) == 2
+    for number, operator in enumerate(("att", "verizon")):
+        file = reading.SCENARIOS / "traces" / f"two-networks-{name}-{operator}.csv"
+        found = recorded.recorded_in(File(file.name, file.read_bytes()))
+        flown = scenario.on_path(number)
+        assert flown.network.uplink == flown.network.downlink
+        assert flown.uplink.is_ordered
+        assert flown.uplink.mean_s == pytest.approx(found.delay_s.mean())
+        assert flown.uplink.loss == pytest.approx(found.lost.mean())
+        assert found.time_s[-1] >= scenario.duration
+        trips.append(round_trips(found))
+    outages = compare(trips)
+    assert min(each.count for each in outages.paths) >= 1
+    assert outages.common.count == together
+    assert (outages.common.share > outages.product) == bool(together)

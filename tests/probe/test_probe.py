@@ -3,9 +3,8 @@
 import csv
 import json
 import subprocess
-import sys
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, suppress
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -16,7 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from helpers import refused
+from helpers import SKYTETHER, refused
 from skytether.__main__ import main
 from skytether.client.link import PlainLink
 from skytether.figures.probing import drawn
@@ -495,10 +494,37 @@ def test_bad_options_are_one_line(
     assert said in refused(["probe", *flags], capsys)
 
 
+@pytest.mark.parametrize(
+    ("flags", "said"),
+    [
+        (("127.0.0.1:1", "--path", "=127.0.0.1:1"), "got both, expected either HOST:PORT"),
+        (("--path", "127.0.0.1:1"), "--path: got '127.0.0.1:1', expected LOCAL=HOST:PORT"),
+        (("--path", "=127.0.0.1:1") * 5, "--path: got 5, expected 1 to 4"),
+        (("--path", "=127.0.0.1:1") * 2, "--path: got '=127.0.0.1:1' twice"),
+        (("--path", "=127.0.0.1:1", "--path", "=192.0.2.1:1"), "192.0.2.1:1: other machines"),
+        (
+            ("--id", "65535", "--path", "=127.0.0.1:1", "--path", "=127.0.0.1:2"),
+            "--id: got 65535, expected 0 to 65534",
+        ),
+    ],
+)
+def test_bad_paths_are_one_line(
+    flags: tuple[str, ...],
+    said: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert said in refused(["probe", *flags], capsys)
+
+
 @contextmanager
-def listening(*flags: str) -> Iterator[str]:
-    command = [sys.executable, "-P", "-m", "skytether", "probe", "--listen", "127.0.0.1:0", *flags]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+def started(*command: str) -> Iterator[str]:
+    """Process that listens; yields its address."""
+    process = subprocess.Popen(
+        [*SKYTETHER, *command], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+    )
     assert process.stdout is not None
     line = process.stdout.readline()
     try:
@@ -506,6 +532,10 @@ def listening(*flags: str) -> Iterator[str]:
     finally:
         process.terminate()
         process.communicate(timeout=30)
+
+
+def listening(*flags: str) -> AbstractContextManager[str]:
+    return started("probe", "--listen", "127.0.0.1:0", *flags)
 
 
 @pytest.mark.long
@@ -539,3 +569,39 @@ def test_a_path_over_loopback_is_measured_sealed_or_not(
     assert "may be wrong by up to" in printed
     flown = [line for line in printed.splitlines() if line.startswith("skytether fly demo")]
     assert len(flown) == 2
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("sealed", [False, True])
+def test_two_paths_are_probed_at_once_of_which_one_is_cut(
+    sealed: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The scenario that is written loses packets on the second path, and flies."""
+    keys: list[str] = []
+    if sealed:
+        keys = ["--keys", str(tmp_path / "keys")]
+        assert main(["keygen", keys[1], "--vehicles", "2"]) == 0
+        capsys.readouterr()
+    cut = ("--to-server", "constant(20ms) & outage(1, 1.5)")
+    out = [f"--{name}={tmp_path / name}" for name in ("out", "json", "record")]
+    limits = ["--duration", "4", "--rate", "100", "--bytes", "200"]
+    with (
+        listening(*keys) as listener,
+        started("netem", "--bind", "127.0.0.1:0", "--server", listener, *cut) as netem,
+    ):
+        paths = [f"127.0.0.1={listener}", f"127.0.0.2={netem}"]
+        flags = [each for path in paths for each in ("--path", path)]
+        assert main(["probe", *flags, *limits, *out, *keys]) == 0
+    told = json.loads((tmp_path / "json").read_text())
+    assert [each["listener"] for each in told["paths"]] == paths
+    assert [each["secure"] for each in told["paths"]] == [sealed, sealed]
+    first, second = told["outages"]["paths"]
+    assert first["share"] < 0.2 < second["share"]
+    assert told["outages"]["product"] == pytest.approx(first["share"] * second["share"])
+    assert told["outages"]["common"]["share"] <= first["share"]
+    flown = reading.load(str(tmp_path / "out" / "paths.toml"))
+    assert [flown.on_path(number).downlink.loss > 0.2 for number in range(2)] == [False, True]
+    assert set(parse((tmp_path / "record").read_bytes())["path"].tolist()) == {0, 1}
+    printed = capsys.readouterr().out
+    for said in (*paths, "all at once", "if independent", "--network.paths '[{", "paths.toml"):
+        assert said in printed

@@ -14,20 +14,22 @@ from skytether.__main__ import main
 from skytether.probe import recorded
 from skytether.probe.outcome import outcome
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
+from skytether.shared.scenario import reading
 from skytether.shared.scenario.air.path import path
 from skytether.shared.scenario.air.recorded import recorded_in
 from skytether.shared.scenario.registry import File
+from skytether.shared.telemetry.record import parse
 
 ROOT = Path(__file__).parents[2]
 RNG = np.random.default_rng(7)
 DELAYS_MS = RNG.gamma(4.0, 5.0, 400) + 30.0
 
 
-def log(lost: Sequence[int] = ()) -> str:
+def log(lost: Sequence[int] = (), begin_s: float = 1.7e9) -> str:
     """Log of ping, five packets a second; those with the numbers in `lost` are lost."""
     line = "[{:.6f}] 64 bytes from 192.0.2.1: icmp_seq={} ttl=57 time={:.3f} ms\n"
     rows = [
-        line.format(1.7e9 + number / 5 + trip_ms / 1e3, number, trip_ms)
+        line.format(begin_s + number / 5 + trip_ms / 1e3, number, trip_ms)
         for number, trip_ms in enumerate(DELAYS_MS.tolist(), 1)
         if number not in lost
     ]
@@ -43,7 +45,7 @@ def test_the_documented_command_reads_a_log(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Table, models and traces are those of half the round trip in each direction."""
-    (line,) = re.findall(r"^skytether (probe --from .*\.log.*)$", docs(), re.MULTILINE)
+    (line,) = re.findall(r"^skytether (probe --from ping\.log.*)$", docs(), re.MULTILINE)
     lost = [*range(100, 110), *range(390, 401)]
     (tmp_path / "ping.log").write_text(log(lost))
     monkeypatch.chdir(tmp_path)
@@ -89,6 +91,31 @@ def test_rows_that_a_table_lacks_are_said(
     (tmp_path / "it.csv").write_text(f"time_s,rtt_ms\n{rows}")
     assert main(["probe", "--from", "it.csv"]) == 0
     assert "no row for 7 packets" in capsys.readouterr().out
+
+
+def test_logs_of_two_modems_are_compared_at_the_same_times(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The second log begins 10 s after the first; both links are out for 2 s, 1 s of it at once."""
+    (line,) = re.findall(r"^skytether (probe --from .*\.log --from .*)$", docs(), re.MULTILINE)
+    (tmp_path / "first.log").write_text(log([*range(151, 161)]))
+    (tmp_path / "second.log").write_text(log([*range(106, 116), 300], begin_s=1.7e9 + 10.0))
+    monkeypatch.chdir(tmp_path)
+    assert main([*line.split(), "--json", "it.json", "--record", "it.rows"]) == 0
+    told = json.loads((tmp_path / "it.json").read_text())
+    assert [each["listener"] for each in told["paths"]] == ["first.log", "second.log"]
+    found = told["outages"]
+    assert found["seconds"] == pytest.approx(70.0, abs=0.5)
+    assert [each["count"] for each in (*found["paths"], found["common"])] == [1, 1, 1]
+    assert [each["longest_s"] for each in found["paths"]] == pytest.approx([2.0, 2.0], abs=0.01)
+    assert found["common"]["longest_s"] == pytest.approx(1.0, abs=0.01)
+    assert found["common"]["share"] == pytest.approx(1.0 / 70.0, rel=0.02)
+    assert found["product"] == pytest.approx((2.0 / 70.0) ** 2, rel=0.02)
+    assert "skytether fly probed/paths.toml --virtual" in capsys.readouterr().out
+    flown = [reading.load("probed/paths.toml").on_path(number).uplink for number in range(2)]
+    assert [each.loss for each in flown] == pytest.approx([10 / 351, 11 / 351], rel=0.01)
+    packets = parse((tmp_path / "it.rows").read_bytes())
+    assert np.bincount(packets["path"]).tolist() == [800, 800]
 
 
 # -- captures -------------------------------------------------------------------------------------
@@ -245,7 +272,8 @@ def test_captures_that_share_too_little_are_refused(near: bytes, far: bytes, sai
         ("--from nothing", "--from: nothing: cannot be read"),
         ("--from near.pcap", "got 1 files, of which 1 are captures, expected one log, or two"),
         ("--from it.log --from near.pcap", "got 2 files, of which 1 are captures"),
-        ("--from it.log --from it.log", "got 2 files, of which 0 are captures"),
+        ("--from it.log --from it.log", "got it.log and it.log, expected each file once"),
+        ("--from it.log --from tomorrow.log", "got paths without a time in common"),
         ("--from bad.log", "--from: bad.log: got no answer to a ping"),
         ("--from near.pcap --from near.pcap", "the same times in both captures"),
         ("--from it.log --listen 127.0.0.1:1", "got both, expected"),
@@ -260,6 +288,7 @@ def test_bad_files_are_one_line(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "it.log").write_text(log())
+    (tmp_path / "tomorrow.log").write_text(log(begin_s=1.7e9 + 86_400.0))
     (tmp_path / "bad.log").write_text("icmp_seq=1")
     (tmp_path / "near.pcap").write_bytes(pcap(flight()[0]))
     assert said in refused(["probe", *line.split()], capsys)

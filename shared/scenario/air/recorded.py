@@ -51,6 +51,8 @@ class RecordedPath:
     halved: bool = False
     copies: int = 0
     """Number of further answers to a packet, if the file lists them."""
+    begin_s: float = 0.0
+    """Time of the first packet on the file's own clock [s]."""
 
 
 @lru_cache(maxsize=16)
@@ -73,7 +75,8 @@ def recorded_in(file: File, way: Way = "auto") -> RecordedPath:
             runs = pings.runs(text)
             times_s, trips_s = pings.joined(runs)
             copies = sum(run.copies for run in runs)
-            return _checked(times_s, trips_s / 2.0, halved=True, copies=copies)
+            begin_s = float(runs[0].timed()[0][0])
+            return _checked(times_s, trips_s / 2.0, halved=True, copies=copies, begin_s=begin_s)
         return _of_csv(text)
     except ValueError as error:
         raise ValueError(f"{file.name}: {error}") from None
@@ -293,13 +296,19 @@ def _refuse(wrong: Flags, values: Array, expected: str) -> None:
 
 
 def _checked(
-    time_s: Array, delay_s: Array, *, halved: bool = False, copies: int = 0
+    time_s: Array,
+    delay_s: Array,
+    *,
+    halved: bool = False,
+    copies: int = 0,
+    begin_s: float = 0.0,
 ) -> RecordedPath:
     """Path of rows, sorted by time.
 
     Args:
         time_s: times of sending [s]; shape (n,).
         delay_s: one-way delays, NaN for a lost packet [s]; shape (n,).
+        begin_s: time on the file's own clock at which `time_s` is 0 [s].
 
     Raises:
         ValueError: with the first invalid row.
@@ -316,6 +325,7 @@ def _checked(
     if lost.all():
         raise ValueError("got lost packets only, expected at least one that arrived")
     order = np.argsort(time_s, kind="stable")
+    begin_s += float(time_s[order[0]])
     time_s, delay_s, lost = time_s[order] - time_s[order[0]], delay_s[order], lost[order]
     if time_s[-1] > 1e9:
         raise ValueError(f"got {time_s[-1]:g} s, expected at most 1e9 s")
@@ -327,4 +337,4 @@ def _checked(
         time_s = np.maximum.accumulate(time_s - shift_s) + shift_s
     came = ~lost
     filled_s = np.interp(time_s, time_s[came], delay_s[came])
-    return RecordedPath(time_s, filled_s, lost, halved, copies)
+    return RecordedPath(time_s, filled_s, lost, halved, copies, begin_s)

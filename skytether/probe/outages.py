@@ -1,0 +1,129 @@
+"""Outages of paths that were measured at the same time, and how many of them they have in common.
+
+T is OUTAGE_S, or SPARSE times the typical time between two probes if that is longer. A path is out
+from the first of consecutive probes that have no answer within T until the next probe that has one,
+if these probes cover at least T. A probe covers the time until the next one, but no more than
+SPARSE typical times: what happens while a train is sent instead is unknown.
+
+    share_k = |out_k and covered| / |covered|        covered: by a probe of every path
+    common  = |out_1 and out_2 and ... and covered| / |covered|
+
+Of independent paths the common share is the product of the shares.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import prod
+
+import msgspec
+import numpy as np
+
+from skytether.shared.law.model import Array
+
+OUTAGE_S = 0.5
+"""Shortest outage, and longest round trip of a probe that counts as answered [s]."""
+SPARSE = 2.0
+
+Intervals = Array
+"""Beginnings and ends [s], rising and without overlap; shape (n, 2)."""
+
+
+@dataclass(frozen=True, slots=True)
+class RoundTrips:
+    """Probes of a path that were sent alone, in order of sending."""
+
+    sent_s: Array
+    """Time of sending, on a clock that all paths have in common [s]; shape (n,)."""
+    trip_s: Array
+    """Round-trip time [s]; NaN without an answer; shape (n,)."""
+
+    @property
+    def every_s(self) -> float:
+        return float(np.median(np.diff(self.sent_s))) if len(self.sent_s) > 1 else 0.0
+
+
+class OutageFigures(msgspec.Struct, frozen=True):
+    share: float
+    """Share of the time."""
+    count: int
+    longest_s: float
+
+
+class CommonOutages(msgspec.Struct, frozen=True, kw_only=True):
+    """Outages of paths, and those of all at once."""
+
+    threshold_s: float
+    """Time T without an answer from which on a path is out."""
+    seconds: float
+    """Time covered by probes of all paths."""
+    paths: list[OutageFigures]
+    common: OutageFigures
+    """Times at which all paths were out."""
+    product: float
+    """Product of the paths' shares."""
+
+
+def compare(paths: Sequence[RoundTrips]) -> CommonOutages:
+    """Outages of paths.
+
+    Raises:
+        ValueError: the paths were not measured at the same time.
+    """
+    threshold_s = max(OUTAGE_S, *(SPARSE * path.every_s for path in paths))
+    found = [outages(path, threshold_s) for path in paths]
+    covered = overlap([each for _, each in found], len(paths))
+    if not len(covered):
+        raise ValueError("got paths without a time in common, expected some of the same time")
+    together = np.array([[covered[0, 0], covered[-1, 1]]])
+    out = [overlap([each, together], 2) for each, _ in found]
+    figures = [_figures(each, covered) for each in out]
+    return CommonOutages(
+        threshold_s=threshold_s,
+        seconds=length_s(covered),
+        paths=figures,
+        common=_figures(overlap(out, len(out)), covered),
+        product=prod(each.share for each in figures),
+    )
+
+
+def common_time(paths: Sequence[RoundTrips]) -> Sequence[tuple[float, float]]:
+    """Begin and end of the time in which all paths were measured, each since a path's first probe
+    [s].
+    """
+    begin_s = max(float(path.sent_s[0]) for path in paths)
+    end_s = min(float(path.sent_s[-1]) for path in paths)
+    return [(begin_s - float(path.sent_s[0]), end_s - float(path.sent_s[0])) for path in paths]
+
+
+def _figures(out: Intervals, covered: Intervals) -> OutageFigures:
+    share = length_s(overlap([out, covered], 2)) / length_s(covered)
+    return OutageFigures(share, len(out), float(np.diff(out).max(initial=0.0)))
+
+
+def outages(path: RoundTrips, threshold_s: float) -> tuple[Intervals, Intervals]:
+    """Outages of one path, and the times that its probes cover."""
+    sent_s, most_s = path.sent_s, SPARSE * path.every_s
+    ends_s = np.minimum(np.append(sent_s[1:], np.inf), sent_s + most_s)
+    failed = ~(path.trip_s <= threshold_s)  # NaN fails too
+    edges = np.diff(failed.astype(np.int8), prepend=0, append=0)
+    first, last = np.flatnonzero(edges == 1), np.flatnonzero(edges == -1) - 1
+    covered_s = np.append(0.0, np.cumsum(ends_s - sent_s))
+    # Probes before and after a train, lost by chance, are no outage however far apart they are.
+    lasting = covered_s[last + 1] - covered_s[first] >= threshold_s - 1e-6
+    out = np.column_stack((sent_s[first], ends_s[last]))[lasting]
+    return out, overlap([np.column_stack((sent_s, ends_s))], 1)
+
+
+def overlap(sets: Sequence[Intervals], least: int) -> Intervals:
+    """Times that lie in at least this many of the sets of intervals."""
+    at_s = np.concatenate(sets).T.ravel()
+    step = np.repeat((1, -1), len(at_s) // 2)
+    order = np.lexsort((-step, at_s))  # beginnings first: intervals that touch are one
+    inside = np.cumsum(step[order]) >= least
+    edges = np.diff(inside.astype(np.int8), prepend=0)
+    found: Intervals = np.column_stack((at_s[order][edges == 1], at_s[order][edges == -1]))
+    return found[found[:, 1] > found[:, 0]]
+
+
+def length_s(intervals: Intervals) -> float:
+    return float(np.diff(intervals).sum())
