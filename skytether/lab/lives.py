@@ -125,6 +125,11 @@ class Lives:
         self.events.append((time_ns / SECOND_NS, host, event))
 
     @property
+    def server(self) -> Server:
+        """Newest run of a server."""
+        return self.servers[-1]
+
+    @property
     def running(self) -> Running | None:
         """Server and its scenario; None while the server is down."""
         return self._running.get(SERVER[0])
