@@ -1,0 +1,137 @@
+"""A standby server: the first server dies at a random time, and the vehicle flies on."""
+
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import tyro
+
+from bench.harness import TextTable
+from skytether.lab.commands.pool import Flags, study
+from skytether.shared.base.chance import stream
+from skytether.shared.base.units import SECOND_NS
+from skytether.shared.core.events import LeaderChanged
+from skytether.shared.scenario import reading
+from skytether.shared.scenario.dotted import set_keys
+from skytether.shared.telemetry.record import Record
+from skytether.shared.telemetry.summary import summarise
+from skytether.shared.wire.protocol import Mode
+from skytether.shell import command
+from skytether.sim.flight import SERVER, fly
+
+FLIGHT_S, SEEDS = 30.0, 200
+DIES_S = 8.0, 25.0
+"""First and last time at which the server dies [s]."""
+TASKS = ("demo", "demo-committed", "target", "paper")
+
+
+class Cell(msgspec.Struct, frozen=True):
+    task: str
+    seed: int
+
+
+class FlownCell(msgspec.Struct, frozen=True):
+    cell: Cell
+    changed_s: float
+    """Time from the death to the change of the leader [s]."""
+    planned_s: float
+    """Time from the death to the first plan in force of the new leader [s]."""
+    brakes: int
+    rmse_m: tuple[float, float]
+    """With the death, and of the same flight with a single server that lives [m]."""
+    error_m: tuple[float, float]
+    """Largest error of both [m]."""
+
+
+def fly_cell(cell: Cell) -> FlownCell:
+    table = reading.to_table(reading.load(cell.task))
+    set_keys({"duration": FLIGHT_S, "seed": cell.seed, "settle": 6.0}, table)
+    scenario = reading.check(table, "bench")
+    dies_s = float(stream(cell.seed, "dies").uniform(*DIES_S))
+    record = fly(scenario, standby=True, actions=[(dies_s, lambda world: world.stop(SERVER[0]))])
+    undisturbed = fly(scenario)
+    changed = [each.time_ns for each in record.events if isinstance(each.event, LeaderChanged)]
+    changed_s = max(changed, default=np.inf) / SECOND_NS
+    brakes = record.client["mode"] == Mode.BRAKE
+    figures = [
+        summarise(scenario, cell.task, each.client, each.server, each.netem)
+        for each in (record, undisturbed)
+    ]
+    rmse_m, error_m = zip(*((each.rmse_xy, each.error_max) for each in figures), strict=True)
+    return FlownCell(
+        cell,
+        changed_s - dies_s,
+        _planned_s(record, changed_s, scenario.control.dt) - dies_s,
+        int(np.count_nonzero(brakes[1:] & ~brakes[:-1])),
+        rmse_m,
+        error_m,
+    )
+
+
+def _planned_s(record: Record, changed_s: float, dt_s: float) -> float:
+    """Time at which the first plan made after the change of the leader is in force [s]."""
+    rows = record.client
+    began_s = record.figures["client"]["by_vehicle"]["1"]["began_s"] % 86_400
+    times_s = began_s + rows["step"] * dt_s
+    before = rows["in_force"][times_s < changed_s][-1]
+    later = times_s[(times_s >= changed_s) & (rows["in_force"] > before)]
+    return float(later[0]) if len(later) else np.inf
+
+
+def tables(flights: Sequence[FlownCell]) -> dict[str, TextTable]:
+    rows = []
+    for task in TASKS:
+        flown = [each for each in flights if each.cell.task == task]
+        changed, planned = ([getattr(each, name) for each in flown] for name in TIMES)
+        rmse, error = (np.array([getattr(each, name) for each in flown]) for name in ERRORS)
+        rows.append(
+            [
+                f"`{task}`",
+                str(len(flown)),
+                str(sum(each.brakes for each in flown)),
+                *(_times(each) for each in (changed, planned)),
+                " / ".join(f"{each:.3f}" for each in np.sqrt((rmse**2).mean(axis=0))),
+                " / ".join(f"{each:.3f}" for each in error.max(axis=0)),
+            ]
+        )
+    headings = ["scenario", "flights", "brakes", "changed", "planned", "RMSE xy", "largest error"]
+    return {"standby": TextTable(headings, rows)}
+
+
+TIMES, ERRORS = ("changed_s", "planned_s"), ("rmse_m", "error_m")
+
+
+def _times(times_s: Sequence[float]) -> str:
+    return ", ".join(f"{each:.2f}" for each in np.quantile(times_s, (0.5, 0.99)))
+
+
+@dataclass(frozen=True)
+class StandbyOptions:
+    seeds: int = SEEDS
+    """Number of seeds, from 1 on."""
+    jobs: int | None = None
+    """Number of flights at once; one per core unless given."""
+    out: Path | None = None
+    """Folder for the flights: after Ctrl-C the same command continues."""
+
+
+def cells(seeds: int) -> list[Cell]:
+    return [Cell(task, seed) for task in TASKS for seed in range(1, seeds + 1)]
+
+
+def main(argv: Sequence[str]) -> None:
+    options = tyro.cli(StandbyOptions, args=argv, description=__doc__)
+    flights = study(fly_cell, cells(options.seeds), FlownCell, {}, options.out, Flags(options.jobs))
+    for title, table in tables(flights).items():
+        table.show(title)
+
+
+def document_tables(folder: Path | None, flags: Flags) -> Mapping[str, TextTable]:
+    return tables(study(fly_cell, cells(SEEDS), FlownCell, {}, folder, flags))
+
+
+if __name__ == "__main__":
+    sys.exit(command.main(main, sys.argv[1:], "standby"))
