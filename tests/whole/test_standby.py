@@ -1,18 +1,22 @@
 """A flight with a standby server: servers die, and the vehicle flies on."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import msgspec
+import numpy as np
 import pytest
 
 from helpers import packaged
 from skytether.client.endpoint import Client
 from skytether.client.leadership import Leadership
+from skytether.server.endpoint import Server
 from skytether.shared.core.events import LeaderChanged, ModeChanged
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Record
 from skytether.shared.telemetry.summary import summarise
+from skytether.shared.wire.protocol import Mode
 from skytether.sim.flight import SERVER, STANDBY, fly
 from skytether.sim.world import World
 
@@ -104,3 +108,52 @@ def test_a_flight_with_a_standby_that_leads_never_costs_little() -> None:
     alone, with_standby = fly(flown), fly(flown, standby=True)
     assert len(with_standby.netem) < 1.25 * len(alone.netem)
     assert changes(with_standby) == []
+
+
+def battered(seed: int) -> tuple[Scenario, Record, int]:
+    """A flight in which both servers and both networks fail at random until 40 s, and the number of
+    faults.
+    """
+    rng = np.random.default_rng(seed)
+    flown = msgspec.structs.replace(scenario(), duration=60.0, seed=seed)
+    actions: list[tuple[float, Callable[[World], None]]] = []
+    for name in (SERVER[0], STANDBY[0]):
+        at_s = 5.0
+        while (at_s := at_s + float(rng.exponential(6.0))) < 35.0:
+            for_s = min(float(rng.exponential(4.0)), 40.0 - at_s)
+            acts = (world_stop, renewed(flown, rng)) if rng.random() < 0.5 else (freeze, thaw)
+            actions += zip((at_s, at_s + for_s), (partial(act, name) for act in acts), strict=True)
+            at_s += for_s
+    actions.sort(key=lambda each: each[0])
+    return flown, fly(flown, standby=True, actions=actions), len(actions) // 2
+
+
+def world_stop(name: str, world: World) -> None:
+    world.stop(name)
+
+
+def freeze(name: str, world: World) -> None:
+    world.freeze(name)
+
+
+def thaw(name: str, world: World) -> None:
+    world.thaw(name)
+
+
+def renewed(flown: Scenario, rng: np.random.Generator) -> Callable[[str, World], None]:
+    def act(name: str, world: World) -> None:
+        boot_id = int(rng.integers(2**62))
+        world.restart(name, Server(flown, boot_id=boot_id, entropy=rng.bytes))
+
+    return act
+
+
+@pytest.mark.parametrize("seed", range(1, 9))
+def test_whatever_fails_it_flies_again_at_the_end(seed: int) -> None:
+    flown, record, faults = battered(seed)
+    assert record.failure is None
+    assert len(changes(record)) <= 2 * faults
+    late = record.client["step"] * flown.control.dt > 52.0
+    assert set(record.client["mode"][late]) <= {Mode.TRACK, Mode.COAST}
+    wanted = flown.make_reference()(record.client["step"][late] * flown.control.dt)
+    assert np.abs(record.client["state"][late] - wanted)[..., 0].max() < 0.3
