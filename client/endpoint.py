@@ -68,8 +68,10 @@ TIME_NS, TIME_ERROR_MAX_US = 2 * SECOND_NS, 2**32 - 1
 [µs]."""
 SOON_NS = 200 * MILLISECOND_NS
 """Time after which a server that has to lead is told again that it does [ns]."""
-NEVER_NS, START_NS = -(2**63), 3 * SECOND_NS
-"""A time before all others, and the time that the first leader has for its first answer [ns]."""
+NEVER_NS = -(2**63)
+GROUND_NS = 3 * SECOND_NS
+"""Additional time for which the leader of a vehicle on the ground may be silent [ns]: there it
+answers HELLOs only, of which the first need several packets each way."""
 DEPARTURES = frozenset({Reason.CLOSED, Reason.RESTARTED})
 """Causes after which a server leads no more if another is heard."""
 PLANLESS = frozenset({Reason.OPENED, Reason.GOOD, Reason.HORIZON, Reason.OLD, Reason.ENDED})
@@ -391,11 +393,9 @@ class Client(Endpoint):
         lead = self._leadership
         if self._began_ns == NEVER_NS:
             self._began_ns = now_ns
-        # The first leader gets time for its handshake.
-        floor_ns = self._began_ns + (START_NS if self._session.number is None else 0)
-        heard_ns = [
-            each.heard_ns or (floor_ns if each.leads else NEVER_NS) for each in self._sessions
-        ]
+        heard_ns = [each.heard_ns or self._began_ns for each in self._sessions]
+        if self._pilot.next_ns is None:
+            heard_ns[lead.leader] += GROUND_NS
         successor = lead.successor(heard_ns, now_ns)
         if successor is not None:
             lead.hand_over(successor)

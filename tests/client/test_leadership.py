@@ -10,7 +10,7 @@ from helpers import packaged
 from skytether.client.endpoint import Client
 from skytether.client.leadership import NUMBER_MAX, Leadership
 from skytether.client.memory import SavedState, recall
-from skytether.client.simulated.vehicle import simulated
+from skytether.client.simulated.vehicle import SimulatedVehicle, simulated
 from skytether.shared.base.units import SECOND_NS, seconds_to_ns
 from skytether.shared.core.endpoint import STANDBY_SOCKETS, Address, Datagram
 from skytether.shared.core.events import LeaderChanged
@@ -69,11 +69,16 @@ def test_another_leads_only_if_it_was_heard_since_the_leader_was_doubted(
 class Vehicle:
     """A client and what its two servers say to it."""
 
-    def __init__(self, scenario: Scenario, before: SavedState | None = None) -> None:
+    def __init__(
+        self,
+        scenario: Scenario,
+        before: SavedState | None = None,
+        flies: SimulatedVehicle | None = None,
+    ) -> None:
         self.scenario, self.now_ns = scenario, SECOND_NS
         self.client = Client(
             scenario,
-            simulated(scenario, 1),
+            flies or simulated(scenario, 1),
             server=SERVERS[0],
             standby=[SERVERS[1]],
             vehicle=4,
@@ -218,3 +223,18 @@ def test_a_number_out_of_range_is_refused_by_the_codec() -> None:
     for index, value in ((4, 2**32), (5, 2), (6, -1), (8, -2), (9, 2**16), (10, b"\0")):
         with pytest.raises(Exception, match=r"field|shape"):
             decode(msgpack.packb([*fields[:index], value, *fields[index + 1 :]]), terms)
+
+
+def test_a_vehicle_that_waits_on_the_ground_keeps_its_leader() -> None:
+    """Until it has flown the leader only answers HELLOs, less often than a time-out."""
+    scenario = packaged("demo")
+    ready = simulated(scenario, 1)
+    ready.take_off = lambda *, now_ns: False  # type: ignore[method-assign] # noqa: ARG005
+    vehicle = Vehicle(scenario, flies=ready)
+    for _ in range(40):
+        for server, after_s in ((0, 0.3), (1, 1.3)):
+            vehicle.step(after_s)
+            if vehicle.told(server, Lead):
+                vehicle.answer(server)
+            vehicle.beat(server)
+    assert vehicle.client.vehicle_figures()["leadership"]["number"] == 0
