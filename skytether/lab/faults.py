@@ -224,6 +224,9 @@ class Trial:
     faults: tuple[ScheduledFault, ...]
     two_paths: bool = False
     """Whether the vehicles have a second path, on which there is no saboteur."""
+    standby: bool = False
+    """Whether there is a standby server, to which no saboteur listens. Every second fault of the
+    server strikes it in place of the first."""
 
     @property
     def end_ns(self) -> int:

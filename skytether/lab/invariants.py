@@ -139,8 +139,60 @@ class _Noted:
         return self.inner.seal(payload)
 
 
+class WatchedLink:
+    """Wrapper around the real link of one run of a client to one server."""
+
+    def __init__(self, life: "WatchedLife", link: ClientLink) -> None:
+        self.secure, self.hello_ns = link.secure, link.hello_ns
+        self._life, self._link = life, link
+        self._adopted_ns = 0
+        """Time at which the newest keys were adopted [ns; vehicle's clock]."""
+        self._welcome: tuple[int, int] | None = None
+        """Session of the newest WELCOME that was opened, and number of the server's run."""
+        self.session: tuple[int, int] | None = None
+        """Session that was adopted, and number of the server's run."""
+
+    def hello(self, payload: bytes, *, now_ns: int) -> bytes:
+        self._life.note_sent(payload)
+        return self._link.hello(payload, now_ns=now_ns)
+
+    def seal(self, payload: bytes) -> bytes:
+        self._life.note_sent(payload)
+        return self._link.seal(payload)
+
+    def open(self, datagram: bytes, *, now_ns: int) -> bytes | None:
+        """Open a message as `ClientLink` does; raises Violation if no server has sent it."""
+        payload = self._link.open(datagram, now_ns=now_ns)
+        if payload is None:
+            return None
+        kind = kind_of(split(payload)[1])
+        session, life = _session(payload), self._life.server_of(payload, kind)
+        if kind == WELCOME:
+            self._welcome = (session, life)
+        elif self.session is not None and session == self.session[0]:
+            self._life.hear((session, life, payload) if kind in (HORIZON, TRAJECTORY) else None)
+        return payload
+
+    def outbox(self) -> list[bytes]:
+        return self._link.outbox()
+
+    def adopt(self, *, now_ns: int) -> None:
+        self._link.adopt(now_ns=now_ns)
+        self._adopted_ns = now_ns
+        assert self._welcome is not None
+        # After a restart of the server, the link must be good for a second again.
+        if self.session is None or self._welcome[1] != self.session[1]:
+            self._life.lose()
+        self.session = self._welcome
+        self._life.hear()
+
+    def wants_hello(self, now_ns: int) -> bool:
+        is_old = self.session is not None and now_ns - self._adopted_ns >= self._life.rekey_ns
+        return is_old or self._link.wants_hello(now_ns)
+
+
 class WatchedLife(Recorder):
-    """Wrapper around the real link of one run of a client, which also checks its record.
+    """Check of one run of a client: of its links, and of its record.
 
     Args:
         number: number of this run.
@@ -153,7 +205,7 @@ class WatchedLife(Recorder):
 
     def __init__(  # noqa: PLR0915 - a docstring counts for a statement
         self,
-        link: ClientLink,
+        links: Sequence[ClientLink],
         scenario: Scenario,
         *,
         vehicle: int,
@@ -166,13 +218,16 @@ class WatchedLife(Recorder):
         drifted_m: float,
     ) -> None:
         super().__init__(client_columns(scenario.model.axes), io.BytesIO())
-        self.secure, self.hello_ns = link.secure, link.hello_ns
+        self.links = [WatchedLink(self, each) for each in links]
+        """Links to the server, and to the standby server if there is one."""
         self.vehicle, self._number = vehicle, number
-        self._link, self._up, self._down = link, up, down
-        self._clock, self._overdue, self._rekey_ns = clock, overdue, rekey_ns
+        self._up, self._down = up, down
+        self._clock, self._overdue, self.rekey_ns = clock, overdue, rekey_ns
         self._terms, self._dt_ns = scenario.terms(), scenario.dt_ns
         self._timeout = seconds_to_ns(scenario.link.timeout_s) // self._dt_ns
-        """Link timeout [steps]."""
+        """Silence of all servers after which the vehicle brakes [steps]."""
+        if len(links) > 1:  # the standby gets a time-out to answer, after half of one
+            self._timeout = self._timeout * 3 // 2 + 2
         self._change_max = scenario.vehicle.slew_mps2 * self._terms.dt_s
         """Largest change of the input from step to step [m/s]."""
         self._regulator = regulator(scenario)
@@ -180,12 +235,6 @@ class WatchedLife(Recorder):
         self._extent = _extent(scenario)
         self._reach_m = _reach_m(scenario.link.age_max_s, self._terms)
 
-        self._adopted_ns = 0
-        """Time at which the newest keys were adopted [ns; vehicle's clock]."""
-        self._welcome: tuple[int, int] | None = None
-        """Session of the newest WELCOME that was opened, and number of the server's run."""
-        self._session: tuple[int, int] | None = None
-        """Session that was adopted, and number of the server's run."""
         self._heard = False
         """Whether a packet of the session has arrived since the last step."""
         self._silent = 0
@@ -222,53 +271,28 @@ class WatchedLife(Recorder):
         self.row_ns = -1
         """Virtual time of the newest step [ns], or -1."""
 
-    # -- the link ----------------------------------------------------------------------------
+    # -- the links ---------------------------------------------------------------------------
 
-    def hello(self, payload: bytes, *, now_ns: int) -> bytes:
+    def note_sent(self, payload: bytes) -> None:
         self._down.seal(self.vehicle, payload, self._number)
-        return self._link.hello(payload, now_ns=now_ns)
 
-    def seal(self, payload: bytes) -> bytes:
-        self._down.seal(self.vehicle, payload, self._number)
-        return self._link.seal(payload)
-
-    def open(self, datagram: bytes, *, now_ns: int) -> bytes | None:
-        """Open a message as `ClientLink` does; raises Violation if the server has not sent it."""
-        payload = self._link.open(datagram, now_ns=now_ns)
-        if payload is None:
-            return None
-        kind = kind_of(split(payload)[1])
+    def server_of(self, payload: bytes, kind: int | None) -> int:
+        """Number of the server's run that has sent a message; raises Violation if there is none."""
         self._up.believe(self.vehicle, payload, kind)
-        life, session = self._up.life(self.vehicle, payload), _session(payload)
-        if kind == WELCOME:
-            self._welcome = (session, life)
-        elif self._session is not None and session == self._session[0]:
-            self._hear()
-            if kind in (HORIZON, TRAJECTORY):
-                self._horizons.append((session, life, payload))
-        return payload
+        return self._up.life(self.vehicle, payload)
 
-    def outbox(self) -> list[bytes]:
-        return self._link.outbox()
-
-    def adopt(self, *, now_ns: int) -> None:
-        self._link.adopt(now_ns=now_ns)
-        self._adopted_ns = now_ns
-        assert self._welcome is not None
-        # After a restart of the server, the link must be good for a second again.
-        if self._session is None or self._welcome[1] != self._session[1]:
-            self._good_ns = None
-        self._session = self._welcome
-        self._hear()
-
-    def wants_hello(self, now_ns: int) -> bool:
-        is_old = self._session is not None and now_ns - self._adopted_ns >= self._rekey_ns
-        return is_old or self._link.wants_hello(now_ns)
-
-    def _hear(self) -> None:
+    def hear(self, horizon: tuple[int, int, bytes] | None = None) -> None:
+        """Note a packet of a session, and its session, run and message if it has a horizon."""
         self._heard = True
         if self._good_ns is None:
             self._good_ns = self._clock()
+        if horizon is not None:
+            self._horizons.append(horizon)
+
+    def lose(self) -> None:
+        """Note that a server has restarted: the link is not good. One of two says little."""
+        if len(self.links) == 1:
+            self._good_ns = None
 
     # -- the record --------------------------------------------------------------------------
 
@@ -352,8 +376,9 @@ class WatchedLife(Recorder):
                 since = "never" if good_ns is None else f"{(now_ns - good_ns) / SECOND_NS:.3f} s"
                 raise Violation("good link", f"a horizon is flown, the link is good since {since}")
         session, life, horizon = self._in_force
-        if (session, life) != self._session:
-            origin = f"of run {life} and session {session}, not {self._session}"
+        sessions = [each.session for each in self.links]
+        if (session, life) not in sessions:
+            origin = f"of run {life} and session {session}, not {sessions}"
             raise Violation("foreign", f"a horizon {origin}")
         if self._observed not in self._times_ns or self._observed > step:
             raise Violation("observed", f"a horizon from an observation of step {self._observed}")

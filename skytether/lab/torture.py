@@ -44,6 +44,7 @@ from skytether.server.schemes.horizons import HorizonScheme
 from skytether.server.sessions import WELCOME_NS
 from skytether.shared.base.chance import stream
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS, seconds_to_ns
+from skytether.shared.core.endpoint import Address
 from skytether.shared.core.events import Event, ModeChanged
 from skytether.shared.core.steady import JUMP_NS, Steady
 from skytether.shared.law.model import Array, Flags
@@ -53,7 +54,7 @@ from skytether.shared.scenario.schema import Scenario
 from skytether.shared.wire.channel import LIFE_NS
 from skytether.shared.wire.keys import Keyring
 from skytether.shared.wire.protocol import Mode
-from skytether.sim.flight import make_keys
+from skytether.sim.flight import STANDBY, make_keys
 from skytether.sim.world import Clock, World
 
 CLOCK_NS = 10**7 * SECOND_NS
@@ -71,6 +72,11 @@ REKEY_NS = 4 * SECOND_NS
 TWO_PATHS = 0.3
 """Share of the trials in which vehicles have a second path."""
 SECOND_PATH = ("second netem", 0)
+STANDBYS = 0.3
+"""Share of the trials with a standby server."""
+STANDBY_PATH = ("standby netem", 0)
+CHANGES = 3
+"""Number of time-outs within which another server comes to lead."""
 STEP_FOUND_NS = (BUCKETS + RECENT) * BUCKET_NS
 """Time after a clock step by which the server holds no older clock measurements [ns]."""
 FLOWS = 128
@@ -169,7 +175,9 @@ def _follow_trajectories(table: dict[str, Any], rng: np.random.Generator) -> Non
 def short_trial(seed: int) -> Trial:
     rng = stream(seed, "torture", "faults")
     two_paths = stream(seed, "torture", "paths").random() < TWO_PATHS
-    return Trial(seed, schedule(rng, seconds_to_ns(rng.uniform(*SHORT_S))), two_paths)
+    standby = stream(seed, "torture", "standby").random() < STANDBYS
+    faults = schedule(rng, seconds_to_ns(rng.uniform(*SHORT_S)))
+    return Trial(seed, faults, two_paths, standby)
 
 
 def long_trial(seed: int, hours: float = 1.0) -> Trial:
@@ -237,6 +245,8 @@ class Torture:
         """Additional recovery time after a small forward step of a clock [ns], which looks like a
         freeze until the server has newer measurements.
         """
+        if trial.standby:
+            self._step_ns += CHANGES * seconds_to_ns(self.scenario.link.timeout_s)
         self._recovery_ns = recovery_ns(self.scenario, restarts=restarts) + self._step_ns
         """Time within which a vehicle must fly again after the last fault [ns]."""
         self.counts: Counter[str] = Counter()
@@ -250,8 +260,9 @@ class Torture:
         self.world.add(OBSERVER, self.observer)
         self.world.add(NETEM[0], self._new_netem(), clock=Clock(CLOCK_NS))
         if trial.two_paths:
-            second = msgspec.structs.replace(self.scenario, seed=trial.seed + 2**31)
-            self.world.add(SECOND_PATH[0], Proxy(second, server=SERVER, flows=FLOWS))
+            self._add_netem(SECOND_PATH, SERVER, trial.seed + 2**31)
+        if trial.standby:
+            self._add_netem(STANDBY_PATH, STANDBY, trial.seed + 2**30)
         self.vehicles: list[TorturedVehicle] = []
         for number, name in enumerate(names, start=1):
             weather = Weather(self.scenario, stream(trial.seed, "wind", number))
@@ -261,6 +272,9 @@ class Torture:
             start_ns = int(self._chance.integers(self.scenario.dt_ns))
             self.world.add(name, client, clock=Clock(CLOCK_NS), start_ns=start_ns)
         self.world.add(SERVER[0], self._new_server(), clock=Clock(CLOCK_NS), compute_ns=COMPUTE_NS)
+        if trial.standby:
+            standby = Steady(self._made_server(self._keyring)[0])
+            self.world.add(STANDBY[0], standby, clock=Clock(CLOCK_NS), compute_ns=COMPUTE_NS)
         self._down_hosts: Counter[str] = Counter()
         """Number of active faults that keep each host down."""
         for fault in trial.faults:
@@ -290,26 +304,35 @@ class Torture:
             counts=dict(self.counts),
         )
 
+    def _add_netem(self, at: Address, server: Address, seed: int) -> None:
+        """Add a network without a saboteur."""
+        scenario = msgspec.structs.replace(self.scenario, seed=seed)
+        self.world.add(at[0], Proxy(scenario, server=server, flows=FLOWS))
+
     # -- lives -------------------------------------------------------------------------------
 
     def _boot_id(self) -> int:
         return int(self._chance.integers(2**63)) | 2**62
 
     def _new_server(self) -> Steady:
-        self._servers += 1
-        entropy = self._chance.bytes
         wrong = make_keys(self.trial.seed + 1, len(self._keyring))
         keyring = wrong if self._wrong_keys else self._keyring
+        self._server, self._gate = self._made_server(keyring)
+        return Steady(self._server)
+
+    def _made_server(self, keyring: Keyring) -> tuple[Server, Gatekeeper]:
+        self._servers += 1
+        entropy = self._chance.bytes
         gate = server_secure.SecureGate(keyring, entropy=entropy)
-        self._gate = Gatekeeper(gate, self._servers, self._up, self._down)
-        self._server = Server(
+        watched = Gatekeeper(gate, self._servers, self._up, self._down)
+        server = Server(
             self.scenario,
             boot_id=self._boot_id(),
             entropy=entropy,
-            gate=self._gate,
+            gate=watched,
             capacity=len(self._keyring),
         )
-        return Steady(self._server)
+        return server, watched
 
     def _new_netem(self) -> Steady:
         scenario = msgspec.structs.replace(self.scenario, seed=self.trial.seed + self._netems)
@@ -321,8 +344,12 @@ class Torture:
         self, vehicle: int, number: int, plant: FirstOrderPlant, drifted_m: float = 0.0
     ) -> tuple[WatchedLife, Steady]:
         key, world = self._keyring.of(vehicle), self.world
+        links = [
+            client_secure.SecureLink(key, entropy=self._chance.bytes)
+            for _ in range(1 + self.trial.standby)
+        ]
         life = WatchedLife(
-            client_secure.SecureLink(key, entropy=self._chance.bytes),
+            links,
             self.scenario,
             vehicle=vehicle,
             number=number,
@@ -340,7 +367,9 @@ class Torture:
             paths=(SABOTEUR, SECOND_PATH) if self.trial.two_paths else (SABOTEUR,),
             vehicle=vehicle,
             boot_id=self._boot_id(),
-            link=life,
+            link=life.links[0],
+            standby=[STANDBY_PATH] if self.trial.standby else [],
+            standby_link=life.links[-1],
             recorder=life,
         )
         life.disturbance = lambda: tuple(client.disturbance.tolist())
@@ -350,6 +379,8 @@ class Torture:
         self.counts[f"lives of {name.partition(' ')[0]}"] += 1
         if name == SERVER[0]:
             self.world.restart(name, self._new_server())
+        elif name == STANDBY[0]:
+            self.world.restart(name, Steady(self._made_server(self._keyring)[0]))
         elif name == NETEM[0]:
             self.world.restart(name, self._new_netem())
         else:
@@ -396,8 +427,10 @@ class Torture:
 
         world.at(fault.start_ns, begin)
 
-    def hosts(self, where: str) -> list[str]:
-        return [each.name for each in self.vehicles] if where == "client" else [where]
+    def hosts(self, fault: ScheduledFault) -> list[str]:
+        if fault.where == SERVER[0] and self.trial.standby and fault.start_ns % 2:
+            return [STANDBY[0]]
+        return [each.name for each in self.vehicles] if fault.where == "client" else [fault.where]
 
     def set_down(self, name: str, *, down: bool) -> None:
         """Take a host down, or start its process again once no fault keeps it down."""
@@ -481,7 +514,7 @@ def act(  # noqa: PLR0912 - a branch for each kind of fault
     torture: Torture, fault: ScheduledFault, *, begins: bool
 ) -> None:
     world, dt_ns = torture.world, torture.scenario.dt_ns
-    names = torture.hosts(fault.where)
+    names = torture.hosts(fault)
     match fault.kind:
         case FaultKind.STEP if begins:
             for name in names:
