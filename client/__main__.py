@@ -25,6 +25,7 @@ from skytether.client.link import ClientLink, PlainLink
 from skytether.client.memory import SavedState, recall
 from skytether.client.vehicle import Vehicle, VehicleMemory
 from skytether.shared.core.aboard import ParametersUnsafe
+from skytether.shared.core.endpoint import PATH_SOCKETS, STANDBY_SOCKETS
 from skytether.shared.core.events import (
     Event,
     NoSession,
@@ -65,6 +66,16 @@ class ClientOptions(ProcessOptions):
             "any. Of several paths, any may be missing for a time.",
         ),
     ] = ()
+    standby: Annotated[
+        tuple[str, ...],
+        Argument(
+            metavar="HOST:PORT",
+            append=True,
+            help="A second server, which leads the vehicle when the first is silent, or netem in "
+            "front of it. LOCAL=HOST:PORT as in --path; repeated, it gives each path to that "
+            "server. It may be missing for a time, also at the start.",
+        ),
+    ] = ()
     number: Annotated[int, Argument(name="id")] = 1
     """Number of this vehicle (0 to 65535), unique among the vehicles of a server."""
     vehicles: Annotated[int, Argument(metavar="N")] = 1
@@ -96,7 +107,7 @@ def fly(argv: Sequence[str]) -> None:
     another scenario, is full, or has another client with this number.
     """
     options = command.parse(ClientOptions(), argv, "skytether client", fly.__doc__)
-    paths = _paths(options)
+    paths, standby = _paths(options), _standby(options)
     command.check_count("--vehicles", options.vehicles, 65_536)
     numbers = range(options.number, options.number + options.vehicles)
     if not (numbers[0] >= 0 and numbers[-1] < 2**16):
@@ -143,7 +154,9 @@ def fly(argv: Sequence[str]) -> None:
             raise CommandError(f"--set-parameters: {kind}", command.CONFIGURATION)
         peers = [path.peer for path in paths]
         several: dict[str, Any] = {"paths": peers} if len(peers) > 1 else {}
-        servers = " and ".join(dict.fromkeys(address_text(*peer) for peer in peers))
+        if standby:
+            standby_link = link(numbers[0])
+            several |= {"standby": [each.peer for each in standby], "standby_link": standby_link}
         clients = [
             Client(
                 scenario,
@@ -165,11 +178,10 @@ def fly(argv: Sequence[str]) -> None:
         running.drive(
             Steady(endpoint),
             bind=None,
-            paths=paths,
+            paths=dict(zip(PATH_SOCKETS, paths, strict=False))
+            | dict(zip(STANDBY_SOCKETS, standby, strict=False)),
             waiting_for=(
-                f"its autopilot at {scenario.vehicle.address}"
-                if line
-                else f"the server at {servers}"
+                f"its autopilot at {scenario.vehicle.address}" if line else _servers(paths, standby)
             ),
             insecure=options.insecure,
             line=line,
@@ -199,6 +211,30 @@ def _paths(options: ClientOptions) -> Sequence[NetworkPath]:
     if options.vehicles > 1:
         raise CommandError(f"--vehicles: got {options.vehicles} with --path, expected 1", 2)
     return command.paths("--path", options.path)
+
+
+def _standby(options: ClientOptions) -> Sequence[NetworkPath]:
+    if not options.standby:
+        return []
+    if options.vehicles > 1:
+        raise CommandError(f"--vehicles: got {options.vehicles} with --standby, expected 1", 2)
+    standby = command.paths("--standby", options.standby, needs_local=False)
+    leading = [path.peer for path in _paths(options)]
+    for path in standby:
+        if path.peer in leading:
+            at = address_text(*path.peer)
+            raise CommandError(f"--standby: got {at}, expected another server than the first", 2)
+    return standby
+
+
+def _servers(paths: Sequence[NetworkPath], standby: Sequence[NetworkPath]) -> str:
+    """Servers that the client waits for, for the operator."""
+
+    def addresses(paths: Sequence[NetworkPath]) -> str:
+        return " and ".join(dict.fromkeys(address_text(*path.peer) for path in paths))
+
+    first = f"the server at {addresses(paths)}"
+    return f"{first}, or the standby server at {addresses(standby)}" if standby else first
 
 
 @contextmanager

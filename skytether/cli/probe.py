@@ -178,7 +178,7 @@ def _probe(options: ProbeOptions, listener: Address) -> None:
         size=options.bytes,
     )
     try:
-        shell = driver.Shell(prober, None, paths=[NetworkPath("", listener)])
+        shell = driver.Shell(prober, None, paths={0: NetworkPath("", listener)})
     except AddressError as error:
         raise CommandError(str(error)) from None
     with terminal.progress(f"probing {options.target}", options.duration) as bar:
