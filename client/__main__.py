@@ -48,6 +48,9 @@ from skytether.shell.memory import MemoryFile, folder
 from skytether.shell.paths import NetworkPath
 from skytether.shell.process import ProcessOptions
 
+NONE = "none"
+"""Value of --standby for no standby server."""
+
 
 @dataclass(frozen=True)
 class ClientOptions(ProcessOptions):
@@ -73,7 +76,7 @@ class ClientOptions(ProcessOptions):
             append=True,
             help="A second server, which leads the vehicle when the first is silent, or netem in "
             "front of it. LOCAL=HOST:PORT as in --path; repeated, it gives each path to that "
-            "server. It may be missing for a time, also at the start.",
+            "server. It may be missing for a time, also at the start. none: no standby server.",
         ),
     ] = ()
     number: Annotated[int, Argument(name="id")] = 1
@@ -214,7 +217,7 @@ def _paths(options: ClientOptions) -> Sequence[NetworkPath]:
 
 
 def _standby(options: ClientOptions) -> Sequence[NetworkPath]:
-    if not options.standby:
+    if options.standby in ((), (NONE,)):
         return []
     if options.vehicles > 1:
         raise CommandError(f"--vehicles: got {options.vehicles} with --standby, expected 1", 2)
