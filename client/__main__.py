@@ -25,6 +25,7 @@ from skytether.client.link import ClientLink, PlainLink
 from skytether.client.memory import SavedState, recall
 from skytether.client.vehicle import Vehicle, VehicleMemory
 from skytether.shared.core.aboard import ParametersUnsafe
+from skytether.shared.core.endpoint import PATH_SOCKETS, STANDBY_SOCKETS
 from skytether.shared.core.events import (
     Event,
     NoSession,
@@ -47,6 +48,9 @@ from skytether.shell.memory import MemoryFile, folder
 from skytether.shell.paths import NetworkPath
 from skytether.shell.process import ProcessOptions
 
+NONE = "none"
+"""Value of --standby for no standby server."""
+
 
 @dataclass(frozen=True)
 class ClientOptions(ProcessOptions):
@@ -63,6 +67,16 @@ class ClientOptions(ProcessOptions):
             "at once. LOCAL is an interface, as in wwan0=ground:47000, or an address of this "
             "machine, as in 192.0.2.7=ground:47000 or [2001:db8::7]=ground:47000, or empty for "
             "any. Of several paths, any may be missing for a time.",
+        ),
+    ] = ()
+    standby: Annotated[
+        tuple[str, ...],
+        Argument(
+            metavar="HOST:PORT",
+            append=True,
+            help="A second server, which leads the vehicle when the first is silent, or netem in "
+            "front of it. LOCAL=HOST:PORT as in --path; repeated, it gives each path to that "
+            "server. It may be missing for a time, also at the start. none: no standby server.",
         ),
     ] = ()
     number: Annotated[int, Argument(name="id")] = 1
@@ -96,7 +110,7 @@ def fly(argv: Sequence[str]) -> None:
     another scenario, is full, or has another client with this number.
     """
     options = command.parse(ClientOptions(), argv, "skytether client", fly.__doc__)
-    paths = _paths(options)
+    paths, standby = _paths(options), _standby(options)
     command.check_count("--vehicles", options.vehicles, 65_536)
     numbers = range(options.number, options.number + options.vehicles)
     if not (numbers[0] >= 0 and numbers[-1] < 2**16):
@@ -143,7 +157,15 @@ def fly(argv: Sequence[str]) -> None:
             raise CommandError(f"--set-parameters: {kind}", command.CONFIGURATION)
         peers = [path.peer for path in paths]
         several: dict[str, Any] = {"paths": peers} if len(peers) > 1 else {}
-        servers = " and ".join(dict.fromkeys(address_text(*peer) for peer in peers))
+        prices = [each.price for each in scenario.paths]
+        if len(prices) > 1 and len(prices) != len(peers):
+            message = f"--path: got {len(peers)}, expected {len(prices)}, as many as network.paths"
+            raise CommandError(message, command.CONFIGURATION)
+        if len(prices) == len(peers) > 1:
+            several["prices"] = prices
+        if standby:
+            standby_link = link(numbers[0])
+            several |= {"standby": [each.peer for each in standby], "standby_link": standby_link}
         clients = [
             Client(
                 scenario,
@@ -165,11 +187,10 @@ def fly(argv: Sequence[str]) -> None:
         running.drive(
             Steady(endpoint),
             bind=None,
-            paths=paths,
+            paths=dict(zip(PATH_SOCKETS, paths, strict=False))
+            | dict(zip(STANDBY_SOCKETS, standby, strict=False)),
             waiting_for=(
-                f"its autopilot at {scenario.vehicle.address}"
-                if line
-                else f"the server at {servers}"
+                f"its autopilot at {scenario.vehicle.address}" if line else _servers(paths, standby)
             ),
             insecure=options.insecure,
             line=line,
@@ -199,6 +220,30 @@ def _paths(options: ClientOptions) -> Sequence[NetworkPath]:
     if options.vehicles > 1:
         raise CommandError(f"--vehicles: got {options.vehicles} with --path, expected 1", 2)
     return command.paths("--path", options.path)
+
+
+def _standby(options: ClientOptions) -> Sequence[NetworkPath]:
+    if options.standby in ((), (NONE,)):
+        return []
+    if options.vehicles > 1:
+        raise CommandError(f"--vehicles: got {options.vehicles} with --standby, expected 1", 2)
+    standby = command.paths("--standby", options.standby, needs_local=False)
+    leading = [path.peer for path in _paths(options)]
+    for path in standby:
+        if path.peer in leading:
+            at = address_text(*path.peer)
+            raise CommandError(f"--standby: got {at}, expected another server than the first", 2)
+    return standby
+
+
+def _servers(paths: Sequence[NetworkPath], standby: Sequence[NetworkPath]) -> str:
+    """Servers that the client waits for, for the operator."""
+
+    def addresses(paths: Sequence[NetworkPath]) -> str:
+        return " and ".join(dict.fromkeys(address_text(*path.peer) for path in paths))
+
+    first = f"the server at {addresses(paths)}"
+    return f"{first}, or the standby server at {addresses(standby)}" if standby else first
 
 
 @contextmanager

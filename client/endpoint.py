@@ -63,6 +63,11 @@ HELD_AGAIN_NS = 5 * SECOND_NS
 AFTER_LEAP = "vehicle.after_leap"
 LEAP = keys_of(InFlight.LEAP)
 """Key with which an operator chooses the frame to use after a leap of the position."""
+LEADER_KEY = "link.leader"
+LEADER = keys_of(InFlight.LEADER)
+"""Key with which an operator lets another server lead."""
+SERVERS = ("server", "standby")
+"""Values of that key, by the number of the server."""
 TIME_NS, TIME_ERROR_MAX_US = 2 * SECOND_NS, 2**32 - 1
 """Interval between two reports of the time of day [ns], and the largest error that fits in one
 [µs]."""
@@ -123,11 +128,14 @@ class Client(Endpoint):
         self._flies, self._port = flies, flies.port
         if before is not None:
             flies.recall(before.frame)
-        self.changeable = flies.changeable | ARMED | LEAP
-        if scenario.vehicle.after_leap != "ask":
-            setting = scenario.vehicle.after_leap
-            expected = "expected 'ask': it is chosen in flight"
-            raise ConfigError(f"{AFTER_LEAP}: got {setting!r}, {expected}")
+        self.changeable = flies.changeable | ARMED | LEAP | LEADER
+        for key, setting, at_start in (
+            (AFTER_LEAP, scenario.vehicle.after_leap, "ask"),
+            (LEADER_KEY, scenario.link.leader, SERVERS[0]),
+        ):
+            if setting != at_start:
+                expected = f"expected {at_start!r}: it is chosen in flight"
+                raise ConfigError(f"{key}: got {setting!r}, {expected}")
         self._failsafe = Failsafe(
             HOLD if terms.exhausted == "hold" else TABLE,
             armed=scenario.armed,
@@ -141,6 +149,10 @@ class Client(Endpoint):
         self._leadership = Leadership(len(servers), number, self._timeout_ns)
         self._led_by, self._began_ns = self._leadership.number, NEVER_NS
         """Number of the leadership last reported, and time of the first wake."""
+        self._followed_ns = NEVER_NS
+        """When it was last looked after who leads."""
+        self._named_ns = NEVER_NS
+        """When a server was named as leader that is not silent, but speaks rarely."""
         self._doubted_ns = NEVER_NS
         """When the leader that is, or was last, doubted had been heard last."""
         self._sessions: list[ServerSession] = []
@@ -390,12 +402,14 @@ class Client(Endpoint):
         """Let another server lead if the leader is silent, and tell all servers who leads."""
         if len(self._sessions) == 1:
             return
-        lead = self._leadership
+        lead, self._followed_ns = self._leadership, now_ns
         if self._began_ns == NEVER_NS:
             self._began_ns = now_ns
         heard_ns = [each.heard_ns or self._began_ns for each in self._sessions]
         if self._pilot.next_ns is None:
             heard_ns[lead.leader] += GROUND_NS
+        # A server that did not lead speaks rarely, so its silence counts from when it was named.
+        heard_ns[lead.leader] = max(heard_ns[lead.leader], self._named_ns)
         successor = lead.successor(heard_ns, now_ns)
         if successor is not None:
             lead.hand_over(successor)
@@ -452,6 +466,7 @@ class Client(Endpoint):
         if cause not in DEPARTURES or not ready:
             return False
         self._leadership.hand_over(ready[0])
+        self._named_ns = now_ns
         self._report_leader()
         if cause in CLOSING:
             session.close()
@@ -477,8 +492,10 @@ class Client(Endpoint):
 
     def objection(self, scenario: Scenario, keys: frozenset[str]) -> str:
         """After a leap, arming requires the operator to choose the frame, which says where the
-        vehicle is.
+        vehicle is. A server that is not heard cannot be made the leader.
         """
+        if keys & LEADER and (objection := self._objection_to_leader(scenario.link.leader)):
+            return objection
         leap_m, choice = self._pilot.leap_m, scenario.vehicle.after_leap
         if leap_m is None and keys & LEAP and choice != "ask":
             return f"{AFTER_LEAP}: got {choice!r}, expected 'ask' before its position has leapt"
@@ -489,6 +506,16 @@ class Client(Endpoint):
             expected = f"expected {AFTER_LEAP} = 'old', 'new' or 'stay' with it"
             return f"armed: got true after its position has leapt by {metres(leap_m)}, {expected}"
         return self._flies.objection(scenario, keys)
+
+    def _objection_to_leader(self, named: str) -> str:
+        server = SERVERS.index(named)
+        if server >= len(self._sessions):
+            return f"{LEADER_KEY}: got {named!r}, expected 'server' without a standby server"
+        session = self._sessions[server]
+        if not session.leads and session.is_lost(self._followed_ns):
+            at = address_text(*session.address)
+            return f"{LEADER_KEY}: got {named!r}, but the server at {at} is not heard"
+        return ""
 
     def learn_time(self, utc_ns: int, error_ns: int, *, now_ns: int) -> None:
         self._time = TimeOfDay(utc_ns - now_ns, error_ns, now_ns)
@@ -504,7 +531,7 @@ class Client(Endpoint):
         error_us = min(-(-error_ns // MICROSECOND_NS) + 1, TIME_ERROR_MAX_US)
         session.tell_time(self._pilot.flown, epoch_us, error_us, now_ns=now_ns)
 
-    def change(self, scenario: Scenario, keys: frozenset[str], *, now_ns: int) -> None:  # noqa: ARG002
+    def change(self, scenario: Scenario, keys: frozenset[str], *, now_ns: int) -> None:
         self._failsafe.armed = scenario.armed
         if keys & ARMED and scenario.armed:
             self._flies.arm()
@@ -514,6 +541,10 @@ class Client(Endpoint):
                     self._pilot.decide(keeps_frame=frame == "old")
                 case choice:
                     self._failsafe.stays = choice == "stay"
+        if keys & LEADER:
+            self._leadership.hand_over(SERVERS.index(scenario.link.leader))
+            self._named_ns = now_ns
+            self._report_leader()
         if keys & self._flies.changeable:
             self._flies.change(scenario)
 

@@ -46,7 +46,8 @@ class NetemOptions(ProcessOptions):
     to_server: str | None = None
     """Impairments of packets from clients to the server; the key network.downlink."""
     path: Annotated[int, Argument(metavar="N")] = 1
-    """Path of the scenario to emulate, from 1, see network.paths."""
+    """Path of the scenario to emulate, from 1, see network.paths; one more than there are is that
+    to a standby server, impaired like the first."""
     flows: Annotated[int | None, Argument(metavar="N")] = None
     """Largest number of clients at once, each of which takes a socket; by default 512, or as many
     as the system allows."""
@@ -91,7 +92,7 @@ def _with_directions(options: NetemOptions) -> NetemOptions:
         CommandError: the scenario has no such path.
         ConfigError: the network is invalid.
     """
-    command.check_count("--path", options.path, len(options.config.paths))
+    command.check_count("--path", options.path, len(options.config.paths) + 1)
     table = reading.to_table(options.config.on_path(options.path - 1))
     directions = {"uplink": options.to_client, "downlink": options.to_server}
     table["network"] |= {key: text for key, text in directions.items() if text is not None}

@@ -25,7 +25,7 @@ from skytether.shared.scenario.owners import InFlight
 from skytether.shared.scenario.schema import Scenario
 
 REQUEST_BYTES_MAX = 4096
-ONCE = keys_of(InFlight.LEAP)
+ONCE = keys_of(InFlight.LEAP, InFlight.LEADER)
 """Keys of one-time decisions, which no later run of the process repeats."""
 KEY_SHOWN_MAX = 60
 """Largest number of characters of an unknown key repeated in a message."""

@@ -38,6 +38,8 @@ class InFlight(Enum):
     """Origin of the scenario's frame, for a vehicle in the air without one."""
     LEAP = auto()
     """Operator's choice after a leap of the position."""
+    LEADER = auto()
+    """Operator's choice of the server that leads."""
     WIND = auto()
     IMPAIRMENT = auto()
     ZONES = auto()

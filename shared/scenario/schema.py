@@ -405,6 +405,9 @@ class LinkConfig(Section, frozen=True):
     spread: OfEach[Literal["auto", "best", "all"]] = "auto"
     """Paths that a message takes, of several: auto: those with the least expected cost, see
     docs/protocol.md; best: the best one; all: every path."""
+    leader: Annotated[Literal["server", "standby"], Key(Owner.VEHICLE, InFlight.LEADER)] = "server"
+    """Server that an operator lets lead, chosen in flight only; it leads until it is silent, see
+    docs/operating.md."""
     connect_s: OfVehicle[Interval] = 120.0
     """Longest wait of the vehicle for its first session [s]; a new server compiles for up to a
     minute."""

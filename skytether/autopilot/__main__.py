@@ -89,7 +89,7 @@ def pilot(argv: Sequence[str]) -> None:
             faults=[faults.parse(each) for each in options.fault],
             recorder=running.recorder,
         )
-        paths = [NetworkPath("", to)] if to and not bind else []
+        paths = {0: NetworkPath("", to)} if to and not bind else {}
         running.drive(
             endpoint, bind=bind, paths=paths, peers=peers, waiting_for="MAVLink", ready=_ready
         )

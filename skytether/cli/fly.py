@@ -22,6 +22,7 @@ from skytether.shared.core.events import (
     ChangeRefused,
     Event,
     Fault,
+    LeaderChanged,
     ModeChanged,
     PlanningStopped,
     RecordIncomplete,
@@ -31,7 +32,7 @@ from skytether.shared.scenario import reading
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Record
 from skytether.shared.telemetry.summary import Summary, summarise
-from skytether.shared.wire.protocol import Mode
+from skytether.shared.wire.protocol import Idle, Mode
 from skytether.shell import command, temporary, terminal
 from skytether.shell.argument import Argument
 from skytether.shell.command import CommandError, ScenarioOptions
@@ -40,7 +41,10 @@ from skytether.view.browser.access import HOST_PORT
 
 UNSEEN = Fault, ReferenceTooFast
 """Events of a flight in virtual time that are printed after it."""
-PRINTED = ModeChanged, PlanningStopped, RecordIncomplete, Changed, ChangeRefused, *UNSEEN
+PRINTED = (
+    *(ModeChanged, LeaderChanged, PlanningStopped, RecordIncomplete, Changed, ChangeRefused),
+    *UNSEEN,
+)
 """Events that are printed during the flight."""
 POLL_S = 0.2
 """Interval at which Ctrl-C is checked while the page stays open."""
@@ -53,6 +57,10 @@ class FlyOptions(ScenarioOptions):
     secure: bool = False
     """Encrypt and authenticate the link, with keys made for this flight. Without --secure, packets
     on loopback are plaintext."""
+    standby: bool = False
+    """Fly with a standby server, which leads the vehicle when the first is silent: processes
+    `server 2` and one more netem, that to it. The flight goes on if a server's process ends.
+    """
     virtual: bool = False
     """Fly in virtual time: the same code in one process, reproducible, many times faster."""
     set_parameters: bool = False
@@ -60,8 +68,9 @@ class FlyOptions(ScenarioOptions):
     --set-parameters, unsafe values are only reported, and the vehicle is not armed.
     """
     control: Path | None = None
-    """Folder for sockets called server, netem and client, through which keys change in flight, see
-    `skytether set`; created if necessary. Not in virtual time.
+    """Folder for sockets called server, netem and client (of --standby also `server 2`, `netem 2`),
+    through which keys change in flight, see `skytether set`; created if necessary. Not in virtual
+    time.
     """
     page: str = os.environ.get(page_process.VARIABLE, HOST_PORT)
     """HOST:PORT of the page that shows the flight and changes it; if the port is taken, the next
@@ -197,7 +206,13 @@ def _virtually(
 ) -> tuple[Record, str | None]:
     """Fly in virtual time; returns the flight, and the fault of its recording, if any."""
     scenario, secure = options.config, options.secure
-    flown = flight.fly(scenario, secure=secure, on_second=on_second, stopped=interrupted)
+    flown = flight.fly(
+        scenario,
+        secure=secure,
+        standby=options.standby,
+        on_second=on_second,
+        stopped=interrupted,
+    )
     for line in flown.events:
         if isinstance(line.event, UNSEEN):
             _tell(line.event)
@@ -224,7 +239,7 @@ def _really(
             from skytether.cli import recorder
 
             sockets = sockets or stack.enter_context(temporary.folder())
-            feeds = processes.feeds_in(sockets, scenario)
+            feeds = processes.feeds_in(sockets, scenario, standby=options.standby)
             live = recorder.Live(options.record, feeds, scenario, name, secure=secure, tell=_tell)
             stack.callback(live.finish)
         run = partial(
@@ -235,6 +250,7 @@ def _really(
             secure=secure,
             set_parameters=options.set_parameters,
             sockets=sockets,
+            standby=options.standby,
         )
         flown = processes.flown(scenario, run)
         if live is None:
@@ -256,5 +272,6 @@ def _missing(scenario: Scenario, flown: Record) -> str | None:
 def _tell(event: Event) -> None:
     """Print events of the link and of the record above the progress bar."""
     begins = isinstance(event, ModeChanged) and event.before in ON_THE_GROUND
-    if isinstance(event, PRINTED) and not begins:
+    stands_by = isinstance(event, PlanningStopped) and event.why == str(Idle.STANDBY)
+    if isinstance(event, PRINTED) and not (begins or stands_by):
         page_process.say(event)

@@ -202,7 +202,7 @@ def _probe(options: ProbeOptions, names: Sequence[str], paths: Sequence[NetworkP
         probers.append(prober)
     try:
         pairs = zip(probers, paths, strict=True)
-        shells = [driver.Shell(prober, None, paths=[path]) for prober, path in pairs]
+        shells = [driver.Shell(prober, None, paths={0: path}) for prober, path in pairs]
     except AddressError as error:
         raise CommandError(str(error)) from None
     with terminal.progress(f"probing {' and '.join(names)}", options.duration) as bar:

@@ -1,4 +1,4 @@
-"""A flight over real UDP: server, netem and client as three processes on loopback.
+"""A flight over real UDP: server, netem and client as processes on loopback.
 
 Each process writes its events as JSON on its standard output (`--log json`). Other output, such as
 a traceback or the one line of an error, is kept to report why the process failed.
@@ -12,13 +12,15 @@ import json
 import signal
 import sys
 from collections import deque
-from collections.abc import AsyncIterator, Callable, Sequence
+from collections.abc import AsyncIterator, Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from operator import attrgetter
 from pathlib import Path
 
+import msgspec
 import numpy as np
 
+from skytether.cli.page_process import say
 from skytether.netem.proxy import of_paths
 from skytether.shared.base import files
 from skytether.shared.core.endpoint import Address
@@ -52,6 +54,8 @@ from skytether.view.browser.play import NETEMS
 ANYWHERE = ("--bind", "127.0.0.1:0")
 NAMES = ("client", "server", "netem")
 """Names of the processes, and of their parts of the record; further paths have `netem 2`, …"""
+STANDBY = "server 2"
+"""Name of the standby server."""
 
 START_S = 120.0
 """Longest time until a process listens [s]; it may have to compile first."""
@@ -65,8 +69,8 @@ LINES_MAX = 20
 """Number of a process's last lines that are kept, to be printed if it fails."""
 
 Chain = Sequence[Sequence[Sequence[str]]]
-"""Stages of processes, each with its name and arguments. The last argument is repeated for each
-address of the stage before, which takes the place of `{}`."""
+"""Stages of processes, each with its name and arguments. An argument that ends with the name of a
+process of an earlier stage in braces, as in `--server={server}`, gets its address there."""
 OnEvent = Callable[[LogLine], None]
 Shortfall = RecordIncomplete | NotFlown
 """Events after which a flight goes on, and which its command reports at the end."""
@@ -112,7 +116,7 @@ async def started(
 
     Args:
         name: process to run: server, netem, client, station or autopilot; `netem N` is that of
-            path N.
+            path N, and `server 2` the standby server.
         arguments: its command line, beside `--log json`.
         on_event: called with each line of its log.
 
@@ -181,18 +185,23 @@ async def _read(child: Child, stream: asyncio.StreamReader, on_event: OnEvent) -
         if logged is None:
             child.said.append(line.decode(errors="replace").rstrip())
             continue
+        kind = child.name.partition(" ")[0]
+        if logged.process.partition(".")[0] == kind:  # the standby calls itself "server", too
+            process = child.name + logged.process.removeprefix(kind)
+            logged = msgspec.structs.replace(logged, process=process)
         if not isinstance(logged.event, Counted):  # counters do not say why a process ended
             child.said.extend(f"{logged.process}: {logged.event}".splitlines())
         on_event(logged)
 
 
-def netems(scenario: Scenario) -> list[str]:
-    """Names of the netems of a scenario's paths."""
-    return list(NETEMS[: len(scenario.paths)])
+def netems(scenario: Scenario, *, standby: bool = False) -> list[str]:
+    """Names of the netems of a scenario's paths, and of the one to the standby server."""
+    return list(NETEMS[: len(scenario.paths) + standby])
 
 
-def feeds_in(folder: Path, scenario: Scenario) -> dict[str, Path]:
-    return {name: folder / f"{name}.feed" for name in ("client", "server", *netems(scenario))}
+def feeds_in(folder: Path, scenario: Scenario, *, standby: bool = False) -> dict[str, Path]:
+    names = ("client", "server", *[STANDBY] * standby, *netems(scenario, standby=standby))
+    return {name: folder / f"{name}.feed" for name in names}
 
 
 def run(
@@ -208,6 +217,7 @@ def run(
     secure: bool = False,
     set_parameters: bool = False,
     sockets: Path | None = None,
+    standby: bool = False,
 ) -> list[Shortfall]:
     """Fly a scenario until its end, or Ctrl-C; the record of the flight is left in a folder.
 
@@ -226,6 +236,8 @@ def run(
         set_parameters: whether the client makes its autopilot's parameters safe.
         sockets: folder for two sockets of each process: `server`, through which keys change in
             flight, and `server.feed`, its feed; of several workers, `server.1`, `server.feed.1`.
+        standby: whether there is a standby server, `server 2`, behind a netem of its own; one of
+            the two may then end during the flight.
 
     Raises:
         CommandError: one of the processes failed, the folder cannot be written to, or it was
@@ -250,18 +262,29 @@ def run(
         if recorded:
             arguments += ["--record", str(parts / name)]
         if sockets:
-            feed = feeds_in(sockets, scenario)[name]
-            arguments += ["--control", str(sockets / name), "--feed", str(feed)]
+            arguments += ["--control", str(sockets / name)]
+            arguments += ["--feed", str(sockets / f"{name}.feed")]
         return [name, str(file), *arguments, *plugins.flags()]
 
     fleet = ["--vehicles", str(vehicles)]
-    server = [*common("server", recorded=watched), *fleet, *keys, "--workers", str(workers)]
+    names = ["server", *[STANDBY] * standby]
+    servers = [
+        [*common(name, recorded=watched), *fleet, *keys, "--workers", str(workers), *ANYWHERE]
+        for name in names
+    ]
     paths = [
         [*common(name, recorded=watched), "--path", str(number), "--flows", str(vehicles)]
-        for number, name in enumerate(netems(scenario), start=1)
+        for number, name in enumerate(netems(scenario, standby=standby), start=1)
     ]
+    leads_to = ["server"] * len(scenario.paths) + [STANDBY] * standby
     client = [*common("client", recorded=True), *fleet, *keys]
     client += ["--set-parameters"] * set_parameters
+    several = len(scenario.paths) > 1
+    client += [
+        f"--path=127.0.0.1={{{name}}}" if several else f"--server={{{name}}}"
+        for name in netems(scenario)
+    ]
+    client += [f"--standby={{{paths[-1][0]}}}"] * standby
 
     def hear(line: LogLine) -> None:
         if isinstance(line.event, Shortfall):
@@ -270,11 +293,15 @@ def run(
 
     fly_chain(
         [
-            [[*server, *ANYWHERE]],
-            [[*netem, *ANYWHERE, "--server={}"] for netem in paths],
-            [[*client, "--server={}" if len(paths) == 1 else "--path=127.0.0.1={}"]],
+            servers,
+            [
+                [*netem, *ANYWHERE, f"--server={{{server}}}"]
+                for netem, server in zip(paths, leads_to, strict=True)
+            ],
+            [client],
         ],
         flies="client",
+        spares=names,
         timeout_s=timeout_s,
         on_second=on_second,
         interrupted=interrupted,
@@ -290,6 +317,7 @@ def fly_chain(
     chain: Chain,
     *,
     flies: str,
+    spares: Collection[str] = (),
     timeout_s: float,
     on_second: Callable[[float], None],
     interrupted: Callable[[], bool],
@@ -300,6 +328,7 @@ def fly_chain(
     Args:
         chain: see `Chain`.
         flies: name of the process whose end is the flight's.
+        spares: names of processes of which all but one may end during the flight.
         timeout_s: longest time that they run [s].
         on_second, interrupted, on_event: see `run`.
 
@@ -309,7 +338,7 @@ def fly_chain(
 
     async def main() -> None:
         flight = asyncio.create_task(
-            _fly(chain, flies, timeout_s=timeout_s, on_second=on_second, on_event=on_event)
+            _fly(chain, flies, spares, timeout_s=timeout_s, on_second=on_second, on_event=on_event)
         )
         while not flight.done() and not interrupted():
             await asyncio.wait((flight,), timeout=POLL_S)
@@ -338,17 +367,22 @@ def record_of(
     """
     axes = scenario.model.axes
     said = sorted(said, key=attrgetter("time_ns"))
-    names = netems(scenario)
+    standby = (parts / STANDBY).exists()
+    names = netems(scenario, standby=standby)
     netem = np.concatenate([_rows(parts / name, PACKET_COLUMNS) for name in names])
     zero_ns = said[0].time_ns if said else 0
     netem["arrived_ns"] -= zero_ns
     counted = {path.name.replace(".json", ""): path.read_bytes() for path in parts.glob("*.json*")}
     figures = {name: json.loads(text) for name, text in counted.items() if text}
+    server = _rows(parts / "server", server_columns(axes, scenario.control.scheme))
+    if standby:
+        server = np.concatenate([server, _rows(parts / STANDBY, server.dtype)])
+        server = server[np.argsort(server["step"], kind="stable")]
     if paths := [figures.pop(name) for name in names if name in figures]:
         figures["netem"] = of_paths(paths)
     return Record(
         client=_rows(parts / "client", client_columns(axes)),
-        server=_rows(parts / "server", server_columns(axes, scenario.control.scheme)),
+        server=server,
         netem=netem,
         failure=next((each for each in shortfalls if isinstance(each, NotFlown)), None),
         figures=figures,
@@ -368,9 +402,16 @@ def _rows(part: Path, columns: np.dtype[np.void]) -> Rows:
         return np.empty(0, columns)
 
 
+def _with_address(argument: str, addresses: Mapping[str, str]) -> str:
+    """Argument of a `Chain`, with an address in place of the name at its end."""
+    head, brace, name = argument.removesuffix("}").rpartition("{")
+    return head + addresses[name] if brace and name in addresses else argument
+
+
 async def _fly(
     chain: Chain,
     flies: str,
+    spares: Collection[str],
     *,
     timeout_s: float,
     on_second: Callable[[float], None],
@@ -387,27 +428,31 @@ async def _fly(
 
     async with contextlib.AsyncExitStack() as stack:
         children: list[Child] = []
-        before: list[str] = []
         for stage in chain:
-            begun = []
-            for *argv, last in stage:
-                flags = [last.format(address) for address in before] or [last]
-                starting = started(*argv, *flags, on_event=hear)
-                begun.append(await stack.enter_async_context(starting))
-            children += begun
-            before = [address_text(*child.address) for child in begun]
+            addresses = {child.name: address_text(*child.address) for child in children}
+            for name, *argv in stage:
+                flags = [_with_address(argument, addresses) for argument in argv]
+                starting = started(name, *flags, on_event=hear)
+                children.append(await stack.enter_async_context(starting))
         began_s = loop.time()
-        ended = [asyncio.create_task(child.end()) for child in children]
+        ended = {child.name: asyncio.create_task(child.end()) for child in children}
         try:
-            while not any(task.done() for task in ended):
-                await asyncio.wait(ended, timeout=POLL_S, return_when=asyncio.FIRST_COMPLETED)
+            while not any(task.done() for task in ended.values()):
+                await asyncio.wait(
+                    ended.values(), timeout=POLL_S, return_when=asyncio.FIRST_COMPLETED
+                )
+                for child in children:
+                    is_spare = child.name in spares and len(ended.keys() & {*spares}) > 1
+                    if is_spare and child.name in ended and ended[child.name].done():
+                        del ended[child.name]
+                        say(f"{child.last_words()}; the flight goes on without {child.name}")
                 on_second(0.0 if flying_s is None else loop.time() - flying_s)
                 if loop.time() - (flying_s or began_s) > timeout_s:
                     raise CommandError(f"the flight has not ended in {timeout_s:.0f} s")
         finally:
-            for task in ended:
+            for task in ended.values():
                 task.cancel()
-        for child in children:
+        for child in (each for each in children if each.name in ended):
             code = child.process.returncode
             # Shortfalls are reported at the end, together with the flight's summary.
             has_flown = child.name == flies and (

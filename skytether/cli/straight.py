@@ -109,13 +109,13 @@ def _really(
         processes.fly_chain(
             [
                 [process("station", *laws.flags(law), *processes.ANYWHERE)],
-                [process("netem", "--flows", "1", *processes.ANYWHERE, "--server={}")],
+                [process("netem", "--flows", "1", *processes.ANYWHERE, "--server={station}")],
                 [
                     process(
                         "autopilot",
                         *("--flavour", options.flavour),
                         f"--ready={virtual.READY_S}",
-                        "--to={}",
+                        "--to={netem}",
                     )
                 ],
             ],

@@ -137,14 +137,19 @@ def address(flag: str, text: str) -> Address:
     return parsed
 
 
-def paths(flag: str, texts: Sequence[str]) -> list[NetworkPath]:
-    """Paths given to a flag, each as LOCAL=HOST:PORT."""
+def paths(flag: str, texts: Sequence[str], *, needs_local: bool = True) -> list[NetworkPath]:
+    """Paths given to a flag, each as LOCAL=HOST:PORT.
+
+    Args:
+        needs_local: whether HOST:PORT alone is refused.
+    """
     check_count(flag, len(texts), len(PATH_SOCKETS))
     parsed: list[NetworkPath] = []
     for text in texts:
-        path = parse_path(text)
+        path = parse_path(text if needs_local or "=" in text else f"={text}")
         if path is None:
-            raise CommandError(f"{flag}: got {text!r}, expected {PATH_FORM}", CONFIGURATION)
+            form = PATH_FORM if needs_local else f"{HOST_PORT}; or {PATH_FORM}"
+            raise CommandError(f"{flag}: got {text!r}, expected {form}", CONFIGURATION)
         if path in parsed:
             raise CommandError(f"{flag}: got {text!r} twice, expected it once", CONFIGURATION)
         parsed.append(path)

@@ -12,21 +12,15 @@ import signal
 import threading
 import time
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from operator import itemgetter
 from socket import socket
+from types import MappingProxyType
 from typing import Any
 
-from skytether.shared.core.endpoint import (
-    PATH_SOCKETS,
-    Address,
-    Datagram,
-    Endpoint,
-    Form,
-    make_datagram,
-)
+from skytether.shared.core.endpoint import Address, Datagram, Endpoint, Form, make_datagram
 from skytether.shared.core.events import (
     Event,
     Fault,
@@ -107,7 +101,7 @@ class Shell:
         control: control socket for changes of keys in flight.
         feed: socket that sends rows and events to readers.
         line: connection to an autopilot, which becomes socket 1.
-        paths: paths to the endpoint's peer; their sockets are PATH_SOCKETS. Of several, any may be
+        paths: paths to the endpoint's peers, by the number of their socket. Of several, any may be
             unusable; it is then opened later.
         is_patient: whether to start although the name of a path's peer cannot be resolved yet; the
             lookup is then repeated.
@@ -128,7 +122,7 @@ class Shell:
         feed: Feed | None = None,
         line: Line | None = None,
         *,
-        paths: Sequence[NetworkPath] = (),
+        paths: Mapping[int, NetworkPath] = MappingProxyType({}),
         is_patient: bool = False,
         memory: MemoryFile | None = None,
     ) -> None:
@@ -142,10 +136,9 @@ class Shell:
         self._names = Names(peers)
         self._elsewhere = within_reach_of(self._names.numbers())
         self._paths = {
-            number: PathSockets(path, is_patient=is_patient)
-            for number, path in zip(PATH_SOCKETS, paths, strict=False)
+            number: PathSockets(path, is_patient=is_patient) for number, path in paths.items()
         }
-        self._watches_paths = any(path.local for path in paths) or len(paths) > 1
+        self._watches_paths = any(path.local for path in paths.values()) or len(paths) > 1
         self._sockets: dict[int, socket] = {}
         self.addresses: dict[int, Address] = {}
         """Addresses of the bound sockets and of the paths' by number."""

@@ -44,9 +44,14 @@ class Metric(NamedTuple):
         return Exposed((PREFIX + self.name).removesuffix("_total"), self.help, self.kind)
 
     def add(self, exposed: Exposed, labels: Mapping[str, str], value: Any) -> None:
-        """Add a figure; a mode becomes one sample for each mode, 1 for the present one, else 0."""
+        """Add a figure; a mode becomes one sample for each mode, 1 for the present one, else 0, and
+        another text a label of a sample of 1.
+        """
         name, labels = PREFIX + self.name, {**labels, **self.labels}
-        if isinstance(value, str):
+        if isinstance(value, str) and not self.figure.endswith("mode"):
+            label = self.figure.rpartition("/")[2]
+            exposed.add_sample(name, {**labels, label: value}, 1.0)
+        elif isinstance(value, str):
             for mode in map(str, Mode):
                 exposed.add_sample(name, {**labels, "mode": mode}, float(mode == value))
         elif self.kind == "histogram":
@@ -190,6 +195,10 @@ by_vehicle/{vehicle}/plan_age_ms client_plan_age_seconds
     Time since the first step of the horizon in force.
 by_vehicle/{vehicle}/horizons client_horizons_total
     Horizons received.
+by_vehicle/{vehicle}/leadership/number client_leadership
+    With a standby server: number of the leadership, which rises when another server leads.
+by_vehicle/{vehicle}/leadership/server client_leader
+    With a standby server: address of the server that leads, as a label; the value is always 1.
 by_vehicle/{vehicle}/dropped/{reason} client_dropped_datagrams_total
     Datagrams that were dropped: not the server's, too late or unreadable, by reason.
 others_dropped/{reason} client_dropped_datagrams_total vehicle=others

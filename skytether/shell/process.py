@@ -3,11 +3,12 @@
 import signal
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from socket import socket
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, BinaryIO, cast
 
 import msgspec
@@ -136,7 +137,7 @@ class Process:
         *,
         bind: list[Address | socket] | Address | None,
         waiting_for: str,
-        paths: Sequence[NetworkPath] = (),
+        paths: Mapping[int, NetworkPath] = MappingProxyType({}),
         peers: Sequence[Address] = (),
         forms: Sequence[Form] = (),
         insecure: bool = False,
@@ -181,7 +182,7 @@ class Process:
             except AddressError as error:
                 raise CommandError(str(error)) from None
             if self.secure is False and not (shell.is_local or insecure):
-                to = dict.fromkeys(path.peer for path in paths) or shell.addresses.values()
+                to = dict.fromkeys(path.peer for path in paths.values()) or shell.addresses.values()
                 raise unsealed(*to)
             ready()
             began_s = time.process_time()

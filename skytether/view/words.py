@@ -75,7 +75,7 @@ def status(state: State, vehicle: int, now_ns: int, title: str = "") -> str:
     rows.append(("distance to reference, last 10 s", number(track.error_m(10.0), ".3f", " m")))
     rows.append(("age of the observation in use", number(track.age_s, ".2f", " s")))
     rows.append(("age of observation at server", number(track.known_s, ".2f", " s")))
-    rows += _mission(state, vehicle) + _autopilot(state, vehicle)
+    rows += _leader(state, vehicle) + _mission(state, vehicle) + _autopilot(state, vehicle)
     rows += _network(state, now_ns)
     curves_ms = track.curves(60).solve_ms
     solved = curves_ms[~np.isnan(curves_ms)]
@@ -138,6 +138,15 @@ def _newest(state: State) -> str:
 def _link(state: State, vehicle: int, now_ns: int) -> Word:
     word = state.link(vehicle, now_ns)
     return Word(f"link {word.word.lower()}", word.text, word.colour)
+
+
+def _leader(state: State, vehicle: int) -> list[tuple[str, str]]:
+    """Row with the server that leads, if there is a standby server."""
+    leadership = group(state.figures("client"), "by_vehicle", str(vehicle), "leadership")
+    if not leadership:
+        return []
+    number_ = number(told(leadership, "number"), ".0f")
+    return [("led by", f"{leadership.get('server', '–')}, leadership {number_}")]
 
 
 def _mission(state: State, vehicle: int) -> list[tuple[str, str]]:

@@ -80,6 +80,16 @@ QUICK = [
         ),
         ("client --path =g:1 --server g:2", "client: --path: got --server as well, expected"),
         ("client --path =g:1 --vehicles 2", "client: --vehicles: got 2 with --path, expected 1"),
+        ("client --standby g", "client: --standby: got 'g', expected HOST:PORT"),
+        ("client --standby a:1 --vehicles 2", "client: --vehicles: got 2 with --standby, expected"),
+        (
+            "client --server g:1 --standby lo=g:1",
+            "client: --standby: got g:1, expected another server than the first",
+        ),
+        (
+            "client " + " ".join(f"--standby g:{port}" for port in range(5)),
+            "client: --standby: got 5, expected 1 to 4",
+        ),
         (
             "server " + " ".join(f"--bind 127.0.0.1:{port}" for port in range(5)),
             "server: --bind: got 5, expected 1 to 4",

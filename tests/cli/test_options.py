@@ -24,6 +24,7 @@ PLAIN: list[tuple[Any, str]] = [
     (CLIENT, "demo --server=netem:47000 --keys=-k"),
     (CLIENT, "--log=json --key-id 2"),
     (CLIENT, "demo --path wwan0=a:1 --path==a:1 --id 1 --path [::1]=[::1]:1"),
+    (CLIENT, "demo --server a:1 --standby b:1 --standby lo=b:2"),
     (CLIENT, "--id 1 --id 2 --record 'a b' --json c"),
     (netem.NetemOptions(), "--flows 5"),
     (fly.FlyOptions(), "demo --virtual --no-page --figure a.png"),

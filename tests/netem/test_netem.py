@@ -229,9 +229,14 @@ def test_netem_emulates_the_path_that_it_is_told() -> None:
     second = directed(scenario="demo-two-links", path=2, to_server="loss(0.5)")
     assert (second.seed, second.uplink.mean_s) == (flown.on_path(1).seed, pytest.approx(0.1))
     assert (second.downlink.loss, second.downlink.mean_s) == (0.5, 0.0)
+    to_standby = directed(scenario="demo-two-links", path=3)
+    assert (to_standby.seed, to_standby.uplink.mean_s) == (
+        flown.on_path(2).seed,
+        flown.on_path(0).uplink.mean_s,
+    )
 
 
-@pytest.mark.parametrize(("scenario", "path"), [("demo", 2), ("demo-two-links", 3), ("demo", 0)])
+@pytest.mark.parametrize(("scenario", "path"), [("demo", 3), ("demo-two-links", 4), ("demo", 0)])
 def test_a_path_that_the_scenario_lacks_is_refused(
     scenario: str, path: int, capsys: pytest.CaptureFixture[str]
 ) -> None:

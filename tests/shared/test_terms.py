@@ -13,12 +13,13 @@ from skytether.client.simulated.vehicle import simulated
 from skytether.server.endpoint import Server
 from skytether.shared.base.chance import stream
 from skytether.shared.base.units import SECOND_NS
+from skytether.shared.core.change import ONCE
 from skytether.shared.core.endpoint import Datagram
 from skytether.shared.law.terms import Difference, Terms
 from skytether.shared.scenario import reading
-from skytether.shared.scenario.catalogue import KEYS, TERMS, differences, keys_of
+from skytether.shared.scenario.catalogue import KEYS, TERMS, differences
 from skytether.shared.scenario.dotted import flat, set_keys
-from skytether.shared.scenario.owners import InFlight, Owner
+from skytether.shared.scenario.owners import Owner
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.wire.protocol import PAYLOAD_BYTES_MAX, Hello, encode
 
@@ -168,7 +169,7 @@ def test_ends_that_differ_in_a_term_are_refused_and_told(key: str, tmp_path: Pat
     assert not server.figures()["vehicles"]
 
 
-@pytest.mark.parametrize("key", sorted(KEYS.keys() - TERMS.values() - keys_of(InFlight.LEAP)))
+@pytest.mark.parametrize("key", sorted(KEYS.keys() - TERMS.values() - ONCE))
 def test_ends_may_differ_in_what_is_free(key: str, tmp_path: Path) -> None:
     ours, theirs = differing(key, tmp_path)
     assert ours != theirs

@@ -85,6 +85,9 @@ def figures() -> dict[str, dict[str, Any]]:
     for end in ("server", "client"):
         paths = two_links.figures[end]["by_vehicle"]["1"]["paths"]
         each[end]["by_vehicle"]["1"]["paths"] = paths
+    led = flight.fly(packaged("demo", duration=1.0, settle=0.0), standby=True)
+    leadership = led.figures["client"]["by_vehicle"]["1"]["leadership"]
+    each["client"]["by_vehicle"]["1"]["leadership"] = leadership
     each["server"] |= {"dropped": {"forged": 3}, "refused": {"full": 1}}
     return {process: told | PROCESS for process, told in each.items()}
 
@@ -174,6 +177,12 @@ def test_numbers_are_the_figures_in_base_units(figures: dict[str, dict[str, Any]
     half = len(buckets) // 2
     assert buckets[:half] == sorted(buckets[:half])
     assert buckets[half - 1] == netem["uplink"]["forwarded"]
+
+
+def test_the_server_that_leads_is_a_label(figures: dict[str, dict[str, Any]]) -> None:
+    told = numbers("client", figures["client"])
+    assert told["skytether_client_leadership", ("vehicle=1",)] == 0.0
+    assert told["skytether_client_leader", ("server=netem 1:0", "vehicle=1")] == 1.0
 
 
 @pytest.mark.parametrize("end", ["server", "client"])

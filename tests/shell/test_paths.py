@@ -106,7 +106,8 @@ async def once(holds: Callable[[], object]) -> None:
 
 def calling(*paths: NetworkPath, is_patient: bool = False) -> tuple[Calling, Shell]:
     endpoint = Calling(*(path.peer for path in paths))
-    return endpoint, Shell(endpoint, None, paths=paths, is_patient=is_patient)
+    by_socket = dict(zip(PATH_SOCKETS, paths, strict=False))
+    return endpoint, Shell(endpoint, None, paths=by_socket, is_patient=is_patient)
 
 
 @pytest.mark.ipv6

@@ -21,6 +21,7 @@ PROFILES = {
     "observe": {"prometheus", "grafana"},
     "px4": {"px4", "aboard"},
     "netem": {"relay"},
+    "standby": {"standby", "netem-standby"},
 }
 DOCKERFILE = (ROOT / "Dockerfile").read_text()
 

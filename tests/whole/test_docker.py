@@ -40,6 +40,8 @@ FLIGHT_S = 60
 GATE_FLIGHT_S = 10
 FAULTY_FLIGHT_S = 110
 """Duration of the flight with faults [s]; faults and the checks after them take 45 s of it."""
+STANDBY_FLIGHT_S = 40
+"""Duration of the flight with a standby server [s]."""
 FAULT_S = 3.0
 """Duration of a fault [s]: more than the demo's `link.timeout_s`, so that the client detects it."""
 HORIZONS = 6
@@ -164,10 +166,24 @@ def test_a_flight_goes_on_after_every_fault(compose: list[str], tmp_path: Path) 
         assert [three.state(service)["ExitCode"] for service in SERVICES] == [0, 0, 0]
 
 
+def test_a_flight_goes_on_with_the_standby_server(compose: list[str], tmp_path: Path) -> None:
+    with containers(compose, STANDBY_FLIGHT_S, standby=True) as five:
+        five.flies()
+        until("the standby's session", lambda: five.has_said("standby", "vehicle 1 flies"))
+        say("the server is killed")
+        five.compose("kill", "server")
+        until("another leader", lambda: five.has_said("client", "leads it now (leadership 1)"))
+        summary = five.land(tmp_path)
+        assert summary.rmse_xy is not None
+        assert summary.rmse_xy < HOVER_M
+        assert "brakes: the server is silent" not in five.said("client")
+
+
 @dataclass
 class Containers:
     command: list[str]
     seconds: int
+    standby: bool = False
     project: str = field(default_factory=lambda: f"skytether-test-{secrets.token_hex(4)}")
     ids: dict[str, str] = field(default_factory=dict)
     """Identifiers of the containers, by service; they stay the same from `up` to `down`."""
@@ -180,11 +196,13 @@ class Containers:
 
     def argv(self, *arguments: str) -> list[str]:
         file = str(ROOT / "docker-compose.yml")
-        return [*self.command, "-f", file, "-p", self.project, *arguments]
+        profile = ["--profile", "standby"] * self.standby
+        return [*self.command, "-f", file, "-p", self.project, *profile, *arguments]
 
     @property
     def flight(self) -> dict[str, str]:
-        return {"FLIGHT_SECONDS": str(self.seconds), "SCENARIO": "demo"}
+        standby = {"STANDBY": "netem-standby:47000"} if self.standby else {}
+        return {"FLIGHT_SECONDS": str(self.seconds), "SCENARIO": "demo", **standby}
 
     def docker(self, *arguments: str) -> str:
         return run("docker", *arguments)
@@ -371,9 +389,9 @@ class Containers:
 
 
 @contextlib.contextmanager
-def containers(compose: list[str], seconds: int) -> Iterator[Containers]:
+def containers(compose: list[str], seconds: int, *, standby: bool = False) -> Iterator[Containers]:
     """The three containers, running; removed at the end in any case."""
-    three = Containers(compose, seconds)
+    three = Containers(compose, seconds, standby)
     try:
         three.compose("up", "--detach")
         say(f"up, for a flight of {seconds} s")

@@ -222,7 +222,7 @@ async def test_a_peer_is_seen_as_it_was_written_whatever_the_kernel_calls_it(
     answerer = Shell(Echo(), loopback)
     peer = (name, answerer.address[1])
     asker = Asker(peer)
-    driver = Shell(asker, None, paths=[NetworkPath("", peer)])
+    driver = Shell(asker, None, paths={0: NetworkPath("", peer)})
     assert driver.address[0] == loopback[0]
     async with driven(answerer):
         await asyncio.wait_for(driver.run(), 5)
@@ -345,7 +345,7 @@ async def test_a_patient_endpoint_is_driven_before_its_peer_is_found(
 
         monkeypatch.setattr(udp, "look_up", look_up)
         asking, events = Asking(peer), list[Event]()
-        driver = Shell(asking, None, paths=[NetworkPath("", peer)], is_patient=True)
+        driver = Shell(asking, None, paths={0: NetworkPath("", peer)}, is_patient=True)
         assert not driver.is_local  # as far as is known
         loop = asyncio.get_running_loop()
         task = asyncio.create_task(driver.run(events.append))

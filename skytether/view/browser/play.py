@@ -14,9 +14,9 @@ from skytether.shared.core.change import Answer
 from skytether.shared.wire.paths import PATHS_MAX
 from skytether.shell.control import Caller, ControlError
 
-NETEMS = ("netem", *(f"netem {number}" for number in range(2, PATHS_MAX + 1)))
-"""Names of the netems of a session's paths."""
-PROCESSES = ("server", *NETEMS, "client")
+NETEMS = ("netem", *(f"netem {number}" for number in range(2, PATHS_MAX + 2)))
+"""Names of the netems of a session's paths, and of the one to a standby server."""
+PROCESSES = ("server", "server 2", *NETEMS, "client")
 """Names of the processes, and of their sockets in a flight's folder."""
 
 Answered = Callable[[str, Mapping[str, Any], Answer | None], None]

@@ -1,0 +1,170 @@
+"""A standby server over real UDP: a server's process dies, or an operator hands over."""
+
+import json
+import os
+import signal
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from helpers import packaged
+from skytether.__main__ import main
+from skytether.cli import keygen
+from skytether.shared.core.events import (
+    Changed,
+    ChangeRefused,
+    HostMissing,
+    LeaderChanged,
+    Listening,
+    ModeChanged,
+)
+from skytether.shared.telemetry.record import Reason
+from skytether.sim.flight import fly
+from warm import Process
+
+FLIGHT = ("--network.uplink", "none", "--network.downlink", "none", "--settle", "0")
+PATIENT = ("--link.timeout-s", "2")
+"""Patience for a busy machine."""
+SILENT = {str(Reason.LOST), str(Reason.ENDED), str(Reason.CLOSED)}
+"""Reasons to brake because no server plans; a busy machine brakes for its own."""
+
+
+@pytest.fixture
+def servers(start: Callable[..., Process], tmp_path: Path) -> list[Process]:
+    keygen.make(tmp_path / "keys", [1])
+    flags = ("--bind", "127.0.0.1:0", "--keys", str(tmp_path / "keys"), "--log", "json")
+    return [start("server", "demo", *flags, *PATIENT) for _ in range(2)]
+
+
+@pytest.fixture
+def client(servers: list[Process], start: Callable[..., Process], tmp_path: Path) -> Process:
+    addresses = ("--server", servers[0].address(), "--standby", servers[1].address())
+    flags = ("--control", str(tmp_path / "client"), "--keys", str(tmp_path / "keys"))
+    return start(
+        *("client", "demo", *addresses, *flags, "--log", "json", "--duration", "12"),
+        *PATIENT,
+        *("--settle", "0"),
+    )
+
+
+def brakes(process: Process) -> list[ModeChanged]:
+    return [
+        each
+        for each in process.events()
+        if isinstance(each, ModeChanged) and each.after == "brake" and each.reason in SILENT
+    ]
+
+
+def led_by(process: Process) -> list[tuple[int, int]]:
+    """Ports of the servers that came to lead, and the numbers of their leaderships."""
+    changes = [each for each in process.events() if isinstance(each, LeaderChanged)]
+    return [(each.port, each.number) for each in changes]
+
+
+def port(server: Process) -> int:
+    return next(each.port for each in server.events() if isinstance(each, Listening))
+
+
+@pytest.mark.long
+def test_the_leading_server_is_killed_and_the_flight_goes_on(
+    servers: list[Process], client: Process
+) -> None:
+    client.wait_for('"after":"track"')
+    first, standby = servers
+    first.popen.kill()
+    assert client.ended() == 0, client.said
+    assert led_by(client) == [(port(standby), 1)]
+    assert brakes(client) == []
+    assert standby.end() == 0
+
+
+@pytest.mark.long
+def test_an_operator_hands_over_and_back(
+    servers: list[Process], client: Process, tmp_path: Path
+) -> None:
+    socket, (first, standby) = str(tmp_path / "client"), servers
+    client.wait_for('"after":"track"')
+    for name in ("standby", "server"):
+        # refused until the server is heard
+        while main(["set", socket, f"link.leader={name}"]):
+            time.sleep(0.1)
+        client.wait_for(f'"Changed".*"after":"\\\\"{name}\\\\""')
+    assert client.ended() == 0, client.said
+    assert led_by(client) == [(port(standby), 1), (port(first), 2)]
+    assert brakes(client) == []
+    for server in servers:
+        assert server.end() == 0
+
+
+@pytest.mark.long
+def test_a_standby_that_cannot_be_found_costs_nothing(start: Callable[..., Process]) -> None:
+    server = start("server", "demo", "--bind", "127.0.0.1:0", *PATIENT)
+    client = start(
+        *("client", "demo", "--server", server.address(), "--standby", "ground.invalid:1"),
+        *("--insecure", "--log", "json", "--duration", "4", "--settle", "0", *PATIENT),
+    )
+    assert client.ended() == 0, client.said
+    told = [each for each in client.events() if isinstance(each, HostMissing)]
+    assert [each.host for each in told] == ["ground.invalid"]
+    listening = next(each for each in client.events() if isinstance(each, Listening))
+    assert listening.waiting_for.endswith(", or the standby server at ground.invalid:1")
+    assert led_by(client) == []
+    assert server.end() == 0
+
+
+def children(pid: int) -> Iterator[tuple[int, list[str]]]:
+    """Children of a process and their command lines."""
+    for thread in Path(f"/proc/{pid}/task").iterdir():
+        for child in (thread / "children").read_text().split():
+            yield int(child), Path(f"/proc/{child}/cmdline").read_text().split("\0")
+
+
+@pytest.mark.long
+def test_fly_goes_on_without_the_server_that_was_killed(
+    start: Callable[..., Process], tmp_path: Path
+) -> None:
+    folder, summary = tmp_path / "flying", tmp_path / "summary.json"
+    argv = ("fly", "demo", "--standby", "--secure", "--no-page", "--duration", "12", *FLIGHT)
+    run = start(*argv, *PATIENT, "--control", str(folder), "--json", str(summary))
+    until = time.monotonic() + 120.0
+    while not (folder / "client").exists():
+        assert time.monotonic() < until
+        time.sleep(0.2)
+    names = {path.name for path in folder.iterdir() if not path.name.endswith(".feed")}
+    assert {"server", "server 2", "netem", "netem 2", "client"} <= names
+    time.sleep(5.0)  # long enough to be flying, and to have heard the standby
+    (server,) = [pid for pid, argv in children(run.popen.pid) if f"{folder}/server" in argv]
+    os.kill(server, signal.SIGKILL)
+    assert run.ended() == 0, run.said
+    said = "\n".join(run.said)
+    assert "server: ended by a signal: Killed; the flight goes on without server" in said
+    assert "leads it now (leadership 1)" in said
+    assert json.loads(summary.read_text())["covered"] > 0.5
+
+
+def test_a_server_is_named_as_leader_and_stays_it() -> None:
+    """A standby server speaks rarely; its silence before it was named does not count."""
+    changes = [(7.3, {"link.leader": "standby"}), (13.0, {"link.leader": "server"})]
+    flight = fly(packaged("demo", duration=20.0), standby=True, secure=True, changes=changes)
+    told = [each for each in flight.events if isinstance(each.event, LeaderChanged)]
+    assert [(each.time_ns / 1e9, each.event.number) for each in told] == [(7.3, 1), (13.0, 2)]
+    assert not [each for each in flight.events if getattr(each.event, "after", None) == "brake"]
+
+
+@pytest.mark.parametrize(
+    ("standby", "reason"),
+    [
+        (False, "link.leader: got 'standby', expected 'server' without a standby server"),
+        (True, "link.leader: got 'standby', but the server at netem 1/2:0 is not heard"),
+    ],
+)
+def test_a_server_that_is_not_heard_is_not_made_the_leader(standby: bool, reason: str) -> None:
+    flown = packaged("demo", duration=8.0)
+    lost = [(0.0, lambda world: world.stop("standby"))] if standby else []
+    changes = [(6.0, {"link.leader": "standby"})]
+    flight = fly(flown, standby=standby, changes=changes, actions=lost)
+    (refused,) = [each.event for each in flight.events if isinstance(each.event, ChangeRefused)]
+    assert refused.reason == reason
+    assert not [each for each in flight.events if isinstance(each.event, Changed | LeaderChanged)]
