@@ -155,14 +155,7 @@ def fly(argv: Sequence[str]) -> None:
         if options.set_parameters and not flying[0].set_parameters():
             kind = f"got vehicle.kind = {scenario.vehicle.kind!r}, expected one with parameters"
             raise CommandError(f"--set-parameters: {kind}", command.CONFIGURATION)
-        peers = [path.peer for path in paths]
-        several: dict[str, Any] = {"paths": peers} if len(peers) > 1 else {}
-        prices = [each.price for each in scenario.paths]
-        if len(prices) > 1 and len(prices) != len(peers):
-            message = f"--path: got {len(peers)}, expected {len(prices)}, as many as network.paths"
-            raise CommandError(message, command.CONFIGURATION)
-        if len(prices) == len(peers) > 1:
-            several["prices"] = prices
+        several = _several(paths, scenario)
         if standby:
             standby_link = link(numbers[0])
             several |= {"standby": [each.peer for each in standby], "standby_link": standby_link}
@@ -220,6 +213,20 @@ def _paths(options: ClientOptions) -> Sequence[NetworkPath]:
     if options.vehicles > 1:
         raise CommandError(f"--vehicles: got {options.vehicles} with --path, expected 1", 2)
     return command.paths("--path", options.path)
+
+
+def _several(paths: Sequence[NetworkPath], scenario: Scenario) -> dict[str, Any]:
+    """Arguments of `Client` for several paths, with the scenario's prices; empty for one."""
+    prices = [path.price for path in scenario.paths]
+    if len(paths) == 1:
+        return {}
+    if 1 < len(prices) != len(paths):
+        message = f"--path: got {len(paths)}, expected {len(prices)}, as many as network.paths"
+        raise CommandError(message, command.CONFIGURATION)
+    return {
+        "paths": [path.peer for path in paths],
+        "prices": prices if len(prices) > 1 else (),
+    }
 
 
 def _standby(options: ClientOptions) -> Sequence[NetworkPath]:

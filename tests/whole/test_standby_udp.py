@@ -25,7 +25,7 @@ from skytether.sim.flight import fly
 from warm import Process
 
 FLIGHT = ("--network.uplink", "none", "--network.downlink", "none", "--settle", "0")
-PATIENT = ("--link.timeout-s", "2")
+PATIENT = ("--link.timeout-s", "4")
 """Patience for a busy machine."""
 SILENT = {str(Reason.LOST), str(Reason.ENDED), str(Reason.CLOSED)}
 """Reasons to brake because no server plans; a busy machine brakes for its own."""
@@ -43,7 +43,7 @@ def client(servers: list[Process], start: Callable[..., Process], tmp_path: Path
     addresses = ("--server", servers[0].address(), "--standby", servers[1].address())
     flags = ("--control", str(tmp_path / "client"), "--keys", str(tmp_path / "keys"))
     return start(
-        *("client", "demo", *addresses, *flags, "--log", "json", "--duration", "12"),
+        *("client", "demo", *addresses, *flags, "--log", "json", "--duration", "20"),
         *PATIENT,
         *("--settle", "0"),
     )
@@ -126,7 +126,7 @@ def test_fly_goes_on_without_the_server_that_was_killed(
     start: Callable[..., Process], tmp_path: Path
 ) -> None:
     folder, summary = tmp_path / "flying", tmp_path / "summary.json"
-    argv = ("fly", "demo", "--standby", "--secure", "--no-page", "--duration", "12", *FLIGHT)
+    argv = ("fly", "demo", "--standby", "--secure", "--no-page", "--duration", "20", *FLIGHT)
     run = start(*argv, *PATIENT, "--control", str(folder), "--json", str(summary))
     until = time.monotonic() + 120.0
     while not (folder / "client").exists():
