@@ -120,6 +120,9 @@ class Client(Endpoint):
         self.keeps = keeps or before is not None
         self._memory = ClientMemory(terms, boot_id, before)
         self._is_mission, self._axes = scenario.is_mission, terms.axes
+        if standby and 3 * (scenario.link.fixed_ns or 0) > seconds_to_ns(scenario.link.timeout_s):
+            expected = "expected at most a third of link.timeout_s with a standby server"
+            raise ConfigError(f"link.heartbeat_s: got {scenario.link.heartbeat_s}, {expected}")
         servers = [paths or (server,), standby] if standby else [paths or (server,)]
         self.vehicle = vehicle
         self._at: dict[tuple[int, Address], tuple[int, int]] = {}
@@ -165,7 +168,9 @@ class Client(Endpoint):
                 ServerSession(
                     terms,
                     vehicle=vehicle,
-                    boot_id=self._memory.boot_id,
+                    # To the other server it is another client: packets that are led astray must
+                    # not replace the session there.
+                    boot_id=self._memory.boot_id ^ i,
                     server=i,
                     sockets=sockets,
                     leadership=self._leadership,
@@ -386,12 +391,14 @@ class Client(Endpoint):
         self._follow_leader(now_ns)
         for session in self._sessions:
             observation = None
+            # A server that does not know who leads would take itself for the leader.
+            if len(self._sessions) > 1 and session.told is None:
+                continue
             if session.leads:
                 observation = pilot.observation(session)
             elif session.is_observation_due(pilot.flown):
                 observation = pilot.observe(session)
-            # A server that does not know who leads would take itself for the leader.
-            if observation is not None and (len(self._sessions) == 1 or session.told is not None):
+            if observation is not None:
                 session.send(observation, now_ns=now_ns)
                 self._tell_time(session, now_ns)
             session.watch_paths(now_ns)
@@ -406,14 +413,18 @@ class Client(Endpoint):
         if self._began_ns == NEVER_NS:
             self._began_ns = now_ns
         heard_ns = [each.heard_ns or self._began_ns for each in self._sessions]
+        heard_ns[lead.leader] = self._session.useful_ns or self._began_ns
         if self._pilot.next_ns is None:
-            heard_ns[lead.leader] += GROUND_NS
+            heard_ns[lead.leader] += GROUND_NS + self._timeout_ns // 2
         # A server that did not lead speaks rarely, so its silence counts from when it was named.
         heard_ns[lead.leader] = max(heard_ns[lead.leader], self._named_ns)
         successor = lead.successor(heard_ns, now_ns)
         if successor is not None:
             lead.hand_over(successor)
         self._report_leader()
+        # The next run must not follow an earlier leadership than the servers have been told.
+        if self.keeps and not self._memory.may_tell(self._to_keep(), now_ns=now_ns):
+            return
         doubts = lead.doubts(heard_ns, now_ns)
         leader_ns = heard_ns[lead.leader]
         if doubts and leader_ns != self._doubted_ns and not self._is_alone(now_ns):

@@ -8,7 +8,8 @@ it hears has been told a larger number by another vehicle, so that all come to f
 
 from collections.abc import Sequence
 
-NUMBER_MAX = 2**32 - 1
+NUMBER_MAX, JUMP_MAX = 2**32 - 1, 10_000
+"""Largest number, and largest rise at once by what a server knows."""
 ASK_SHARE, CHANGE_SHARE = 0.5, 0.75
 """Shares of the time-out for which the leader has to be silent before another server is asked
 whether it is there, and before it leads."""
@@ -56,9 +57,18 @@ class Leadership:
         if raised <= NUMBER_MAX:
             self.number = raised
 
+    def exceed(self, told: int, server: int) -> None:
+        """Let `server` lead if it has been told a larger number by this vehicle, by an earlier run
+        that has not saved it.
+        """
+        if self.number < told <= NUMBER_MAX - self._servers:
+            self.number = told + 1
+            self.hand_over(server)
+
     def learn(self, known: int, server: int) -> bool:
         """Take over a larger number that `server` knows, if that server leads with it."""
-        if not self.number < known <= NUMBER_MAX or known % self._servers != server:
+        is_larger = self.number < known <= min(NUMBER_MAX, self.number + JUMP_MAX)
+        if not is_larger or known % self._servers != server:
             return False
         self.number = known
         return True

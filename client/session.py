@@ -16,7 +16,7 @@ from skytether.shared.base.units import SECOND_NS, seconds_to_ns
 from skytether.shared.core.endpoint import PATH_SOCKETS, Address, Datagram, Events
 from skytether.shared.core.events import Failure, NoAnswer, NoSession, SessionRefused, Unanswered
 from skytether.shared.core.steady import JUMP_NS
-from skytether.shared.law.heartbeat import NUMBERS, STANDBY_TIMES, Hearing
+from skytether.shared.law.heartbeat import NUMBERS, SESSION_NS, STANDBY_TIMES, Hearing
 from skytether.shared.law.terms import Terms
 from skytether.shared.scenario.catalogue import differences
 from skytether.shared.telemetry.record import Reason
@@ -52,6 +52,8 @@ REFUSED = {
     Refusal.TAKEN: Drop.TAKEN,
 }
 """Reason for dropping a WELCOME that refuses the vehicle."""
+DEAF = frozenset({Idle.OBSERVATION, Idle.DELAY})
+"""Reasons for which a server cannot plan that may not hold for another server."""
 DEGRADED = "the server misses its deadlines"
 """Why there is no newer horizon although the server plans: it reports that it is degraded."""
 
@@ -147,6 +149,8 @@ class ServerSession:
         self.heard_ns: int | None = None
         """Time of the newest packet of the session; None before the first, and once it is closed.
         """
+        self.useful_ns: int | None = None
+        """Time of the newest packet that does not say that the server cannot plan."""
         self.sent_step = -1
         """Step of the newest observation; -1 before the first of the session."""
         self.told: int | None = None
@@ -179,7 +183,9 @@ class ServerSession:
         return self._leadership.leader == self._index
 
     def is_lost(self, now_ns: int) -> bool:
-        timeout_ns = self._timeout_ns * (1 if self.leads else STANDBY_TIMES)
+        timeout_ns = self._timeout_ns
+        if not self.leads:  # before the server forgets the session
+            timeout_ns = max(timeout_ns, min(STANDBY_TIMES * timeout_ns, SESSION_NS // 2))
         return self.heard_ns is None or now_ns - self.heard_ns > timeout_ns
 
     @property
@@ -227,8 +233,11 @@ class ServerSession:
             case Welcome() as welcome:
                 self._welcome(welcome, now_ns)
             case Heartbeat() as heartbeat:
+                useful_ns = self.useful_ns
                 self._heard(heartbeat, now_ns)
                 planning = heartbeat.idle == Idle.PLANS
+                if heartbeat.idle in DEAF:
+                    self.useful_ns = useful_ns
                 missing = planning and heartbeat.degraded
                 self.idle = DEGRADED if missing else str(Idle(heartbeat.idle))
             case Close() as close:
@@ -244,6 +253,7 @@ class ServerSession:
                 self._check(lead)
                 self.told = lead.number
                 self._leadership.learn(lead.known, self._index)
+                self._leadership.exceed(lead.number, self._index)
                 self._note_heard(now_ns)
             case _:
                 raise ProtocolError(Drop.NOT_FOR_A_CLIENT)
@@ -329,7 +339,7 @@ class ServerSession:
             self.hearing.hear(message.number, server_ns)
 
     def _note_heard(self, now_ns: int) -> None:
-        self.heard_ns = now_ns
+        self.heard_ns = self.useful_ns = now_ns
         self._watch.heard(now_ns=now_ns)
 
     # -- sending -----------------------------------------------------------------------------
@@ -415,7 +425,7 @@ class ServerSession:
 
     def close(self) -> None:
         """Close the session; only another WELCOME opens one."""
-        self._is_open, self.heard_ns = False, None
+        self._is_open, self.heard_ns, self.useful_ns = False, None, None
 
     def wait(self, *, now_ns: int) -> bool:
         """Whether to go on waiting for the flight; fails after too long without a session."""

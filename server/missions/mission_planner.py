@@ -257,6 +257,8 @@ class MissionPlanner(SplineScheme):
         """Reason why this vehicle has to wait before it is sent a motion, in words; or empty."""
         if row in self._state.restarted:
             return "its restarted client"
+        if self._state.awaits(row):
+            return "its first observation"
         if vehicle.sent:
             return "an acknowledgement"  # before it, the motion flown is unknown
         has_motion = vehicle.in_force is not None and vehicle.in_force.step >= 0

@@ -193,6 +193,10 @@ class MissionState:
             self.rows.unknown_until[row] = -1
         self._mark_changed(row, vehicle)
 
+    def awaits(self, row: int) -> bool:
+        """Whether nothing was observed of a vehicle since this server began to lead it."""
+        return row in self._awaited
+
     def _find_unled(self) -> None:
         newest = max((each or 0 for each in self._leaderships.values()), default=0)
         self.unled = next(

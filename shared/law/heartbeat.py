@@ -37,7 +37,7 @@ SESSION_NS = 30 * SECOND_NS
 """Silence after which the server forgets a vehicle."""
 RARE_TIMES, STANDBY_TIMES = 2, 4
 """Between a vehicle and a server that does not lead it: longest silence, and silence after which
-the vehicle takes the server for lost, as multiples of the time-out."""
+the vehicle takes the server for lost, as multiples of the time-out; SESSION_NS bounds both."""
 # Three were worse: the observations from which plans were made became so old that at 30 % loss 5 of
 # 30 flights of `target` braked before a newer plan came; with two, none.
 PATIENCE = 2
@@ -91,7 +91,8 @@ class Hearing:
 
     def __init__(self, timeout_ns: int, step_ns: int, fixed_ns: int | None) -> None:
         self._fixed_ns, self._half_step_ns = fixed_ns, step_ns // 2
-        self.rare = min(RARE_TIMES * timeout_ns // self._half_step_ns, SILENCE_MAX)
+        rare_ns = min(RARE_TIMES * timeout_ns, SESSION_NS // 4)
+        self.rare = min(rare_ns // self._half_step_ns, SILENCE_MAX)
         """Longest silence between a vehicle and a server that does not lead it [half steps]."""
         table = silences(timeout_ns, step_ns)
         self._losses, self._silences = [loss for loss, _ in table], [ns for _, ns in table]

@@ -491,7 +491,7 @@ _FLOAT32 = np.dtype("<f4")
 _FLOATS = {count: Struct(f"<{count}f") for count in range(1, 3 * AXES_MAX + 1)}
 _FLAG = range(2)
 _U16 = range(2**16)
-_U32 = range(2**32)
+_U31, _U32 = range(2**31), range(2**32)
 _U64 = range(2**64)
 PRICE = range(1, 10**9)
 _CLOCK = range(2**63)
@@ -520,7 +520,7 @@ _TYPES: tuple[tuple[type[Message], tuple[_Check, ...]], ...] = (
     (PathProof, (_U16, _U32, range(PATHS_MAX), _U64, _prices)),
     (
         Lead,
-        (_U16, _U32, _U32, _FLAG, _U32, _U32, _OrNone(_U32), range(2**16), _knots_or_none),
+        (_U16, _U32, _U32, _FLAG, _U32, _U31, _OrNone(_U31), range(2**16), _knots_or_none),
     ),
 )
 """Message of each type number (from 1) and the check of each of its fields on the wire."""

@@ -131,8 +131,8 @@ class Lives:
 
     @property
     def running(self) -> Running | None:
-        """Server and its scenario; None while the server is down."""
-        return self._running.get(SERVER[0])
+        """A server that is up, the first if both are, and its scenario; None if none is."""
+        return self._running.get(SERVER[0]) or self._running.get(STANDBY[0])
 
     def _server(self, scenario: Scenario, name: str) -> Server:
         number = len(self.servers) + 1

@@ -54,6 +54,7 @@ TERMS = (
 
 u16 = st.integers(0, 2**16 - 1)
 u32 = st.integers(0, 2**32 - 1)
+u31 = st.integers(0, 2**31 - 1)
 u64 = st.integers(0, 2**64 - 1)
 clock = st.integers(0, 2**63 - 1)
 number = st.integers(0, NUMBERS - 1)
@@ -144,7 +145,7 @@ messages: st.SearchStrategy[Message] = st.one_of(
     st.builds(Time, u16, u32, u32, u32, u32),
     st.builds(
         Lead,
-        *(u16, u32, u32, st.integers(0, 1), u32, u32, st.none() | u32, u16),
+        *(u16, u32, u32, st.integers(0, 1), u32, u31, st.none() | u31, u16),
         knots=st.just(np.empty((2, 0, 2))),
     ),
 )
@@ -162,7 +163,7 @@ trajectories = st.builds(
     u16,
     u32,
 )
-leads = st.builds(Lead, u16, u32, u32, st.just(1), u32, u32, st.none() | u32, u16, knots)
+leads = st.builds(Lead, u16, u32, u32, st.just(1), u32, u31, st.none() | u31, u16, knots)
 along_splines = TERMS._replace(scheme="trajectory")
 
 
