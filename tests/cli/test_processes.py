@@ -10,6 +10,7 @@ from types import SimpleNamespace
 from typing import cast
 
 import msgspec
+import numpy as np
 import pytest
 
 from skytether.cli.fly import _tell
@@ -28,7 +29,7 @@ from skytether.shared.core.events import (
     SessionEnded,
 )
 from skytether.shared.scenario.reading import load
-from skytether.shared.telemetry.record import PACKET_COLUMNS, Recorder
+from skytether.shared.telemetry.record import PACKET_COLUMNS, Recorder, server_columns
 from skytether.shell.command import CommandError
 from skytether.shell.log import LogLine
 from warm import Process
@@ -142,6 +143,30 @@ def test_the_record_has_the_packets_and_figures_of_every_path(tmp_path: Path) ->
     assert netem["by_path"]["2"]["uplink"]["packets"] == 5
     assert feeds_in(tmp_path, scenario)["netem 2"] == tmp_path / "netem 2.feed"
     assert set(feeds_in(tmp_path, load("demo"))) == {"client", "server", "netem"}
+
+
+def test_the_record_has_the_rows_of_both_servers_in_order(tmp_path: Path) -> None:
+    scenario = load("demo")
+    columns = server_columns(scenario.model.axes, scenario.control.scheme)
+    for part in ("client", "netem", "netem 2"):
+        (tmp_path / part).touch()
+    for name, steps in {"server": [3, 4, 8], "server 2": [5, 6, 7]}.items():
+        with (tmp_path / name).open("wb") as file:
+            Recorder(columns, file).append(3, step=np.array(steps))
+        (tmp_path / f"{name}.json").write_bytes(b'{"vehicles": 1}')
+    record = record_of(tmp_path, scenario, ())
+    assert record.server["step"].tolist() == [3, 4, 5, 6, 7, 8]
+    assert record.figures == {"server": {"vehicles": 1}, "server 2": {"vehicles": 1}}
+    feeds = set(feeds_in(tmp_path, scenario, standby=True))
+    assert feeds == {"client", "server", "server 2", "netem", "netem 2"}
+
+
+async def test_a_second_server_is_told_from_the_first_in_what_they_say() -> None:
+    heard: list[LogLine] = []
+    async with started("server 2", "demo", "--bind", "127.0.0.1:0", on_event=heard.append) as child:
+        pass
+    assert {line.process for line in heard} == {"server 2"}
+    assert child.last_words().startswith("server 2: ")
 
 
 DEEP = b'{"process":"client","event":' + b"[" * 50_000

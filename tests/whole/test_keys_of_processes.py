@@ -84,8 +84,9 @@ def test_plaintext_is_said_loudly(start: Callable[..., Process]) -> None:
     [
         ("server", "demo", "--bind", "0.0.0.0:0"),
         ("client", "demo", "--server", "192.0.2.1:47000"),
+        ("client", "demo", "--standby", "192.0.2.1:47000"),
     ],
-    ids=["server", "client"],
+    ids=["server", "client", "standby"],
 )
 def test_without_keys_no_other_machine_is_spoken_to(argv: tuple[str, ...]) -> None:
     ended = skytether(*argv)
