@@ -149,6 +149,10 @@ class Client(Endpoint):
             changed=self._mode_changed,
         )
         number = self._memory.before.leadership
+        # A vehicle that has lost its standby server tells the other that it leads now.
+        number += bool(number and not standby)
+        self._has_leader = number > 0 or len(servers) > 1
+        """Whether servers are told who leads."""
         self._leadership = Leadership(len(servers), number, self._timeout_ns)
         self._led_by, self._began_ns = self._leadership.number, NEVER_NS
         """Number of the leadership last reported, and time of the first wake."""
@@ -392,7 +396,7 @@ class Client(Endpoint):
         for session in self._sessions:
             observation = None
             # A server that does not know who leads would take itself for the leader.
-            if len(self._sessions) > 1 and session.told is None:
+            if self._has_leader and session.told is None:
                 continue
             if session.leads:
                 observation = pilot.observation(session)
@@ -407,7 +411,7 @@ class Client(Endpoint):
 
     def _follow_leader(self, now_ns: int) -> None:
         """Let another server lead if the leader is silent, and tell all servers who leads."""
-        if len(self._sessions) == 1:
+        if not self._has_leader:
             return
         lead, self._followed_ns = self._leadership, now_ns
         if self._began_ns == NEVER_NS:
@@ -616,7 +620,7 @@ class Client(Endpoint):
             observed_ns = pilot.starts_ns(compensator.observed)
             vehicle_figures["age_ms"] = (now_ns - observed_ns) / MILLISECOND_NS
             vehicle_figures["plan_age_ms"] = (now_ns - planned_ns) / MILLISECOND_NS
-        if len(self._sessions) > 1:
+        if self._has_leader:
             vehicle_figures["leadership"] = {
                 "number": self._leadership.number,
                 "server": address_text(*self._session.address),

@@ -252,8 +252,8 @@ class ServerSession:
             case Lead() as lead:
                 self._check(lead)
                 self.told = lead.number
-                self._leadership.learn(lead.known, self._index)
                 self._leadership.exceed(lead.number, self._index)
+                self._leadership.learn(lead.known, self._index)
                 self._note_heard(now_ns)
             case _:
                 raise ProtocolError(Drop.NOT_FOR_A_CLIENT)

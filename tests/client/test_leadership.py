@@ -11,6 +11,7 @@ from skytether.client.endpoint import Client
 from skytether.client.leadership import NUMBER_MAX, Leadership
 from skytether.client.memory import SavedState, recall
 from skytether.client.simulated.vehicle import SimulatedVehicle, simulated
+from skytether.shared.base.errors import ConfigError
 from skytether.shared.base.units import SECOND_NS, seconds_to_ns
 from skytether.shared.core.endpoint import STANDBY_SOCKETS, Address, Datagram
 from skytether.shared.core.events import LeaderChanged
@@ -74,13 +75,16 @@ class Vehicle:
         scenario: Scenario,
         before: SavedState | None = None,
         flies: SimulatedVehicle | None = None,
+        *,
+        has_standby: bool = True,
     ) -> None:
         self.scenario, self.now_ns = scenario, SECOND_NS
+        self.saves, self.writes = True, False
         self.client = Client(
             scenario,
             flies or simulated(scenario, 1),
             server=SERVERS[0],
-            standby=[SERVERS[1]],
+            standby=[SERVERS[1]] if has_standby else [],
             vehicle=4,
             boot_id=99,
             keeps=True,
@@ -89,8 +93,10 @@ class Vehicle:
         self.sent: list[tuple[int, Message]] = []
         """Server, and message to it."""
         self.step()
-        for server in (0, 1):
-            welcome = Welcome(4, 7 + server, 99, server, 1234, Refusal.ACCEPTED, scenario.terms())
+        for server in range(1 + has_standby):
+            welcome = Welcome(
+                4, 7 + server, 99 ^ server, server, 1234, Refusal.ACCEPTED, scenario.terms()
+            )
             self.hear(server, welcome)
 
     def hear(self, server: int, message: Message) -> None:
@@ -114,11 +120,14 @@ class Vehicle:
                 return
 
     def _take(self) -> None:
-        if self.client.keep(now_ns=self.now_ns) is not None:
-            self.client.kept()
+        # As the driver does: what is written meanwhile does not count for what is sent.
+        self.writes |= self.client.keep(now_ns=self.now_ns) is not None
         for payload, _, socket in self.client.outbox():
             message = decode(payload, self.scenario.terms())
             self.sent.append((SOCKETS.index(socket), message))
+        if self.writes and self.saves:
+            self.writes = False
+            self.client.kept()
 
     def told(self, server: int, kind: type[Message]) -> list[Message]:
         return [each for to, each in self.sent if to == server and isinstance(each, kind)]
@@ -238,3 +247,54 @@ def test_a_vehicle_that_waits_on_the_ground_keeps_its_leader() -> None:
                 vehicle.answer(server)
             vehicle.beat(server)
     assert vehicle.client.vehicle_figures()["leadership"]["number"] == 0
+
+
+def test_a_vehicle_that_has_no_standby_any_more_is_led_by_its_server() -> None:
+    """The server may know that another led; it is told a larger number."""
+    vehicle = Vehicle(packaged("paper-every-step"), SavedState(leadership=3), has_standby=False)
+    vehicle.step(0.2)
+    (told, *_) = vehicle.told(0, Lead)
+    assert isinstance(told, Lead)
+    assert (told.number, told.leads) == (4, 1)
+    vehicle.answer(0)
+    datagram = Datagram(plan(vehicle.scenario, 3, 0, 4), SERVERS[0], SOCKETS[0])
+    vehicle.client.receive(datagram, now_ns=vehicle.now_ns)
+    assert not vehicle.client.dropped[Drop.NOT_THE_LEADER]
+
+
+def test_a_number_is_saved_before_it_is_told(vehicle: Vehicle) -> None:
+    """Else the next run would take plans of a leadership that a server no longer reckons with."""
+    for server in (0, 1):
+        vehicle.step(0.1)
+        vehicle.answer(server)
+    vehicle.saves = False
+    vehicle.step(0.8)
+    vehicle.answer(1)
+    vehicle.step(0.6)
+    assert vehicle.client.vehicle_figures()["leadership"]["number"] == 1
+    assert {each.number for each in vehicle.told(1, Lead)} == {0}  # type: ignore[union-attr]
+    vehicle.saves = True
+    vehicle.step(0.1)
+    assert {each.number for each in vehicle.told(1, Lead)} == {0, 1}  # type: ignore[union-attr]
+
+
+def test_a_server_that_was_told_more_by_an_earlier_run_leads(vehicle: Vehicle) -> None:
+    """The earlier run has not saved its number, and nobody would lead."""
+    vehicle.step(0.1)
+    vehicle.hear(1, Lead(4, 8, 5, 0, 5))
+    assert vehicle.client.vehicle_figures()["leadership"]["number"] == 7
+    vehicle.step(0.1)
+    vehicle.hear(0, Lead(4, 7, 6, 0, 6))
+    assert vehicle.client.vehicle_figures()["leadership"]["number"] == 7
+
+
+def test_a_number_far_above_the_own_is_not_believed(vehicle: Vehicle) -> None:
+    vehicle.step(0.1)
+    vehicle.answer(1, NUMBER_MAX)
+    assert vehicle.client.vehicle_figures()["leadership"]["number"] == 0
+
+
+def test_a_fixed_heartbeat_that_is_too_rare_for_a_standby_is_refused() -> None:
+    rare = packaged("demo", link={"heartbeat_s": 0.6})
+    with pytest.raises(ConfigError, match=r"link\.heartbeat_s: got 0\.6, expected at most a third"):
+        Vehicle(rare)

@@ -11,8 +11,10 @@ import pytest
 from helpers import packaged
 from skytether.client.endpoint import Client
 from skytether.client.leadership import Leadership
+from skytether.netem.proxy import Proxy
 from skytether.server.endpoint import Server
-from skytether.shared.core.events import LeaderChanged, ModeChanged
+from skytether.shared.core.change import Running
+from skytether.shared.core.events import LeaderChanged, ModeChanged, SessionEnded
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Record
 from skytether.shared.telemetry.summary import summarise
@@ -157,3 +159,32 @@ def test_whatever_fails_it_flies_again_at_the_end(seed: int) -> None:
     assert set(record.client["mode"][late]) <= {Mode.TRACK, Mode.COAST}
     wanted = flown.make_reference()(record.client["step"][late] * flown.control.dt)
     assert np.abs(record.client["state"][late] - wanted)[..., 0].max() < 0.3
+
+
+@pytest.mark.parametrize("name", ["demo", "target"])
+def test_a_leader_that_hears_nothing_is_replaced(name: str) -> None:
+    """Its heartbeats arrive, and say that it cannot plan."""
+    deaf = {"network.downlink": "loss(1)"}
+    flown = msgspec.structs.replace(scenario(name), duration=30.0)
+    record = fly(flown, standby=True, actions=[(DIES_S, lambda world: _deafen(world, deaf))])
+    (changed_s,) = changes(record)
+    assert changed_s < DIES_S + flown.link.age_max_s + 2.0 * flown.link.timeout_s
+    assert brakes(record) <= 1
+
+
+def _deafen(world: World, values: dict[str, str]) -> None:
+    netem = world._hosts["netem 1"].endpoint
+    assert isinstance(netem, Proxy)
+    world.act("netem 1", partial(Running(netem, netem._scenario).change, values))
+
+
+@pytest.mark.parametrize("timeout_s", [8.0, 20.0])
+def test_a_standby_is_kept_while_the_time_out_is_long(timeout_s: float) -> None:
+    """The server forgets a session after 30 s of silence."""
+    flown = msgspec.structs.replace(
+        scenario("demo", link={"timeout_s": timeout_s, "age_max_s": 60.0}), duration=100.0
+    )
+    record = fly(flown, standby=True)
+    told = [each for each in record.events if each.process == "standby"]
+    assert [type(each.event) for each in told].count(SessionEnded) == 0
+    assert changes(record) == []
