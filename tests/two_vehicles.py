@@ -42,6 +42,13 @@ def observation(step: int, in_force: int, place: tuple[float, float]) -> Observa
     return Observation(1, 1, step, in_force, max(in_force, 0), 0, 0, 3, 1, state, NO_INPUT)
 
 
+def along(start: list[float], velocity: list[float], *, first: int = 0) -> Motion:
+    """Motion over 11 knots with constant velocity between its ends, where it rests."""
+    v = np.vstack([np.zeros(len(start)), *[velocity] * 9, np.zeros(len(start))])
+    moved = np.cumsum(0.5 * SPACING * DT_S * (v[1:] + v[:-1]), axis=0)
+    return Motion(first, np.array(start) + np.vstack([np.zeros(len(start)), moved]), v)
+
+
 class Decision(MissionPlanner):
     """Mission planner for two vehicles, with its inputs."""
 

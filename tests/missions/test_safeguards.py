@@ -10,19 +10,12 @@ from skytether.server.missions.possible_motions import NEVER, PossibleMotion, Po
 from skytether.server.missions.separation import too_near
 from skytether.server.missions.vehicle_motions import SentMotion, VehicleMotions
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
-from skytether.shared.law.motion import SPACING, Motion, resting
+from skytether.shared.law.motion import Motion, resting
 from skytether.shared.scenario import zone_texts
 from skytether.shared.wire.protocol import NO_HORIZON
-from two_vehicles import DT_S, alone, planned, ready, scenario
+from two_vehicles import DT_S, alone, along, planned, ready, scenario
 
 FAR = 100.0
-
-
-def along(start: list[float], velocity: list[float], *, first: int = 0) -> Motion:
-    """Motion over 11 knots with constant velocity between its ends, where it rests."""
-    v = np.vstack([np.zeros(len(start)), *[velocity] * 9, np.zeros(len(start))])
-    moved = np.cumsum(0.5 * SPACING * DT_S * (v[1:] + v[:-1]), axis=0)
-    return Motion(first, np.array(start) + np.vstack([np.zeros(len(start)), moved]), v)
 
 
 def is_too_near(

@@ -8,8 +8,11 @@ from helpers import packaged
 from skytether.lab.adversary import Climb, Move, MoveKind, Raid, climb, spare_m
 from skytether.server.missions.mission_state import MissionState
 from skytether.shared.base.units import SECOND_NS
+from skytether.shared.law.motion import SPACING, Motion, resting
 from skytether.shared.scenario.mission import Mission
 from skytether.shared.scenario.schema import Scenario
+from skytether.shared.wire.protocol import NO_HORIZON, Lead
+from two_vehicles import along, ready
 
 SPLIT_S = 30
 
@@ -76,3 +79,62 @@ def test_an_adversary_of_two_servers_finds_nothing(seed: int) -> None:
     task = Climb(swaps(seed), kinds, seed, 8)
     assert min(climb(task).spares_m) > 0.0
     assert spare_m(task.scenario, climb(task).best) > 0.3
+
+
+def told(row: int, step: int, number: int = 1, motion: Motion | None = None) -> Lead:
+    if motion is None:
+        return Lead(row + 1, 7, number, 1, step=step, knots=np.empty((2, 0, 2), np.float32))
+    knots = np.stack([motion.position, motion.velocity], axis=-1).transpose(1, 0, 2)
+    flown = np.ascontiguousarray(knots, np.float32)
+    return Lead(row + 1, 7, number, 1, 0, step, motion.first, SPACING, flown)
+
+
+def test_a_vehicle_is_sent_nothing_before_it_was_observed_under_the_new_leader() -> None:
+    """What was known of it before may be long past: it was led by another server since."""
+    made = ready()
+    for row in (0, 1):
+        made.follow(row, told(row, 200))
+    made.align(201)
+    made.decide(201)
+    assert all(vehicle.next is None for vehicle in made.vehicles.values())
+    assert made.waits(0) == "its first observation"
+    made.hear(0, 205, NO_HORIZON, 2.0)
+    made.align(211)
+    made.decide(211)
+    assert made.vehicles[1].next is None
+    hovers = made.vehicles[0].next
+    assert hovers is not None
+    assert hovers.position[-1].tolist() == [2.0, 0.0]
+
+
+def test_a_motion_that_was_told_is_known_once_all_were_observed() -> None:
+    made = ready()
+    flown = along([4.0, 0.0], [-0.8, 0.0], first=190)
+    for row, motion in ((0, flown), (1, resting(200, np.array([-4.0, 0.0])))):
+        made.follow(row, told(row, 200, motion=motion))
+        assert made.state.unled is not None
+    for row, x in ((0, 3.9), (1, -4.0)):
+        in_force = made.vehicles[row].in_force
+        assert in_force is not None
+        made.hear(row, 200, in_force.step, x)
+    made.align(201)
+    assert made.state.unled is None
+    (kept, *_) = made.vehicles[0].motions()
+    assert np.allclose(kept.position, flown.position, atol=1e-6)
+    assert np.allclose(kept.velocity, flown.velocity, atol=1e-6)
+    assert not made.vehicles[0].is_foreign
+
+
+def test_vehicles_of_two_numbers_are_not_planned_for() -> None:
+    made = ready()
+    for row, number in ((0, 1), (1, 3)):
+        made.follow(row, told(row, 200, number))
+        made.hear(row, 200, NO_HORIZON, 4.0 - 8.0 * row)
+    made.align(201)
+    assert made.state.unled == 0
+    made.follow(0, told(0, 210, 3))
+    made.hear(0, 210, NO_HORIZON, 4.0)
+    made.align(211)
+    assert made.state.unled is None
+    made.follow(1, Lead(2, 7, 4, 0))
+    assert made.state.unled == 1
