@@ -14,6 +14,7 @@ from skytether.client.leadership import Leadership
 from skytether.netem.proxy import Proxy
 from skytether.server.endpoint import Server
 from skytether.shared.core.change import Running
+from skytether.shared.core.endpoint import Address, Datagram, Endpoint
 from skytether.shared.core.events import LeaderChanged, ModeChanged, SessionEnded
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Record
@@ -188,3 +189,37 @@ def test_a_standby_is_kept_while_the_time_out_is_long(timeout_s: float) -> None:
     told = [each for each in record.events if each.process == "standby"]
     assert [type(each.event) for each in told].count(SessionEnded) == 0
     assert changes(record) == []
+
+
+class Astray(Endpoint):
+    """In place of the standby server: leads its packets to the first, and the answers back."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._came_from: Address = ("", 0)
+
+    def receive(self, datagram: Datagram, *, now_ns: int) -> None:  # noqa: ARG002
+        if datagram.peer == SERVER:
+            self._out.append(Datagram(datagram.payload, self._came_from))
+        else:
+            self._came_from = datagram.peer
+            self._out.append(Datagram(datagram.payload, SERVER))
+
+    def wake(self, *, now_ns: int) -> None:
+        """Nothing is ever due."""
+
+    def next_wake_ns(self) -> None:
+        """None: it is never woken."""
+
+
+@pytest.mark.parametrize("secure", [False, True])
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_packets_for_the_standby_that_are_led_to_the_server_change_nothing(
+    seed: int, *, secure: bool
+) -> None:
+    """A wrong address, or somebody who holds the standby's network."""
+    flown = msgspec.structs.replace(scenario(), seed=seed)
+    record = fly(flown, standby=Astray(), secure=secure)
+    assert record.failure is None
+    assert brakes(record) == 0
+    assert rmse_m(flown, record) < 0.05
