@@ -31,7 +31,7 @@ NOT_MEASURED = {
     "docs/fly-a-real-one.md: From start to flight": "values of parameters",
     "docs/fly-a-real-one.md: What each failsafe does": "times that programs wait",
     "docs/compare.md: What is compared": "what cases are",
-    "docs/operating.md: Two links": "addresses",
+    "docs/two-links.md": "addresses",
     "docs/compare.md: Set-points sent straight": "defaults; figures from the tables of Measured",
     "docs/paper.md: What the paper leaves open, and what is done": "the paper's own numbers",
     "docs/torture.md: The invariants": "bounds",
