@@ -87,7 +87,7 @@ def ran(*argv: object, **keys: Any) -> "subprocess.CompletedProcess[str]":
     return done
 
 
-def until(holds: Callable[[], object], within_s: float = 60.0) -> None:
+def until(holds: Callable[[], object], within_s: float = 180.0) -> None:
     """Wait until a condition holds; fail after `within_s` [s]."""
     deadline_s = time.monotonic() + within_s
     while not holds():

@@ -154,7 +154,7 @@ class Process:
         return self.popen.wait(PATIENCE_S)
 
 
-def skytether(*argv: str, timeout_s: float = 60.0) -> subprocess.CompletedProcess[str]:
+def skytether(*argv: str, timeout_s: float = 180.0) -> subprocess.CompletedProcess[str]:
     with TemporaryFile() as out, TemporaryFile() as err:
         with Command(*argv, stdout=out.fileno(), stderr=err.fileno()) as command:
             try:

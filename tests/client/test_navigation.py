@@ -205,7 +205,7 @@ def test_a_vehicle_of_one_s_own_is_flown_by_what_it_tells() -> None:
     assert np.isnan(rows["measured"]).all(axis=(1, 2)).tolist() == [False, True, True] * 2
     assert (rows["estimate"] == [[0.5, 0.0], [0.25, 0.0]]).all()
     assert flies.flown == [[0.0, 0.0]] * 6
-    assert server.client.changeable == {"armed", "vehicle.after_leap"}
+    assert server.client.changeable == {"armed", "link.leader", "vehicle.after_leap"}
 
 
 # -- the filter --------------------------------------------------------------------------------

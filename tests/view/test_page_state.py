@@ -241,15 +241,15 @@ def test_an_autopilot_s_mode_battery_and_home_are_shown_where_they_are_told() ->
 
 
 def test_the_server_that_leads_is_shown_if_there_is_a_standby() -> None:
-    shown = demo()
-    assert "led by" not in words.status(shown.state, 1, shown.now_ns)
+    now_ns, state = demo().now_ns, state_of(demo().frames)
+    assert "led by" not in words.status(state, 1, now_ns)
     for told, said in (
         ({"number": 3, "server": "b:47001"}, "b:47001, leadership 3"),
         ({"number": "x", "server": "<b>"}, "&lt;b&gt;, leadership –"),
     ):
         figures = {"by_vehicle": {"1": {"leadership": told}}}
-        shown.state.take("client", Figures(time_ns=shown.now_ns, figures=figures))
-        assert said in words.status(shown.state, 1, shown.now_ns)
+        state.take("client", Figures(time_ns=now_ns, figures=figures))
+        assert said in words.status(state, 1, now_ns)
 
 
 def test_a_mission_s_zones_waits_and_distances_are_shown() -> None:
