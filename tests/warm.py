@@ -24,7 +24,7 @@ from skytether.__main__ import main
 from skytether.shared.core.events import Event, address_text
 from skytether.shell.log import LogLine
 
-PATIENCE_S = 60.0
+PATIENCE_S = 180.0
 
 FORK = multiprocessing.get_context("forkserver")
 FORK.set_forkserver_preload(

@@ -336,5 +336,8 @@ def test_it_flies_over_udp(tmp_path: Path) -> None:
     _is_counted_as_flown(summary)
     scene = scenario(duration=12.0, settle=6.0)
     virtual = summary_of(scene, "autopilot", flown(duration=12.0, settle=6.0))
-    assert summary.rmse_xy == pytest.approx(virtual.rmse_xy, abs=0.05)
+    # A step that the busy machine misses leaves the vehicle to fly on for as long.
+    assert summary.rmse_xy == pytest.approx(
+        virtual.rmse_xy, abs=0.05 + 0.01 * summary.deadline_misses
+    )
     assert figure.read_text().startswith("<?xml")

@@ -19,7 +19,7 @@ from skytether.__main__ import main
 
 pytestmark = pytest.mark.long
 
-PATIENCE_S = 60.0
+PATIENCE_S = 180.0
 SIGUSR1_IGNORED = 1 << (signal.SIGUSR1 - 1)
 
 VIRTUAL = ["--virtual", "--vehicles", "2", "--duration", "1", "--settle", "0"]

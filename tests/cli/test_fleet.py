@@ -139,7 +139,7 @@ def test_a_datagram_reaches_the_vehicle_whose_socket_it_came_to_and_no_other() -
 
 def fleet_command(tmp_path: Path, *argv: str) -> dict[str, object]:
     file = tmp_path / "fleet.json"
-    done = skytether("fleet", *argv, "--json", str(file), timeout_s=100.0)
+    done = skytether("fleet", *argv, "--json", str(file), timeout_s=250.0)
     assert done.returncode == 0, done.stderr
     summary: dict[str, object] = json.loads(file.read_bytes())
     return summary
@@ -262,7 +262,7 @@ def test_a_fleet_over_udp_is_summed_up(tmp_path: Path, count: int) -> None:
 @pytest.mark.long
 def test_a_fleet_has_a_page_where_one_is_asked_for() -> None:
     argv = ["fleet", "--vehicles", "3", "--duration", "6", "--page", "127.0.0.1:0"]
-    done = ran(*SKYTETHER, *argv, timeout=90)
+    done = ran(*SKYTETHER, *argv, timeout=250)
     assert done.returncode == 0
     assert "http://127.0.0.1:" in done.stderr
     assert "without a page" not in done.stderr
