@@ -43,7 +43,9 @@ class Leadership:
         return now_ns - heard_ns[self.leader] >= self._ask_ns
 
     def successor(self, heard_ns: Sequence[int], now_ns: int) -> int | None:
-        """The server to lead instead of a silent leader; None if it leads on, or none is heard."""
+        """Server that is to lead in place of a silent leader; None if the leader is not silent, or
+        no other server is heard.
+        """
         last_ns = heard_ns[self.leader]
         if now_ns - last_ns < self._change_ns:
             return None

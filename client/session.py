@@ -150,7 +150,7 @@ class ServerSession:
         """Time of the newest packet of the session; None before the first, and once it is closed.
         """
         self.useful_ns: int | None = None
-        """Time of the newest packet that does not say that the server cannot plan."""
+        """The same without heartbeats that say that the server cannot plan."""
         self.sent_step = -1
         """Step of the newest observation; -1 before the first of the session."""
         self.told: int | None = None

@@ -32,7 +32,7 @@ from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Recorder
 from skytether.shared.wire.drop import Drop
 from skytether.shared.wire.paths import EVERYWHERE
-from skytether.shared.wire.protocol import CLOSES, Close, Lead, Refusal, encode
+from skytether.shared.wire.protocol import CLOSES, Close, Refusal, encode
 
 VEHICLES_MAX = 64
 """Default largest number of vehicles at once."""
@@ -161,8 +161,7 @@ class Server(Endpoint):
         for session in self.sessions:
             number = session.leadership
             if number is not None and (known := self.controller.known(number)) > number:
-                told = Lead(session.vehicle, session.number, number, int(session.leads), known)
-                self._out += session.sealed(encode(told), now_ns)
+                self._out += session.sealed(encode(session.lead(known)), now_ns)
 
     def close(self, *, now_ns: int) -> None:
         for _ in range(CLOSES):

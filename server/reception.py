@@ -250,9 +250,8 @@ class Reception:
                 self._controller.follow(session.row, message)
             else:
                 session.first = message
-        leads = int(session.leads)
-        number, known = session.leadership, self._controller.known(session.leadership)
-        self._answer(Lead(session.vehicle, session.number, number, leads, known), call, datagram)
+        known = self._controller.known(session.leadership)
+        self._answer(session.lead(known), call, datagram)
 
     def _make_paths(self, session: Session, prices: tuple[int, ...]) -> ServerPaths:
         paths = ServerPaths(prices, self._spread, self._sessions.entropy, self._timeout_ns)

@@ -77,6 +77,11 @@ class Session:
     first: Lead | None = None
     """What the vehicle has told before its first observation."""
 
+    def lead(self, known: int) -> Lead:
+        """What the vehicle has told of its leader, and the largest number that it should know."""
+        assert self.leadership is not None
+        return Lead(self.vehicle, self.number, self.leadership, int(self.leads), known)
+
     def number_next(self, now_ns: int) -> int:
         number = self.sent
         self.sent, self.sent_ns = (number + 1) % NUMBERS, now_ns

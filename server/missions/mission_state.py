@@ -142,8 +142,8 @@ class MissionState:
         """Number of the leadership with which each row is led by this server; None if another
         server leads it."""
         self._awaited: dict[int, int] = {}
-        """Rows of which this server has not yet planned with an observation since it began to lead
-        them, and the step from which on one counts."""
+        """Rows that this server has begun to lead, until it has an observation of them from under
+        its lead: the step from which on an observation is one."""
         self.unled: int | None = None
         """Row because of which no motion may be planned: not all vehicles follow this server with
         one number, or this one was not observed since. None if there is none."""
