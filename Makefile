@@ -55,11 +55,11 @@ reproduce: setup  ## the paper's table and figures, and more, in results/report.
 
 test: setup  ## everything but Docker and what takes long, in four minutes on two cores
 	@$(KERNELS)
-	$(BIN)/pytest -q -m "not docker and not long and not browser and not autopilot" -n 3 --dist loadfile --no-loadscope-reorder --durations=12
+	$(BIN)/pytest -q -m "not docker and not long and not browser and not autopilot" -n 3 --dist loadfile --no-loadscope-reorder --durations=40
 
 long-test: setup  ## the commands of the documents, benchmarks, and flights of many processes
 	@$(KERNELS)
-	$(BIN)/pytest -q -m "long and not docker and not browser and not autopilot" -n 5 --dist loadfile --no-loadscope-reorder --durations=12
+	$(BIN)/pytest -q -m "long and not docker and not browser and not autopilot" -n 5 --dist loadfile --no-loadscope-reorder --durations=40
 
 check: setup  ## style, types, and who imports whom
 	$(BIN)/ruff format --check .

@@ -14,11 +14,11 @@ import msgspec
 from skytether.client.failsafe import CLOSING, GOOD_NS, HOLD, TABLE, Failsafe, brake_ns
 from skytether.client.followers import SplineFollower
 from skytether.client.ground import GroundReports
-from skytether.client.leadership import Leadership
 from skytether.client.link import ClientLink, PlainLink
 from skytether.client.memory import ClientMemory, FlownMotion, SavedState
 from skytether.client.pilot import Pilot
-from skytether.client.session import ServerSession, Watch
+from skytether.client.servers import LEADER_KEY, NAMES, Servers
+from skytether.client.session import ServerSession
 from skytether.client.vehicle import Vehicle
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.base.units import MICROSECOND_NS, MILLISECOND_NS, SECOND_NS, seconds_to_ns
@@ -36,7 +36,6 @@ from skytether.shared.core.events import (
     FenceHolds,
     Finished,
     Flying,
-    LeaderChanged,
     ModeChanged,
     NotFlown,
     StateLeapt,
@@ -51,7 +50,7 @@ from skytether.shared.scenario.owners import InFlight
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Reason, Recorder
 from skytether.shared.wire.drop import Drop, ProtocolError
-from skytether.shared.wire.protocol import CLOSES, NO_HORIZON, Close, Lead, Mode, stamp_us
+from skytether.shared.wire.protocol import CLOSES, NO_HORIZON, Close, Mode, stamp_us
 
 NOWHERE: Address = ("", 0)
 VEHICLE_SOCKET = 1
@@ -63,22 +62,11 @@ HELD_AGAIN_NS = 5 * SECOND_NS
 AFTER_LEAP = "vehicle.after_leap"
 LEAP = keys_of(InFlight.LEAP)
 """Key with which an operator chooses the frame to use after a leap of the position."""
-LEADER_KEY = "link.leader"
 LEADER = keys_of(InFlight.LEADER)
 """Key with which an operator lets another server lead."""
-SERVERS = ("server", "standby")
-"""Values of that key, by the number of the server."""
 TIME_NS, TIME_ERROR_MAX_US = 2 * SECOND_NS, 2**32 - 1
 """Interval between two reports of the time of day [ns], and the largest error that fits in one
 [µs]."""
-SOON_NS = 200 * MILLISECOND_NS
-"""Time after which a server that has to lead is told again that it does [ns]."""
-NEVER_NS = -(2**63)
-GROUND_NS = 3 * SECOND_NS
-"""Additional time for which the leader of a vehicle on the ground may be silent [ns]: there it
-answers HELLOs only, of which the first need several packets each way."""
-DEPARTURES = frozenset({Reason.CLOSED, Reason.RESTARTED})
-"""Causes after which a server leads no more if another is heard."""
 PLANLESS = frozenset({Reason.OPENED, Reason.GOOD, Reason.HORIZON, Reason.OLD, Reason.ENDED})
 """Reasons for a mode that do not explain why there is no newer horizon."""
 
@@ -134,7 +122,7 @@ class Client(Endpoint):
         self.changeable = flies.changeable | ARMED | LEAP | LEADER
         for key, setting, at_start in (
             (AFTER_LEAP, scenario.vehicle.after_leap, "ask"),
-            (LEADER_KEY, scenario.link.leader, SERVERS[0]),
+            (LEADER_KEY, scenario.link.leader, NAMES[0]),
         ):
             if setting != at_start:
                 expected = f"expected {at_start!r}: it is chosen in flight"
@@ -148,21 +136,17 @@ class Client(Endpoint):
             returns=scenario.vehicle.on_loss == "return",
             changed=self._mode_changed,
         )
-        number = self._memory.before.leadership
-        # A vehicle that has lost its standby server tells the other that it leads now.
-        number += bool(number and not standby)
-        self._has_leader = number > 0 or len(servers) > 1
-        """Whether servers are told who leads."""
-        self._leadership = Leadership(len(servers), number, self._timeout_ns)
-        self._led_by, self._began_ns = self._leadership.number, NEVER_NS
-        """Number of the leadership last reported, and time of the first wake."""
-        self._followed_ns = NEVER_NS
-        """When it was last looked after who leads."""
-        self._named_ns = NEVER_NS
-        """When a server was named as leader that is not silent, but speaks rarely."""
-        self._doubted_ns = NEVER_NS
-        """When the leader that is, or was last, doubted had been heard last."""
-        self._sessions: list[ServerSession] = []
+        self._servers = Servers(
+            len(servers),
+            self._memory.before.leadership,
+            self._failsafe,
+            vehicle=vehicle,
+            timeout_ns=self._timeout_ns,
+            motion=self._flown_motion,
+            may_tell=self._may_tell,
+            events=self._events,
+        )
+        self._sessions = self._servers.sessions
         for i, (addresses, sockets) in enumerate(
             zip(servers, (PATH_SOCKETS, STANDBY_SOCKETS), strict=False)
         ):
@@ -177,7 +161,7 @@ class Client(Endpoint):
                     boot_id=self._memory.boot_id ^ i,
                     server=i,
                     sockets=sockets,
-                    leadership=self._leadership,
+                    leadership=self._servers.leadership,
                     paths=addresses,
                     prices=prices if len(prices) == len(addresses) else (1.0,) * len(addresses),
                     spread=scenario.link.spread,
@@ -185,7 +169,7 @@ class Client(Endpoint):
                     connect_s=scenario.link.connect_s,
                     link=(link, standby_link)[i] or PlainLink(),
                     hearing=Hearing(self._timeout_ns, terms.dt_ns, scenario.link.fixed_ns),
-                    watch=self._failsafe if len(servers) == 1 else _OfLeader(self, i),
+                    watch=self._servers.watch(i),
                     out=self._out,
                     events=self._events,
                 )
@@ -208,7 +192,7 @@ class Client(Endpoint):
     @property
     def _session(self) -> ServerSession:
         """Session with the server that leads."""
-        return self._sessions[self._leadership.leader]
+        return self._servers.leading
 
     @property
     def failure(self) -> Failure | None:
@@ -293,7 +277,7 @@ class Client(Endpoint):
             return msgspec.structs.replace(
                 self._memory.before,
                 frame=self._flies.frame,
-                leadership=self._leadership.number,
+                leadership=self._servers.leadership.number,
             )
         return SavedState(
             boot_id=self._memory.boot_id,
@@ -301,11 +285,11 @@ class Client(Endpoint):
             heard_ns=self._failsafe.heard_ns or pilot.began_ns,
             motion=self._flown_motion(),
             frame=self._flies.frame,
-            leadership=self._leadership.number,
+            leadership=self._servers.leadership.number,
         )
 
     def _flown_motion(self) -> FlownMotion | None:
-        """Motion in force; None without one, or without a mission."""
+        """Motion in force; None without one, on the ground, or without a mission."""
         compensator = self._pilot.compensator
         flown = compensator.follower
         if not self._is_mission or compensator.in_force == NO_HORIZON:
@@ -320,6 +304,9 @@ class Client(Endpoint):
 
     def keep(self, *, now_ns: int) -> bytes | None:
         return self._memory.keep(self._to_keep(), now_ns=now_ns) if self.keeps else None
+
+    def _may_tell(self, now_ns: int) -> bool:
+        return not self.keeps or self._memory.may_tell(self._to_keep(), now_ns=now_ns)
 
     def kept(self) -> None:
         self._memory.kept()
@@ -353,7 +340,7 @@ class Client(Endpoint):
             elif not self._session.wait(now_ns=now_ns):
                 return
             else:
-                self._follow_leader(now_ns)
+                self._servers.follow(step=self._pilot.flown, on_ground=True, now_ns=now_ns)
             for session in self._sessions:
                 session.ask(now_ns=now_ns)
                 if self._pilot.next_ns is None:
@@ -371,7 +358,7 @@ class Client(Endpoint):
 
     def _watch_ground(self, now_ns: int) -> None:
         session, waits_for = self._session, self._flies.waits_for
-        ground = self._ground[self._leadership.leader]
+        ground = self._ground[self._servers.leadership.leader]
         if session.number is not None:
             ground.hear(session.number, session.echo.received_ns, now_ns=now_ns)
         elif self._flies.is_ready:
@@ -390,13 +377,13 @@ class Client(Endpoint):
             self._end(now_ns)
         # Nothing is sent before the state is saved: otherwise the server would not know which
         # motion the next run flies.
-        if self.keeps and not self._memory.may_tell(self._to_keep(), now_ns=now_ns):
+        if not self._may_tell(now_ns):
             return
-        self._follow_leader(now_ns)
+        self._servers.follow(step=pilot.flown, on_ground=False, now_ns=now_ns)
         for session in self._sessions:
             observation = None
             # A server that does not know who leads would take itself for the leader.
-            if self._has_leader and session.told is None:
+            if self._servers.are_told and session.told is None:
                 continue
             if session.leads:
                 observation = pilot.observation(session)
@@ -406,86 +393,6 @@ class Client(Endpoint):
                 session.send(observation, now_ns=now_ns)
                 self._tell_time(session, now_ns)
             session.watch_paths(now_ns)
-
-    # -- leadership --------------------------------------------------------------------------
-
-    def _follow_leader(self, now_ns: int) -> None:
-        """Let another server lead if the leader is silent, and tell all servers who leads."""
-        if not self._has_leader:
-            return
-        lead, self._followed_ns = self._leadership, now_ns
-        if self._began_ns == NEVER_NS:
-            self._began_ns = now_ns
-        heard_ns = [each.heard_ns or self._began_ns for each in self._sessions]
-        heard_ns[lead.leader] = self._session.useful_ns or self._began_ns
-        if self._pilot.next_ns is None:
-            heard_ns[lead.leader] += GROUND_NS + self._timeout_ns // 2
-        # A server that did not lead speaks rarely, so its silence counts from when it was named.
-        heard_ns[lead.leader] = max(heard_ns[lead.leader], self._named_ns)
-        successor = lead.successor(heard_ns, now_ns)
-        if successor is not None:
-            lead.hand_over(successor)
-        self._report_leader()
-        # The next run must not follow an earlier leadership than the servers have been told.
-        if self.keeps and not self._memory.may_tell(self._to_keep(), now_ns=now_ns):
-            return
-        doubts = lead.doubts(heard_ns, now_ns)
-        leader_ns = heard_ns[lead.leader]
-        if doubts and leader_ns != self._doubted_ns and not self._is_alone(now_ns):
-            self._doubted_ns = leader_ns
-            self._failsafe.heard(now_ns=now_ns)  # the other server gets a time-out to answer
-        for session in self._sessions:
-            if session.number is None or now_ns < session.lead_ns:
-                continue
-            asks = doubts and not session.leads
-            if asks or (session.told != lead.number and not session.is_lost(now_ns)):
-                self._tell_leader(session, now_ns, is_urgent=asks or session.leads)
-
-    def _is_alone(self, now_ns: int) -> bool:
-        """Whether no server is heard that could lead in place of the leader."""
-        return all(each.leads or each.is_lost(now_ns) for each in self._sessions)
-
-    def _tell_leader(self, session: ServerSession, now_ns: int, *, is_urgent: bool) -> None:
-        assert session.number is not None
-        number, leads, motion = self._leadership.number, session.leads, None
-        if leads and self._pilot.next_ns is not None:
-            motion = self._flown_motion()
-        message = Lead(self.vehicle, session.number, number, int(leads), step=self._pilot.flown)
-        if motion is not None:
-            message = message._replace(
-                in_force=motion.step, spacing=motion.spacing, knots=motion.numbers
-            )
-        session.tell_leader(message, SOON_NS if is_urgent else SECOND_NS, now_ns=now_ns)
-
-    def _report_leader(self) -> None:
-        """Report that another server leads; its packets count as the link's from now on."""
-        if self._led_by == self._leadership.number:
-            return
-        self._led_by, session = self._leadership.number, self._session
-        if session.heard_ns is not None:
-            self._failsafe.heard(now_ns=max(session.heard_ns, self._failsafe.heard_ns or 0))
-        (host, port), number = session.address, self._led_by
-        self._events.append(
-            LeaderChanged(vehicle=self.vehicle, host=host, port=port, number=number)
-        )
-
-    def _depart(self, server: int, cause: Reason, now_ns: int) -> bool:
-        """Whether a cause on the side of a server is none for the vehicle, since another leads."""
-        session = self._sessions[server]
-        if not session.leads:
-            if cause in CLOSING:
-                session.close()
-            return True
-        others = [i for i, each in enumerate(self._sessions) if i != server]
-        ready = [i for i in others if not self._sessions[i].is_lost(now_ns)]
-        if cause not in DEPARTURES or not ready:
-            return False
-        self._leadership.hand_over(ready[0])
-        self._named_ns = now_ns
-        self._report_leader()
-        if cause in CLOSING:
-            session.close()
-        return True
 
     def _tell_leap(self, leap_m: tuple[float, ...] | None) -> None:
         self._reported_leap = leap_m
@@ -509,7 +416,7 @@ class Client(Endpoint):
         """After a leap, arming requires the operator to choose the frame, which says where the
         vehicle is. A server that is not heard cannot be made the leader.
         """
-        if keys & LEADER and (objection := self._objection_to_leader(scenario.link.leader)):
+        if keys & LEADER and (objection := self._servers.objection(scenario.link.leader)):
             return objection
         leap_m, choice = self._pilot.leap_m, scenario.vehicle.after_leap
         if leap_m is None and keys & LEAP and choice != "ask":
@@ -521,16 +428,6 @@ class Client(Endpoint):
             expected = f"expected {AFTER_LEAP} = 'old', 'new' or 'stay' with it"
             return f"armed: got true after its position has leapt by {metres(leap_m)}, {expected}"
         return self._flies.objection(scenario, keys)
-
-    def _objection_to_leader(self, named: str) -> str:
-        server = SERVERS.index(named)
-        if server >= len(self._sessions):
-            return f"{LEADER_KEY}: got {named!r}, expected 'server' without a standby server"
-        session = self._sessions[server]
-        if not session.leads and session.is_lost(self._followed_ns):
-            at = address_text(*session.address)
-            return f"{LEADER_KEY}: got {named!r}, but the server at {at} is not heard"
-        return ""
 
     def learn_time(self, utc_ns: int, error_ns: int, *, now_ns: int) -> None:
         self._time = TimeOfDay(utc_ns - now_ns, error_ns, now_ns)
@@ -557,9 +454,7 @@ class Client(Endpoint):
                 case choice:
                     self._failsafe.stays = choice == "stay"
         if keys & LEADER:
-            self._leadership.hand_over(SERVERS.index(scenario.link.leader))
-            self._named_ns = now_ns
-            self._report_leader()
+            self._servers.name(NAMES.index(scenario.link.leader), now_ns=now_ns)
         if keys & self._flies.changeable:
             self._flies.change(scenario)
 
@@ -620,9 +515,9 @@ class Client(Endpoint):
             observed_ns = pilot.starts_ns(compensator.observed)
             vehicle_figures["age_ms"] = (now_ns - observed_ns) / MILLISECOND_NS
             vehicle_figures["plan_age_ms"] = (now_ns - planned_ns) / MILLISECOND_NS
-        if self._has_leader:
+        if self._servers.are_told:
             vehicle_figures["leadership"] = {
-                "number": self._leadership.number,
+                "number": self._servers.leadership.number,
                 "server": address_text(*self._session.address),
             }
         if self._session.paths:
@@ -630,25 +525,6 @@ class Client(Endpoint):
         if self._port is not None:
             vehicle_figures["autopilot"] = self._port.figures()
         return vehicle_figures
-
-
-class _OfLeader(Watch):
-    """Packets and faults of one of several servers: those of the leader reach the failsafe."""
-
-    def __init__(self, client: Client, server: int) -> None:
-        self._client, self._server = client, server
-
-    def heard(self, *, now_ns: int) -> None:
-        if self._client._leadership.leader == self._server:
-            self._client._failsafe.heard(now_ns=now_ns)
-
-    def malformed(self, *, now_ns: int) -> None:
-        if self._client._leadership.leader == self._server:
-            self._client._failsafe.malformed(now_ns=now_ns)
-
-    def meet(self, cause: Reason, *, now_ns: int) -> None:
-        if not self._client._depart(self._server, cause, now_ns):
-            self._client._failsafe.meet(cause, now_ns=now_ns)
 
 
 def figures(clients: Sequence[Client]) -> dict[str, Any]:

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from helpers import packaged
-from skytether.client.endpoint import Client
 from skytether.client.leadership import Leadership
+from skytether.client.servers import Servers
 from skytether.netem.proxy import Proxy
 from skytether.server.endpoint import Server
 from skytether.shared.core.change import Running
@@ -88,7 +88,7 @@ def test_a_vehicle_that_does_not_wait_for_the_answer_brakes(
     flown = scenario(**slow)
     dies = [(DIES_S, stops(SERVER[0]))]
     assert brakes(fly(flown, standby=True, actions=dies)) == 0
-    monkeypatch.setattr(Client, "_is_alone", lambda *_: True)
+    monkeypatch.setattr(Servers, "_is_alone", lambda *_: True)
     assert brakes(fly(flown, standby=True, actions=dies)) == 1
 
 

@@ -1,0 +1,200 @@
+"""The servers of a vehicle: which one leads, and what each is told of it.
+
+With one server nothing is decided and nothing is told. With two the vehicle changes the leader by
+the rules of `client.leadership`; packets and faults of the leader alone reach the failsafe.
+"""
+
+from collections.abc import Callable
+
+from skytether.client.failsafe import CLOSING, Failsafe
+from skytether.client.leadership import Leadership
+from skytether.client.memory import FlownMotion
+from skytether.client.session import ServerSession, Watch
+from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
+from skytether.shared.core.endpoint import Events
+from skytether.shared.core.events import LeaderChanged, address_text
+from skytether.shared.telemetry.record import Reason
+from skytether.shared.wire.protocol import Lead
+
+LEADER_KEY = "link.leader"
+NAMES = ("server", "standby")
+"""Values of that key, by the number of the server."""
+SOON_NS = 200 * MILLISECOND_NS
+"""Time after which a server that has to lead is told again that it does [ns]."""
+GROUND_NS = 3 * SECOND_NS
+"""Additional time for which the leader of a vehicle on the ground may be silent [ns]: there it
+answers HELLOs only, of which the first need several packets each way."""
+DEPARTURES = frozenset({Reason.CLOSED, Reason.RESTARTED})
+"""Causes after which a server leads no more if another is heard."""
+NEVER_NS = -(2**63)
+
+
+class Servers:
+    """Sessions of a vehicle with its servers.
+
+    Args:
+        count: number of servers.
+        number: number of the leadership of an earlier run of the client; 0 at first.
+        timeout_ns: silence after which the vehicle takes a server for lost [ns].
+        motion: tells the motion in force of a mission; None on the ground, or without one.
+        may_tell: saves the number, if it is to be saved; whether it may be told at a time [ns].
+        events: list to which events for the operator are appended.
+    """
+
+    def __init__(
+        self,
+        count: int,
+        number: int,
+        failsafe: Failsafe,
+        *,
+        vehicle: int,
+        timeout_ns: int,
+        motion: Callable[[], FlownMotion | None],
+        may_tell: Callable[[int], bool],
+        events: Events,
+    ) -> None:
+        # A vehicle that has lost its standby server tells the other that it leads now.
+        number += bool(number and count == 1)
+        self.are_told = number > 0 or count > 1
+        """Whether the servers are told who leads."""
+        self.leadership = Leadership(count, number, timeout_ns)
+        self.sessions: list[ServerSession] = []
+        """Session with each; the caller appends them."""
+        self.failsafe = failsafe
+        self._count, self._vehicle, self._events = count, vehicle, events
+        self._timeout_ns, self._motion, self._may_tell = timeout_ns, motion, may_tell
+        self._reported = number
+        """Number of the leadership that was last reported."""
+        self._now_ns = NEVER_NS
+        self._named_ns: int | None = None
+        """Time from which the silence of the leader counts at most: a server that did not lead
+        speaks rarely. None before the first wake."""
+        self._doubted_ns = NEVER_NS
+        """When the leader that is, or was last, doubted had been heard last."""
+
+    @property
+    def leading(self) -> ServerSession:
+        return self.sessions[self.leadership.leader]
+
+    def watch(self, server: int) -> Watch:
+        """What notes the packets and faults of a server."""
+        return self.failsafe if self._count == 1 else _OfLeader(self, server)
+
+    # -- deciding ----------------------------------------------------------------------------
+
+    def follow(self, *, step: int, on_ground: bool, now_ns: int) -> None:
+        """Let another server lead if the leader is silent, and tell all servers who leads.
+
+        Args:
+            step: step of the vehicle.
+        """
+        if not self.are_told:
+            return
+        lead, self._now_ns = self.leadership, now_ns
+        if self._named_ns is None:
+            self._named_ns = now_ns
+        heard_ns = [NEVER_NS if each.heard_ns is None else each.heard_ns for each in self.sessions]
+        useful_ns = self.leading.useful_ns
+        leader_ns = max(NEVER_NS if useful_ns is None else useful_ns, self._named_ns)
+        if on_ground:
+            leader_ns += GROUND_NS + self._timeout_ns // 2
+        heard_ns[lead.leader] = leader_ns
+        successor = lead.successor(heard_ns, now_ns)
+        if successor is not None:
+            lead.hand_over(successor)
+        self._report()
+        # The next run must not follow an earlier leadership than the servers have been told.
+        if self._may_tell(now_ns):
+            self._tell(lead.doubts(heard_ns, now_ns), heard_ns[lead.leader], step, now_ns)
+
+    def name(self, server: int, *, now_ns: int) -> None:
+        """Let a server lead."""
+        self.leadership.hand_over(server)
+        self._named_ns = now_ns
+        self._report()
+
+    def leave(self, server: int, cause: Reason, *, now_ns: int) -> bool:
+        """Whether a cause on the side of a server is none for the vehicle, since another leads."""
+        if self.sessions[server].leads:
+            others = [i for i, each in enumerate(self.sessions) if i != server]
+            ready = [i for i in others if not self.sessions[i].is_lost(now_ns)]
+            if cause not in DEPARTURES or not ready:
+                return False
+            self.name(ready[0], now_ns=now_ns)
+        if cause in CLOSING:
+            self.sessions[server].close()
+        return True
+
+    def objection(self, named: str) -> str:
+        """Why a server cannot be made the leader by `link.leader`; empty if it can."""
+        server = NAMES.index(named)
+        if server >= len(self.sessions):
+            return f"{LEADER_KEY}: got {named!r}, expected 'server' without a standby server"
+        session = self.sessions[server]
+        if not session.leads and session.is_lost(self._now_ns):
+            at = address_text(*session.address)
+            return f"{LEADER_KEY}: got {named!r}, but the server at {at} is not heard"
+        return ""
+
+    # -- telling -----------------------------------------------------------------------------
+
+    def _tell(self, doubts: bool, leader_ns: int, step: int, now_ns: int) -> None:
+        """Tell each server that does not know who leads, and ask the others if that is in doubt.
+
+        Args:
+            leader_ns: when the leader was last heard.
+        """
+        if doubts and leader_ns != self._doubted_ns and not self._is_alone(now_ns):
+            self._doubted_ns = leader_ns
+            self.failsafe.heard(now_ns=now_ns)  # the other server gets a time-out to answer
+        for session in self.sessions:
+            if session.number is None or now_ns < session.lead_ns:
+                continue
+            asks = doubts and not session.leads
+            if asks or (session.told != self.leadership.number and not session.is_lost(now_ns)):
+                again_ns = SOON_NS if asks or session.leads else SECOND_NS
+                session.tell_leader(self._lead(session, step), again_ns, now_ns=now_ns)
+
+    def _is_alone(self, now_ns: int) -> bool:
+        """Whether no server is heard that could lead in place of the leader."""
+        return all(each.leads or each.is_lost(now_ns) for each in self.sessions)
+
+    def _lead(self, session: ServerSession, step: int) -> Lead:
+        assert session.number is not None
+        number, leads = self.leadership.number, session.leads
+        message = Lead(self._vehicle, session.number, number, int(leads), step=step)
+        motion = self._motion() if leads else None
+        if motion is None:
+            return message
+        return message._replace(in_force=motion.step, spacing=motion.spacing, knots=motion.numbers)
+
+    def _report(self) -> None:
+        """Report that another server leads; its packets count as the link's from now on."""
+        if self._reported == self.leadership.number:
+            return
+        self._reported, session = self.leadership.number, self.leading
+        if session.heard_ns is not None:
+            self.failsafe.heard(now_ns=max(session.heard_ns, self.failsafe.heard_ns or 0))
+        (host, port), number = session.address, self._reported
+        self._events.append(
+            LeaderChanged(vehicle=self._vehicle, host=host, port=port, number=number)
+        )
+
+
+class _OfLeader(Watch):
+    """Packets and faults of one of several servers: those of the leader reach the failsafe."""
+
+    def __init__(self, servers: Servers, server: int) -> None:
+        self._servers, self._server = servers, server
+
+    def heard(self, *, now_ns: int) -> None:
+        if self._servers.leadership.leader == self._server:
+            self._servers.failsafe.heard(now_ns=now_ns)
+
+    def malformed(self, *, now_ns: int) -> None:
+        if self._servers.leadership.leader == self._server:
+            self._servers.failsafe.malformed(now_ns=now_ns)
+
+    def meet(self, cause: Reason, *, now_ns: int) -> None:
+        if not self._servers.leave(self._server, cause, now_ns=now_ns):
+            self._servers.failsafe.meet(cause, now_ns=now_ns)
