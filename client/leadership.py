@@ -10,9 +10,10 @@ from collections.abc import Sequence
 
 NUMBER_MAX, JUMP_MAX = 2**32 - 1, 10_000
 """Largest number, and largest rise at once by what a server knows."""
-ASK_SHARE, CHANGE_SHARE = 0.5, 0.75
+ASK_SHARE, CHANGE_SHARE = 0.35, 0.75
 """Shares of the time-out for which the leader has to be silent before another server is asked
-whether it is there, and before it leads."""
+whether it is there, and before it leads. The first is just more than the time between heartbeats
+over a good link: every tenth of a second counts, since the plan in force ends."""
 
 
 class Leadership:

@@ -35,7 +35,7 @@ SILENCE_MAX = 2**16 - 1
 """Longest silence that can be requested [half steps]."""
 SESSION_NS = 30 * SECOND_NS
 """Silence after which the server forgets a vehicle."""
-RARE_TIMES, STANDBY_TIMES = 2, 4
+RARE_TIMES, STANDBY_TIMES = 2, 6
 """Between a vehicle and a server that does not lead it: longest silence, and silence after which
 the vehicle takes the server for lost, as multiples of the time-out; SESSION_NS bounds both."""
 # Three were worse: the observations from which plans were made became so old that at 30 % loss 5 of

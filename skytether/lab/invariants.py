@@ -17,6 +17,7 @@ import msgpack
 import numpy as np
 
 from skytether.client.failsafe import GOOD_NS, STALL_NS, TABLE
+from skytether.client.leadership import ASK_SHARE
 from skytether.client.link import ClientLink
 from skytether.client.pilot import LAND_MPS
 from skytether.lab.courses import Course, FollowedCourse, PlannedCourse
@@ -226,8 +227,8 @@ class WatchedLife(Recorder):
         self._terms, self._dt_ns = scenario.terms(), scenario.dt_ns
         self._timeout = seconds_to_ns(scenario.link.timeout_s) // self._dt_ns
         """Silence of all servers after which the vehicle brakes [steps]."""
-        if len(links) > 1:  # the standby gets a time-out to answer, after half of one
-            self._timeout = self._timeout * 3 // 2 + 2
+        if len(links) > 1:  # the standby gets a time-out to answer when it is asked
+            self._timeout = round((1 + ASK_SHARE) * self._timeout) + 2
         self._change_max = scenario.vehicle.slew_mps2 * self._terms.dt_s
         """Largest change of the input from step to step [m/s]."""
         self._regulator = regulator(scenario)

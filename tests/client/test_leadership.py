@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from helpers import packaged
 from skytether.client.endpoint import Client
-from skytether.client.leadership import NUMBER_MAX, Leadership
+from skytether.client.leadership import ASK_SHARE, NUMBER_MAX, Leadership
 from skytether.client.memory import SavedState, recall
 from skytether.client.simulated.vehicle import SimulatedVehicle, simulated
 from skytether.shared.base.errors import ConfigError
@@ -63,7 +63,7 @@ def test_another_leads_only_if_it_was_heard_since_the_leader_was_doubted(
     if successor is not None:
         assert successor != lead.leader
         assert lead.doubts(times_ns, now_ns)
-        assert other_ns - heard_ns >= TIMEOUT_NS // 2
+        assert other_ns - heard_ns >= ASK_SHARE * TIMEOUT_NS
         assert now_ns - heard_ns >= 3 * TIMEOUT_NS // 4
 
 

@@ -84,7 +84,10 @@ def test_a_vehicle_that_does_not_wait_for_the_answer_brakes(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """The delay there and back is almost a time-out: the question alone comes too late."""
-    slow = {"network": {"uplink": "constant(0.45)", "downlink": "constant(0.45)"}}
+    slow = {
+        "network": {"uplink": "constant(0.45)", "downlink": "constant(0.45)"},
+        "link": {"timeout_s": 1.0},
+    }
     flown = scenario(**slow)
     dies = [(DIES_S, stops(SERVER[0]))]
     assert brakes(fly(flown, standby=True, actions=dies)) == 0
