@@ -22,7 +22,7 @@ from skytether.shared.wire.protocol import Mode
 from skytether.shell import command
 from skytether.sim.flight import SERVER, fly
 
-FLIGHT_S, SEEDS = 30.0, 200
+FLIGHT_S, SEEDS = 30.0, 50
 DIES_S = 8.0, 25.0
 """First and last time at which the server dies [s]."""
 TASKS = ("demo", "demo-committed", "target", "paper")

@@ -16,7 +16,7 @@ from skytether.shared.base.units import SECOND_NS, seconds_to_ns
 from skytether.shared.core.endpoint import PATH_SOCKETS, Address, Datagram, Events
 from skytether.shared.core.events import Failure, NoAnswer, NoSession, SessionRefused, Unanswered
 from skytether.shared.core.steady import JUMP_NS
-from skytether.shared.law.heartbeat import NUMBERS, SESSION_NS, STANDBY_TIMES, Hearing
+from skytether.shared.law.heartbeat import NUMBERS, RARE_TIMES, SESSION_NS, STANDBY_TIMES, Hearing
 from skytether.shared.law.terms import Terms
 from skytether.shared.scenario.catalogue import differences
 from skytether.shared.telemetry.record import Reason
@@ -352,7 +352,7 @@ class ServerSession:
         if wanted and now_ns >= self.hello_ns:
             unheard = self.number is None and self._refusal is None
             again_ns = self.link.hello_ns if unheard else AGAIN_NS
-            self.hello_ns = now_ns + again_ns * (1 if self.leads else STANDBY_TIMES)
+            self.hello_ns = now_ns + again_ns * (1 if self.leads else RARE_TIMES)
             hello = encode(Hello(self._vehicle, self._boot_id, self._terms))
             self._put(self.link.hello(hello, now_ns=now_ns), (self._greeted,))
             self._greeted = (self._greeted + 1) % len(self._addresses)
