@@ -165,7 +165,7 @@ def test_the_bare_wheel_is_a_bad_network_for_any_program(
 
 
 @pytest.mark.long
-@pytest.mark.timeout(900)  # a new server compiles its kernels
+@pytest.mark.timeout(1800)  # a new server compiles its kernels, for minutes where others work
 def test_the_wheel_flies_with_its_extras_alone(
     interpreter: str, wheel: Path, tmp_path: Path
 ) -> None:
