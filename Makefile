@@ -1,5 +1,5 @@
-# Everything runs in .venv, made from lock files by uv, which pip brings; only python3 with venv, make
-# and a compiler need to be there.
+# Everything runs in .venv, made from lock files by uv, which pip brings; only python3 with venv and
+# make need to be there.
 PYTHON ?= python3
 BIN := .venv/bin
 UV := .venv/.uv
@@ -24,7 +24,7 @@ unexport PYTHONDONTWRITEBYTECODE
 # pytest compiles kernels before its first test, and rewrites the tests' asserts: not by each of its workers.
 KERNELS = $(BIN)/pytest --collect-only -qq >/dev/null
 
-.PHONY: help setup demo reproduce test long-test check format lock keys docs docker-test page-test autopilot-test bench figures fuzz clean
+.PHONY: help setup demo reproduce test long-test check format lock dist keys docs docker-test page-test autopilot-test bench figures fuzz clean
 
 help:  ## what can be made
 	@sed -n 's/^\([a-z-]*\):.*  ## \(.*\)/\1\t\2/p' $(MAKEFILE_LIST) | expand -t 16
@@ -61,15 +61,21 @@ long-test: setup  ## the commands of the documents, benchmarks, and flights of m
 	@$(KERNELS)
 	$(BIN)/pytest -q -m "long and not docker and not browser and not autopilot" -n 5 --dist loadfile --no-loadscope-reorder --durations=40
 
-check: setup  ## style, types, and who imports whom
+check: setup  ## style, types, who imports whom, and the forge's files
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+	$(BIN)/zizmor --offline --quiet .github
+	$(BIN)/check-jsonschema --quiet --builtin-schema vendor.github-workflows .github/workflows/*.yml
+	$(BIN)/check-jsonschema --quiet --builtin-schema vendor.citation-file-format CITATION.cff
 
 format: setup  ## format the code as `check` wants it
 	$(BIN)/ruff format .
 	$(BIN)/ruff check --fix .
+
+dist: $(UV)  ## the wheel and the source distribution, in dist/
+	$(BIN)/python -m hatchling build
 
 keys: setup  ## docs/keys.md, from the keys in shared/scenario/schema.py
 	$(BIN)/python -m skytether.lab.keys_document > docs/keys.md

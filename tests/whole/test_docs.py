@@ -1,5 +1,6 @@
 """Documents: their commands run, their links have targets, their names exist."""
 
+import json
 import re
 import shlex
 import signal
@@ -20,8 +21,10 @@ from skytether.shell import command
 pytestmark = pytest.mark.long
 
 ROOT = Path(__file__).parents[2]
-DOCUMENTS = [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md")]
-DOCUMENTS += sorted((ROOT / "docs").glob("*.md"))
+DOCUMENTS = [
+    ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md", "SECURITY.md")
+]
+DOCUMENTS += sorted((ROOT / "docs").glob("*.md")) + sorted((ROOT / "docs").glob("*.ipynb"))
 
 
 def blocks(document: Path) -> list[list[str]]:
@@ -228,26 +231,33 @@ def test_the_documented_recordings_are_made_and_read(
         assert made.stdout.strip()
 
 
-@pytest.mark.parametrize("document", ["README.md", "docs/python.md"])
+@pytest.mark.parametrize("document", ["README.md", "docs/python.md", "docs/first-flight.ipynb"])
 def test_the_documented_python_runs_and_prints_what_it_says(
     document: str,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    """Every block of a document in order; `# →` is the output of a block."""
+    """Every block of a document, or cell of a notebook, in order; `# →` is its output."""
     pytest.importorskip("pandas")
     monkeypatch.chdir(tmp_path)
     names: dict[str, object] = {"__name__": "docs"}
     compared = 0
-    found = re.findall(r"```python\n(.*?)```", (ROOT / document).read_text(), re.DOTALL)
-    for block in found:
+    for block in python_blocks(ROOT / document):
         exec(block, names)
         printed = capsys.readouterr().out.splitlines()
         told = re.findall(r"^# → (.*)$", block, re.MULTILINE)
         assert not told or printed == told, block
         compared += len(told)
     assert compared
+
+
+def python_blocks(document: Path) -> list[str]:
+    text = document.read_text()
+    if document.suffix != ".ipynb":
+        return re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+    cells = json.loads(text)["cells"]
+    return ["".join(cell["source"]) for cell in cells if cell["cell_type"] == "code"]
 
 
 @pytest.mark.parametrize("line", sorted({line for line in COMMANDS if line.startswith("make")}))

@@ -2,22 +2,31 @@
 
 import os
 import re
+import shlex
+import signal
+import socket
 import sys
 import sysconfig
 import tarfile
 import venv
 import zipfile
+from contextlib import suppress
+from importlib import metadata
 from pathlib import Path
+from subprocess import Popen
 
 import pytest
 
-from helpers import ran
+from helpers import ran, until
 from skytether.shared.scenario import reading
 
 ROOT = Path(__file__).parents[2]
 OLD_NAMES = ("shared", "shell", "server", "client", "netem", "sim", "lab", "view", "scenarios")
 """Former names of top-level packages, which other distributions may have."""
 LOCKS = sorted((ROOT / "locks").glob("*.lock"))
+README = (ROOT / "README.md").read_text()
+OTHER_PYTHON = os.environ.get("OTHER_PYTHON", "")
+"""Another Python that shall install the wheel and fly, as /usr/bin/python3.13."""
 SOMEBODY_ELSE = "raise SystemExit('somebody else')"
 
 
@@ -88,43 +97,134 @@ def test_what_is_in_two_lock_files_has_one_version() -> None:
     assert len(pins) == len(dict(pins))
 
 
+def test_what_is_cited_is_this_version() -> None:
+    assert f"\nversion: {metadata.version('skytether')}\n" in (ROOT / "CITATION.cff").read_text()
+
+
+@pytest.fixture(scope="module", params=[sys.executable, OTHER_PYTHON], ids=["this", "other"])
+def interpreter(request: pytest.FixtureRequest) -> str:
+    if not request.param:
+        pytest.skip("needs OTHER_PYTHON=, the path of another Python")
+    return str(request.param)
+
+
+def installed(extras: str, wheel: Path, interpreter: str, folder: Path) -> Path:
+    """Programs of an environment with the wheel and what its extras ask for, nothing else.
+
+    As `uvx` and `pipx` make it. Nothing is compiled, and versions are those of the lock file.
+    """
+    line = ("-m", "uv", "tool", "install", "--no-build", "--python", interpreter)
+    what = ("--constraints", ROOT / "locks" / "dev.lock", f"skytether{extras} @ {wheel.as_uri()}")
+    places = {"UV_TOOL_DIR": str(folder), "UV_TOOL_BIN_DIR": str(folder / "bin")}
+    done = ran(sys.executable, *line, *what, env=os.environ | places)
+    assert done.returncode == 0, done.stderr
+    return folder / "skytether" / "bin"
+
+
+def alone(folder: Path) -> dict[str, str]:
+    """Environment variables of somebody who has no compiler, no home and no page."""
+    return {"PATH": str(folder), "HOME": str(folder), "SKYTETHER_PAGE": "none"}
+
+
 @pytest.mark.long
-@pytest.mark.timeout(600)  # a new server compiles its kernels
-@pytest.mark.parametrize("kind", ["wheel", "editable"])
-def test_it_flies_in_an_environment_that_has_a_package_called_server(
-    kind: str, wheel: Path, tmp_path: Path
+def test_the_bare_wheel_is_a_bad_network_for_any_program(
+    interpreter: str, wheel: Path, tmp_path: Path
+) -> None:
+    """README's line carries packets; a command that needs an extra names it."""
+    skytether = installed("", wheel, interpreter, tmp_path) / "skytether"
+    refused = ran(skytether, "fly", "demo", env=alone(tmp_path), cwd=tmp_path)
+    assert refused.returncode == 2
+    assert "pip install 'skytether[server]'" in refused.stderr
+
+    (line,) = re.findall(r"`skytether (netem [^`]+)`", README)
+    with (
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as server,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as client,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free,
+    ):
+        for each in (server, client, free):
+            each.bind(("127.0.0.1", 0))
+            each.setblocking(False)
+        ports = {"5000": str(server.getsockname()[1]), "5001": str(free.getsockname()[1])}
+        free.close()
+        argv = shlex.split(re.sub("|".join(ports), lambda port: ports[port[0]], line))
+
+        def arrived() -> bool:
+            with suppress(OSError):  # netem is not there yet
+                client.sendto(b"asked", ("127.0.0.1", int(ports["5001"])))
+            with suppress(BlockingIOError):
+                return server.recv(100) == b"asked"
+            return False
+
+        with Popen([skytether, *argv], env=alone(tmp_path), cwd=tmp_path) as netem:
+            try:
+                until(arrived)
+            finally:
+                netem.send_signal(signal.SIGINT)
+    assert netem.returncode == 0
+
+
+@pytest.mark.long
+@pytest.mark.timeout(1800)  # a new server compiles its kernels, for minutes where others work
+def test_the_wheel_flies_with_its_extras_alone(
+    interpreter: str, wheel: Path, tmp_path: Path
+) -> None:
+    """README's line without a checkout, with the wheel in place of the address, and its example.
+
+    They fly whatever folders are in the directory.
+    """
+    ((extras, command),) = re.findall(
+        r'^uvx --from "skytether(\[.*\]) @ git\+ADDRESS" skytether (.*?) *(?:#.*)?$',
+        README,
+        re.MULTILINE,
+    )
+    programs = installed(extras, wheel, interpreter, tmp_path)
+    beside = tmp_path / "beside"
+    strangers(beside, *OLD_NAMES)
+    python = programs / "python"
+    # -c, without -P: folders here precede installed packages
+    done = ran(python, "-c", example(), env=alone(tmp_path), cwd=beside)
+    assert done.returncode == 0, done.stderr
+    assert_flown(done.stdout.splitlines()[0])
+    short = ("--duration", "6", "--settle", "0")
+    done = ran(programs / "skytether", *command.split(), *short, env=alone(tmp_path), cwd=beside)
+    assert done.returncode == 0, done.stderr
+    assert "over UDP" in done.stdout
+
+
+@pytest.mark.long
+def test_an_editable_installation_flies_in_an_environment_that_has_a_package_called_server(
+    tmp_path: Path,
 ) -> None:
     """With `skytether` added, README's example flies, whatever folders are in the directory."""
     python, packages = environment(tmp_path / "environment")
     (packages / "server").mkdir()
     (packages / "server" / "__init__.py").write_text("NAME = 'unrelated'")
     before = names(packages)
-    what = [str(wheel)] if kind == "wheel" else ["--no-build-isolation", "--editable", str(ROOT)]
     install = ["-m", "uv", "pip", "install", "--offline", "--no-deps", "--python", str(python)]
+    what = ["--no-build-isolation", "--editable", str(ROOT)]
     assert ran(sys.executable, *install, *what).returncode == 0
     added = names(packages) - before
-    if kind == "wheel":
-        assert added == {"skytether", "skytether-0.1.0.dist-info"}
-    else:
-        assert added == {"_editable_impl_skytether.pth", "skytether-0.1.0.dist-info"}
+    assert added == {"_editable_impl_skytether.pth", "skytether-0.1.0.dist-info"}
 
-    (example,) = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
-    example += "\nimport server\nprint(skytether.__file__, server.NAME)"
     beside = tmp_path / "beside"
     strangers(beside, *(name for name in OLD_NAMES if name != "server"))
-    # -c, without -P: folders here precede installed packages
-    done = ran(python, "-c", example, cwd=beside)
+    where = "\nimport server\nprint(skytether.__file__, server.NAME)"
+    done = ran(python, "-c", example() + where, cwd=beside)
     assert done.returncode == 0, done.stderr
-    compiled = "compiling control loops, once on this machine: takes up to a minute\n"
-    assert done.stderr in ("", compiled)
     flown, where = done.stdout.splitlines()
-    assert 0 < float(flown.split()[0]) < 0.1
-    home = packages if kind == "wheel" else ROOT
-    assert where == f"{home / 'skytether' / '__init__.py'} unrelated"
+    assert_flown(flown)
+    assert where == f"{ROOT / 'skytether' / '__init__.py'} unrelated"
 
-    command = ("fly", "demo", "--virtual", "--duration", "10")
-    done = ran(python.with_name("skytether"), *command, cwd=beside)
-    assert (done.returncode, done.stderr) == (0, "")
+
+def example() -> str:
+    (example,) = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
+    return str(example)
+
+
+def assert_flown(line: str) -> None:
+    """What README's example prints."""
+    assert 0 < float(line.split(maxsplit=1)[0]) < 0.1
 
 
 def environment(folder: Path) -> tuple[Path, Path]:
