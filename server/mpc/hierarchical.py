@@ -49,7 +49,7 @@ from skytether.server.mpc.problem import (
 from skytether.server.mpc.solver import Solver
 from skytether.shared.base.kernel import B1, F1, F3, I1, kernel, part
 from skytether.shared.core.stopwatch import Stopwatch
-from skytether.shared.law.model import Indices
+from skytether.shared.law.model import Flags, Indices
 from skytether.shared.law.terms import Terms
 from skytether.shared.scenario.schema import ControlConfig
 
@@ -139,6 +139,9 @@ class Planner:
 
     def forget(self, row: int) -> None:
         self._memory.step[row] = -1
+
+    def remember(self, rows: Indices, event: Flags) -> None:
+        """Note which plans are sent: none of the MPC's matter, which goes on from every plan."""
 
     def plan(self, rows: Indices, step: Indices, foresight: Foresight) -> None:
         """Plan for vehicles: generator, then tracker; fills in `foresight.horizons` and `figures`.

@@ -16,12 +16,13 @@ from traceback import format_exception
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from skytether.server.common.scheme import Fleet
 from skytether.server.mpc.appraisal import GENERATOR, TRACKER
 from skytether.server.mpc.hierarchical import PlanBatch, Planner, conclude_given, start_plans
 from skytether.shared.base.errors import ConfigError
-from skytether.shared.law.model import Array, Indices
+from skytether.shared.law.model import Array, Flags, Indices
 from skytether.shared.scenario.planners import Problem
 from skytether.shared.scenario.registry import PLANNERS
 from skytether.shared.wire.protocol import FLOAT_MAX
@@ -153,7 +154,9 @@ class OwnPlanner(Planner):
     """Planners of plug-ins for a scheme that sends inputs, with the figures of the MPC.
 
     What a planner returns is the generator's plan, which knows no disturbance; the tracker's, which
-    is sent, is the same minus the disturbance.
+    is sent, is the same minus the disturbance. The MPC's generator never uses the vehicle's state,
+    but a planner always starts from it. So the previous plan, with which triggers compare, is the
+    last that was sent.
     """
 
     def __init__(self, fleet: Fleet, counts: Counter[str]) -> None:
@@ -162,6 +165,8 @@ class OwnPlanner(Planner):
         super().__init__(control, terms, desired, capacity, block, fleet.stopwatch)
         self._planners = OwnPlanners(fleet, counts, states=False)
         self._bounds = np.array(terms.u_max)[:, None]
+        self._sent: list[NDArray[Any]] = []
+        """Inputs, start and step of the plans sent last to the vehicles of this block."""
 
     def forget(self, row: int) -> None:
         super().forget(row)
@@ -169,6 +174,8 @@ class OwnPlanner(Planner):
 
     def _plan_all(self, batch: PlanBatch, rows: Indices, step: Indices) -> None:
         n, draft, foresight = len(rows), self._draft, batch.foresight
+        memory = self._memory
+        self._sent = [memory.inputs[GENERATOR, rows], memory.start[rows], memory.step[rows]]
         start_plans(batch, rows, step)
         state, begins = foresight.start[:n], step + foresight.ahead[:n]
         reference = self._desired.states(rows, step, foresight.ahead)
@@ -178,7 +185,12 @@ class OwnPlanner(Planner):
             disturbance = foresight.disturbance[i][:, None]
             draft.inputs[GENERATOR, i] = inputs
             draft.inputs[TRACKER, i] = np.clip(inputs - disturbance, -self._bounds, self._bounds)
-        self.figures["solved"][:n] = solved = np.array([plan is not None for plan in plans])
+        self.figures["solved"][:n] = [plan is not None for plan in plans]
         conclude_given(batch, n)
-        # The MPC's generator goes on from its own last plan, a planner from where the vehicle is.
-        self._memory.start[rows[solved]] = state[solved]
+        memory.start[rows] = state
+
+    def remember(self, rows: Indices, event: Flags) -> None:
+        memory, kept = self._memory, ~event
+        inputs, start, step = (each[kept] for each in self._sent)
+        memory.inputs[GENERATOR, rows[kept]] = inputs
+        memory.start[rows[kept]], memory.step[rows[kept]] = start, step

@@ -107,6 +107,7 @@ class HorizonScheme(InputScheme):
 
     def remember(self, rows: Indices, step: Indices, foresight: Foresight, event: Flags) -> None:
         self.predictor.remember(rows, step, foresight, event)
+        self.planner.remember(rows, event)
 
     def plan(self, rows: Indices, step: Indices, foresight: Foresight) -> None:
         self.planner.plan(rows, step, foresight)

@@ -151,7 +151,7 @@ class Guidance(SplineScheme):
         plans = desired.seen > 0 and terms.horizon * terms.dt_s >= lead_s.max()
         self._own = None if control.planner == MPC else OwnPlanners(fleet, self.counts, states=True)
         seen = terms.horizon if self._own else desired.seen
-        self._desired, self._clock = desired, fleet.clock
+        self._desired, self._clock, self._stopwatch = desired, fleet.clock, fleet.stopwatch
         self._loop_gain = np.array(terms.gain)
         self._settings = Settings(
             dt_s=terms.dt_s,
@@ -219,6 +219,8 @@ class Guidance(SplineScheme):
             self.counts["unsolved"] += unsolved
         n = len(rows)
         foresight.horizons[:n, :, 0] = self._intended[:n, :, 0, 1] / self._loop_gain
+        took_ns = self._stopwatch.lap("plan")
+        self.solve_ns = took_ns if self._stopwatch.runs else -1
 
     def _plan_own(
         self, own: OwnPlanners, rows: Indices, step: Indices, foresight: Foresight
