@@ -61,12 +61,9 @@ def fly_cell(cell: Cell) -> FlownCell:
     scenario = reading.check(table, "bench")
     flown = fly(scenario, stopwatch=Stopwatch(time.process_time_ns))
     found = summarise(scenario, cell.scenario, flown.client, flown.server, flown.netem)
-    assert found.rmse_xy is not None
-    assert found.solve_ms_p50 is not None
-    assert found.solve_ms_p99 is not None
-    return FlownCell(
-        cell, found.rmse_xy, found.packets_per_s, found.solve_ms_p50, found.solve_ms_p99
-    )
+    figures = found.rmse_xy, found.packets_per_s, found.solve_ms_p50, found.solve_ms_p99
+    assert None not in figures
+    return FlownCell(cell, *figures)  # type: ignore[arg-type]
 
 
 def tables(flights: Sequence[FlownCell]) -> dict[str, TextTable]:
