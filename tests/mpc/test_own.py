@@ -3,6 +3,7 @@
 import json
 import re
 import shlex
+import sys
 from contextlib import chdir
 from itertools import pairwise
 from pathlib import Path
@@ -14,7 +15,7 @@ import pytest
 
 import skytether
 from bench.planners import PAGE, documented
-from helpers import faults, packaged, refusal
+from helpers import faults, packaged, ran, refusal
 from skytether.__main__ import main
 from skytether.plugin import Problem, planner
 from skytether.server.endpoint import Server
@@ -294,6 +295,32 @@ def test_a_mistake_that_passes_costs_its_steps_alone() -> None:
     assert flight.figures["server"]["counts"]["planner_errors"] == 10
     assert (~flight.server["solved"]).sum() == 10
     assert flight.server["solved"][-1]
+
+
+HANGS = """
+import time
+import numpy as np
+from skytether.plugin import planner
+
+@planner(name="hangs")
+class Hangs:
+    calls = 0
+    def __init__(self, problem):
+        self.inputs = np.zeros((problem.axes, problem.horizon))
+    def plan(self, state, reference, previous):
+        self.calls += 1
+        time.sleep(3600.0 * (self.calls > 20))
+        return self.inputs
+"""
+
+
+@pytest.mark.long
+def test_a_planner_that_hangs_over_udp_is_told_once_and_its_flight_ends(tmp_path: Path) -> None:
+    (tmp_path / "hangs.py").write_text(HANGS)
+    own = "--plugin", "hangs.py", "--control.planner", "hangs", "--duration", "8"
+    made = ran(sys.executable, "-m", "skytether", "fly", "demo", *own, cwd=tmp_path)
+    assert made.stderr.count("TimeoutError: got no plan after 0.025 s, half a step") == 1
+    assert "Traceback" not in made.stderr
 
 
 @pytest.mark.parametrize(
