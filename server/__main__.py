@@ -30,6 +30,7 @@ from skytether.shared.wire.keys import Keyring
 from skytether.shell import command, process, terminal, workers
 from skytether.shell.argument import Argument
 from skytether.shell.command import CommandError
+from skytether.shell.planning import SHARE, Planners
 from skytether.shell.process import ProcessOptions
 from skytether.shell.udp import AddressError
 
@@ -157,6 +158,7 @@ def _work(
             recorder=running.recorder,
             plans=running.fed("plan", plan_columns(axes, control.horizon)),
             stopwatch=stopwatch,
+            planning=Planners(SHARE * control.dt),
         )
         running.drive(
             Steady(endpoint),

@@ -24,8 +24,10 @@ from skytether.server.common.scheme import (
     Batch,
     Figures,
     Fleet,
+    Planning,
     Scheme,
     empty_foresight,
+    in_turn,
 )
 from skytether.server.missions.mission_planner import MissionPlanner
 from skytether.server.missions.mission_state import MissionState
@@ -97,6 +99,7 @@ class Controller:
         clock: ClockMap,
         stopwatch: Stopwatch,
         references: Callable[[int], Reference] | None = None,
+        planning: Planning = in_turn,
     ) -> None:
         control = scenario.control
         # Arrays of a block are allocated once and reused for each block of a tick.
@@ -121,6 +124,7 @@ class Controller:
             references,
             stopwatch,
             self.faults.append,
+            planning,
         )
         self._is_mission = scenario.is_mission and references is not None
         self.scheme = _mission(fleet) if self._is_mission else table.make(fleet)

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from skytether.server.common.clock import ClockMap
+from skytether.server.common.scheme import Planning, in_turn
 from skytether.server.controller import Controller
 from skytether.server.gate import Gate, PlainGate
 from skytether.server.reception import Reception
@@ -56,6 +57,7 @@ class Server(Endpoint):
         stopwatch: measures the parts of a tick; the core has no clock of its own.
         references: desired trajectory of each vehicle, by its number, if they differ; default: the
             scenario's.
+        planning: calls planners of plug-ins.
     """
 
     def __init__(
@@ -70,6 +72,7 @@ class Server(Endpoint):
         plans: Recorder | None = None,
         stopwatch: Stopwatch | None = None,
         references: Callable[[int], Reference] | None = None,
+        planning: Planning = in_turn,
     ) -> None:
         super().__init__()
         if too_fast := first_too_fast(scenario):
@@ -93,7 +96,7 @@ class Server(Endpoint):
         self.stopwatch = stopwatch or Stopwatch()
         self._clock = ClockMap(capacity, terms.dt_ns, seconds_to_ns(scenario.link.asymmetry_s))
         self.controller = Controller(
-            scenario, terms, capacity, self._clock, self.stopwatch, references
+            scenario, terms, capacity, self._clock, self.stopwatch, references, planning
         )
         silence_ns = scenario.link.patience_ns
         self.sessions = Sessions(

@@ -35,6 +35,7 @@ reorders and loses their packets.
   triggers              policies for control.trigger, a sentence each
   reports               policies for vehicle.report, a sentence each
   schemes               schemes for control.scheme, a sentence each
+  planners              planners for control.planner, a sentence each
   references            shapes for reference.shape, a sentence each
   impairments           effects of a network on packets, a sentence each
   vehicles              vehicle models for vehicle.kind, a sentence each
@@ -90,6 +91,7 @@ COMMANDS = {
     "triggers": "skytether.cli.names:triggers",
     "reports": "skytether.cli.names:reports",
     "schemes": "skytether.cli.names:schemes",
+    "planners": "skytether.cli.names:planners",
     "references": "skytether.cli.names:references",
     "impairments": "skytether.cli.names:impairments",
     "vehicles": "skytether.cli.names:vehicles",

@@ -1,13 +1,15 @@
 """Names that a plug-in imports: the decorators, and the types of its functions' arguments.
 
-docs/triggers.md describes triggers, docs/schemes.md references, docs/vehicles.md vehicles,
-docs/network.md impairments. A scheme also imports `skytether.plugin_scheme`.
+docs/python.md describes planners, docs/triggers.md triggers, docs/schemes.md references,
+docs/vehicles.md vehicles, docs/network.md impairments. A scheme also imports
+`skytether.plugin_scheme`.
 """
 
 from skytether.client.vehicle import Measurement, Vehicle
 from skytether.client.vehicles import vehicle
 from skytether.shared.scenario.air.draws import Draws, Fate
 from skytether.shared.scenario.air.impairment import Impairment, Share, Time, impairment
+from skytether.shared.scenario.planners import Planner, Problem, planner
 from skytether.shared.scenario.reference import Reference
 from skytether.shared.scenario.schema import ControlConfig, Scenario
 from skytether.shared.scenario.trajectories import reference
@@ -20,6 +22,8 @@ __all__ = [
     "Fate",
     "Impairment",
     "Measurement",
+    "Planner",
+    "Problem",
     "Reference",
     "Scenario",
     "Share",
@@ -30,6 +34,7 @@ __all__ = [
     "Verdict",
     "above",
     "impairment",
+    "planner",
     "reference",
     "trigger",
     "vehicle",

@@ -6,9 +6,9 @@ scheme.
 
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
-from typing import Annotated, ClassVar, NamedTuple
+from typing import Annotated, Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -179,6 +179,22 @@ class SentPlans(NamedTuple):
     """Planned inputs [m/s]; shape (m, axes, H)."""
 
 
+Planning = Callable[[Sequence[tuple[int, Callable[[], Any]]]], list[Any]]
+"""Function that calls planners of plug-ins, each with the row of its vehicle: returns what each has
+returned, or its exception; TimeoutError if it took too long."""
+
+
+def in_turn(calls: Sequence[tuple[int, Callable[[], Any]]]) -> list[Any]:
+    """Call planners one after the other, however long they take, as in virtual time."""
+    answers = []
+    for _, call in calls:
+        try:
+            answers.append(call())
+        except Exception as error:
+            answers.append(error)
+    return answers
+
+
 class Fleet(NamedTuple):
     scenario: Scenario
     terms: Terms
@@ -192,6 +208,7 @@ class Fleet(NamedTuple):
     stopwatch: Stopwatch
     tell: Callable[[str], None]
     """Called with the traceback of a plug-in's first error in flight, for the log."""
+    planning: Planning = in_turn
 
 
 class Scheme(ABC):

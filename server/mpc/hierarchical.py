@@ -49,7 +49,7 @@ from skytether.server.mpc.problem import (
 from skytether.server.mpc.solver import Solver
 from skytether.shared.base.kernel import B1, F1, F3, I1, kernel, part
 from skytether.shared.core.stopwatch import Stopwatch
-from skytether.shared.law.model import Indices
+from skytether.shared.law.model import Flags, Indices
 from skytether.shared.law.terms import Terms
 from skytether.shared.scenario.schema import ControlConfig
 
@@ -140,6 +140,9 @@ class Planner:
     def forget(self, row: int) -> None:
         self._memory.step[row] = -1
 
+    def remember(self, rows: Indices, event: Flags) -> None:
+        """Note which plans are sent: none of the MPC's matter, which goes on from every plan."""
+
     def plan(self, rows: Indices, step: Indices, foresight: Foresight) -> None:
         """Plan for vehicles: generator, then tracker; fills in `foresight.horizons` and `figures`.
 
@@ -149,6 +152,11 @@ class Planner:
         batch = self._batch
         if batch is None or batch.desired is not window or batch.foresight is not foresight:
             batch = self._batch = self._batch_of(window, foresight)
+        self._plan_all(batch, rows, step)
+        took_ns = self._stopwatch.lap("plan")
+        self.solve_ns = took_ns if self._stopwatch.runs else -1
+
+    def _plan_all(self, batch: PlanBatch, rows: Indices, step: Indices) -> None:
         solver, undone = self.solvers[LATER], len(rows)
         # Not isinstance: a derived solver may override `solve`, which the compiled pass would not
         # call.
@@ -156,8 +164,6 @@ class Planner:
             undone = _plan(batch, rows, step, solver.work)
         if undone:
             self._plan_with_solvers(batch, rows, step, undone)
-        took_ns = self._stopwatch.lap("plan")
-        self.solve_ns = took_ns if self._stopwatch.runs else -1
 
     def _batch_of(self, window: Window, foresight: Foresight) -> PlanBatch:
         return PlanBatch(
@@ -188,7 +194,7 @@ class Planner:
         for tier in (GENERATOR, TRACKER):
             _pose(batch, rows, step, left, tier)
             self._solve(tier, left)
-        _conclude_all(batch, left)
+        _conclude_all(batch, left, True)
 
     def _solve(self, tier: int, left: Indices) -> None:
         draft = self._draft
@@ -361,13 +367,25 @@ def _pose(batch: PlanBatch, rows: I1, steps: I1, left: I1, tier: int) -> None:
             column(simd.previous, 0, draft.guess[i, axis])
 
 
+def start_plans(batch: PlanBatch, rows: Indices, step: Indices) -> None:
+    """Fill in where plans that no solver makes start; the guess is the plan before, shifted."""
+    _pose(batch, rows, step, np.arange(len(rows)), GENERATOR)
+
+
+def conclude_given(batch: PlanBatch, n: int) -> None:
+    """Compare plans that no solver has made, and store them; each counts as the optimum."""
+    batch.draft.gradient[:n] = 0.0
+    _conclude_all(batch, np.arange(n), False)
+
+
 @kernel
-def _conclude_all(batch: PlanBatch, left: I1) -> None:
+def _conclude_all(batch: PlanBatch, left: I1, sloping: bool) -> None:
+    """Fill in figures and store plans; `sloping`: `draft.gradient` is g, and not yet the slope."""
     draft, simd = batch.draft, simd_batch(batch.alone)
     for i in left:
         which = FIRST if batch.figures[i].fresh else LATER
         for axis in range(len(batch.mpc.model)):
-            if batch.compares:
+            if batch.compares and sloping:
                 set_inputs(draft.inputs[TRACKER, i, axis], simd, 0)
                 for stage in range(len(simd.gradient)):
                     simd.gradient[stage, 0] = draft.gradient[i, axis, stage]

@@ -12,8 +12,10 @@ import numpy as np
 
 from skytether.server.common.scheme import Batch, Fleet, Foresight, Header, Scheme, SentPlans
 from skytether.server.mpc.hierarchical import Planner
+from skytether.server.mpc.own import OwnPlanner
 from skytether.shared.base.kernel import I1, I2, S1, S3, kernel
 from skytether.shared.law.model import Flags, Indices
+from skytether.shared.scenario.planners import MPC
 from skytether.shared.scenario.schemes import SchemeProperties
 from skytether.shared.wire.protocol import FEEDBACK, Observation, committed_max, encode_horizon
 
@@ -85,8 +87,10 @@ class HorizonScheme(InputScheme):
         super().__init__(fleet)
         control, terms, stopwatch = fleet.scenario.control, fleet.terms, fleet.stopwatch
         self.predictor = predictor
-        self.planner = Planner(
-            control, terms, fleet.desired, fleet.capacity, fleet.block, stopwatch
+        self.planner = (
+            Planner(control, terms, fleet.desired, fleet.capacity, fleet.block, stopwatch)
+            if control.planner == MPC
+            else OwnPlanner(fleet, predictor.counts)
         )
         self.observed_step, self.counts = predictor.observed_step, predictor.counts
         self.figures, self.planned = self.planner.figures, self.planner.planned
@@ -103,6 +107,7 @@ class HorizonScheme(InputScheme):
 
     def remember(self, rows: Indices, step: Indices, foresight: Foresight, event: Flags) -> None:
         self.predictor.remember(rows, step, foresight, event)
+        self.planner.remember(rows, event)
 
     def plan(self, rows: Indices, step: Indices, foresight: Foresight) -> None:
         self.planner.plan(rows, step, foresight)

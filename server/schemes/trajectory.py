@@ -4,7 +4,9 @@ At step k the server sends the trajectory to follow from k on:
 
 - the nominal motion of the vehicle along the known desired trajectory (`server.mpc.nominal`);
 - the known desired trajectory itself, if the horizon is shorter than the time h below;
-- the target's present state, if the server knows nothing ahead.
+- the target's present state, if the server knows nothing ahead;
+
+- what a planner of a plug-in plans along it, extrapolated where it is unknown (`server.mpc.own`).
 
 It is sent as a spline with the fewest uniform knots that keep its error within
 `control.spline_error_m` (`shared.law.spline`); a single state is one knot. A regulator aboard
@@ -42,6 +44,7 @@ from skytether.server.common.scheme import Figures, Fleet, Foresight, Splines
 from skytether.server.common.splines import SplineScheme
 from skytether.server.mpc import exact
 from skytether.server.mpc.nominal import Nominal, make_nominal, plan_nominal
+from skytether.server.mpc.own import OwnPlanners
 from skytether.server.schemes import knots
 from skytether.server.schemes import sent as tracker
 from skytether.server.schemes.delay_bound import SAMPLES, DelayBound
@@ -71,6 +74,7 @@ from skytether.shared.base.kernel import (
 from skytether.shared.law import spline
 from skytether.shared.law.model import Flags, Indices
 from skytether.shared.scenario.gain import regulator
+from skytether.shared.scenario.planners import MPC
 from skytether.shared.wire.protocol import KNOTS_MAX, NO_HORIZON, Observation, committed_max
 
 RING = 64
@@ -108,7 +112,8 @@ class Settings(NamedTuple):
     age_max: int
     """Largest age of an observation that is used [steps]."""
     seen: int
-    """Number of steps for which the desired trajectory is known ahead, at most H."""
+    """Number of steps for which the desired trajectory is known ahead, at most H; H if a planner of
+    a plug-in plans."""
     bounds: F1
     """Largest velocity on each axis [m/s]; shape (axes,)."""
     weight: float
@@ -144,12 +149,14 @@ class Guidance(SplineScheme):
         # A plan shorter than h ends before the vehicle has come near the trajectory, and after its
         # end the spline is a straight line: measured errors reached 12 m (docs/studies.md).
         plans = desired.seen > 0 and terms.horizon * terms.dt_s >= lead_s.max()
-        self._desired, self._clock = desired, fleet.clock
+        self._own = None if control.planner == MPC else OwnPlanners(fleet, self.counts, states=True)
+        seen = terms.horizon if self._own else desired.seen
+        self._desired, self._clock, self._stopwatch = desired, fleet.clock, fleet.stopwatch
         self._loop_gain = np.array(terms.gain)
         self._settings = Settings(
             dt_s=terms.dt_s,
             age_max=terms.age_max,
-            seen=desired.seen,
+            seen=seen,
             bounds=self._loop_gain * terms.u_max,
             weight=control.state_weight[0],
             lead_s=lead_s,
@@ -164,11 +171,13 @@ class Guidance(SplineScheme):
         )
         self.observed_step = self._memory.sent.observed
         self._nominal = make_nominal(terms, control, capacity if plans else 0)
-        self._intended = np.zeros((block, axes, desired.seen + 1, 2))
+        self._intended = np.zeros((block, axes, seen + 1, 2))
         """Trajectory that would be sent now [m, m/s]; shape (block, axes, seen + 1, 2)."""
 
     def forget(self, row: int) -> None:
         tracker.forget(self._memory.sent, row)
+        if self._own:
+            self._own.forget(row)
 
     def observe(self, row: int, observation: Observation) -> bool:
         delivery = self._memory.sent.delivery[row]
@@ -194,24 +203,41 @@ class Guidance(SplineScheme):
         `planned` has the states at k of the trajectories sent last. The first column of `horizons`
         is the velocity at k, as an input.
         """
-        lost, unsolved = _appraise(
-            self._settings,
-            self._memory,
-            self._clock.seen,
-            self._nominal,
-            self._desired.window(rows, step, foresight.ahead),
-            rows,
-            step,
-            self.figures,
-            self.planned,
-            self._intended,
-        )
+        settings, memory, intended = self._settings, self._memory, self._intended
+        figures, clock = self.figures, self._clock.seen
+        lost = _begin(settings, memory, clock, rows, step, figures, self.planned, intended)
+        unsolved = 0
+        if self._own:
+            self._plan_own(self._own, rows, step, foresight)
+        else:
+            window = self._desired.window(rows, step, foresight.ahead)
+            unsolved = _intend(settings, self._nominal, window, rows, step, intended)
+        _appraise(settings, memory, rows, step, figures, intended)
         if lost:
             self.counts["horizons_lost"] += lost
         if unsolved:
             self.counts["unsolved"] += unsolved
         n = len(rows)
         foresight.horizons[:n, :, 0] = self._intended[:n, :, 0, 1] / self._loop_gain
+        took_ns = self._stopwatch.lap("plan")
+        self.solve_ns = took_ns if self._stopwatch.runs else -1
+
+    def _plan_own(
+        self, own: OwnPlanners, rows: Indices, step: Indices, foresight: Foresight
+    ) -> None:
+        """Fill in the trajectories of planners; without a plan the desired one, which is not
+        sent.
+        """
+        n, intended, model = len(rows), self._intended, self.terms.model
+        desired = self._desired.states(rows, step, foresight.ahead)
+        plans = own.plan(rows, step, intended[:n, :, 0], desired)
+        for i, plan in enumerate(plans):
+            if plan is None:
+                intended[i] = desired[i]
+            else:
+                states = model.roll(intended[i, :, 0], plan) if plan.ndim == 2 else plan
+                intended[i] = states.swapaxes(0, 1)
+        self.figures["solved"][:n] = [plan is not None for plan in plans]
 
     def remember(self, rows: Indices, step: Indices, foresight: Foresight, event: Flags) -> None:
         """See `Scheme`; splines are fitted only for vehicles whose trajectory is sent."""
@@ -284,7 +310,7 @@ def _gap(
 
 
 @part
-def _intend(
+def _intend_one(
     settings: Settings, nominal: Nominal, row: int, k: int, desired: F3, intended: F3
 ) -> bool:
     """Fill in the trajectory that would be sent now; False if the nominal MPC finds no plan.
@@ -306,44 +332,79 @@ def _intend(
 
 
 @kernel
-def _appraise(
+def _intend(
+    settings: Settings, nominal: Nominal, window: Window, rows: I1, steps: I1, intended: F4
+) -> int:
+    """Fill in the trajectories that would be sent now; returns the number of unsolved plans."""
+    unsolved, axes = 0, len(settings.bounds)
+    for i in range(len(rows)):
+        desired = window.states[window.place[i], :axes, window.first[i] :]
+        if not _intend_one(settings, nominal, rows[i], steps[i], desired, intended[i]):
+            unsolved += 1
+    return unsolved
+
+
+@inline
+def _newest(sent: Sent, row: int, first: int) -> int:
+    """Number of the newest trajectory that may arrive, or the one in force; negative: none."""
+    delivery = sent.delivery[row]
+    if first < delivery.sent:
+        return delivery.sent - 1
+    return number_of(sent, row, delivery.in_force)
+
+
+@kernel
+def _begin(
     settings: Settings,
     memory: Memory,
     clock: Seen,
-    nominal: Nominal,
-    window: Window,
     rows: I1,
     steps: I1,
     figures: Figures,
     planned: F3,
     intended: F4,
-) -> tuple[int, int]:
-    """See `Guidance.plan`; returns the numbers of newly lost trajectories and of unsolved plans."""
-    sent, lost, unsolved, axes = memory.sent, 0, 0, len(settings.bounds)
+) -> int:
+    """Fill in where the trajectories start that would be sent now, in `planned` and `intended`, and
+    which are `fresh`; returns the number of newly lost trajectories.
+    """
+    sent, lost, axes = memory.sent, 0, len(settings.bounds)
     for i in range(len(rows)):
         row, k, plan = rows[i], steps[i], figures[i]
         lost += update_delay_and_loss(sent, clock, row)
         delivery, d, observed = sent.delivery[row], sent.bound.steps[row], sent.observed[row]
-        in_force = number_of(sent, row, delivery.in_force)
-        newest, ends, in_force_ends = in_force, -1, np.inf
+        in_force, ends = number_of(sent, row, delivery.in_force), -1
         if in_force >= 0:
-            in_force_ends = ends = memory.trajectories[row, in_force % RING].ends
+            ends = memory.trajectories[row, in_force % RING].ends
         first = first_in_flight(sent, row, delivery.in_force, observed)
         for number in range(first, delivery.sent):
-            newest, ends = number, max(ends, memory.trajectories[row, number % RING].ends)
+            ends = max(ends, memory.trajectories[row, number % RING].ends)
+        plan.row, plan.step, plan.start, plan.gap, plan.solved = row, k, k, 1, True
         # Only if a new trajectory could be flown at k + d: otherwise one would be sent at each
         # step.
         plan.fresh = ends <= k + d <= observed + settings.age_max
+        newest = _newest(sent, row, first)
         for axis in range(axes):
             p, v = memory.state[row, axis, 0], memory.state[row, axis, 1]
             if not plan.fresh:
                 p, v = _followed(settings, memory, row, newest, axis, k)
             intended[i, axis, 0, 0], intended[i, axis, 0, 1] = p, v
             planned[i, axis, 0], planned[i, axis, 1] = p, v
-        place = window.place[i]
-        desired = window.states[place, :axes, window.first[i] :]
-        if not _intend(settings, nominal, row, k, desired, intended[i]):
-            unsolved += 1
+    return lost
+
+
+@kernel
+def _appraise(
+    settings: Settings, memory: Memory, rows: I1, steps: I1, figures: Figures, intended: F4
+) -> None:
+    """Fill in the gaps between the trajectories sent before and those that would be sent now."""
+    sent = memory.sent
+    for i in range(len(rows)):
+        row, k, plan = rows[i], steps[i], figures[i]
+        delivery, d, observed = sent.delivery[row], sent.bound.steps[row], sent.observed[row]
+        in_force, in_force_ends = number_of(sent, row, delivery.in_force), np.inf
+        if in_force >= 0:
+            in_force_ends = memory.trajectories[row, in_force % RING].ends
+        first = first_in_flight(sent, row, delivery.in_force, observed)
         share, expected = 1.0, 0.0
         for number in range(delivery.sent - 1, first - 1, -1):
             if share <= IGNORED:
@@ -356,16 +417,14 @@ def _appraise(
         if share > IGNORED:
             gap, _ = _gap(settings, memory, intended[i], row, in_force, k, d)
             expected += share * gap
-        plan.row, plan.step, plan.start, plan.gap = row, k, k, 1
-        plan.solved = True
         plan.state_gap, plan.expected_gap = 0.0, expected
         plan.cost_gap, plan.deviation_m = 0.0, 0.0
         if not plan.fresh:
+            newest = _newest(sent, row, first)
             plan.cost_gap, plan.deviation_m = _gap(settings, memory, intended[i], row, newest, k, d)
         # The trajectory in force ends soon and all in flight may be lost: the vehicle would brake.
         soon = in_force_ends <= k + COMPARED * d <= observed + settings.age_max
         plan.fresh |= soon and share > RUNS_OUT
-    return lost, unsolved
 
 
 @kernel

@@ -14,7 +14,15 @@ from skytether.shared.scenario.fence import inner_bounds, is_home_inside, margin
 from skytether.shared.scenario.geographic import NORTH_MAX
 from skytether.shared.scenario.grammar import GrammarError, leaves
 from skytether.shared.scenario.mission import Mission, format_goals, parse_goals
-from skytether.shared.scenario.registry import REFERENCES, REPORTS, TRIGGERS, PluginTable
+from skytether.shared.scenario.planners import MPC
+from skytether.shared.scenario.registry import (
+    PLANNERS,
+    REFERENCES,
+    REPORTS,
+    SCHEMES,
+    TRIGGERS,
+    PluginTable,
+)
 from skytether.shared.scenario.schema import (
     TABLES,
     ControlConfig,
@@ -93,6 +101,7 @@ def contradictions(
     yield from wrong
     if wrong:
         return
+    yield from _no_planner(scenario)
     yield from _no_mission(scenario)
     no_network = list(_no_impairments(scenario))
     yield from no_network
@@ -139,6 +148,23 @@ def _no_scheme(scenario: Scenario) -> Iterator[Contradiction]:
         yield "control.feedback", feedback, f"{needed} with control.scheme = {control.scheme!r}"
     if scenario.is_mission and not properties.missions:
         yield "control.scheme", repr(control.scheme), "'trajectory' on a mission"
+
+
+def _no_planner(scenario: Scenario) -> Iterator[Contradiction]:
+    control = scenario.control
+    try:
+        PLANNERS.one(control.planner)
+    except GrammarError as error:
+        yield "control.planner", repr(error.given), error.expected
+        return
+    if control.planner == MPC:
+        return
+    if scenario.is_mission:
+        expected = f"{MPC!r} on a mission, whose vehicles keep apart by motions of the server's own"
+        yield "control.planner", repr(control.planner), expected
+    if not SCHEMES[schemes.call(control.scheme).name].is_ours:
+        expected = f"{MPC!r} with control.scheme = {control.scheme!r}, which plans itself"
+        yield "control.planner", repr(control.planner), expected
 
 
 def _no_mission(scenario: Scenario) -> Iterator[Contradiction]:

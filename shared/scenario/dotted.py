@@ -13,6 +13,7 @@ from skytether.shared.base.hint import hint
 from skytether.shared.scenario.grammar import GrammarError
 from skytether.shared.scenario.registry import (
     IMPAIRMENTS,
+    PLANNERS,
     REFERENCES,
     REPORTS,
     TRIGGERS,
@@ -22,6 +23,7 @@ from skytether.shared.scenario.registry import (
 TEXTS: Mapping[str, PluginTable] = MappingProxyType(
     {
         "control.trigger": TRIGGERS,
+        "control.planner": PLANNERS,
         "reference.shape": REFERENCES,
         "vehicle.report": REPORTS,
         "network.uplink": IMPAIRMENTS,

@@ -437,6 +437,9 @@ SCHEMES = PluginTable("scheme", "a scheme such as 'trajectory', or 'name(1.5)'",
 """Schemes of `control.scheme`. A built-in one is a function that returns its properties; a
 plug-in's is the class itself, called with a `server.common.scheme.Fleet`. See
 `shared.scenario.schemes`."""
+PLANNERS = PluginTable("planner", "a planner such as 'mpc', or 'name(1.5)'", given=1, class_=1)
+"""Planners of `control.planner`, called with a `planners.Problem`. See
+`shared.scenario.planners`."""
 VEHICLES = PluginTable(
     "vehicle", "a vehicle such as 'simulated', or 'name(1.5)'", given=2, class_=2
 )
@@ -455,5 +458,5 @@ IMPAIRMENTS = PluginTable(
     texts=True,
 )
 """Impairments of a direction of the network: classes. See `shared.scenario.air`."""
-TABLES = (SCHEMES, TRIGGERS, REFERENCES, VEHICLES, IMPAIRMENTS)
+TABLES = (SCHEMES, PLANNERS, TRIGGERS, REFERENCES, VEHICLES, IMPAIRMENTS)
 """Tables to which plug-ins can add entries."""

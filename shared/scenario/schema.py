@@ -43,6 +43,7 @@ from skytether.shared.scenario.owners import (
     Term,
 )
 from skytether.shared.scenario.registry import (
+    PLANNERS,
     REFERENCES,
     SCHEMES,
     TRIGGERS,
@@ -124,6 +125,8 @@ class ControlConfig(Section, frozen=True):
     """Largest data rate to all vehicles together, IP and UDP headers included [B/s]; horizons with
     the largest gain per byte are sent first. auto: the largest measured rate without queueing; 0:
     no limit."""
+    planner: OfServer[Text] = "mpc"
+    """What plans, see `skytether planners`: the MPC of eq. (9), or a planner of your own."""
     solver: OfServer[Literal["exact", "osqp"]] = "exact"
     """Solver of eq. (9): a Riccati active set (exact and fast), or OSQP for comparison."""
     spline_error_m: OfServer[Annotated[float, Meta(ge=0, le=1e3)]] = 0.01
@@ -670,8 +673,11 @@ class Scenario(Section, frozen=True):
         return parsed.to_the_sky() if self.lands else parsed
 
     def entries(self) -> Iterator[Entry]:
-        """Entries of the scheme, the policies of the trigger, the shape and the vehicle."""
+        """Entries of the scheme, the planner, the policies of the trigger, the shape and the
+        vehicle.
+        """
         yield SCHEMES[schemes.call(self.control.scheme).name]
+        yield PLANNERS[PLANNERS.one(self.control.planner).name]
         for policy in leaves(TRIGGERS.parse(self.control.trigger)):
             yield TRIGGERS[policy.name]
         yield REFERENCES[REFERENCES.one(self.reference.shape).name]

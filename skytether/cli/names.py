@@ -6,6 +6,7 @@ from functools import partial
 
 from skytether.client.vehicles import vehicle
 from skytether.shared.scenario import registry
+from skytether.shared.scenario.planners import planner
 from skytether.shared.scenario.schemes import scheme
 from skytether.shell import command, options
 
@@ -30,6 +31,9 @@ reports = partial(
     names, "reports", registry.REPORTS, "List the policies for vehicle.report, a sentence each."
 )
 schemes = partial(names, "schemes", scheme, "List the values of control.scheme, a sentence each.")
+planners = partial(
+    names, "planners", planner, "List the values of control.planner, a sentence each."
+)
 references = partial(
     names, "references", registry.REFERENCES, "List the values of reference.shape, a sentence each."
 )

@@ -1,7 +1,7 @@
 """Scenarios and flights from Python: `load`, `check`, `fly` and `fly_batch`."""
 
 import threading
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from os import PathLike, fspath
@@ -15,6 +15,8 @@ from skytether.shared.base.errors import ConfigError, FlightError
 from skytether.shared.core.endpoint import Endpoint
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.dotted import flat, set_keys
+from skytether.shared.scenario.planners import Planner
+from skytether.shared.scenario.registry import PLANNERS
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Record
 from skytether.shell import plugins, temporary
@@ -66,6 +68,7 @@ def fly(
     udp: bool = False,
     secure: bool = False,
     server: Endpoint | None = None,
+    planner: Callable[..., Planner] | None = None,
     **keys: Any,
 ) -> Flight:
     """Fly a scenario: in virtual time, reproducible to the last bit, or over real UDP.
@@ -76,6 +79,9 @@ def fly(
         secure: whether the link is encrypted, with keys made for this flight.
         server: endpoint that plans in place of Skytether's server, only in virtual time; each
             flight needs a new one.
+        planner: class that plans in place of the MPC, see `skytether.plugin.Planner`, only in
+            virtual time; the same as `control.planner` with the name of a class that `@planner`
+            decorates.
         keys: see `load`.
 
     Returns:
@@ -88,6 +94,8 @@ def fly(
     """
     if server is not None:
         _check_server(server, udp=udp, secure=secure)
+    if planner is not None:
+        keys["control.planner"] = _planner(planner, udp=udp)
     name, flown = named(scenario, keys)
     if server is None:
         prepare()
@@ -185,6 +193,26 @@ def _check_server(server: Endpoint, *, udp: bool, secure: bool) -> None:
     if secure:
         message = "got True with a server of your own, which cannot open encrypted packets"
         raise ConfigError(f"secure: {message}")
+
+
+def _planner(planner: Callable[..., Planner], *, udp: bool) -> str:
+    """Name of a planner in scenarios, added to the table unless it is there.
+
+    Raises:
+        ConfigError: the flight is over UDP, or another planner has the name.
+        TypeError: the planner is not a class.
+    """
+    if not callable(planner):
+        expected = "expected a class with the method plan, not an object made from it"
+        raise TypeError(f"planner: got {planner!r}, {expected}")
+    if udp:
+        expected = "skytether fly with the planner in a file: --plugin FILE"
+        raise ConfigError(f"udp: got True with a planner of this process, expected {expected}")
+    for name, entry in PLANNERS.items():
+        if entry.make is planner:
+            return name
+    PLANNERS.add(planner, planner.__name__)
+    return planner.__name__
 
 
 def _over_udp(scenario: Scenario, *, secure: bool) -> Record:

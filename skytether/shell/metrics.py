@@ -127,6 +127,10 @@ counts/horizons_lost server_lost_horizons_total
     Horizons that were sent but did not come into force in time.
 counts/scheme_errors server_scheme_errors_total
     Steps of vehicles for which a plug-in's scheme failed.
+counts/planner_errors server_planner_errors_total
+    Steps of vehicles for which a plug-in's planner failed.
+counts/planner_late server_planner_late_total
+    Steps of vehicles for which a plug-in's planner took too long.
 dropped/{reason} server_dropped_datagrams_total
     Datagrams that were dropped because they came from no vehicle or could not be read, by reason.
 refused/{reason} server_refused_vehicles_total

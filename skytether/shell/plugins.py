@@ -21,6 +21,7 @@ from skytether.shared.base import files
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.scenario.registry import (
     IMPAIRMENTS,
+    PLANNERS,
     REFERENCES,
     SCHEMES,
     TABLES,
@@ -32,6 +33,7 @@ FLAG = "--plugin"
 FILE_BYTES_MAX = 1_000_000
 GROUPS = {
     "skytether.schemes": SCHEMES,
+    "skytether.planners": PLANNERS,
     "skytether.triggers": TRIGGERS,
     "skytether.references": REFERENCES,
     "skytether.vehicles": VEHICLES,
@@ -123,7 +125,7 @@ def _import(plugin: Plugin) -> None:
                 if entry.source == path:
                     table[name], added = replace(entry, version=version), added + 1
         if not added:
-            kinds = "@trigger, @scheme, @reference, @vehicle or @impairment"
+            kinds = "@planner, @trigger, @scheme, @reference, @vehicle or @impairment"
             expected = f"{kinds} on a function or class, see docs"
             raise ConfigError(f"{FLAG}: {path}: adds nothing, expected {expected}")
 

@@ -22,7 +22,10 @@ LAB = (
     *("crowd", "sweep", "envelope", "margins", "identify", "torture", "adversary", "reproduce"),
     *("compare", "calibrate"),
 )
-LISTS = ("scenarios", "schemes", "triggers", "reports", "references", "vehicles", "impairments")
+LISTS = (
+    *("scenarios", "schemes", "planners", "triggers", "reports", "references", "vehicles"),
+    "impairments",
+)
 BARE = ("client", "netem", "keygen", "set", "probe", *LISTS)
 NEEDS: dict[str, tuple[str, ...]] = {
     **dict.fromkeys(BARE, ()),

@@ -20,8 +20,11 @@ from skytether.shared.scenario import reading
 from skytether.shared.scenario.catalogue import KEYS, TERMS, differences
 from skytether.shared.scenario.dotted import flat, set_keys
 from skytether.shared.scenario.owners import Owner
+from skytether.shared.scenario.registry import PLANNERS
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.wire.protocol import PAYLOAD_BYTES_MAX, Hello, encode
+
+pytestmark = pytest.mark.usefixtures("plugin_tables")
 
 HERE = reading.check(
     {
@@ -46,6 +49,7 @@ OTHER: dict[str, Any] = {
     "sensor.velocity_every_s": 1.0,
     "control.delay_bound": 0.5,
     "control.trigger": "always",
+    "control.planner": "own",
     "control.solver": "osqp",
     "control.input_reference": False,
     "reference.shape": "square",
@@ -125,6 +129,8 @@ def differing(key: str, folder: Path) -> tuple[Scenario, Scenario]:
         table = reading.to_table(ON_MISSION)
         set_keys({key: MISSION[key]}, table)
         return ON_MISSION, reading.check(table, "there")
+    if key == "control.planner":
+        PLANNERS.add(lambda problem: problem, "own")
     value = OTHER.get(key)
     if value is None:
         here = ALL[key]

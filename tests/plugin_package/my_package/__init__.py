@@ -1,4 +1,4 @@
-"""A trigger, a reference, a vehicle and an impairment in a package of their own."""
+"""A planner, a trigger, a reference, a vehicle and an impairment in a package of their own."""
 
 from collections.abc import Sequence
 from typing import Annotated
@@ -12,6 +12,7 @@ from skytether.plugin import (
     Fate,
     Impairment,
     Measurement,
+    Problem,
     Reference,
     Scenario,
     Situation,
@@ -19,6 +20,7 @@ from skytether.plugin import (
     Verdict,
     above,
     impairment,
+    planner,
     reference,
     trigger,
     vehicle,
@@ -30,6 +32,17 @@ def slip(now: Situation, mps: Annotated[float, Meta(ge=0)] = 0.3) -> Verdict:
     """Sends if the velocity differs from its plan by more than so many m/s."""
     off = now.estimate[:, :, 1] - now.planned[:, :, 1]
     return above(now, np.linalg.norm(off, axis=1), mps)
+
+
+@planner(name="idle")
+class Idle:
+    """Plans to stay."""
+
+    def __init__(self, problem: Problem) -> None:
+        self._inputs = np.zeros((problem.axes, problem.horizon))
+
+    def plan(self, *_: NDArray[np.float64]) -> NDArray[np.float64]:
+        return self._inputs
 
 
 @reference

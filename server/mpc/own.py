@@ -1,0 +1,196 @@
+"""Planners of plug-ins in place of the MPC (`shared.scenario.planners`): one for each vehicle.
+
+A planner that raises, takes too long, or returns what cannot be flown makes no plan for its vehicle
+at that step: the vehicle flies its present plan to the end, and then its failsafe acts. What takes
+too long is decided by the caller of planners (`server.common.scheme.Planning`): a core has no
+clock.
+
+A planner optimises a cost that nobody else knows. So its plan counts as the optimum, and the cost
+of flying on with the inputs already sent is that of their difference from it, ΔUᵀ 𝓗 ΔU of eq. (9).
+"""
+
+from collections import Counter
+from dataclasses import dataclass
+from functools import partial
+from traceback import format_exception
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skytether.server.common.scheme import Fleet
+from skytether.server.mpc.appraisal import GENERATOR, TRACKER
+from skytether.server.mpc.hierarchical import PlanBatch, Planner, conclude_given, start_plans
+from skytether.shared.base.errors import ConfigError
+from skytether.shared.law.model import Array, Flags, Indices
+from skytether.shared.scenario.planners import Problem
+from skytether.shared.scenario.registry import PLANNERS
+from skytether.shared.wire.protocol import FLOAT_MAX
+
+ERRORS, LATE = "planner_errors", "planner_late"
+"""Names of the counts of steps without a plan."""
+
+
+@dataclass(slots=True)
+class Own:
+    """Planner of one vehicle, and its last plan."""
+
+    planner: Any
+    """None until it is first needed."""
+    inputs: Array
+    """Inputs of the last plan [m/s]; shape (axes, H)."""
+    start: int = -1
+    """Step at which that plan started, or -1."""
+
+
+class OwnPlanners:
+    """Planners of up to `capacity` vehicles.
+
+    Args:
+        counts: counts of the scheme, to which ERRORS and LATE are added.
+        states: whether a planner may return states instead of inputs.
+
+    Raises:
+        ConfigError: a planner cannot be made.
+    """
+
+    def __init__(self, fleet: Fleet, counts: Counter[str], *, states: bool) -> None:
+        self._text = text = fleet.scenario.control.planner
+        self._problem = Problem.of(fleet.scenario)
+        self._make = partial(PLANNERS.make, PLANNERS.one(text), (), self._problem)
+        self._states, self._tell, self._planning = states, fleet.tell, fleet.planning
+        self._counts = counts
+        self._own: dict[int, Own] = {}
+        """Planners by the rows of their vehicles."""
+        try:
+            self._spare = self._make()
+            self._spare.plan  # noqa: B018 - a planner has it
+        except Exception as error:
+            wrong = f"a planner that can be made ({type(error).__name__}: {error})"
+            raise ConfigError(f"control.planner: got {text!r}, expected {wrong}") from error
+
+    def forget(self, row: int) -> None:
+        self._own.pop(row, None)
+
+    def plan(
+        self, rows: Indices, starts: Indices, state: Array, reference: Array
+    ) -> list[Array | None]:
+        """Plan for n vehicles.
+
+        Args:
+            rows: rows of the vehicles; shape (n,).
+            starts: step at which each plan starts; shape (n,).
+            state: state at that step [m, m/s]; shape (n, axes, 2).
+            reference: desired states from then on [m, m/s]; shape (n, axes, H + 1, 2).
+
+        Returns:
+            for each vehicle inputs within ±u_max [m/s], shape (axes, H); states [m, m/s], shape
+            (H + 1, axes, 2); or None.
+        """
+        calls = [
+            (
+                row,
+                partial(self._plan, self._of(row), start, x.copy(), desired.swapaxes(0, 1).copy()),
+            )
+            for row, start, x, desired in zip(
+                rows.tolist(), starts.tolist(), state, reference, strict=True
+            )
+        ]
+        answers = self._planning(calls)
+        return [
+            self._checked(self._own[row], start, answer)
+            for row, start, answer in zip(rows.tolist(), starts.tolist(), answers, strict=True)
+        ]
+
+    def _of(self, row: int) -> Own:
+        if row not in self._own:
+            inputs = np.zeros((self._problem.axes, self._problem.horizon))
+            self._own[row] = Own(self._spare, inputs)
+            self._spare = None
+        return self._own[row]
+
+    def _plan(self, own: Own, start: int, state: Array, reference: Array) -> Any:
+        if own.planner is None:
+            own.planner = self._make()
+        gap, H = start - own.start, self._problem.horizon
+        previous = np.zeros_like(own.inputs)
+        if own.start >= 0 and 0 <= gap <= H:
+            previous = own.inputs[:, np.minimum(np.arange(H) + gap, H - 1)]
+        return own.planner.plan(state, reference, previous)
+
+    def _checked(self, own: Own, start: int, answer: Any) -> Array | None:
+        problem = self._problem
+        shapes: list[tuple[int, ...]] = [(problem.axes, problem.horizon)]
+        if self._states:
+            shapes.append((problem.horizon + 1, problem.axes, 2))
+        try:
+            if isinstance(answer, Exception):
+                raise answer
+            plan = np.array(answer, dtype=np.float64)
+            if plan.shape not in shapes:
+                expected = " or ".join(map(str, shapes))
+                raise ValueError(f"got a plan of shape {plan.shape}, expected {expected}")
+            if not (np.abs(plan) <= FLOAT_MAX).all():  # NaN fails too
+                raise ValueError("expected a plan of finite numbers")
+        except Exception as error:
+            self._fail(error)
+            return None
+        if plan.ndim == len(shapes[0]):
+            bounds = problem.u_max[:, None]
+            own.inputs, own.start = np.clip(plan, -bounds, bounds), start
+            return own.inputs
+        return plan
+
+    def _fail(self, error: Exception) -> None:
+        count = LATE if isinstance(error, TimeoutError) else ERRORS
+        if not self._counts[count]:
+            what = f"the planner {self._text}: {type(error).__name__}: {error}"
+            trace = "" if count == LATE else "".join(format_exception(error))
+            self._tell(f"{trace}{what}; a vehicle for which it fails is sent no plan at that step")
+        self._counts[count] += 1
+
+
+class OwnPlanner(Planner):
+    """Planners of plug-ins for a scheme that sends inputs, with the figures of the MPC.
+
+    What a planner returns is the generator's plan, which knows no disturbance; the tracker's, which
+    is sent, is the same minus the disturbance. The MPC's generator never uses the vehicle's state,
+    but a planner always starts from it. So the previous plan, with which triggers compare, is the
+    last that was sent.
+    """
+
+    def __init__(self, fleet: Fleet, counts: Counter[str]) -> None:
+        control, terms = fleet.scenario.control, fleet.terms
+        desired, capacity, block = fleet.desired, fleet.capacity, fleet.block
+        super().__init__(control, terms, desired, capacity, block, fleet.stopwatch)
+        self._planners = OwnPlanners(fleet, counts, states=False)
+        self._bounds = np.array(terms.u_max)[:, None]
+        self._sent: list[NDArray[Any]] = []
+        """Inputs, start and step of the plans sent last to the vehicles of this block."""
+
+    def forget(self, row: int) -> None:
+        super().forget(row)
+        self._planners.forget(row)
+
+    def _plan_all(self, batch: PlanBatch, rows: Indices, step: Indices) -> None:
+        n, draft, foresight = len(rows), self._draft, batch.foresight
+        memory = self._memory
+        self._sent = [memory.inputs[GENERATOR, rows], memory.start[rows], memory.step[rows]]
+        start_plans(batch, rows, step)
+        state, begins = foresight.start[:n], step + foresight.ahead[:n]
+        reference = self._desired.states(rows, step, foresight.ahead)
+        plans = self._planners.plan(rows, begins, state, reference)
+        for i, plan in enumerate(plans):
+            inputs = draft.guess[i] if plan is None else plan
+            disturbance = foresight.disturbance[i][:, None]
+            draft.inputs[GENERATOR, i] = inputs
+            draft.inputs[TRACKER, i] = np.clip(inputs - disturbance, -self._bounds, self._bounds)
+        self.figures["solved"][:n] = [plan is not None for plan in plans]
+        conclude_given(batch, n)
+        memory.start[rows] = state
+
+    def remember(self, rows: Indices, event: Flags) -> None:
+        memory, kept = self._memory, ~event
+        inputs, start, step = (each[kept] for each in self._sent)
+        memory.inputs[GENERATOR, rows[kept]] = inputs
+        memory.start[rows[kept]], memory.step[rows[kept]] = start, step

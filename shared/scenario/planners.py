@@ -1,0 +1,68 @@
+"""Planners: what `control.planner` names. A plug-in's replaces the MPC of eq. (9).
+
+The server makes one for each vehicle, and calls its `plan` at every step; `server.mpc.own` checks
+what it returns. Prediction, acknowledgements, trigger and failsafe stay those of the scheme.
+"""
+
+from typing import NamedTuple, Protocol, Self
+
+from skytether.shared.law.model import Array, Model
+from skytether.shared.scenario.registry import PLANNERS
+from skytether.shared.scenario.schema import Scenario
+
+planner = PLANNERS
+"""Decorator of a planner: a class of a `Problem` and its own numbers with the method `plan`, see
+`Planner`."""
+
+MPC = "mpc"
+"""The planner that the server has itself."""
+
+
+class Problem(NamedTuple):
+    """What a planner is made from."""
+
+    model: Model
+    """Model of the vehicle: `model.step(x, u)` is the state one step later, `model.roll(x, inputs)`
+    the states under several inputs; A and B of eq. (4) are `model.A` and `model.B`."""
+    dt_s: float
+    """Length of a step [s]."""
+    horizon: int
+    """Number of steps planned ahead, H."""
+    axes: int
+    u_max: Array
+    """Bound of the input on each axis [m/s]; shape (axes,)."""
+    scenario: Scenario
+    """All keys of the flight; `scenario.control` has the weights of eq. (5)."""
+
+    @classmethod
+    def of(cls, scenario: Scenario) -> Self:
+        terms = scenario.terms()
+        axes, u_max = terms.axes, scenario.u_max
+        return cls(terms.model, terms.dt_s, terms.horizon, axes, u_max, scenario)
+
+
+class Planner(Protocol):
+    """Planner of one vehicle."""
+
+    def plan(self, state: Array, reference: Array, previous: Array) -> Array:
+        """Plan of the next H steps.
+
+        The model needs no wind: an estimated disturbance is subtracted from the inputs afterwards.
+
+        Args:
+            state: where the vehicle will be when the plan comes into force [m, m/s]; shape (axes,
+                2). With the scheme "trajectory": where the trajectory it follows will be.
+            reference: desired states from then on, extrapolated where they are unknown [m, m/s];
+                shape (H + 1, axes, 2).
+            previous: inputs of the vehicle's last plan from then on, the last one repeated [m/s];
+                0 without one; shape (axes, H).
+
+        Returns:
+            inputs [m/s], shape (axes, H), cut to ±u_max; or, with the scheme "trajectory", states
+            to be followed [m, m/s], shape (H + 1, axes, 2).
+        """
+
+
+@planner
+def mpc(problem: Problem) -> None:
+    """The MPC of the paper, with the weights of `control`, solved by `control.solver`."""

@@ -1,0 +1,53 @@
+"""Planners in threads: one that hangs is not waited for, and nobody else's plan is lost."""
+
+import time
+from threading import Event
+from typing import Any
+
+from skytether.shell.planning import Planners
+
+LIMIT_S = 30.0
+"""Never reached by a planner that answers, however busy the machine is."""
+
+
+def test_answers_are_in_the_order_of_the_calls() -> None:
+    planners = Planners(LIMIT_S)
+    for tick in range(20):
+        calls = [(row, lambda row=row, tick=tick: (row, tick)) for row in (3, 1, 2)]
+        assert planners(calls) == [(3, tick), (1, tick), (2, tick)]
+
+
+def test_an_exception_is_an_answer() -> None:
+    (answer, other) = Planners(LIMIT_S)([(1, lambda: 1 / 0), (2, lambda: 5)])
+    assert isinstance(answer, ZeroDivisionError)
+    assert other == 5
+
+
+def test_a_planner_that_hangs_is_waited_for_once() -> None:
+    """Its vehicle gets no plan until it is back, and then a new one; the late plan is dropped."""
+    planners, goes_on, asked = Planners(0.2), Event(), []
+
+    def hangs() -> str:
+        goes_on.wait()
+        return "late"
+
+    def quick(what: str) -> Any:
+        asked.append(what)
+        return what
+
+    late, other = planners([(1, hangs), (2, lambda: quick("a"))])
+    assert isinstance(late, TimeoutError)
+    assert other == "a"
+    planners._limit_s = LIMIT_S
+    began_s = time.monotonic()
+    for _ in range(5):
+        late, other = planners([(1, lambda: quick("not asked")), (2, lambda: quick("b"))])
+        assert isinstance(late, TimeoutError)
+        assert other == "b"
+    assert time.monotonic() - began_s < LIMIT_S
+    goes_on.set()
+    answers: list[Any] = [late]
+    while isinstance(answers[0], TimeoutError):
+        answers = planners([(1, lambda: "new")])
+    assert answers == ["new"]
+    assert "not asked" not in asked
