@@ -1,0 +1,343 @@
+"""Players of remote policies over bad networks: what each makes of the same policy, and its price.
+
+Every player gets chunks of one policy, or single actions, over one network with the same seeds. A
+policy here is scripted; it predicts its chunk by a model that knows nothing of the disturbances.
+Delays are the same in both directions, at least half of the mean, with a standard deviation of a
+fifth of it. Needs the extra `bench`, for gym-pusht.
+"""
+
+import hashlib
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import product
+from math import cos, sin
+from pathlib import Path
+from typing import Any, Literal, NamedTuple, get_args
+
+import gymnasium
+import msgspec
+import numpy as np
+import tyro
+from numpy.typing import NDArray
+
+from bench import push_t
+from bench.harness import TextTable
+from skytether.gym import Clocked, Networked, Newest, Player, Queue
+from skytether.lab.commands.pool import Flags, study
+from skytether.shell import command
+
+Rows = NDArray[np.float64]
+PlayerName = Literal["newest", "replace", "average", "clocked", "sparing"]
+PLAYERS: Mapping[PlayerName, tuple[str, Callable[[], Player]]] = {
+    "newest": ("newest action held", Newest),
+    "replace": ("queue, replaced", Queue),
+    "average": ("queue, averaged", lambda: Queue("average")),
+    "clocked": ("by the clock", Clocked),
+    "sparing": ("by the clock, when needed", Clocked),
+}
+"""Title of each player, and what the robot runs. The last sends a chunk only where it differs from
+what the robot plays anyway."""
+DELAYS_S, LOSSES = (0.0, 0.05, 0.1, 0.2), (0.0, 0.1, 0.3)
+SEEDS = 50
+FOR_S = 0.4
+"""Time of rows that the robot keeps in hand when a chunk is not needed [s]."""
+
+
+class Pendulum:
+    """Pendulum-v1, with gusts: swung up by its energy, held by a linear law."""
+
+    title, step_s, thinking_s, rows, steps = "Pendulum-v1", 0.05, 0.05, 30, 200
+    tolerance = 0.4
+
+    def make(self) -> gymnasium.Env[Any, Any]:
+        return Gusts(gymnasium.make("Pendulum-v1"), 0.2)
+
+    def plan(self, observation: Rows, committed: Rows) -> Rows:
+        angle, rate = float(np.arctan2(observation[1], observation[0])), float(observation[2])
+        planned = []
+        for i in range(self.rows):
+            if i < len(committed):
+                torque = float(committed[i, 0])
+            elif abs(angle) < 0.5 and abs(rate) < 3.0:
+                torque = -8.0 * angle - 1.8 * rate
+            else:
+                torque = -0.15 * rate * (0.5 * rate * rate + 15.0 * (cos(angle) - 1.0))
+            torque = min(max(torque, -2.0), 2.0)
+            rate = min(max(rate + (15.0 * sin(angle) + 3.0 * torque) * 0.05, -8.0), 8.0)
+            angle = (angle + rate * 0.05 + np.pi) % (2.0 * np.pi) - np.pi
+            planned.append([torque])
+        return np.array(planned)
+
+    def score(self, rewards: Sequence[float], ended: bool) -> float:  # noqa: ARG002
+        return float(sum(rewards))
+
+
+class CartPole:
+    """CartPole-v1 with a force from -10 to 10 N, and gusts; the score is the steps it stands."""
+
+    title, step_s, thinking_s, rows, steps = "CartPole-v1, any force", 0.02, 0.04, 50, 500
+    tolerance = 0.15
+
+    def make(self) -> gymnasium.Env[Any, Any]:
+        return AnyForce(gymnasium.make("CartPole-v1"), 0.05)
+
+    def plan(self, observation: Rows, committed: Rows) -> Rows:
+        x, speed, angle, rate = map(float, observation)
+        planned = []
+        for i in range(self.rows):
+            if i < len(committed):
+                share = float(committed[i, 0])
+            else:
+                share = 0.1 * (0.8 * x + 2.2 * speed + 33.0 * angle + 7.0 * rate)
+            share = min(max(share, -1.0), 1.0)
+            sine, cosine = sin(angle), cos(angle)
+            push = (10.0 * share + 0.05 * rate * rate * sine) / 1.1
+            turning = (9.8 * sine - cosine * push) / (0.5 * (4.0 / 3.0 - 0.1 * cosine**2 / 1.1))
+            pushing = push - 0.05 * turning * cosine / 1.1
+            x, speed = x + 0.02 * speed, speed + 0.02 * pushing
+            angle, rate = angle + 0.02 * rate, rate + 0.02 * turning
+            planned.append([share])
+        return np.array(planned)
+
+    def score(self, rewards: Sequence[float], ended: bool) -> float:  # noqa: ARG002
+        return float(sum(rewards))
+
+
+class PushT:
+    """gym-pusht; the score is the mean coverage of the goal over 300 steps, 1 once it is reached."""
+
+    title, step_s, thinking_s, rows, steps = "PushT", 0.1, 0.1, 16, 300
+    tolerance = 12.0
+
+    def make(self) -> gymnasium.Env[Any, Any]:
+        import gym_pusht  # noqa: F401 - registers the environment
+
+        return gymnasium.make("gym_pusht/PushT-v0", disable_env_checker=True)
+
+    def plan(self, observation: Rows, committed: Rows) -> Rows:
+        return push_t.plan(observation, committed, self.rows)
+
+    def score(self, rewards: Sequence[float], ended: bool) -> float:
+        return (sum(rewards) + (self.steps - len(rewards)) * ended) / self.steps
+
+
+TASKS = {"pendulum": Pendulum(), "cartpole": CartPole(), "pusht": PushT()}
+
+
+class Gusts(gymnasium.ActionWrapper[Any, Any, Any]):
+    """Adds a normal disturbance to each action."""
+
+    def __init__(self, env: gymnasium.Env[Any, Any], sd: float) -> None:
+        super().__init__(env)
+        self._sd = sd
+
+    def action(self, action: Any) -> Any:
+        return action + self._sd * self.np_random.standard_normal(action.shape)
+
+
+class AnyForce(Gusts):
+    """CartPole with a continuous force, as a share of 10 N."""
+
+    def __init__(self, env: gymnasium.Env[Any, Any], sd: float) -> None:
+        super().__init__(env, sd)
+        self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (1,), np.float32)
+
+    def action(self, action: Any) -> Any:
+        force: Any = self.unwrapped
+        share = float(super().action(action)[0])
+        force.force_mag = 10.0 * abs(share)
+        return int(share > 0.0)
+
+
+class Played(gymnasium.Wrapper[Any, Any, Any, Any]):
+    """Notes actions and rewards of an episode."""
+
+    def __init__(self, env: gymnasium.Env[Any, Any]) -> None:
+        super().__init__(env)
+        self.actions: list[Any] = []
+        self.rewards: list[float] = []
+
+    def step(self, action: Any) -> Any:
+        outcome = self.env.step(action)
+        self.actions.append(action)
+        self.rewards.append(float(outcome[1]))
+        return outcome
+
+
+class Cell(NamedTuple):
+    task: str
+    player: PlayerName
+    delay_s: float
+    loss: float
+    seed: int
+
+
+class FlownCell(msgspec.Struct, frozen=True):
+    cell: Cell
+    score: float
+    packets_per_s: float
+    """Answers sent a second."""
+    stalled: float
+    """Share of the steps at which the robot had no row."""
+    jump: float
+    """Mean change of the action from step to step, in units of the action."""
+
+
+class Sparing:
+    """Decides whether a chunk differs from what the robot plays anyway."""
+
+    def __init__(self, task: Any) -> None:
+        self._task = task
+        self._sent: tuple[int, int, Rows] | None = None
+        """Generation, step and rows of the newest chunk."""
+
+    def sends(self, rows: Rows, info: Mapping[str, Any]) -> bool:
+        plays, at = info["held"], info["step"]
+        if self._sent and self._sent[0] > info["acknowledged"]:
+            generation, step, sent = self._sent
+            if at <= step + info["delay_steps"]:  # still under way
+                plays = sent[at - step :]
+        enough = len(plays) * self._task.step_s > FOR_S
+        if enough and np.abs(rows[: len(plays)] - plays[: len(rows)]).max() < self._task.tolerance:
+            return False
+        self._sent = info["generation"] + 1, at, rows
+        return True
+
+
+def fly_cell(cell: Cell) -> FlownCell:
+    task: Any = TASKS[cell.task]
+    mean = cell.delay_s
+    delay = f"gamma({mean / 2:g}, {mean:g}, {mean / 5:g})" if mean else "none"
+    way = f"{delay} & loss({cell.loss:g})"
+    played = Played(task.make())
+    env = Networked(
+        played,
+        uplink=way,
+        downlink=way,
+        thinking=task.thinking_s,
+        player=PLAYERS[cell.player][1],
+        step_s=task.step_s,
+    )
+    observation, info = env.reset(seed=cell.seed)
+    sparing = Sparing(task) if cell.player == "sparing" else None
+    is_ours = cell.player in ("clocked", "sparing")
+    terminated = truncated = False
+    while not (terminated or truncated):
+        rows = task.plan(observation, info["committed"] if is_ours else info["committed"][:0])
+        answer = rows[0] if cell.player == "newest" else rows
+        if sparing and not sparing.sends(rows, info):
+            answer = None
+        observation, _, terminated, truncated, info = env.step(answer)
+    env.close()
+    steps = len(played.actions)
+    return FlownCell(
+        cell,
+        task.score(played.rewards, terminated),
+        info["uplink_packets"] / (steps * task.step_s),
+        info["exhausted_steps"] / steps,
+        float(np.abs(np.diff(played.actions, axis=0)).mean()),
+    )
+
+
+def cells(seeds: int, tasks: Sequence[str]) -> list[Cell]:
+    numbers = range(1, seeds + 1)
+    return [
+        Cell(*each) for each in product(tasks, get_args(PlayerName), DELAYS_S, LOSSES, numbers)
+    ]
+
+
+def tables(flights: Sequence[FlownCell]) -> dict[str, TextTable]:
+    """For each task a table of the mean score and packets a second, and one of stalls and jumps."""
+    found: dict[tuple[Any, ...], list[FlownCell]] = {}
+    for each in flights:
+        found.setdefault(each.cell[:-1], []).append(each)
+    shown = {}
+    for task in dict.fromkeys(key[0] for key in found):
+        networks = list(dict.fromkeys(key[2:] for key in found))
+        headings = ["delay, loss each way", *(PLAYERS[name][0] for name in get_args(PlayerName))]
+        for kind, text in (("scores", _score), ("stalls", _stalls)):
+            rows = []
+            for delay_s, loss in networks:
+                row = [f"{1e3 * delay_s:g} ms, {loss:.0%}"]
+                row += [text(found[task, name, delay_s, loss]) for name in get_args(PlayerName)]
+                rows.append(row)
+            shown[f"players {task} {kind}"] = TextTable(headings, rows)
+    return shown
+
+
+def _score(flown: Sequence[FlownCell]) -> str:
+    score, packets = (np.mean([getattr(f, name) for f in flown]) for name in FIGURES[:2])
+    return f"{score:.{2 if abs(score) < 10 else 0}f} ({packets:.1f}/s)"
+
+
+def _stalls(flown: Sequence[FlownCell]) -> str:
+    stalled, jump = (np.mean([getattr(f, name) for f in flown]) for name in FIGURES[2:])
+    return f"{stalled:.1%}, {jump:.3g}"
+
+
+FIGURES = ("score", "packets_per_s", "stalled", "jump")
+
+
+def draw(flights: Sequence[FlownCell], path: Path) -> None:
+    """Score over the delay, a panel for each task and loss, a line for each player."""
+    import matplotlib.pyplot as plt
+
+    tasks = list(dict.fromkeys(each.cell.task for each in flights))
+    figure, panels = plt.subplots(
+        len(tasks),
+        len(LOSSES),
+        figsize=(11, 2.8 * len(tasks)),
+        sharey="row",
+        squeeze=False,
+        layout="constrained",
+    )
+    for (task, loss), panel in zip(product(tasks, LOSSES), panels.flat, strict=True):
+        for name, style in zip(get_args(PlayerName), ("C7s:", "C1^--", "C3v--", "C0o-", "C2D-")):
+            means = [
+                np.mean([f.score for f in flights if f.cell[:4] == (task, name, delay_s, loss)])
+                for delay_s in DELAYS_S
+            ]
+            panel.plot(np.array(DELAYS_S) * 1e3, means, style, markersize=4, label=PLAYERS[name][0])
+        panel.set_title(f"{TASKS[task].title}, {loss:.0%} lost", fontsize=10)
+        panel.grid(alpha=0.3)
+    for panel in panels[-1]:
+        panel.set_xlabel("delay each way [ms]")
+    for panel in panels[:, 0]:
+        panel.set_ylabel("score")
+    panels[0, 0].legend(fontsize=8)
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+
+
+@dataclass(frozen=True)
+class PlayersOptions:
+    seeds: int = SEEDS
+    """Number of seeds, from 1 on."""
+    tasks: tuple[str, ...] = tuple(TASKS)
+    """Tasks to fly: pendulum, cartpole, pusht."""
+    jobs: int | None = None
+    """Number of flights at once; one per core unless given."""
+    out: Path | None = None
+    """Folder for the flights: after Ctrl-C the same command continues."""
+    figure: Path | None = None
+    """PNG of the scores over delay and loss."""
+
+
+def main(argv: Sequence[str]) -> None:
+    options = tyro.cli(PlayersOptions, args=argv, description=__doc__)
+    every = cells(options.seeds, options.tasks)
+    flights = study(fly_cell, every, FlownCell, {}, options.out, Flags(options.jobs))
+    for title, table in tables(flights).items():
+        table.show(title)
+    if options.figure:
+        draw(flights, options.figure)
+    print(f"hash of all flights: {hashlib.sha256(msgspec.json.encode(flights)).hexdigest()[:16]}")
+
+
+def document_tables(folder: Path | None, flags: Flags) -> Mapping[str, TextTable]:
+    return tables(study(fly_cell, cells(SEEDS, tuple(TASKS)), FlownCell, {}, folder, flags))
+
+
+if __name__ == "__main__":
+    sys.exit(command.main(main, sys.argv[1:], "players"))
