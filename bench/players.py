@@ -9,6 +9,7 @@ fifth of it. Needs the extra `bench`, for gym-pusht.
 import hashlib
 import sys
 from collections.abc import Callable, Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass
 from itertools import product
 from math import cos, sin
@@ -23,8 +24,10 @@ from numpy.typing import NDArray
 
 from bench import push_t
 from bench.harness import TextTable
-from skytether.gym import Clocked, Networked, Newest, Player, Queue
+from skytether.gym import Clocked, Held, Networked, Newest, Player, Queue
+from skytether.gym.players import Row
 from skytether.lab.commands.pool import Flags, study
+from skytether.lab.intervals import interval
 from skytether.shell import command
 
 Rows = NDArray[np.float64]
@@ -36,8 +39,9 @@ PLAYERS: Mapping[PlayerName, tuple[str, Callable[[], Player]]] = {
     "clocked": ("by the clock", Clocked),
     "sparing": ("by the clock, when needed", Clocked),
 }
-"""Title of each player, and what the robot runs. The last sends a chunk only where it differs from
-what the robot plays anyway."""
+"""Title of each player, and what the robot runs. For the queues a chunk is sent when half of one is
+left or less (LeRobot's threshold), for the last when it differs from what the robot plays anyway,
+for the others always."""
 DELAYS_S, LOSSES = (0.0, 0.05, 0.1, 0.2), (0.0, 0.1, 0.3)
 SEEDS = 50
 FOR_S = 0.4
@@ -47,11 +51,11 @@ FOR_S = 0.4
 class Pendulum:
     """Pendulum-v1, with gusts: swung up by its energy, held by a linear law."""
 
-    title, step_s, thinking_s, rows, steps = "Pendulum-v1", 0.05, 0.05, 30, 200
+    title, step_s, thinking_s, rows, steps = "Pendulum-v1", 0.05, 0.05, 16, 200
     tolerance = 0.4
 
     def make(self) -> gymnasium.Env[Any, Any]:
-        return Gusts(gymnasium.make("Pendulum-v1"), 0.2)
+        return Gusts(gymnasium.make("Pendulum-v1"), 0.1)
 
     def plan(self, observation: Rows, committed: Rows) -> Rows:
         angle, rate = float(np.arctan2(observation[1], observation[0])), float(observation[2])
@@ -74,13 +78,17 @@ class Pendulum:
 
 
 class CartPole:
-    """CartPole-v1 with a force from -10 to 10 N, and gusts; the score is the steps it stands."""
+    """CartPole-v1 with a pole of 4 m, a force from -10 to 10 N, and gusts; the score is the number
+    of steps that it stands.
+    """
 
-    title, step_s, thinking_s, rows, steps = "CartPole-v1, any force", 0.02, 0.04, 50, 500
+    title, step_s, thinking_s, rows, steps = "CartPole-v1, any force", 0.02, 0.04, 40, 500
     tolerance = 0.15
 
     def make(self) -> gymnasium.Env[Any, Any]:
-        return AnyForce(gymnasium.make("CartPole-v1"), 0.05)
+        env: Any = gymnasium.make("CartPole-v1")
+        env.unwrapped.length, env.unwrapped.polemass_length = 2.0, 0.2
+        return AnyForce(env, 0.05)
 
     def plan(self, observation: Rows, committed: Rows) -> Rows:
         x, speed, angle, rate = map(float, observation)
@@ -89,12 +97,12 @@ class CartPole:
             if i < len(committed):
                 share = float(committed[i, 0])
             else:
-                share = 0.1 * (0.8 * x + 2.2 * speed + 33.0 * angle + 7.0 * rate)
+                share = 0.1 * (0.8 * x + 2.5 * speed + 45.0 * angle + 22.0 * rate)
             share = min(max(share, -1.0), 1.0)
             sine, cosine = sin(angle), cos(angle)
-            push = (10.0 * share + 0.05 * rate * rate * sine) / 1.1
-            turning = (9.8 * sine - cosine * push) / (0.5 * (4.0 / 3.0 - 0.1 * cosine**2 / 1.1))
-            pushing = push - 0.05 * turning * cosine / 1.1
+            push = (10.0 * share + 0.2 * rate * rate * sine) / 1.1
+            turning = (9.8 * sine - cosine * push) / (2.0 * (4.0 / 3.0 - 0.1 * cosine**2 / 1.1))
+            pushing = push - 0.2 * turning * cosine / 1.1
             x, speed = x + 0.02 * speed, speed + 0.02 * pushing
             angle, rate = angle + 0.02 * rate, rate + 0.02 * turning
             planned.append([share])
@@ -105,9 +113,9 @@ class CartPole:
 
 
 class PushT:
-    """gym-pusht; the score is the mean coverage of the goal over 300 steps, 1 once it is reached."""
+    """gym-pusht; the score is the mean coverage of the goal over 300 steps, 1 once it is solved."""
 
-    title, step_s, thinking_s, rows, steps = "PushT", 0.1, 0.1, 16, 300
+    title, step_s, thinking_s, rows, steps = "PushT", 0.1, 0.1, 8, 300
     tolerance = 12.0
 
     def make(self) -> gymnasium.Env[Any, Any]:
@@ -115,8 +123,8 @@ class PushT:
 
         return gymnasium.make("gym_pusht/PushT-v0", disable_env_checker=True)
 
-    def plan(self, observation: Rows, committed: Rows) -> Rows:
-        return push_t.plan(observation, committed, self.rows)
+    def plan(self, observation: Rows, committed: Rows) -> Rows:  # noqa: ARG002
+        return push_t.plan(observation, self.rows)
 
     def score(self, rewards: Sequence[float], ended: bool) -> float:
         return (sum(rewards) + (self.steps - len(rewards)) * ended) / self.steps
@@ -151,18 +159,42 @@ class AnyForce(Gusts):
 
 
 class Played(gymnasium.Wrapper[Any, Any, Any, Any]):
-    """Notes actions and rewards of an episode."""
+    """Notes the rewards of an episode, step by step."""
 
     def __init__(self, env: gymnasium.Env[Any, Any]) -> None:
         super().__init__(env)
-        self.actions: list[Any] = []
         self.rewards: list[float] = []
 
     def step(self, action: Any) -> Any:
         outcome = self.env.step(action)
-        self.actions.append(action)
         self.rewards.append(float(outcome[1]))
         return outcome
+
+
+class Watched(Player):
+    """A player, and how far each chunk that arrives moves the row of the present step."""
+
+    def __init__(self, player: Player, jumps: list[float]) -> None:
+        super().__init__()
+        self._player, self._jumps = player, jumps
+
+    def __copy__(self) -> Player:
+        return copy(self._player)
+
+    def number(self, step: int) -> int:
+        return self._player.number(step)
+
+    def accept(self, chunk: Held, step: int) -> None:
+        before = copy(self._player).row(step)
+        self._player.accept(chunk, step)
+        after = copy(self._player).row(step)
+        if before is not None and after is not None:
+            self._jumps.append(float(np.abs(after - before).max()))
+
+    def row(self, step: int) -> Row | None:
+        row = self._player.row(step)
+        self.last = self._player.last
+        return row
 
 
 class Cell(NamedTuple):
@@ -181,7 +213,7 @@ class FlownCell(msgspec.Struct, frozen=True):
     stalled: float
     """Share of the steps at which the robot had no row."""
     jump: float
-    """Mean change of the action from step to step, in units of the action."""
+    """Mean change of the present row when a chunk arrives, in units of the action."""
 
 
 class Sparing:
@@ -195,7 +227,7 @@ class Sparing:
     def sends(self, rows: Rows, info: Mapping[str, Any]) -> bool:
         plays, at = info["held"], info["step"]
         if self._sent and self._sent[0] > info["acknowledged"]:
-            generation, step, sent = self._sent
+            _, step, sent = self._sent
             if at <= step + info["delay_steps"]:  # still under way
                 plays = sent[at - step :]
         enough = len(plays) * self._task.step_s > FOR_S
@@ -210,13 +242,13 @@ def fly_cell(cell: Cell) -> FlownCell:
     mean = cell.delay_s
     delay = f"gamma({mean / 2:g}, {mean:g}, {mean / 5:g})" if mean else "none"
     way = f"{delay} & loss({cell.loss:g})"
-    played = Played(task.make())
+    played, jumps = Played(task.make()), list[float]()
     env = Networked(
         played,
         uplink=way,
         downlink=way,
         thinking=task.thinking_s,
-        player=PLAYERS[cell.player][1],
+        player=lambda: Watched(PLAYERS[cell.player][1](), jumps),
         step_s=task.step_s,
     )
     observation, info = env.reset(seed=cell.seed)
@@ -226,25 +258,26 @@ def fly_cell(cell: Cell) -> FlownCell:
     while not (terminated or truncated):
         rows = task.plan(observation, info["committed"] if is_ours else info["committed"][:0])
         answer = rows[0] if cell.player == "newest" else rows
+        is_queue = cell.player in ("replace", "average")
+        if is_queue and 2 * len(info["held"]) > task.rows:
+            answer = None
         if sparing and not sparing.sends(rows, info):
             answer = None
         observation, _, terminated, truncated, info = env.step(answer)
     env.close()
-    steps = len(played.actions)
+    steps = len(played.rewards)
     return FlownCell(
         cell,
         task.score(played.rewards, terminated),
         info["uplink_packets"] / (steps * task.step_s),
         info["exhausted_steps"] / steps,
-        float(np.abs(np.diff(played.actions, axis=0)).mean()),
+        float(np.mean(jumps or [0.0])),
     )
 
 
 def cells(seeds: int, tasks: Sequence[str]) -> list[Cell]:
     numbers = range(1, seeds + 1)
-    return [
-        Cell(*each) for each in product(tasks, get_args(PlayerName), DELAYS_S, LOSSES, numbers)
-    ]
+    return [Cell(*each) for each in product(tasks, get_args(PlayerName), DELAYS_S, LOSSES, numbers)]
 
 
 def tables(flights: Sequence[FlownCell]) -> dict[str, TextTable]:
@@ -267,16 +300,19 @@ def tables(flights: Sequence[FlownCell]) -> dict[str, TextTable]:
 
 
 def _score(flown: Sequence[FlownCell]) -> str:
-    score, packets = (np.mean([getattr(f, name) for f in flown]) for name in FIGURES[:2])
-    return f"{score:.{2 if abs(score) < 10 else 0}f} ({packets:.1f}/s)"
+    """Mean score with half of its 95 % interval, and packets a second."""
+    middle, half = interval([each.score for each in flown])
+    digits = 2 if abs(middle) < 10 else 0
+    packets = np.mean([each.packets_per_s for each in flown])
+    return f"{middle:.{digits}f} ± {half or 0.0:.{digits}f}, {packets:.1f}/s"
 
 
 def _stalls(flown: Sequence[FlownCell]) -> str:
-    stalled, jump = (np.mean([getattr(f, name) for f in flown]) for name in FIGURES[2:])
-    return f"{stalled:.1%}, {jump:.3g}"
+    stalled, jump = (np.mean([getattr(each, key) for each in flown]) for key in ("stalled", "jump"))
+    return f"{stalled:.1%}, {jump:.2g}"
 
 
-FIGURES = ("score", "packets_per_s", "stalled", "jump")
+STYLES = "C7s:", "C1^--", "C3v--", "C0o-", "C2D-"
 
 
 def draw(flights: Sequence[FlownCell], path: Path) -> None:
@@ -293,7 +329,7 @@ def draw(flights: Sequence[FlownCell], path: Path) -> None:
         layout="constrained",
     )
     for (task, loss), panel in zip(product(tasks, LOSSES), panels.flat, strict=True):
-        for name, style in zip(get_args(PlayerName), ("C7s:", "C1^--", "C3v--", "C0o-", "C2D-")):
+        for name, style in zip(get_args(PlayerName), STYLES, strict=True):
             means = [
                 np.mean([f.score for f in flights if f.cell[:4] == (task, name, delay_s, loss)])
                 for delay_s in DELAYS_S

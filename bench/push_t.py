@@ -56,11 +56,8 @@ def _outline() -> tuple[Array, Array]:
 PLACES, NORMALS = _outline()
 
 
-def plan(observation: Array, committed: Array, rows: int) -> Array:
-    """Next positions of the pusher [px], the committed ones first; shape (rows, 2)."""
-    if len(committed):
-        after = np.concatenate([committed[-1].astype(float), observation[2:]])
-        return np.concatenate([committed, plan(after, committed[:0], rows)])[:rows]
+def plan(observation: Array, rows: int) -> Array:
+    """Next positions of the pusher [px]; shape (rows, 2)."""
     pusher, block, angle = observation[:2], observation[2:4], observation[4]
     turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
     goal_turn = np.array(

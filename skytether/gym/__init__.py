@@ -1,8 +1,8 @@
 """Gymnasium environments behind a bad network, with the price of every packet; see docs/gym.md.
 
-    from skytether.gym import Networked
+from skytether.gym import Networked
 
-    env = Networked(gymnasium.make("Pendulum-v1"), uplink="constant(50ms) & loss(10%)")
+env = Networked(gymnasium.make("Pendulum-v1"), uplink="constant(50ms) & loss(10%)")
 """
 
 from skytether.shared.base import extras

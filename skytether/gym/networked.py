@@ -26,7 +26,7 @@ from skytether.gym.remote import ROWS_MAX, Network, Remote
 from skytether.netem.fate import Fates
 from skytether.shared.base.chance import stream
 from skytether.shared.base.errors import ConfigError
-from skytether.shared.base.units import SECOND_NS, seconds_to_ns
+from skytether.shared.base.units import seconds_to_ns
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.air.draws import SLOT_NS
 from skytether.shared.scenario.air.path import Path, path
@@ -63,7 +63,9 @@ class _Far:
             if not isinstance(space, Box):
                 raise ConfigError(f"env: got the {name} space {space}, expected a Box")
         if exhausted not in ("hold", "zero") and not callable(exhausted):
-            raise ConfigError(f"exhausted: got {exhausted!r}, expected 'hold', 'zero' or a function")
+            raise ConfigError(
+                f"exhausted: got {exhausted!r}, expected 'hold', 'zero' or a function"
+            )
         step_s = 1.0 / metadata.get("render_fps", np.nan) if step_s is None else step_s
         if not step_s >= 1e-3:
             raise ConfigError(f"step_s: got {step_s!r}, expected at least 0.001 s")
@@ -90,7 +92,9 @@ class _Far:
         mixed = int(stream(self._network_seed, "episode", self._episode).integers(2**32))
         network = Network(*self.ways, mixed)
         zero, like = self._zero, self._observation
-        self.remote = Remote(network, self._player, self.step_ns, zero, like, self.count)
+        self.remote = Remote(
+            network, self._player, self.step_ns, zero, like, self._fill, self.count
+        )
         if self.thinking is not None:
             self._thoughts = Fates(self.thinking, mixed, "thinking", 0)
         self.begin(range(self.count), observations)
@@ -133,12 +137,19 @@ class _Far:
         rows = self.remote.rows()
         return [self._rule(i) if row is None else row for i, row in enumerate(rows)]
 
+    def _fill(self, last: Row | None) -> Row | None:
+        if callable(self._exhausted):
+            return None
+        return self._zero if last is None or self._exhausted == "zero" else last
+
     def _rule(self, index: int) -> Row:
         last = self.remote.last(index)
         if callable(self._exhausted):
-            rule = self._exhausted(self._present[index], last)
-            return np.asarray(rule, self.space.dtype).reshape(self.space.shape)
-        return self._zero if last is None or self._exhausted == "zero" else last
+            row = np.asarray(self._exhausted(self._present[index], last), self.space.dtype)
+            return row.reshape(self.space.shape)
+        fill = self._fill(last)
+        assert fill is not None
+        return fill
 
     def advance(self, observations: Sequence[NDArray[Any]]) -> None:
         self._present = list(observations)
@@ -157,9 +168,9 @@ class Networked(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
 
     `reset` gives the first observation at once. Then the agent sees the newest observation that
     has arrived. It answers with an action, with an array of actions for successive steps from that
-    observation on, with a `Chunk`, or with None: nothing is sent. `info` says what arrived, what the
-    robot holds, and what was sent, see docs/gym.md. The reward is the sum over the steps that have
-    passed, minus `price` for a packet. The end of an episode is known at once.
+    observation on, with a `Chunk`, or with None: nothing is sent. `info` says what arrived, what
+    the robot holds, and what was sent, see docs/gym.md. The reward is the sum over the steps that
+    have passed, minus `price` for a packet. The end of an episode is known at once.
 
     Args:
         env: environment with a Box of observations and one of actions.
@@ -271,7 +282,9 @@ class NetworkedVector(VectorWrapper[Any, Any, Any, Any, Any]):
     def step(self, actions: Sequence[Answer]) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         far, remote, count = self._far, self._far.remote, self.num_envs
         if len(actions) != count:
-            raise ValueError(f"actions: got {len(actions)}, expected one for each of {count} robots")
+            raise ValueError(
+                f"actions: got {len(actions)}, expected one for each of {count} robots"
+            )
         thought_ns = far.thought_ns(is_nothing=all(each is None for each in actions))
         answers = [far.chunk(each, thought_ns) for each in actions]
         thought_ns = max(each.thought_ns or 0 for each in answers)
@@ -282,7 +295,9 @@ class NetworkedVector(VectorWrapper[Any, Any, Any, Any, Any]):
                 remote.answer(index, answer, free_ns)
                 reward[index] -= far.price
         while True:
-            observations, gained, terminated, truncated, info = self.env.step(np.array(far.played()))
+            observations, gained, terminated, truncated, info = self.env.step(
+                np.array(far.played())
+            )
             reward += gained
             far.advance(list(observations))
             began = np.flatnonzero(self._ended)

@@ -95,6 +95,8 @@ class Remote:
         make_player: called for each robot and episode.
         step_ns: length of a step of the environment [ns].
         action, observation: arrays of the shapes and dtypes of both.
+        fill: row that a robot plays without one of its own, from the last row (None before the
+            first); None if the agent cannot know.
     """
 
     def __init__(
@@ -104,10 +106,11 @@ class Remote:
         step_ns: int,
         action: NDArray[Any],
         observation: NDArray[Any],
+        fill: Callable[[Row | None], Row | None],
         count: int = 1,
     ) -> None:
         self._network, self._make_player, self._step_ns = network, make_player, step_ns
-        self._action, self._observation = action, observation
+        self._action, self._observation, self._fill = action, observation, fill
         self.uplink = Link(UPLINK, QUEUE_BYTES_MAX, None, network.uplink)
         self.downlink = Link(DOWNLINK, QUEUE_BYTES_MAX, None, network.downlink)
         self._bound = delay_bound(count, step_ns / SECOND_NS, DELAY_STEPS_MAX, None)
@@ -218,17 +221,19 @@ class Remote:
     def info(self, index: int) -> dict[str, Any]:
         """What an agent knows, and what happened on the network so far; see docs/gym.md."""
         robot, report = self._robots[index], self._robots[index].report
-        delay_steps = int(self._bound.steps[index])
-        held = self._held(robot, max(SHOWN_ROWS_MAX, delay_steps))
+        age_steps = self.step - report.step
+        # Until an answer was acknowledged, the way there is taken to be as long as the way back.
+        delay_steps = int(self._bound.steps[index]) or 2 * age_steps
+        held, committed = self._coming(robot, delay_steps)
         up, down = self.uplink.counts, self.downlink.counts
         return {
             "step": report.step,
-            "age_s": (self.step - report.step) * self._step_ns / SECOND_NS,
+            "age_s": age_steps * self._step_ns / SECOND_NS,
             "generation": robot.generation,
             "acknowledged": report.acknowledged,
             "delay_steps": delay_steps,
             "held": held,
-            "committed": held[:delay_steps],
+            "committed": committed,
             "exhausted_steps": robot.exhausted,
             "uplink_packets": up.packets,
             "uplink_bytes": up.bytes + HEADER_BYTES * up.packets,
@@ -237,18 +242,24 @@ class Remote:
             "lost": sum(each.lost + each.dropped + each.overflowed for each in (up, down)),
         }
 
-    def _held(self, robot: Robot, most: int) -> NDArray[Any]:
-        """Rows that the robot plays from the observation on if nothing more arrives; (n, *action).
+    def _coming(self, robot: Robot, delay_steps: int) -> tuple[NDArray[Any], NDArray[Any]]:
+        """Rows that a robot holds for the observation's step and those after, and the first
+        `delay_steps` that it plays, if nothing more arrives; shapes (n, *action).
 
         The agent can tell: it knows what it sent, and the report says what has arrived.
         """
         rows: list[Row] = []
-        step = robot.report.step
+        step, last = robot.report.step, None
         if step in robot.snapshots:
             player = copy(robot.snapshots[step])
+            most = max(SHOWN_ROWS_MAX, delay_steps)
             while len(rows) < most and (row := player.row(step + len(rows))) is not None:
                 rows.append(row)
-        return np.array(rows, dtype=self._action.dtype).reshape(-1, *self._action.shape)
+            last = player.last
+        held, fill = len(rows), self._fill(last)
+        rows += [] if fill is None else [fill] * (delay_steps - held)
+        every = np.array(rows, dtype=self._action.dtype).reshape(-1, *self._action.shape)
+        return every[:held], every[:delay_steps]
 
 
 def _sealed(body: bytes) -> bytes:
