@@ -216,7 +216,9 @@ class Crowd(ParallelEnv[str, NDArray[np.float32], Any]):
         return self._spaces[agent]
 
     def reset(
-        self, seed: int | None = None, options: dict[str, Any] | None = None  # noqa: ARG002
+        self,
+        seed: int | None = None,
+        options: dict[str, Any] | None = None,  # noqa: ARG002
     ) -> tuple[dict[str, NDArray[np.float32]], dict[str, Any]]:
         if seed is not None:
             self._rng = np.random.default_rng(seed)

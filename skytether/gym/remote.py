@@ -30,7 +30,7 @@ from skytether.shared.telemetry.record import DOWNLINK, UPLINK
 ROWS_MAX = 1024
 """Largest number of rows of a chunk."""
 SHOWN_ROWS_MAX = 64
-"""Largest number of coming rows in `info["held"]`."""
+"""Largest number of rows in `info["coming"]`, unless more are committed."""
 UNDER_WAY_MAX = 4096
 """Number of newest reports and answers that the agent remembers, each way."""
 DELAY_STEPS_MAX = 4096
@@ -70,8 +70,8 @@ class Robot:
     """Newest report at the agent's end."""
     uplink: Lane
     downlink: Lane
-    sent: OrderedDict[int, int]
-    """Step of the observation that each answer under way was made from, by generation."""
+    sent: OrderedDict[int, tuple[int, Held]]
+    """Answers under way, by generation, with the step of the observation of each."""
     snapshots: OrderedDict[int, Player]
     """What the robot held at the steps of reports under way."""
     session: int = 0
@@ -111,6 +111,7 @@ class Remote:
     ) -> None:
         self._network, self._make_player, self._step_ns = network, make_player, step_ns
         self._action, self._observation, self._fill = action, observation, fill
+        self._none = np.zeros((0, *action.shape), action.dtype)
         self.uplink = Link(UPLINK, QUEUE_BYTES_MAX, None, network.uplink)
         self.downlink = Link(DOWNLINK, QUEUE_BYTES_MAX, None, network.downlink)
         self._bound = delay_bound(count, step_ns / SECOND_NS, DELAY_STEPS_MAX, None)
@@ -149,7 +150,8 @@ class Remote:
         robot, rows = self._robots[index], chunk.rows
         robot.generation += 1
         first = robot.report.number if chunk.first is None else chunk.first
-        _remember(robot.sent, robot.generation, robot.report.step)
+        sent = Held(robot.generation, first, rows)
+        _remember(robot.sent, robot.generation, (robot.report.step, sent))
         head = _ANSWER.pack(robot.session, robot.generation, first, len(rows))
         self._leaving.append((at_ns, index, _sealed(head + rows.tobytes())))
 
@@ -213,7 +215,7 @@ class Remote:
             _forget_before(robot.sent, report.acknowledged + 1)
             _forget_before(robot.snapshots, step)
             if made is not None:
-                learn(self._bound, index, report.since - made)
+                learn(self._bound, index, report.since - made[0])
 
     def report(self, index: int) -> Report:
         return self._robots[index].report
@@ -224,7 +226,7 @@ class Remote:
         age_steps = self.step - report.step
         # Until an answer was acknowledged, the way there is taken to be as long as the way back.
         delay_steps = int(self._bound.steps[index]) or 2 * age_steps
-        held, committed = self._coming(robot, delay_steps)
+        held, coming, committed = self._coming(robot, delay_steps)
         up, down = self.uplink.counts, self.downlink.counts
         return {
             "step": report.step,
@@ -233,6 +235,7 @@ class Remote:
             "acknowledged": report.acknowledged,
             "delay_steps": delay_steps,
             "held": held,
+            "coming": coming,
             "committed": committed,
             "exhausted_steps": robot.exhausted,
             "uplink_packets": up.packets,
@@ -242,24 +245,35 @@ class Remote:
             "lost": sum(each.lost + each.dropped + each.overflowed for each in (up, down)),
         }
 
-    def _coming(self, robot: Robot, delay_steps: int) -> tuple[NDArray[Any], NDArray[Any]]:
-        """Rows that a robot holds for the observation's step and those after, and the first
-        `delay_steps` that it plays, if nothing more arrives; shapes (n, *action).
+    def _coming(self, robot: Robot, delay_steps: int) -> tuple[int, NDArray[Any], NDArray[Any]]:
+        """Number of rows that a robot held at the observation's step; rows that it plays from then
+        on, until they run out; and those of the first `delay_steps`; shapes (n, *action).
 
-        The agent can tell: it knows what it sent, and the report says what has arrived.
+        As the agent can tell: it knows what it sent, the report says what has arrived, and each
+        answer under way is expected `delay_steps` after its observation.
         """
-        rows: list[Row] = []
-        step, last = robot.report.step, None
-        if step in robot.snapshots:
-            player = copy(robot.snapshots[step])
-            most = max(SHOWN_ROWS_MAX, delay_steps)
-            while len(rows) < most and (row := player.row(step + len(rows))) is not None:
-                rows.append(row)
-            last = player.last
-        held, fill = len(rows), self._fill(last)
-        rows += [] if fill is None else [fill] * (delay_steps - held)
+        step, rows = robot.report.step, list[Row]()
+        if step not in robot.snapshots:
+            return 0, self._none, self._none
+        player, held = copy(robot.snapshots[step]), 0
+        alone = copy(player)
+        while held < SHOWN_ROWS_MAX and alone.row(step + held) is not None:
+            held += 1
+        under_way = [each for each in robot.sent.values() if each[0] + delay_steps > step]
+        ran_out: int | None = None
+        for at in range(step, step + max(SHOWN_ROWS_MAX, delay_steps)):
+            for made, chunk in under_way:
+                if made + delay_steps == at:
+                    player.accept(chunk, at)
+            row = player.row(at)
+            if row is None:
+                ran_out = len(rows) if ran_out is None else ran_out
+                row = self._fill(player.last)
+                if row is None or len(rows) >= delay_steps:
+                    break
+            rows.append(row)
         every = np.array(rows, dtype=self._action.dtype).reshape(-1, *self._action.shape)
-        return every[:held], every[:delay_steps]
+        return held, every[:ran_out], every[:delay_steps]
 
 
 def _sealed(body: bytes) -> bytes:

@@ -14,7 +14,7 @@ from helpers import ran
 ROOT = Path(__file__).parents[2]
 CORES = (
     *("shared", "quadrotor", "mavlink", "server", "client", "netem", "autopilot"),
-    *("sim", "figures", "view", "lab"),
+    *("sim", "figures", "view", "lab", "gym"),
 )
 WITHOUT_FILES = (
     *("shared/law", "shared/core", "quadrotor", "mavlink", "server", "client", "netem"),
