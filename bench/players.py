@@ -130,7 +130,7 @@ class PushT:
         return (sum(rewards) + (self.steps - len(rewards)) * ended) / self.steps
 
 
-TASKS = {"pendulum": Pendulum(), "cartpole": CartPole(), "pusht": PushT()}
+TASKS: dict[str, Any] = {"pendulum": Pendulum(), "cartpole": CartPole(), "pusht": PushT()}
 
 
 class Gusts(gymnasium.ActionWrapper[Any, Any, Any]):
@@ -225,7 +225,7 @@ def differs(task: Any, rows: Rows, coming: Rows) -> bool:
 
 
 def fly_cell(cell: Cell) -> FlownCell:
-    task: Any = TASKS[cell.task]
+    task = TASKS[cell.task]
     mean = cell.delay_s
     delay = f"gamma({mean / 2:g}, {mean:g}, {mean / 5:g})" if mean else "none"
     way = f"{delay} & loss({cell.loss:g})"
@@ -288,6 +288,7 @@ def tables(flights: Sequence[FlownCell]) -> dict[str, TextTable]:
 def _score(flown: Sequence[FlownCell]) -> str:
     """Mean score with half of its 95 % interval, and packets a second."""
     middle, half = interval([each.score for each in flown])
+    assert middle is not None
     digits = 2 if abs(middle) < 10 else 0
     packets = np.mean([each.packets_per_s for each in flown])
     return f"{middle:.{digits}f} ± {half or 0.0:.{digits}f}, {packets:.1f}/s"

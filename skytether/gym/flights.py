@@ -181,7 +181,7 @@ class Target(gymnasium.Env[NDArray[np.float32], Any]):
         return {"time_s": flight.time_s, "packets": int(flight.trigger.sent_packets[0])}
 
 
-class Crowd(ParallelEnv[str, NDArray[np.float32], Any]):
+class Crowd(ParallelEnv):  # type: ignore[misc]  # it ships no types
     """Many vehicles on one shared link, each with an agent that decides whether to send to it.
 
     Args:

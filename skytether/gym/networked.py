@@ -203,7 +203,7 @@ class Networked(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         step_s: float | None = None,
         clock_ns: Callable[[], int] = perf_counter_ns,
     ) -> None:
-        options = {
+        options: dict[str, Any] = {
             "uplink": uplink,
             "downlink": downlink,
             "thinking": thinking,

@@ -205,12 +205,12 @@ class Remote:
             robot, body = self._robots[index], _opened(packet)
             if body is None or _REPORT.unpack_from(body)[0] != robot.session:
                 continue
-            _, step, *head = _REPORT.unpack_from(body)
+            _, step, number, newest, since = _REPORT.unpack_from(body)
             if step <= robot.report.step:
                 continue  # overtaken
             observation = np.frombuffer(body, self._observation.dtype, offset=_REPORT.size)
             observation = observation.reshape(self._observation.shape).copy()
-            robot.report = report = Report(step, *head, observation)
+            robot.report = report = Report(step, number, newest, since, observation)
             made = robot.sent.get(report.acknowledged)
             _forget_before(robot.sent, report.acknowledged + 1)
             _forget_before(robot.snapshots, step)

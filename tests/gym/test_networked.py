@@ -5,11 +5,9 @@ import math
 from collections.abc import Callable, Iterator
 from typing import Any
 
-import pytest
-
-gymnasium = pytest.importorskip("gymnasium")
-
+import gymnasium
 import numpy as np
+import pytest
 from gymnasium.utils.env_checker import check_env
 from numpy.typing import NDArray
 
@@ -32,7 +30,7 @@ class Counting(gymnasium.Env[Any, Any]):
     def __init__(self, steps: int = 1000) -> None:
         self.steps, self.played = steps, list[float]()
 
-    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:  # noqa: ARG002
         super().reset(seed=seed)
         self.played.clear()
         return np.zeros(1), {}

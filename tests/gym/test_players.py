@@ -5,8 +5,6 @@ from copy import copy
 import numpy as np
 import pytest
 
-pytest.importorskip("gymnasium")
-
 from skytether.gym.players import HELD_MAX, Clocked, Held, Newest, Player, Queue
 
 
