@@ -6,7 +6,6 @@ import gymnasium
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
-from pettingzoo.test import parallel_api_test, parallel_seed_test
 
 from skytether.gym.flights import Crowd
 
@@ -52,7 +51,10 @@ def test_gymnasiums_own_checker_is_content(action: str) -> None:
     check_env(env.unwrapped, skip_render_check=True)
 
 
-@pytest.mark.filterwarnings("ignore::UserWarning")
+@pytest.mark.filterwarnings("ignore::UserWarning", "ignore::DeprecationWarning")
 def test_pettingzoos_own_checkers_are_content() -> None:
+    pytest.importorskip("pygame", reason="PettingZoo's checkers import its own games")
+    from pettingzoo.test import parallel_api_test, parallel_seed_test
+
     parallel_api_test(Crowd(3, keys=SHORT), num_cycles=80)
     parallel_seed_test(lambda: Crowd(2, keys=SHORT))

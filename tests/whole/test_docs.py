@@ -228,7 +228,7 @@ def test_the_documented_recordings_are_made_and_read(
         assert made.stdout.strip()
 
 
-@pytest.mark.parametrize("document", ["README.md", "docs/python.md"])
+@pytest.mark.parametrize("document", ["README.md", "docs/gym.md", "docs/python.md"])
 def test_the_documented_python_runs_and_prints_what_it_says(
     document: str,
     tmp_path: Path,
