@@ -116,7 +116,8 @@ class Remote:
         self.downlink = Link(DOWNLINK, QUEUE_BYTES_MAX, None, network.downlink)
         self._bound = delay_bound(count, step_ns / SECOND_NS, DELAY_STEPS_MAX, None)
         self._leaving: list[tuple[int, int, bytes]] = []
-        """Answers that agents still think about: time of sending [ns], robot, packet."""
+        """Answers that agents still think about: time of sending [ns], robot, packet. A call of
+        `step` adds at most one for each robot, and mostly lasts until they have left."""
         self._robots: list[Robot] = []
         self.step = 0
         self._flows = 0
