@@ -333,7 +333,7 @@ def draw(flights: Sequence[FlownCell], path: Path) -> None:
         panel.set_xlabel("delay each way [ms]")
     for panel in panels[:, 0]:
         panel.set_ylabel("score")
-    panels[0, 0].legend(fontsize=8)
+    figure.legend(*panels[0, 0].get_legend_handles_labels(), loc="outside upper center", ncols=5)
     figure.savefig(path, dpi=110)
     plt.close(figure)
 
