@@ -38,7 +38,13 @@ from skytether.shared.law.model import Array, Flags, Indices
 from skytether.shared.law.terms import Terms
 from skytether.shared.scenario.reference import Reference
 from skytether.shared.scenario.schema import ControlConfig, Scenario
-from skytether.shared.scenario.triggers import Situation, SituationArrays, Verdict, make_trigger
+from skytether.shared.scenario.triggers import (
+    Situation,
+    SituationArrays,
+    Trigger,
+    Verdict,
+    make_trigger,
+)
 from skytether.shared.wire.protocol import Idle, Lead, Observation, committed_max
 
 PLANS, OBSERVATION, DELAY, UNSOLVED, STANDBY = map(int, Idle)
@@ -162,9 +168,12 @@ class Controller:
         return Counter({**self._counts, **self.scheme.counts})
 
     def change_trigger(self, control: ControlConfig) -> None:
+        """Use the trigger of a scenario from the next step on, see `use_trigger`."""
+        self.use_trigger(make_trigger(control, self._capacity, self.faults.append))
+
+    def use_trigger(self, trigger: Trigger) -> None:
         """Use another trigger from the next step on; it starts without a memory of sent plans."""
-        terms = self._terms
-        self._trigger = make_trigger(control, self._capacity, self.faults.append)
+        terms, self._trigger = self._terms, trigger
         doubts = LOSS_CASES if self._trigger.doubts else 0
         self._foresight = arrays = empty_foresight(
             self._block,

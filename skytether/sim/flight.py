@@ -20,6 +20,7 @@ from types import MappingProxyType
 from typing import Any
 
 import msgspec
+import numpy as np
 
 from skytether.client import vehicles as kinds
 from skytether.client.endpoint import Client
@@ -211,7 +212,9 @@ class Run:
         self._server_rows, self._server_figures = server_rows, server_figures
         self._before = number * vehicles
         self._sinks = io.BytesIO(), io.BytesIO()
-        recorder = Recorder(client_columns(scenario.model.axes), self._sinks[0])
+        self._axes = scenario.model.axes
+        recorder = Recorder(client_columns(self._axes), self._sinks[0])
+        self._header_bytes = self._sinks[0].tell()
         packets = Recorder(PACKET_COLUMNS, self._sinks[1])
         self._netems: dict[str, Proxy] = {}
         self.running: dict[str, Running] = {}
@@ -290,6 +293,14 @@ class Run:
             "netem": of_paths([netem.figures() for netem in self._netems.values()]),
             "client": {"by_vehicle": each},
         }
+
+    def newest(self, count: int) -> Rows:
+        """The newest rows of the vehicles, at most `count`, in the order of their steps."""
+        columns = client_columns(self._axes)
+        with self._sinks[0].getbuffer() as written:
+            recorded = min(count, (len(written) - self._header_bytes) // columns.itemsize)
+            newest = written[len(written) - recorded * columns.itemsize :]
+            return np.frombuffer(newest.tobytes(), columns)
 
     def flight(self, server_rows: Rows) -> Record:
         """Record of the run, with vehicles numbered from 1, from the server's rows of all runs."""

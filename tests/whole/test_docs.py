@@ -231,7 +231,9 @@ def test_the_documented_recordings_are_made_and_read(
         assert made.stdout.strip()
 
 
-@pytest.mark.parametrize("document", ["README.md", "docs/python.md", "docs/first-flight.ipynb"])
+@pytest.mark.parametrize(
+    "document", ["README.md", "docs/gym.md", "docs/python.md", "docs/first-flight.ipynb"]
+)
 def test_the_documented_python_runs_and_prints_what_it_says(
     document: str,
     tmp_path: Path,

@@ -1,0 +1,259 @@
+"""Skytether's own flights as environments: the agent is the trigger, which decides when to send.
+
+`gymnasium.make("skytether/Target-v0")` is one vehicle after a target, and `crowd` is PettingZoo's
+parallel environment of many vehicles on one shared link. All else flies as in `skytether fly`:
+planner, wire, netem, vehicle and failsafe, in virtual time.
+
+A step is a control step. An action decides at the server's next tick, and the observation is what
+the server knew at its last one. The reward is minus the squared distance from the target [m²], by
+the truth, minus `price` for each packet to the vehicle.
+"""
+
+from collections.abc import Mapping
+from typing import Any
+
+import gymnasium
+import msgspec
+import numpy as np
+from gymnasium.spaces import Box, Discrete
+from numpy.typing import NDArray
+from pettingzoo import ParallelEnv
+
+from skytether.server.endpoint import Server
+from skytether.shared.base.chance import stream
+from skytether.shared.base.units import SECOND_NS, seconds_to_ns
+from skytether.shared.law.model import Indices
+from skytether.shared.scenario import reading
+from skytether.shared.scenario.dotted import set_keys
+from skytether.shared.scenario.reference import Reference
+from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.triggers import Compared, Figures, Situation, Trigger, Verdict
+from skytether.shared.telemetry.record import Rows
+from skytether.sim.flight import BOOT_ID, MIDNIGHT_NS, SERVER, Run
+from skytether.sim.world import Clock, World
+
+SINCE_MAX_S = 60.0
+OBSERVED = ("expected_gap", "error_x_m", "error_y_m", "since_sent_s", "heartbeat_due")
+"""What an observation consists of: the cost that flying on without a new packet is expected to add,
+the distance that the server believes the vehicle to be from its target, the time since the last
+packet to it, and whether a heartbeat is due. All 0 before the first plan."""
+_SPACE = Box(-1e9, 1e9, (len(OBSERVED),), np.float32)
+
+
+class Decided(Trigger):
+    """Trigger that does what an agent has decided for each vehicle.
+
+    Args:
+        vehicle: number of the vehicle in each row; shape (capacity,).
+        thresholds: threshold of `expected_gap` of each vehicle from 0 on; infinite: do not send,
+            below 0: send.
+    """
+
+    doubts = True
+
+    def __init__(self, vehicle: Indices, thresholds: NDArray[np.float64]) -> None:
+        self._vehicle, self._thresholds = vehicle, thresholds
+        self.seen = np.zeros((len(thresholds), len(OBSERVED)), dtype=np.float32)
+        self.sent_packets = np.zeros(len(thresholds), dtype=np.int64)
+        self.ticks = np.zeros(len(thresholds), dtype=np.int64)
+
+    def test(self, situation: Situation) -> Verdict:
+        each, figures = self._vehicle[situation.rows] - 1, situation.figures
+        error = situation.estimate[:, :2, 0] - situation.desired[:, :2, 0, 0]
+        since = np.minimum(situation.since_sent_s, SINCE_MAX_S)
+        seen = figures["expected_gap"], *error.T, since, situation.heartbeat_due
+        self.seen[each] = np.clip(np.column_stack(seen), _SPACE.low, _SPACE.high)
+        self.ticks[each] += 1
+        gap, threshold = figures["expected_gap"], self._thresholds[each]
+        event = figures["fresh"] | (situation.since_sent_s == np.inf) | (gap > threshold)
+        return Verdict(event, gap, threshold, Compared.EXPECTED_GAP)
+
+    def sent(self, rows: Indices, figures: Figures) -> None:  # noqa: ARG002
+        self.sent_packets[self._vehicle[rows] - 1] += 1
+
+
+class Flight:
+    """A flight in virtual time that waits for decisions, step by step."""
+
+    def __init__(self, scenario: Scenario, vehicles: int) -> None:
+        self._scenario, self._vehicles = scenario, vehicles
+        self.world = World(lambda *_: None)
+        self.run = Run(self.world, scenario, lambda: 0, lambda _: {}, 0, vehicles, None)
+        self._references = [scenario.make_reference(i + 1) for i in range(vehicles)]
+        server = Server(
+            scenario,
+            boot_id=BOOT_ID,
+            entropy=stream(scenario.seed, "entropy").bytes,
+            capacity=vehicles,
+            references=self._measured,
+        )
+        compute_ns = seconds_to_ns(scenario.simulation.compute_s)
+        self.world.add(SERVER[0], server, clock=Clock(MIDNIGHT_NS), compute_ns=compute_ns)
+        self.thresholds = np.zeros(vehicles)
+        self.trigger = Decided(server.sessions.vehicle, self.thresholds)
+        server.controller.use_trigger(self.trigger)
+        self._step_ns = 0
+
+    def _measured(self, vehicle: int) -> Reference:
+        return self._scenario.measured_reference(vehicle)
+
+    @property
+    def time_s(self) -> float:
+        return self._step_ns / SECOND_NS
+
+    def go(self) -> bool:
+        """Fly one control step; whether every vehicle still flies."""
+        self._step_ns += self._scenario.dt_ns
+        self.world.run(lambda: not self.run.flying, limit_ns=self._step_ns)
+        return self.run.flying == self._vehicles
+
+    def squares_m2(self) -> NDArray[np.float64]:
+        """Squared distance of each vehicle from its target by the truth [m²]; 0 before it flies."""
+        rows: Rows = self.run.newest(2 * self._vehicles)
+        found = np.zeros(self._vehicles)
+        for row in rows:
+            vehicle = int(row["vehicle"]) - 1
+            at_s = np.array([row["step"] * self._scenario.control.dt])
+            desired = self._references[vehicle](at_s)[0, :, 0]
+            found[vehicle] = np.sum((row["state"][:, 0] - desired) ** 2)
+        return found
+
+
+def _scenario(name: str, keys: Mapping[str, Any], seed: int) -> Scenario:
+    table = reading.to_table(reading.load(name))
+    set_keys(dict(keys) | {"seed": seed, "control.trigger": "expected_gap | heartbeat"}, table)
+    return reading.check(table, name)
+
+
+class Target(gymnasium.Env[NDArray[np.float32], Any]):
+    """One vehicle after a target that only the server sees.
+
+    Args:
+        action: "send": 1 sends a plan, 0 does not; "threshold": a plan is sent if the expected cost
+            of none exceeds it.
+        price: cost of a packet to the vehicle [m²].
+        scenario: name of a scenario with a trigger that computes `expected_gap`.
+        keys: keys of the scenario, as in `skytether.load`.
+
+    Raises:
+        ConfigError: the scenario cannot be flown.
+    """
+
+    metadata = {"render_modes": []}  # noqa: RUF012 - gymnasium's own form
+
+    def __init__(
+        self,
+        action: str = "send",
+        price: float = 0.01,
+        scenario: str = "target",
+        keys: Mapping[str, Any] | None = None,
+    ) -> None:
+        self.observation_space = _SPACE
+        is_sending = action == "send"
+        self.action_space = Discrete(2) if is_sending else Box(0.0, 1e3, (1,), np.float32)
+        self._is_sending, self._price, self._name, self._keys = is_sending, price, scenario, keys
+        self._flight: Flight | None = None
+        self._config = _scenario(scenario, keys or {}, 1)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[NDArray[np.float32], dict[str, Any]]:
+        super().reset(seed=seed, options=options)
+        config = msgspec.structs.replace(
+            self._config, seed=int(self.np_random.integers(2**32, dtype=np.uint64))
+        )
+        self._flight = Flight(config, 1)
+        return self._flight.trigger.seen[0].copy(), self._info(self._flight)
+
+    def step(self, action: Any) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
+        flight = self._flight
+        assert flight is not None, "reset comes first"
+        value = float(np.asarray(action).reshape(-1)[0])
+        flight.thresholds[0] = (-1.0 if value else np.inf) if self._is_sending else value
+        before = int(flight.trigger.sent_packets[0])
+        flies = flight.go()
+        sent = int(flight.trigger.sent_packets[0]) - before
+        reward = -float(flight.squares_m2()[0]) - self._price * sent
+        over = not flies or flight.time_s >= self._config.duration
+        return flight.trigger.seen[0].copy(), reward, False, over, self._info(flight)
+
+    def _info(self, flight: Flight) -> dict[str, Any]:
+        return {"time_s": flight.time_s, "packets": int(flight.trigger.sent_packets[0])}
+
+
+class Crowd(ParallelEnv):  # type: ignore[misc]  # it ships no types
+    """Many vehicles on one shared link, each with an agent that decides whether to send to it.
+
+    Args:
+        vehicles: number of vehicles.
+        price: cost of a packet to a vehicle [m²].
+        scenario: name of a scenario, with a finite rate if the link is to be scarce.
+        keys: keys of the scenario, as in `skytether.load`.
+    """
+
+    metadata = {"name": "skytether/Crowd-v0", "render_modes": []}  # noqa: RUF012
+
+    def __init__(
+        self,
+        vehicles: int = 8,
+        price: float = 0.01,
+        scenario: str = "crowd",
+        keys: Mapping[str, Any] | None = None,
+    ) -> None:
+        self.possible_agents = [f"vehicle_{number}" for number in range(1, vehicles + 1)]
+        self.agents: list[str] = []
+        self._price, self._keys = price, keys or {}
+        self._config = _scenario(scenario, self._keys, 1)
+        self._spaces = {agent: Discrete(2) for agent in self.possible_agents}
+        self._seen = {agent: Box(-1e9, 1e9, _SPACE.shape, np.float32) for agent in self._spaces}
+        self._rng = np.random.default_rng(0)
+        self._flight: Flight | None = None
+
+    def observation_space(self, agent: str) -> Box:
+        return self._seen[agent]
+
+    def action_space(self, agent: str) -> Discrete[Any]:
+        return self._spaces[agent]
+
+    def reset(
+        self,
+        seed: int | None = None,
+        options: dict[str, Any] | None = None,  # noqa: ARG002
+    ) -> tuple[dict[str, NDArray[np.float32]], dict[str, Any]]:
+        if seed is not None:
+            self._rng = np.random.default_rng(seed)
+        drawn = int(self._rng.integers(2**32, dtype=np.uint64))
+        config = msgspec.structs.replace(self._config, seed=drawn)
+        self.agents = list(self.possible_agents)
+        self._flight = Flight(config, len(self.agents))
+        return self._observations(self._flight), {agent: {} for agent in self.agents}
+
+    def step(self, actions: dict[str, Any]) -> tuple[Any, Any, Any, Any, Any]:
+        flight = self._flight
+        assert flight is not None, "reset comes first"
+        for number, agent in enumerate(self.possible_agents):
+            flight.thresholds[number] = -1.0 if actions.get(agent) else np.inf
+        before = flight.trigger.sent_packets.copy()
+        flies = flight.go()
+        sent = flight.trigger.sent_packets - before
+        rewards = -flight.squares_m2() - self._price * sent
+        over = not flies or flight.time_s >= self._config.duration
+        agents, observations = self.agents, self._observations(flight)
+        self.agents = [] if over else agents
+        return (
+            observations,
+            {agent: float(reward) for agent, reward in zip(agents, rewards, strict=True)},
+            dict.fromkeys(agents, False),
+            dict.fromkeys(agents, over),
+            {
+                agent: {"packets": int(count)}
+                for agent, count in zip(agents, flight.trigger.sent_packets, strict=True)
+            },
+        )
+
+    def _observations(self, flight: Flight) -> dict[str, NDArray[np.float32]]:
+        seen = flight.trigger.seen
+        return {agent: seen[i].copy() for i, agent in enumerate(self.possible_agents)}
+
+
+gymnasium.register("skytether/Target-v0", entry_point="skytether.gym.flights:Target")

@@ -1,0 +1,93 @@
+"""`gym.players`: the row that a robot plays at each step."""
+
+from copy import copy
+
+import numpy as np
+import pytest
+
+from skytether.gym.players import HELD_MAX, Clocked, Held, Newest, Player, Queue
+
+
+def held(generation: int, first: int, *rows: float) -> Held:
+    return Held(generation, first, np.array(rows)[:, None])
+
+
+def played(player: Player, steps: range) -> list[float | None]:
+    rows = [player.row(step) for step in steps]
+    return [None if row is None else float(row[0]) for row in rows]
+
+
+def test_the_row_of_the_present_step_is_played_whenever_the_chunk_arrives() -> None:
+    player = Clocked()
+    player.accept(held(1, 2, 20.0, 21.0, 22.0), 3)
+    assert played(player, range(3, 6)) == [21.0, 22.0, None]
+    assert player.last is not None
+    assert player.last[0] == 22.0
+
+
+def test_an_older_generation_fills_the_steps_for_which_the_newest_has_no_row() -> None:
+    """A chunk that was overtaken changes nothing but what the newer one leaves open."""
+    player = Clocked()
+    player.accept(held(3, 2, 32.0), 0)
+    player.accept(held(2, 0, 20.0, 21.0, 22.0, 23.0), 0)
+    assert played(player, range(5)) == [20.0, 21.0, 32.0, 23.0, None]
+
+
+def test_a_single_action_that_comes_late_is_the_row_to_hold() -> None:
+    player = Clocked()
+    player.accept(held(1, 0, 5.0), 4)
+    assert played(player, range(4, 5)) == [None]
+    assert player.last is not None
+    assert player.last[0] == 5.0
+
+
+def test_a_player_holds_a_bounded_number_of_chunks_and_each_once() -> None:
+    player = Clocked()
+    for generation in range(3 * HELD_MAX):
+        for _ in range(2):
+            player.accept(held(generation, 1000, 1.0), 0)
+    assert [each.generation for each in player.held] == [
+        *range(3 * HELD_MAX - 1, 2 * HELD_MAX - 1, -1)
+    ]
+
+
+def test_a_copy_is_a_snapshot() -> None:
+    player = Queue()
+    player.accept(held(1, 0, 1.0, 2.0, 3.0), 0)
+    snapshot = copy(player)
+    assert played(player, range(2)) == [1.0, 2.0]
+    assert played(snapshot, range(4)) == [1.0, 2.0, 3.0, None]
+
+
+def test_the_newest_action_is_held_and_an_overtaken_one_is_ignored() -> None:
+    player = Newest()
+    assert played(player, range(1)) == [None]
+    player.accept(held(2, 0, 2.0), 1)
+    player.accept(held(1, 0, 1.0), 1)
+    assert played(player, range(1, 4)) == [2.0, 2.0, 2.0]
+
+
+def test_a_queue_counts_the_rows_that_it_has_played_and_stands_still_when_empty() -> None:
+    """So after a stall its rows are played too late, by the length of the stall."""
+    player = Queue()
+    player.accept(held(1, 0, 0.0, 1.0), 0)
+    assert played(player, range(4)) == [0.0, 1.0, None, None]
+    assert player.number(4) == 2
+    player.accept(held(2, 2, 2.0, 3.0), 4)
+    assert played(player, range(4, 6)) == [2.0, 3.0]
+
+
+def test_a_queue_skips_what_it_has_played_and_drops_what_the_new_chunk_lacks() -> None:
+    player = Queue()
+    player.accept(held(1, 0, 0.0, 1.0, 2.0, 3.0, 4.0), 0)
+    assert played(player, range(2)) == [0.0, 1.0]
+    player.accept(held(2, 1, 11.0, 12.0, 13.0), 2)
+    assert played(player, range(2, 5)) == [12.0, 13.0, None]
+
+
+def test_a_queue_averages_where_both_have_a_row() -> None:
+    player = Queue("average")
+    player.accept(held(1, 0, 0.0, 1.0, 2.0), 0)
+    player.accept(held(2, 1, 11.0, 12.0, 13.0), 0)
+    assert played(player, range(1)) == [pytest.approx(0.3 * 1.0 + 0.7 * 11.0)]
+    assert played(player, range(1, 3)) == [pytest.approx(0.3 * 2.0 + 0.7 * 12.0), 13.0]

@@ -1,0 +1,47 @@
+"""`bench.players`: what players make of one policy over one network."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from bench.players import TASKS, Cell, FlownCell, PlayerName, differs, fly_cell, tables
+
+
+@pytest.fixture(scope="module")
+def flown() -> dict[PlayerName, FlownCell]:
+    players: tuple[PlayerName, ...] = ("newest", "replace", "average", "clocked", "sparing")
+    return {player: fly_cell(Cell("pendulum", player, 0.1, 0.1, 1)) for player in players}
+
+
+def test_a_chunk_by_the_clock_continues_the_last_and_one_of_a_queue_jumps(
+    flown: dict[PlayerName, FlownCell],
+) -> None:
+    scores = {player: each.score for player, each in flown.items()}
+    assert scores["newest"] < scores["replace"] < scores["clocked"]
+    assert flown["clocked"].jump < 0.1 * flown["replace"].jump
+
+
+def test_when_needed_takes_fewer_packets_for_nearly_the_same(
+    flown: dict[PlayerName, FlownCell],
+) -> None:
+    assert flown["sparing"].packets_per_s < 0.5 * flown["clocked"].packets_per_s
+    assert flown["sparing"].score == pytest.approx(flown["clocked"].score, rel=0.1)
+
+
+def test_a_flight_is_the_same_each_time(flown: dict[PlayerName, FlownCell]) -> None:
+    assert fly_cell(flown["sparing"].cell) == flown["sparing"]
+
+
+def test_a_chunk_differs_by_a_row_beyond_the_tolerance_or_when_rows_run_out() -> None:
+    task: Any = TASKS["pendulum"]
+    coming = np.zeros((12, 1))
+    assert not differs(task, coming + 0.9 * task.tolerance, coming)
+    assert differs(task, coming + 1.1 * task.tolerance, coming)
+    assert differs(task, coming, coming[:8])
+
+
+def test_the_tables_have_a_row_for_each_network(flown: dict[PlayerName, FlownCell]) -> None:
+    shown = tables(list(flown.values()))
+    assert [len(table.rows) for table in shown.values()] == [1, 1]
+    assert shown["players pendulum scores"].rows[0][0] == "100 ms, 10%"
