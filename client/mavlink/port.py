@@ -12,7 +12,7 @@ from skytether.client.mavlink.autopilot import Autopilot
 from skytether.client.mavlink.connection import Connection
 from skytether.client.mavlink.hindrances import Hindrances
 from skytether.client.mavlink.launch import Phase
-from skytether.client.mavlink.positions import Vector
+from skytether.client.positions import Vector
 from skytether.client.mavlink.setpoints import Sends, Setpoints
 from skytether.mavlink.codec import Message
 from skytether.mavlink.dialect import dialect
