@@ -117,9 +117,7 @@ class Positions:
         """Altitude above our origin [m]; 0 before the first measurement."""
         return self.position[2] - self.origin[2] if self.position else 0.0
 
-    def take_in(
-        self, boot_ns: int, position: Vector, velocity: Vector, *, now_ns: int
-    ) -> None:
+    def take_in(self, boot_ns: int, position: Vector, velocity: Vector, *, now_ns: int) -> None:
         """Process what was measured at a time since the autopilot's boot, in our axes [m, m/s]."""
         self.heard_ns = now_ns
         self._fault = reason = self._wrong(boot_ns, position, velocity, now_ns)

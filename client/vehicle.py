@@ -14,8 +14,10 @@ from typing import Annotated, NamedTuple
 import msgspec
 import numpy as np
 
+from skytether.ros2.graph import Node
 from skytether.shared.core.endpoint import Endpoint
 from skytether.shared.core.events import Failure
+from skytether.shared.core.line import Line
 from skytether.shared.law.model import Array
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Reason
@@ -69,6 +71,8 @@ class Vehicle(ABC):
     """Keys of the scenario that may change in flight."""
     port: Endpoint | None = None
     """Endpoint that talks to the vehicle's own hardware; None if there is none."""
+    line: Line | Node | None = None
+    """Connection of the port, to be opened as its process's socket 1; None without a port."""
     returns = False
     """Whether the vehicle can return home by itself, see `return_home`."""
     leap_m: tuple[float, ...] | None = None

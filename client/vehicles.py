@@ -37,6 +37,15 @@ def mavlink(scenario: Scenario, number: int) -> Vehicle:
     return MavlinkVehicle(scenario, number)
 
 
+@vehicle
+def ros2(scenario: Scenario, number: int) -> Vehicle:
+    """Robot that speaks ROS 2 by rmw_zenoh at `vehicle.address`, flown by velocities."""
+    extras.need("ros2")
+    from skytether.client.ros2.vehicle import Ros2Vehicle
+
+    return Ros2Vehicle(scenario, number)
+
+
 def make(scenario: Scenario, number: int) -> Vehicle:
     try:
         named = VEHICLES.one(scenario.vehicle.kind)
