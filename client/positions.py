@@ -1,4 +1,4 @@
-"""Measurements of an autopilot or a robot: by the client's clock, in order and without duplicates."""
+"""Measurements of an autopilot or a robot: by the client's clock, in order, each once."""
 
 import math
 from collections import Counter, deque

@@ -2,8 +2,8 @@
 
     topic       <domain>/<topic>/<type>/<type hash>
     token       @ros2_lv/<domain>/<session>/<node>/<entity>/<kind>/<enclave>/<namespace>/<name>
-                and, of a publisher or a subscriber, /<topic>/<type>/<type hash>/<quality of service>
-    attachment  sequence number (8 B), time stamp (8 B), length of the identity (1 B), identity (16 B)
+                and, of a publisher or a subscriber, /<topic>/<type>/<type hash>/<quality>
+    attachment  sequence number (8 B), time stamp (8 B), 16 (1 B), identity (16 B)
 
 In a token each `/` of a name is `%`; the enclave and the namespace of our nodes are empty. Tokens
 are Zenoh's liveliness tokens: they vanish with their session, and `ros2 topic list` shows whoever
