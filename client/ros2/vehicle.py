@@ -31,6 +31,8 @@ class Ros2Vehicle(Vehicle):
         self._port = self.port = Port(scenario, number, line)
         self.line = self._port.node
         self._positions = self._port.odometry.positions
+        self._placed = 0
+        """Number of measurements before the origin was placed: the pilot needs one after it."""
 
     def fly(self, velocity: Array) -> None:
         x, y, *up = velocity.tolist()
@@ -52,11 +54,13 @@ class Ros2Vehicle(Vehicle):
         self._port.now_ns = now_ns
         if self._port.is_ready and not self._positions.has_origin:
             self._positions.begin()
+            self._placed = self._positions.taken
         return self.is_up(now_ns=now_ns)
 
     def is_up(self, *, now_ns: int) -> bool:
         self._port.now_ns = now_ns
-        return self._port.is_ready and self._positions.has_origin
+        positions = self._positions
+        return self._port.is_ready and positions.has_origin and positions.taken > self._placed
 
     @property
     def frame(self) -> VehicleMemory:
