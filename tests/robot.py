@@ -5,16 +5,23 @@ odometry by its own clock. In virtual time it is two hosts, named like its topic
 """
 
 import io
+import json
 import math
+import socket
+import threading
+import time
 from types import SimpleNamespace
 from typing import Any
 
+import zenoh
 from mcap_ros2._dynamic import generate_dynamic, serialize_dynamic
 from rosbags.typesys import Stores, get_typestore
 
 from skytether.client import vehicles
 from skytether.client.endpoint import Client
 from skytether.netem.proxy import Proxy
+from skytether.ros2 import graph, messages
+from skytether.ros2.graph import Node
 from skytether.server.endpoint import Server
 from skytether.shared.core.endpoint import Datagram, Endpoint
 from skytether.shared.core.events import Event
@@ -235,3 +242,58 @@ class Ground:
 
     def rows(self) -> Rows:
         return parse(self._sink.getvalue())
+
+
+# -- on an actual Zenoh network ------------------------------------------------------------
+
+ODOM = messages.topic("/odom", messages.ODOMETRY)
+CMD_VEL = messages.topic("/cmd_vel", messages.TWIST_STAMPED)
+
+
+def free_port() -> int:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        return int(server.getsockname()[1])
+
+
+def opened(mode: str, port: int) -> Any:
+    """Zenoh session of a router at a port, or of a peer that knows it."""
+    settings = graph.session_settings(Node("127.0.0.1", port, 0, "other", ODOM, ODOM))
+    settings["mode"] = mode
+    if mode == "router":
+        settings |= {"connect/endpoints": [], "listen/endpoints": [f"tcp/127.0.0.1:{port}"]}
+    config = zenoh.Config()
+    for key, value in settings.items():
+        config.insert_json5(key, json.dumps(value))
+    return zenoh.open(config)
+
+
+class Live:
+    """Router, and a robot that lives in a thread until the block ends."""
+
+    def __init__(self, port: int) -> None:
+        self._router, self._session = opened("router", port), opened("peer", port)
+        self.robot = Robot()
+        self._is_over = threading.Event()
+        self._thread = threading.Thread(target=self._live)
+
+    def __enter__(self) -> Robot:
+        self._thread.start()
+        return self.robot
+
+    def _live(self) -> None:
+        def hear(sample: Any) -> None:
+            self.robot.hear(bytes(sample.payload), time.time_ns())
+
+        commands = self._session.declare_subscriber(CMD_VEL.key(0), hear)
+        out = self._session.declare_publisher(ODOM.key(0))
+        while not self._is_over.wait(0.02):
+            now_ns = time.time_ns()
+            self.robot.step(now_ns)
+            out.put(self.robot.odometry(now_ns))
+        commands.undeclare()
+
+    def __exit__(self, *_: object) -> None:
+        self._is_over.set()
+        self._thread.join()
+        self._session.close()
+        self._router.close()

@@ -17,7 +17,7 @@ from skytether.__main__ import COMMANDS
 from skytether.shared.base import extras
 from skytether.shared.base.extras import MODULES
 
-ALL = ["server", "mavlink", "page", "plot", "record", "pandas", "parquet", "cluster", "lab"]
+ALL = ["server", "mavlink", "ros2", "page", "plot", "record", "pandas", "parquet", "cluster", "lab"]
 LAB = (
     *("crowd", "sweep", "envelope", "margins", "identify", "torture", "adversary", "reproduce"),
     *("compare", "calibrate"),

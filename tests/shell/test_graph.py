@@ -1,8 +1,6 @@
 """A node on an actual Zenoh network on loopback: router, robot, and another publisher."""
 
 import asyncio
-import json
-import socket
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
@@ -13,33 +11,15 @@ import zenoh
 
 import robot
 from helpers import Idle
+from robot import CMD_VEL, ODOM, free_port, opened
 from skytether.ros2 import graph, messages
 from skytether.ros2.graph import Node
 from skytether.shared.core.endpoint import Datagram
 from skytether.shell.driver import Shell, new_event_loop
 
 PATIENCE_S = 60.0
-
-
-def opened(mode: str, port: int) -> Any:
-    """Zenoh session of a router at a port, or of a peer that knows it."""
-    node = Node("127.0.0.1", port, 0, "other", ODOM, ODOM)
-    settings = graph.session_settings(node) | {"mode": mode}
-    if mode == "router":
-        settings |= {"connect/endpoints": [], "listen/endpoints": [f"tcp/127.0.0.1:{port}"]}
-    config = zenoh.Config()
-    for key, value in settings.items():
-        config.insert_json5(key, json.dumps(value))
-    return zenoh.open(config)
-
-
-def free_port() -> int:
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        return int(server.getsockname()[1])
-
-
-ODOM = messages.topic("/odom", messages.ODOMETRY)
-CMD_VEL = messages.topic("/cmd_vel", messages.TWIST_STAMPED)
+LAST_MPS = 9.0
+"""Last command, sent when the process ends."""
 
 
 class Pilot(Idle):
@@ -62,6 +42,9 @@ class Pilot(Idle):
         self.sent += 1
         payload = messages.twist_stamped(now_ns, "base_link", (0.001 * self.sent, 0.0, 0.0), 0.0)
         self.send(payload, ("/cmd_vel", 0), 1)
+
+    def close(self, *, now_ns: int) -> None:
+        self.send(messages.twist_stamped(now_ns, "", (LAST_MPS, 0.0, 0.0), 0.0), ("/cmd_vel", 0), 1)
 
     @property
     def finished(self) -> bool:
@@ -153,8 +136,8 @@ def test_when_the_node_ends_its_last_command_has_left_and_its_tokens_are_gone(ne
     while any(net.tokens.values()) and time.monotonic() < ends_s:
         time.sleep(0.01)
     assert not any(net.tokens.values())
-    last = graph.ATTACHMENT.unpack(bytes(net.commands[-1].attachment))[0]
-    assert last == net.pilot.sent
+    last = robot.decode(robot.TWIST_STAMPED, bytes(net.commands[-1].payload))
+    assert last.twist.linear.x == LAST_MPS
 
 
 def test_the_loss_of_the_router_stops_nothing(net: Net) -> None:
