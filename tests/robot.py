@@ -19,6 +19,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from skytether.client import vehicles
 from skytether.client.endpoint import Client
+from skytether.client.memory import SavedState, recall
 from skytether.netem.proxy import Proxy
 from skytether.ros2 import graph, messages
 from skytether.ros2.graph import Node
@@ -34,6 +35,7 @@ from skytether.sim.world import Clock, World
 SECOND, MS = 1_000_000_000, 1_000_000
 EPOCH_NS = 1_790_000_000 * SECOND
 """The robot's clock at time 0 of the world: time since 1970."""
+CLIENT_NS = 86_400 * SECOND
 PERIOD_NS, TIME_OUT_NS = 20 * MS, 500 * MS
 TAU_S = 0.2
 STORE = get_typestore(Stores.ROS2_JAZZY)
@@ -201,23 +203,40 @@ class Ground:
 
         self.world = World(hear)
         self._sink = io.BytesIO()
-        self.flies: Any = vehicles.make(self.scenario, 1)
-        self.client = Client(
-            self.scenario,
-            self.flies,
-            server=("netem", 0),
-            vehicle=1,
-            boot_id=2**60,
-            recorder=Recorder(client_columns(2), self._sink),
-        )
+        self._recorder = Recorder(client_columns(2), self._sink)
+        self.flies: Any = None
+        self.client = self._client(0, None)
         clock = Clock(EPOCH_NS, round(1000 * drift_ppm))
         self.world.add("/odom", self.odometer, clock=clock)
         self.world.add("/cmd_vel", Commanded(self.robot), clock=clock)
         self.netem = Cut(self.scenario, server=("server", 0), flows=1)
         self.world.add("netem", self.netem)
-        self.world.add("client", self.client, clock=Clock(86_400 * SECOND))
+        self.world.add("client", self.client, clock=Clock(CLIENT_NS))
         server = Server(self.scenario, boot_id=2**60, entropy=bytes)
         self.world.add("server", server, clock=Clock(7 * SECOND))
+
+    def _client(self, life: int, before: SavedState | None) -> Client:
+        self.flies = vehicles.make(self.scenario, 1)
+        return Client(
+            self.scenario,
+            self.flies,
+            server=("netem", 0),
+            vehicle=1,
+            boot_id=2**60 + life,
+            recorder=self._recorder,
+            keeps=True,
+            before=before,
+        )
+
+    def restart(self) -> None:
+        """Kill the client's process, and start another one a second later."""
+        self.world.stop("client")
+        self.run(1.0)
+        kept = self.world.memory("client")
+        assert kept is not None
+        before = recall(*kept, CLIENT_NS + self.world.now_ns, self.scenario.terms())
+        self.client = self._client(1, before)
+        self.world.restart("client", self.client)
 
     def run(self, seconds: float) -> None:
         over: list[bool] = []

@@ -167,6 +167,27 @@ def test_a_minute_with_losses_and_a_link_that_dies_twice() -> None:
         assert max(speeds) > 0.2
 
 
+def test_a_restarted_client_keeps_the_origin() -> None:
+    ground = Ground(heading=0.5, duration=40.0)
+    ground.robot.place[:2] = 30.0, -20.0
+    ground.run(12.0)
+    origin = ground.flies._positions.origin
+    assert origin == pytest.approx((30.0, -20.0, 0.0))
+    ground.restart()
+    ground.run(6.0)
+    assert ground.flies._positions.origin == pytest.approx(origin)
+    assert ground.mode in (Mode.TRACK, Mode.COAST)
+
+
+@pytest.mark.parametrize("stops_early", [True, False])
+def test_the_origin_is_that_of_the_odometry_if_asked(stops_early: bool) -> None:
+    ground = Ground(duration=8.0, ros2={"origin": "odometry"})
+    ground.robot.place[:2] = 0.5, -0.25
+    ground.run(7.0 if stops_early else 12.0)
+    assert ground.rows()["state"][0, :2, 0] == pytest.approx([0.5, -0.25], abs=0.05)
+    assert ground.client.finished is not stops_early
+
+
 def test_after_a_landing_come_zeros_and_then_silence() -> None:
     ground = Ground(vehicle={"land_after_s": 3.0})
     ground.run(8.0)
