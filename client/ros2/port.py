@@ -141,6 +141,8 @@ class Port(Endpoint):
         if len(self._rivals_ns) < RIVALS_LEAST or now_ns - self._rivals_ns[0] > RIVAL_NS:
             return
         self._rival_ns = now_ns
+        if self._silent_ns is not None:  # the robot is left to others
+            return
         if self._reported_ns is None or now_ns - self._reported_ns >= REPORT_NS:
             self._reported_ns = now_ns
             nodes, topic = tuple(sorted(set(self._others.values()))), self._keys.command

@@ -6,12 +6,18 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 import robot
 from robot import EPOCH_NS, MS, SECOND, Ground
 from skytether.client import vehicles
 from skytether.client.ros2 import drive
 from skytether.client.ros2.odometry import OdometryFilter
+from skytether.lab.identify.fit import fit
+from skytether.lab.identify.flight import Identifying
+from skytether.lab.identify.responses import responses
+from skytether.lab.identify.steps import Experiment, ExperimentPlan
 from skytether.ros2 import messages
 from skytether.shared.base import extras
 from skytether.shared.base.errors import ConfigError
@@ -19,6 +25,7 @@ from skytether.shared.base.extras import ExtraMissing
 from skytether.shared.core.aboard import OdometryDropped, SecondPublisher
 from skytether.shared.core.endpoint import Datagram
 from skytether.shared.wire.protocol import Mode
+from skytether.sim.world import Clock, World
 
 STEP = 0.05
 
@@ -141,6 +148,7 @@ def test_commands_are_stamped_by_the_robots_clock() -> None:
     assert max(map(abs, ages_ns)) < 5 * MS
 
 
+@pytest.mark.long
 def test_a_minute_with_losses_and_a_link_that_dies_twice() -> None:
     """Every tick of `cmd_vel`: a command at each step; zeros while the link is dead."""
     lossy = "constant(0.05) & loss(0.3)"
@@ -158,10 +166,13 @@ def test_a_minute_with_losses_and_a_link_that_dies_twice() -> None:
         ground.netem.is_cut = False
     ground.run(56.0 - 44.0)
     assert ground.mode in (Mode.TRACK, Mode.COAST)
-    times = [at for at, _ in ground.commands(5.0, 56.0)]
+    times = [at for at, _ in ground.commands(0.0, 56.0)]
+    assert times[0] < 7.0
     assert all(b - a == pytest.approx(STEP, abs=0.001) for a, b in pairwise(times))
-    for dead_s, alive_s in ((15.0 + 4.5, 21.0), (36.0 + 4.5, 44.0)):
+    for dead_s, alive_s in ((15.0 + 2.0, 21.0), (36.0 + 2.0, 44.0)):
         assert {command for _, command in ground.commands(dead_s, alive_s)} == {(0.0, 0.0, 0.0)}
+        again = [command for _, command in ground.commands(alive_s, alive_s + 3.0)]
+        assert max(math.hypot(*command[:2]) for command in again) > 0.2
     for since_s in (8.0, 27.0, 50.0):
         speeds = [math.hypot(*command[:2]) for _, command in ground.commands(since_s, since_s + 5)]
         assert max(speeds) > 0.2
@@ -222,6 +233,51 @@ def test_silent_or_wrong_odometry_stops_the_robot(payload: bytes | None) -> None
     ground.odometer.is_mute, ground.odometer.payload = False, None
     ground.run(4.0)
     assert ground.mode in (Mode.TRACK, Mode.COAST)
+
+
+@settings(max_examples=50)
+@given(
+    st.lists(
+        st.tuples(
+            st.sampled_from(["/odom", "/cmd_vel", "@ros2_lv/0/a/0/1/MP/%/%/n/%t/T/H/Q", "/x"])
+            | st.text(),
+            st.binary(max_size=40)
+            | st.sampled_from([robot.odometry(EPOCH_NS + k) for k in (1, 2)]),
+            st.integers(0, 2 * SECOND),
+        ),
+        max_size=12,
+    )
+)
+def test_any_datagrams_raise_nothing_and_move_nothing(
+    datagrams: list[tuple[str, bytes, int]],
+) -> None:
+    port, now_ns = vehicles.make(robot.scenario(), 1).port, SECOND
+    assert port is not None
+    for topic, payload, later_ns in datagrams:
+        now_ns += later_ns
+        port.receive(Datagram(payload, (topic, 0), 1), now_ns=now_ns)
+        port.wake(now_ns=now_ns)
+    assert not port.outbox()
+
+
+def test_identify_finds_the_model_of_a_robot() -> None:
+    scenario = robot.scenario(
+        ros2={"drive": "differential"}, fence={"radius_m": 6.0, "wind_mps": 0.1}
+    )
+    plan = ExperimentPlan((0.5, 0.5), 3.0, 1)
+    body, flies, world = robot.Robot(0.3), vehicles.make(scenario, 1), World()
+    experiment = Experiment(scenario, plan)
+    flight = Identifying(scenario, flies, experiment)
+    clock = Clock(EPOCH_NS)
+    world.add("/odom", robot.Odometer(body), clock=clock)
+    world.add("/cmd_vel", robot.Commanded(body), clock=clock)
+    world.add("client", flight, clock=Clock(robot.CLIENT_NS))
+    world.run(lambda: flight.finished, limit_ns=300 * SECOND)
+    for axis in range(2):
+        found = fit(responses(flight.inputs, flight.measured, experiment.steps, axis))
+        assert found is not None
+        assert found.numbers.tau_s == pytest.approx(robot.TAU_S, abs=0.03)
+        assert found.numbers.gain == pytest.approx(1.0, abs=0.03)
 
 
 def test_another_publisher_is_reported_by_name_and_stops_the_robot() -> None:
