@@ -147,7 +147,7 @@ def fly(argv: Sequence[str]) -> None:
         ):  # a vehicle with compiled functions is used
             terminal.prepare(kernel.missing())
             kernel.load()
-        line = flying[0].line
+        line = vehicles.connection(flying[0], scenario)
         if line is not None:
             command.check_count(f"--vehicles with {scenario.vehicle.kind}", len(numbers), 1)
         if options.set_parameters and not flying[0].set_parameters():

@@ -17,7 +17,6 @@ import numpy as np
 from skytether.ros2.graph import Node
 from skytether.shared.core.endpoint import Endpoint
 from skytether.shared.core.events import Failure
-from skytether.shared.core.line import Line
 from skytether.shared.law.model import Array
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Reason
@@ -71,8 +70,9 @@ class Vehicle(ABC):
     """Keys of the scenario that may change in flight."""
     port: Endpoint | None = None
     """Endpoint that talks to the vehicle's own hardware; None if there is none."""
-    line: Line | Node | None = None
-    """Connection of the port, to be opened as its process's socket 1; None without a port."""
+    node: Node | None = None
+    """Node of the ROS graph whose topics the port is connected to; None: the port is connected to
+    the line at `vehicle.address`."""
     returns = False
     """Whether the vehicle can return home by itself, see `return_home`."""
     leap_m: tuple[float, ...] | None = None

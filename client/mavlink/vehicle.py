@@ -33,7 +33,7 @@ class MavlinkVehicle(Vehicle):
     changeable = keys_of(InFlight.ARMED, InFlight.ORIGIN)
 
     def __init__(self, scenario: Scenario, number: int) -> None:
-        line = self.line = parse_line("vehicle.address", scenario.vehicle.address)
+        line = parse_line("vehicle.address", scenario.vehicle.address)
         self._may_arm = scenario.armed
         self._port = self.port = Port(scenario, number, line, altitude(scenario, number))
         self._autopilot = self._port.autopilot

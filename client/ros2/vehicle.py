@@ -29,7 +29,7 @@ class Ros2Vehicle(Vehicle):
             expected = "expected 'holonomic' or 'fixed' with model.axes = 3"
             raise ConfigError(f"ros2.drive: got 'differential', {expected}")
         self._port = self.port = Port(scenario, number, line)
-        self.line = self._port.node
+        self.node = self._port.node
         self._positions = self._port.odometry.positions
         self._placed = 0
         """Number of measurements before the origin was placed: the pilot needs one after it."""

@@ -197,7 +197,7 @@ def _fly(scenario: Scenario, plan: ExperimentPlan, *, sets: bool) -> SizeFlown:
         if flies.port is None:
             _virtually(flight, show)
         else:
-            _really(flight, flies.line, show)
+            _really(flight, vehicles.connection(flies, scenario), show)
     steps, cut = flight.experiment.steps, flight.experiment.cut
     axes = []
     for number, speed in enumerate(plan.speeds):
