@@ -120,7 +120,7 @@ $(FUZZ_STAMP): $(STAMP) locks/fuzz.lock
 lock: $(UV)  ## pin what pyproject.toml asks for: one version of each package, whoever needs it
 	$(COMPILE) --extra dev pyproject.toml -o locks/dev.lock
 	$(COMPILE) --group setup -o locks/setup.lock
-	for need in fly client mavlink page server bench fuzz docs; do \
+	for need in fly client mavlink ros2 page server bench fuzz docs; do \
 		case "$$need" in \
 			fly) extras="--extra server --extra page --extra plot --extra record";; \
 			client) extras="";; \

@@ -34,7 +34,6 @@ from skytether.shared.core.events import (
     SessionRefused,
     address_text,
 )
-from skytether.shared.core.line import parse_line
 from skytether.shared.core.steady import Steady
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import client_columns
@@ -148,9 +147,8 @@ def fly(argv: Sequence[str]) -> None:
         ):  # a vehicle with compiled functions is used
             terminal.prepare(kernel.missing())
             kernel.load()
-        line = None
-        if flying[0].port:
-            line = parse_line("vehicle.address", scenario.vehicle.address)
+        line = vehicles.connection(flying[0], scenario)
+        if line is not None:
             command.check_count(f"--vehicles with {scenario.vehicle.kind}", len(numbers), 1)
         if options.set_parameters and not flying[0].set_parameters():
             kind = f"got vehicle.kind = {scenario.vehicle.kind!r}, expected one with parameters"
@@ -183,7 +181,9 @@ def fly(argv: Sequence[str]) -> None:
             paths=dict(zip(PATH_SOCKETS, paths, strict=False))
             | dict(zip(STANDBY_SOCKETS, standby, strict=False)),
             waiting_for=(
-                f"its autopilot at {scenario.vehicle.address}" if line else _servers(paths, standby)
+                f"its {scenario.vehicle.kind} vehicle at {scenario.vehicle.address}"
+                if line
+                else _servers(paths, standby)
             ),
             insecure=options.insecure,
             line=line,

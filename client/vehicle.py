@@ -14,6 +14,7 @@ from typing import Annotated, NamedTuple
 import msgspec
 import numpy as np
 
+from skytether.ros2.graph import Node
 from skytether.shared.core.endpoint import Endpoint
 from skytether.shared.core.events import Failure
 from skytether.shared.law.model import Array
@@ -69,6 +70,9 @@ class Vehicle(ABC):
     """Keys of the scenario that may change in flight."""
     port: Endpoint | None = None
     """Endpoint that talks to the vehicle's own hardware; None if there is none."""
+    node: Node | None = None
+    """Node of the ROS graph whose topics the port is connected to; None: the port is connected to
+    the line at `vehicle.address`."""
     returns = False
     """Whether the vehicle can return home by itself, see `return_home`."""
     leap_m: tuple[float, ...] | None = None

@@ -6,8 +6,10 @@ when it is made.
 
 from skytether.client.simulated import vehicle as computed
 from skytether.client.vehicle import Vehicle
+from skytether.ros2.graph import Node
 from skytether.shared.base import extras
 from skytether.shared.base.errors import ConfigError
+from skytether.shared.core.line import Line, parse_line
 from skytether.shared.scenario.grammar import GrammarError
 from skytether.shared.scenario.registry import VEHICLES
 from skytether.shared.scenario.schema import Scenario
@@ -37,6 +39,15 @@ def mavlink(scenario: Scenario, number: int) -> Vehicle:
     return MavlinkVehicle(scenario, number)
 
 
+@vehicle
+def ros2(scenario: Scenario, number: int) -> Vehicle:
+    """Robot that speaks ROS 2 by rmw_zenoh at `vehicle.address`, flown by velocities."""
+    extras.need("ros2")
+    from skytether.client.ros2.vehicle import Ros2Vehicle
+
+    return Ros2Vehicle(scenario, number)
+
+
 def make(scenario: Scenario, number: int) -> Vehicle:
     try:
         named = VEHICLES.one(scenario.vehicle.kind)
@@ -47,3 +58,10 @@ def make(scenario: Scenario, number: int) -> Vehicle:
         expected = f"'land' with vehicle.kind = {named.name!r}, which cannot return by itself"
         raise ConfigError(f"vehicle.on_loss: got 'return', expected {expected}")
     return instance
+
+
+def connection(flies: Vehicle, scenario: Scenario) -> Line | Node | None:
+    """Connection of a vehicle's port, which becomes its process's socket 1; None without a port."""
+    if flies.port is None:
+        return None
+    return flies.node or parse_line("vehicle.address", scenario.vehicle.address)

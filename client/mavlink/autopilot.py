@@ -8,7 +8,7 @@ Messages of the autopilot are distributed to these parts; the requests of the pa
 
 from typing import NamedTuple
 
-from skytether.client.mavlink.clock import BootClock
+from skytether.client.clock import BootClock
 from skytether.client.mavlink.condition import Condition
 from skytether.client.mavlink.flavours import ARDUPILOT, FLAVOURS, Flavour, unfit
 from skytether.client.mavlink.launch import (
@@ -19,13 +19,14 @@ from skytether.client.mavlink.launch import (
     Launch,
     Phase,
 )
-from skytether.client.mavlink.positions import Positions, given_origin, take_off_place
+from skytether.client.mavlink.positions import Positions, given_origin
 from skytether.client.mavlink.safety import returns_below_m
 from skytether.client.mavlink.setup import Setup
 from skytether.client.mavlink.streams import SET_INTERVAL, Streams, rates
 from skytether.client.mavlink.texts import LoggedTexts
 from skytether.client.mavlink.timesync import Timesync
 from skytether.client.navigation import Leaps
+from skytether.client.positions import take_off_place
 from skytether.client.vehicle import VehicleMemory
 from skytether.mavlink.codec import Message
 from skytether.mavlink.dialect import dialect

@@ -3,12 +3,12 @@
 disarmed → another mode → second commander → bad estimate → low battery → silence
 """
 
-from skytether.client.mavlink.clock import BootClock
+from skytether.client.clock import BootClock
 from skytether.client.mavlink.condition import Condition
 from skytether.client.mavlink.obedience import Obedience
-from skytether.client.mavlink.positions import Positions, Vector
 from skytether.client.mavlink.rivals import Rivals
 from skytether.client.mavlink.texts import SAME_TEXT_NS
+from skytether.client.positions import Positions, Vector
 from skytether.shared.base.units import MILLISECOND_NS, seconds_to_ns
 from skytether.shared.core.aboard import (
     AboardEvent,

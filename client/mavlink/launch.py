@@ -15,7 +15,7 @@ from enum import Enum, auto
 
 from skytether.client.mavlink.condition import Condition
 from skytether.client.mavlink.flavours import Flavour, LaunchStep
-from skytether.client.mavlink.positions import Positions
+from skytether.client.positions import Positions
 from skytether.mavlink.codec import Message
 from skytether.mavlink.dialect import dialect
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS

@@ -17,7 +17,7 @@ autopilots in wind and turbulence, with models wrong by 30 % and 20 %, without a
 import math
 from collections import deque
 
-from skytether.client.mavlink.positions import Vector
+from skytether.client.positions import Vector
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS, seconds_to_ns
 from skytether.shared.scenario.schema import Scenario
 

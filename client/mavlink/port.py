@@ -12,8 +12,8 @@ from skytether.client.mavlink.autopilot import Autopilot
 from skytether.client.mavlink.connection import Connection
 from skytether.client.mavlink.hindrances import Hindrances
 from skytether.client.mavlink.launch import Phase
-from skytether.client.mavlink.positions import Vector
 from skytether.client.mavlink.setpoints import Sends, Setpoints
+from skytether.client.positions import Vector
 from skytether.mavlink.codec import Message
 from skytether.mavlink.dialect import dialect
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS, seconds_to_ns

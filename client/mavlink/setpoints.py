@@ -6,7 +6,7 @@ UNFLOWN_NS: silence, and the autopilot's own time-out acts
 
 from enum import Enum, auto
 
-from skytether.client.mavlink.positions import Vector
+from skytether.client.positions import Vector
 from skytether.mavlink.codec import Message
 from skytether.mavlink.dialect import dialect
 from skytether.mavlink.frames import turned

@@ -2,7 +2,7 @@
 restarts or is silent.
 """
 
-from skytether.client.mavlink.clock import BootClock
+from skytether.client.clock import BootClock
 from skytether.mavlink.codec import Message
 from skytether.mavlink.dialect import dialect
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib import util
 
-MODULES = {"pillow": "PIL"}
+MODULES = {"eclipse-zenoh": "zenoh", "pillow": "PIL"}
 """Import names of packages, where they differ from the names of the packages."""
 
 

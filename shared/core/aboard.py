@@ -146,6 +146,25 @@ class SecondCommander(VehicleEvent, frozen=True, kw_only=True):
         return f"vehicle {self.vehicle}: {who} commands its autopilot as well: {self.said}"
 
 
+class SecondPublisher(VehicleEvent, frozen=True, kw_only=True):
+    """Somebody else publishes commands for a robot."""
+
+    topic: str
+    nodes: tuple[str, ...]
+    """Other nodes of the ROS graph that may publish on the topic; empty if none has told."""
+
+    def __str__(self) -> str:
+        who = " or ".join(self.nodes) or "a node without a name"
+        return f"vehicle {self.vehicle}: {who} publishes on {self.topic} as well"
+
+
+class OdometryDropped(VehicleEvent, frozen=True, kw_only=True):
+    why: str
+
+    def __str__(self) -> str:
+        return f"vehicle {self.vehicle}: messages of its odometry are dropped: {self.why}"
+
+
 class Strays(VehicleEvent, frozen=True, kw_only=True):
     """A vehicle deviates from its commands by more than wind and model errors explain."""
 
@@ -226,6 +245,8 @@ AboardEvent = (
     | ArmingAwaited
     | OriginAwaited
     | SecondCommander
+    | SecondPublisher
+    | OdometryDropped
     | Strays
     | AboardFailure
 )

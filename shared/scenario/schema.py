@@ -74,6 +74,8 @@ Interval = Annotated[float, Meta(ge=1e-3, le=3600)]
 MeanTime = Annotated[float, Meta(ge=1e-9, le=1e9)]
 Text = Annotated[str, Meta(max_length=TEXT_MAX)]
 Direction = Annotated[str, Meta(max_length=air.TEXT_MAX)]
+TopicName = Annotated[str, Meta(max_length=200, pattern=r"^(/[A-Za-z_][A-Za-z0-9_]*)+$")]
+"""Name of a ROS topic, with its namespace."""
 
 
 SHAPE_CHARS = 15
@@ -201,7 +203,7 @@ class VehicleConfig(Section, frozen=True):
     """Vehicle, see `skytether vehicles`."""
     address: OfVehicle[str] = "udp:127.0.0.1:14550"
     """Connection to an autopilot: udp:HOST:PORT (listens there), udpout:HOST:PORT, tcp:HOST:PORT or
-    serial:PATH:BAUD."""
+    serial:PATH:BAUD; to a robot that speaks ROS 2: tcp:HOST:PORT of a Zenoh router."""
     memory: OfVehicle[Annotated[str, Meta(max_length=4096)]] = "auto"
     """Folder for the state that a restarted client needs; none: not saved; auto: for a vehicle with
     an autopilot, the state folder of its service or user."""
@@ -362,6 +364,29 @@ class MavlinkConfig(Section, frozen=True):
     """Longest wait for the first heartbeat, and for each step of take-off [s]."""
 
 
+class Ros2Config(Section, frozen=True):
+    """Robot of a vehicle of the kind `ros2`, see docs/ros2.md."""
+
+    domain: OfVehicle[Annotated[int, Meta(ge=0, le=232)]] = 0
+    """Domain of the robot's nodes (ROS_DOMAIN_ID)."""
+    odometry: OfVehicle[TopicName] = "/odom"
+    """Topic of nav_msgs/Odometry."""
+    command: OfVehicle[TopicName] = "/cmd_vel"
+    """Topic on which velocities are commanded."""
+    stamped: OfVehicle[bool] = True
+    """Whether commands are geometry_msgs/TwistStamped; otherwise Twist."""
+    drive: OfVehicle[Literal["holonomic", "differential", "fixed"]] = "holonomic"
+    """Way in which the robot is commanded: any velocity in its own frame; forwards and a turn; or
+    any velocity in the fixed frame of its odometry."""
+    ahead_m: OfVehicle[Annotated[float, Meta(ge=0.01, le=10)]] = 0.2
+    """Distance before the axle of the point of a differential robot that is flown [m]."""
+    origin: OfVehicle[Literal["start", "odometry"]] = "start"
+    """Origin of the scenario: where the robot stands at the start (on a mission, its start is
+    there), or the origin of its odometry."""
+    silence_s: OfVehicle[Annotated[float, Meta(ge=0.05, le=5)]] = 0.5
+    """Time without odometry after which the robot brakes [s]."""
+
+
 class PathConfig(Section, frozen=True):
     """Path of a session: a network of its own between vehicle and server."""
 
@@ -468,6 +493,7 @@ class Scenario(Section, frozen=True):
     mission: MissionConfig = MissionConfig()
     sensor: SensorConfig = SensorConfig()
     mavlink: MavlinkConfig = MavlinkConfig()
+    ros2: Ros2Config = Ros2Config()
     network: NetworkConfig = NetworkConfig()
     link: LinkConfig = LinkConfig()
     simulation: SimulationConfig = SimulationConfig()

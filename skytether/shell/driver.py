@@ -20,6 +20,7 @@ from socket import socket
 from types import MappingProxyType
 from typing import Any
 
+from skytether.ros2.graph import Node
 from skytether.shared.core.endpoint import Address, Datagram, Endpoint, Form, make_datagram
 from skytether.shared.core.events import (
     Event,
@@ -34,6 +35,7 @@ from skytether.shared.core.stopwatch import Stopwatch
 from skytether.shell.batch import BATCH_MAX, DatagramBatch, Segments
 from skytether.shell.control import Control
 from skytether.shell.feed import Feed
+from skytether.shell.graph import GraphSession
 from skytether.shell.memory import MemoryFile
 from skytether.shell.paths import NetworkPath, PathSockets
 from skytether.shell.stream import ByteStream
@@ -100,7 +102,7 @@ class Shell:
         forms: forms of the datagrams accepted at the bound sockets; empty accepts all.
         control: control socket for changes of keys in flight.
         feed: socket that sends rows and events to readers.
-        line: connection to an autopilot, which becomes socket 1.
+        line: connection to an autopilot or a robot, which becomes socket 1.
         paths: paths to the endpoint's peers, by the number of their socket. Of several, any may be
             unusable; it is then opened later.
         is_patient: whether to start although the name of a path's peer cannot be resolved yet; the
@@ -120,7 +122,7 @@ class Shell:
         forms: Sequence[Form] = (),
         control: Control | None = None,
         feed: Feed | None = None,
-        line: Line | None = None,
+        line: Line | Node | None = None,
         *,
         paths: Mapping[int, NetworkPath] = MappingProxyType({}),
         is_patient: bool = False,
@@ -142,7 +144,7 @@ class Shell:
         self._sockets: dict[int, socket] = {}
         self.addresses: dict[int, Address] = {}
         """Addresses of the bound sockets and of the paths' by number."""
-        self._stream: ByteStream | None = None
+        self._line: ByteStream | GraphSession | None = None
         bound = bind if isinstance(bind, list) else [bind] if bind else []
         excused = (AddressError,) if len(paths) > 1 else ()
         with contextlib.ExitStack() as failed:
@@ -195,18 +197,20 @@ class Shell:
         path = self._paths.get(number)
         return path.names if path else self._names
 
-    def _add(self, line: Line) -> None:
-        if line.kind in ("tcp", "serial"):
-            self._stream = ByteStream(line, self._hear_line)
+    def _add(self, line: Line | Node) -> None:
+        if isinstance(line, Node):
+            self._line = GraphSession(line, self._hear_line)
+        elif line.kind in ("tcp", "serial"):
+            self._line = ByteStream(line, lambda piece: self._hear_line(Datagram(piece, LINE, 1)))
         elif line.kind == "udp":
             self._sockets[1] = open_socket(line.address)
         else:
             self._names.add(line.address)
             self._sockets[1] = open_socket(within_reach_of([self._names.number(line.address)]))
 
-    def _hear_line(self, piece: bytes) -> None:
+    def _hear_line(self, datagram: Datagram) -> None:
         try:
-            self.endpoint.receive(Datagram(piece, LINE, 1), now_ns=time.monotonic_ns())
+            self.endpoint.receive(datagram, now_ns=time.monotonic_ns())
         finally:
             self._after()
 
@@ -229,8 +233,8 @@ class Shell:
             self._loop.create_task(self._keep_resolving()),
             self._loop.create_task(self._watch_paths()),
         ]
-        if self._stream:
-            beside.append(self._loop.create_task(self._stream.run()))
+        if self._line:
+            beside.append(self._loop.create_task(self._line.run()))
         try:
             self._after()
             await self._done
@@ -471,8 +475,8 @@ class Shell:
 
     def _send(self, datagram: Datagram) -> None:
         payload, peer, number = datagram
-        if peer == LINE:
-            self.send_errors += not (self._stream and self._stream.send(payload))
+        if self._line and number == 1:
+            self.send_errors += not self._line.send(payload, peer)
             return
         try:
             sock = self._sockets.get(number)

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO, cast
 import msgspec
 import numpy as np
 
+from skytether.ros2.graph import Node
 from skytether.shared.base import files
 from skytether.shared.core.change import Running
 from skytether.shared.core.endpoint import Address, Endpoint, Form
@@ -142,7 +143,7 @@ class Process:
         forms: Sequence[Form] = (),
         insecure: bool = False,
         stopwatch: Stopwatch | None = None,
-        line: Line | None = None,
+        line: Line | Node | None = None,
         is_patient: bool = False,
         memory: MemoryFile | None = None,
         ready: Callable[[], None] = lambda: None,

@@ -12,6 +12,7 @@ import termios
 import tty
 from collections.abc import Callable
 
+from skytether.shared.core.endpoint import Address
 from skytether.shared.core.line import Line
 from skytether.shell.udp import AddressError
 
@@ -36,7 +37,7 @@ class ByteStream:
         self._line, self._hear = line, hear
         self._end: int | None = None
 
-    def send(self, payload: bytes) -> bool:
+    def send(self, payload: bytes, peer: Address) -> bool:  # noqa: ARG002 - there is only one
         """Send bytes; False if the stream is not open or cannot take all of them."""
         if self._end is None:
             return False

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from skytether.client.mavlink.clock import BootClock
+from skytether.client.clock import BootClock
 from skytether.client.mavlink.condition import Condition
 from skytether.client.mavlink.flavours import FLAVOURS, PX4, Flavour, unfit
 from skytether.client.mavlink.launch import Launch

@@ -170,7 +170,7 @@ def _mission(state: State, vehicle: int) -> list[tuple[str, str]]:
 
 def _autopilot(state: State, vehicle: int) -> list[tuple[str, str]]:
     says = group(state.figures("client"), "by_vehicle", str(vehicle), "autopilot")
-    if not says:
+    if "mode" not in says:  # a robot has none of these
         return []
     armed = "armed" if says.get("armed") else "disarmed"
     charge, volts = 100.0 * told(says, "battery"), told(says, "voltage_v")

@@ -17,7 +17,19 @@ from skytether.__main__ import COMMANDS
 from skytether.shared.base import extras
 from skytether.shared.base.extras import MODULES
 
-ALL = ["server", "mavlink", "page", "plot", "record", "pandas", "parquet", "cluster", "gym", "lab"]
+ALL = [
+    "server",
+    "mavlink",
+    "ros2",
+    "page",
+    "plot",
+    "record",
+    "pandas",
+    "parquet",
+    "cluster",
+    "gym",
+    "lab",
+]
 LAB = (
     *("crowd", "sweep", "envelope", "margins", "identify", "torture", "adversary", "reproduce"),
     *("compare", "calibrate"),

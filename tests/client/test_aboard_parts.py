@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 
 from airborne import scenario
 from skytether.client import vehicles
+from skytether.client.clock import DRIFT_MAX, KNOWN, WANDER, WINDOW, BootClock
 from skytether.client.mavlink import safety
-from skytether.client.mavlink.clock import DRIFT_MAX, KNOWN, WANDER, WINDOW, BootClock
 from skytether.mavlink.codec import Codec
 from skytether.mavlink.dialect import dialect
 from skytether.shared.base import extras

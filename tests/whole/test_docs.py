@@ -1,6 +1,7 @@
 """Documents: their commands run, their links have targets, their names exist."""
 
 import json
+import math
 import re
 import shlex
 import signal
@@ -14,6 +15,7 @@ import pytest
 
 import warm
 from helpers import SKYTETHER, ran
+from robot import Live, free_port
 from skytether.__main__ import main
 from skytether.cli.set import set_keys
 from skytether.shell import command
@@ -137,6 +139,19 @@ def test_the_documented_links_carry_one_flight(tmp_path: Path) -> None:
         processes = [re.sub(there, here, line) for line in processes]
     said = fly_together(processes, tmp_path)
     assert said.count("listening on ") == 2
+
+
+@pytest.mark.usefixtures("documented_ports")
+def test_the_documented_robot_is_driven(tmp_path: Path) -> None:
+    document, port = ROOT / "docs" / "ros2.md", free_port()
+    (table,) = re.findall(r"```toml\n(.*?)```", document.read_text(), re.DOTALL)
+    (tmp_path / "robot.toml").write_text(table.replace("7447", str(port)))
+    with Live(port) as robot:
+        fly_together(*blocks(document), tmp_path)
+    speeds = [math.hypot(*robot.twist(message)[:2]) for _, message in robot.heard]
+    assert len(speeds) > 50
+    assert 0.1 < max(speeds) < 1.0
+    assert speeds[-3:] == [0.0] * 3
 
 
 def fly_together(lines: list[str], folder: Path) -> str:

@@ -13,11 +13,11 @@ from helpers import ran
 
 ROOT = Path(__file__).parents[2]
 CORES = (
-    *("shared", "quadrotor", "mavlink", "server", "client", "netem", "autopilot"),
+    *("shared", "quadrotor", "mavlink", "ros2", "server", "client", "netem", "autopilot"),
     *("sim", "figures", "view", "lab", "gym"),
 )
 WITHOUT_FILES = (
-    *("shared/law", "shared/core", "quadrotor", "mavlink", "server", "client", "netem"),
+    *("shared/law", "shared/core", "quadrotor", "mavlink", "ros2", "server", "client", "netem"),
     *("autopilot", "station", "probe", "sim"),
 )
 """Rooms whose modules import neither paths nor the operating system."""

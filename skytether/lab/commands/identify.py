@@ -27,11 +27,12 @@ from skytether.lab.identify.steps import (
     default_speeds,
     fenced,
 )
+from skytether.ros2.graph import Node
 from skytether.shared.base import files, kernel
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.core.events import Event
-from skytether.shared.core.line import parse_line
+from skytether.shared.core.line import Line
 from skytether.shared.core.steady import Steady
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.schema import Scenario
@@ -196,7 +197,7 @@ def _fly(scenario: Scenario, plan: ExperimentPlan, *, sets: bool) -> SizeFlown:
         if flies.port is None:
             _virtually(flight, show)
         else:
-            _really(flight, scenario, show)
+            _really(flight, vehicles.connection(flies, scenario), show)
     steps, cut = flight.experiment.steps, flight.experiment.cut
     axes = []
     for number, speed in enumerate(plan.speeds):
@@ -225,9 +226,8 @@ def _virtually(flight: Identifying, show: Callable[[], None]) -> None:
             flight.close(now_ns=world.now_ns)
 
 
-def _really(flight: Identifying, scenario: Scenario, show: Callable[[], None]) -> None:
+def _really(flight: Identifying, line: Line | Node | None, show: Callable[[], None]) -> None:
     """Fly in real time; raises CommandError if the connection to the hardware cannot be opened."""
-    line = parse_line("vehicle.address", scenario.vehicle.address)
     try:
         shell = driver.Shell(Steady(flight), None, line=line)
     except AddressError as error:

@@ -186,6 +186,10 @@ class BootClock:
         since_ns = boot_ns + int(offset_ns) - origin_ns
         return origin_ns + round(since_ns / (1.0 - drift))
 
+    def boot_ns(self, local_ns: int) -> int:
+        """Time since boot at a time of the client's clock; needs `is_known`."""
+        return local_ns - round(self._offset(local_ns))
+
 
 def _agreeing(samples: list[Sample]) -> tuple[list[Sample], float, float]:
     """Newest answers that are consistent, and the smallest and largest drift that they allow.

@@ -1,0 +1,58 @@
+"""The point of a robot that is flown, and the command that gives it a velocity.
+
+A holonomic robot moves in every direction, and the point is the origin of its child frame. A
+differential one moves along its axis only, and turns: there the point lies `ahead` metres before
+the axle, where every velocity can be reached (feedback linearisation by a point ahead). With the
+rotation R and the turn ω of the robot:
+
+    position = p + R (ahead, 0, 0)      velocity = R (v + (0, ahead ω, 0))
+    command: linear x = (Rᵀ u)₁, and turn = (Rᵀ u)₂ / ahead
+
+The heading then follows the motion by itself, stably as long as the robot drives forward.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from skytether.ros2.messages import Odometry, Rotation, Vector
+
+
+class Command(NamedTuple):
+    frame: str
+    linear: Vector
+    """Linear velocity in that frame [m/s]."""
+    turn: float
+    """Turn about the vertical axis [rad/s]."""
+
+
+def point(odometry: Odometry, ahead: float) -> tuple[Vector, Vector]:
+    """Position and velocity of the point in the fixed frame [m, m/s]; `ahead` [m] may be 0."""
+    x, y, z = odometry.velocity
+    if odometry.child != odometry.frame:
+        velocity = from_robot(odometry.rotation, (x, y + ahead * odometry.turn[2], z))
+    else:  # the velocity is already in the fixed frame
+        dx, dy, dz = from_robot(odometry.rotation, (0.0, ahead * odometry.turn[2], 0.0))
+        velocity = x + dx, y + dy, z + dz
+    px, py, pz = odometry.position
+    dx, dy, dz = from_robot(odometry.rotation, (ahead, 0.0, 0.0))
+    return (px + dx, py + dy, pz + dz), velocity
+
+
+def command(velocity: Vector, odometry: Odometry, drive: str, ahead: float) -> Command:
+    """Command for a velocity of the point in the fixed frame [m/s]; `drive` as in `ros2.drive`."""
+    if drive == "fixed":
+        return Command(odometry.frame, velocity, 0.0)
+    forward, left, up = to_robot(odometry.rotation, velocity)
+    if drive == "differential":
+        return Command(odometry.child, (forward, 0.0, 0.0), left / ahead)
+    return Command(odometry.child, (forward, left, up), 0.0)
+
+
+def from_robot(rotation: Rotation, vector: Sequence[float]) -> Vector:
+    x, y, z = (sum(a * b for a, b in zip(row, vector, strict=True)) for row in rotation)
+    return x, y, z
+
+
+def to_robot(rotation: Rotation, vector: Sequence[float]) -> Vector:
+    x, y, z = zip(*rotation, strict=True)
+    return from_robot((x, y, z), vector)

@@ -1,0 +1,93 @@
+"""Measurements from nav_msgs/Odometry: in one frame, by the client's clock, in order.
+
+A robot answers no questions about its clock, so it is known from the arrivals alone:
+
+    the fastest message of an interval, stamped b, arrives at t, after at most ROUND_TRIP_NS:
+    offset = t - ROUND_TRIP_NS / 2 - b
+
+which is a sample like the answer of an autopilot. A delay that all messages have in common cannot
+be seen, and makes the measurements that much younger than they are.
+"""
+
+from skytether.client.clock import BootClock
+from skytether.client.navigation import Leaps
+from skytether.client.positions import Positions, take_off_place
+from skytether.client.ros2 import drive
+from skytether.ros2 import messages
+from skytether.ros2.messages import MessageError
+from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
+from skytether.shared.scenario.schema import Scenario
+
+ROUND_TRIP_NS = 4 * MILLISECOND_NS
+"""Assumed bound of the delay of an interval's fastest message: the client runs aboard."""
+BEGIN_NS, INTERVAL_NS = 100 * MILLISECOND_NS, SECOND_NS
+"""Interval of the samples before the clock is known, and after."""
+
+
+class OdometryFilter:
+    """Odometry of one robot, turned into positions and velocities of the point that is flown."""
+
+    def __init__(self, scenario: Scenario, vehicle: int) -> None:
+        keys = scenario.ros2
+        self._ahead = keys.ahead_m if keys.drive == "differential" else 0.0
+        self.clock = BootClock(SECOND_NS)
+        self.positions = Positions(
+            scenario.model.axes,
+            self.clock,
+            start=take_off_place(scenario, vehicle),
+            origin=(0.0, 0.0, 0.0) if keys.origin == "odometry" else None,
+            leaps=Leaps(scenario),
+        )
+        self.newest: messages.Odometry | None = None
+        """Newest message that was used."""
+        self.heard = 0
+        self._frames: tuple[str, str] | None = None
+        self._fastest: tuple[int, int] | None = None
+        """Arrival and stamp of the interval's fastest message [ns]."""
+        self._sampled_ns: int | None = None
+        self._fault = ""
+        """Why the newest message was not used, if not because of `positions`; otherwise empty."""
+
+    @property
+    def fault(self) -> str:
+        """Why the newest message was not used, in words; empty if it was."""
+        return self._fault or self.positions.fault
+
+    def hear(self, payload: bytes, *, now_ns: int) -> None:
+        self.heard += 1
+        positions = self.positions
+        positions.heard_ns = now_ns
+        try:
+            message = messages.odometry(payload)
+        except MessageError as error:
+            self._drop("garbage", f"they are no odometry: {error}")
+            return
+        frames = message.frame, message.child
+        self._frames = self._frames or (frames if all(frames) else None)
+        if frames != self._frames:
+            expected = f"expected {self._frames}" if self._frames else "expected two names"
+            self._drop("frame", f"their frames are {frames}, {expected}")
+            return
+        self._fault = ""
+        self._time(message.stamp_ns, now_ns)
+        taken = positions.taken
+        positions.take_in(message.stamp_ns, *drive.point(message, self._ahead), now_ns=now_ns)
+        if positions.taken > taken:
+            self.newest = message
+
+    def _drop(self, reason: str, fault: str) -> None:
+        self.positions.dropped[reason] += 1
+        self._fault = fault
+
+    def _time(self, stamp_ns: int, now_ns: int) -> None:
+        """Sample the robot's clock with the fastest message of each interval."""
+        if self._sampled_ns is None:
+            self._sampled_ns = now_ns
+        if self._fastest is None or now_ns - stamp_ns < self._fastest[0] - self._fastest[1]:
+            self._fastest = now_ns, stamp_ns
+        interval_ns = INTERVAL_NS if self.clock.is_known else BEGIN_NS
+        if now_ns - self._sampled_ns >= interval_ns:
+            came_ns, fastest_ns = self._fastest
+            asked_ns = self.clock.ask(now_ns=came_ns - ROUND_TRIP_NS)
+            self.clock.hear(fastest_ns, asked_ns, now_ns=came_ns)
+            self._sampled_ns, self._fastest = now_ns, None

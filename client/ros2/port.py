@@ -1,0 +1,199 @@
+"""The connection to a robot as an endpoint: its topics are the peers of the datagrams.
+
+    in   odometry; commands of anybody else; tokens of the graph, with an empty payload for one that
+         is gone
+    out  commands, at each of the pilot's steps; after a landing zeros for ZEROS_NS, then silence
+
+No command is repeated: if the pilot stops, the robot's own time-out acts.
+"""
+
+from collections import deque
+from typing import Any
+
+from skytether.client.positions import Vector
+from skytether.client.ros2 import drive
+from skytether.client.ros2.odometry import OdometryFilter
+from skytether.ros2 import messages
+from skytether.ros2.graph import TOKENS, Node, node_of
+from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS, seconds_to_ns
+from skytether.shared.core.aboard import OdometryDropped, SecondPublisher
+from skytether.shared.core.endpoint import Datagram, Endpoint, by_name
+from skytether.shared.core.line import Line
+from skytether.shared.scenario.schema import Scenario
+from skytether.shared.telemetry.record import Reason
+
+TICK_NS = 100 * MILLISECOND_NS
+"""Interval at which the time is followed while nothing arrives."""
+ZEROS_NS = 500 * MILLISECOND_NS
+"""Time for which zeros are commanded at the end of a flight, before the silence."""
+CLOSES = 3
+"""Number of zeros if the process ends."""
+ZERO = 0.0, 0.0, 0.0
+RIVAL_NS, RIVALS_LEAST = SECOND_NS, 2
+"""Commands of others within this window that count as a second commander; one may be a stray."""
+QUIET_NS = 3 * SECOND_NS
+"""Silence after which a second commander counts as gone."""
+REPORT_NS = 10 * SECOND_NS
+"""Time after which a second commander is reported again."""
+NODES_MAX = 32
+"""Number of other publishers whose names are kept."""
+
+
+class Port(Endpoint):
+    """Connection to one robot."""
+
+    def __init__(self, scenario: Scenario, vehicle: int, line: Line) -> None:
+        super().__init__()
+        keys = self._keys = scenario.ros2
+        self._vehicle, self._step_ns = vehicle, scenario.dt_ns
+        self._silence_ns = seconds_to_ns(keys.silence_s)
+        kind = messages.TWIST_STAMPED if keys.stamped else messages.TWIST
+        self.node = Node(
+            line.host,
+            line.number,
+            keys.domain,
+            f"skytether_{vehicle}",
+            messages.topic(keys.command, kind),
+            messages.topic(keys.odometry, messages.ODOMETRY),
+        )
+        self.odometry = OdometryFilter(scenario, vehicle)
+        self._others: dict[str, str] = {}
+        """Nodes that may publish commands too, by their tokens."""
+        self._rivals_ns: deque[int] = deque(maxlen=RIVALS_LEAST)
+        self._rival_ns: int | None = None
+        """Time of the newest command of a second commander; None without one."""
+        self._reported_ns: int | None = None
+        self._reported_fault = False
+        self._tick_ns = self._zero_ns = 0
+        self._silent_ns: int | None = None
+        """End of the zeros after a landing; None before it."""
+        self._commands = self._rival_commands = 0
+        self.now_ns = 0
+
+    # -- for the vehicle ---------------------------------------------------------------------
+
+    @property
+    def is_down(self) -> bool:
+        """Whether the robot is not, or no longer, commanded."""
+        return not self._commands or (
+            self._silent_ns is not None and self.now_ns >= self._silent_ns
+        )
+
+    @property
+    def is_ready(self) -> bool:
+        return self.odometry.newest is not None and self._is_fresh(self.now_ns)
+
+    @property
+    def waits_for(self) -> str:
+        if self.is_ready:
+            return ""
+        wanted = f"nav_msgs/Odometry on {self._keys.odometry}"
+        if self._is_past(self.odometry.positions.heard_ns, self.now_ns):
+            at = f"{self.node.host}:{self.node.port}"
+            return f"{wanted}, domain {self._keys.domain}, at {at}"
+        return f"usable {wanted}: {self.odometry.fault}"
+
+    def fly(self, velocity: Vector) -> None:
+        if self._silent_ns is None:
+            self._command(velocity)
+
+    def land(self) -> None:
+        if self._silent_ns is None:
+            self._silent_ns, self._zero_ns = self.now_ns + ZEROS_NS, self.now_ns
+
+    def hindrance(self, *, now_ns: int) -> Reason | None:
+        """Second commander → silence → unusable odometry."""
+        self.now_ns = now_ns
+        if self._rival_ns is not None and now_ns - self._rival_ns <= QUIET_NS:
+            return Reason.RIVAL
+        positions = self.odometry.positions
+        if self._is_fresh(now_ns):
+            self._reported_fault = False
+            return None
+        if self._is_past(positions.heard_ns, now_ns):
+            return Reason.MUTE
+        if not self._reported_fault and self.odometry.fault:
+            self._reported_fault = True
+            self._events.append(OdometryDropped(vehicle=self._vehicle, why=self.odometry.fault))
+        return Reason.UNUSABLE
+
+    def _is_fresh(self, now_ns: int) -> bool:
+        return not self._is_past(self.odometry.positions.came_ns, now_ns)
+
+    def _is_past(self, came_ns: int | None, now_ns: int) -> bool:
+        return came_ns is None or now_ns - came_ns > self._silence_ns
+
+    # -- received ----------------------------------------------------------------------------
+
+    def receive(self, datagram: Datagram, *, now_ns: int) -> None:
+        self.now_ns = now_ns
+        payload, (topic, _), _ = datagram
+        if topic == self._keys.odometry:
+            self.odometry.hear(payload, now_ns=now_ns)
+        elif topic == self._keys.command:
+            self._hear_rival(now_ns)
+        elif topic.startswith(TOKENS):
+            self._hear_token(topic, is_gone=not payload)
+
+    def _hear_rival(self, now_ns: int) -> None:
+        self._rival_commands += 1
+        self._rivals_ns.append(now_ns)
+        if len(self._rivals_ns) < RIVALS_LEAST or now_ns - self._rivals_ns[0] > RIVAL_NS:
+            return
+        self._rival_ns = now_ns
+        if self._silent_ns is not None:  # the robot is left to others
+            return
+        if self._reported_ns is None or now_ns - self._reported_ns >= REPORT_NS:
+            self._reported_ns = now_ns
+            nodes, topic = tuple(sorted(set(self._others.values()))), self._keys.command
+            self._events.append(SecondPublisher(vehicle=self._vehicle, topic=topic, nodes=nodes))
+
+    def _hear_token(self, token: str, *, is_gone: bool) -> None:
+        if is_gone:
+            self._others.pop(token, None)
+        elif (node := node_of(token)) and len(self._others) < NODES_MAX:
+            self._others[token] = node
+
+    # -- sent --------------------------------------------------------------------------------
+
+    def wake(self, *, now_ns: int) -> None:
+        self.now_ns = now_ns
+        self._tick_ns = now_ns + TICK_NS
+        if self._silent_ns is not None and self._zero_ns <= now_ns < self._silent_ns:
+            self._zero_ns = now_ns + self._step_ns
+            self._command(ZERO)
+
+    def next_wake_ns(self) -> int:
+        if self._silent_ns is None or self.now_ns >= self._silent_ns:
+            return self._tick_ns
+        return min(self._tick_ns, self._zero_ns)
+
+    def _command(self, velocity: Vector) -> None:
+        newest, keys = self.odometry.newest, self._keys
+        if newest is None:
+            return
+        command = drive.command(velocity, newest, keys.drive, keys.ahead_m)
+        payload = messages.twist(command.linear, command.turn)
+        if keys.stamped:
+            stamp_ns = self.odometry.clock.boot_ns(self.now_ns)
+            payload = messages.twist_stamped(stamp_ns, *command)
+        self._commands += 1
+        self.send(payload, (keys.command, 0))
+
+    def close(self, *, now_ns: int) -> None:
+        """Stop the robot, whatever it does when commands end."""
+        self.now_ns = now_ns
+        if self._commands and not self.is_down:
+            for _ in range(CLOSES):
+                self._command(ZERO)
+
+    def figures(self) -> dict[str, Any]:
+        """Names as those of an autopilot, so that the same metrics show them."""
+        return {
+            "measurements": self.odometry.positions.taken,
+            "heard": self.odometry.heard,
+            "setpoints": self._commands,
+            "dropped": by_name(self.odometry.positions.dropped)
+            | {"for_others": self._rival_commands},
+            "drift_ppm": 1e6 * self.odometry.clock.drift,
+        }

@@ -1,0 +1,122 @@
+"""Names of topics and nodes on a Zenoh network, as rmw_zenoh has them (its docs/design.md).
+
+    topic       <domain>/<topic>/<type>/<type hash>
+    token       @ros2_lv/<domain>/<session>/<node>/<entity>/<kind>/<enclave>/<namespace>/<name>
+                and, of a publisher or a subscriber, /<topic>/<type>/<type hash>/<quality>
+    attachment  sequence number (8 B), time stamp (8 B), 16 (1 B), identity (16 B)
+
+In a token each `/` of a name is `%`; the enclave and the namespace of our nodes are empty. Tokens
+are Zenoh's liveliness tokens: they vanish with their session, and `ros2 topic list` shows whoever
+has one. Numbers are little-endian.
+"""
+
+import struct
+from dataclasses import dataclass
+from hashlib import blake2b
+
+TOKENS = "@ros2_lv"
+IDENTITY_BYTES = 16
+ATTACHMENT = struct.Struct(f"<qqB{IDENTITY_BYTES}s")
+QUALITY = "::,1:,:,:,,"
+"""Quality of service in a token: rmw_zenoh's defaults (reliable, volatile, keep the last), and a
+depth of 1."""
+NODE, PUBLISHER, SUBSCRIBER = "NN", "MP", "MS"
+NAME_AT, PARTS = 8, 13
+"""Index of a node's name in a token, and the number of a publisher's parts."""
+
+
+@dataclass(frozen=True, slots=True)
+class Topic:
+    name: str
+    """Name with its namespace, as in `/cmd_vel`."""
+    kind: str
+    """Type of its messages, as in `geometry_msgs/msg/Twist`."""
+    type_hash: str
+    """Hash of the type's definition (REP 2016), as in `RIHS01_…`."""
+
+    @property
+    def dds_kind(self) -> str:
+        """Type as it is named on the network: `geometry_msgs::msg::dds_::Twist_`."""
+        package, folder, name = self.kind.split("/")
+        return f"{package}::{folder}::dds_::{name}_"
+
+    def key(self, domain: int) -> str:
+        return f"{domain}/{self.name.strip('/')}/{self.dds_kind}/{self.type_hash}"
+
+
+@dataclass(frozen=True, slots=True)
+class Node:
+    """A node of the ROS graph that we put on a Zenoh network."""
+
+    host: str
+    """Host of a Zenoh router or peer that speaks TCP."""
+    port: int
+    domain: int
+    name: str
+    publishes: Topic
+    subscribes: Topic
+
+    def tokens(self, session: str) -> list[str]:
+        """Tokens of the node, its publisher and its subscriber; `session` is Zenoh's identity."""
+        subscriber = self._token(session, 2, SUBSCRIBER, self.subscribes)
+        return [self._token(session, 0, NODE), self.publisher(session), subscriber]
+
+    def publisher(self, session: str) -> str:
+        return self._token(session, 1, PUBLISHER, self.publishes)
+
+    def _token(self, session: str, number: int, kind: str, topic: Topic | None = None) -> str:
+        parts = [TOKENS, str(self.domain), session, "0", str(number), kind, "%", "%", self.name]
+        if topic is not None:
+            parts += [mangled(topic.name), topic.dds_kind, topic.type_hash, QUALITY]
+        return "/".join(parts)
+
+    @property
+    def other_publishers(self) -> str:
+        """Pattern of the tokens of all publishers of the topic that we publish."""
+        topic = mangled(self.publishes.name)
+        return f"{TOKENS}/{self.domain}/*/*/*/{PUBLISHER}/*/*/*/{topic}/**"
+
+
+def mangled(name: str) -> str:
+    return name.replace("/", "%")
+
+
+def node_of(token: str) -> str | None:
+    """Name of the node of a publisher's token, with its namespace; None for any other text."""
+    parts = token.split("/")
+    if len(parts) != PARTS or parts[0] != TOKENS or parts[5] != PUBLISHER:
+        return None
+    namespace, name = (part.replace("%", "/") for part in parts[NAME_AT - 1 : NAME_AT + 1])
+    return f"{namespace.rstrip('/')}/{name}"
+
+
+def identity(token: str) -> bytes:
+    """Identity of a publisher in its attachments: 16 bytes made from its token."""
+    return blake2b(token.encode(), digest_size=IDENTITY_BYTES).digest()
+
+
+def attachment(number: int, stamp_ns: int, publisher: bytes) -> bytes:
+    """Attachment of a message.
+
+    Args:
+        number: sequence number of the message, from 1.
+        stamp_ns: time of sending since 1970 [ns].
+        publisher: `identity` of the publisher.
+    """
+    return ATTACHMENT.pack(number, stamp_ns, IDENTITY_BYTES, publisher)
+
+
+def session_settings(node: Node) -> dict[str, object]:
+    """Settings of a Zenoh session as rmw_zenoh has them: no multicast, and peers find each other
+    by gossip, so that they go on without the router.
+    """
+    host = f"[{node.host}]" if ":" in node.host else node.host
+    return {
+        "mode": "peer",
+        "connect/endpoints": [f"tcp/{host}:{node.port}"],
+        "connect/timeout_ms": -1,
+        "connect/exit_on_failure": False,
+        "listen/endpoints": ["tcp/localhost:0"],  # any free port, for peers on this machine
+        "scouting/multicast/enabled": False,
+        "scouting/gossip/enabled": True,
+    }

@@ -1,0 +1,110 @@
+"""Messages of ROS 2 in CDR: the few types that are used here, by rosbags."""
+
+import math
+from typing import Any, NamedTuple
+
+from rosbags.serde import SerdeError
+from rosbags.typesys.store import Typestore
+from rosbags.typesys.stores.ros2_jazzy import FIELDDEFS
+
+from skytether.ros2.graph import Topic
+from skytether.shared.base.units import SECOND_NS
+
+ODOMETRY = "nav_msgs/msg/Odometry"
+TWIST, TWIST_STAMPED = "geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped"
+PARTS = (
+    "builtin_interfaces/msg/Time",
+    "std_msgs/msg/Header",
+    *(f"geometry_msgs/msg/{name}" for name in ("Point", "Quaternion", "Vector3", "Pose")),
+    *(f"geometry_msgs/msg/{name}" for name in ("PoseWithCovariance", "TwistWithCovariance")),
+)
+STORE = Typestore()
+# Loading only these takes a tenth of the time, and of the memory, of all types of a distribution.
+STORE.register({kind: FIELDDEFS[kind] for kind in (*PARTS, TWIST, TWIST_STAMPED, ODOMETRY)})
+UNIT = 0.01
+"""Largest deviation from 1 of the length of a quaternion."""
+
+Vector = tuple[float, float, float]
+Rotation = tuple[Vector, Vector, Vector]
+"""Matrix by rows, from the axes of a robot to those of its fixed frame; shape (3, 3)."""
+
+
+class MessageError(ValueError):
+    """Bytes are no message of the expected type, or its numbers make no sense."""
+
+
+class Odometry(NamedTuple):
+    stamp_ns: int
+    """Time of measurement by the robot's clock [ns]."""
+    frame: str
+    """Fixed frame of position and rotation."""
+    child: str
+    """Frame of the velocities: that of the robot."""
+    position: Vector
+    """Position of the robot in the fixed frame [m]."""
+    rotation: Rotation
+    velocity: Vector
+    """Velocity in the child frame [m/s]."""
+    turn: Vector
+    """Angular velocity in the child frame [rad/s]."""
+
+
+def topic(name: str, kind: str) -> Topic:
+    return Topic(name, kind, STORE.hash_rihs01(kind))
+
+
+def odometry(payload: bytes) -> Odometry:
+    """Decode nav_msgs/Odometry.
+
+    Raises:
+        MessageError: the bytes are no such message, or its orientation is no rotation.
+    """
+    try:
+        message: Any = STORE.deserialize_cdr(payload, ODOMETRY)
+    except SerdeError as error:
+        raise MessageError(str(error)) from None
+    header, pose, twist = message.header, message.pose.pose, message.twist.twist
+    return Odometry(
+        header.stamp.sec * SECOND_NS + header.stamp.nanosec,
+        header.frame_id,
+        message.child_frame_id,
+        _vector(pose.position),
+        rotation(pose.orientation.w, *_vector(pose.orientation)),
+        _vector(twist.linear),
+        _vector(twist.angular),
+    )
+
+
+def rotation(w: float, x: float, y: float, z: float) -> Rotation:
+    """Rotation of a unit quaternion; raises MessageError for any other one."""
+    if not abs(math.hypot(w, x, y, z) - 1.0) <= UNIT:
+        raise MessageError("the orientation is no unit quaternion")
+    return (
+        (1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)),
+        (2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)),
+        (2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)),
+    )
+
+
+def twist(linear: Vector, turn: float) -> bytes:
+    """Encode geometry_msgs/Twist, with a turn about the vertical axis [rad/s]."""
+    return bytes(STORE.serialize_cdr(_twist(linear, turn), TWIST))
+
+
+def twist_stamped(stamp_ns: int, frame: str, linear: Vector, turn: float) -> bytes:
+    """Encode geometry_msgs/TwistStamped; `stamp_ns` is by the robot's clock."""
+    types: Any = STORE.types
+    stamp = types["builtin_interfaces/msg/Time"](*divmod(max(stamp_ns, 0), SECOND_NS))
+    header = types["std_msgs/msg/Header"](stamp, frame)
+    message = types[TWIST_STAMPED](header, _twist(linear, turn))
+    return bytes(STORE.serialize_cdr(message, TWIST_STAMPED))
+
+
+def _twist(linear: Vector, turn: float) -> Any:
+    types: Any = STORE.types
+    vector = types["geometry_msgs/msg/Vector3"]
+    return types[TWIST](vector(*linear), vector(0.0, 0.0, turn))
+
+
+def _vector(message: Any) -> Vector:
+    return message.x, message.y, message.z

@@ -1,0 +1,77 @@
+"""Messages in CDR, compared with two independent libraries, and hashes with published ones."""
+
+import math
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from rosbags.typesys import Stores, get_typestore
+
+import robot
+from skytether.ros2 import messages
+from skytether.ros2.messages import MessageError
+
+NUMBERS = st.floats(allow_nan=False, width=64)
+PUBLISHED = {
+    messages.ODOMETRY: "3cc97dc7fb7502f8714462c526d369e35b603cfc34d946e3f2eda2766dfec6e0",
+    messages.TWIST: "9c45bf16fe0983d80e3cfe750d6835843d265a9a6c46bd2e609fcddde6fb8d2a",
+    messages.TWIST_STAMPED: "5f0fcd4f81d5d06ad9b4c4c63e3ea51b82d6ae4d0558f1d475229b1121db6f64",
+}
+"""As `ros2 topic info --verbose` prints them."""
+
+
+@pytest.mark.parametrize("kind", PUBLISHED)
+def test_type_hashes_are_the_published_ones(kind: str) -> None:
+    assert messages.topic("/topic", kind).type_hash == f"RIHS01_{PUBLISHED[kind]}"
+
+
+@given(st.integers(0, 2**31 * 10**9 - 1), st.text("abc/_"), st.tuples(*[NUMBERS] * 3), NUMBERS)
+def test_a_stamped_twist_has_the_bytes_of_two_other_libraries(
+    stamp_ns: int, frame: str, linear: tuple[float, float, float], turn: float
+) -> None:
+    payload = messages.twist_stamped(stamp_ns, frame, linear, turn)
+    read = robot.decode(robot.TWIST_STAMPED, payload)
+    assert (read.header.stamp.sec, read.header.stamp.nanosec) == divmod(stamp_ns, 10**9)
+    assert read.header.frame_id == frame
+    assert (read.twist.linear.x, read.twist.linear.y, read.twist.linear.z) == linear
+    assert robot.encode(robot.TWIST_STAMPED, read) == payload
+    store = get_typestore(Stores.LATEST)
+    again = store.deserialize_cdr(payload, robot.TWIST_STAMPED)
+    assert bytes(store.serialize_cdr(again, robot.TWIST_STAMPED)) == payload
+
+
+def test_a_twist_has_the_bytes_of_another_library() -> None:
+    payload = messages.twist((1.0, -2.0, 0.5), 0.25)
+    assert robot.encode(robot.TWIST, robot.decode(robot.TWIST, payload)) == payload
+    assert robot.decode(robot.TWIST, payload).angular.z == 0.25
+
+
+def test_odometry_of_another_library_is_read() -> None:
+    payload = robot.odometry(5 * 10**9 + 7, (1.0, 2.0, math.pi / 2), (0.5, -0.25, 0.1))
+    read = messages.odometry(payload)
+    assert (read.stamp_ns, read.frame, read.child) == (5 * 10**9 + 7, "odom", "base_link")
+    assert (read.position, read.velocity) == ((1.0, 2.0, 0.0), (0.5, -0.25, 0.0))
+    assert read.turn == (0.0, 0.0, 0.1)
+    for row, expected in zip(read.rotation, ((0, -1, 0), (1, 0, 0), (0, 0, 1)), strict=True):
+        assert row == pytest.approx(expected, abs=1e-12)
+
+
+GOOD = robot.odometry(10**9)
+
+
+@given(
+    st.binary(max_size=800)
+    | st.binary(max_size=800).map(b"\0\1\0\0".__add__)
+    | st.builds(
+        lambda at, byte: GOOD[:at] + bytes([byte]) + GOOD[at + 1 :],
+        st.integers(0, 200),
+        st.integers(0, 255),
+    )
+    | st.integers(0, len(GOOD) - 1).map(lambda size: GOOD[:size])
+)
+def test_bytes_that_are_no_odometry_raise_one_error(payload: bytes) -> None:
+    try:
+        messages.odometry(payload)
+    except MessageError:
+        return
+    assert len(payload) >= 700

@@ -1,0 +1,183 @@
+"""A node on an actual Zenoh network on loopback: router, robot, and another publisher."""
+
+import asyncio
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from typing import Any
+
+import pytest
+import zenoh
+
+import robot
+from helpers import Idle
+from robot import CMD_VEL, ODOM, free_port, opened
+from skytether.ros2 import graph, messages
+from skytether.ros2.graph import Node
+from skytether.shared.core.endpoint import Datagram
+from skytether.shell.driver import Shell, new_event_loop
+
+PATIENCE_S = 60.0
+LAST_MPS = 9.0
+"""Last command, sent when the process ends."""
+
+
+class Pilot(Idle):
+    """Endpoint that commands every 20 ms until it is told to end, and keeps what it hears."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.heard: list[tuple[str, bytes]] = []
+        self.sent, self._next_ns, self.is_over = 0, 0, False
+
+    def receive(self, datagram: Datagram, *, now_ns: int) -> None:  # noqa: ARG002
+        assert datagram.socket == 1
+        self.heard.append((datagram.peer[0], datagram.payload))
+
+    def next_wake_ns(self) -> int:
+        return self._next_ns
+
+    def wake(self, *, now_ns: int) -> None:
+        self._next_ns = now_ns + 20_000_000
+        self.sent += 1
+        payload = messages.twist_stamped(now_ns, "base_link", (0.001 * self.sent, 0.0, 0.0), 0.0)
+        self.send(payload, ("/cmd_vel", 0), 1)
+
+    def close(self, *, now_ns: int) -> None:
+        self.send(messages.twist_stamped(now_ns, "", (LAST_MPS, 0.0, 0.0), 0.0), ("/cmd_vel", 0), 1)
+
+    @property
+    def finished(self) -> bool:
+        return self.is_over
+
+
+class Net:
+    """Router and robot beside the node of a `Pilot`."""
+
+    def __init__(self, stack: ExitStack) -> None:
+        self.port = free_port()
+        self.router = opened("router", self.port)
+        stack.callback(self._close_router)
+        self.robot = opened("peer", self.port)
+        stack.callback(self.robot.close)
+        self.commands: list[Any] = []
+        self.tokens: dict[str, bool] = {}
+        self._declared = [
+            self.robot.declare_subscriber(CMD_VEL.key(0), self.commands.append),
+            self.robot.liveliness().declare_subscriber("@ros2_lv/0/**", self._token, history=True),
+        ]
+        self.odometry = self.robot.declare_publisher(ODOM.key(0))
+        self.pilot = Pilot()
+
+    def _token(self, sample: Any) -> None:
+        self.tokens[str(sample.key_expr)] = sample.kind == zenoh.SampleKind.PUT
+
+    def _close_router(self) -> None:
+        if not self.router.is_closed():
+            self.router.close()
+
+    def fly(self, story: Callable[[], Any]) -> None:
+        """Run the node while a coroutine tells what happens meanwhile."""
+
+        async def both() -> None:
+            node = Node("127.0.0.1", self.port, 0, "skytether_1", CMD_VEL, ODOM)
+            shell = Shell(self.pilot, None, line=node)
+            running = asyncio.get_running_loop().create_task(shell.run())
+            try:
+                await asyncio.wait_for(story(), PATIENCE_S)
+            finally:
+                self.pilot.is_over = True
+                await asyncio.wait_for(running, PATIENCE_S)
+
+        with asyncio.Runner(loop_factory=new_event_loop) as runner:
+            runner.run(both())
+
+
+@pytest.fixture
+def net() -> Iterator[Net]:
+    with ExitStack() as stack:
+        yield Net(stack)
+
+
+async def until(so: Callable[[], object]) -> None:
+    while not so():
+        await asyncio.sleep(0.01)
+
+
+def test_commands_and_odometry_pass_and_the_graph_shows_the_node(net: Net) -> None:
+    async def story() -> None:
+        await until(lambda: net.commands and len(net.tokens) == 3)
+        payload = robot.odometry(time.time_ns())
+        while (("/odom", payload)) not in net.pilot.heard:
+            net.odometry.put(payload)
+            await asyncio.sleep(0.05)
+
+    net.fly(story)
+    kinds = sorted(token.split("/")[5] for token in net.tokens)
+    assert kinds == ["MP", "MS", "NN"]
+    first, second = (bytes(each.attachment) for each in net.commands[:2])
+    (number, stamp_ns, size, publisher), after = (
+        graph.ATTACHMENT.unpack(each) for each in (first, second)
+    )
+    (token,) = (each for each in net.tokens if "/MP/" in each)
+    assert (after[0] - number, size, publisher) == (1, 16, graph.identity(token))
+    assert abs(stamp_ns - time.time_ns()) < 120 * 10**9
+    command = robot.decode(robot.TWIST_STAMPED, bytes(net.commands[0].payload))
+    assert command.twist.linear.x == pytest.approx(0.001 * number, abs=0.0011)
+    assert not any(topic == "/cmd_vel" for topic, _ in net.pilot.heard)
+
+
+def test_when_the_node_ends_its_last_command_has_left_and_its_tokens_are_gone(net: Net) -> None:
+    async def story() -> None:
+        await until(lambda: net.commands and len(net.tokens) == 3)
+
+    net.fly(story)
+    ends_s = time.monotonic() + PATIENCE_S
+    while any(net.tokens.values()) and time.monotonic() < ends_s:
+        time.sleep(0.01)
+    assert not any(net.tokens.values())
+    last = robot.decode(robot.TWIST_STAMPED, bytes(net.commands[-1].payload))
+    assert last.twist.linear.x == LAST_MPS
+
+
+def test_the_loss_of_the_router_stops_nothing(net: Net) -> None:
+    async def story() -> None:
+        await until(lambda: net.commands)
+        payload = robot.odometry(time.time_ns())
+        await until(lambda: net.odometry.put(payload) or net.pilot.heard)
+        net.router.close()
+        await asyncio.sleep(0.2)
+        commands, heard = len(net.commands), len(net.pilot.heard)
+        await until(lambda: len(net.commands) > commands + 10)
+        await until(lambda: net.odometry.put(payload) or len(net.pilot.heard) > heard)
+
+    net.fly(story)
+
+
+def test_another_publisher_and_its_node_are_heard(net: Net) -> None:
+    node = Node("127.0.0.1", net.port, 0, "teleop", CMD_VEL, ODOM)
+    with opened("peer", net.port) as other:
+        token = node.publisher(str(other.zid()))
+        alive = other.liveliness().declare_token(token)
+
+        async def story() -> None:
+            await until(lambda: (token, b"1") in net.pilot.heard)
+            while ("/cmd_vel", b"rival") not in net.pilot.heard:
+                other.put(CMD_VEL.key(0), b"rival")
+                await asyncio.sleep(0.05)
+            alive.undeclare()
+            await until(lambda: (token, b"") in net.pilot.heard)
+
+        net.fly(story)
+
+
+def test_the_queue_is_bounded_and_large_messages_are_dropped(net: Net) -> None:
+    async def story() -> None:
+        await until(lambda: net.commands)
+        while ("/odom", b"end") not in net.pilot.heard:
+            net.odometry.put(bytes(1_000_000))
+            net.odometry.put(b"end")
+            await asyncio.sleep(0.05)
+
+    net.fly(story)
+    assert max(len(payload) for _, payload in net.pilot.heard) <= 65_535
