@@ -28,6 +28,7 @@ from skytether.gym import Clocked, Held, Networked, Newest, Player, Queue
 from skytether.gym.players import Row
 from skytether.lab.commands.pool import Flags, study
 from skytether.lab.intervals import interval
+from skytether.shared.base import files
 from skytether.shell import command
 
 Rows = NDArray[np.float64]
@@ -334,7 +335,8 @@ def draw(flights: Sequence[FlownCell], path: Path) -> None:
     for panel in panels[:, 0]:
         panel.set_ylabel("score")
     figure.legend(*panels[0, 0].get_legend_handles_labels(), loc="outside upper center", ncols=5)
-    figure.savefig(path, dpi=110)
+    with files.replacing(path) as file:
+        figure.savefig(file, format=path.suffix[1:], dpi=110)
     plt.close(figure)
 
 

@@ -25,6 +25,7 @@ ROOT = figures.ROOT
 REGISTER = register()
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 NOT_MEASURED = {
+    "README.md: Skytether": "commands",
     "docs/keys.md": "defaults and bounds of keys",
     "docs/failsafe.md": "times that the program waits",
     "docs/fly-a-real-one.md: Install and wire": "versions and bounds",

@@ -364,7 +364,7 @@ def command(*argv: str) -> list[str]:
 
 
 def run(*argv: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(command(*argv), capture_output=True, text=True, timeout=300, check=False)
+    return subprocess.run(command(*argv), capture_output=True, text=True, timeout=800, check=False)
 
 
 def lines(out: Path) -> int:

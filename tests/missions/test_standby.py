@@ -77,8 +77,9 @@ def test_an_adversary_of_two_servers_finds_nothing(seed: int) -> None:
         *(MoveKind.DELAYS, MoveKind.LOSSES, MoveKind.GOALS),
     )
     task = Climb(swaps(seed), kinds, seed, 8)
-    assert min(climb(task).spares_m) > 0.0
-    assert spare_m(task.scenario, climb(task).best) > 0.3
+    climbed = climb(task)
+    assert min(climbed.spares_m) > 0.0
+    assert spare_m(task.scenario, climbed.best) > 0.3
 
 
 def told(row: int, step: int, number: int = 1, motion: Motion | None = None) -> Lead:

@@ -411,8 +411,8 @@ def test_a_trigger_that_cannot_be_made_is_refused_before_a_flight(tmp_path: Path
 
 IMPORTS = "from typing import Annotated\nfrom msgspec import Meta\n"
 ADDS = (
-    "expected @trigger, @scheme, @reference, @vehicle or @impairment on a function or class, "
-    "see docs"
+    "expected @planner, @trigger, @scheme, @reference, @vehicle or @impairment on a function or "
+    "class, see docs"
 )
 OURS = "skytether.shared.scenario.triggers"
 WRONG = {
@@ -802,7 +802,7 @@ def test_a_mistake_of_an_impairment_ends_no_flight(mistake: str, tmp_path: Path)
 
 
 @pytest.mark.long
-@pytest.mark.timeout(400)
+@pytest.mark.timeout(900)
 def test_every_process_of_a_flight_knows_the_plugin(tmp_path: Path) -> None:
     """Over UDP: a trigger's mistake is logged, and both ends know the reference."""
     bad = "@trigger\ndef bad(now):\n    raise RuntimeError('no')\n"
@@ -815,7 +815,7 @@ def test_every_process_of_a_flight_knows_the_plugin(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-@pytest.mark.timeout(400)
+@pytest.mark.timeout(900)
 def test_workers_of_every_kind_know_the_plugin(tmp_path: Path) -> None:
     (tmp_path / "mine.py").write_text(HEAD + SLOPE + NEVER)
     here = f"--workers 2 --plugin mine.py {SHORT}"
@@ -827,7 +827,7 @@ def test_workers_of_every_kind_know_the_plugin(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-@pytest.mark.timeout(400)
+@pytest.mark.timeout(900)
 @pytest.mark.skipif(importlib.util.find_spec("distributed") is None, reason="needs `distributed`")
 def test_a_dask_worker_knows_the_plugin(tmp_path: Path) -> None:
     (tmp_path / "mine.py").write_text(HEAD + NEVER)
