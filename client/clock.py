@@ -1,4 +1,5 @@
-"""The autopilot's clock from TIMESYNC: time since its boot, converted to the client's clock.
+"""The clock of an autopilot or a robot, converted to the client's. For an autopilot it is the time
+since its boot, asked for by TIMESYNC; for a robot see `client.ros2.odometry`.
 
     the client asks at t₁; the answer, at which the autopilot's clock showed b, arrives at t₂:
     offset = (t₁ + t₂) / 2 - b, with an error of at most (t₂ - t₁) / 2

@@ -108,13 +108,17 @@ class Servers:
             self._tell(lead.doubts(heard_ns, now_ns), heard_ns[lead.leader], step, now_ns)
 
     def name(self, server: int, *, now_ns: int) -> None:
-        """Let a server lead."""
+        """Let a server lead, on an operator's order or because the leader has left."""
         self.leadership.hand_over(server)
         self._named_ns = now_ns
         self._report()
 
     def leave(self, server: int, cause: Reason, *, now_ns: int) -> bool:
-        """Whether a cause on the side of a server is none for the vehicle, since another leads."""
+        """Act on a fault of a server, or on its end, by letting another lead.
+
+        Returns:
+            whether another leads; otherwise the failsafe has to act on the cause.
+        """
         if self.sessions[server].leads:
             others = [i for i, each in enumerate(self.sessions) if i != server]
             ready = [i for i in others if not self.sessions[i].is_lost(now_ns)]

@@ -46,7 +46,7 @@ class OdometryFilter:
         """Arrival and stamp of the interval's fastest message [ns]."""
         self._sampled_ns: int | None = None
         self._fault = ""
-        """Why the newest message was not used, if not because of `positions`; otherwise empty."""
+        """What is wrong with the newest message by itself, in words; empty if nothing is."""
 
     @property
     def fault(self) -> str:

@@ -222,7 +222,7 @@ class Remote:
         return self._robots[index].report
 
     def info(self, index: int) -> dict[str, Any]:
-        """What an agent knows, and what happened on the network so far; see docs/gym.md."""
+        """Entries of `info` for the agent of a robot, as docs/gym.md lists them."""
         robot, report = self._robots[index], self._robots[index].report
         age_steps = self.step - report.step
         # Until an answer was acknowledged, the way there is taken to be as long as the way back.
