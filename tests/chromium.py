@@ -27,7 +27,8 @@ FLAGS = (
 SCHEMES: tuple[Literal["dark", "light"], ...] = ("dark", "light")
 SIZES = {"wide": (1400, 900), "narrow": (420, 860)}
 """Width and height of windows [pixels]."""
-PATIENCE_S = 90.0
+PATIENCE_S = 180.0
+"""Time within which a page must do what it is waited for [s]; a picture may take five seconds."""
 SHOWN_S = 25.0
 """Time of flight at which pictures are taken [s]."""
 
@@ -74,6 +75,7 @@ def opened(
 ) -> "Iterator[Page]":
     width, height = SIZES[size]
     page = browser.new_page(viewport={"width": width, "height": height}, color_scheme=prefers)
+    page.set_default_timeout(1000.0 * PATIENCE_S)
     page.goto(address)
     yield page
     page.close()
