@@ -14,8 +14,10 @@ from dataclasses import dataclass, replace
 from typing import Annotated
 
 from skytether.netem.proxy import FLOWS_MAX, Proxy
+from skytether.netem.relay import Relay
 from skytether.shared.core.endpoint import Address
 from skytether.shared.core.events import address_text
+from skytether.shared.core.line import Listen
 from skytether.shared.scenario import reading
 from skytether.shared.telemetry.record import PACKET_COLUMNS
 from skytether.shell import command, process
@@ -48,9 +50,11 @@ class NetemOptions(ProcessOptions):
     path: Annotated[int, Argument(metavar="N")] = 1
     """Path of the scenario to emulate, from 1, see network.paths; one more than there are is that
     to a standby server, impaired like the first."""
+    tcp: bool = False
+    """Relay TCP connections in place of UDP: latency, a rate and cuts, and no packet loss."""
     flows: Annotated[int | None, Argument(metavar="N")] = None
     """Largest number of clients at once, each of which takes a socket; by default 512, or as many
-    as the system allows."""
+    as the system allows. With --tcp there are at most 128 connections, always."""
 
 
 def emulate(argv: Sequence[str]) -> None:
@@ -74,15 +78,14 @@ def emulate(argv: Sequence[str]) -> None:
     _check_server(server, bind)
     name = f"netem {options.path}" if options.path > 1 else "netem"
     with process.begin(name, options, PACKET_COLUMNS, secure=None) as running:
-        endpoint = Proxy(
-            running.scenario,
-            server=server,
-            flows=flows,
-            recorder=running.recorder,
-            path=options.path - 1,
-        )
+        recorder, path = running.recorder, options.path - 1
         waiting_for = f"clients of {options.server}"
-        running.drive(endpoint, bind=bind, peers=[server], waiting_for=waiting_for)
+        if options.tcp:
+            relay = Relay(running.scenario, server=server, recorder=recorder, path=path)
+            running.drive(relay, bind=None, line=Listen(bind, server), waiting_for=waiting_for)
+            return
+        proxy = Proxy(running.scenario, server=server, flows=flows, recorder=recorder, path=path)
+        running.drive(proxy, bind=bind, peers=[server], waiting_for=waiting_for)
 
 
 def _with_directions(options: NetemOptions) -> NetemOptions:

@@ -122,6 +122,9 @@ class Bottleneck(Generic[T]):
             self._count(longest, last, -1)
             self.dropped.append(last.item)
 
+    def has_room(self, size: int) -> bool:
+        return self._served is None or self.waiting_bytes + size <= self._queue.room_bytes
+
     def release(self, *, now_ns: int) -> Iterator[tuple[T, int]]:
         """Packets that have passed by now, each with the time at which it passed [ns]."""
         while self._served is not None and self._done_ns <= now_ns:

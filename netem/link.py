@@ -334,6 +334,11 @@ class Link:
             return passed_ns
         return due_ns
 
+    def has_room(self, size: int) -> bool:
+        """Whether a packet of this size [B] would be dropped by no full queue."""
+        bottleneck = self._bottleneck
+        return not self._is_full(size) and (bottleneck is None or bottleneck.has_room(size))
+
     def depth(self) -> int:
         """Number of packets in queue and bottleneck, without the one being served."""
         waiting = self._bottleneck.waiting if self._bottleneck else 0

@@ -13,6 +13,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from skytether.library.bad_network import bad_network
     from skytether.library.comparing import compare
     from skytether.library.flight import Column, Flight, table
     from skytether.library.flying import check, fly, fly_batch, load
@@ -35,6 +36,7 @@ __all__ = [
     "Summary",
     "Swept",
     "World",
+    "bad_network",
     "check",
     "compare",
     "fly",
@@ -45,6 +47,7 @@ __all__ = [
 ]
 
 _HOMES = {
+    "skytether.library.bad_network": ("bad_network",),
     "skytether.library.comparing": ("compare",),
     "skytether.library.flight": ("Column", "Flight", "table"),
     "skytether.library.flying": ("check", "fly", "fly_batch", "load"),

@@ -18,6 +18,10 @@ from skytether.shared.core.endpoint import Address
 HOST_PORT = "HOST:PORT, or [HOST]:PORT where HOST is an IPv6 address"
 LINE: Address = ("line", 0)
 """Peer at the other end of a TCP or serial line."""
+CLIENT, SERVER = "client", "server"
+"""Ends of a relayed connection; the peers are `(CLIENT, number)` and `(SERVER, number)`."""
+PIECE_BYTES = 1448
+"""Largest piece of a relayed connection [B]: the data of a TCP packet on Ethernet."""
 FORMS = "udp:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or serial:PATH:BAUD"
 
 
@@ -36,6 +40,14 @@ class Line(NamedTuple):
     def peer(self) -> Address | None:
         """Peer at the other end; None if the first sender becomes the peer."""
         return {"udp": None, "udpout": self.address}.get(self.kind, LINE)
+
+
+class Listen(NamedTuple):
+    """TCP connections to relay: where clients connect, and where they are led."""
+
+    bind: Address
+    """Port 0 takes a free one."""
+    server: Address
 
 
 def parse_address(text: str) -> Address | None:

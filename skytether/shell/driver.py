@@ -30,9 +30,10 @@ from skytether.shared.core.events import (
     PathFound,
     PathMissing,
 )
-from skytether.shared.core.line import LINE, Line
+from skytether.shared.core.line import LINE, Line, Listen
 from skytether.shared.core.stopwatch import Stopwatch
 from skytether.shell.batch import BATCH_MAX, DatagramBatch, Segments
+from skytether.shell.connections import Connections
 from skytether.shell.control import Control
 from skytether.shell.feed import Feed
 from skytether.shell.graph import GraphSession
@@ -102,7 +103,7 @@ class Shell:
         forms: forms of the datagrams accepted at the bound sockets; empty accepts all.
         control: control socket for changes of keys in flight.
         feed: socket that sends rows and events to readers.
-        line: connection to an autopilot or a robot, which becomes socket 1.
+        line: connection to an autopilot or a robot, or connections to relay, which become socket 1.
         paths: paths to the endpoint's peers, by the number of their socket. Of several, any may be
             unusable; it is then opened later.
         is_patient: whether to start although the name of a path's peer cannot be resolved yet; the
@@ -122,7 +123,7 @@ class Shell:
         forms: Sequence[Form] = (),
         control: Control | None = None,
         feed: Feed | None = None,
-        line: Line | Node | None = None,
+        line: Line | Node | Listen | None = None,
         *,
         paths: Mapping[int, NetworkPath] = MappingProxyType({}),
         is_patient: bool = False,
@@ -144,7 +145,7 @@ class Shell:
         self._sockets: dict[int, socket] = {}
         self.addresses: dict[int, Address] = {}
         """Addresses of the bound sockets and of the paths' by number."""
-        self._line: ByteStream | GraphSession | None = None
+        self._line: ByteStream | GraphSession | Connections | None = None
         bound = bind if isinstance(bind, list) else [bind] if bind else []
         excused = (AddressError,) if len(paths) > 1 else ()
         with contextlib.ExitStack() as failed:
@@ -197,9 +198,12 @@ class Shell:
         path = self._paths.get(number)
         return path.names if path else self._names
 
-    def _add(self, line: Line | Node) -> None:
+    def _add(self, line: Line | Node | Listen) -> None:
         if isinstance(line, Node):
             self._line = GraphSession(line, self._hear_line)
+        elif isinstance(line, Listen):
+            self._line = Connections(line, self._hear_line, self._hear_refusal)
+            self.addresses[0] = self._line.address
         elif line.kind in ("tcp", "serial"):
             self._line = ByteStream(line, lambda piece: self._hear_line(Datagram(piece, LINE, 1)))
         elif line.kind == "udp":
@@ -214,6 +218,12 @@ class Shell:
         finally:
             self._after()
 
+    def _hear_refusal(self, reason: str) -> None:
+        try:
+            self.endpoint.undelivered(1, reason)
+        finally:
+            self._after()
+
     async def run(self, on_event: Callable[[Event], None] = lambda _: None) -> None:
         self._loop = asyncio.get_running_loop()
         self._done = self._loop.create_future()
@@ -224,7 +234,7 @@ class Shell:
         for number in self._sockets:
             self._listen(number)
         if self._control:
-            self._control.begin(self._loop, self._changed)
+            self._control.begin(self._loop, self.changed)
         if self._feed:
             self._feed.begin(self._loop)
         if self._memory:
@@ -417,7 +427,8 @@ class Shell:
         finally:
             self._after()
 
-    def _changed(self) -> None:
+    def changed(self) -> None:
+        """To be called after the endpoint was changed, by whoever changed it."""
         self._heard_ns = time.monotonic_ns()
         self._after()
 

@@ -26,7 +26,7 @@ from skytether.shared.core.events import (
     Plaintext,
     address_text,
 )
-from skytether.shared.core.line import Line
+from skytether.shared.core.line import Line, Listen
 from skytether.shared.core.stopwatch import Stopwatch
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.schema import Scenario
@@ -143,7 +143,7 @@ class Process:
         forms: Sequence[Form] = (),
         insecure: bool = False,
         stopwatch: Stopwatch | None = None,
-        line: Line | Node | None = None,
+        line: Line | Node | Listen | None = None,
         is_patient: bool = False,
         memory: MemoryFile | None = None,
         ready: Callable[[], None] = lambda: None,

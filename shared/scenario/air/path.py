@@ -5,6 +5,7 @@ impairments act on it, with random numbers of the time at which it entered: dela
 packet lost by one is lost.
 """
 
+from copy import copy
 from functools import lru_cache
 
 from skytether.shared.scenario.air import delays, losses, queues, traces  # noqa: F401 - fills the table
@@ -44,6 +45,15 @@ class Path:
         for each in impairments:
             self.loss += each.loss * (1.0 - self.loss)
         """Mean share of packets that are lost, without the losses of the queue."""
+
+    def for_streams(self) -> "Path":
+        """The same for pieces of byte streams: they stay in order, and its queue drops none."""
+        path = copy(self)
+        path.is_ordered = True
+        if path.queue:
+            path.queue = copy(path.queue)
+            path.queue.drop = "tail"
+        return path
 
 
 def path(text: str, files: Files = ()) -> Path:

@@ -1,0 +1,169 @@
+"""A bad network in front of a server, inside a Python program: `bad_network`."""
+
+import asyncio
+import logging
+import threading
+import time
+from collections.abc import Callable
+from concurrent.futures import Future
+from types import TracebackType
+from typing import Any, Self, TypeVar
+
+from skytether.netem.proxy import Proxy
+from skytether.netem.relay import Relay
+from skytether.shared.core.change import Running
+from skytether.shared.core.endpoint import Address
+from skytether.shared.core.line import Listen
+from skytether.shared.scenario import reading
+from skytether.shell import plugins
+from skytether.shell.driver import Shell, new_event_loop
+
+LOG = logging.getLogger("skytether.netem")
+"""Says what `skytether netem` prints, such as a server that cannot be reached."""
+T = TypeVar("T")
+
+
+class BadNetwork:
+    """Emulated network in front of a UDP or TCP server, for as long as a `with` block lasts.
+
+        with skytether.bad_network("loss(0.1) & constant(0.05)", to=("127.0.0.1", 5000)) as net:
+            client.sendto(b"hello", net.address)
+
+    In a plain `with` block it runs in a thread, in an `async with` block as a task of that loop.
+
+    Args:
+        network: impairments of both directions, as in "constant(50ms) & loss(10%)".
+        to: address of the server.
+        to_server, to_client: impairments of one direction, in place of `network`.
+        seed: seed of all fates: packets sent at the same times meet the same ones.
+        bind: address to listen on; port 0 takes a free one.
+        tcp: whether it relays TCP connections in place of UDP: latency, a rate and cuts, and no
+            packet loss.
+
+    Attributes:
+        address: address that clients send to, in place of the server's.
+
+    Raises:
+        ConfigError: a network is invalid.
+        AddressError: an address cannot be bound, or a name cannot be resolved.
+    """
+
+    def __init__(
+        self,
+        network: str = "none",
+        *,
+        to: Address,
+        to_server: str | None = None,
+        to_client: str | None = None,
+        seed: int = 1,
+        bind: Address = ("127.0.0.1", 0),
+        tcp: bool = False,
+    ) -> None:
+        plugins.load()
+        table = reading.to_table(reading.load_base("transparent")) | {"seed": seed}
+        table["network"] |= _directions(network, to_server, to_client)
+        scenario = reading.check(table, "bad_network", any_network=True)
+        self._endpoint = Relay(scenario, server=to) if tcp else Proxy(scenario, server=to)
+        self._running = Running(self._endpoint, scenario)
+        if tcp:
+            self._shell = Shell(self._endpoint, None, line=Listen(bind, to))
+        else:
+            self._shell = Shell(self._endpoint, bind, [to])
+        self.address: Address = self._shell.address
+        self._thread: threading.Thread | None = None
+        self._loop: asyncio.AbstractEventLoop | None = None
+
+    def set(
+        self,
+        network: str | None = None,
+        *,
+        to_server: str | None = None,
+        to_client: str | None = None,
+    ) -> None:
+        """Change the impairments; packets on their way keep their fate.
+
+        Raises:
+            ConfigError: a network is invalid; nothing was changed.
+        """
+        values = {
+            f"network.{key}": text
+            for key, text in _directions(network, to_server, to_client).items()
+        }
+
+        def change() -> None:
+            self._running.change(values, now_ns=time.monotonic_ns())
+            if self._loop:
+                self._shell.changed()
+
+        self._within(change)
+
+    @property
+    def counts(self) -> dict[str, Any]:
+        """Counters as `skytether netem --json` writes them, with "to_server" and "to_client"."""
+        figures = self._within(self._endpoint.figures)
+        return {_NAMES.get(key, key): value for key, value in figures.items()}
+
+    def __enter__(self) -> Self:
+        began: Future[None] = Future()
+        self._thread = threading.Thread(target=self._drive, args=(began,), daemon=True)
+        self._thread.start()
+        began.result()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        assert self._thread
+        assert self._loop
+        self._loop.call_soon_threadsafe(self._task.cancel)
+        self._thread.join()
+        self._thread = None
+
+    async def __aenter__(self) -> Self:
+        self._begin()
+        return self
+
+    async def __aexit__(
+        self, _: type[BaseException] | None, __: BaseException | None, ___: TracebackType | None
+    ) -> None:
+        self._task.cancel()
+        await asyncio.wait([self._task])
+
+    def _drive(self, began: "Future[None]") -> None:
+        async def run() -> None:
+            self._begin()
+            began.set_result(None)
+            await asyncio.wait([self._task])
+
+        with asyncio.Runner(loop_factory=new_event_loop) as runner:
+            runner.run(run())
+
+    def _begin(self) -> None:
+        self._loop = asyncio.get_running_loop()
+        self._task = self._loop.create_task(self._shell.run(lambda event: LOG.info("%s", event)))
+
+    def _within(self, work: Callable[[], T]) -> T:
+        """What `work` returns, called where the endpoint is driven."""
+        if self._thread is None or self._loop is None:
+            return work()
+        done: Future[T] = Future()
+
+        def call() -> None:
+            try:
+                done.set_result(work())
+            except Exception as error:
+                done.set_exception(error)
+
+        self._loop.call_soon_threadsafe(call)
+        return done.result()
+
+
+bad_network = BadNetwork
+"""Read as a function: `with bad_network(...) as net`."""
+_NAMES = {"uplink": "to_client", "downlink": "to_server"}
+
+
+def _directions(both: str | None, to_server: str | None, to_client: str | None) -> dict[str, str]:
+    texts = {
+        "uplink": both if to_client is None else to_client,
+        "downlink": both if to_server is None else to_server,
+    }
+    return {key: text for key, text in texts.items() if text is not None}

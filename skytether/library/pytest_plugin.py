@@ -1,0 +1,23 @@
+"""Fixture `bad_network` of pytest, by the entry point `pytest11`."""
+
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+import skytether
+
+if TYPE_CHECKING:
+    from skytether.library.bad_network import BadNetwork
+
+
+@pytest.fixture(name="bad_network")
+def _bad_network() -> "Iterator[Callable[..., BadNetwork]]":
+    """Network in front of a server until the test ends; arguments of `skytether.bad_network`."""
+    with ExitStack() as networks:
+
+        def opened(*network: str, **options: Any) -> "BadNetwork":
+            return networks.enter_context(skytether.bad_network(*network, **options))
+
+        yield opened

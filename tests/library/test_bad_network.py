@@ -1,0 +1,178 @@
+"""`skytether.bad_network` and the pytest fixture, with real sockets on loopback."""
+
+import asyncio
+import socket
+import urllib.request
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from threading import Thread
+
+import pytest
+
+import skytether
+from helpers import until
+from skytether.library.bad_network import BadNetwork
+from skytether.shell.connections import CONNECTIONS_MAX
+from skytether.shell.udp import AddressError
+
+pytest_plugins = ["skytether.library.pytest_plugin"]
+
+PATIENCE_S = 60.0
+Opened = Callable[..., BadNetwork]
+
+
+@contextmanager
+def echoing() -> Iterator[tuple[str, int]]:
+    """UDP server that sends back what it gets, until it gets nothing."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as server:
+        server.bind(("127.0.0.1", 0))
+
+        def echo() -> None:
+            while True:
+                datagram, sender = server.recvfrom(2048)
+                if datagram == b"end":
+                    return
+                server.sendto(datagram, sender)
+
+        thread = Thread(target=echo)
+        thread.start()
+        try:
+            yield server.getsockname()
+        finally:
+            server.sendto(b"end", server.getsockname())
+            thread.join()
+
+
+@pytest.fixture
+def client() -> Iterator[socket.socket]:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as made:
+        made.settimeout(PATIENCE_S)
+        yield made
+
+
+@pytest.fixture
+def served(tmp_path: Path) -> Iterator[tuple[str, int]]:
+    """HTTP server of a file of 300 kB."""
+    (tmp_path / "file").write_bytes(bytes(range(250)) * 1200)
+
+    class Quiet(SimpleHTTPRequestHandler):
+        def log_message(self, *_: object) -> None:
+            pass
+
+    class Server(ThreadingHTTPServer):
+        def handle_error(self, *_: object) -> None:
+            """Say nothing of connections that were broken off."""
+
+    with Server(("127.0.0.1", 0), partial(Quiet, directory=str(tmp_path))) as server:
+        Thread(target=server.serve_forever, daemon=True).start()
+        yield ("127.0.0.1", server.server_port)
+        server.shutdown()
+
+
+def fetched(net: BadNetwork) -> bytes:
+    host, port = net.address
+    with urllib.request.urlopen(f"http://{host}:{port}/file", timeout=PATIENCE_S) as answer:
+        return bytes(answer.read())
+
+
+def test_a_udp_client_meets_losses_and_changes(bad_network: Opened, client: socket.socket) -> None:
+    with echoing() as server:
+        net = bad_network(to=server)
+        client.sendto(b"hello", net.address)
+        assert client.recv(2048) == b"hello"
+        net.set(to_client="loss(1)")
+        for _ in range(20):
+            client.sendto(b"lost", net.address)
+        until(lambda: net.counts["to_client"]["lost"] == 20)
+        assert net.counts["to_server"]["lost"] == 0
+        with pytest.raises(skytether.ConfigError, match="expected loss"):
+            net.set("loss(2)")
+        net.set("none")
+        client.sendto(b"again", net.address)
+        assert client.recv(2048) == b"again"
+
+
+def test_seeds_decide_the_fates(client: socket.socket) -> None:
+    def lost(seed: int) -> int:
+        with echoing() as server, skytether.bad_network("loss(0.5)", to=server, seed=seed) as net:
+            for _ in range(64):  # ranks within slots; a stall may shift some to the next slot
+                client.sendto(b"x", net.address)
+            until(lambda: net.counts["to_server"]["packets"] == 64)
+            return int(net.counts["to_server"]["lost"])
+
+    assert 16 < lost(1) < 48
+
+
+def test_an_http_client_is_delayed_slowed_and_cut(
+    bad_network: Opened, served: tuple[str, int]
+) -> None:
+    net = bad_network("constant(0.05) & loss(0.05)", to=served, tcp=True)
+    assert fetched(net) == bytes(range(250)) * 1200
+    assert net.counts["to_client"]["bytes"] > 300_000
+    assert net.counts["to_client"]["lost"] == 0
+    net.set("loss(1)")
+    began: list[bytes] = []
+    thread = Thread(target=lambda: began.append(fetched(net)))
+    thread.start()
+    until(lambda: net.counts["retries"] > 2)
+    assert not began
+    net.set("none")
+    thread.join(PATIENCE_S)
+    assert began == [bytes(range(250)) * 1200]
+    until(lambda: net.counts["flows"] == 0)
+
+
+def test_a_server_that_is_not_there_breaks_the_connection_off(bad_network: Opened) -> None:
+    with socket.socket() as closed:
+        closed.bind(("127.0.0.1", 0))
+        net = bad_network(to=closed.getsockname(), tcp=True)
+        with pytest.raises(OSError, match=r"reset|closed"):
+            fetched(net)
+
+
+def test_a_client_that_breaks_off_is_forgotten(
+    bad_network: Opened, served: tuple[str, int]
+) -> None:
+    net = bad_network("constant(0.01)", to=served, tcp=True)
+    for _ in range(CONNECTIONS_MAX + 20):
+        with socket.create_connection(net.address) as sock:
+            sock.sendall(b"GET /file HTTP/1.0\r\n\r\n")
+            sock.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, b"\1\0\0\0\0\0\0\0")
+    until(lambda: net.counts["flows"] == 0)
+    assert fetched(net) == bytes(range(250)) * 1200
+
+
+def test_it_runs_within_ones_own_loop(client: socket.socket) -> None:
+    client.setblocking(False)
+
+    async def main() -> bytes:
+        loop = asyncio.get_running_loop()
+        with echoing() as server:
+            async with skytether.bad_network("constant(0.01)", to=server) as net:
+                await loop.sock_sendto(client, b"hello", net.address)
+                answer = await asyncio.wait_for(loop.sock_recv(client, 2048), PATIENCE_S)
+                assert net.counts["to_client"]["forwarded"] == 1
+            return answer
+
+    assert asyncio.run(main()) == b"hello"
+
+
+def test_wrong_arguments_are_told() -> None:
+    with pytest.raises(skytether.ConfigError, match=r"network\.uplink"):
+        skytether.bad_network("lost(0.1)", to=("127.0.0.1", 5000))
+    with pytest.raises(skytether.ConfigError, match="seed"):
+        skytether.bad_network(to=("127.0.0.1", 5000), seed=-1)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
+        taken.bind(("127.0.0.1", 0))
+        with pytest.raises(AddressError):
+            skytether.bad_network(to=("127.0.0.1", 5000), bind=taken.getsockname())
+
+
+def test_nothing_is_left_behind(served: tuple[str, int]) -> None:
+    with skytether.bad_network(to=served, tcp=True) as net:
+        assert fetched(net)
+    with suppress(OSError), socket.create_connection(net.address, timeout=1):
+        pytest.fail("it still listens")
