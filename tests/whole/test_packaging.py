@@ -25,6 +25,7 @@ OLD_NAMES = ("shared", "shell", "server", "client", "netem", "sim", "lab", "view
 """Former names of top-level packages, which other distributions may have."""
 LOCKS = sorted((ROOT / "locks").glob("*.lock"))
 README = (ROOT / "README.md").read_text()
+NETEM = (ROOT / "docs" / "netem.md").read_text()
 OTHER_PYTHON = os.environ.get("OTHER_PYTHON", "")
 """Another Python that shall install the wheel and fly, as /usr/bin/python3.13."""
 SOMEBODY_ELSE = "raise SystemExit('somebody else')"
@@ -108,13 +109,16 @@ def interpreter(request: pytest.FixtureRequest) -> str:
     return str(request.param)
 
 
-def installed(extras: str, wheel: Path, interpreter: str, folder: Path) -> Path:
-    """Programs of an environment with the wheel and what its extras ask for, nothing else.
+def installed(
+    extras: str, wheel: Path, interpreter: str, folder: Path, *beside: str | Path
+) -> Path:
+    """Programs of an environment with the wheel, what its extras ask for, and packages `beside`.
 
     As `uvx` and `pipx` make it. Nothing is compiled, and versions are those of the lock file.
     """
     line = ("-m", "uv", "tool", "install", "--no-build", "--python", interpreter)
     what = ("--constraints", ROOT / "locks" / "dev.lock", f"skytether{extras} @ {wheel.as_uri()}")
+    what += tuple(each for package in beside for each in ("--with", package))
     places = {"UV_TOOL_DIR": str(folder), "UV_TOOL_BIN_DIR": str(folder / "bin")}
     done = ran(sys.executable, *line, *what, env=os.environ | places)
     assert done.returncode == 0, done.stderr
@@ -162,6 +166,21 @@ def test_the_bare_wheel_is_a_bad_network_for_any_program(
             finally:
                 netem.send_signal(signal.SIGINT)
     assert netem.returncode == 0
+
+
+@pytest.mark.long
+def test_a_project_with_the_wheel_has_the_fixture(
+    interpreter: str, wheel: Path, tmp_path: Path
+) -> None:
+    """The example of docs/netem.md, as the only file of a project, under pytest."""
+    (example,) = re.findall(r"```python\n(# test_mine.py\n.*?)```", NETEM, re.DOTALL)
+    project = tmp_path / "project"
+    project.mkdir()
+    (project / "test_mine.py").write_text(example)
+    python = installed("", wheel, interpreter, tmp_path, "pytest") / "python"
+    done = ran(python, "-m", "pytest", "-q", env=alone(tmp_path), cwd=project)
+    assert done.returncode == 0, done.stdout
+    assert "2 passed" in done.stdout
 
 
 @pytest.mark.long
