@@ -1,4 +1,4 @@
-"""The log of a process: its events on stdout, as text for an operator or as JSON for a program.
+"""The log of a process: its events on stdout or stderr, as text for an operator or as JSON for a program.
 
 A line of text begins with the local time and the name of the process. Lines wait in a bounded queue
 and are written by a thread, so that logging never blocks the process; if stdout is closed or full,
@@ -58,16 +58,23 @@ class Log:
     Args:
         form: text or JSON.
         beside: called with each event that is logged.
+        to_stderr: whether lines go to stderr instead of stdout.
     """
 
     def __init__(
-        self, process: str, form: LogFormat, beside: Callable[[Event], None] = lambda _: None
+        self,
+        process: str,
+        form: LogFormat,
+        beside: Callable[[Event], None] = lambda _: None,
+        *,
+        to_stderr: bool = False,
     ) -> None:
         self._process = process
         self._form = form
         self._beside = beside
         closed = OSError(errno.EBADF, "the standard output is closed")
-        self._writer = Writer(sys.stdout or closed, room=ROOM_BYTES, together=TOGETHER_BYTES)
+        stream = sys.stderr if to_stderr else sys.stdout
+        self._writer = Writer(stream or closed, room=ROOM_BYTES, together=TOGETHER_BYTES)
         self._limit = Limit()
         self._unread = 0
 

@@ -48,6 +48,7 @@ from skytether.shell.local import LocalError
 from skytether.shell.log import Log, LogFormat
 from skytether.shell.memory import MemoryFile
 from skytether.shell.paths import NetworkPath
+from skytether.shell.program import Program
 from skytether.shell.recording import RecordFile
 from skytether.shell.time_of_day import TimeTeller
 from skytether.shell.udp import AddressError, is_loopback
@@ -143,7 +144,7 @@ class Process:
         forms: Sequence[Form] = (),
         insecure: bool = False,
         stopwatch: Stopwatch | None = None,
-        line: Line | Node | None = None,
+        line: Line | Node | Program | None = None,
         is_patient: bool = False,
         memory: MemoryFile | None = None,
         ready: Callable[[], None] = lambda: None,
@@ -155,7 +156,11 @@ class Process:
             waiting_for: name of the peer whose datagrams the endpoint waits for, for the operator.
             insecure: whether it may run without keys where other machines can reach it.
             ready: called once all checks have passed, before the first datagram is received.
+
+        Of a program's packets: stdout is the program's, so news goes to stderr, and the counters
+        only on request; signals are the program's, too.
         """
+        program = line if isinstance(line, Program) else None
         options, feed, journal = self.options, self.feed, self.journal
         clocks = [TimeTeller(endpoint)] if options.config.link.time_of_day == "host" else []
         running = journal.running(endpoint) if journal else Running(endpoint, options.config)
@@ -218,23 +223,23 @@ class Process:
                 if served:
                     served.take(snapshot)
 
-            with (
-                _told_once() as told,
-                closing(Log(self.name, options.log, feed.say if feed else lambda _: None)) as out,
-            ):
+            beside: Callable[[Event], None] = feed.say if feed else lambda _: None
+            log = Log(self.name, options.log, beside, to_stderr=program is not None)
+            with _told_once() as told, closing(log) as out:
                 run(
                     [shell],
                     on_start=start,
                     on_event=out.hear,
                     on_usr1=lambda: out.say(Counted(figures=figures())),
                     on_second=each_second,
+                    on_signal=program.signal if program else None,
                 )
                 told()
                 if self.recording:
                     self.recording.end()
                 each_second(last=True)
                 last = figures()
-                out.say(Counted(figures=last))
+                (beside if program else out.say)(Counted(figures=last))
                 if options.json:
                     write(options.json, msgspec.json.encode(last))
 
