@@ -11,9 +11,9 @@ from typing import Any, Literal
 
 from skytether.netem.fate import Fates
 from skytether.netem.link import Lane, Link
+from skytether.shared.base.packets import OUTSIDE, PROGRAM, flow_of, too_long
 from skytether.shared.core.endpoint import Datagram, Endpoint
 from skytether.shared.core.events import Fault
-from skytether.shared.base.packets import OUTSIDE, PROGRAM, flow_of, too_long
 from skytether.shared.scenario.catalogue import keys_of
 from skytether.shared.scenario.owners import InFlight
 from skytether.shared.scenario.schema import Scenario

@@ -587,8 +587,9 @@ def run(
         task = asyncio.gather(*(shell.run(on_event) for shell in shells))
         for number in (signal.SIGINT, signal.SIGTERM):
             loop.add_signal_handler(number, task.cancel)
-        for number in ENDING if on_signal else ():
-            loop.add_signal_handler(number, on_signal, number)
+        if on_signal:
+            for number in ENDING:
+                loop.add_signal_handler(number, on_signal, number)
         # A closed loop restores the default action of SIGUSR1, which would end the process.
         signal.signal(signal.SIGUSR1, lambda *_: loop.call_soon_threadsafe(on_usr1))
         loop.set_exception_handler(lambda _, context: on_event(_fault(context)))

@@ -19,8 +19,8 @@ import struct
 import subprocess
 import sys
 import tempfile
-from collections.abc import Sequence
-from contextlib import suppress
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from skytether.shared.base.packets import ADDRESS, ADDRESS6, RESOLVER
@@ -45,7 +45,8 @@ ADMIN = ":/usr/local/sbin:/usr/sbin:/sbin"
 _NEWNS, _NEWUSER, _NEWPID, _NEWNET = 0x00020000, 0x10000000, 0x20000000, 0x40000000
 _TUNSETIFF, _IFF_TUN, _IFF_NO_PI = 0x400454CA, 0x0001, 0x1000
 _MS_BIND, _MS_REC, _MS_PRIVATE = 0x1000, 0x4000, 0x40000
-_PR_SET_PDEATHSIG = 1
+_PR_SET_PDEATHSIG, _PR_CAP_AMBIENT = 1, 47
+_CAPABILITY_VERSION_3, _CAP_NET_ADMIN, _RAISE, _CLEAR_ALL = 0x20080522, 12, 2, 4
 
 _libc = ctypes.CDLL(None, use_errno=True)
 
@@ -123,15 +124,16 @@ def _open_device() -> int:
 
 def _configure(mtu: int) -> None:
     """Bring the device up. Without a link-local address the kernel sends no packet of its own."""
-    _ip(
-        "link set lo up",
-        "link set netem addrgenmode none",
-        f"link set netem mtu {mtu} txqueuelen {QUEUE} up",
-        f"addr add {ADDRESS}/24 dev netem",
-        "route add default dev netem",
-    )
-    with suppress(subprocess.CalledProcessError):  # a kernel without IPv6
-        _ip(f"addr add {ADDRESS6}/64 dev netem nodad", "route add ::/0 dev netem")
+    with _handing_down():
+        _ip(
+            "link set lo up",
+            "link set netem addrgenmode none",
+            f"link set netem mtu {mtu} txqueuelen {QUEUE} up",
+            f"addr add {ADDRESS}/24 dev netem",
+            "route add default dev netem",
+        )
+        with suppress(subprocess.CalledProcessError):  # a kernel without IPv6
+            _ip(f"addr add {ADDRESS6}/64 dev netem nodad", "route add ::/0 dev netem")
     # Here file capabilities have no effect, by which `ping` or a web server would do the same.
     group = os.getegid()
     for name, value in (
@@ -140,6 +142,20 @@ def _configure(mtu: int) -> None:
     ):
         with suppress(OSError):
             Path("/proc/sys/net/ipv4", name).write_text(str(value))
+
+
+@contextmanager
+def _handing_down() -> Iterator[None]:
+    """Let `ip` administer the network, which no program of an ordinary user may by itself."""
+    header, own = struct.pack("Ii", _CAPABILITY_VERSION_3, 0), ctypes.create_string_buffer(24)
+    _call(_libc.capget, header, own)
+    effective, permitted, inheritable, *others = struct.unpack("6I", own.raw)
+    inheritable |= 1 << _CAP_NET_ADMIN
+    _call(_libc.capset, header, struct.pack("6I", effective, permitted, inheritable, *others))
+    _call(_libc.prctl, _PR_CAP_AMBIENT, _RAISE, _CAP_NET_ADMIN, 0, 0)
+    yield
+    _call(_libc.prctl, _PR_CAP_AMBIENT, _CLEAR_ALL, 0, 0, 0)
+    _call(_libc.capset, header, own.raw)
 
 
 def _ip(*lines: str) -> None:
@@ -173,13 +189,13 @@ def _mount() -> None:
         _call(_libc.mount, file.name.encode(), os.fsencode(real), None, _MS_BIND, None)
 
 
-def _run(command: Sequence[str], mask: set[signal.Signals]) -> None:
+def _run(command: Sequence[str], mask: Iterable[int]) -> None:
     """Become the program, with signals as netem found them."""
     for number in (signal.SIGPIPE, signal.SIGXFSZ, signal.SIGUSR1):
         signal.signal(number, signal.SIG_DFL)
     signal.pthread_sigmask(signal.SIG_SETMASK, mask)
     try:
-        os.execvp(command[0], command)
+        os.execvp(command[0], list(command))
     except OSError as error:
         print(f"netem run: {command[0]}: {error.strerror}", file=sys.stderr, flush=True)
         os._exit(127 if isinstance(error, FileNotFoundError) else 126)  # as a shell does
@@ -209,11 +225,11 @@ def _wait(control: socket.socket, program: int) -> None:
             if linger_s <= 0.0:
                 control.send(ALL_ENDED)
         wait_s = LOOK_EVERY_S if not are_left and linger_s > 0.0 else None
-        ready, _, _ = select.select([control, woken], [], [], wait_s)
+        ready, _, _ = select.select([control.fileno(), woken], [], [], wait_s)
         if woken in ready:
             with suppress(BlockingIOError):
                 os.read(woken, 4096)
-        if control in ready:
+        if control.fileno() in ready:
             message = control.recv(1)
             if not message or not is_running:
                 return

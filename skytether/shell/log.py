@@ -1,4 +1,4 @@
-"""The log of a process: its events on stdout or stderr, as text for an operator or as JSON for a program.
+"""The log of a process: its events on stdout, as text for an operator or as JSON for a program.
 
 A line of text begins with the local time and the name of the process. Lines wait in a bounded queue
 and are written by a thread, so that logging never blocks the process; if stdout is closed or full,
@@ -58,7 +58,7 @@ class Log:
     Args:
         form: text or JSON.
         beside: called with each event that is logged.
-        to_stderr: whether lines go to stderr instead of stdout.
+        to_stderr: whether lines go to stderr, since stdout is another program's.
     """
 
     def __init__(
@@ -83,10 +83,10 @@ class Log:
         for admitted in self._limit.admit(event, now_ns=time.monotonic_ns()):
             self.say(admitted)
 
-    def say(self, event: Event) -> None:
+    def say(self, event: Event, *, is_printed: bool = True) -> None:
         """Log an event in one write of whole lines: several workers may share the output."""
         self._beside(event)
-        for line in self._lines(event):
+        for line in self._lines(event) if is_printed else ():
             if not self._writer.write(line):
                 self._unread += 1
 

@@ -133,6 +133,11 @@ class Process:
         """Recorder of a further part of the record, for the feed only; None without a feed."""
         return _followed(Recorder(columns), self.feed, part, columns) if self.feed else None
 
+    def _log(self, line: Line | Node | Program | None) -> Log:
+        beside: Callable[[Event], None] = self.feed.say if self.feed else lambda _: None
+        to_stderr = isinstance(line, Program)
+        return Log(self.name, self.options.log, beside, to_stderr=to_stderr)
+
     def drive(
         self,
         endpoint: Endpoint,
@@ -157,10 +162,9 @@ class Process:
             insecure: whether it may run without keys where other machines can reach it.
             ready: called once all checks have passed, before the first datagram is received.
 
-        Of a program's packets: stdout is the program's, so news goes to stderr, and the counters
-        only on request; signals are the program's, too.
+        If the line is of a program's packets, stdout and signals are the program's: events go to
+        stderr, and the last counters to the feed and the file alone.
         """
-        program = line if isinstance(line, Program) else None
         options, feed, journal = self.options, self.feed, self.journal
         clocks = [TimeTeller(endpoint)] if options.config.link.time_of_day == "host" else []
         running = journal.running(endpoint) if journal else Running(endpoint, options.config)
@@ -223,23 +227,21 @@ class Process:
                 if served:
                     served.take(snapshot)
 
-            beside: Callable[[Event], None] = feed.say if feed else lambda _: None
-            log = Log(self.name, options.log, beside, to_stderr=program is not None)
-            with _told_once() as told, closing(log) as out:
+            with _told_once() as told, closing(self._log(line)) as out:
                 run(
                     [shell],
                     on_start=start,
                     on_event=out.hear,
                     on_usr1=lambda: out.say(Counted(figures=figures())),
                     on_second=each_second,
-                    on_signal=program.signal if program else None,
+                    on_signal=line.signal if isinstance(line, Program) else None,
                 )
                 told()
                 if self.recording:
                     self.recording.end()
                 each_second(last=True)
                 last = figures()
-                (beside if program else out.say)(Counted(figures=last))
+                out.say(Counted(figures=last), is_printed=not isinstance(line, Program))
                 if options.json:
                     write(options.json, msgspec.json.encode(last))
 

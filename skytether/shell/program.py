@@ -28,7 +28,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import IO
 
-from skytether.shared.core.endpoint import Address, Datagram
 from skytether.shared.base.packets import (
     ADDRESS,
     OUTSIDE,
@@ -37,6 +36,7 @@ from skytether.shared.base.packets import (
     framed,
     unframed,
 )
+from skytether.shared.core.endpoint import Address, Datagram
 from skytether.shell import temporary
 from skytether.shell.batch import BATCH_MAX
 from skytether.shell.inside import ADMIN, ALL_ENDED, ENDED, READY, START
