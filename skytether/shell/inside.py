@@ -54,6 +54,7 @@ _libc = ctypes.CDLL(None, use_errno=True)
 def main(argv: Sequence[str]) -> int:
     control, mtu, command = socket.socket(fileno=int(argv[0])), int(argv[1]), argv[2:]
     control.set_inheritable(False)
+    _end_with_parent()
     # Process 1 passes on signals that only netem has received; see `_pass_on`.
     mask = signal.pthread_sigmask(signal.SIG_BLOCK, signal.valid_signals())
     try:
@@ -65,7 +66,7 @@ def main(argv: Sequence[str]) -> int:
         control.close()
         os.waitpid(first, 0)
         return 0
-    _call(_libc.prctl, _PR_SET_PDEATHSIG, signal.SIGKILL)
+    _end_with_parent()
     try:
         device = _open_device()
         _configure(mtu)
@@ -82,6 +83,11 @@ def main(argv: Sequence[str]) -> int:
             _run(command, mask)
         _wait(control, program)
     return 0
+
+
+def _end_with_parent() -> None:
+    """Be killed when the parent ends; a change of credentials makes the kernel forget it."""
+    _call(_libc.prctl, _PR_SET_PDEATHSIG, signal.SIGKILL)
 
 
 def _fail(control: socket.socket, message: str) -> int:
@@ -267,4 +273,5 @@ def _call(function: "ctypes._FuncPointer", *arguments: object) -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    with suppress(ConnectionError):  # netem has ended
+        sys.exit(main(sys.argv[1:]))

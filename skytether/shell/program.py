@@ -123,36 +123,35 @@ def _slirp(mtu: int, exposed: Sequence[Address]) -> Iterator[socket.socket]:
             f"{SLIRP} is missing, the way out of namespaces: install it (apt install {SLIRP}, "
             f"dnf install {SLIRP})"
         )
+    exit_end, exit_held = os.pipe()
     with ExitStack() as stack:
-        folder = stack.enter_context(temporary.folder())
-        said = stack.enter_context((folder / "said").open("w+b"))
-        exit_end, exit_held = os.pipe()
-        ready, ready_end = os.pipe()
-        frames, orders = folder / "frames", folder / "orders"
-        command = [found, "--target-type=bess", "--enable-ipv6", f"--mtu={mtu}"]
-        command += [f"--exit-fd={exit_end}", f"--ready-fd={ready_end}"]
-        command += [f"--api-socket={orders}", str(frames)]
-        slirp = subprocess.Popen(
-            command,
-            pass_fds=(exit_end, ready_end),
-            stdin=subprocess.DEVNULL,
-            stdout=said,
-            stderr=said,
-            start_new_session=True,  # Ctrl-C is for the program
-        )
-        stack.callback(slirp.wait)
-        stack.callback(os.close, exit_held)
-        os.close(exit_end)
-        os.close(ready_end)
         outside = stack.enter_context(socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET))
-        _connect(outside, frames, slirp, said)
-        with os.fdopen(ready, "rb") as started:
-            if not started.read(1):
-                raise _failed(said)
+        with temporary.folder() as folder, (folder / "said").open("w+b") as said:
+            ready, ready_end = os.pipe()
+            frames, orders = folder / "frames", folder / "orders"
+            command = [found, "--target-type=bess", "--enable-ipv6", f"--mtu={mtu}"]
+            command += [f"--exit-fd={exit_end}", f"--ready-fd={ready_end}"]
+            command += [f"--api-socket={orders}", str(frames)]
+            slirp = subprocess.Popen(
+                command,
+                pass_fds=(exit_end, ready_end),
+                stdin=subprocess.DEVNULL,
+                stdout=said,
+                stderr=said,
+                start_new_session=True,  # Ctrl-C is for the program
+            )
+            stack.callback(slirp.wait)
+            stack.callback(os.close, exit_held)
+            os.close(exit_end)
+            os.close(ready_end)
+            _connect(outside, frames, slirp, said)
+            with os.fdopen(ready, "rb") as started:
+                if not started.read(1):
+                    raise _failed(said)
+            for address in exposed:
+                _expose(orders, address)
         _, most = resource.getrlimit(resource.RLIMIT_NOFILE)
         resource.prlimit(slirp.pid, resource.RLIMIT_NOFILE, (most, most))  # a socket a flow
-        for address in exposed:
-            _expose(orders, address)
         for each in announcements():
             outside.send(each)
         outside.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, BUFFER_BYTES)
