@@ -172,7 +172,8 @@ def _end_like(program: Program) -> None:
     if os.WIFSIGNALED(program.status):
         number = os.WTERMSIG(program.status)
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))  # the program has dumped its own
-        signal.signal(number, signal.SIG_DFL)
+        with suppress(OSError):  # SIGKILL always has its own action
+            signal.signal(number, signal.SIG_DFL)
         os.kill(os.getpid(), number)
     raise SystemExit(os.waitstatus_to_exitcode(program.status))
 

@@ -35,6 +35,8 @@ class Fates:
             its slot; what lasts for a time is then common to all flows.
     """
 
+    by_number = False
+
     def __init__(
         self, direction: Path, seed: int, name: str, flow: int, *, by_number: bool = False
     ) -> None:

@@ -40,6 +40,7 @@ from skytether.shared.core.endpoint import Address, Datagram
 from skytether.shell import temporary
 from skytether.shell.batch import BATCH_MAX
 from skytether.shell.inside import ADMIN, ALL_ENDED, ENDED, READY, START
+from skytether.shell.start import PARENT
 from skytether.shell.udp import BUFFER_BYTES
 
 SLIRP = "slirp4netns"
@@ -245,12 +246,10 @@ class ProgramLine:
 
     async def run(self) -> None:
         self._loop = loop = asyncio.get_running_loop()
-        program, parent = self._program, _parent()
+        program, parent = self._program, self._watch_parent()
         loop.add_reader(program.device, self._read_device)
         loop.add_reader(program.outside, self._read_outside)
         loop.add_reader(program.control, self._read_control)
-        if parent is not None:
-            loop.add_reader(parent, self._orphan, parent)
         program.start()
         try:
             await loop.create_future()
@@ -305,16 +304,21 @@ class ProgramLine:
             self._loop.remove_reader(each)
         self._hear(Datagram(b"", OUTSIDE, 1))
 
-    def _orphan(self, parent: int) -> None:
-        self._loop.remove_reader(parent)
+    def _watch_parent(self) -> int | None:
+        """File that is readable once netem's parent has ended; None under `nohup`."""
+        if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN:
+            return None
+        try:
+            parent = os.pidfd_open(PARENT)
+        except (AttributeError, OSError) as error:  # Linux before 5.3, or it has ended
+            if isinstance(error, ProcessLookupError):
+                self._loop.call_soon(self._orphan)
+            return None
+        self._loop.add_reader(parent, self._orphan, parent)
+        return parent
+
+    def _orphan(self, parent: int | None = None) -> None:
+        if parent is not None:
+            self._loop.remove_reader(parent)
         self._program.signal(signal.SIGHUP)
         self._loop.call_later(GRACE_S, self._end, "the process that started it has ended")
-
-
-def _parent() -> int | None:
-    """File that is readable once netem's parent has ended; None under `nohup`."""
-    if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN:
-        return None
-    with suppress(OSError, AttributeError):  # Linux before 5.3
-        return os.pidfd_open(os.getppid())
-    return None
