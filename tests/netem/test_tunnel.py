@@ -1,5 +1,6 @@
 """The network of a program, in virtual time."""
 
+import io
 import struct
 from ipaddress import ip_address
 
@@ -12,7 +13,7 @@ from skytether.shared.base.packets import OUTSIDE, PROGRAM
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
 from skytether.shared.core.endpoint import Address, Datagram
 from skytether.shared.scenario.schema import NetworkConfig, Scenario
-from skytether.shared.telemetry.record import DOWNLINK, PACKET_COLUMNS, Recorder
+from skytether.shared.telemetry.record import DOWNLINK, PACKET_COLUMNS, Recorder, parse
 
 UDP = 17
 
@@ -78,7 +79,8 @@ def fates(
     seed: int, jitter_ns: int, *, concurrent: bool = False
 ) -> list[tuple[int, int, bool, int]]:
     """Flow, number, loss and delay of each packet of a program that sends 300, every 7 ms or so."""
-    recorder = Recorder(PACKET_COLUMNS)
+    sink = io.BytesIO()
+    recorder = Recorder(PACKET_COLUMNS, sink)
     air = "uniform(0.01, 0.2) & loss(0.3)"
     tunnel = make_tunnel(air, air, seed=seed, recorder=recorder)
     rng = np.random.default_rng(jitter_ns)
@@ -88,7 +90,7 @@ def fates(
         if concurrent and rng.random() < 0.5:
             send(tunnel, packet(6000), at_ns=at_ns)
     tunnel.wake(now_ns=10 * SECOND_NS)
-    rows = recorder.rows()
+    rows = parse(sink.getvalue())
     ours = rows[(rows["direction"] == DOWNLINK) & (rows["flow"] == 0)]
     columns = ("flow", "number", "lost", "delay_ns")
     return sorted(tuple(row[name].item() for name in columns) for row in ours)
