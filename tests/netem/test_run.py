@@ -2,6 +2,8 @@
 
 import json
 import os
+import re
+import shlex
 import shutil
 import signal
 import socket
@@ -15,10 +17,11 @@ from functools import cache
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
+from urllib.request import urlopen
 
 import pytest
 
-from helpers import SKYTETHER
+from helpers import SKYTETHER, until
 from robot import free_port
 from skytether.netem.__main__ import emulate_for
 from skytether.shared.base.packets import GATEWAY, GATEWAY6
@@ -80,6 +83,17 @@ def echo(host: str = "127.0.0.1") -> Iterator[int]:
         yield server.getsockname()[1]
         server.sendto(b"end", server.getsockname()[:2])
         thread.join(PATIENCE_S)
+
+
+def documented(words: str) -> list[list[str]]:
+    """Commands of docs/netem.md that contain these words."""
+    text = (Path(__file__).parents[2] / "docs" / "netem.md").read_text()
+    blocks = re.findall(r"```sh\n(.*?)```", text, re.DOTALL)
+    lines = [line for block in blocks for line in block.splitlines() if words in line]
+    names = {"skytether": SKYTETHER, "python": (sys.executable,)}
+    return [
+        [part for word in shlex.split(line) for part in names.get(word, (word,))] for line in lines
+    ]
 
 
 def left(mark: str) -> list[str]:
@@ -248,7 +262,8 @@ class TestNetwork:
                 options = ("--downlink", air, "--seed", str(seed), "--record", str(record))
                 ran(*options, of=python(code, GATEWAY, port))
                 rows = read(record)
-                rows = rows[rows["direction"] == DOWNLINK]
+                # Answers to a closed port get an ICMP error of the kernel, which is another flow.
+                rows = rows[(rows["direction"] == DOWNLINK) & (rows["flow"] == 0)]
                 fates = [rows[name].tolist() for name in ("flow", "number", "lost", "delay_ns")]
                 met.append(sorted(zip(*fates, strict=True)))
         assert len(met[0]) == 300
@@ -348,6 +363,46 @@ class TestNetwork:
             os.wait()"""
         run = ran(of=python(code))
         assert run.stdout.split() == ["b'here'"] * 2, run.stderr
+
+
+@pytest.mark.long
+@needs_namespaces
+class TestDocument:
+    """Commands of docs/netem.md."""
+
+    def test_the_pings_of_the_document(self) -> None:
+        for line in documented("-- ping -c 20"):
+            run = subprocess.run(
+                line, capture_output=True, text=True, timeout=PATIENCE_S, check=False
+            )
+            assert "20 packets transmitted" in run.stdout, run.stderr
+
+    def test_the_server_of_the_document(self, tmp_path: Path) -> None:
+        (line,) = documented("http.server")
+        port = free_port()
+        line = [re.sub("8080", str(port), word) for word in line]
+        with subprocess.Popen(line, cwd=tmp_path, stderr=subprocess.DEVNULL) as run:
+
+            def answer() -> bool:
+                with suppress(OSError), urlopen(f"http://127.0.0.1:{port}/", timeout=5) as page:
+                    return page.status == 200
+                return False
+
+            until(answer)
+            run.terminate()
+
+    def test_the_changes_of_the_document(self, tmp_path: Path) -> None:
+        (line,) = documented("-c 40")
+        (tmp_path / "air").mkdir()
+        with subprocess.Popen(line, cwd=tmp_path, stdout=subprocess.PIPE, text=True) as run:
+            until((tmp_path / "air" / "netem").exists)
+            (change,) = documented("skytether set")
+            subprocess.run(change, cwd=tmp_path, check=True, timeout=PATIENCE_S)
+            assert run.stdout is not None
+            assert "40 packets transmitted" in run.stdout.read()
+        (export,) = documented("skytether export")
+        subprocess.run(export, cwd=tmp_path, check=True, timeout=PATIENCE_S)
+        assert (tmp_path / "tables" / "netem.csv").exists()
 
 
 @pytest.mark.long
