@@ -83,12 +83,16 @@ class Log:
         for admitted in self._limit.admit(event, now_ns=time.monotonic_ns()):
             self.say(admitted)
 
-    def say(self, event: Event, *, is_printed: bool = True) -> None:
+    def say(self, event: Event) -> None:
         """Log an event in one write of whole lines: several workers may share the output."""
         self._beside(event)
-        for line in self._lines(event) if is_printed else ():
+        for line in self._lines(event):
             if not self._writer.write(line):
                 self._unread += 1
+
+    def note(self, event: Event) -> None:
+        """Log an event without printing it."""
+        self._beside(event)
 
     def each_second(self, *, last: bool = False) -> None:
         """Report omitted events; called once a second, and at the end."""

@@ -241,7 +241,7 @@ class Process:
                     self.recording.end()
                 each_second(last=True)
                 last = figures()
-                out.say(Counted(figures=last), is_printed=not isinstance(line, Program))
+                (out.note if isinstance(line, Program) else out.say)(Counted(figures=last))
                 if options.json:
                     write(options.json, msgspec.json.encode(last))
 
