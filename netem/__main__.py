@@ -8,6 +8,9 @@ if __name__ == "__main__":  # called before the slow imports below
     sys.exit(run("skytether.netem.__main__:emulate", "netem"))
 
 import gc
+import os
+import resource
+import signal
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -15,19 +18,24 @@ from typing import Annotated
 
 from skytether.netem.proxy import FLOWS_MAX, Proxy
 from skytether.netem.relay import Relay
+from skytether.netem.tunnel import Tunnel
 from skytether.shared.core.endpoint import Address
 from skytether.shared.core.events import address_text
 from skytether.shared.core.line import Listen
 from skytether.shared.scenario import reading
+from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import PACKET_COLUMNS
 from skytether.shell import command, process
 from skytether.shell.argument import Argument
 from skytether.shell.process import ProcessOptions
+from skytether.shell.program import Program, ProgramError, program
 from skytether.shell.udp import files_max, leads_back, sockets_max
 
 COLLECT_AFTER = 100_000
 """Number of new objects after which garbage is collected. Queued packets are not garbage, and the
 default of 700 would scan all of them many times a second."""
+MTU_MIN, MTU_MAX = 1280, 65_520
+"""Bounds of an MTU: the least that IPv6 allows, and the most that slirp4netns takes [B]."""
 
 
 @dataclass(frozen=True)
@@ -57,6 +65,26 @@ class NetemOptions(ProcessOptions):
     as the system allows. With --tcp there are at most 128 connections, always."""
 
 
+@dataclass(frozen=True)
+class RunOptions(ProcessOptions):
+    """Options of `skytether netem run`."""
+
+    scenario: command.ScenarioName = "transparent"
+    """A scenario's name (see `skytether scenarios`) or a .toml file, for its network and seed."""
+    uplink: str | None = None
+    """Impairments of packets to the program, joined by &, as in "constant(50ms) & loss(10%)", see
+    `skytether impairments`; the key network.uplink of a scenario."""
+    downlink: str | None = None
+    """Impairments of packets from the program; the key network.downlink."""
+    expose: Annotated[tuple[str, ...], Argument(metavar="PORT", append=True)] = ()
+    """Port of this machine, TCP and UDP, that leads to the same port of the program; PORT listens
+    on 127.0.0.1, HOST:PORT elsewhere. May be repeated."""
+    mtu: Annotated[int, Argument(metavar="BYTES")] = 1500
+    """Largest packet of the program's network device, 1280 to 65520 bytes."""
+    path_mtu: Annotated[int | None, Argument(metavar="BYTES")] = None
+    """Largest packet that passes, if smaller: for a longer one the program gets an ICMP error."""
+
+
 def emulate(argv: Sequence[str]) -> None:
     """Delay, reorder and lose datagrams between clients and a server, until SIGINT or SIGTERM.
 
@@ -67,11 +95,17 @@ def emulate(argv: Sequence[str]) -> None:
 
     Without these, packets pass at once. SIGUSR1 prints the counters so far; they are also printed
     at the end. With --control, `skytether set` changes the impairments meanwhile.
+
+    `skytether netem run … -- CMD ARG…` does the same to all packets of one program.
     """
+    if argv[:1] == ["run"]:
+        emulate_for(argv[1:])
+        return
     gc.set_threshold(COLLECT_AFTER)
-    options = _with_directions(
-        command.parse(NetemOptions(), argv, "skytether netem", emulate.__doc__, is_final=False)
+    options = command.parse(
+        NetemOptions(), argv, "skytether netem", emulate.__doc__, is_final=False
     )
+    options = _with_directions(options)
     flows = _flows(options.flows)
     server = command.address("--server", options.server)
     bind = command.address("--bind", options.bind)
@@ -88,6 +122,64 @@ def emulate(argv: Sequence[str]) -> None:
         running.drive(proxy, bind=bind, peers=[server], waiting_for=waiting_for)
 
 
+def emulate_for(argv: Sequence[str]) -> None:
+    """Run a program whose only network is netem; exit code and standard streams are its own.
+
+        skytether netem run --uplink "constant(50ms)" --downlink "constant(50ms) & loss(5%)"
+            --seed 7 -- curl http://10.0.2.2:8000/
+
+    All its packets of IPv4 and IPv6 are impaired, as are those of its children: TCP, UDP, QUIC,
+    ICMP, DNS. It reaches other machines as ever, and this one at 10.0.2.2 and fd00::2. With one
+    seed, the packet with the same number in its flow has the same fate in each run. It needs Linux
+    and slirp4netns, and root or user namespaces.
+
+    SIGUSR1 prints the counters so far to stderr; with --control, `skytether set` changes the
+    impairments meanwhile. All other signals are the program's.
+    """
+    gc.set_threshold(COLLECT_AFTER)
+    end = argv.index("--") if "--" in argv else len(argv)
+    options = command.parse(
+        RunOptions(), argv[:end], "skytether netem run", emulate_for.__doc__, is_final=False
+    )
+    if not argv[end + 1 :]:
+        message = "got no program, expected -- CMD ARG… at the end"
+        raise command.CommandError(message, command.CONFIGURATION)
+    options = replace(options, config=_impaired(options, options.uplink, options.downlink))
+    exposed = [
+        command.address("--expose", text if ":" in text else f"127.0.0.1:{text}")
+        for text in options.expose
+    ]
+    mtu, path_mtu = options.mtu, options.path_mtu
+    if path_mtu is None:
+        path_mtu = mtu
+    for flag, size in (("--mtu", mtu), ("--path-mtu", path_mtu)):
+        if not MTU_MIN <= size <= MTU_MAX:
+            message = f"{flag}: got {size}, expected {MTU_MIN} to {MTU_MAX}"
+            raise command.CommandError(message, command.CONFIGURATION)
+    with process.begin("netem", options, PACKET_COLUMNS, secure=None) as running:
+        try:
+            with program(argv[end + 1 :], mtu=mtu, exposed=exposed) as run_:
+                recorder, mtu = running.recorder, min(mtu, path_mtu)
+                endpoint = Tunnel(running.scenario, mtu=mtu, recorder=recorder)
+                running.drive(endpoint, bind=None, waiting_for="", line=run_)
+        except ProgramError as error:
+            raise command.CommandError(str(error)) from None
+    _end_like(run_)
+
+
+def _end_like(program: Program) -> None:
+    """End this process as the program has ended."""
+    if program.fault or program.status is None:
+        raise command.CommandError(program.fault or "the program was killed with its namespaces")
+    if os.WIFSIGNALED(program.status):
+        number = os.WTERMSIG(program.status)
+        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))  # the program has dumped its own
+        with suppress(OSError):  # SIGKILL always has its own action
+            signal.signal(number, signal.SIG_DFL)
+        os.kill(os.getpid(), number)
+    raise SystemExit(os.waitstatus_to_exitcode(program.status))
+
+
 def _with_directions(options: NetemOptions) -> NetemOptions:
     """Options with the scenario of --path alone, and --to-client and --to-server in its network.
 
@@ -96,11 +188,21 @@ def _with_directions(options: NetemOptions) -> NetemOptions:
         ConfigError: the network is invalid.
     """
     command.check_count("--path", options.path, len(options.config.paths) + 1)
-    table = reading.to_table(options.config.on_path(options.path - 1))
-    directions = {"uplink": options.to_client, "downlink": options.to_server}
+    alone = replace(options, config=options.config.on_path(options.path - 1))
+    return replace(options, config=_impaired(alone, options.to_client, options.to_server))
+
+
+def _impaired(options: command.Options, uplink: str | None, downlink: str | None) -> Scenario:
+    """Scenario of the options with these texts of its two directions, where they are given.
+
+    Raises:
+        ConfigError: the network is invalid.
+    """
+    table = reading.to_table(options.config)
+    directions = {"uplink": uplink, "downlink": downlink}
     table["network"] |= {key: text for key, text in directions.items() if text is not None}
     source = f"{options.scenario} and the command line"
-    return replace(options, config=reading.check(table, source, any_network=True))
+    return reading.check(table, source, any_network=True)
 
 
 def _check_server(server: Address, bind: Address) -> None:

@@ -28,9 +28,21 @@ COPIES_MAX = 100
 
 
 class Fates:
-    def __init__(self, direction: Path, seed: int, name: str, flow: int) -> None:
-        at = seed, name, flow
+    """Fates of the packets of one flow in one direction.
+
+    Args:
+        by_number: whether what is drawn for a packet depends on its number in the flow, and not on
+            its slot; what lasts for a time is then common to all flows.
+    """
+
+    by_number = False
+
+    def __init__(
+        self, direction: Path, seed: int, name: str, flow: int, *, by_number: bool = False
+    ) -> None:
+        at, lasting = (seed, name, flow), (seed, name, 0 if by_number else flow)
         packets = Stream(*at, "packets")
+        self.by_number = by_number
         self._impairments: list[tuple[Impairment, Draws]] = []
         self.fault = ""
         """Traceback of the first error of a plug-in, or empty."""
@@ -44,10 +56,11 @@ class Fates:
             # change when other impairments are added or changed.
             if each.kind != "other" and kinds[each.kind] == 1:
                 moments = "moments" if each.kind == "loss" else "moments of the delay"
-                draws = Draws(packets, int(each.kind == "loss"), (*at, moments))
+                stream, which = packets, int(each.kind == "loss")
             else:
                 own = f"{name_} {names[name_]}"
-                draws = Draws(Stream(*at, own), 0, (*at, f"moments of {own}"))
+                stream, which, moments = Stream(*at, own), 0, f"moments of {own}"
+            draws = Draws(stream, which, (*lasting, moments), by_number=by_number)
             self._impairments.append((each, draws))
             self._guarded |= not IMPAIRMENTS[name_].is_ours
 
@@ -56,7 +69,8 @@ class Fates:
 
         Args:
             slot: time slot in which the packet enters.
-            rank: number of packets of the flow that entered in that slot before it.
+            rank: number of packets of the flow that entered in that slot before it; with
+                `by_number`, in any slot.
         """
         fate = Fate(slot, rank)
         # Built-in impairments are trusted: guarding against a plug-in takes a copy per impairment

@@ -157,7 +157,9 @@ class Queue:
 class Link:
     """Delays, loses and reorders packets of one direction; drops UDP payloads above `mtu` [B].
 
-    `number` is that of the session's path, from 0, in the record.
+    Args:
+        number: number of the session's path, from 0, in the record.
+        header_bytes: size of the headers that the payload is without [B]; 0 for packets of IP.
     """
 
     def __init__(
@@ -167,8 +169,11 @@ class Link:
         recorder: Recorder | None,
         path: Path | None = None,
         number: int = 0,
+        *,
+        header_bytes: int = HEADER_BYTES,
     ) -> None:
         self._direction = direction
+        self._header_bytes = header_bytes
         self._number = number
         self._mtu = mtu
         self._recorder = recorder
@@ -196,7 +201,10 @@ class Link:
         counts, number, size = self.counts, lane.taken, len(datagram.payload)
         slot = (now_ns - lane.began_ns) // SLOT_NS
         # Packets in the same slot have a rank; otherwise they would all have the same fate.
-        lane.rank = lane.rank + 1 if slot == lane.slot else 0
+        if lane.fates.by_number:
+            lane.rank = number
+        else:
+            lane.rank = lane.rank + 1 if slot == lane.slot else 0
         lane.slot = slot
         fate = lane.fates.at(slot, lane.rank)
         lane.taken += 1
@@ -220,7 +228,7 @@ class Link:
             self.counts.overflowed += 1
         else:
             flow = entered.lane.flow
-            bottleneck.accept(entered, size + HEADER_BYTES, flow, now_ns=now_ns)
+            bottleneck.accept(entered, size + self._header_bytes, flow, now_ns=now_ns)
             self._count_dropped(bottleneck)
 
     def _pass(self, now_ns: int) -> None:

@@ -41,7 +41,7 @@ reorders and loses their packets.
   vehicles              vehicle models for vehicle.kind, a sentence each
   keygen FILE           keys for vehicles, so that nobody else can fly them
   server [SCENARIO]     one process by hand: plans for vehicles
-  netem [SCENARIO]      one process by hand: the network
+  netem [SCENARIO]      one process by hand: the network; `netem run` starts a program in it
   client [SCENARIO]     one process by hand: a vehicle
   autopilot [SCENARIO]  one process by hand: an autopilot that speaks MAVLink, simulated
   station [SCENARIO]    one process by hand: a ground station that sends set-points to one

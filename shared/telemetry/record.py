@@ -200,7 +200,7 @@ PACKET_COLUMNS: np.dtype[np.void] = np.dtype(
         ("path", "<u1"),  # number of the session's path, from 0
         ("flow", "<u4"),  # number of the client
         ("number", "<u4"),  # number of the packet in its flow and direction
-        ("bytes", "<u2"),  # UDP payload
+        ("bytes", "<u2"),  # UDP payload; of `netem run` the packet of IP
         ("arrived_ns", "<i8"),  # [netem's clock]
         ("delay_ns", "<i8"),  # as drawn, also for a lost packet
         ("lost", "?"),

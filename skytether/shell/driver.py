@@ -39,6 +39,7 @@ from skytether.shell.feed import Feed
 from skytether.shell.graph import GraphSession
 from skytether.shell.memory import MemoryFile
 from skytether.shell.paths import NetworkPath, PathSockets
+from skytether.shell.program import Program, ProgramLine
 from skytether.shell.stream import ByteStream
 from skytether.shell.timer import make_timer
 from skytether.shell.udp import (
@@ -72,6 +73,9 @@ DATAGRAM_BYTES_MAX = 65535
 RESOLVE_EVERY_S = 2.0
 """Interval at which names are looked up again [s]: a restarted host may have a new address."""
 CHECK_PATHS_EVERY_S = 1.0
+ENDING = (signal.SIGHUP, signal.SIGINT, signal.SIGQUIT, signal.SIGTERM)
+"""Signals by which users and systems end a process."""
+AnyLine = Line | Node | Program | Listen
 Numbers = dict[Address, Address]
 """Numeric addresses by the peers' names."""
 
@@ -103,7 +107,8 @@ class Shell:
         forms: forms of the datagrams accepted at the bound sockets; empty accepts all.
         control: control socket for changes of keys in flight.
         feed: socket that sends rows and events to readers.
-        line: connection to an autopilot or a robot, or connections to relay, which become socket 1.
+        line: connection to an autopilot, a robot, a program's packets or relayed clients, which
+            becomes socket 1.
         paths: paths to the endpoint's peers, by the number of their socket. Of several, any may be
             unusable; it is then opened later.
         is_patient: whether to start although the name of a path's peer cannot be resolved yet; the
@@ -123,7 +128,7 @@ class Shell:
         forms: Sequence[Form] = (),
         control: Control | None = None,
         feed: Feed | None = None,
-        line: Line | Node | Listen | None = None,
+        line: AnyLine | None = None,
         *,
         paths: Mapping[int, NetworkPath] = MappingProxyType({}),
         is_patient: bool = False,
@@ -145,7 +150,7 @@ class Shell:
         self._sockets: dict[int, socket] = {}
         self.addresses: dict[int, Address] = {}
         """Addresses of the bound sockets and of the paths' by number."""
-        self._line: ByteStream | GraphSession | Connections | None = None
+        self._line: ByteStream | GraphSession | ProgramLine | Connections | None = None
         bound = bind if isinstance(bind, list) else [bind] if bind else []
         excused = (AddressError,) if len(paths) > 1 else ()
         with contextlib.ExitStack() as failed:
@@ -198,9 +203,11 @@ class Shell:
         path = self._paths.get(number)
         return path.names if path else self._names
 
-    def _add(self, line: Line | Node | Listen) -> None:
+    def _add(self, line: AnyLine) -> None:
         if isinstance(line, Node):
             self._line = GraphSession(line, self._hear_line)
+        elif isinstance(line, Program):
+            self._line = ProgramLine(line, self._hear_line)
         elif isinstance(line, Listen):
             self._line = Connections(line, self._hear_line, self._hear_refusal)
             self.addresses[0] = self._line.address
@@ -212,9 +219,10 @@ class Shell:
             self._names.add(line.address)
             self._sockets[1] = open_socket(within_reach_of([self._names.number(line.address)]))
 
-    def _hear_line(self, datagram: Datagram) -> None:
+    def _hear_line(self, *datagrams: Datagram) -> None:
         try:
-            self.endpoint.receive(datagram, now_ns=time.monotonic_ns())
+            for datagram in datagrams:
+                self.endpoint.receive(datagram, now_ns=time.monotonic_ns())
         finally:
             self._after()
 
@@ -572,6 +580,7 @@ def run(
     on_event: Callable[[Event], None] = lambda _: None,
     on_usr1: Callable[[], None] = lambda: None,
     on_second: Callable[[], None] = lambda: None,
+    on_signal: Callable[[int], None] | None = None,
 ) -> None:
     """Drive several endpoints in this process until all have finished, or SIGINT or SIGTERM comes.
 
@@ -580,6 +589,7 @@ def run(
         on_event: called with each event of an endpoint, and with each exception of its code.
         on_usr1: called at SIGUSR1.
         on_second: called about once a second.
+        on_signal: called at signals that would end this process, instead of ending it.
     """
     # Imported objects live as long as the process; without `freeze`, collecting them takes 13 ms.
     gc.collect()
@@ -590,6 +600,9 @@ def run(
         task = asyncio.gather(*(shell.run(on_event) for shell in shells))
         for number in (signal.SIGINT, signal.SIGTERM):
             loop.add_signal_handler(number, task.cancel)
+        if on_signal:
+            for number in ENDING:
+                loop.add_signal_handler(number, on_signal, number)
         # A closed loop restores the default action of SIGUSR1, which would end the process.
         signal.signal(signal.SIGUSR1, lambda *_: loop.call_soon_threadsafe(on_usr1))
         loop.set_exception_handler(lambda _, context: on_event(_fault(context)))

@@ -58,16 +58,23 @@ class Log:
     Args:
         form: text or JSON.
         beside: called with each event that is logged.
+        to_stderr: whether lines go to stderr, since stdout is another program's.
     """
 
     def __init__(
-        self, process: str, form: LogFormat, beside: Callable[[Event], None] = lambda _: None
+        self,
+        process: str,
+        form: LogFormat,
+        beside: Callable[[Event], None] = lambda _: None,
+        *,
+        to_stderr: bool = False,
     ) -> None:
         self._process = process
         self._form = form
         self._beside = beside
         closed = OSError(errno.EBADF, "the standard output is closed")
-        self._writer = Writer(sys.stdout or closed, room=ROOM_BYTES, together=TOGETHER_BYTES)
+        stream = sys.stderr if to_stderr else sys.stdout
+        self._writer = Writer(stream or closed, room=ROOM_BYTES, together=TOGETHER_BYTES)
         self._limit = Limit()
         self._unread = 0
 
@@ -82,6 +89,10 @@ class Log:
         for line in self._lines(event):
             if not self._writer.write(line):
                 self._unread += 1
+
+    def note(self, event: Event) -> None:
+        """Log an event without printing it."""
+        self._beside(event)
 
     def each_second(self, *, last: bool = False) -> None:
         """Report omitted events; called once a second, and at the end."""

@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any, BinaryIO, cast
 import msgspec
 import numpy as np
 
-from skytether.ros2.graph import Node
 from skytether.shared.base import files
 from skytether.shared.core.change import Running
 from skytether.shared.core.endpoint import Address, Endpoint, Form
@@ -26,7 +25,6 @@ from skytether.shared.core.events import (
     Plaintext,
     address_text,
 )
-from skytether.shared.core.line import Line, Listen
 from skytether.shared.core.stopwatch import Stopwatch
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.schema import Scenario
@@ -41,13 +39,14 @@ from skytether.shell.command import (
     write,
 )
 from skytether.shell.control import controlled
-from skytether.shell.driver import Shell, run
+from skytether.shell.driver import AnyLine, Shell, run
 from skytether.shell.feed import Feed
 from skytether.shell.journal import Journal, take_up
 from skytether.shell.local import LocalError
 from skytether.shell.log import Log, LogFormat
 from skytether.shell.memory import MemoryFile
 from skytether.shell.paths import NetworkPath
+from skytether.shell.program import Program
 from skytether.shell.recording import RecordFile
 from skytether.shell.time_of_day import TimeTeller
 from skytether.shell.udp import AddressError, is_loopback
@@ -132,6 +131,11 @@ class Process:
         """Recorder of a further part of the record, for the feed only; None without a feed."""
         return _followed(Recorder(columns), self.feed, part, columns) if self.feed else None
 
+    def _log(self, line: AnyLine | None) -> Log:
+        beside: Callable[[Event], None] = self.feed.say if self.feed else lambda _: None
+        to_stderr = isinstance(line, Program)
+        return Log(self.name, self.options.log, beside, to_stderr=to_stderr)
+
     def drive(
         self,
         endpoint: Endpoint,
@@ -143,7 +147,7 @@ class Process:
         forms: Sequence[Form] = (),
         insecure: bool = False,
         stopwatch: Stopwatch | None = None,
-        line: Line | Node | Listen | None = None,
+        line: AnyLine | None = None,
         is_patient: bool = False,
         memory: MemoryFile | None = None,
         ready: Callable[[], None] = lambda: None,
@@ -155,6 +159,9 @@ class Process:
             waiting_for: name of the peer whose datagrams the endpoint waits for, for the operator.
             insecure: whether it may run without keys where other machines can reach it.
             ready: called once all checks have passed, before the first datagram is received.
+
+        If the line is of a program's packets, stdout and signals are the program's: events go to
+        stderr, and the last counters to the feed and the file alone.
         """
         options, feed, journal = self.options, self.feed, self.journal
         clocks = [TimeTeller(endpoint)] if options.config.link.time_of_day == "host" else []
@@ -218,23 +225,21 @@ class Process:
                 if served:
                     served.take(snapshot)
 
-            with (
-                _told_once() as told,
-                closing(Log(self.name, options.log, feed.say if feed else lambda _: None)) as out,
-            ):
+            with _told_once() as told, closing(self._log(line)) as out:
                 run(
                     [shell],
                     on_start=start,
                     on_event=out.hear,
                     on_usr1=lambda: out.say(Counted(figures=figures())),
                     on_second=each_second,
+                    on_signal=line.signal if isinstance(line, Program) else None,
                 )
                 told()
                 if self.recording:
                     self.recording.end()
                 each_second(last=True)
                 last = figures()
-                out.say(Counted(figures=last))
+                (out.note if isinstance(line, Program) else out.say)(Counted(figures=last))
                 if options.json:
                     write(options.json, msgspec.json.encode(last))
 

@@ -12,6 +12,9 @@ import sys
 from collections.abc import Iterator, Sequence
 from importlib import import_module
 
+PARENT = os.getppid()
+"""Process that started this one, asked for before the slow imports: it may end meanwhile."""
+
 
 def run(command: str, prog: str, argv: Sequence[str] | None = None) -> int:
     """Run a command from the start of its process; returns its exit code.

@@ -18,8 +18,6 @@ from skytether.library.bad_network import BadNetwork
 from skytether.shell.connections import CONNECTIONS_MAX
 from skytether.shell.udp import AddressError
 
-pytest_plugins = ["skytether.library.pytest_plugin"]
-
 PATIENCE_S = 60.0
 Opened = Callable[..., BadNetwork]
 

@@ -1,4 +1,6 @@
-"""Netem for any UDP: the examples of docs/network.md, with real programs on loopback."""
+"""Netem for any program: the examples of docs/network.md, and of docs/netem.md those without a
+namespace, with real programs on loopback.
+"""
 
 import re
 import shlex
@@ -14,12 +16,13 @@ from pathlib import Path
 from queue import Empty, Queue
 from threading import Thread
 from typing import Any
+from urllib.request import urlopen
 
 import msgspec
 import numpy as np
 import pytest
 
-from helpers import packaged
+from helpers import packaged, until
 from skytether.__main__ import main
 from skytether.netem.__main__ import NetemOptions, _with_directions
 from skytether.netem.proxy import Proxy
@@ -37,7 +40,11 @@ from skytether.view import traffic
 
 ROOT = Path(__file__).parents[2]
 TEXT = (ROOT / "docs" / "network.md").read_text()
-BLOCKS = [block.splitlines() for block in re.findall(r"```sh\n(.*?)```", TEXT, re.DOTALL)]
+BLOCKS = [
+    block.splitlines()
+    for text in (TEXT, (ROOT / "docs" / "netem.md").read_text())
+    for block in re.findall(r"```sh\n(.*?)```", text, re.DOTALL)
+]
 PATIENCE_S = 60.0
 
 
@@ -112,6 +119,26 @@ def test_two_programs_of_ones_own(tmp_path: Path) -> None:
     assert int(found[2]) >= 50
     assert counted(said, "lost") == (0, int(found[1]))
     assert counted(said, "packets") == (100 - int(found[1]), 100)
+
+
+@pytest.mark.long
+def test_connections_of_tcp_are_relayed(tmp_path: Path) -> None:
+    server, netem, curl = block("--tcp")
+    (tmp_path / "here").touch()
+    url = shlex.split(curl)[-1]
+    with running(server, tmp_path), running(netem, tmp_path, "listening") as relay:
+
+        def came() -> bool:
+            with suppress(OSError), urlopen(url, timeout=PATIENCE_S) as page:
+                return b"here" in page.read()
+            return False
+
+        until(came)
+        said = ended(relay)
+    up, down = counted(said, "forwarded")
+    assert up > 1  # pieces, and an end of each direction
+    assert down > 1
+    assert counted(said, "lost") == (0, 0)
 
 
 @pytest.mark.long

@@ -4,6 +4,10 @@ The fate of a packet depends on the seed, its direction, its flow and the slot o
 it enters, counted from the start of the flow. It does not depend on earlier packets. So two
 controllers are compared on the same network, however often each of them sends. Packets of one flow
 in one slot are numbered by rank.
+
+The network of a program (`netem.tunnel`) is different: two runs of it send the same packets, but
+never in the same milliseconds. There a packet's rank is its number in its flow, and what is drawn
+for it alone depends on that number; what lasts depends on the time, and is common to all flows.
 """
 
 from dataclasses import dataclass
@@ -87,10 +91,14 @@ class Draws:
         packets: stream with a pair of numbers for each packet, shared by two impairments.
         which: index of this impairment's number in the pair, 0 or 1.
         names: names of the stream for `lasting`.
+        by_number: whether a packet's own numbers follow from its rank alone, not from its slot.
     """
 
-    def __init__(self, packets: Stream, which: int, names: tuple[str | int, ...]) -> None:
+    def __init__(
+        self, packets: Stream, which: int, names: tuple[str | int, ...], *, by_number: bool = False
+    ) -> None:
         self._pair, self._which, self._names = packets.pair, which, names
+        self._by_number = by_number
 
     @cached_property
     def _events(self) -> Stream:
@@ -98,7 +106,7 @@ class Draws:
 
     def uniform(self, fate: Fate) -> float:
         """Random number below 1, independent for each packet."""
-        return self._pair(fate.slot, fate.rank)[self._which]
+        return self._pair(0 if self._by_number else fate.slot, fate.rank)[self._which]
 
     def lasting(self, fate: Fate, mean_s: float) -> float:
         """Random number below 1 that is redrawn at the events of a Poisson process.

@@ -1,0 +1,324 @@
+"""A program in namespaces of its own, and the two ends of its network: device and slirp4netns.
+
+    program ── TUN device ── netem ── slirp4netns ── this machine's sockets
+
+slirp4netns makes sockets of this machine from packets, as for a virtual machine: for User Mode
+Linux it takes Ethernet frames at a Unix socket, so that it needs no namespace. It ends with the
+pipe `--exit-fd`, whose other end netem alone holds. See `shell.inside` for the program.
+"""
+
+import asyncio
+import fcntl
+import json
+import os
+import resource
+import select
+import shutil
+import signal
+import socket
+import struct
+import subprocess
+import sys
+import termios
+import time
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO
+
+from skytether.shared.base.packets import (
+    ADDRESS,
+    OUTSIDE,
+    PROGRAM,
+    announcements,
+    framed,
+    unframed,
+)
+from skytether.shared.core.endpoint import Address, Datagram
+from skytether.shell import temporary
+from skytether.shell.batch import BATCH_MAX
+from skytether.shell.inside import ADMIN, ALL_ENDED, ENDED, READY, START
+from skytether.shell.start import PARENT
+from skytether.shell.udp import BUFFER_BYTES
+
+SLIRP = "slirp4netns"
+FRAME_BYTES_MAX = 65_536
+WAITING_MAX = 16_384
+"""Largest number of packets that wait for slirp4netns; further ones are send errors."""
+PATIENCE_S = 30.0
+"""Longest time for slirp4netns to start."""
+GRACE_S = 1.0
+"""Time after SIGHUP at which the program is killed, if netem's parent has ended [s]."""
+FLUSH_S = 1.0
+"""Longest time at the end for slirp4netns to read the last packets [s]."""
+
+
+class ProgramError(Exception):
+    """The program cannot be started, or has lost its network: one line that says why."""
+
+
+@dataclass(slots=True)
+class Program:
+    device: int
+    """The program's TUN device."""
+    outside: socket.socket
+    """Connection to slirp4netns, a frame a packet."""
+    control: socket.socket
+    """Connection to process 1 of the program's namespaces."""
+    status: int | None = None
+    """Status of `os.waitpid`; None until the program has ended."""
+    fault: str = ""
+    """Why the program has lost its network, or empty."""
+
+    def start(self) -> None:
+        self.control.send(START)
+
+    def signal(self, number: int) -> None:
+        """Pass a signal on to the program; if it has ended, end what it left."""
+        with suppress(OSError):
+            self.control.send(bytes([number]))
+
+
+@contextmanager
+def program(command: Sequence[str], *, mtu: int, exposed: Sequence[Address]) -> Iterator[Program]:
+    """Namespaces for a program, which starts with `Program.start` and ends with the block.
+
+    Args:
+        mtu: MTU of its device [B].
+        exposed: addresses on this machine whose TCP and UDP lead to the same port of the program.
+
+    Raises:
+        ProgramError: something is missing, or an address cannot be exposed.
+    """
+    if sys.platform != "linux":
+        raise ProgramError(
+            "needs the namespaces of Linux; elsewhere use `skytether netem --server`"
+        )
+    with ExitStack() as stack:
+        outside = stack.enter_context(_slirp(mtu, exposed))
+        control, inner = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        inner.set_inheritable(True)
+        # With the descriptors that a shell has opened for the program, as in `<(command)`.
+        start = [sys.executable, "-P", "-m", "skytether.shell.inside"]
+        start += [str(inner.fileno()), str(mtu), *command]
+        inside = subprocess.Popen(start, close_fds=False)
+        stack.callback(inside.wait)
+        stack.enter_context(control)
+        inner.close()
+        said, devices, _, _ = socket.recv_fds(control, 4096, 1)
+        if said != READY:
+            raise ProgramError(said.decode(errors="replace") or "its namespaces could not be made")
+        stack.callback(os.close, devices[0])
+        control.setblocking(False)
+        yield Program(devices[0], outside, control)
+
+
+@contextmanager
+def _slirp(mtu: int, exposed: Sequence[Address]) -> Iterator[socket.socket]:
+    """Connection to slirp4netns during the block."""
+    found = shutil.which(SLIRP, path=os.environ.get("PATH", "") + ADMIN)
+    if found is None:
+        raise ProgramError(
+            f"{SLIRP} is missing, the way out of namespaces: install it (apt install {SLIRP}, "
+            f"dnf install {SLIRP})"
+        )
+    exit_end, exit_held = os.pipe()
+    with ExitStack() as stack:
+        outside = stack.enter_context(socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET))
+        with temporary.folder() as folder, (folder / "said").open("w+b") as said:
+            ready, ready_end = os.pipe()
+            frames, orders = folder / "frames", folder / "orders"
+            command = [found, "--target-type=bess", "--enable-ipv6", f"--mtu={mtu}"]
+            command += [f"--exit-fd={exit_end}", f"--ready-fd={ready_end}"]
+            command += [f"--api-socket={orders}", str(frames)]
+            slirp = subprocess.Popen(
+                command,
+                pass_fds=(exit_end, ready_end),
+                stdin=subprocess.DEVNULL,
+                stdout=said,
+                stderr=said,
+                start_new_session=True,  # Ctrl-C is for the program
+            )
+            stack.callback(slirp.wait)
+            stack.callback(os.close, exit_held)
+            os.close(exit_end)
+            os.close(ready_end)
+            _connect(outside, frames, slirp, said)
+            with os.fdopen(ready, "rb") as started:
+                if not started.read(1):
+                    raise _failed(said)
+            for address in exposed:
+                _expose(orders, address)
+        _, most = resource.getrlimit(resource.RLIMIT_NOFILE)
+        resource.prlimit(slirp.pid, resource.RLIMIT_NOFILE, (most, most))  # a socket a flow
+        for each in announcements():
+            outside.send(each)
+        outside.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, BUFFER_BYTES)
+        outside.setblocking(False)
+        yield outside
+        _flush(outside)
+
+
+def _connect(
+    outside: socket.socket, frames: Path, slirp: "subprocess.Popen[bytes]", said: IO[bytes]
+) -> None:
+    until_s = time.monotonic() + PATIENCE_S
+    while slirp.poll() is None and time.monotonic() < until_s:
+        try:
+            outside.connect(str(frames))
+        except (FileNotFoundError, ConnectionRefusedError):
+            time.sleep(0.002)
+        else:
+            return
+    slirp.kill()
+    raise _failed(said)
+
+
+def _failed(said: IO[bytes]) -> ProgramError:
+    said.seek(0)
+    lines = said.read().decode(errors="replace").split("\n")
+    what = next((line for line in lines if "unrecognized" in line), " ".join(lines).strip())
+    return ProgramError(f"{SLIRP} does not start, expected version 1.2 or later: {what}")
+
+
+def _expose(orders: Path, address: Address) -> None:
+    host, port = address
+    for protocol in ("tcp", "udp"):
+        asked = {"proto": protocol, "host_addr": host, "host_port": port}
+        asked |= {"guest_addr": str(ADDRESS), "guest_port": port}
+        with socket.socket(socket.AF_UNIX) as order:
+            order.connect(str(orders))
+            order.send(json.dumps({"execute": "add_hostfwd", "arguments": asked}).encode())
+            order.shutdown(socket.SHUT_WR)
+            answer = json.loads(order.recv(4096) or b"{}")
+        if "return" not in answer:
+            raise ProgramError(f"--expose: {SLIRP} cannot listen on {host}:{port} ({protocol})")
+
+
+def _flush(outside: socket.socket) -> None:
+    """Wait until slirp4netns has read all packets that were sent."""
+    until_s, left = time.monotonic() + FLUSH_S, struct.pack("i", 1)
+    while any(left) and time.monotonic() < until_s:
+        left = fcntl.ioctl(outside, termios.TIOCOUTQ, left)
+        if any(left):
+            time.sleep(0.001)
+
+
+class ProgramLine:
+    """Packets of a program, beside the sockets of a `Shell`.
+
+    Args:
+        hear: called with the packets that have come at once, see `netem.tunnel.Tunnel`.
+    """
+
+    def __init__(self, program: Program, hear: Callable[..., None]) -> None:
+        self._program, self._hear = program, hear
+        self._waiting: deque[bytes] = deque()
+        """Frames that slirp4netns cannot take yet."""
+        self._room = memoryview(bytearray(FRAME_BYTES_MAX))
+
+    def send(self, payload: bytes, peer: Address) -> bool:
+        """Send a packet; False if it is invalid, or too many wait."""
+        try:
+            if peer == PROGRAM:
+                return os.write(self._program.device, payload) == len(payload)
+            frame = framed(payload)
+            if not self._waiting:
+                try:
+                    return self._program.outside.send(frame) > 0
+                except BlockingIOError:
+                    self._loop.add_writer(self._program.outside, self._send_waiting)
+        except OSError:
+            return False
+        if len(self._waiting) >= WAITING_MAX:
+            return False
+        self._waiting.append(frame)
+        return True
+
+    def _send_waiting(self) -> None:
+        with suppress(OSError):
+            while self._waiting:
+                self._program.outside.send(self._waiting[0])
+                self._waiting.popleft()
+            self._loop.remove_writer(self._program.outside)
+
+    async def run(self) -> None:
+        self._loop = loop = asyncio.get_running_loop()
+        program, parent = self._program, self._watch_parent()
+        loop.add_reader(program.device, self._read_device)
+        loop.add_reader(program.outside, self._read_outside)
+        loop.add_reader(program.control, self._read_control)
+        program.start()
+        try:
+            await loop.create_future()
+        finally:
+            self._send_waiting()
+            loop.remove_writer(program.outside)
+            for each in (program.device, program.outside, program.control, parent):
+                if each is not None:
+                    loop.remove_reader(each)
+            if parent is not None:
+                os.close(parent)
+
+    def _read_device(self) -> None:
+        room, packets = self._room, list[Datagram]()
+        with suppress(OSError):
+            while len(packets) < BATCH_MAX:
+                size = os.readv(self._program.device, [room])
+                packets.append(Datagram(room[:size].tobytes(), PROGRAM, 1))
+        self._hear(*packets)
+
+    def _read_outside(self) -> None:
+        room, packets = self._room, list[Datagram]()
+        with suppress(OSError):
+            for _ in range(BATCH_MAX):
+                size = self._program.outside.recv_into(room)
+                if not size:
+                    self._end(f"{SLIRP} has ended: the program has no network any more")
+                    return
+                packet = unframed(room[:size].tobytes())
+                if packet is not None:
+                    packets.append(Datagram(packet, OUTSIDE, 1))
+        self._hear(*packets)
+
+    def _read_control(self) -> None:
+        with suppress(BlockingIOError):
+            message = self._program.control.recv(64)
+            if message.startswith(ENDED):
+                (self._program.status,) = struct.unpack("<i", message[len(ENDED) :])
+            elif message == ALL_ENDED:
+                while self._loop and self._is_more():
+                    self._read_device()
+                self._hear(Datagram(b"", PROGRAM, 1))
+            else:
+                self._end("" if self._program.status is not None else "its namespaces have ended")
+
+    def _is_more(self) -> bool:
+        return bool(select.select([self._program.device], [], [], 0)[0])
+
+    def _end(self, fault: str) -> None:
+        self._program.fault = fault
+        for each in (self._program.outside, self._program.control):
+            self._loop.remove_reader(each)
+        self._hear(Datagram(b"", OUTSIDE, 1))
+
+    def _watch_parent(self) -> int | None:
+        """File that is readable once netem's parent has ended; None under `nohup`."""
+        if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN:
+            return None
+        try:
+            parent = os.pidfd_open(PARENT)
+        except (AttributeError, OSError) as error:  # Linux before 5.3, or it has ended
+            if isinstance(error, ProcessLookupError):
+                self._loop.call_soon(self._orphan)
+            return None
+        self._loop.add_reader(parent, self._orphan, parent)
+        return parent
+
+    def _orphan(self, parent: int | None = None) -> None:
+        if parent is not None:
+            self._loop.remove_reader(parent)
+        self._program.signal(signal.SIGHUP)
+        self._loop.call_later(GRACE_S, self._end, "the process that started it has ended")

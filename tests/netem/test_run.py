@@ -1,0 +1,477 @@
+"""`skytether netem run`: actual programs whose only network is netem."""
+
+import json
+import os
+import re
+import shlex
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from functools import cache
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import Any
+from urllib.request import urlopen
+
+import pytest
+
+from helpers import SKYTETHER, until
+from robot import free_port
+from skytether.netem.__main__ import emulate_for
+from skytether.shared.base.packets import GATEWAY, GATEWAY6
+from skytether.shared.telemetry.record import DOWNLINK, read
+from skytether.shell.command import CommandError
+from skytether.shell.inside import ADMIN
+
+PATIENCE_S = 180.0
+
+
+@cache
+def missing() -> str:
+    """What this machine lacks, or empty."""
+    slirp = shutil.which("slirp4netns", path=os.environ["PATH"] + ADMIN)
+    if slirp is None or not shutil.which("unshare"):
+        return "no slirp4netns"
+    said = subprocess.run([slirp, "--help"], capture_output=True, check=False).stdout
+    if b"--target-type" not in said:
+        return "slirp4netns before 1.2"
+    spaces = ["unshare", "-nmp"] if os.geteuid() == 0 else ["unshare", "-Unmp"]
+    made = subprocess.run([*spaces, "--fork", "true"], capture_output=True, check=False)
+    return "" if made.returncode == 0 and Path("/dev/net/tun").exists() else "no namespaces or TUN"
+
+
+needs_ping = pytest.mark.skipif(shutil.which("ping") is None, reason="no ping here")
+needs_namespaces = pytest.mark.skipif("missing()", reason="no slirp4netns, namespaces or TUN here")
+
+
+def argv(*options: str, of: list[str]) -> list[str]:
+    return [*SKYTETHER, "netem", "run", *options, "--", *of]
+
+
+def ran(*options: str, of: list[str], **more: Any) -> "subprocess.CompletedProcess[str]":
+    command = argv(*options, of=of)
+    return subprocess.run(
+        command, capture_output=True, text=True, timeout=PATIENCE_S, check=False, **more
+    )
+
+
+def python(code: str, *arguments: object) -> list[str]:
+    return [sys.executable, "-uc", code, *map(str, arguments)]
+
+
+@contextmanager
+def echo(host: str = "127.0.0.1") -> Iterator[int]:
+    """Port of a UDP server on this machine that sends back what it hears."""
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    with socket.socket(family, socket.SOCK_DGRAM) as server:
+        server.bind((host, 0))
+
+        def answer() -> None:
+            while True:
+                data, peer = server.recvfrom(65536)
+                if data == b"end":
+                    return
+                server.sendto(data, peer)
+
+        thread = threading.Thread(target=answer, daemon=True)
+        thread.start()
+        yield server.getsockname()[1]
+        server.sendto(b"end", server.getsockname()[:2])
+        thread.join(PATIENCE_S)
+
+
+def documented(words: str) -> list[list[str]]:
+    """Commands of docs/netem.md that contain these words."""
+    text = (Path(__file__).parents[2] / "docs" / "netem.md").read_text()
+    blocks = re.findall(r"```sh\n(.*?)```", text, re.DOTALL)
+    lines = [line for block in blocks for line in block.splitlines() if words in line]
+    names = {"skytether": SKYTETHER, "python": (sys.executable,)}
+    return [
+        [part for word in shlex.split(line) for part in names.get(word, (word,))] for line in lines
+    ]
+
+
+def left(mark: str) -> list[str]:
+    """Processes whose command lines contain a mark."""
+    found = []
+    for each in Path("/proc").glob("[0-9]*/cmdline"):
+        with suppress(OSError):
+            if mark.encode() in (line := each.read_bytes()):
+                found.append(line.decode())
+    return found
+
+
+def gone(mark: str) -> bool:
+    until_s = time.monotonic() + PATIENCE_S
+    while left(mark) and time.monotonic() < until_s:
+        time.sleep(0.05)
+    return not left(mark)
+
+
+def test_without_slirp4netns_one_line_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(shutil, "which", lambda *_, **__: None)
+    with pytest.raises(CommandError, match="slirp4netns is missing"):
+        emulate_for(["--", "true"])
+
+
+@pytest.mark.parametrize(
+    ("line", "wrong"),
+    [
+        ([], "--"),
+        (["--"], "--"),
+        (["--mtu", "1279", "--", "true"], "--mtu"),
+        (["--mtu", "65521", "--", "true"], "--mtu"),
+        (["--path-mtu", "0", "--", "true"], "--path-mtu"),
+        (["--expose", "x", "--", "true"], "--expose"),
+    ],
+)
+def test_an_impossible_request_is_refused(line: list[str], wrong: str) -> None:
+    with pytest.raises(CommandError, match=wrong) as refused:
+        emulate_for(line)
+    assert refused.value.code == 2
+
+
+@pytest.mark.long
+@needs_namespaces
+class TestProgram:
+    def test_streams_folder_and_exit_code_are_the_programs(self, tmp_path: Path) -> None:
+        script = "pwd; cat; echo wrong >&2; exit 7"
+        run = ran(of=["sh", "-c", script], input="given", cwd=tmp_path)
+        assert (run.stdout, run.stderr) == (f"{tmp_path}\ngiven", "wrong\n")
+        assert run.returncode == 7
+
+    def test_it_ends_by_the_signal_that_ended_the_program(self) -> None:
+        for number in (signal.SIGTERM, signal.SIGKILL):
+            run = ran(of=["sh", "-c", f"kill -{number} $$"])
+            assert (run.returncode, run.stderr) == (-number, "")
+
+    def test_a_missing_program_is_reported_as_by_a_shell(self) -> None:
+        run = ran(of=["no-such-program"])
+        assert run.returncode == 127
+        assert run.stderr.count("\n") == 1
+        assert "no-such-program" in run.stderr
+
+    def test_a_child_that_outlives_the_program_keeps_its_network(self) -> None:
+        code = """if 1:
+            import os, socket, sys, time
+            if os.fork():
+                sys.exit(3)
+            time.sleep(1)
+            client = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+            client.settimeout(120)
+            client.connect((sys.argv[1], int(sys.argv[2])))
+            client.send(b"late")
+            print(client.recv(100))"""
+        with echo() as port:
+            run = ran(of=python(code, GATEWAY, port))
+        assert (run.stdout, run.returncode) == ("b'late'\n", 3)
+
+    def test_a_signal_reaches_the_program_once(self) -> None:
+        code = """if 1:
+            import signal, sys
+            for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+                signal.signal(number, lambda number, _: print(number))
+            print("up")
+            while True:
+                signal.pause()"""
+        with subprocess.Popen(
+            argv(of=python(code)), stdout=subprocess.PIPE, text=True, start_new_session=True
+        ) as run:
+            assert run.stdout is not None
+            assert run.stdout.readline() == "up\n"
+            for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+                run.send_signal(number)  # as by kill
+                assert run.stdout.readline() == f"{number}\n"
+                os.killpg(run.pid, number)  # as by a terminal
+                assert run.stdout.readline() == f"{number}\n"
+            run.kill()
+            assert run.stdout.read() == ""
+
+    def test_the_kernel_sends_nothing_by_itself(self, tmp_path: Path) -> None:
+        ran("--json", str(tmp_path / "counted"), of=["sleep", "2"])
+        counted = json.loads((tmp_path / "counted").read_bytes())
+        assert counted["uplink"]["packets"] == counted["downlink"]["packets"] == 0
+
+
+@pytest.mark.long
+@needs_namespaces
+class TestNetwork:
+    @pytest.mark.parametrize("hosts", [("127.0.0.1", GATEWAY), ("::1", GATEWAY6)])
+    def test_datagrams_of_all_sizes_come_back(self, hosts: tuple[str, object]) -> None:
+        host, seen_as = hosts
+        # slirp4netns does not put fragments of IPv6 together
+        sizes = (0, 1, 1400) if ":" in host else (0, 1, 1472, 1473, 9000)
+        code = """if 1:
+            import socket, sys
+            host, port, *sizes = sys.argv[1:]
+            family = socket.AF_INET6 if ":" in host else socket.AF_INET
+            client = socket.socket(family, socket.SOCK_DGRAM)
+            client.settimeout(120)
+            client.connect((host, int(port)))
+            for size in map(int, sizes):
+                client.send(b"x" * size)
+                print(len(client.recv(65536)))"""
+        try:
+            with echo(host) as port:
+                run = ran(of=python(code, seen_as, port, *sizes))
+        except OSError:
+            pytest.skip("no IPv6 loopback")
+        assert run.stdout.split() == [str(size) for size in sizes], run.stderr
+
+    def test_a_file_comes_over_http_as_it_is(self, tmp_path: Path) -> None:
+        content = os.urandom(300_000)
+
+        class Page(BaseHTTPRequestHandler):
+            def do_GET(self) -> None:
+                self.send_response(200)
+                self.end_headers()
+                self.wfile.write(content)
+
+            def log_message(self, *_: object) -> None: ...
+
+        code = """if 1:
+            import sys, urllib.request
+            with urllib.request.urlopen(sys.argv[1], timeout=120) as page:
+                open(sys.argv[2], "wb").write(page.read())"""
+        with ThreadingHTTPServer(("127.0.0.1", 0), Page) as server:
+            threading.Thread(target=server.serve_forever, daemon=True).start()
+            url = f"http://{GATEWAY}:{server.server_port}/"
+            air = "constant(0.02) & loss(0.02)"
+            run = ran("--uplink", air, "--downlink", air, of=python(code, url, tmp_path / "came"))
+            server.shutdown()
+        assert run.returncode == 0, run.stderr
+        assert (tmp_path / "came").read_bytes() == content
+
+    def test_a_program_that_sends_alike_meets_the_same_fates(self, tmp_path: Path) -> None:
+        code = """if 1:
+            import socket, sys, time
+            client = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+            for number in range(300):
+                client.sendto(b"%d" % number, (sys.argv[1], int(sys.argv[2])))
+                time.sleep(0.002)"""
+        air = "uniform(0, 0.02) & loss(0.3)"
+        met = []
+        with echo() as port:
+            for run, seed in enumerate((7, 7, 8)):
+                record = tmp_path / str(run)
+                options = ("--downlink", air, "--seed", str(seed), "--record", str(record))
+                ran(*options, of=python(code, GATEWAY, port))
+                rows = read(record)
+                # Answers to a closed port get an ICMP error of the kernel, which is another flow.
+                rows = rows[(rows["direction"] == DOWNLINK) & (rows["flow"] == 0)]
+                fates = [rows[name].tolist() for name in ("flow", "number", "lost", "delay_ns")]
+                met.append(sorted(zip(*fates, strict=True)))
+        assert len(met[0]) == 300
+        assert met[0] == met[1] != met[2]
+        lost = sum(fate[2] for fate in met[0])
+        assert 55 <= lost <= 127  # 0.3 of 300, four standard deviations
+
+    def test_the_network_changes_while_the_program_runs(self, tmp_path: Path) -> None:
+        code = """if 1:
+            import socket, sys
+            client = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+            client.settimeout(0.2)
+            client.connect((sys.argv[1], int(sys.argv[2])))
+            print("up")
+            for _ in range(600):
+                client.send(b"?")
+                try:
+                    sys.exit(client.recv(100) != b"?")
+                except TimeoutError:
+                    pass
+            sys.exit("no answer")"""
+        control = tmp_path / "control"
+        with echo() as port:
+            line = argv(
+                *("--downlink", "loss(1)", "--control", str(control)),
+                of=python(code, GATEWAY, port),
+            )
+            with subprocess.Popen(line, stdout=subprocess.PIPE, text=True) as run:
+                assert run.stdout is not None
+                assert run.stdout.readline() == "up\n"
+                change = [*SKYTETHER, "set", str(control), "network.downlink=none"]
+                subprocess.run(change, check=True, timeout=PATIENCE_S, capture_output=True)
+                assert run.wait(PATIENCE_S) == 0
+
+    def test_the_outside_reaches_a_server_at_an_exposed_port(self) -> None:
+        code = """if 1:
+            import socket, sys
+            with socket.create_server(("", int(sys.argv[1]))) as server:
+                print("up")
+                connection, _ = server.accept()
+                connection.sendall(connection.recv(100).upper())"""
+        port = free_port()
+        line = argv("--expose", str(port), of=python(code, port))
+        with subprocess.Popen(line, stdout=subprocess.PIPE, text=True) as run:
+            assert run.stdout is not None
+            assert run.stdout.readline() == "up\n"
+            with socket.create_connection(("127.0.0.1", port), timeout=PATIENCE_S) as client:
+                client.sendall(b"hello")
+                assert client.recv(100) == b"HELLO"
+            assert run.wait(PATIENCE_S) == 0
+
+    def test_a_packet_too_long_for_the_path_is_an_error_of_the_program(self) -> None:
+        code = """if 1:
+            import errno, socket, sys
+            client = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+            client.settimeout(120)
+            client.connect((sys.argv[1], int(sys.argv[2])))
+            client.setsockopt(socket.IPPROTO_IP, 10, 2)  # IP_MTU_DISCOVER: do not fragment
+            try:
+                client.send(bytes(1400))
+                client.recv(2000)
+            except OSError as error:
+                print(errno.errorcode[error.errno])
+            print(client.getsockopt(socket.IPPROTO_IP, 14))  # IP_MTU"""
+        with echo() as port:
+            run = ran("--path-mtu", "1300", of=python(code, GATEWAY, port))
+        assert run.stdout.split() == ["EMSGSIZE", "1300"], run.stderr
+
+    def test_what_a_program_sent_last_still_arrives(self) -> None:
+        code = """if 1:
+            import socket, sys
+            socket.socket(socket.AF_INET, socket.SOCK_DGRAM).sendto(
+                b"bye", (sys.argv[1], int(sys.argv[2])))"""
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as server:
+            server.bind(("127.0.0.1", 0))
+            server.settimeout(PATIENCE_S)
+            ran("--downlink", "constant(0.5)", of=python(code, GATEWAY, server.getsockname()[1]))
+            assert server.recv(100) == b"bye"
+
+    def test_programs_find_each_other_by_multicast(self) -> None:
+        code = """if 1:
+            import os, socket, struct
+            def member():
+                heard = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+                heard.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+                heard.bind(("", 7400))
+                group = struct.pack("4s4x", socket.inet_aton("239.255.0.1"))
+                heard.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, group)
+                heard.settimeout(120)
+                return heard
+            one, other = member(), member()
+            if not os.fork():
+                print(other.recv(100))
+                os._exit(0)
+            socket.socket(socket.AF_INET, socket.SOCK_DGRAM).sendto(b"here", ("239.255.0.1", 7400))
+            print(one.recv(100))
+            os.wait()"""
+        run = ran(of=python(code))
+        assert run.stdout.split() == ["b'here'"] * 2, run.stderr
+
+
+@pytest.mark.long
+@needs_namespaces
+class TestDocument:
+    """Commands of docs/netem.md."""
+
+    @needs_ping
+    def test_the_pings_of_the_document(self) -> None:
+        for line in documented("-- ping -c 20"):
+            run = subprocess.run(
+                line, capture_output=True, text=True, timeout=PATIENCE_S, check=False
+            )
+            assert "20 packets transmitted" in run.stdout, run.stderr
+
+    def test_the_server_of_the_document(self, tmp_path: Path) -> None:
+        (line,) = documented("--expose 8080")
+        port = free_port()
+        line = [re.sub("8080", str(port), word) for word in line]
+        with subprocess.Popen(line, cwd=tmp_path, stderr=subprocess.DEVNULL) as run:
+
+            def answer() -> bool:
+                with suppress(OSError), urlopen(f"http://127.0.0.1:{port}/", timeout=5) as page:
+                    return page.status == 200
+                return False
+
+            until(answer)
+            run.terminate()
+
+    @needs_ping
+    def test_the_changes_of_the_document(self, tmp_path: Path) -> None:
+        (line,) = documented("-c 40")
+        (tmp_path / "air").mkdir()
+        with subprocess.Popen(line, cwd=tmp_path, stdout=subprocess.PIPE, text=True) as run:
+            until((tmp_path / "air" / "netem").exists)
+            (change,) = documented("skytether set")
+            subprocess.run(change, cwd=tmp_path, check=True, timeout=PATIENCE_S)
+            assert run.stdout is not None
+            assert "40 packets transmitted" in run.stdout.read()
+        (export,) = documented("skytether export")
+        subprocess.run(export, cwd=tmp_path, check=True, timeout=PATIENCE_S)
+        assert (tmp_path / "tables" / "netem.csv").exists()
+
+
+@pytest.mark.long
+@needs_namespaces
+class TestEnd:
+    """Whatever is killed, no process is left, and so no namespace and no device."""
+
+    @contextmanager
+    def running(self, mark: str) -> Iterator["subprocess.Popen[str]"]:
+        """Program with a child that nothing but SIGKILL ends, in a session of its own."""
+        script = f"(trap '' HUP INT TERM; setsid sleep {mark}) & echo up; sleep {mark}"
+        with subprocess.Popen(
+            argv(of=["sh", "-c", script]),
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            start_new_session=True,
+        ) as run:
+            assert run.stdout is not None
+            assert run.stdout.readline() == "up\n"
+            try:
+                yield run
+            finally:
+                run.kill()
+
+    def test_netem_is_killed(self) -> None:
+        mark = f"1000.{os.getpid()}1"
+        with self.running(mark) as run:
+            run.kill()
+            assert gone(mark)
+
+    @pytest.mark.parametrize("name", ["skytether.shell.inside", "slirp4netns"])
+    def test_another_process_is_killed(self, name: str) -> None:
+        mark = f"1000.{os.getpid()}2"
+        with self.running(mark) as run:
+            children = Path(f"/proc/{run.pid}/task/{run.pid}/children").read_text().split()
+            (victim,) = (
+                int(each)
+                for each in children
+                if name in Path(f"/proc/{each}/cmdline").read_text().replace("\0", " ")
+            )
+            os.kill(victim, signal.SIGKILL)
+            assert gone(mark)
+            assert run.wait(PATIENCE_S) == 1
+            assert run.stderr is not None
+            assert run.stderr.read().count("\n") == 1
+
+    def test_ctrl_c_ends_what_the_program_left(self) -> None:
+        mark = f"1000.{os.getpid()}3"
+        with self.running(mark) as run:
+            until_s = time.monotonic() + PATIENCE_S
+            while run.poll() is None and time.monotonic() < until_s:
+                os.killpg(run.pid, signal.SIGINT)
+                time.sleep(0.2)
+            assert run.returncode == -signal.SIGINT
+            assert gone(mark)
+
+    def test_its_parent_ends(self) -> None:
+        mark = f"1000.{os.getpid()}4"
+        line = argv(of=["sh", "-c", f"trap '' HUP; echo up; sleep {mark}"])
+        with subprocess.Popen(
+            python("import subprocess, sys; subprocess.run(sys.argv[1:])", *line),
+            stdout=subprocess.PIPE,
+            text=True,
+        ) as parent:
+            assert parent.stdout is not None
+            assert parent.stdout.readline() == "up\n"
+            parent.kill()
+            assert gone(mark)
