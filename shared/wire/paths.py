@@ -13,9 +13,12 @@ silence of each path in its own direction, and finds out within a round trip tha
 
 A message goes over the set S of paths with the least expected cost,
 
-    Σ price_p + worth · Π q_p      over p in S          q_p: probability that it does not arrive
+    Σ price_p + worth · Π q_p + alive · Π r_p           q_p: probability that it does not arrive
+        p in S           p in S         all p           r_p: that nothing sent on p arrives
 
-where `worth` is what its loss costs, in packets of price 1. q_p follows from the share of packets
+where `worth` is what its loss costs, in packets of price 1, and `alive` what it costs if nothing
+arrives since the newest packet that is known to have: a path on which much is under way already
+would lose it all at once, so the next message takes another. q_p follows from the share of packets
 that path p loses, and from the probability that p is down: each packet in a row that has not
 arrived makes that likelier by Bayes' rule, and so does time without news of the path.
 """
@@ -150,15 +153,15 @@ class PathState:
     copies: int = 0
     """Number of later copies that this path brought."""
 
-    def failure(self, now_ns: int) -> float:
-        """Probability q that a packet sent now does not arrive."""
+    def failure(self, now_ns: int, count: int = 1) -> float:
+        """Probability q that none of so many packets, the last one sent now, arrives."""
         down = DOWN
         if self.arrived_ns is not None:
             away_s = max(now_ns - self.arrived_ns, 0) / SECOND_NS
             down *= 1.0 - math.exp(-away_s / (DOWN * DOWN_EVERY_S))
             down = max(down, 1.0 - math.exp(-0.2 / DOWN_EVERY_S))
         up = (1.0 - down) * self.loss**self.missing
-        return 1.0 - (1.0 - self.loss) * up / (up + down)
+        return 1.0 - (1.0 - self.loss**count) * up / (up + down)
 
     @property
     def quick_ns(self) -> int:
@@ -233,11 +236,12 @@ class Paths:
 
     Args:
         prices: price of a packet on each path.
+        timeout_ns: time without a packet after which the other end takes the link for lost [ns].
         spread: `link.spread`.
     """
 
-    def __init__(self, prices: Sequence[float], spread: str = "auto") -> None:
-        self._spread = spread
+    def __init__(self, prices: Sequence[float], timeout_ns: int, spread: str = "auto") -> None:
+        self._timeout_ns, self._spread = timeout_ns, spread
         self.each = [PathState(price / min(prices)) for price in prices]
         self._sets = _SETS[len(prices)]
         self._sequence = 0
@@ -277,12 +281,18 @@ class Paths:
         if self._spread == "all":
             return tuple(among)
         failure = [path.failure(now_ns) for path in self.each]
+        under_way = self._under_way()
+        alive = self.alive_worth(now_ns)
         costs, best = [], self._spread == "best"
         for chosen in self._sets:
             if all(one in among for one in chosen) and not (best and len(chosen) > 1):
                 missing = math.prod(failure[one] for one in chosen)
+                silent = math.prod(
+                    path.failure(now_ns, under_way[one] + (one in chosen))
+                    for one, path in enumerate(self.each)
+                )
                 price = sum(self.each[one].price for one in chosen)
-                costs.append((price + max(worth, 1.0) * missing, chosen))
+                costs.append((price + max(worth, 1.0) * missing + alive * silent, chosen))
         least = min(costs)[0]
         alike = [chosen for cost, chosen in costs if cost <= ALIKE * least]
         few = min(map(len, alike))
@@ -290,6 +300,26 @@ class Paths:
             (chosen for chosen in alike if len(chosen) == few),
             key=lambda chosen: max(self.each[one].used_ns or 0 for one in chosen),
         )
+
+    def _arrived_ns(self) -> int | None:
+        """Time at which the newest packet that is known to have arrived on any path was sent."""
+        return max((path.arrived_ns for path in self.each if path.arrived_ns is not None), default=None)
+
+    def _under_way(self) -> list[int]:
+        """Number of packets on each path since the newest one that is known to have arrived."""
+        since_ns = self._arrived_ns()
+        return [
+            sum(since_ns is None or packet.sent_ns > since_ns for packet in path.in_flight)
+            for path in self.each
+        ]
+
+    def alive_worth(self, now_ns: int) -> float:
+        """What it costs if nothing arrives: the other end takes the link for lost after its
+        time-out.
+        """
+        since_ns = self._arrived_ns()
+        share = 1.0 if since_ns is None else max(now_ns - since_ns, 0) / self._timeout_ns
+        return ALIVE_WORTH * min(share, 1.0) ** 2
 
     def sent(
         self, datagram: bytes, on: Sequence[int], now_ns: int, *, is_probe: bool = False
@@ -353,14 +383,6 @@ class Paths:
                 path.looked_ns = now_ns
                 due.append(one)
         return due
-
-    def alive_worth(self, timeout_ns: int, now_ns: int) -> float:
-        """What the loss of any message costs: the other end takes the link for lost if nothing
-        arrives within its time-out.
-        """
-        arrived = [path.arrived_ns for path in self.each if path.arrived_ns is not None]
-        share = max(now_ns - max(arrived), 0) / timeout_ns if arrived else 1.0
-        return ALIVE_WORTH * min(share, 1.0) ** 2
 
     # -- receiving ---------------------------------------------------------------------------
 

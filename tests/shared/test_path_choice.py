@@ -19,7 +19,7 @@ class Ends:
     """Two ends that send in turn, every step; `dead` are paths that lose everything."""
 
     def __init__(self, prices: Sequence[float] = (1.0, 1.0)) -> None:
-        self.near, self.far = Paths(prices), Paths(prices)
+        self.near, self.far = Paths(prices, SECOND_NS), Paths(prices, SECOND_NS)
         self.now_ns, self.dead = 0, set[int]()
         self._payloads = count()
 
@@ -76,7 +76,7 @@ def test_any_other_beginning_is_refused_or_read(payload: bytes) -> None:
 
 
 def test_report_of_other_paths_is_refused() -> None:
-    ends, three = Ends(), Paths((1.0, 1.0, 1.0))
+    ends, three = Ends(), Paths((1.0, 1.0, 1.0), SECOND_NS)
     report, _ = split(three.report() + b"x")
     assert report
     with pytest.raises(ProtocolError):
@@ -200,7 +200,7 @@ def test_unused_path_is_tried_now_and_then_and_a_doubted_one_more_often() -> Non
     assert ends.near.looks(ends.now_ns) == []
     assert ends.near.looks(ends.now_ns + LOOK_NS) == [0]
     assert ends.near.looks(ends.now_ns + 4 * LOOK_NS) == [0, 1]
-    new = Paths((1.0, 1.0))
+    new = Paths((1.0, 1.0), SECOND_NS)
     assert new.looks(0) == [0, 1]
     assert new.looks(AGAIN_NS - 1) == []
     assert new.looks(AGAIN_NS) == [0, 1]
@@ -215,7 +215,7 @@ def test_some_of_the_allowed_paths_are_always_chosen(
     prices: list[float], worth: float, data: st.DataObject
 ) -> None:
     among = data.draw(st.sets(st.sampled_from(range(len(prices))), min_size=1))
-    chosen = Paths(prices).choose(worth, 0, sorted(among))
+    chosen = Paths(prices, SECOND_NS).choose(worth, 0, sorted(among))
     assert chosen
     assert {*chosen} <= among
 
@@ -253,7 +253,7 @@ def test_report_that_a_slow_path_brings_late_does_not_tell_what_was_lost_since()
 def test_end_that_begins_its_numbers_anew_is_understood_at_once() -> None:
     ends = Ends()
     ends.exchange(60)
-    ends.near = Paths((1.0, 1.0))
+    ends.near = Paths((1.0, 1.0), SECOND_NS)
     ends.far.peer_may_restart = True
     ends.exchange(10)
     assert max(path.failure(ends.now_ns) for path in ends.near.each) < 0.2
@@ -263,7 +263,7 @@ def test_clock_set_back_makes_no_message_precious() -> None:
     ends = Ends()
     ends.exchange(20)
     earlier_ns = ends.now_ns - 3600 * SECOND_NS
-    assert ends.near.alive_worth(SECOND_NS, earlier_ns) == 0.0
+    assert ends.near.alive_worth(earlier_ns) == 0.0
 
 
 def test_a_probe_is_not_sent_again_and_displaces_no_message() -> None:
