@@ -54,6 +54,8 @@ DELAYS = 16
 """Number of newest delays of acknowledgements that are kept."""
 GAPS = 16
 """Number of newest times between messages of the other end that are kept."""
+LATE_WEIGHT = 8
+"""Part of a new time by which an overtaken packet was late."""
 WAIT_NS, WAIT_MIN_NS, WAIT_MAX_NS = (
     600 * MILLISECOND_NS,
     150 * MILLISECOND_NS,
@@ -152,6 +154,8 @@ class PathState:
     """Number of packets from the other end of which this path brought the first copy."""
     copies: int = 0
     """Number of later copies that this path brought."""
+    has_brought: bool = False
+    """Whether it has brought a packet since it was last tried."""
 
     def failure(self, now_ns: int, count: int = 1) -> float:
         """Probability q that none of so many packets, the last one sent now, arrives."""
@@ -250,6 +254,14 @@ class Paths:
         """Newest sequence number of the other end; None before the first."""
         self._masks = [0] * len(prices)
         self._heard_ns: int | None = None
+        self._newest_path: int | None = None
+        """Path that brought the newest packet."""
+        self._awaited: dict[int, int] = {}
+        """Times at which packets of the other end were found missing, by sequence number."""
+        self._late_ns = 0
+        """Usual time after which such a packet comes all the same [ns]."""
+        self._sent_ns = 0
+        """Time of the newest packet sent [ns]."""
         self._gaps_ns: deque[int] = deque(maxlen=GAPS)
         """Newest times from one message of the other end to the next."""
         self.peer_may_restart = False
@@ -303,7 +315,9 @@ class Paths:
 
     def _arrived_ns(self) -> int | None:
         """Time at which the newest packet that is known to have arrived on any path was sent."""
-        return max((path.arrived_ns for path in self.each if path.arrived_ns is not None), default=None)
+        return max(
+            (path.arrived_ns for path in self.each if path.arrived_ns is not None), default=None
+        )
 
     def _under_way(self) -> list[int]:
         """Number of packets on each path since the newest one that is known to have arrived."""
@@ -331,6 +345,7 @@ class Paths:
         """
         if not is_probe:
             self._newest = _Newest(self._sequence, datagram, set(on))
+        self._sent_ns = now_ns
         self._note(self._sequence, datagram, on, now_ns)
 
     def _note(self, sequence: int, datagram: bytes, on: Sequence[int], now_ns: int) -> None:
@@ -369,8 +384,8 @@ class Paths:
         return newest.datagram, best
 
     def looks(self, now_ns: int) -> list[int]:
-        """Paths to try now: those that have not been used for long, and those that may be down or
-        are not known yet.
+        """Paths on which something is to be sent now: those that have not been used for long, those
+        that may be down or are not known yet, and one to report a packet that has not come.
         """
         due = []
         for one, path in enumerate(self.each):
@@ -379,10 +394,23 @@ class Paths:
             if doubted:  # longer each time
                 dear *= min(max(path.missing - OUTAGE, 1), PATIENCE)
             since_ns = path.looked_ns if doubted else path.used_ns
-            if since_ns is None or now_ns - since_ns >= (AGAIN_NS if doubted else LOOK_NS) * dear:
-                path.looked_ns = now_ns
+            wait_ns = (AGAIN_NS if doubted else LOOK_NS) * dear
+            if path.missing >= OUTAGE and path.has_brought:  # it may be well again
+                wait_ns = path.quick_ns
+            if since_ns is None or now_ns - since_ns >= wait_ns:
+                path.looked_ns, path.has_brought = now_ns, False
                 due.append(one)
+        if self._newest_path is not None and self._newest_path not in due and self._misses(now_ns):
+            due.append(self._newest_path)
         return due
+
+    def _misses(self, now_ns: int) -> bool:
+        """Whether to tell the other end that a packet was overtaken and has not come."""
+        wait_ns = 2 * self._late_ns + SPARE_NS
+        return any(
+            self._sent_ns < due_ns <= now_ns
+            for due_ns in (at_ns + wait_ns for at_ns in self._awaited.values())
+        )
 
     # -- receiving ---------------------------------------------------------------------------
 
@@ -412,7 +440,10 @@ class Paths:
             self.peer_may_restart, ahead = False, WINDOW
         if ahead > 0:
             self._masks = [mask << min(ahead, WINDOW) & 0xFFFF for mask in self._masks]
-            self._heard = report.sequence
+            self._await(report.sequence, ahead, now_ns)
+            self._heard, self._newest_path = report.sequence, path
+        elif (since_ns := self._awaited.pop(report.sequence, None)) is not None:
+            self._late_ns += (now_ns - since_ns - self._late_ns) // LATE_WEIGHT
         if self._heard_ns is not None:
             self._gaps_ns.append(now_ns - self._heard_ns)
         self._heard_ns = now_ns
@@ -428,7 +459,18 @@ class Paths:
         ):
             self._newest = None
 
+    def _await(self, sequence: int, ahead: int, now_ns: int) -> None:
+        """Note the packets that a packet with this sequence number has overtaken."""
+        if ahead >= WINDOW:
+            self._awaited.clear()
+            return
+        for back in range(ahead - 1, 0, -1):
+            self._awaited[(sequence - back) % SEQUENCES] = now_ns
+        while self._awaited and _ahead(sequence, next(iter(self._awaited))) >= WINDOW:
+            del self._awaited[next(iter(self._awaited))]
+
     def _mark(self, sequence: int, path: int) -> None:
+        self.each[path].has_brought = True
         back = _ahead(self._heard if self._heard is not None else sequence, sequence)
         if 0 <= back < WINDOW:
             self._masks[path] |= 1 << back
