@@ -68,6 +68,8 @@ SPARE_NS = 50 * MILLISECOND_NS
 LOOK_NS, AGAIN_NS, DEAR_MAX = 2 * SECOND_NS, SECOND_NS, 8.0
 """Times after which an unused path of the least price is tried, and a doubted one again [ns], and
 the largest factor by which a dearer path is tried more rarely."""
+DOUBT = 0.5
+"""Probability that a packet does not arrive above which a path is doubted."""
 PATIENCE = 3
 """Largest factor by which a path that stays down is tried more rarely."""
 ALIKE = 1.25
@@ -390,12 +392,13 @@ class Paths:
         due = []
         for one, path in enumerate(self.each):
             dear = min(path.price, DEAR_MAX)
-            doubted = path.arrived_ns is None or path.missing >= OUTAGE
-            if doubted:  # longer each time
-                dear *= min(max(path.missing - OUTAGE, 1), PATIENCE)
+            doubted = path.arrived_ns is None
+            if path.missing and path.failure(now_ns) > DOUBT:
+                doubted = True
+                dear *= min(max(path.missing - OUTAGE, 1), PATIENCE)  # longer each time
             since_ns = path.looked_ns if doubted else path.used_ns
             wait_ns = (AGAIN_NS if doubted else LOOK_NS) * dear
-            if path.missing >= OUTAGE and path.has_brought:  # it may be well again
+            if doubted and path.missing and path.has_brought:  # it may be well again
                 wait_ns = path.quick_ns
             if since_ns is None or now_ns - since_ns >= wait_ns:
                 path.looked_ns, path.has_brought = now_ns, False
