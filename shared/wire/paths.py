@@ -46,6 +46,8 @@ IN_FLIGHT_MAX = 64
 DOWN, DOWN_EVERY_S = 0.05, 30.0
 """Share of the time for which a path is assumed to be down, and mean time between two outages [s].
 """
+DOWN_S = DOWN * DOWN_EVERY_S
+"""Mean length of an outage [s]."""
 LOSS, LOSS_MIN, LOSS_WEIGHT = 0.05, 0.02, 1 / 32
 """Share of lost packets assumed at first, least share, and weight of a new packet."""
 OUTAGE = 3
@@ -159,15 +161,36 @@ class PathState:
     has_brought: bool = False
     """Whether it has brought a packet since it was last tried."""
 
-    def failure(self, now_ns: int, count: int = 1) -> float:
-        """Probability q that none of so many packets, the last one sent now, arrives."""
+    def failure(self, now_ns: int) -> float:
+        """Probability q that a packet sent now does not arrive."""
+        down = self._down(now_ns)
+        return down + (1.0 - down) * self.loss
+
+    def silence(self, now_ns: int, under_way: int, *, is_sent: bool) -> float:
+        """Probability r that nothing sent on the path arrives.
+
+        Args:
+            under_way: number of packets that may still arrive.
+            is_sent: whether another one is sent now, for which the path may be well again.
+        """
+        down, loss = self._down(now_ns), self.loss
+        if is_sent and self.used_ns is not None:
+            away_s = max(now_ns - self.used_ns, 0) / SECOND_NS
+            stays = math.exp(-away_s / DOWN_S)
+            down_after = down * (stays + (1.0 - stays) * loss)
+        else:
+            down_after = down
+        return down_after + (1.0 - down) * loss ** (under_way + is_sent)
+
+    def _down(self, now_ns: int) -> float:
+        """Probability that the path is down."""
         down = DOWN
         if self.arrived_ns is not None:
             away_s = max(now_ns - self.arrived_ns, 0) / SECOND_NS
-            down *= 1.0 - math.exp(-away_s / (DOWN * DOWN_EVERY_S))
+            down *= 1.0 - math.exp(-away_s / DOWN_S)
             down = max(down, 1.0 - math.exp(-0.2 / DOWN_EVERY_S))
         up = (1.0 - down) * self.loss**self.missing
-        return 1.0 - (1.0 - self.loss**count) * up / (up + down)
+        return down / (up + down)
 
     @property
     def quick_ns(self) -> int:
@@ -302,7 +325,7 @@ class Paths:
             if all(one in among for one in chosen) and not (best and len(chosen) > 1):
                 missing = math.prod(failure[one] for one in chosen)
                 silent = math.prod(
-                    path.failure(now_ns, under_way[one] + (one in chosen))
+                    path.silence(now_ns, under_way[one], is_sent=one in chosen)
                     for one, path in enumerate(self.each)
                 )
                 price = sum(self.each[one].price for one in chosen)
