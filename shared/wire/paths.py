@@ -70,6 +70,8 @@ SPARE_NS = 50 * MILLISECOND_NS
 LOOK_NS, AGAIN_NS, DEAR_MAX = 2 * SECOND_NS, SECOND_NS, 8.0
 """Times after which an unused path of the least price is tried, and a doubted one again [ns], and
 the largest factor by which a dearer path is tried more rarely."""
+TRIES_MAX = 4
+"""Number of tries after which a path that brings packets and takes none is tried no more rarely."""
 DOUBT = 0.5
 """Probability that a packet does not arrive above which a path is doubted."""
 PATIENCE = 3
@@ -159,7 +161,9 @@ class PathState:
     copies: int = 0
     """Number of later copies that this path brought."""
     has_brought: bool = False
-    """Whether it has brought a packet since it was last tried."""
+    """Whether it has brought a packet since one was last sent on it."""
+    tries: int = 0
+    """Number of tries since the last arrival, because it had brought a packet."""
 
     def failure(self, now_ns: int) -> float:
         """Probability q that a packet sent now does not arrive."""
@@ -243,7 +247,7 @@ class PathState:
         missing = self.missing - packet.is_lost
         lost = missing if 0 <= missing < OUTAGE else 0
         self.loss += LOSS_WEIGHT * (lost - self.loss) / max(lost, 1)
-        self.loss, self.missing = max(self.loss, LOSS_MIN), 0
+        self.loss, self.missing, self.tries = max(self.loss, LOSS_MIN), 0, 0
         self.arrived_ns = max(packet.sent_ns, self.arrived_ns or packet.sent_ns)
 
 
@@ -377,7 +381,7 @@ class Paths:
         for one in on:
             path = self.each[one]
             path.in_flight.append(_InFlight(sequence, now_ns))
-            path.used_ns = now_ns
+            path.used_ns, path.has_brought = now_ns, False
             path.packets += 1
             path.bytes += len(datagram)
 
@@ -421,10 +425,12 @@ class Paths:
                 dear *= min(max(path.missing - OUTAGE, 1), PATIENCE)  # longer each time
             since_ns = path.looked_ns if doubted else path.used_ns
             wait_ns = (AGAIN_NS if doubted else LOOK_NS) * dear
-            if doubted and path.missing and path.has_brought:  # it may be well again
-                wait_ns = path.quick_ns
+            is_back = doubted and path.missing > 0 and path.has_brought
+            if is_back:  # unless it is down in this direction only
+                wait_ns = min(wait_ns, path.quick_ns << path.tries)
             if since_ns is None or now_ns - since_ns >= wait_ns:
-                path.looked_ns, path.has_brought = now_ns, False
+                path.looked_ns = now_ns
+                path.tries = min(path.tries + is_back, TRIES_MAX)
                 due.append(one)
         if self._newest_path is not None and self._newest_path not in due and self._misses(now_ns):
             due.append(self._newest_path)

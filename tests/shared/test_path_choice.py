@@ -321,7 +321,24 @@ def test_path_that_was_down_is_tried_as_soon_as_it_brings_a_packet() -> None:
     ends.dead = set()
     ends.send(on=(0,), back=True)
     assert ends.near.looks(soon_ns) == [0]
-    assert ends.near.looks(soon_ns + ends.near.each[0].quick_ns) == []
+
+
+def test_path_that_brings_packets_and_takes_none_is_tried_more_and_more_rarely() -> None:
+    ends = Ends()
+    ends.exchange(20)
+    tries = 0
+    for step in range(200):
+        ends.now_ns += STEP_NS
+        ends.dead = {0}
+        ends.send(on=(1,))
+        for path in ends.near.looks(ends.now_ns):
+            tries += path == 0
+            ends.send(on=(path,))
+        ends.dead = set()
+        ends.send(on=BOTH, back=True)
+        if step == 60:
+            tries_before = tries
+    assert tries - tries_before <= 14
 
 
 def overtaken(ends: Ends) -> bytes:
