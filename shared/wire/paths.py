@@ -56,8 +56,8 @@ DELAYS = 16
 """Number of newest delays of acknowledgements that are kept."""
 GAPS = 16
 """Number of newest times between messages of the other end that are kept."""
-LATE_WEIGHT = 8
-"""Part of a new time by which an overtaken packet was late."""
+LATE_PART = 8
+"""The usual time by which overtaken packets are late moves by this part to each new one."""
 WAIT_NS, WAIT_MIN_NS, WAIT_MAX_NS = (
     600 * MILLISECOND_NS,
     150 * MILLISECOND_NS,
@@ -475,7 +475,8 @@ class Paths:
             self._await(report.sequence, ahead, now_ns)
             self._heard, self._newest_path = report.sequence, path
         elif (since_ns := self._awaited.pop(report.sequence, None)) is not None:
-            self._late_ns += (now_ns - since_ns - self._late_ns) // LATE_WEIGHT
+            late_ns = min(max(now_ns - since_ns, 0), WAIT_MAX_NS)
+            self._late_ns += (late_ns - self._late_ns) // LATE_PART
         if self._heard_ns is not None:
             self._gaps_ns.append(now_ns - self._heard_ns)
         self._heard_ns = now_ns
