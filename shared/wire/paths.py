@@ -432,8 +432,9 @@ class Paths:
                 path.looked_ns = now_ns
                 path.tries = min(path.tries + is_back, TRIES_MAX)
                 due.append(one)
-        if self._newest_path is not None and self._newest_path not in due and self._misses(now_ns):
-            due.append(self._newest_path)
+        newest = self._newest_path
+        if self._awaited and newest is not None and newest not in due and self._misses(now_ns):
+            due.append(newest)
         return due
 
     def _misses(self, now_ns: int) -> bool:
