@@ -290,7 +290,8 @@ class ServerSession:
             self.sent, self.sent_step, self.told = 0, -1, None
             self.hearing.begin()
             self._proofs.clear()
-            self.paths = Paths(self._prices, self._spread) if len(self._addresses) > 1 else None
+            several = len(self._addresses) > 1
+            self.paths = Paths(self._prices, self._timeout_ns, self._spread) if several else None
         self.number, self._server_boot_id = welcome.session, welcome.server_boot_id
         self._is_open = True
         self.link.adopt(now_ns=now_ns)
@@ -411,8 +412,7 @@ class ServerSession:
             self._put(self.link.seal(payload), (0,))
             return
         if not on:
-            closes = isinstance(message, Close)
-            worth = EVERYWHERE if closes else self.paths.alive_worth(self._timeout_ns, now_ns)
+            worth = EVERYWHERE if isinstance(message, Close) else 1.0
             on = self.paths.choose(worth, now_ns, range(len(self._addresses)))
         datagram = self.link.seal(self.paths.report() + payload)
         is_probe = isinstance(message, PathProof)

@@ -37,8 +37,8 @@ class ServerPaths:
         entropy: Callable[[int], bytes],
         timeout_ns: int,
     ) -> None:
-        self.paths, self.prices = Paths(prices, spread), prices
-        self._secret, self._timeout_ns = entropy(hashlib.blake2s.MAX_KEY_SIZE), timeout_ns
+        self.paths, self.prices = Paths(prices, timeout_ns, spread), prices
+        self._secret = entropy(hashlib.blake2s.MAX_KEY_SIZE)
         self._places: dict[int, Place] = {}
 
     def number(self, place: Place) -> int | None:
@@ -78,7 +78,6 @@ class ServerPaths:
 
     def sealed(self, payload: bytes, line: ReplyPath, now_ns: int, worth: float) -> list[Datagram]:
         among = sorted(self._places)
-        worth = max(worth, self.paths.alive_worth(self._timeout_ns, now_ns))
         return self._put(payload, line, self.paths.choose(worth, now_ns, among), now_ns)
 
     def watched(

@@ -13,9 +13,12 @@ silence of each path in its own direction, and finds out within a round trip tha
 
 A message goes over the set S of paths with the least expected cost,
 
-    Σ price_p + worth · Π q_p      over p in S          q_p: probability that it does not arrive
+    Σ price_p + worth · Π q_p + alive · Π r_p           q_p: probability that it does not arrive
+        p in S           p in S         all p           r_p: that nothing sent on p arrives
 
-where `worth` is what its loss costs, in packets of price 1. q_p follows from the share of packets
+where `worth` is what its loss costs, in packets of price 1, and `alive` what it costs if nothing
+arrives since the newest packet that is known to have: a path on which much is under way already
+would lose it all at once, so the next message takes another. q_p follows from the share of packets
 that path p loses, and from the probability that p is down: each packet in a row that has not
 arrived makes that likelier by Bayes' rule, and so does time without news of the path.
 """
@@ -43,6 +46,8 @@ IN_FLIGHT_MAX = 64
 DOWN, DOWN_EVERY_S = 0.05, 30.0
 """Share of the time for which a path is assumed to be down, and mean time between two outages [s].
 """
+DOWN_S = DOWN * DOWN_EVERY_S
+"""Mean length of an outage [s]."""
 LOSS, LOSS_MIN, LOSS_WEIGHT = 0.05, 0.02, 1 / 32
 """Share of lost packets assumed at first, least share, and weight of a new packet."""
 OUTAGE = 3
@@ -51,6 +56,8 @@ DELAYS = 16
 """Number of newest delays of acknowledgements that are kept."""
 GAPS = 16
 """Number of newest times between messages of the other end that are kept."""
+LATE_PART = 8
+"""The usual time by which overtaken packets are late moves by this part to each new one."""
 WAIT_NS, WAIT_MIN_NS, WAIT_MAX_NS = (
     600 * MILLISECOND_NS,
     150 * MILLISECOND_NS,
@@ -63,6 +70,10 @@ SPARE_NS = 50 * MILLISECOND_NS
 LOOK_NS, AGAIN_NS, DEAR_MAX = 2 * SECOND_NS, SECOND_NS, 8.0
 """Times after which an unused path of the least price is tried, and a doubted one again [ns], and
 the largest factor by which a dearer path is tried more rarely."""
+TRIES_MAX = 4
+"""Number of tries after which a path that brings packets and takes none is tried no more rarely."""
+DOUBT = 0.5
+"""Probability that a packet does not arrive above which a path is doubted."""
 PATIENCE = 3
 """Largest factor by which a path that stays down is tried more rarely."""
 ALIKE = 1.25
@@ -149,16 +160,41 @@ class PathState:
     """Number of packets from the other end of which this path brought the first copy."""
     copies: int = 0
     """Number of later copies that this path brought."""
+    has_brought: bool = False
+    """Whether it has brought a packet since one was last sent on it."""
+    tries: int = 0
+    """Number of tries since the last arrival, because it had brought a packet."""
 
     def failure(self, now_ns: int) -> float:
         """Probability q that a packet sent now does not arrive."""
+        down = self._down(now_ns)
+        return down + (1.0 - down) * self.loss
+
+    def silence(self, now_ns: int, under_way: int, *, is_sent: bool) -> float:
+        """Probability r that nothing sent on the path arrives.
+
+        Args:
+            under_way: number of packets that may still arrive.
+            is_sent: whether another one is sent now, for which the path may be well again.
+        """
+        down, loss = self._down(now_ns), self.loss
+        if is_sent and self.used_ns is not None:
+            away_s = max(now_ns - self.used_ns, 0) / SECOND_NS
+            stays = math.exp(-away_s / DOWN_S)
+            down_after = down * (stays + (1.0 - stays) * loss)
+        else:
+            down_after = down
+        return down_after + (1.0 - down) * loss ** (under_way + is_sent)
+
+    def _down(self, now_ns: int) -> float:
+        """Probability that the path is down."""
         down = DOWN
         if self.arrived_ns is not None:
             away_s = max(now_ns - self.arrived_ns, 0) / SECOND_NS
-            down *= 1.0 - math.exp(-away_s / (DOWN * DOWN_EVERY_S))
+            down *= 1.0 - math.exp(-away_s / DOWN_S)
             down = max(down, 1.0 - math.exp(-0.2 / DOWN_EVERY_S))
         up = (1.0 - down) * self.loss**self.missing
-        return 1.0 - (1.0 - self.loss) * up / (up + down)
+        return down / (up + down)
 
     @property
     def quick_ns(self) -> int:
@@ -211,7 +247,7 @@ class PathState:
         missing = self.missing - packet.is_lost
         lost = missing if 0 <= missing < OUTAGE else 0
         self.loss += LOSS_WEIGHT * (lost - self.loss) / max(lost, 1)
-        self.loss, self.missing = max(self.loss, LOSS_MIN), 0
+        self.loss, self.missing, self.tries = max(self.loss, LOSS_MIN), 0, 0
         self.arrived_ns = max(packet.sent_ns, self.arrived_ns or packet.sent_ns)
 
 
@@ -233,11 +269,12 @@ class Paths:
 
     Args:
         prices: price of a packet on each path.
+        timeout_ns: time without a packet after which the other end takes the link for lost [ns].
         spread: `link.spread`.
     """
 
-    def __init__(self, prices: Sequence[float], spread: str = "auto") -> None:
-        self._spread = spread
+    def __init__(self, prices: Sequence[float], timeout_ns: int, spread: str = "auto") -> None:
+        self._timeout_ns, self._spread = timeout_ns, spread
         self.each = [PathState(price / min(prices)) for price in prices]
         self._sets = _SETS[len(prices)]
         self._sequence = 0
@@ -246,6 +283,14 @@ class Paths:
         """Newest sequence number of the other end; None before the first."""
         self._masks = [0] * len(prices)
         self._heard_ns: int | None = None
+        self._newest_path: int | None = None
+        """Path that brought the newest packet."""
+        self._awaited: dict[int, int] = {}
+        """Times at which packets of the other end were found missing, by sequence number."""
+        self._late_ns = 0
+        """Usual time after which such a packet comes all the same [ns]."""
+        self._sent_ns = 0
+        """Time of the newest packet sent [ns]."""
         self._gaps_ns: deque[int] = deque(maxlen=GAPS)
         """Newest times from one message of the other end to the next."""
         self.peer_may_restart = False
@@ -277,12 +322,18 @@ class Paths:
         if self._spread == "all":
             return tuple(among)
         failure = [path.failure(now_ns) for path in self.each]
+        under_way = self._under_way()
+        alive = self.alive_worth(now_ns)
         costs, best = [], self._spread == "best"
         for chosen in self._sets:
             if all(one in among for one in chosen) and not (best and len(chosen) > 1):
                 missing = math.prod(failure[one] for one in chosen)
+                silent = math.prod(
+                    path.silence(now_ns, under_way[one], is_sent=one in chosen)
+                    for one, path in enumerate(self.each)
+                )
                 price = sum(self.each[one].price for one in chosen)
-                costs.append((price + max(worth, 1.0) * missing, chosen))
+                costs.append((price + max(worth, 1.0) * missing + alive * silent, chosen))
         least = min(costs)[0]
         alike = [chosen for cost, chosen in costs if cost <= ALIKE * least]
         few = min(map(len, alike))
@@ -290,6 +341,28 @@ class Paths:
             (chosen for chosen in alike if len(chosen) == few),
             key=lambda chosen: max(self.each[one].used_ns or 0 for one in chosen),
         )
+
+    def _arrived_ns(self) -> int | None:
+        """Time at which the newest packet that is known to have arrived on any path was sent."""
+        return max(
+            (path.arrived_ns for path in self.each if path.arrived_ns is not None), default=None
+        )
+
+    def _under_way(self) -> list[int]:
+        """Number of packets on each path since the newest one that is known to have arrived."""
+        since_ns = self._arrived_ns()
+        return [
+            sum(since_ns is None or packet.sent_ns > since_ns for packet in path.in_flight)
+            for path in self.each
+        ]
+
+    def alive_worth(self, now_ns: int) -> float:
+        """What it costs if nothing arrives: the other end takes the link for lost after its
+        time-out.
+        """
+        since_ns = self._arrived_ns()
+        share = 1.0 if since_ns is None else max(now_ns - since_ns, 0) / self._timeout_ns
+        return ALIVE_WORTH * min(share, 1.0) ** 2
 
     def sent(
         self, datagram: bytes, on: Sequence[int], now_ns: int, *, is_probe: bool = False
@@ -301,13 +374,14 @@ class Paths:
         """
         if not is_probe:
             self._newest = _Newest(self._sequence, datagram, set(on))
+        self._sent_ns = now_ns
         self._note(self._sequence, datagram, on, now_ns)
 
     def _note(self, sequence: int, datagram: bytes, on: Sequence[int], now_ns: int) -> None:
         for one in on:
             path = self.each[one]
             path.in_flight.append(_InFlight(sequence, now_ns))
-            path.used_ns = now_ns
+            path.used_ns, path.has_brought = now_ns, False
             path.packets += 1
             path.bytes += len(datagram)
 
@@ -339,28 +413,37 @@ class Paths:
         return newest.datagram, best
 
     def looks(self, now_ns: int) -> list[int]:
-        """Paths to try now: those that have not been used for long, and those that may be down or
-        are not known yet.
+        """Paths on which something is to be sent now: those that have not been used for long, those
+        that may be down or are not known yet, and one to report a packet that has not come.
         """
         due = []
         for one, path in enumerate(self.each):
             dear = min(path.price, DEAR_MAX)
-            doubted = path.arrived_ns is None or path.missing >= OUTAGE
-            if doubted:  # longer each time
-                dear *= min(max(path.missing - OUTAGE, 1), PATIENCE)
+            doubted = path.arrived_ns is None
+            if path.missing and path.failure(now_ns) > DOUBT:
+                doubted = True
+                dear *= min(max(path.missing - OUTAGE, 1), PATIENCE)  # longer each time
             since_ns = path.looked_ns if doubted else path.used_ns
-            if since_ns is None or now_ns - since_ns >= (AGAIN_NS if doubted else LOOK_NS) * dear:
+            wait_ns = (AGAIN_NS if doubted else LOOK_NS) * dear
+            is_back = doubted and path.missing > 0 and path.has_brought
+            if is_back:  # unless it is down in this direction only
+                wait_ns = min(wait_ns, path.quick_ns << path.tries)
+            if since_ns is None or now_ns - since_ns >= wait_ns:
                 path.looked_ns = now_ns
+                path.tries = min(path.tries + is_back, TRIES_MAX)
                 due.append(one)
+        newest = self._newest_path
+        if self._awaited and newest is not None and newest not in due and self._misses(now_ns):
+            due.append(newest)
         return due
 
-    def alive_worth(self, timeout_ns: int, now_ns: int) -> float:
-        """What the loss of any message costs: the other end takes the link for lost if nothing
-        arrives within its time-out.
-        """
-        arrived = [path.arrived_ns for path in self.each if path.arrived_ns is not None]
-        share = max(now_ns - max(arrived), 0) / timeout_ns if arrived else 1.0
-        return ALIVE_WORTH * min(share, 1.0) ** 2
+    def _misses(self, now_ns: int) -> bool:
+        """Whether to tell the other end that a packet was overtaken and has not come."""
+        wait_ns = 2 * self._late_ns + SPARE_NS
+        return any(
+            self._sent_ns < due_ns <= now_ns
+            for due_ns in (at_ns + wait_ns for at_ns in self._awaited.values())
+        )
 
     # -- receiving ---------------------------------------------------------------------------
 
@@ -390,7 +473,11 @@ class Paths:
             self.peer_may_restart, ahead = False, WINDOW
         if ahead > 0:
             self._masks = [mask << min(ahead, WINDOW) & 0xFFFF for mask in self._masks]
-            self._heard = report.sequence
+            self._await(report.sequence, ahead, now_ns)
+            self._heard, self._newest_path = report.sequence, path
+        elif (since_ns := self._awaited.pop(report.sequence, None)) is not None:
+            late_ns = min(max(now_ns - since_ns, 0), WAIT_MAX_NS)
+            self._late_ns += (late_ns - self._late_ns) // LATE_PART
         if self._heard_ns is not None:
             self._gaps_ns.append(now_ns - self._heard_ns)
         self._heard_ns = now_ns
@@ -406,7 +493,18 @@ class Paths:
         ):
             self._newest = None
 
+    def _await(self, sequence: int, ahead: int, now_ns: int) -> None:
+        """Note the packets that a packet with this sequence number has overtaken."""
+        if ahead >= WINDOW:
+            self._awaited.clear()
+            return
+        for back in range(ahead - 1, 0, -1):
+            self._awaited[(sequence - back) % SEQUENCES] = now_ns
+        while self._awaited and _ahead(sequence, next(iter(self._awaited))) >= WINDOW:
+            del self._awaited[next(iter(self._awaited))]
+
     def _mark(self, sequence: int, path: int) -> None:
+        self.each[path].has_brought = True
         back = _ahead(self._heard if self._heard is not None else sequence, sequence)
         if 0 <= back < WINDOW:
             self._masks[path] |= 1 << back

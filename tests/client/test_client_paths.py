@@ -17,7 +17,7 @@ def test_report_of_an_earlier_session_is_not_taken_for_one_of_this() -> None:
         flown, simulated(flown, 1), paths=(SERVER, ("server", 2)), vehicle=4, boot_id=99
     )
     welcome = Welcome(4, 7, 99, 1, 1234, Refusal.ACCEPTED, flown.terms())
-    late, now_ns = Paths((1.0, 1.0)), 5 * SECOND_NS
+    late, now_ns = Paths((1.0, 1.0), SECOND_NS), 5 * SECOND_NS
 
     def newest() -> Report:
         """Newest report that the client has sent, after its next step."""

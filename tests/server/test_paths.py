@@ -60,7 +60,7 @@ class Vehicle:
         self.terms, self.dt_ns = flown.terms(), flown.dt_ns
         self.server = Server(flown, boot_id=77, entropy=stream(1, "entropy").bytes)
         self.now_ns = 10 * SECOND_NS
-        self.paths: Paths | None = Paths(PRICES)
+        self.paths: Paths | None = Paths(PRICES, SECOND_NS)
         self.step = self.number = 0
         self.session = 0
         self.open()
@@ -150,7 +150,7 @@ def test_client_that_was_started_again_with_more_paths_is_heard() -> None:
     vehicle = Vehicle()
     vehicle.observe(FIRST)
     vehicle.prove(0, FIRST)
-    vehicle.paths = Paths((1000, 1000, 1000))
+    vehicle.paths = Paths((1000, 1000, 1000), SECOND_NS)
     vehicle.open()
     vehicle.observe(FIRST)
     session = vehicle.server.sessions.live(1)
@@ -178,7 +178,7 @@ def test_client_that_was_started_again_in_its_session_is_acknowledged_at_once() 
     vehicle.prove(1, SECOND)
     for _ in range(60):
         vehicle.observe(FIRST)
-    vehicle.paths = Paths(PRICES)
+    vehicle.paths = Paths(PRICES, SECOND_NS)
     before = vehicle.session
     vehicle.open()
     assert vehicle.session == before

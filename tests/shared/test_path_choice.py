@@ -19,7 +19,7 @@ class Ends:
     """Two ends that send in turn, every step; `dead` are paths that lose everything."""
 
     def __init__(self, prices: Sequence[float] = (1.0, 1.0)) -> None:
-        self.near, self.far = Paths(prices), Paths(prices)
+        self.near, self.far = Paths(prices, SECOND_NS), Paths(prices, SECOND_NS)
         self.now_ns, self.dead = 0, set[int]()
         self._payloads = count()
 
@@ -76,7 +76,7 @@ def test_any_other_beginning_is_refused_or_read(payload: bytes) -> None:
 
 
 def test_report_of_other_paths_is_refused() -> None:
-    ends, three = Ends(), Paths((1.0, 1.0, 1.0))
+    ends, three = Ends(), Paths((1.0, 1.0, 1.0), SECOND_NS)
     report, _ = split(three.report() + b"x")
     assert report
     with pytest.raises(ProtocolError):
@@ -200,7 +200,7 @@ def test_unused_path_is_tried_now_and_then_and_a_doubted_one_more_often() -> Non
     assert ends.near.looks(ends.now_ns) == []
     assert ends.near.looks(ends.now_ns + LOOK_NS) == [0]
     assert ends.near.looks(ends.now_ns + 4 * LOOK_NS) == [0, 1]
-    new = Paths((1.0, 1.0))
+    new = Paths((1.0, 1.0), SECOND_NS)
     assert new.looks(0) == [0, 1]
     assert new.looks(AGAIN_NS - 1) == []
     assert new.looks(AGAIN_NS) == [0, 1]
@@ -215,7 +215,7 @@ def test_some_of_the_allowed_paths_are_always_chosen(
     prices: list[float], worth: float, data: st.DataObject
 ) -> None:
     among = data.draw(st.sets(st.sampled_from(range(len(prices))), min_size=1))
-    chosen = Paths(prices).choose(worth, 0, sorted(among))
+    chosen = Paths(prices, SECOND_NS).choose(worth, 0, sorted(among))
     assert chosen
     assert {*chosen} <= among
 
@@ -253,7 +253,7 @@ def test_report_that_a_slow_path_brings_late_does_not_tell_what_was_lost_since()
 def test_end_that_begins_its_numbers_anew_is_understood_at_once() -> None:
     ends = Ends()
     ends.exchange(60)
-    ends.near = Paths((1.0, 1.0))
+    ends.near = Paths((1.0, 1.0), SECOND_NS)
     ends.far.peer_may_restart = True
     ends.exchange(10)
     assert max(path.failure(ends.now_ns) for path in ends.near.each) < 0.2
@@ -263,7 +263,7 @@ def test_clock_set_back_makes_no_message_precious() -> None:
     ends = Ends()
     ends.exchange(20)
     earlier_ns = ends.now_ns - 3600 * SECOND_NS
-    assert ends.near.alive_worth(SECOND_NS, earlier_ns) == 0.0
+    assert ends.near.alive_worth(earlier_ns) == 0.0
 
 
 def test_a_probe_is_not_sent_again_and_displaces_no_message() -> None:
@@ -285,3 +285,99 @@ def test_a_lost_packet_is_noticed_after_the_usual_silence_and_not_the_longest() 
     ends.send(on=(0,))
     soon_ns = ends.now_ns + 2 * STEP_NS + 2 * ends.near.each[0].quick_ns
     assert ends.near.again(10 * SECOND_NS, soon_ns, BOTH)
+
+
+def test_messages_do_not_follow_each_other_into_a_path_that_may_be_down() -> None:
+    """Path 1 loses a fifth of its packets, so path 0 is preferred as long as reports come."""
+    ends = Ends()
+    for step in range(100):
+        ends.dead = {1} if step % 5 == 0 else set()
+        ends.now_ns += STEP_NS
+        ends.send(on=BOTH)
+        ends.send(on=BOTH, back=True)
+    first, second = (path.failure(ends.now_ns) for path in ends.near.each)
+    assert second > 2 * first
+    ends.dead = {0}
+    ends.now_ns += 5 * STEP_NS
+    chosen = []
+    for _ in range(4):
+        ends.now_ns += STEP_NS
+        chosen.append(ends.send())
+    assert [1] in chosen[:2]
+    assert len({*map(tuple, chosen)}) == 2
+
+
+def test_path_that_was_down_is_tried_as_soon_as_it_brings_a_packet() -> None:
+    ends = Ends()
+    ends.exchange(20)
+    ends.dead = {0}
+    for _ in range(20):
+        ends.send(on=BOTH)
+        ends.exchange(1)
+    ends.near.looks(ends.now_ns)
+    soon_ns = ends.now_ns + ends.near.each[0].quick_ns
+    assert soon_ns < ends.now_ns + AGAIN_NS
+    assert ends.near.looks(soon_ns) == []
+    ends.dead = set()
+    ends.send(on=(0,), back=True)
+    assert ends.near.looks(soon_ns) == [0]
+
+
+def test_path_that_brings_packets_and_takes_none_is_tried_more_and_more_rarely() -> None:
+    ends = Ends()
+    ends.exchange(20)
+    tries = 0
+    for step in range(200):
+        ends.now_ns += STEP_NS
+        ends.dead = {0}
+        ends.send(on=(1,))
+        for path in ends.near.looks(ends.now_ns):
+            tries += path == 0
+            ends.send(on=(path,))
+        ends.dead = set()
+        ends.send(on=BOTH, back=True)
+        if step == 60:
+            tries_before = tries
+    assert tries - tries_before <= 14
+
+
+def overtaken(ends: Ends) -> bytes:
+    """A packet that is sent on path 0, and arrives later than the next one on path 1, or never."""
+    late = ends.near.report() + b"\x93late"
+    ends.near.sent(late, (0,), ends.now_ns)
+    ends.send(on=(1,))
+    return late
+
+
+def test_packet_that_was_overtaken_and_does_not_come_is_reported_soon_and_once() -> None:
+    ends = Ends()
+    ends.exchange(20)
+    overtaken(ends)
+    assert ends.far.looks(ends.now_ns + DELAY_NS) == []
+    soon_ns = ends.now_ns + 3 * DELAY_NS
+    assert ends.far.looks(soon_ns) == [1]
+    ends.far.sent(ends.far.report() + b"\x93", (1,), soon_ns, is_probe=True)
+    assert ends.far.looks(soon_ns + DELAY_NS) == []
+
+
+def test_any_other_packet_reports_what_was_overtaken_as_well() -> None:
+    ends = Ends()
+    ends.exchange(20)
+    overtaken(ends)
+    ends.now_ns += 3 * DELAY_NS
+    ends.send(on=(1,), back=True)
+    assert ends.far.looks(ends.now_ns) == []
+
+
+def test_packets_that_are_always_overtaken_are_soon_awaited_for_longer() -> None:
+    ends, late_by_ns = Ends(), SECOND_NS // 2
+    told = []
+    for _ in range(30):
+        ends.exchange(2)
+        late = overtaken(ends)
+        ends.now_ns += late_by_ns
+        told.append(bool(ends.far.looks(ends.now_ns)))
+        ends.arrive(ends.far, late, 0)
+        ends.send(on=BOTH, back=True)
+    assert told[0]
+    assert not any(told[10:])

@@ -69,7 +69,7 @@ def browser() -> Iterator["sync_api.Browser"]:
 @pytest.fixture(scope="module")
 def flight(browser: "sync_api.Browser") -> Iterator[str]:
     """Address of the page of a flight that has begun."""
-    with served("fly", "demo", "--duration", "600", "--page", "127.0.0.1:0") as address:
+    with served("fly", "demo", "--duration", "3600", "--page", "127.0.0.1:0") as address:
         page = browser.new_page()
         page.goto(address)
         until(lambda: flown_s(page) > 6, "the flight begins")
@@ -246,7 +246,7 @@ def test_one_of_two_links_is_cut_alone_and_the_vehicle_flies_on(
     scenario = tmp_path / "two.toml"
     scenario.write_text(TWO_LINKS)
     with (
-        served("fly", str(scenario), "--duration", "600", "--page", "127.0.0.1:0") as at,
+        served("fly", str(scenario), "--duration", "3600", "--page", "127.0.0.1:0") as at,
         opened(browser, at) as page,
     ):
         until(lambda: "TRACK" in status(page), "it flies a plan")
@@ -280,7 +280,7 @@ def test_zones_and_goals_of_a_mission_are_changed_and_refused_in_words(
     """A zone around a vehicle is refused; another one is accepted and shown. The chosen vehicle is
     sent along x by its handle, and elsewhere by a click.
     """
-    argv = ("fleet", "--mission", "warehouse", "--duration", "300", "--page", "127.0.0.1:0")
+    argv = ("fleet", "--mission", "warehouse", "--duration", "1200", "--page", "127.0.0.1:0")
     with served(*argv) as address, opened(browser, address) as page:
         until(lambda: "nearest other vehicle" in status(page), "the mission is shown")
         until(lambda: flown_s(page) > 12, "the mission begins")
@@ -308,7 +308,7 @@ def test_zones_and_goals_of_a_mission_are_changed_and_refused_in_words(
             assert page.get_by_text("mission.goals is").count() == 0  # the handle is still held
             page.mouse.up()
             try:
-                page.get_by_text('mission.goals is "goal(').first.wait_for(timeout=20_000)
+                page.get_by_text('mission.goals is "goal(').first.wait_for(timeout=60_000)
             except sync_api.TimeoutError:
                 return False
             return True
@@ -378,7 +378,7 @@ def test_a_wide_table_of_a_report_fits_the_window(browser: "sync_api.Browser") -
 
 def test_who_has_no_token_can_only_look(browser: "sync_api.Browser") -> None:
     """Under a name that may mean another machine, buttons appear only with the token."""
-    with served("fly", "demo", "--duration", "120", "--page", "0.0.0.0:0") as address:
+    with served("fly", "demo", "--duration", "1200", "--page", "0.0.0.0:0") as address:
         port, token = re.search(r":(\d+)/.*token=(\S+)", address).groups()  # type: ignore[union-attr]
         with opened(browser, f"http://0.0.0.0:{port}/") as page:
             cuts = page.get_by_role("button", name="Cut the link")
