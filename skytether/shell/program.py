@@ -81,11 +81,14 @@ class Program:
 
 
 @contextmanager
-def program(command: Sequence[str], *, mtu: int, exposed: Sequence[Address]) -> Iterator[Program]:
+def program(
+    command: Sequence[str], mtu: int, *, path_mtu: int, exposed: Sequence[Address]
+) -> Iterator[Program]:
     """Namespaces for a program, which starts with `Program.start` and ends with the block.
 
     Args:
         mtu: MTU of its device [B].
+        path_mtu: largest packet that slirp4netns sends to it [B].
         exposed: addresses on this machine whose TCP and UDP lead to the same port of the program.
 
     Raises:
@@ -96,7 +99,7 @@ def program(command: Sequence[str], *, mtu: int, exposed: Sequence[Address]) -> 
             "needs the namespaces of Linux; elsewhere use `skytether netem --server`"
         )
     with ExitStack() as stack:
-        outside = stack.enter_context(_slirp(mtu, exposed))
+        outside = stack.enter_context(_slirp(path_mtu, exposed))
         control, inner = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         inner.set_inheritable(True)
         # With the descriptors that a shell has opened for the program, as in `<(command)`.
