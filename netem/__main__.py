@@ -156,6 +156,7 @@ def emulate_for(argv: Sequence[str]) -> None:
         try:
             passing = min(mtu, path_mtu)
             with program(argv[end + 1 :], mtu, path_mtu=passing, exposed=exposed) as run_:
+                signal.signal(signal.SIGINT, lambda *_: None)  # also while all is taken down
                 endpoint = Tunnel(running.scenario, mtu=passing, recorder=running.recorder)
                 running.drive(endpoint, bind=None, waiting_for="", line=run_)
         except ProgramError as error:
