@@ -149,18 +149,18 @@ def emulate_for(argv: Sequence[str]) -> None:
         command.address("--expose", text if ":" in text else f"127.0.0.1:{text}")
         for text in options.expose
     ]
-    mtu, path_mtu = options.mtu, options.path_mtu
-    if path_mtu is None:
-        path_mtu = mtu
+    mtu = options.mtu
+    path_mtu = mtu if options.path_mtu is None else options.path_mtu
     for flag, size in (("--mtu", mtu), ("--path-mtu", path_mtu)):
         if not MTU_MIN <= size <= MTU_MAX:
             message = f"{flag}: got {size}, expected {MTU_MIN} to {MTU_MAX}"
             raise command.CommandError(message, command.CONFIGURATION)
     with process.begin("netem", options, PACKET_COLUMNS, secure=None) as running:
         try:
-            with program(argv[end + 1 :], mtu=mtu, exposed=exposed) as run_:
-                recorder, mtu = running.recorder, min(mtu, path_mtu)
-                endpoint = Tunnel(running.scenario, mtu=mtu, recorder=recorder)
+            passing = min(mtu, path_mtu)
+            with program(argv[end + 1 :], mtu, path_mtu=passing, exposed=exposed) as run_:
+                signal.signal(signal.SIGINT, lambda *_: None)  # also while all is taken down
+                endpoint = Tunnel(running.scenario, mtu=passing, recorder=running.recorder)
                 running.drive(endpoint, bind=None, waiting_for="", line=run_)
         except ProgramError as error:
             raise command.CommandError(str(error)) from None

@@ -167,7 +167,7 @@ def _handing_down() -> Iterator[None]:
 def _ip(*lines: str) -> None:
     found = shutil.which("ip", path=os.environ.get("PATH", "") + ADMIN)
     if found is None:
-        raise FileNotFoundError(0, "it is missing; install iproute2", "ip")
+        raise subprocess.CalledProcessError(127, "ip", stderr=b"it is missing; install iproute2")
     text = "".join(line + "\n" for line in lines).encode()
     subprocess.run([found, "-batch", "-"], input=text, check=True, capture_output=True)
 

@@ -12,7 +12,6 @@ import fcntl
 import json
 import os
 import resource
-import select
 import shutil
 import signal
 import socket
@@ -82,11 +81,14 @@ class Program:
 
 
 @contextmanager
-def program(command: Sequence[str], *, mtu: int, exposed: Sequence[Address]) -> Iterator[Program]:
+def program(
+    command: Sequence[str], mtu: int, *, path_mtu: int, exposed: Sequence[Address]
+) -> Iterator[Program]:
     """Namespaces for a program, which starts with `Program.start` and ends with the block.
 
     Args:
         mtu: MTU of its device [B].
+        path_mtu: largest packet that slirp4netns sends to it [B].
         exposed: addresses on this machine whose TCP and UDP lead to the same port of the program.
 
     Raises:
@@ -97,7 +99,7 @@ def program(command: Sequence[str], *, mtu: int, exposed: Sequence[Address]) -> 
             "needs the namespaces of Linux; elsewhere use `skytether netem --server`"
         )
     with ExitStack() as stack:
-        outside = stack.enter_context(_slirp(mtu, exposed))
+        outside = stack.enter_context(_slirp(path_mtu, exposed))
         control, inner = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         inner.set_inheritable(True)
         # With the descriptors that a shell has opened for the program, as in `<(command)`.
@@ -262,13 +264,15 @@ class ProgramLine:
             if parent is not None:
                 os.close(parent)
 
-    def _read_device(self) -> None:
+    def _read_device(self) -> int:
+        """Hear packets of the program; returns how many."""
         room, packets = self._room, list[Datagram]()
         with suppress(OSError):
             while len(packets) < BATCH_MAX:
                 size = os.readv(self._program.device, [room])
                 packets.append(Datagram(room[:size].tobytes(), PROGRAM, 1))
         self._hear(*packets)
+        return len(packets)
 
     def _read_outside(self) -> None:
         room, packets = self._room, list[Datagram]()
@@ -289,14 +293,11 @@ class ProgramLine:
             if message.startswith(ENDED):
                 (self._program.status,) = struct.unpack("<i", message[len(ENDED) :])
             elif message == ALL_ENDED:
-                while self._loop and self._is_more():
-                    self._read_device()
+                while self._read_device():  # the program's last packets
+                    pass
                 self._hear(Datagram(b"", PROGRAM, 1))
             else:
                 self._end("" if self._program.status is not None else "its namespaces have ended")
-
-    def _is_more(self) -> bool:
-        return bool(select.select([self._program.device], [], [], 0)[0])
 
     def _end(self, fault: str) -> None:
         self._program.fault = fault

@@ -243,7 +243,8 @@ class TestNetwork:
             threading.Thread(target=server.serve_forever, daemon=True).start()
             url = f"http://{GATEWAY}:{server.server_port}/"
             air = "constant(0.02) & loss(0.02)"
-            run = ran("--uplink", air, "--downlink", air, of=python(code, url, tmp_path / "came"))
+            options = ("--uplink", air, "--downlink", air, "--path-mtu", "1300")
+            run = ran(*options, of=python(code, url, tmp_path / "came"))
             server.shutdown()
         assert run.returncode == 0, run.stderr
         assert (tmp_path / "came").read_bytes() == content
