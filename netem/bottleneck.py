@@ -115,7 +115,7 @@ class Bottleneck(Generic[T]):
             queue = self._lines[key] = FlowQueue(credit=QUANTUM_BYTES)
         queue.packets.append(packet)
         self._count(key, packet, 1)
-        while self.waiting_bytes > self._queue.room_bytes:
+        while self.waiting_bytes > self._queue.room_bytes and not self._queue.keeps_all:
             # The flow with the longest queue loses its newest packet, at no other flow's expense.
             longest = max(self._lines, key=lambda flow_key: self._lines[flow_key].bytes)
             last = self._lines[longest].packets.pop()

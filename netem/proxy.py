@@ -12,25 +12,22 @@ long, and the first that does not reach the server, are reported.
 
 import hashlib
 from collections import OrderedDict
-from collections.abc import Mapping, Sequence
-from typing import Any, Literal
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
 
-from skytether.netem.fate import Fates
-from skytether.netem.link import QUEUE_MAX, Lane, Link
+from skytether.netem.emulator import Emulator
+from skytether.netem.link import QUEUE_MAX, Lane
 from skytether.netem.places import Flow, Places
 from skytether.shared.base.units import MILLISECOND_NS
 from skytether.shared.core.endpoint import (
     Address,
     Datagram,
-    Endpoint,
     host_of,
     make_datagram,
 )
-from skytether.shared.core.events import Fault, FlowOpened, Returned, TooLong, Unreachable
-from skytether.shared.scenario.catalogue import keys_of
-from skytether.shared.scenario.owners import InFlight
+from skytether.shared.core.events import FlowOpened, Returned, TooLong, Unreachable
 from skytether.shared.scenario.schema import Scenario
-from skytether.shared.telemetry.record import DOWNLINK, UPLINK, Recorder
+from skytether.shared.telemetry.record import Recorder
 
 FLOWS_MAX = 512
 """Default largest number of clients at once; packets of further clients are dropped and counted."""
@@ -38,14 +35,13 @@ LAPS_MAX = 16
 """Largest number of flows, each from another address, that one packet opens before an answer."""
 
 
-class Proxy(Endpoint):
+class Proxy(Emulator):
     """Delays, reorders and loses datagrams between one server and at most `flows` clients.
 
     Args:
-        path: number of the session's path, from 0, in the record.
+        recorder, path: see `Emulator`.
     """
 
-    changeable = keys_of(InFlight.IMPAIRMENT)
     patience_ns = MILLISECOND_NS // 4
 
     def __init__(
@@ -57,13 +53,10 @@ class Proxy(Endpoint):
         recorder: Recorder | None = None,
         path: int = 0,
     ) -> None:
-        super().__init__()
-        self._flows_max = flows
-        self._scenario = scenario
-        self._server = server
         self._mtu = mtu = scenario.network.mtu
-        self.uplink = Link(UPLINK, mtu, recorder, scenario.uplink, path)
-        self.downlink = Link(DOWNLINK, mtu, recorder, scenario.downlink, path)
+        super().__init__(scenario, mtu=mtu, recorder=recorder, path=path)
+        self._flows_max = flows
+        self._server = server
         self._places = Places(flows)
         self._by_socket: dict[int, Flow] = {}
         self._opened = 0
@@ -78,8 +71,6 @@ class Proxy(Endpoint):
         self._passed: OrderedDict[bytes, tuple[int, Address]] = OrderedDict()
         """Until the server answers: laps of each of the newest packets, and the latest client that
         sent it, by digest of the packet."""
-        self._faults: set[str] = set()
-        """Tracebacks of plug-ins' errors that were reported."""
         self.refused = 0
         """Number of packets from clients without a flow, and to a flow's socket not from the
         server."""
@@ -110,17 +101,12 @@ class Proxy(Endpoint):
             self._is_answered, self._is_unreachable = True, False
             self._passed.clear()
         if flow.uplink.fates.fault or flow.downlink.fates.fault:
-            self._report_faults(flow)
+            self._report(flow.uplink.fates.fault)
+            self._report(flow.downlink.fates.fault)
         self._places.hear(flow, now_ns, is_answer=socket != 0)
         # A packet without delay leaves now, not at the next wake.
         if may_leave:
             self._forward(now_ns)
-
-    def _report_faults(self, flow: Flow) -> None:
-        for lane in (flow.uplink, flow.downlink):
-            if lane.fates.fault and lane.fates.fault not in self._faults:
-                self._faults.add(lane.fates.fault)
-                self._events.append(Fault(traceback=lane.fates.fault))
 
     def undelivered(self, socket: int, reason: str) -> None:
         """See `Endpoint`; undelivered packets to clients, which come and go, are only counted."""
@@ -131,20 +117,6 @@ class Proxy(Endpoint):
             self._is_unreachable = True
             host, port = self._server
             self._events.append(Unreachable(host=host, port=port, reason=reason))
-
-    def wake(self, *, now_ns: int) -> None:
-        self._forward(now_ns)
-
-    def _forward(self, now_ns: int) -> None:
-        for link in (self.uplink, self.downlink):
-            if link.is_due(now_ns):
-                self._out += link.release(now_ns=now_ns)
-
-    def next_wake_ns(self) -> int | None:
-        up_ns, down_ns = self.uplink.next_due_ns(), self.downlink.next_due_ns()
-        if up_ns is None or (down_ns is not None and down_ns < up_ns):
-            return down_ns
-        return up_ns
 
     def _open(self, datagram: Datagram, now_ns: int) -> Flow | None:
         client = host, port = datagram.peer
@@ -164,8 +136,8 @@ class Proxy(Endpoint):
         flow = Flow(
             client,
             socket,
-            Lane(number, self._fates("uplink", number), now_ns),
-            Lane(number, self._fates("downlink", number), now_ns),
+            Lane(number, self.fates("uplink", number), now_ns),
+            Lane(number, self.fates("downlink", number), now_ns),
             now_ns,
             host_of(client),
             self._places.others,
@@ -197,32 +169,11 @@ class Proxy(Endpoint):
         if len(self._passed) > QUEUE_MAX:
             self._passed.popitem(last=False)
 
-    def _fates(self, name: Literal["uplink", "downlink"], flow: int) -> Fates:
-        direction = getattr(self._scenario, name)
-        return Fates(direction, self._scenario.seed, name, flow)
-
-    def change(
-        self,
-        scenario: Scenario,
-        keys: frozenset[str],  # noqa: ARG002
-        *,
-        now_ns: int,
-    ) -> None:
-        """See `Endpoint`; queued packets keep their fate."""
-        self._scenario = scenario
-        self.uplink.change(scenario.uplink, now_ns=now_ns)
-        self.downlink.change(scenario.downlink, now_ns=now_ns)
-        for flow in self._by_socket.values():
-            flow.uplink.fates = self._fates("uplink", flow.uplink.flow)
-            flow.downlink.fates = self._fates("downlink", flow.downlink.flow)
+    def lanes(self) -> Iterable[tuple[Lane, Lane]]:
+        return ((flow.uplink, flow.downlink) for flow in self._by_socket.values())
 
     def figures(self) -> dict[str, Any]:
-        return {
-            "flows": len(self._by_socket),
-            "refused": self.refused,
-            "uplink": self.uplink.figures(),
-            "downlink": self.downlink.figures(),
-        }
+        return {"flows": len(self._by_socket), "refused": self.refused} | super().figures()
 
 
 def of_paths(each: Sequence[Mapping[str, Any]]) -> dict[str, Any]:

@@ -11,20 +11,21 @@ end sends no more.
 """
 
 from collections import deque
+from collections.abc import Iterable
 from dataclasses import replace
 from typing import Any
 
+from skytether.netem.emulator import Direction, Emulator
 from skytether.netem.fate import Fates
 from skytether.netem.link import Lane, Link
 from skytether.shared.base.units import MILLISECOND_NS
-from skytether.shared.core.endpoint import Address, Datagram, Endpoint, make_datagram
+from skytether.shared.core.endpoint import Address, Datagram, make_datagram
 from skytether.shared.core.events import FlowOpened, Unreachable
 from skytether.shared.core.line import CLIENT, PIECE_BYTES, SERVER
 from skytether.shared.scenario.air.draws import SLOT_NS, Fate
-from skytether.shared.scenario.catalogue import keys_of
-from skytether.shared.scenario.owners import InFlight
+from skytether.shared.scenario.air.path import Path
 from skytether.shared.scenario.schema import Scenario
-from skytether.shared.telemetry.record import DOWNLINK, UPLINK, Recorder
+from skytether.shared.telemetry.record import Recorder
 
 RETRY_NS = 200 * MILLISECOND_NS
 """Time after which a piece that would have been lost is tried again [ns]: Linux's smallest
@@ -44,23 +45,27 @@ class Whole(Fates):
 class Stream:
     """One direction of a connection."""
 
-    def __init__(self, lane: Lane, fates: Whole, link: Link) -> None:
-        self.lane, self.fates, self.link = lane, fates, link
+    def __init__(self, lane: Lane, link: Link) -> None:
+        self.lane, self.link = lane, link
         self.held: deque[Datagram] = deque()
         """Pieces that have not entered the link."""
         self.retry_ns: int | None = None
         """Time at which the first held piece is tried again; None while it waits for room."""
 
+    def loses(self, now_ns: int) -> bool:
+        """Whether a packet would be lost now."""
+        fates = self.lane.fates
+        assert isinstance(fates, Whole)
+        return fates.loses((now_ns - self.lane.began_ns) // SLOT_NS)
 
-class Relay(Endpoint):
+
+class Relay(Emulator):
     """Delays, slows and cuts the connections to one server.
 
     Args:
         server: address of the server, for events only.
-        path: number of the session's path, from 0, in the record.
+        recorder, path: see `Emulator`.
     """
-
-    changeable = keys_of(InFlight.IMPAIRMENT)
 
     def __init__(
         self,
@@ -70,10 +75,8 @@ class Relay(Endpoint):
         recorder: Recorder | None = None,
         path: int = 0,
     ) -> None:
-        super().__init__()
-        self._scenario, self._server = scenario, server
-        self.uplink = Link(UPLINK, PIECE_BYTES, recorder, number=path)
-        self.downlink = Link(DOWNLINK, PIECE_BYTES, recorder, number=path)
+        super().__init__(scenario, mtu=PIECE_BYTES, recorder=recorder, path=path)
+        self._server = server
         self._streams: dict[Address, Stream] = {}
         """Streams by their source."""
         self._holding: dict[Address, Stream] = {}
@@ -82,38 +85,35 @@ class Relay(Endpoint):
         """Sources whose end has left."""
         self._opened = 0
         self._retries = 0
-        self._change_links(now_ns=0)
 
     def receive(self, datagram: Datagram, *, now_ns: int) -> None:
         source = side, number = datagram.peer
         if source not in self._streams:
             self._open(number, now_ns)
-        onward = make_datagram((datagram.payload, (_other(side), number), datagram.socket))
         stream = self._streams[source]
-        stream.held.append(onward)
+        onward = (datagram.payload, (_other(side), number), datagram.socket)
+        stream.held.append(make_datagram(onward))
         if len(stream.held) == 1:
             self._admit(source, stream, now_ns)
+        self._report(stream.lane.fates.fault)
         self._forward(now_ns)
 
     def _open(self, number: int, now_ns: int) -> None:
-        for side, name, link in (
-            (CLIENT, "downlink", self.downlink),
-            (SERVER, "uplink", self.uplink),
-        ):
-            fates = Whole(getattr(self._scenario, name), self._scenario.seed, name, self._opened)
-            lane = Lane(self._opened, fates, now_ns)
-            self._streams[side, number] = Stream(lane, fates, link)
-        self._events.append(FlowOpened(flow=self._opened, host=CLIENT, port=number))
+        flow = self._opened
+        up = Lane(flow, self.fates("uplink", flow), now_ns)
+        down = Lane(flow, self.fates("downlink", flow), now_ns)
+        self._streams[SERVER, number] = Stream(up, self.uplink)
+        self._streams[CLIENT, number] = Stream(down, self.downlink)
+        self._events.append(FlowOpened(flow=flow, host=CLIENT, port=number))
         self._opened += 1
 
     def _admit(self, source: Address, stream: Stream, now_ns: int) -> None:
         """Let the held pieces of a stream enter its link, up to one that must wait."""
         self._holding.pop(source, None)
         while stream.held:
-            first = stream.held[0]
-            if not stream.link.has_room(len(first.payload)):
+            if not stream.link.has_room(len(stream.held[0].payload)):
                 stream.retry_ns = None
-            elif stream.fates.loses((now_ns - stream.lane.began_ns) // SLOT_NS):
+            elif stream.loses(now_ns):
                 stream.retry_ns = now_ns + RETRY_NS
                 self._retries += 1
             else:
@@ -129,66 +129,51 @@ class Relay(Endpoint):
                 self._admit(source, stream, now_ns)
         self._forward(now_ns)
 
-    def _forward(self, now_ns: int) -> None:
-        for link in (self.uplink, self.downlink):
-            if link.is_due(now_ns):
-                for piece in link.release(now_ns=now_ns):
-                    self._out.append(piece)
-                    if not piece.payload:
-                        self._end(piece.peer)
+    def next_wake_ns(self) -> int | None:
+        retries_ns = [stream.retry_ns for stream in self._holding.values()]
+        due_ns = (each for each in (super().next_wake_ns(), *retries_ns) if each is not None)
+        return min(due_ns, default=None)
 
-    def _end(self, peer: Address) -> None:
+    def _leave(self, datagrams: list[Datagram]) -> None:
+        super()._leave(datagrams)
+        for payload, (side, number), _ in datagrams:
+            if not payload:
+                self._end(_other(side), number)
+
+    def _end(self, side: str, number: int) -> None:
         """Forget a connection once both of its ends have sent all."""
-        side, number = peer
-        self._ended.add((_other(side), number))
+        self._ended.add((side, number))
         both = (CLIENT, number), (SERVER, number)
         if self._ended.issuperset(both):
+            self._ended.difference_update(both)
             for source in both:
-                self._ended.discard(source)
-                self._streams.pop(source, None)
-
-    def next_wake_ns(self) -> int | None:
-        due_ns = [self.uplink.next_due_ns(), self.downlink.next_due_ns()]
-        due_ns += [stream.retry_ns for stream in self._holding.values()]
-        return min((each for each in due_ns if each is not None), default=None)
+                del self._streams[source]
 
     def undelivered(self, socket: int, reason: str) -> None:  # noqa: ARG002 - there is only one
         """Report a connection that the server has refused."""
         host, port = self._server
         self._events.append(Unreachable(host=host, port=port, reason=reason))
 
-    def change(
-        self,
-        scenario: Scenario,
-        keys: frozenset[str],  # noqa: ARG002
-        *,
-        now_ns: int,
-    ) -> None:
-        """See `Endpoint`; pieces that have entered keep their fate."""
-        self._scenario = scenario
-        self._change_links(now_ns=now_ns)
-        for (side, _), stream in self._streams.items():
-            name = "downlink" if side == CLIENT else "uplink"
-            direction, flow = getattr(scenario, name), stream.lane.flow
-            stream.fates = Whole(direction, scenario.seed, name, flow)
-            stream.lane.fates = stream.fates
-            if stream.held:
-                stream.retry_ns = now_ns
+    def lanes(self) -> Iterable[tuple[Lane, Lane]]:
+        for (side, number), stream in self._streams.items():
+            if side == SERVER:
+                yield stream.lane, self._streams[CLIENT, number].lane
 
-    def _change_links(self, *, now_ns: int) -> None:
-        for link, path in (
-            (self.uplink, self._scenario.uplink),
-            (self.downlink, self._scenario.downlink),
-        ):
-            link.change(path.for_streams(), now_ns=now_ns)
+    def path(self, name: Direction) -> Path:
+        return super().path(name).for_streams()
+
+    def fates(self, name: Direction, flow: int) -> Fates:
+        return Whole(self.path(name), self._scenario.seed, name, flow)
+
+    def change(self, scenario: Scenario, keys: frozenset[str], *, now_ns: int) -> None:
+        """See `Endpoint`; what is held up is tried again at once."""
+        super().change(scenario, keys, now_ns=now_ns)
+        for stream in self._holding.values():
+            stream.retry_ns = now_ns
 
     def figures(self) -> dict[str, Any]:
-        return {
-            "flows": len(self._streams) // 2,
-            "retries": self._retries,
-            "uplink": self.uplink.figures(),
-            "downlink": self.downlink.figures(),
-        }
+        flows = {"flows": len(self._streams) // 2, "retries": self._retries}
+        return flows | super().figures()
 
 
 def _other(side: str) -> str:

@@ -6,18 +6,17 @@ network in each run.
 """
 
 from collections import OrderedDict
+from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
+from skytether.netem.emulator import Direction, Emulator
 from skytether.netem.fate import Fates
-from skytether.netem.link import Lane, Link
+from skytether.netem.link import Lane
 from skytether.shared.base.packets import OUTSIDE, PROGRAM, flow_of, too_long
-from skytether.shared.core.endpoint import Datagram, Endpoint
-from skytether.shared.core.events import Fault
-from skytether.shared.scenario.catalogue import keys_of
-from skytether.shared.scenario.owners import InFlight
+from skytether.shared.core.endpoint import Datagram
 from skytether.shared.scenario.schema import Scenario
-from skytether.shared.telemetry.record import DOWNLINK, UPLINK, Recorder
+from skytether.shared.telemetry.record import Recorder
 
 FLOWS_MAX = 16_384
 """Largest number of flows known at once; a further one replaces that which was silent longest."""
@@ -31,7 +30,7 @@ class Flow:
     downlink: Lane
 
 
-class Tunnel(Endpoint):
+class Tunnel(Emulator):
     """Delays, reorders and loses packets between a program and the outside.
 
     A datagram's peer is PROGRAM or OUTSIDE, and its payload a packet of IP. An empty one is the
@@ -41,20 +40,14 @@ class Tunnel(Endpoint):
         mtu: largest packet that passes [B]; the program gets an ICMP error for a longer one.
     """
 
-    changeable = keys_of(InFlight.IMPAIRMENT)
-
     def __init__(self, scenario: Scenario, *, mtu: int, recorder: Recorder | None = None) -> None:
-        super().__init__()
-        self._scenario, self._mtu = scenario, mtu
-        self.uplink = Link(UPLINK, mtu, recorder, scenario.uplink, header_bytes=0)
-        self.downlink = Link(DOWNLINK, mtu, recorder, scenario.downlink, header_bytes=0)
+        super().__init__(scenario, mtu=mtu, recorder=recorder, header_bytes=0)
+        self._mtu = mtu
         self._flows: OrderedDict[bytes, Flow] = OrderedDict()
         """Flows by key, that which was silent longest first."""
         self._opened = 0
         self._began_ns = 0
         """Time of the first packet: outages and traces begin with it, for all flows."""
-        self._faults: set[str] = set()
-        """Tracebacks of plug-ins' errors that were reported."""
         self._has_ended = self._is_cut = False
         """Whether the program has ended, and whether the outside has."""
         self.refused = 0
@@ -78,27 +71,9 @@ class Tunnel(Endpoint):
         may_leave = link.accept(onward, lane, now_ns=now_ns)
         if len(packet) > self._mtu and is_outward and (answer := too_long(packet, self._mtu)):
             self.send(answer, PROGRAM, number)
-        if lane.fates.fault:
-            self._report(lane.fates.fault)
+        self._report(lane.fates.fault)
         if may_leave:  # a packet without delay leaves now, not at the next wake
             self._forward(now_ns)
-
-    def _report(self, fault: str) -> None:
-        if fault not in self._faults:
-            self._faults.add(fault)
-            self._events.append(Fault(traceback=fault))
-
-    def wake(self, *, now_ns: int) -> None:
-        self._forward(now_ns)
-
-    def _forward(self, now_ns: int) -> None:
-        for link in (self.uplink, self.downlink):
-            if link.is_due(now_ns):
-                self._out += link.release(now_ns=now_ns)
-
-    def next_wake_ns(self) -> int | None:
-        due = (self.uplink.next_due_ns(), self.downlink.next_due_ns())
-        return min((each for each in due if each is not None), default=None)
 
     @property
     def finished(self) -> bool:
@@ -108,36 +83,18 @@ class Tunnel(Endpoint):
         self._began_ns = self._began_ns or now_ns
         number = self._opened
         self._opened += 1
-        up, down = self._fates("uplink", number), self._fates("downlink", number)
+        up, down = self.fates("uplink", number), self.fates("downlink", number)
         flow = Flow(Lane(number, up, self._began_ns), Lane(number, down, self._began_ns))
         self._flows[key] = flow
         if len(self._flows) > FLOWS_MAX:
             self._flows.popitem(last=False)
         return flow
 
-    def _fates(self, name: Literal["uplink", "downlink"], flow: int) -> Fates:
-        direction = getattr(self._scenario, name)
-        return Fates(direction, self._scenario.seed, name, flow, by_number=True)
+    def lanes(self) -> Iterable[tuple[Lane, Lane]]:
+        return ((flow.uplink, flow.downlink) for flow in self._flows.values())
 
-    def change(
-        self,
-        scenario: Scenario,
-        keys: frozenset[str],  # noqa: ARG002
-        *,
-        now_ns: int,
-    ) -> None:
-        """See `Endpoint`; queued packets keep their fate."""
-        self._scenario = scenario
-        self.uplink.change(scenario.uplink, now_ns=now_ns)
-        self.downlink.change(scenario.downlink, now_ns=now_ns)
-        for flow in self._flows.values():
-            flow.uplink.fates = self._fates("uplink", flow.uplink.flow)
-            flow.downlink.fates = self._fates("downlink", flow.downlink.flow)
+    def fates(self, name: Direction, flow: int) -> Fates:
+        return Fates(self.path(name), self._scenario.seed, name, flow, by_number=True)
 
     def figures(self) -> dict[str, Any]:
-        return {
-            "flows": self._opened,
-            "refused": self.refused,
-            "uplink": self.uplink.figures(),
-            "downlink": self.downlink.figures(),
-        }
+        return {"flows": self._opened, "refused": self.refused} | super().figures()

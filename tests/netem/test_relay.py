@@ -99,6 +99,16 @@ def test_a_cut_stream_goes_on_once_it_is_healed() -> None:
     assert at == 20 * SECOND_NS + SECOND_NS // 10
 
 
+def test_a_smaller_queue_takes_nothing_back() -> None:
+    relay = make_relay("rate(10000, queue=30000)")
+    sent = [bytes([number]) * PIECE_BYTES for number in range(20)]
+    for piece in sent:
+        hear(relay, piece)
+    narrow = NetworkConfig(uplink="rate(20000, queue=2000)", downlink="rate(20000, queue=2000)")
+    relay.change(Scenario(network=narrow), frozenset(), now_ns=SECOND_NS)
+    assert [piece.payload for _, piece in run(relay)] == sent
+
+
 def test_a_lost_piece_is_tried_again_as_by_a_retransmission() -> None:
     relay = make_relay("outage(0, 0.5)")
     hear(relay, b"first")

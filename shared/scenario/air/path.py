@@ -52,7 +52,7 @@ class Path:
         path.is_ordered = True
         if path.queue:
             path.queue = copy(path.queue)
-            path.queue.drop = "tail"
+            path.queue.drop, path.queue.keeps_all = "tail", True
         return path
 
 

@@ -26,6 +26,9 @@ class Ordered(Impairment):
 class Queued(Impairment):
     """Finite rate with a queue that packets of all flows share."""
 
+    keeps_all = False
+    """Whether nothing is dropped, because whoever sends waits for room."""
+
     def __init__(self, queue: int, drop: Drop, serve: Served) -> None:
         self.room_bytes = queue
         self.drop: Drop = drop

@@ -1,0 +1,107 @@
+"""Both directions of an emulated network, for whatever passes through: see `proxy` for datagrams,
+`relay` for byte streams and `tunnel` for packets of IP.
+
+As in the paper, uplink is to the vehicle, or to whoever takes its place: a proxy's client, a
+tunnel's program.
+"""
+
+from abc import abstractmethod
+from collections.abc import Iterable
+from typing import Any, Literal
+
+from skytether.netem.fate import Fates
+from skytether.netem.link import Lane, Link
+from skytether.shared.base.units import HEADER_BYTES
+from skytether.shared.core.endpoint import Datagram, Endpoint
+from skytether.shared.core.events import Fault
+from skytether.shared.scenario.air.path import Path
+from skytether.shared.scenario.catalogue import keys_of
+from skytether.shared.scenario.owners import InFlight
+from skytether.shared.scenario.schema import Scenario
+from skytether.shared.telemetry.record import DOWNLINK, UPLINK, Recorder
+
+Direction = Literal["uplink", "downlink"]
+
+
+class Emulator(Endpoint):
+    """Delays, reorders and loses what passes in two directions.
+
+    Args:
+        mtu: largest payload that passes [B].
+        path: number of the session's path, from 0, in the record.
+        header_bytes: see `Link`.
+    """
+
+    changeable = keys_of(InFlight.IMPAIRMENT)
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        *,
+        mtu: int,
+        recorder: Recorder | None,
+        path: int = 0,
+        header_bytes: int = HEADER_BYTES,
+    ) -> None:
+        super().__init__()
+        self._scenario = scenario
+
+        def link(direction: int, name: Direction) -> Link:
+            of = self.path(name)
+            return Link(direction, mtu, recorder, of, path, header_bytes=header_bytes)
+
+        self.uplink, self.downlink = link(UPLINK, "uplink"), link(DOWNLINK, "downlink")
+        self._faults: set[str] = set()
+        """Tracebacks of plug-ins' errors that were reported."""
+
+    @abstractmethod
+    def lanes(self) -> Iterable[tuple[Lane, Lane]]:
+        """Uplink and downlink of each flow."""
+
+    def path(self, name: Direction) -> Path:
+        """Impairments of a direction."""
+        path: Path = getattr(self._scenario, name)
+        return path
+
+    def fates(self, name: Direction, flow: int) -> Fates:
+        return Fates(self.path(name), self._scenario.seed, name, flow)
+
+    def wake(self, *, now_ns: int) -> None:
+        self._forward(now_ns)
+
+    def _forward(self, now_ns: int) -> None:
+        for link in (self.uplink, self.downlink):
+            if link.is_due(now_ns):
+                self._leave(link.release(now_ns=now_ns))
+
+    def _leave(self, datagrams: list[Datagram]) -> None:
+        self._out += datagrams
+
+    def next_wake_ns(self) -> int | None:
+        up_ns, down_ns = self.uplink.next_due_ns(), self.downlink.next_due_ns()
+        if up_ns is None or (down_ns is not None and down_ns < up_ns):
+            return down_ns
+        return up_ns
+
+    def change(
+        self,
+        scenario: Scenario,
+        keys: frozenset[str],  # noqa: ARG002
+        *,
+        now_ns: int,
+    ) -> None:
+        """See `Endpoint`; queued packets keep their fate."""
+        self._scenario = scenario
+        self.uplink.change(self.path("uplink"), now_ns=now_ns)
+        self.downlink.change(self.path("downlink"), now_ns=now_ns)
+        for up, down in self.lanes():
+            up.fates, down.fates = self.fates("uplink", up.flow), self.fates("downlink", down.flow)
+
+    def _report(self, fault: str) -> None:
+        """Report a plug-in's error once."""
+        if fault and fault not in self._faults:
+            self._faults.add(fault)
+            self._events.append(Fault(traceback=fault))
+
+    def figures(self) -> dict[str, Any]:
+        return {"uplink": self.uplink.figures(), "downlink": self.downlink.figures()}
