@@ -3,15 +3,14 @@
     program ── TUN device ── netem ── slirp4netns ── this machine's sockets
 
 slirp4netns makes sockets of this machine from packets, as for a virtual machine: for User Mode
-Linux it takes Ethernet frames at a Unix socket, so that it needs no namespace. It ends with the
-pipe `--exit-fd`, whose other end netem alone holds. See `shell.inside` for the program.
+Linux it takes Ethernet frames at a Unix socket, so that it needs no namespace. See `shell.inside`
+for the program.
 """
 
 import asyncio
 import fcntl
 import json
 import os
-import resource
 import shutil
 import signal
 import socket
@@ -43,6 +42,9 @@ from skytether.shell.start import PARENT
 from skytether.shell.udp import BUFFER_BYTES
 
 SLIRP = "slirp4netns"
+GUARD = 'ulimit -n "$(ulimit -Hn)"; exec 9<&0; (read -r _ <&9; kill -9 0) & "$@" </dev/null'
+"""Shell script that runs slirp4netns, with a file for each flow, and kills it when netem ends:
+netem holds the other end of standard input. `--exit-fd` has no effect before netem is connected."""
 FRAME_BYTES_MAX = 65_536
 WAITING_MAX = 16_384
 """Largest number of packets that wait for slirp4netns; further ones are send errors."""
@@ -126,35 +128,36 @@ def _slirp(mtu: int, exposed: Sequence[Address]) -> Iterator[socket.socket]:
             f"{SLIRP} is missing, the way out of namespaces: install it (apt install {SLIRP}, "
             f"dnf install {SLIRP})"
         )
-    exit_end, exit_held = os.pipe()
+    held_end, held = os.pipe()
     with ExitStack() as stack:
         outside = stack.enter_context(socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET))
         with temporary.folder() as folder, (folder / "said").open("w+b") as said:
-            ready, ready_end = os.pipe()
             frames, orders = folder / "frames", folder / "orders"
             command = [found, "--target-type=bess", "--enable-ipv6", f"--mtu={mtu}"]
-            command += [f"--exit-fd={exit_end}", f"--ready-fd={ready_end}"]
             command += [f"--api-socket={orders}", str(frames)]
             slirp = subprocess.Popen(
-                command,
-                pass_fds=(exit_end, ready_end),
-                stdin=subprocess.DEVNULL,
+                ["sh", "-c", GUARD, "sh", *command],
+                stdin=held_end,
                 stdout=said,
                 stderr=said,
                 start_new_session=True,  # Ctrl-C is for the program
             )
             stack.callback(slirp.wait)
-            stack.callback(os.close, exit_held)
-            os.close(exit_end)
-            os.close(ready_end)
+            stack.callback(os.close, held)
+            os.close(held_end)
             _connect(outside, frames, slirp, said)
-            with os.fdopen(ready, "rb") as started:
-                if not started.read(1):
-                    raise _failed(said)
+
+            def order(execute: str, **arguments: object) -> bool:
+                asked = json.dumps({"execute": execute, "arguments": arguments})
+                with socket.socket(socket.AF_UNIX) as sock:
+                    _connect(sock, orders, slirp, said)
+                    sock.send(asked.encode())
+                    sock.shutdown(socket.SHUT_WR)
+                    return "return" in json.loads(sock.recv(4096) or b"{}")
+
+            order("list_hostfwd")  # it needs the folder until it can answer
             for address in exposed:
-                _expose(orders, address)
-        _, most = resource.getrlimit(resource.RLIMIT_NOFILE)
-        resource.prlimit(slirp.pid, resource.RLIMIT_NOFILE, (most, most))  # a socket a flow
+                _expose(order, address)
         for each in announcements():
             outside.send(each)
         outside.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, BUFFER_BYTES)
@@ -164,17 +167,17 @@ def _slirp(mtu: int, exposed: Sequence[Address]) -> Iterator[socket.socket]:
 
 
 def _connect(
-    outside: socket.socket, frames: Path, slirp: "subprocess.Popen[bytes]", said: IO[bytes]
+    sock: socket.socket, path: Path, slirp: "subprocess.Popen[bytes]", said: IO[bytes]
 ) -> None:
+    """Connect to a socket of slirp4netns as soon as it is there."""
     until_s = time.monotonic() + PATIENCE_S
     while slirp.poll() is None and time.monotonic() < until_s:
         try:
-            outside.connect(str(frames))
+            sock.connect(str(path))
         except (FileNotFoundError, ConnectionRefusedError):
             time.sleep(0.002)
         else:
             return
-    slirp.kill()
     raise _failed(said)
 
 
@@ -185,17 +188,11 @@ def _failed(said: IO[bytes]) -> ProgramError:
     return ProgramError(f"{SLIRP} does not start, expected version 1.2 or later: {what}")
 
 
-def _expose(orders: Path, address: Address) -> None:
+def _expose(order: Callable[..., bool], address: Address) -> None:
     host, port = address
+    at = {"host_addr": host, "host_port": port, "guest_addr": str(ADDRESS), "guest_port": port}
     for protocol in ("tcp", "udp"):
-        asked = {"proto": protocol, "host_addr": host, "host_port": port}
-        asked |= {"guest_addr": str(ADDRESS), "guest_port": port}
-        with socket.socket(socket.AF_UNIX) as order:
-            order.connect(str(orders))
-            order.send(json.dumps({"execute": "add_hostfwd", "arguments": asked}).encode())
-            order.shutdown(socket.SHUT_WR)
-            answer = json.loads(order.recv(4096) or b"{}")
-        if "return" not in answer:
+        if not order("add_hostfwd", proto=protocol, **at):
             raise ProgramError(f"--expose: {SLIRP} cannot listen on {host}:{port} ({protocol})")
 
 
@@ -278,7 +275,10 @@ class ProgramLine:
         room, packets = self._room, list[Datagram]()
         with suppress(OSError):
             for _ in range(BATCH_MAX):
-                size = self._program.outside.recv_into(room)
+                try:
+                    size = self._program.outside.recv_into(room)
+                except ConnectionError:
+                    size = 0
                 if not size:
                     self._end(f"{SLIRP} has ended: the program has no network any more")
                     return
