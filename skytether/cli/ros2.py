@@ -39,6 +39,8 @@ from skytether.shell.log import Log
 from skytether.shell.options import read
 from skytether.view.rows import check_columns, planned
 
+REPEAT_S = 1.0
+"""Interval at which the newest paths are published again, for tools that have started since."""
 GOALS, POINT, VELOCITY = "mission.goals", "reference.points_m", "reference.velocity_mps"
 
 
@@ -93,6 +95,8 @@ class Bridge:
         """Columns of plans; None without plans."""
         self._nodes: dict[int, tuple[Node, GraphSession]] = {}
         """Nodes by the numbers of their vehicles, at most VEHICLES_TOLD_MAX."""
+        self._paths: dict[int, Sequence[Vector]] = {}
+        """Newest path of each node's vehicle [m]."""
         self._wanted: dict[int, Vector] = {}
         """Newest goals [m] that the server has not been asked for, by vehicle."""
 
@@ -100,6 +104,7 @@ class Bridge:
         self._loop, self._asked = asyncio.get_running_loop(), asyncio.Event()
         feeds = {"server": self._options.folder / "server.feed"}
         async with asyncio.TaskGroup() as self._tasks:
+            self._tasks.create_task(self._repeat())
             with closing(Subscriber(feeds, self._read)):
                 await self._ask_for_goals()
 
@@ -124,15 +129,25 @@ class Bridge:
                 path[:, : self._scenario.model.axes] = planned(self._scenario, row)
                 positions = [(x, y, z) for x, y, z in path.tolist()]
                 with suppress(RuntimeError):  # the loop has closed meanwhile
-                    self._loop.call_soon_threadsafe(self._publish, vehicle, positions)
+                    self._loop.call_soon_threadsafe(self._show, vehicle, positions)
 
-    def _publish(self, vehicle: int, positions: Sequence[Vector]) -> None:
+    def _show(self, vehicle: int, positions: Sequence[Vector]) -> None:
         if vehicle not in self._nodes and len(self._nodes) < VEHICLES_TOLD_MAX:
             self._nodes[vehicle] = self._opened(vehicle)
         if vehicle in self._nodes:
-            node, session = self._nodes[vehicle]
-            path = messages.path(time.time_ns(), self._options.frame, positions)
-            session.send(path, (node.publishes.name, 0))
+            self._paths[vehicle] = positions
+            self._publish(vehicle)
+
+    def _publish(self, vehicle: int) -> None:
+        node, session = self._nodes[vehicle]
+        path = messages.path(time.time_ns(), self._options.frame, self._paths[vehicle])
+        session.send(path, (node.publishes.name, 0))
+
+    async def _repeat(self) -> None:
+        while True:
+            await asyncio.sleep(REPEAT_S)
+            for vehicle in self._nodes:
+                self._publish(vehicle)
 
     def _opened(self, vehicle: int) -> tuple[Node, GraphSession]:
         name = f"/skytether_{vehicle}"

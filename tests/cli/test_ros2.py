@@ -1,4 +1,4 @@
-"""Plans and goals of a flight in ROS 2: what is asked for, and a mission over an actual Zenoh."""
+"""Plans and goals of a flight in ROS 2: what is asked for, and a flight over an actual Zenoh."""
 
 import subprocess
 import time
@@ -72,8 +72,8 @@ def test_options_that_lead_nowhere_are_refused(option: tuple[str, str], said: st
 
 @pytest.mark.long
 @pytest.mark.usefixtures("documented_ports")
-def test_a_mission_is_seen_and_led_over_zenoh(tmp_path: Path) -> None:
-    """A vehicle at rest is sent elsewhere, and the path that comes then ends there."""
+def test_a_flight_is_seen_and_led_over_zenoh(tmp_path: Path) -> None:
+    """A vehicle at a live point is sent elsewhere, and a path that comes then ends there."""
     port = robot.free_port()
     router, tools = robot.opened("router", port), robot.opened("peer", port)
     came: deque[Any] = deque(maxlen=100)
@@ -85,7 +85,8 @@ def test_a_mission_is_seen_and_led_over_zenoh(tmp_path: Path) -> None:
         at = came[-1].poses[-1].pose.position
         return at.x, at.y
 
-    flight = [*SKYTETHER, "fly", "swap", "--control", "flying", "--duration", "170"]
+    live = "--reference.shape", "live", "--reference.points_m", "[[0.0, 0.0]]"
+    flight = [*SKYTETHER, "fly", "demo", *live, "--control", "flying", "--duration", "300"]
     bridge = [*SKYTETHER, "ros2", "flying", "--address", f"tcp:127.0.0.1:{port}"]
     with (
         subprocess.Popen(flight, cwd=tmp_path, stdout=subprocess.DEVNULL) as flies,
@@ -107,5 +108,5 @@ def test_a_mission_is_seen_and_led_over_zenoh(tmp_path: Path) -> None:
     tools.close()
     router.close()
     assert came[-1].header.frame_id == "map"
-    assert "goal(1, 0.5, -0.25)" in said
+    assert "reference.points_m is [[0.5,-0.25]] from now on" in said
     assert shows.returncode == 0
