@@ -34,7 +34,7 @@ ERRORS, LATE, NOT_CALLED = "planner_errors", "planner_late", "planner_not_called
 
 
 @dataclass(slots=True)
-class Own:
+class VehiclePlanner:
     """Planner of one vehicle, and its last plan."""
 
     number: int
@@ -47,7 +47,7 @@ class Own:
     """Step at which that plan started, or -1."""
 
 
-class OwnPlanners:
+class PluginPlanners:
     """Planners of up to `capacity` vehicles.
 
     Args:
@@ -65,7 +65,7 @@ class OwnPlanners:
         self._states, self._tell, self._planning = states, fleet.tell, fleet.planning
         self._counts = counts
         self._numbers = count()
-        self._own: dict[int, Own] = {}
+        self._own: dict[int, VehiclePlanner] = {}
         """Planners by the rows of their vehicles."""
         try:
             self._spare = self._make()
@@ -103,14 +103,14 @@ class OwnPlanners:
             for own, start, answer in zip(owns, starts.tolist(), answers, strict=True)
         ]
 
-    def _of(self, row: int) -> Own:
+    def _of(self, row: int) -> VehiclePlanner:
         if row not in self._own:
             inputs = np.zeros((self._problem.axes, self._problem.horizon))
-            self._own[row] = Own(next(self._numbers), self._spare, inputs)
+            self._own[row] = VehiclePlanner(next(self._numbers), self._spare, inputs)
             self._spare = None
         return self._own[row]
 
-    def _plan(self, own: Own, start: int, state: Array, reference: Array) -> Any:
+    def _plan(self, own: VehiclePlanner, start: int, state: Array, reference: Array) -> Any:
         if own.planner is None:
             own.planner = self._make()
         gap, H = start - own.start, self._problem.horizon
@@ -119,7 +119,7 @@ class OwnPlanners:
             previous = own.inputs[:, np.minimum(np.arange(H) + gap, H - 1)]
         return own.planner.plan(state, reference, previous)
 
-    def _checked(self, own: Own, start: int, answer: Any) -> Array | None:
+    def _checked(self, own: VehiclePlanner, start: int, answer: Any) -> Array | None:
         problem = self._problem
         shapes: list[tuple[int, ...]] = [(problem.axes, problem.horizon)]
         if self._states:
@@ -152,7 +152,7 @@ class OwnPlanners:
         self._counts[name] += 1
 
 
-class OwnPlanner(Planner):
+class InputPlanner(Planner):
     """Planners of plug-ins for a scheme that sends inputs, with the figures of the MPC.
 
     What a planner returns is the generator's plan, which knows no disturbance; the tracker's, which
@@ -165,7 +165,7 @@ class OwnPlanner(Planner):
         control, terms = fleet.scenario.control, fleet.terms
         desired, capacity, block = fleet.desired, fleet.capacity, fleet.block
         super().__init__(control, terms, desired, capacity, block, fleet.stopwatch)
-        self._planners = OwnPlanners(fleet, counts, states=False)
+        self._planners = PluginPlanners(fleet, counts, states=False)
         self._bounds = np.array(terms.u_max)[:, None]
         self._sent: list[NDArray[Any]] = []
         """Inputs, start and step of the plans sent last to the vehicles of this block."""
