@@ -302,7 +302,7 @@ def test_a_mistake_that_passes_costs_its_steps_alone() -> None:
 
 @pytest.mark.parametrize("hangs", ["made", "asked"])
 def test_a_vehicle_that_takes_the_row_of_one_whose_planner_hangs_is_planned_for(hangs: str) -> None:
-    goes_on = Event()
+    blocks, entered, goes_on = Event(), Event(), Event()
 
     @planner(name="mine")
     class Hanging(Mine):
@@ -310,13 +310,16 @@ def test_a_vehicle_that_takes_the_row_of_one_whose_planner_hangs_is_planned_for(
 
         def __init__(self, problem: Problem) -> None:
             super().__init__(problem)
-            if hangs == "made" and self.number == 2:
-                goes_on.wait()
+            self.wait("made")
 
         def plan(self, *given: Array) -> Any:
-            if hangs == "asked" and self.number == 2:
-                goes_on.wait()
+            self.wait("asked")
             return super().plan(*given)
+
+        def wait(self, where: str) -> None:
+            if where == hangs and self.number > 1 and blocks.is_set():
+                entered.set()
+                goes_on.wait()
 
     planning = Planners(0.3)
     server = Server(scenario(), boot_id=1, entropy=bytes, capacity=2, planning=planning)
@@ -327,9 +330,13 @@ def test_a_vehicle_that_takes_the_row_of_one_whose_planner_hangs_is_planned_for(
         given = np.full(n, 5), np.zeros((n, 2, 2)), np.zeros((n, 2, 41, 2))
         return [plan is not None for plan in own.plan(np.array(rows), *given)]
 
+    blocks.set()
     assert not plans(0, 1)[1]
-    planning._limit_s = 30.0
-    assert plans(0, 1) == [True, False]
+    assert entered.wait(60.0)
+    blocks.clear()
+    planning._limit_s = 60.0
+    while plans(0, 1) != [True, False]:  # the other planner may have been late too
+        pass
     own.forget(1)
     assert plans(0, 1) == [True, True]
     goes_on.set()
