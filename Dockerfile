@@ -1,5 +1,6 @@
-# Four images, each with what it runs and no more: `client` (netem and keygen as well), `aboard` (a
-# client that speaks MAVLink), `page` and `server`. What a lock file pins, and our wheel.
+# Five images, each with what it runs and no more: `client` (netem and keygen as well), `aboard` (a
+# client that speaks MAVLink), `driver` (one that speaks ROS 2), `page` and `server`. What a lock file
+# pins, and our wheel. And `ground`, a robot of ROS 2.
 # BASE_IMAGE may be any with Python 3.11 or later and its venv; either builder of Docker will do.
 ARG BASE_IMAGE=python:3.12-slim
 
@@ -29,6 +30,13 @@ RUN $INSTALL --no-deps --no-index /wheel/*.whl
 FROM tools AS aboard-packages
 COPY locks/mavlink.lock ./
 RUN $INSTALL --require-hashes -r mavlink.lock && $TRIM
+COPY --from=wheel /wheel /wheel
+RUN $INSTALL --no-deps --no-index /wheel/*.whl
+
+
+FROM tools AS driver-packages
+COPY locks/ros2.lock ./
+RUN $INSTALL --require-hashes -r ros2.lock && $TRIM
 COPY --from=wheel /wheel /wheel
 RUN $INSTALL --no-deps --no-index /wheel/*.whl
 
@@ -74,6 +82,10 @@ FROM bare AS aboard
 COPY --from=aboard-packages /opt/skytether /opt/skytether
 
 
+FROM bare AS driver
+COPY --from=driver-packages /opt/skytether /opt/skytether
+
+
 FROM bare AS page
 COPY --from=page-packages /opt/skytether /opt/skytether
 
@@ -83,3 +95,11 @@ ENV NUMBA_CACHE_DIR=/tmp/kernels
 COPY --from=server-packages /opt/skytether /opt/skytether
 # The compiled kernels move to where they can be written to, or nobody would look at them.
 ENTRYPOINT ["/bin/sh", "-c", "cp -r /opt/skytether/kernels /tmp; exec skytether \"$@\"", "skytether"]
+
+
+# The last stage: a builder that makes all before its target pulls no ROS for the others.
+FROM ros:jazzy-ros-base AS ground
+RUN apt-get update && apt-get install --yes --no-install-recommends ros-jazzy-rmw-zenoh-cpp ros-jazzy-nav-msgs && \
+    rm -r /var/lib/apt/lists/*
+ENV RMW_IMPLEMENTATION=rmw_zenoh_cpp HOME=/tmp
+USER 10001:10001

@@ -44,7 +44,7 @@ PLAYERS: Mapping[PlayerName, tuple[str, Callable[[], Player]]] = {
 left or less (LeRobot's threshold), for the last when it differs from what the robot plays anyway,
 for the others always."""
 DELAYS_S, LOSSES = (0.0, 0.05, 0.1, 0.2), (0.0, 0.1, 0.3)
-SEEDS = {"pendulum": 10, "cartpole": 10, "pusht": 5}
+SEEDS = {"pendulum": 20, "cartpole": 20, "pusht": 15}
 """Number of seeds of the tables in docs/gym.md, from 1 on."""
 FOR_S = 0.4
 """Time of rows that the robot keeps in hand when a chunk is not needed [s]."""

@@ -26,6 +26,7 @@ reorders and loses their packets.
   duel SCENARIO...      two or more scenarios on the same network, side by side on one page
   replay FILE           a recording on the page that showed the flight
   page FOLDER...        the page of flights in a browser; `fly` has its own
+  ros2 FOLDER           plans and goals of a flight for RViz and other tools of ROS 2
   report FILE           a recording as an HTML page with figures
   export FILE           a recording as tables, CSV or Parquet
   join FILE...          recordings of server, netem and client, as one
@@ -82,6 +83,7 @@ COMMANDS = {
     "duel": "skytether.cli.duel:duel",
     "replay": "skytether.cli.replay:replay",
     "page": "skytether.view.__main__:show",
+    "ros2": "skytether.cli.ros2:connect",
     "report": "skytether.cli.report:report",
     "export": "skytether.cli.export:export",
     "join": "skytether.cli.join:join",

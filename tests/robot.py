@@ -55,6 +55,7 @@ def decode(kind: str, payload: bytes) -> Any:
 
 ODOMETRY, TWIST = "nav_msgs/msg/Odometry", "geometry_msgs/msg/Twist"
 TWIST_STAMPED = "geometry_msgs/msg/TwistStamped"
+POSE_STAMPED, PATH = "geometry_msgs/msg/PoseStamped", "nav_msgs/msg/Path"
 ENCODE = serialize_dynamic(ODOMETRY, definition(ODOMETRY))[ODOMETRY]
 DECODE = {kind: generate_dynamic(kind, definition(kind))[kind] for kind in (TWIST, TWIST_STAMPED)}
 
@@ -84,6 +85,14 @@ def odometry(
         twist=SimpleNamespace(twist=twist, covariance=[0.0] * 36),
     )
     return bytes(ENCODE(message))
+
+
+def goal(frame: str, place: tuple[float, float, float]) -> bytes:
+    """geometry_msgs/PoseStamped, as RViz sends it."""
+    header = SimpleNamespace(stamp=SimpleNamespace(sec=1, nanosec=2), frame_id=frame)
+    level = SimpleNamespace(x=0.0, y=0.0, z=0.0, w=1.0)
+    pose = SimpleNamespace(position=vector(*place), orientation=level)
+    return encode(POSE_STAMPED, SimpleNamespace(header=header, pose=pose))
 
 
 class Robot:

@@ -180,8 +180,8 @@ class SentPlans(NamedTuple):
 
 
 Planning = Callable[[Sequence[tuple[int, Callable[[], Any]]]], list[Any]]
-"""Function that calls planners of plug-ins, each with the row of its vehicle: returns what each has
-returned, or its exception; TimeoutError if it took too long."""
+"""Function that calls planners of plug-ins, each with a number of its own: returns what each has
+returned, or its exception; TimeoutError if it takes too long, `queue.Full` if too many hang."""
 
 
 def in_turn(calls: Sequence[tuple[int, Callable[[], Any]]]) -> list[Any]:

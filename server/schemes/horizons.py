@@ -12,7 +12,7 @@ import numpy as np
 
 from skytether.server.common.scheme import Batch, Fleet, Foresight, Header, Scheme, SentPlans
 from skytether.server.mpc.hierarchical import Planner
-from skytether.server.mpc.own import OwnPlanner
+from skytether.server.mpc.plugin_planners import InputPlanner
 from skytether.shared.base.kernel import I1, I2, S1, S3, kernel
 from skytether.shared.law.model import Flags, Indices
 from skytether.shared.scenario.planners import MPC
@@ -90,7 +90,7 @@ class HorizonScheme(InputScheme):
         self.planner = (
             Planner(control, terms, fleet.desired, fleet.capacity, fleet.block, stopwatch)
             if control.planner == MPC
-            else OwnPlanner(fleet, predictor.counts)
+            else InputPlanner(fleet, predictor.counts)
         )
         self.observed_step, self.counts = predictor.observed_step, predictor.counts
         self.figures, self.planned = self.planner.figures, self.planner.planned

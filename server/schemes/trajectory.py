@@ -6,7 +6,8 @@ At step k the server sends the trajectory to follow from k on:
 - the known desired trajectory itself, if the horizon is shorter than the time h below;
 - the target's present state, if the server knows nothing ahead;
 
-- what a planner of a plug-in plans along it, extrapolated where it is unknown (`server.mpc.own`).
+- what a planner of a plug-in plans along it, extrapolated where it is unknown
+  (`server.mpc.plugin_planners`).
 
 It is sent as a spline with the fewest uniform knots that keep its error within
 `control.spline_error_m` (`shared.law.spline`); a single state is one knot. A regulator aboard
@@ -44,7 +45,7 @@ from skytether.server.common.scheme import Figures, Fleet, Foresight, Splines
 from skytether.server.common.splines import SplineScheme
 from skytether.server.mpc import exact
 from skytether.server.mpc.nominal import Nominal, make_nominal, plan_nominal
-from skytether.server.mpc.own import OwnPlanners
+from skytether.server.mpc.plugin_planners import PluginPlanners
 from skytether.server.schemes import knots
 from skytether.server.schemes import sent as tracker
 from skytether.server.schemes.delay_bound import SAMPLES, DelayBound
@@ -149,7 +150,9 @@ class Guidance(SplineScheme):
         # A plan shorter than h ends before the vehicle has come near the trajectory, and after its
         # end the spline is a straight line: measured errors reached 12 m (docs/studies.md).
         plans = desired.seen > 0 and terms.horizon * terms.dt_s >= lead_s.max()
-        self._own = None if control.planner == MPC else OwnPlanners(fleet, self.counts, states=True)
+        self._own = (
+            None if control.planner == MPC else PluginPlanners(fleet, self.counts, states=True)
+        )
         seen = terms.horizon if self._own else desired.seen
         self._desired, self._clock, self._stopwatch = desired, fleet.clock, fleet.stopwatch
         self._loop_gain = np.array(terms.gain)
@@ -223,7 +226,7 @@ class Guidance(SplineScheme):
         self.solve_ns = took_ns if self._stopwatch.runs else -1
 
     def _plan_own(
-        self, own: OwnPlanners, rows: Indices, step: Indices, foresight: Foresight
+        self, own: PluginPlanners, rows: Indices, step: Indices, foresight: Foresight
     ) -> None:
         """Fill in the trajectories of planners; without a plan the desired one, which is not
         sent.

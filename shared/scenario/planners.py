@@ -1,7 +1,8 @@
 """Planners: what `control.planner` names. A plug-in's replaces the MPC of eq. (9).
 
-The server makes one for each vehicle, and calls its `plan` at every step; `server.mpc.own` checks
-what it returns. Prediction, acknowledgements, trigger and failsafe stay those of the scheme.
+The server makes one for each vehicle, and calls its `plan` at every step;
+`server.mpc.plugin_planners` checks what it returns. Prediction, acknowledgements, trigger and
+failsafe stay those of the scheme.
 """
 
 from typing import NamedTuple, Protocol, Self

@@ -95,13 +95,13 @@ REASON_TEXTS = {
     Reason.RETURNED: "its autopilot follows commands again",
     Reason.BATTERY: "its battery is low",
     Reason.ASTRAY: "its autopilot has no position estimate",
-    Reason.MUTE: "its autopilot is silent",
+    Reason.MUTE: "its autopilot or robot is silent",
     Reason.HOMEWARD: "the server has been silent for long",
-    Reason.RIVAL: "somebody else commands its autopilot",
+    Reason.RIVAL: "somebody else commands it too",
     Reason.STRAYED: "it does not follow its commands",
     Reason.WAITED: "it has waited too long",
     Reason.RESUMED: "its process has restarted, and it continues its motion",
-    Reason.UNUSABLE: "the positions of its autopilot cannot be used",
+    Reason.UNUSABLE: "its measured positions cannot be used",
 }
 
 

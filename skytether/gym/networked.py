@@ -12,7 +12,7 @@ read here.
 
 from collections.abc import Callable, Sequence
 from time import perf_counter_ns
-from typing import Any, Literal
+from typing import Any, Literal, TypedDict, Unpack
 
 import gymnasium
 import numpy as np
@@ -37,6 +37,31 @@ Answer = NDArray[Any] | Chunk | None
 Exhausted = Literal["hold", "zero"] | Callable[[NDArray[Any], Row | None], Any]
 """Rule when rows have run out: the last row again, zeros, or a function of the robot's present
 observation and the last row (None before the first), which returns an action."""
+
+
+class Options(TypedDict, total=False):
+    """Options of `Networked` and `NetworkedVector`."""
+
+    uplink: str
+    """Impairments from agent to robot (`skytether impairments`)."""
+    downlink: str
+    """Impairments from robot to agent."""
+    thinking: float | str
+    """Time that an answer takes [s], a distribution of it such as "gamma(20ms, 80ms, 30ms)", or
+    "measured": the time that passes until `step` is called."""
+    price: float
+    """Cost of a packet with an answer, subtracted from the reward."""
+    seed: int
+    """Seed of the network. `reset(seed=…)` starts its random numbers anew, others with another
+    seed; each further `reset` draws those of the next episode."""
+    exhausted: Exhausted
+    """What the robot plays when rows have run out: "hold", "zero", or a function."""
+    player: Callable[[], Player]
+    """Makes the robot's rule for the row to play, for each episode."""
+    step_s: float | None
+    """Length of a step [s]; None: by the environment's `render_fps`."""
+    clock_ns: Callable[[], int]
+    """Clock for "measured" [ns]."""
 
 
 class _Far:
@@ -174,46 +199,13 @@ class Networked(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
 
     Args:
         env: environment with a Box of observations and one of actions.
-        uplink, downlink: impairments from agent to robot, and back (`skytether impairments`).
-        thinking: time that an answer takes [s], a distribution of it such as "gamma(20ms, 80ms,
-            30ms)", or "measured": the time that passes until `step` is called.
-        price: cost of a packet with an answer, subtracted from the reward.
-        seed: seed of the network. `reset(seed=…)` starts its random numbers anew, others with
-            another seed; each further `reset` draws those of the next episode.
-        exhausted: what the robot plays when rows have run out: "hold", "zero", or a function.
-        player: makes the robot's rule for the row to play, for each episode.
-        step_s: length of a step [s]; None: by the environment's `render_fps`.
-        clock_ns: clock for "measured" [ns].
+        options: see `Options`.
 
     Raises:
         ConfigError: an argument is impossible.
     """
 
-    def __init__(
-        self,
-        env: gymnasium.Env[Any, Any],
-        *,
-        uplink: str = "none",
-        downlink: str = "none",
-        thinking: float | str = 0.0,
-        price: float = 0.0,
-        seed: int = 1,
-        exhausted: Exhausted = "hold",
-        player: Callable[[], Player] = Clocked,
-        step_s: float | None = None,
-        clock_ns: Callable[[], int] = perf_counter_ns,
-    ) -> None:
-        options: dict[str, Any] = {
-            "uplink": uplink,
-            "downlink": downlink,
-            "thinking": thinking,
-            "price": price,
-            "seed": seed,
-            "exhausted": exhausted,
-            "player": player,
-            "step_s": step_s,
-            "clock_ns": clock_ns,
-        }
+    def __init__(self, env: gymnasium.Env[Any, Any], **options: Unpack[Options]) -> None:
         RecordConstructorArgs.__init__(self, **options)
         super().__init__(env)
         self._far = _Far(env.action_space, env.observation_space, env.metadata, 1, **options)
@@ -257,10 +249,10 @@ class NetworkedVector(VectorWrapper[Any, Any, Any, Any, Any]):
     Args:
         env: vector environment that starts an episode in the step after an end (gymnasium's
             default).
-        options: see `Networked`.
+        options: see `Options`.
     """
 
-    def __init__(self, env: VectorEnv[Any, Any, Any], **options: Any) -> None:
+    def __init__(self, env: VectorEnv[Any, Any, Any], **options: Unpack[Options]) -> None:
         super().__init__(env)
         mode = env.metadata.get("autoreset_mode", AutoresetMode.NEXT_STEP)
         if mode != AutoresetMode.NEXT_STEP:

@@ -131,6 +131,8 @@ counts/planner_errors server_planner_errors_total
     Steps of vehicles for which a plug-in's planner failed.
 counts/planner_late server_planner_late_total
     Steps of vehicles for which a plug-in's planner took too long.
+counts/planner_not_called server_planner_not_called_total
+    Steps of vehicles for which a plug-in's planner was not called, because too many hang.
 dropped/{reason} server_dropped_datagrams_total
     Datagrams that were dropped because they came from no vehicle or could not be read, by reason.
 refused/{reason} server_refused_vehicles_total

@@ -49,6 +49,7 @@ NEEDS: dict[str, tuple[str, ...]] = {
     "fleet": ("server",),
     "duel": ("server", "page"),
     "page": ("page",),
+    "ros2": ("ros2",),
     "replay": ("page", "record"),
     "export": ("record",),
     "join": ("record",),

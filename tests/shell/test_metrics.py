@@ -130,6 +130,7 @@ def test_no_line_of_the_tables_is_about_nothing(figures: dict[str, dict[str, Any
         "counts/scheme_errors",  # of a plug-in
         "counts/planner_errors",
         "counts/planner_late",
+        "counts/planner_not_called",
         "by_vehicle/{vehicle}/age_ms",
         "by_vehicle/{vehicle}/plan_age_ms",
         "by_vehicle/{vehicle}/clock_m",  # on missions

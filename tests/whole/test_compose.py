@@ -20,6 +20,7 @@ ALWAYS = {"keys", "server", "netem", "client", "page"}
 PROFILES = {
     "observe": {"prometheus", "grafana"},
     "px4": {"px4", "aboard"},
+    "ros2": {"ground", "driver"},
     "netem": {"relay"},
     "standby": {"standby", "netem-standby"},
 }
@@ -54,7 +55,8 @@ def test_compose_understands_its_file() -> None:
 
 def test_each_image_of_ours_is_a_stage_with_a_lock_file() -> None:
     targets = {each["build"]["target"] for each in SERVICES.values() if "build" in each}
-    assert targets == set(re.findall(r"^FROM bare AS (\w+)$", DOCKERFILE, re.MULTILINE))
+    last = r"^FROM (?:bare|ros:\S+) AS (\w+)$"
+    assert targets == set(re.findall(last, DOCKERFILE, re.MULTILINE))
     for lock in re.findall(r"^COPY (locks/\w+\.lock)", DOCKERFILE, re.MULTILINE):
         assert (ROOT / lock).exists()
 
@@ -81,3 +83,17 @@ def test_the_computer_aboard_flies_it_by_the_scenario_that_the_server_has() -> N
     assert options.config.model == reading.load("px4").model
     assert options.config.vehicle.kind == "mavlink"
     assert options.config.vehicle.address == "udp:127.0.0.1:14540"
+
+
+def test_the_robot_and_its_router_are_reached_by_the_computer_aboard_alone() -> None:
+    robot, driver = SERVICES["ground"], SERVICES["driver"]
+    assert driver["network_mode"] == "service:ground"
+    assert not {"ports"} & {*robot, *driver}
+    assert all(FILE["networks"][each]["internal"] for each in robot["networks"])
+    name, *flags = argv("driver", "demo")
+    assert (name, argv("server", "demo")[1]) == ("client", flags[0])
+    here = [flag for flag in flags if "=/" not in flag]  # paths are those of the container
+    options = command.parse(ClientOptions(), here, "skytether client", "")
+    assert options.config.vehicle.kind == "ros2"
+    assert options.config.vehicle.address == "tcp:127.0.0.1:7447"
+    compile((ROOT / "deploy" / "ros2" / "robot.py").read_text(), "robot.py", "exec")

@@ -12,6 +12,8 @@ of flying on with the inputs already sent is that of their difference from it, Î
 from collections import Counter
 from dataclasses import dataclass
 from functools import partial
+from itertools import count
+from queue import Full
 from traceback import format_exception
 from typing import Any
 
@@ -27,27 +29,29 @@ from skytether.shared.scenario.planners import Problem
 from skytether.shared.scenario.registry import PLANNERS
 from skytether.shared.wire.protocol import FLOAT_MAX
 
-ERRORS, LATE = "planner_errors", "planner_late"
+ERRORS, LATE, NOT_CALLED = "planner_errors", "planner_late", "planner_not_called"
 """Names of the counts of steps without a plan."""
 
 
 @dataclass(slots=True)
-class Own:
+class VehiclePlanner:
     """Planner of one vehicle, and its last plan."""
 
+    number: int
+    """Differs from that of every other planner, also of one that had its row before."""
     planner: Any
-    """None until it is first needed."""
+    """None until it is made, with its first plan."""
     inputs: Array
     """Inputs of the last plan [m/s]; shape (axes, H)."""
     start: int = -1
     """Step at which that plan started, or -1."""
 
 
-class OwnPlanners:
+class PluginPlanners:
     """Planners of up to `capacity` vehicles.
 
     Args:
-        counts: counts of the scheme, to which ERRORS and LATE are added.
+        counts: counts of the scheme, to which ERRORS, LATE and NOT_CALLED are added.
         states: whether a planner may return states instead of inputs.
 
     Raises:
@@ -60,7 +64,8 @@ class OwnPlanners:
         self._make = partial(PLANNERS.make, PLANNERS.one(text), (), self._problem)
         self._states, self._tell, self._planning = states, fleet.tell, fleet.planning
         self._counts = counts
-        self._own: dict[int, Own] = {}
+        self._numbers = count()
+        self._own: dict[int, VehiclePlanner] = {}
         """Planners by the rows of their vehicles."""
         try:
             self._spare = self._make()
@@ -87,29 +92,25 @@ class OwnPlanners:
             for each vehicle inputs within Â±u_max [m/s], shape (axes, H); states [m, m/s], shape
             (H + 1, axes, 2); or None.
         """
+        owns = [self._of(row) for row in rows.tolist()]
         calls = [
-            (
-                row,
-                partial(self._plan, self._of(row), start, x.copy(), desired.swapaxes(0, 1).copy()),
-            )
-            for row, start, x, desired in zip(
-                rows.tolist(), starts.tolist(), state, reference, strict=True
-            )
+            (own.number, partial(self._plan, own, start, x.copy(), desired.swapaxes(0, 1).copy()))
+            for own, start, x, desired in zip(owns, starts.tolist(), state, reference, strict=True)
         ]
         answers = self._planning(calls)
         return [
-            self._checked(self._own[row], start, answer)
-            for row, start, answer in zip(rows.tolist(), starts.tolist(), answers, strict=True)
+            self._checked(own, start, answer)
+            for own, start, answer in zip(owns, starts.tolist(), answers, strict=True)
         ]
 
-    def _of(self, row: int) -> Own:
+    def _of(self, row: int) -> VehiclePlanner:
         if row not in self._own:
             inputs = np.zeros((self._problem.axes, self._problem.horizon))
-            self._own[row] = Own(self._spare, inputs)
+            self._own[row] = VehiclePlanner(next(self._numbers), self._spare, inputs)
             self._spare = None
         return self._own[row]
 
-    def _plan(self, own: Own, start: int, state: Array, reference: Array) -> Any:
+    def _plan(self, own: VehiclePlanner, start: int, state: Array, reference: Array) -> Any:
         if own.planner is None:
             own.planner = self._make()
         gap, H = start - own.start, self._problem.horizon
@@ -118,7 +119,7 @@ class OwnPlanners:
             previous = own.inputs[:, np.minimum(np.arange(H) + gap, H - 1)]
         return own.planner.plan(state, reference, previous)
 
-    def _checked(self, own: Own, start: int, answer: Any) -> Array | None:
+    def _checked(self, own: VehiclePlanner, start: int, answer: Any) -> Array | None:
         problem = self._problem
         shapes: list[tuple[int, ...]] = [(problem.axes, problem.horizon)]
         if self._states:
@@ -142,15 +143,16 @@ class OwnPlanners:
         return plan
 
     def _fail(self, error: Exception) -> None:
-        count = LATE if isinstance(error, TimeoutError) else ERRORS
-        if not self._counts[count]:
+        kinds = {TimeoutError: LATE, Full: NOT_CALLED}
+        name = kinds.get(type(error), ERRORS)
+        if not self._counts[name]:
             what = f"the planner {self._text}: {type(error).__name__}: {error}"
-            trace = "" if count == LATE else "".join(format_exception(error))
+            trace = "".join(format_exception(error)) if name == ERRORS else ""
             self._tell(f"{trace}{what}; a vehicle for which it fails is sent no plan at that step")
-        self._counts[count] += 1
+        self._counts[name] += 1
 
 
-class OwnPlanner(Planner):
+class InputPlanner(Planner):
     """Planners of plug-ins for a scheme that sends inputs, with the figures of the MPC.
 
     What a planner returns is the generator's plan, which knows no disturbance; the tracker's, which
@@ -163,7 +165,7 @@ class OwnPlanner(Planner):
         control, terms = fleet.scenario.control, fleet.terms
         desired, capacity, block = fleet.desired, fleet.capacity, fleet.block
         super().__init__(control, terms, desired, capacity, block, fleet.stopwatch)
-        self._planners = OwnPlanners(fleet, counts, states=False)
+        self._planners = PluginPlanners(fleet, counts, states=False)
         self._bounds = np.array(terms.u_max)[:, None]
         self._sent: list[NDArray[Any]] = []
         """Inputs, start and step of the plans sent last to the vehicles of this block."""

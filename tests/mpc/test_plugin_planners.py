@@ -7,6 +7,7 @@ import sys
 from contextlib import chdir
 from itertools import pairwise
 from pathlib import Path
+from threading import Event
 from typing import Any, ClassVar
 
 import msgspec
@@ -24,6 +25,7 @@ from skytether.shared.law.model import Array
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Record
 from skytether.shell import plugins
+from skytether.shell.planning import Planners
 from skytether.sim.flight import fly, fly_batch
 
 pytestmark = pytest.mark.usefixtures("plugin_tables")
@@ -296,6 +298,50 @@ def test_a_mistake_that_passes_costs_its_steps_alone() -> None:
     assert flight.figures["server"]["counts"]["planner_errors"] == 10
     assert (~flight.server["solved"]).sum() == 10
     assert flight.server["solved"][-1]
+
+
+@pytest.mark.parametrize("hangs", ["made", "asked"])
+def test_a_vehicle_that_takes_the_row_of_one_whose_planner_hangs_is_planned_for(hangs: str) -> None:
+    blocks, entered, goes_on = Event(), Event(), Event()
+
+    @planner(name="mine")
+    class Hanging(Mine):
+        made = 0
+
+        def __init__(self, problem: Problem) -> None:
+            super().__init__(problem)
+            self.wait("made")
+
+        def plan(self, *given: Array) -> Any:
+            self.wait("asked")
+            return super().plan(*given)
+
+        def wait(self, where: str) -> None:
+            if where == hangs and self.number > 1 and blocks.is_set():
+                entered.set()
+                goes_on.wait()
+
+    planning = Planners(0.3)
+    server = Server(scenario(), boot_id=1, entropy=bytes, capacity=2, planning=planning)
+    own = server.controller.scheme.planner._planners  # type: ignore[attr-defined]
+
+    def plans(*rows: int) -> list[bool]:
+        n = len(rows)
+        given = np.full(n, 5), np.zeros((n, 2, 2)), np.zeros((n, 2, 41, 2))
+        return [plan is not None for plan in own.plan(np.array(rows), *given)]
+
+    blocks.set()
+    assert not plans(0, 1)[1]
+    assert entered.wait(60.0)
+    blocks.clear()
+    planning._limit_s = 60.0
+    while plans(0, 1) != [True, False]:  # the other planner may have been late too
+        pass
+    own.forget(1)
+    assert plans(0, 1) == [True, True]
+    goes_on.set()
+    assert server.controller.counts["planner_late"] >= 2
+    assert "planner_errors" not in server.controller.counts
 
 
 HANGS = """
