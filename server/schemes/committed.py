@@ -180,8 +180,7 @@ def _foresee(
     for i in range(len(rows)):
         row, k, bound = rows[i], steps[i], sent.bound.steps
         delivery, observed = sent.delivery[row], sent.observed[row]
-        age = k - observed
-        assert age <= settings.age_max  # the controller ensures it; `track` holds no more steps
+        age = k - observed  # at most age_max: the controller ensures it
         # If the bound is so large that no plan could be flown, nothing would be sent, and no
         # acknowledgement could ever show that the delay has become smaller. So it is reset.
         if bound[row] > age and age + bound[row] > settings.age_max:

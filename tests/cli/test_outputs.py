@@ -75,7 +75,8 @@ LINES = {
 """Command line for each option that names an output; OUT is the option's value, and another path of
 the input.
 """
-READ = {"plugin", "keys", "replay", "file", "files", "folders", "path", "show", "contender"}
+READ = {"plugin", "keys", "replay", "file", "files", "folder", "folders", "path", "show"}
+READ |= {"contender"}
 """Options that name files to read, or sockets and folders of sockets."""
 SOCKETS = {"control", "feed"}
 """Options that name sockets to create, which replace no file."""
