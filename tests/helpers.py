@@ -4,6 +4,7 @@ import asyncio
 import socket
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import AsyncIterator, Callable, Iterator, Mapping, Sequence
 from contextlib import asynccontextmanager, contextmanager
@@ -175,3 +176,24 @@ def faults(flight: Record) -> list[str]:
     """Last lines of the tracebacks that a flight reported."""
     events = (each.event for each in flight.events)
     return [each.traceback.splitlines()[-1] for each in events if isinstance(each, Fault)]
+
+
+@contextmanager
+def echo(host: str = "127.0.0.1") -> Iterator[int]:
+    """Port of a UDP server on this machine that sends back what it hears."""
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    with socket.socket(family, socket.SOCK_DGRAM) as server:
+        server.bind((host, 0))
+
+        def answer() -> None:
+            while True:
+                data, peer = server.recvfrom(65536)
+                if data == b"end":
+                    return
+                server.sendto(data, peer)
+
+        thread = threading.Thread(target=answer, daemon=True)
+        thread.start()
+        yield server.getsockname()[1]
+        server.sendto(b"end", server.getsockname()[:2])
+        thread.join(180.0)

@@ -184,8 +184,8 @@ def _mount() -> None:
     for folder in filter(os.path.isdir, RESOLVERS):
         _call(_libc.mount, b"tmpfs", folder.encode(), b"tmpfs", 0, None)
     real = path.resolve()
-    if not real.exists():
-        with suppress(OSError):  # a machine without this file resolves no names
+    if not real.exists():  # a machine without this file resolves no names
+        if str(real.parent) in RESOLVERS:  # hidden by now, and nobody else's
             real.write_text(text)
         return
     with tempfile.NamedTemporaryFile("w") as file:  # its name goes, the mount stays

@@ -4,7 +4,7 @@ import asyncio
 import socket
 import urllib.request
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -13,35 +13,13 @@ from threading import Thread
 import pytest
 
 import skytether
-from helpers import until
+from helpers import echo, until
 from skytether.library.bad_network import BadNetwork
 from skytether.shell.connections import CONNECTIONS_MAX
 from skytether.shell.udp import AddressError
 
 PATIENCE_S = 60.0
 Opened = Callable[..., BadNetwork]
-
-
-@contextmanager
-def echoing() -> Iterator[tuple[str, int]]:
-    """UDP server that sends back what it gets, until it gets nothing."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as server:
-        server.bind(("127.0.0.1", 0))
-
-        def echo() -> None:
-            while True:
-                datagram, sender = server.recvfrom(2048)
-                if datagram == b"end":
-                    return
-                server.sendto(datagram, sender)
-
-        thread = Thread(target=echo)
-        thread.start()
-        try:
-            yield server.getsockname()
-        finally:
-            server.sendto(b"end", server.getsockname())
-            thread.join()
 
 
 @pytest.fixture
@@ -77,8 +55,8 @@ def fetched(net: BadNetwork) -> bytes:
 
 
 def test_a_udp_client_meets_losses_and_changes(bad_network: Opened, client: socket.socket) -> None:
-    with echoing() as server:
-        net = bad_network(to=server)
+    with echo() as port:
+        net = bad_network(to=("127.0.0.1", port))
         client.sendto(b"hello", net.address)
         assert client.recv(2048) == b"hello"
         net.set(to_client="loss(1)")
@@ -95,7 +73,10 @@ def test_a_udp_client_meets_losses_and_changes(bad_network: Opened, client: sock
 
 def test_seeds_decide_the_fates(client: socket.socket) -> None:
     def lost(seed: int) -> int:
-        with echoing() as server, skytether.bad_network("loss(0.5)", to=server, seed=seed) as net:
+        with (
+            echo() as port,
+            skytether.bad_network("loss(0.5)", to=("127.0.0.1", port), seed=seed) as net,
+        ):
             for _ in range(64):  # ranks within slots; a stall may shift some to the next slot
                 client.sendto(b"x", net.address)
             until(lambda: net.counts["to_server"]["packets"] == 64)
@@ -148,8 +129,8 @@ def test_it_runs_within_ones_own_loop(client: socket.socket) -> None:
 
     async def main() -> bytes:
         loop = asyncio.get_running_loop()
-        with echoing() as server:
-            async with skytether.bad_network("constant(0.01)", to=server) as net:
+        with echo() as port:
+            async with skytether.bad_network("constant(0.01)", to=("127.0.0.1", port)) as net:
                 await loop.sock_sendto(client, b"hello", net.address)
                 answer = await asyncio.wait_for(loop.sock_recv(client, 2048), PATIENCE_S)
                 assert net.counts["to_client"]["forwarded"] == 1

@@ -21,7 +21,7 @@ from urllib.request import urlopen
 
 import pytest
 
-from helpers import SKYTETHER, until
+from helpers import SKYTETHER, echo, until
 from robot import free_port
 from skytether.netem.__main__ import emulate_for
 from skytether.shared.base.packets import GATEWAY, GATEWAY6
@@ -63,27 +63,6 @@ def ran(*options: str, of: list[str], **more: Any) -> "subprocess.CompletedProce
 
 def python(code: str, *arguments: object) -> list[str]:
     return [sys.executable, "-uc", code, *map(str, arguments)]
-
-
-@contextmanager
-def echo(host: str = "127.0.0.1") -> Iterator[int]:
-    """Port of a UDP server on this machine that sends back what it hears."""
-    family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    with socket.socket(family, socket.SOCK_DGRAM) as server:
-        server.bind((host, 0))
-
-        def answer() -> None:
-            while True:
-                data, peer = server.recvfrom(65536)
-                if data == b"end":
-                    return
-                server.sendto(data, peer)
-
-        thread = threading.Thread(target=answer, daemon=True)
-        thread.start()
-        yield server.getsockname()[1]
-        server.sendto(b"end", server.getsockname()[:2])
-        thread.join(PATIENCE_S)
 
 
 def documented(words: str) -> list[list[str]]:
