@@ -14,7 +14,7 @@ import msgspec
 import numpy as np
 import pytest
 
-import skytether.netem.proxy
+import skytether.netem.emulator
 from skytether.client.compensator import Compensator
 from skytether.netem.fate import Fates
 from skytether.server.common.clock import ClockMap, Contradiction
@@ -71,7 +71,7 @@ def fly_over(flown: Scenario, delays: Sequence[tuple[Delay, Delay]]) -> list[Rec
             return Fate(delay_ns=round(self._delay(slot * SLOT_NS / SECOND_NS) * SECOND_NS))
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(skytether.netem.proxy, "Fates", Clocked)
+        patch.setattr(skytether.netem.emulator, "Fates", Clocked)
         return fly_batch(flown, range(len(delays)))
 
 
