@@ -23,7 +23,7 @@ LOG = logging.getLogger("skytether.netem")
 T = TypeVar("T")
 
 
-class BadNetwork:
+class bad_network:  # noqa: N801 - read as a function, like `contextlib.closing`
     """Emulated network in front of a UDP or TCP server, for as long as a `with` block lasts.
 
         with skytether.bad_network("loss(0.1) & constant(0.05)", to=("127.0.0.1", 5000)) as net:
@@ -156,8 +156,6 @@ class BadNetwork:
         return done.result()
 
 
-bad_network = BadNetwork
-"""Read as a function: `with bad_network(...) as net`."""
 _NAMES = {"uplink": "to_client", "downlink": "to_server"}
 
 

@@ -2,22 +2,19 @@
 
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pytest
 
 import skytether
 
-if TYPE_CHECKING:
-    from skytether.library.bad_network import BadNetwork
-
 
 @pytest.fixture(name="bad_network")
-def _bad_network() -> "Iterator[Callable[..., BadNetwork]]":
+def _bad_network() -> "Iterator[Callable[..., skytether.bad_network]]":
     """Network in front of a server until the test ends; arguments of `skytether.bad_network`."""
     with ExitStack() as networks:
 
-        def opened(*network: str, **options: Any) -> "BadNetwork":
+        def opened(*network: str, **options: Any) -> "skytether.bad_network":
             return networks.enter_context(skytether.bad_network(*network, **options))
 
         yield opened

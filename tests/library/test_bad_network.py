@@ -14,12 +14,11 @@ import pytest
 
 import skytether
 from helpers import echo, until
-from skytether.library.bad_network import BadNetwork
 from skytether.shell.connections import CONNECTIONS_MAX
 from skytether.shell.udp import AddressError
 
 PATIENCE_S = 60.0
-Opened = Callable[..., BadNetwork]
+Opened = Callable[..., skytether.bad_network]
 
 
 @pytest.fixture
@@ -48,7 +47,7 @@ def served(tmp_path: Path) -> Iterator[tuple[str, int]]:
         server.shutdown()
 
 
-def fetched(net: BadNetwork) -> bytes:
+def fetched(net: skytether.bad_network) -> bytes:
     host, port = net.address
     with urllib.request.urlopen(f"http://{host}:{port}/file", timeout=PATIENCE_S) as answer:
         return bytes(answer.read())

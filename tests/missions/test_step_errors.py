@@ -384,7 +384,7 @@ def delay(monkeypatch: pytest.MonkeyPatch, delays: Delays) -> None:
         delay_s = delays(flow)[name == "downlink"]
         return Fates(path(f"constant({delay_s})"), 1, name, flow)
 
-    monkeypatch.setattr(Proxy, "_fates", fates)
+    monkeypatch.setattr(Proxy, "fates", fates)
 
 
 def mission(name: str, shape: str = "", duration: float = 30.0) -> Scenario:
