@@ -34,7 +34,8 @@ class bad_network:  # noqa: N801 - read as a function, like `contextlib.closing`
     Args:
         network: impairments of both directions, as in "constant(50ms) & loss(10%)".
         to: address of the server.
-        to_server, to_client: impairments of one direction, in place of `network`.
+        to_server: impairments of packets to the server, in place of `network`.
+        to_client: the same of packets to the client.
         seed: seed of all fates: packets sent at the same times meet the same ones.
         bind: address to listen on; port 0 takes a free one.
         tcp: whether it relays TCP connections in place of UDP: latency, a rate and cuts, and no
