@@ -52,7 +52,7 @@ class Emulator(Endpoint):
 
         self.uplink, self.downlink = link(UPLINK, "uplink"), link(DOWNLINK, "downlink")
         self._faults: set[str] = set()
-        """Tracebacks of plug-ins' errors that were reported."""
+        """Tracebacks of errors in impairments of plug-ins: each is reported once."""
 
     @abstractmethod
     def lanes(self) -> Iterable[tuple[Lane, Lane]]:
@@ -64,6 +64,7 @@ class Emulator(Endpoint):
         return path
 
     def fates(self, name: Direction, flow: int) -> Fates:
+        """What the packets of one flow meet in a direction."""
         return Fates(self.path(name), self._scenario.seed, name, flow)
 
     def wake(self, *, now_ns: int) -> None:

@@ -32,8 +32,8 @@ RETRY_NS = 200 * MILLISECOND_NS
 retransmission time-out."""
 
 
-class Whole(Fates):
-    """Fates that lose, copy and damage nothing; the relay asks for losses beforehand."""
+class LosslessFates(Fates):
+    """Fates of the pieces of a stream: delays alone. `loses` says what a packet would have met."""
 
     def at(self, slot: int, rank: int = 0) -> Fate:
         return replace(super().at(slot, rank), lost=False, copies=0, flipped=None)
@@ -42,8 +42,8 @@ class Whole(Fates):
         return super().at(slot).lost
 
 
-class Stream:
-    """One direction of a connection."""
+class HalfConnection:
+    """One direction of a connection, before and within its link."""
 
     def __init__(self, lane: Lane, link: Link) -> None:
         self.lane, self.link = lane, link
@@ -55,7 +55,7 @@ class Stream:
     def loses(self, now_ns: int) -> bool:
         """Whether a packet would be lost now."""
         fates = self.lane.fates
-        assert isinstance(fates, Whole)
+        assert isinstance(fates, LosslessFates)
         return fates.loses((now_ns - self.lane.began_ns) // SLOT_NS)
 
 
@@ -77,9 +77,9 @@ class Relay(Emulator):
     ) -> None:
         super().__init__(scenario, mtu=PIECE_BYTES, recorder=recorder, path=path)
         self._server = server
-        self._streams: dict[Address, Stream] = {}
+        self._streams: dict[Address, HalfConnection] = {}
         """Streams by their source."""
-        self._holding: dict[Address, Stream] = {}
+        self._holding: dict[Address, HalfConnection] = {}
         """Streams with held pieces, in the order in which they are tried."""
         self._ended: set[Address] = set()
         """Sources whose end has left."""
@@ -102,12 +102,12 @@ class Relay(Emulator):
         flow = self._opened
         up = Lane(flow, self.fates("uplink", flow), now_ns)
         down = Lane(flow, self.fates("downlink", flow), now_ns)
-        self._streams[SERVER, number] = Stream(up, self.uplink)
-        self._streams[CLIENT, number] = Stream(down, self.downlink)
+        self._streams[SERVER, number] = HalfConnection(up, self.uplink)
+        self._streams[CLIENT, number] = HalfConnection(down, self.downlink)
         self._events.append(FlowOpened(flow=flow, host=CLIENT, port=number))
         self._opened += 1
 
-    def _admit(self, source: Address, stream: Stream, now_ns: int) -> None:
+    def _admit(self, source: Address, stream: HalfConnection, now_ns: int) -> None:
         """Let the held pieces of a stream enter its link, up to one that must wait."""
         self._holding.pop(source, None)
         while stream.held:
@@ -163,7 +163,7 @@ class Relay(Emulator):
         return super().path(name).for_streams()
 
     def fates(self, name: Direction, flow: int) -> Fates:
-        return Whole(self.path(name), self._scenario.seed, name, flow)
+        return LosslessFates(self.path(name), self._scenario.seed, name, flow)
 
     def change(self, scenario: Scenario, keys: frozenset[str], *, now_ns: int) -> None:
         """See `Endpoint`; what is held up is tried again at once."""

@@ -7,7 +7,6 @@ network in each run.
 
 from collections import OrderedDict
 from collections.abc import Iterable
-from dataclasses import dataclass
 from typing import Any
 
 from skytether.netem.emulator import Direction, Emulator
@@ -20,14 +19,6 @@ from skytether.shared.telemetry.record import Recorder
 
 FLOWS_MAX = 16_384
 """Largest number of flows known at once; a further one replaces that which was silent longest."""
-
-
-@dataclass(slots=True)
-class Flow:
-    """Packets with the same protocol, addresses and ports, both ways."""
-
-    uplink: Lane
-    downlink: Lane
 
 
 class Tunnel(Emulator):
@@ -43,8 +34,9 @@ class Tunnel(Emulator):
     def __init__(self, scenario: Scenario, *, mtu: int, recorder: Recorder | None = None) -> None:
         super().__init__(scenario, mtu=mtu, recorder=recorder, header_bytes=0)
         self._mtu = mtu
-        self._flows: OrderedDict[bytes, Flow] = OrderedDict()
-        """Flows by key, that which was silent longest first."""
+        self._flows: OrderedDict[bytes, tuple[Lane, Lane]] = OrderedDict()
+        """Uplink and downlink of each flow by its key, that which was silent longest first. A flow is
+        packets with the same protocol, addresses and ports, both ways."""
         self._opened = 0
         self._began_ns = 0
         """Time of the first packet: outages and traces begin with it, for all flows."""
@@ -64,9 +56,9 @@ class Tunnel(Emulator):
         if key is None:
             self.refused += 1
             return
-        flow = self._flows.get(key) or self._open(key, now_ns)
+        up, down = self._flows.get(key) or self._open(key, now_ns)
         self._flows.move_to_end(key)
-        link, lane = (self.downlink, flow.downlink) if is_outward else (self.uplink, flow.uplink)
+        link, lane = (self.downlink, down) if is_outward else (self.uplink, up)
         onward = Datagram(packet, OUTSIDE if is_outward else PROGRAM, number)
         may_leave = link.accept(onward, lane, now_ns=now_ns)
         if len(packet) > self._mtu and is_outward and (answer := too_long(packet, self._mtu)):
@@ -79,19 +71,19 @@ class Tunnel(Emulator):
     def finished(self) -> bool:
         return self._is_cut or (self._has_ended and self.downlink.next_due_ns() is None)
 
-    def _open(self, key: bytes, now_ns: int) -> Flow:
+    def _open(self, key: bytes, now_ns: int) -> tuple[Lane, Lane]:
         self._began_ns = self._began_ns or now_ns
         number = self._opened
         self._opened += 1
         up, down = self.fates("uplink", number), self.fates("downlink", number)
-        flow = Flow(Lane(number, up, self._began_ns), Lane(number, down, self._began_ns))
+        flow = Lane(number, up, self._began_ns), Lane(number, down, self._began_ns)
         self._flows[key] = flow
         if len(self._flows) > FLOWS_MAX:
             self._flows.popitem(last=False)
         return flow
 
     def lanes(self) -> Iterable[tuple[Lane, Lane]]:
-        return ((flow.uplink, flow.downlink) for flow in self._flows.values())
+        return self._flows.values()
 
     def fates(self, name: Direction, flow: int) -> Fates:
         return Fates(self.path(name), self._scenario.seed, name, flow, by_number=True)

@@ -116,7 +116,7 @@ class bad_network:  # noqa: N801 - read as a function, like `contextlib.closing`
         assert self._loop
         self._loop.call_soon_threadsafe(self._task.cancel)
         self._thread.join()
-        self._thread = None
+        self._thread = self._loop = None
 
     async def __aenter__(self) -> Self:
         self._begin()
@@ -127,6 +127,7 @@ class bad_network:  # noqa: N801 - read as a function, like `contextlib.closing`
     ) -> None:
         self._task.cancel()
         await asyncio.wait([self._task])
+        self._loop = None
 
     def _drive(self, began: "Future[None]") -> None:
         async def run() -> None:

@@ -29,7 +29,7 @@ BREAKS_OFF = struct.pack("ii", 1, 0)
 Hear = Callable[[bytes, Address], None]
 
 
-class Way:
+class HalfConnection:
     """One direction of a connection, from a source, whose peer is `peer`, to a target."""
 
     def __init__(
@@ -85,7 +85,7 @@ class Connections:
     ) -> None:
         self._server, self._refused = listen.server, refused
         self._hear: Hear = lambda piece, peer: hear(Datagram(piece, peer, 1))
-        self._ways: dict[Address, Way] = {}
+        self._ways: dict[Address, HalfConnection] = {}
         """Ways by the peer to which they lead."""
         self._running: set[asyncio.Task[None]] = set()
         self._opened = 0
@@ -151,7 +151,10 @@ class Connections:
             each.setblocking(False)
             each.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         (here, one), (there, other) = ends.items()
-        down, up = Way(one, other, here, self._hear), Way(other, one, there, self._hear)
+        down, up = (
+            HalfConnection(one, other, here, self._hear),
+            HalfConnection(other, one, there, self._hear),
+        )
         self._ways |= {there: down, here: up}
         try:
             with contextlib.suppress(ExceptionGroup):  # an end has broken off

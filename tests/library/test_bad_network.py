@@ -152,5 +152,7 @@ def test_wrong_arguments_are_told() -> None:
 def test_nothing_is_left_behind(served: tuple[str, int]) -> None:
     with skytether.bad_network(to=served, tcp=True) as net:
         assert fetched(net)
+    net.set("loss(1)")  # neither has an effect, and nothing fails
+    assert net.counts["flows"] == 0
     with suppress(OSError), socket.create_connection(net.address, timeout=1):
         pytest.fail("it still listens")
