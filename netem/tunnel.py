@@ -35,8 +35,9 @@ class Tunnel(Emulator):
         super().__init__(scenario, mtu=mtu, recorder=recorder, header_bytes=0)
         self._mtu = mtu
         self._flows: OrderedDict[bytes, tuple[Lane, Lane]] = OrderedDict()
-        """Uplink and downlink of each flow by its key, that which was silent longest first. A flow is
-        packets with the same protocol, addresses and ports, both ways."""
+        """Uplink and downlink of each flow by its key, that which was silent longest first.
+
+        A flow is packets with the same protocol, addresses and ports, both ways."""
         self._opened = 0
         self._began_ns = 0
         """Time of the first packet: outages and traces begin with it, for all flows."""
