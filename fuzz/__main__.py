@@ -4,14 +4,16 @@ import argparse
 import multiprocessing
 import os
 import resource
+import signal
 import sys
 import tempfile
 import time
 from ctypes import c_longlong
 from pathlib import Path
 from random import Random
+from types import FrameType
 
-from fuzz.target import functions
+from fuzz.target import Target, functions
 from fuzz.targets import TARGETS
 
 try:
@@ -24,8 +26,32 @@ LOOK_EVERY = 100
 GUIDED_SHARE = 0.5
 """Share of inputs mutated by the target's own mutator, which keeps to the format; atheris mutates
 the rest."""
+INPUT_CPU_S = 60.0
+"""CPU time that one input may take [s]. Wall time would blame the input for a busy machine."""
 SHM = Path("/dev/shm")
 """Folder in memory for files that are rewritten often."""
+
+
+class TooSlow(BaseException):
+    """An input took more CPU time than `INPUT_CPU_S`; no `Exception`, which targets may catch."""
+
+
+def limited(target: Target, payload: bytes) -> None:
+    """Feed an input to a target; call `stop_slow` first."""
+    signal.setitimer(signal.ITIMER_VIRTUAL, INPUT_CPU_S)
+    try:
+        target(payload)
+    finally:
+        signal.setitimer(signal.ITIMER_VIRTUAL, 0.0)
+
+
+def stop_slow() -> None:
+    """Raise `TooSlow` in this process whenever the time of an input is over."""
+
+    def stop(_number: int, _frame: FrameType | None) -> None:
+        raise TooSlow(f"the input took {INPUT_CPU_S:g} s of CPU time")
+
+    signal.signal(signal.SIGVTALRM, stop)
 
 
 def memory_mb() -> float:
@@ -35,12 +61,13 @@ def memory_mb() -> float:
 def attack(name: str, folder: Path, seed: int, count: int, seconds: float) -> str:
     """Feed at most `count` random inputs to a target; returns the result, as a sentence."""
     target, rng = TARGETS[name](folder), Random(seed)
+    stop_slow()
     begin_s, done, before_mb = time.monotonic(), 0, 0.0
     while done < count and time.monotonic() - begin_s < seconds:
         for _ in range(min(LOOK_EVERY, count - done)):
             payload = target.next(rng)
             try:
-                target(payload)
+                limited(target, payload)
             except BaseException:
                 print(f"{name}, seed {seed}, input {done}: {payload.hex()}", file=sys.stderr)
                 raise
@@ -77,7 +104,7 @@ def _search(name: str, folder: Path, seconds: float, done: c_longlong) -> None:
 
     def one(payload: bytes) -> None:
         done.value += 1
-        target(payload)
+        limited(target, payload)
 
     def mutated(payload: bytes, size: int, seed: int) -> bytes:
         rng = Random(seed)
@@ -90,7 +117,8 @@ def _search(name: str, folder: Path, seconds: float, done: c_longlong) -> None:
     for number, payload in enumerate(target.seeds()):
         (corpus / str(number)).write_bytes(payload)
     limits = [f"-max_total_time={seconds:.0f}", f"-max_len={target.largest}"]
-    limits += ["-mutate_depth=2", "-timeout=60"]
+    limits += ["-mutate_depth=2", "-timeout=0"]
+    stop_slow()
     atheris.Setup(["fuzz", *limits, str(corpus)], one, custom_mutator=mutated)
     atheris.Fuzz()
 

@@ -187,3 +187,18 @@ def test_a_fault_is_told_with_the_input_that_makes_it_again(
     assert told.startswith("fussy, seed 1, input ")
     with pytest.raises(ZeroDivisionError):
         Fussy(tmp_path)(bytes.fromhex(payload))
+
+
+class Endless(Fussy):
+    def __call__(self, _: bytes) -> None:
+        while True:
+            pass
+
+
+def test_an_input_without_an_end_is_a_fault(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(command, "TARGETS", {"endless": Endless})
+    monkeypatch.setattr(command, "INPUT_CPU_S", 0.05)
+    with pytest.raises(command.TooSlow):
+        command.attack("endless", tmp_path, 1, 1, 60.0)
