@@ -48,6 +48,8 @@ from skytether.shared.scenario.triggers import (
 from skytether.shared.wire.protocol import Idle, Lead, Observation, committed_max
 
 PLANS, OBSERVATION, DELAY, UNSOLVED, STANDBY = map(int, Idle)
+TAKEOVER_PLANS = 2
+"""Number of plans that a new leader sends in any case."""
 BLOCK = 128
 """Number of vehicles planned for together: their data stay in the cache, and no array is so large
 (128 KiB) that the C library would get new memory from the kernel for it each time."""
@@ -155,6 +157,8 @@ class Controller:
         """Reason for the missing plan of each vehicle, one of `Idle`; shape (capacity,)."""
         self._led = np.ones(capacity, dtype=np.bool_)
         """Whether this server leads each vehicle; shape (capacity,)."""
+        self._owed: dict[int, int] = {}
+        """Number of plans that vehicles are sent in any case, by row."""
         self._known = 0
         """Largest number of a leadership that a vehicle has told."""
         self._takes = np.ones(capacity, dtype=np.bool_)
@@ -201,19 +205,26 @@ class Controller:
         self._takes[row] = True
         self.scheme.forget(row)
         self._trigger.forget(row)
+        self._owed.pop(row, None)
         if self.budget:
             self.budget.forget(row)
 
     def follow(self, row: int, told: Lead | None) -> None:
         """Note who leads a vehicle; None if it has no other server.
 
-        A server that begins to lead sends a plan at once, whatever it sent before.
+        A server that begins to lead sends a plan at once, whatever it sent before. If it takes over
+        from another, it sends a second one a step later: the vehicle may be about to brake, and a
+        plan may be lost. Vehicles of a mission hold their place instead.
         """
         self._led[row] = told is None or bool(told.leads)
         self._known = max(self._known, told.number if told else 0)
         if self._led[row]:
             self._sent_step[row] = -1
             self._trigger.forget(row)
+        if self._led[row] and told and told.number and not self._is_mission:
+            self._owed[row] = TAKEOVER_PLANS
+        else:
+            self._owed.pop(row, None)
         self.scheme.follow(row, told)
 
     def known(self, number: int) -> int:
@@ -267,6 +278,8 @@ class Controller:
         situation = Situation(rows, figures, predicted.start[:n], planned, self._trigger_inputs)
         verdict = self._trigger.test(situation)  # eq. (16)
         event = verdict.event.copy()
+        if self._owed:
+            event |= np.isin(rows, list(self._owed))
         unsolved, events = _withhold(
             rows,
             step,
@@ -298,6 +311,8 @@ class Controller:
             self._trigger.sent(rows[sent], figures[sent])
         else:
             sent = self._none
+        if self._owed:
+            self._pay(rows[sent])
         counts = self._counts
         counts["steps"] += n
         counts["events"] += events
@@ -305,6 +320,12 @@ class Controller:
         stopwatch.lap("trigger")
         batch = Batch(rows, step, predicted, sent)
         return Decisions(batch, figures, planned, verdict, event, self.scheme.solve_ns)
+
+    def _pay(self, sent: Indices) -> None:
+        for row in self._owed.keys() & set(sent.tolist()):
+            self._owed[row] -= 1
+            if not self._owed[row]:
+                del self._owed[row]
 
 
 @kernel

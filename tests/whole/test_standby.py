@@ -226,3 +226,12 @@ def test_packets_for_the_standby_that_are_led_to_the_server_change_nothing(
     assert record.failure is None
     assert brakes(record) == 0
     assert rmse_m(flown, record) < 0.05
+
+
+@pytest.mark.parametrize("name", ["demo-committed", "demo-paper", "paper", "target"])
+def test_a_new_leader_sends_its_first_plan_twice(name: str) -> None:
+    record = fly(scenario(name), standby=True, actions=[(DIES_S, stops(SERVER[0]))])
+    by_new_leader = record.server[
+        -np.flatnonzero(np.diff(record.server["step"])[::-1] > 1)[0] - 1 :
+    ]
+    assert by_new_leader["event"][:2].all()
