@@ -503,7 +503,7 @@ class Controls:
         armed = flight.values.get("client", {}).get("armed", self._armed.value)
         if armed != self._armed.value:
             assign(self._armed, armed)
-        flies_real = flight.state.scenario.vehicle.kind != "simulated"
+        flies_real = flight.state.scenario.vehicle.kind in ("mavlink", "ros2")
         values = flight.values.get("client", {})
         self._after_leap.visible = flies_real and "vehicle.after_leap" in values
         if self._lead:
