@@ -111,7 +111,7 @@ class PositionsDropped(VehicleEvent, frozen=True, kw_only=True):
     why: str
 
     def __str__(self) -> str:
-        return f"vehicle {self.vehicle}: positions of its autopilot are dropped: {self.why}"
+        return f"vehicle {self.vehicle}: its positions are dropped: {self.why}"
 
 
 class ClockSilent(VehicleEvent, frozen=True, kw_only=True):
@@ -173,7 +173,7 @@ class Strays(VehicleEvent, frozen=True, kw_only=True):
 
     def __str__(self) -> str:
         off = f"deviates by {self.off_mps:.1f} m/s from its commands"
-        return f"vehicle {self.vehicle} {off}: somebody else commands it, or its autopilot fails"
+        return f"vehicle {self.vehicle} {off}: somebody else commands it, or it fails"
 
 
 class ParametersUnsafe(ParametersEvent, frozen=True, kw_only=True):
