@@ -33,13 +33,14 @@ from skytether.shared.wire.paths import split
 from skytether.shared.wire.protocol import (
     NO_HORIZON,
     Horizon,
+    Lead,
     Mode,
     Trajectory,
     decode,
     kind_of,
 )
 
-WELCOME, OBSERVATION, HORIZON, HEARTBEAT, TRAJECTORY = 2, 3, 4, 5, 7
+WELCOME, OBSERVATION, HORIZON, HEARTBEAT, TRAJECTORY, LEAD = 2, 3, 4, 5, 7, 10
 """Message types on the wire, see `shared.wire.protocol`."""
 ONCE = frozenset({OBSERVATION, HORIZON, HEARTBEAT, TRAJECTORY})
 """Message types of which each message is unique, so it may be accepted at most once."""
@@ -246,8 +247,11 @@ class WatchedLife(Recorder):
         """Speed at the last step before the link was lost [m/s]."""
         self._times_ns: OrderedDict[int, int] = OrderedDict()
         """Virtual time of each step that was flown [ns]."""
+        self._leadership = 0
+        """Largest number of a leadership that the vehicle has told."""
         self._horizons: deque[tuple[int, int, bytes]] = deque(maxlen=HORIZONS_MAX)
-        """Session, number of the server's run, and message of each horizon that was received."""
+        """Session, number of the server's run, and message of each horizon that was received and
+        not of an earlier leadership."""
         self._in_force: tuple[int, int, Horizon | Trajectory] | None = None
         """Session, number of the server's run, and the horizon or trajectory in force."""
         self._observed = -1
@@ -276,6 +280,11 @@ class WatchedLife(Recorder):
 
     def note_sent(self, payload: bytes) -> None:
         self._down.seal(self.vehicle, payload, self._number)
+        message = split(payload)[1]
+        if kind_of(message) == LEAD:
+            lead = decode(message, self._terms)
+            assert isinstance(lead, Lead)
+            self._leadership = max(self._leadership, lead.number)
 
     def server_of(self, payload: bytes, kind: int | None) -> int:
         """Number of the server's run that has sent a message; raises Violation if there is none."""
@@ -287,7 +296,7 @@ class WatchedLife(Recorder):
         self._heard = True
         if self._good_ns is None:
             self._good_ns = self._clock()
-        if horizon is not None:
+        if horizon is not None and self._decoded(horizon[2]).leadership >= self._leadership:
             self._horizons.append(horizon)
 
     def lose(self) -> None:
@@ -367,7 +376,8 @@ class WatchedLife(Recorder):
         if in_force == NO_HORIZON:
             self._in_force = self._course = None
             return
-        if self._in_force is None or self._in_force[2].step != in_force:
+        is_new = self._in_force is None or self._in_force[2].step != in_force
+        if is_new:
             self._observed = step - age_ns // self._dt_ns
             self._in_force = self._find(in_force)
             self._course = None
@@ -376,9 +386,11 @@ class WatchedLife(Recorder):
             if good_ns is None or now_ns - good_ns < GOOD_NS - 2 * self._dt_ns:
                 since = "never" if good_ns is None else f"{(now_ns - good_ns) / SECOND_NS:.3f} s"
                 raise Violation("good link", f"a horizon is flown, the link is good since {since}")
+        assert self._in_force is not None
         session, life, horizon = self._in_force
         sessions = [each.session for each in self.links]
-        if (session, life) not in sessions:
+        # Another server may lead by now, and the plan of one that has restarted goes on.
+        if (session, life) not in sessions and (is_new or len(sessions) == 1):
             origin = f"of run {life} and session {session}, not {sessions}"
             raise Violation("foreign", f"a horizon {origin}")
         if self._observed not in self._times_ns or self._observed > step:
@@ -394,11 +406,15 @@ class WatchedLife(Recorder):
         """Horizon in force, identified by its step and its observation."""
         # The step alone is ambiguous: two runs of the server may have planned for the same step.
         for session, life, payload in reversed(self._horizons):
-            horizon = decode(split(payload)[1], self._terms)
-            assert isinstance(horizon, Horizon | Trajectory)
+            horizon = self._decoded(payload)
             if horizon.step == made_for and horizon.step - horizon.age == self._observed:
                 return session, life, horizon
         raise Violation("foreign", f"a horizon for step {made_for} that was never received")
+
+    def _decoded(self, payload: bytes) -> Horizon | Trajectory:
+        horizon = decode(split(payload)[1], self._terms)
+        assert isinstance(horizon, Horizon | Trajectory)
+        return horizon
 
     def _check_follows(self, step: int, state: Array, flown: list[float], *, covered: bool) -> None:
         """Check that the input follows the horizon within the rate limit, and that its plan is not
