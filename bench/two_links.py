@@ -27,7 +27,7 @@ from skytether.shell import command
 from skytether.sim.flight import fly
 
 DELAYS = "uniform(0.05, 0.15)"
-FLIGHT_S, SEEDS = 60.0, 6
+FLIGHT_S, SEEDS = 60.0, 40
 Common = Literal["none", "half", "all"]
 Links = Literal["one", "auto", "all"]
 """One link, or two links and `link.spread`."""
