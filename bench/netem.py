@@ -9,8 +9,8 @@ and includes two passages through the kernel. The machine's share is measured as
 process that only sleeps wakes, and how long netem waited for a core.
 
 The sender sends in batches, four a millisecond: no process can sleep for 50 µs. With several flows
-it sends from one socket after the other. A first packet from each, which is empty and not counted,
-opens the flows; the receiver answers one, because netem looks closer until a server has answered.
+it sends from one socket after the other. A first packet from each, which is not counted, opens the
+flows; the receiver answers one, because netem looks closer until a server has answered.
 """
 
 import contextlib
@@ -113,9 +113,9 @@ def work(task: Callable[..., object], pipe: Connection, *args: object) -> None:
 def send(pipe: Connection, options: NetemBenchmarkOptions, port: int) -> int:
     """Number, timestamp and send packets by absolute deadlines; returns their number."""
     socks = [open_blocking() for _ in range(options.flows)]
-    for sock in socks:
+    for flow, sock in enumerate(socks):
         sock.connect((HOST, port))
-        sock.send(b"")
+        sock.send(HEAD.pack(flow, 0))  # netem takes equal packets from many addresses for a loop
     packet, number = bytearray(options.size), 0
     pipe.send("ready")
     start_ns = pipe.recv()
@@ -132,9 +132,9 @@ def receive(pipe: Connection, options: NetemBenchmarkOptions) -> tuple[bytes, li
     """Receive packets; returns headers, arrival times [ns], and the kernel's drops."""
     sock = open_blocking()
     pipe.send(sock.getsockname()[1])
-    sock.sendto(b"", sock.recvfrom(0)[1])
+    sock.sendto(b"", sock.recvfrom(1)[1])
     for _ in range(1, options.flows):
-        sock.recv(0)
+        sock.recv(1)
     pipe.send("flows are open")
     pipe.recv()
     # The kernel's own time-out: Python's would call poll() before every packet.
