@@ -8,7 +8,9 @@ record contains the delay drawn for each packet. So the error of the added delay
 and includes two passages through the kernel. The machine's share is measured as well: how late a
 process that only sleeps wakes, and how long netem waited for a core.
 
-The sender sends in batches, four a millisecond: no process can sleep for 50 µs.
+The sender sends in batches, four a millisecond: no process can sleep for 50 µs. With several flows
+it sends from one socket after the other. A first packet from each, which is not counted, opens the
+flows; the receiver answers one, because netem looks closer until a server has answered.
 """
 
 import contextlib
@@ -18,9 +20,9 @@ import signal
 import socket
 import struct
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from multiprocessing.connection import Connection
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -55,13 +57,17 @@ class NetemBenchmarkOptions:
     rate: int = 20_000
     size: int = 600
     """UDP payload of each packet [B]."""
+    flows: int = 1
+    """Number of the clients' addresses."""
+    crowds: tuple[int, ...] = (10, 1000)
+    """Further numbers of flows, for which the runs are repeated."""
 
     @property
     def packets(self) -> int:
         return self.rate * self.seconds
 
 
-FULL, QUICK = NetemBenchmarkOptions(), NetemBenchmarkOptions(runs=1, seconds=1)
+FULL, QUICK = NetemBenchmarkOptions(), NetemBenchmarkOptions(runs=1, seconds=1, crowds=(10,))
 
 
 @dataclass(frozen=True)
@@ -104,8 +110,10 @@ def work(task: Callable[..., object], pipe: Connection, *args: object) -> None:
 
 def send(pipe: Connection, options: NetemBenchmarkOptions, port: int) -> int:
     """Number, timestamp and send packets by absolute deadlines; returns their number."""
-    sock = open_blocking()
-    sock.connect((HOST, port))
+    socks = [open_blocking() for _ in range(options.flows)]
+    for flow, sock in enumerate(socks):
+        sock.connect((HOST, port))
+        sock.send(HEAD.pack(flow, 0))  # netem takes equal packets from many addresses for a loop
     packet, number = bytearray(options.size), 0
     pipe.send("ready")
     start_ns = pipe.recv()
@@ -113,7 +121,7 @@ def send(pipe: Connection, options: NetemBenchmarkOptions, port: int) -> int:
         sleep_until(start_ns + batch_ns)
         while number < options.rate * batch_ns // SECOND_NS:
             HEAD.pack_into(packet, 0, number, time.monotonic_ns())
-            sock.send(packet)
+            socks[number % options.flows].send(packet)
             number += 1
     return number
 
@@ -122,6 +130,10 @@ def receive(pipe: Connection, options: NetemBenchmarkOptions) -> tuple[bytes, li
     """Receive packets; returns headers, arrival times [ns], and the kernel's drops."""
     sock = open_blocking()
     pipe.send(sock.getsockname()[1])
+    sock.sendto(b"", sock.recvfrom(1)[1])
+    for _ in range(1, options.flows):
+        sock.recv(1)
+    pipe.send("flows are open")
     pipe.recv()
     # The kernel's own time-out: Python's would call poll() before every packet.
     sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, struct.pack("ll", QUIET_S, 0))
@@ -160,10 +172,10 @@ def measure_once(options: NetemBenchmarkOptions, seed: int) -> NetemRun:
     with ExitStack() as stack:
         receiver = start(stack, receive, options)
         record = Path(stack.enter_context(TemporaryDirectory())) / "netem.rec"
-        netem = start_netem(stack, answer(receiver), seed, record)
+        netem = start_netem(stack, answer(receiver), seed, record, options.flows)
         port = netem.address[1]
         sender, sleeper = start(stack, send, options, port), start(stack, sleep, options)
-        answer(sender), answer(sleeper)
+        answer(sender), answer(sleeper), answer(receiver)
 
         used_ns, start_ns = scheduled_ns(netem.process.pid), time.monotonic_ns() + SECOND_NS // 10
         for pipe in (receiver, sleeper, sender):
@@ -173,13 +185,13 @@ def measure_once(options: NetemBenchmarkOptions, seed: int) -> NetemRun:
         (heads, arrivals, dropped_after), late_ns = answer(receiver), answer(sleeper)
 
         netem.stop()
-        drawn_ns = drawn_delays_ns(record, sent)
+        drawn_ns = drawn_delays_ns(record, sent, options.flows)
 
     numbers, stamps = np.frombuffer(heads, "<i8").reshape(-1, 2).T
     counted = netem.all(Counted)[-1].event
     assert isinstance(counted, Counted)
     downlink = counted.figures["downlink"]
-    read_packets = downlink["packets"]
+    read_packets = downlink["packets"] - options.flows
     # A packet that netem never read has no row in the record, and shifts the numbers after it.
     counted_until = sent if read_packets == sent else first_missing(numbers)
     error_ns = (np.array(arrivals) - stamps - drawn_ns[numbers])[numbers < counted_until]
@@ -213,9 +225,12 @@ def start(stack: ExitStack, task: Callable[..., object], *args: object) -> Conne
     return ours
 
 
-def start_netem(stack: ExitStack, server_port: int, seed: int, record: Path) -> ChildProcess:
+def start_netem(
+    stack: ExitStack, server_port: int, seed: int, record: Path, flows: int
+) -> ChildProcess:
     at = f"--bind={HOST}:0", f"--server={HOST}:{server_port}", f"--record={record}"
-    return ChildProcess(stack, "netem", "paper", f"--seed={seed}", *at, "--network.downlink.loss=0")
+    arguments = f"--seed={seed}", f"--flows={flows}", "--network.downlink.loss=0"
+    return ChildProcess(stack, "netem", "paper", *at, *arguments)
 
 
 def answer(pipe: Connection) -> Any:
@@ -230,11 +245,11 @@ def scheduled_ns(pid: int) -> NDArray[np.int64]:
     return np.array(Path(f"/proc/{pid}/schedstat").read_text().split()[:2], dtype=np.int64)
 
 
-def drawn_delays_ns(record: Path, count: int) -> NDArray[np.int64]:
+def drawn_delays_ns(record: Path, count: int, flows: int) -> NDArray[np.int64]:
     """Delays that netem drew for the packets to the server, by number [ns]; shape (count,)."""
     rows, drawn_ns = read(record), np.zeros(count, np.int64)
-    rows = rows[rows["direction"] == DOWNLINK]
-    drawn_ns[rows["number"]] = rows["delay_ns"]
+    rows = rows[(rows["direction"] == DOWNLINK) & (rows["number"] > 0)]
+    drawn_ns[(rows["number"].astype(np.int64) - 1) * flows + rows["flow"]] = rows["delay_ns"]
     return drawn_ns
 
 
@@ -245,12 +260,13 @@ def first_missing(numbers: NDArray[np.int64]) -> int:
 
 
 def measure(options: NetemBenchmarkOptions) -> dict[str, Any]:
-    """Figures of all runs, and the median of each over the runs."""
-    seeds = range(1, options.runs + 1)
-    runs = [measure_once(options, seed) for seed in progress(seeds, "netem")]
+    """Figures of all runs, and the median of each over the runs, also for more flows."""
+    runs = measure_all(options)
+    more = {each: measure_all(replace(options, flows=each)) for each in options.crowds}
     return {
         "options": asdict(options),
-        "median": {name: median(getattr(run, name) for run in runs) for name in asdict(runs[0])},
+        "median": medians(runs),
+        "flows": {flows: medians(each) for flows, each in ({options.flows: runs} | more).items()},
         "runs": [asdict(run) for run in runs],
         "wake": {
             "p50_ms": median(run.wake_ms_p50 for run in runs),
@@ -258,6 +274,17 @@ def measure(options: NetemBenchmarkOptions) -> dict[str, Any]:
             "max_ms": max(run.wake_ms_max for run in runs),
         },
     }
+
+
+def measure_all(options: NetemBenchmarkOptions) -> list[NetemRun]:
+    seeds = range(1, options.runs + 1)
+    return [
+        measure_once(options, seed) for seed in progress(seeds, f"netem, {options.flows} flows")
+    ]
+
+
+def medians(runs: Sequence[NetemRun]) -> dict[str, float]:
+    return {name: median(getattr(run, name) for run in runs) for name in asdict(runs[0])}
 
 
 def tables(result: Mapping[str, Any]) -> dict[str, TextTable]:
@@ -279,7 +306,24 @@ def tables(result: Mapping[str, Any]) -> dict[str, TextTable]:
         ]
         for number, run in enumerate(runs_of(result), start=1)
     ]
-    return {"netem": TextTable(headings, rows)}
+    crowds = []
+    for flows, run in result.get("flows", {}).items():  # older results have none
+        read_packets = run["sent"] - run["dropped_before"]
+        packet_s = run["netem_cpu"] * result["options"]["seconds"] / read_packets
+        crowds.append(
+            [
+                str(flows),
+                f"{packet_s * 1e6:.1f}",
+                f"{1 / packet_s:.0f}",
+                f"{run['error_ms_p50']:.2f}",
+                f"{run['error_ms_p99']:.2f}",
+                f"{run['netem_waited']:.0%}",
+                f"{1 - run['received'] / run['sent']:.1%}",
+            ]
+        )
+    titles = ["flows", "CPU a packet [µs]", "packets a core-second", "error p50 [ms]", "p99"]
+    titles += ["netem waited", "lost"]
+    return {"netem": TextTable(headings, rows), "netem-flows": TextTable(titles, crowds)}
 
 
 def runs_of(result: Mapping[str, Any]) -> list[NetemRun]:

@@ -46,11 +46,11 @@ class Emulator(Endpoint):
         super().__init__()
         self._scenario = scenario
 
-        def link(direction: int, name: Direction) -> Link:
+        def make(direction: int, name: Direction) -> Link:
             of = self.path(name)
             return Link(direction, mtu, recorder, of, path, header_bytes=header_bytes)
 
-        self.uplink, self.downlink = link(UPLINK, "uplink"), link(DOWNLINK, "downlink")
+        self.uplink, self.downlink = make(UPLINK, "uplink"), make(DOWNLINK, "downlink")
         self._faults: set[str] = set()
         """Tracebacks of errors in impairments of plug-ins: each is reported once."""
 
@@ -63,9 +63,12 @@ class Emulator(Endpoint):
         path: Path = getattr(self._scenario, name)
         return path
 
+    def link(self, name: Direction) -> Link:
+        return self.uplink if name == "uplink" else self.downlink
+
     def fates(self, name: Direction, flow: int) -> Fates:
         """What the packets of one flow meet in a direction."""
-        return Fates(self.path(name), self._scenario.seed, name, flow)
+        return Fates(self.link(name).path, self._scenario.seed, name, flow)
 
     def wake(self, *, now_ns: int) -> None:
         self._forward(now_ns)

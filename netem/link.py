@@ -181,15 +181,15 @@ class Link:
         self._bytes = 0
         """UDP payload in the queue [B]."""
         self._entered = 0
-        self._path = path or Path()
-        self._is_ordered = self._path.is_ordered
-        self._bottleneck = _bottleneck(self._path)
+        self.path = path or Path()
+        self._is_ordered = self.path.is_ordered
+        self._bottleneck = _bottleneck(self.path)
         self.counts = Counts()
 
     def change(self, path: Path, *, now_ns: int) -> None:
         """Change order and rate; packets at the bottleneck are queued again if they fit."""
         self._pass(now_ns)
-        previous, self._path, self._is_ordered = self._path, path, path.is_ordered
+        previous, self.path, self._is_ordered = self.path, path, path.is_ordered
         if path.queue is previous.queue:
             return
         before, self._bottleneck = self._bottleneck, _bottleneck(path)

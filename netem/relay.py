@@ -163,7 +163,7 @@ class Relay(Emulator):
         return super().path(name).for_streams()
 
     def fates(self, name: Direction, flow: int) -> Fates:
-        return LosslessFates(self.path(name), self._scenario.seed, name, flow)
+        return LosslessFates(self.link(name).path, self._scenario.seed, name, flow)
 
     def change(self, scenario: Scenario, keys: frozenset[str], *, now_ns: int) -> None:
         """See `Endpoint`; what is held up is tried again at once."""

@@ -87,7 +87,7 @@ class Tunnel(Emulator):
         return self._flows.values()
 
     def fates(self, name: Direction, flow: int) -> Fates:
-        return Fates(self.path(name), self._scenario.seed, name, flow, by_number=True)
+        return Fates(self.link(name).path, self._scenario.seed, name, flow, by_number=True)
 
     def figures(self) -> dict[str, Any]:
         return {"flows": self._opened, "refused": self.refused} | super().figures()

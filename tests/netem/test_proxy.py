@@ -83,6 +83,22 @@ def test_every_client_address_is_a_flow_with_a_socket_of_its_own() -> None:
     assert proxy.events() == ()
 
 
+def test_the_impairments_are_parsed_once_not_for_each_flow(monkeypatch: pytest.MonkeyPatch) -> None:
+    proxy, changed = make_proxy(), make_proxy("loss(1)")
+    for client in (ALICE, BOB):
+        pass_on(proxy, b"?", client)
+    parsed: list[str] = []
+    path_of = Proxy.path
+    monkeypatch.setattr(
+        Proxy, "path", lambda self, name: parsed.append(name) or path_of(self, name)
+    )
+    proxy.change(changed._scenario, frozenset({"network.downlink"}), now_ns=0)
+    for client in (ALICE, BOB, CAROL):
+        hear(proxy, b"?", client)
+    assert parsed == ["uplink", "downlink"]
+    assert (proxy.outbox(), proxy.downlink.counts.lost) == ([], 3)
+
+
 def test_the_servers_answers_find_their_client() -> None:
     proxy = make_proxy()
     socket_of = {client: pass_on(proxy, b"?", client) for client in (ALICE, BOB, CAROL)}
