@@ -10,7 +10,6 @@ from LAPS_MAX new addresses, one after another, opens no further flow. The first
 long, and the first that does not reach the server, are reported.
 """
 
-import hashlib
 from collections import OrderedDict
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
@@ -68,9 +67,9 @@ class Proxy(Emulator):
         """Whether a packet that is too long was reported."""
         self._is_unreachable = False
         """Whether packets to the server have failed since its last answer."""
-        self._passed: OrderedDict[bytes, tuple[int, Address]] = OrderedDict()
+        self._passed: OrderedDict[int, tuple[int, Address]] = OrderedDict()
         """Until the server answers: laps of each of the newest packets, and the latest client that
-        sent it, by digest of the packet."""
+        sent it, by hash of the packet: Python's own, of 64 bits with a key of the process."""
         self.refused = 0
         """Number of packets from clients without a flow, and to a flow's socket not from the
         server."""
@@ -153,7 +152,7 @@ class Proxy(Emulator):
 
         If no server answers, such a packet is one that netem itself has sent.
         """
-        passed = self._passed.get(_digest(datagram.payload)) if not self._is_answered else None
+        passed = self._passed.get(hash(datagram.payload)) if not self._is_answered else None
         if passed is None:
             return 0
         laps = passed[0] + (passed[1] != datagram.peer)
@@ -163,9 +162,9 @@ class Proxy(Emulator):
         return laps
 
     def _note(self, payload: bytes, flow: Flow) -> None:
-        digest = _digest(payload)
-        laps, client = self._passed.pop(digest, (0, flow.client))
-        self._passed[digest] = (laps, client) if laps > flow.laps else (flow.laps, flow.client)
+        key = hash(payload)
+        laps, client = self._passed.pop(key, (0, flow.client))
+        self._passed[key] = (laps, client) if laps > flow.laps else (flow.laps, flow.client)
         if len(self._passed) > QUEUE_MAX:
             self._passed.popitem(last=False)
 
@@ -196,7 +195,3 @@ def _added(each: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         elif isinstance(values[0], int) and not name.endswith("_max"):
             total[name] = sum(values)
     return total
-
-
-def _digest(payload: bytes) -> bytes:
-    return hashlib.blake2s(payload, digest_size=16).digest()
