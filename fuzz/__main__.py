@@ -28,6 +28,8 @@ GUIDED_SHARE = 0.5
 the rest."""
 INPUT_CPU_S = 60.0
 """CPU time that one input may take [s]. Wall time would blame the input for a busy machine."""
+WALL_S = 86_400
+"""Wall time of one input after which atheris gives up, which is never [s]; 0 means a second."""
 SHM = Path("/dev/shm")
 """Folder in memory for files that are rewritten often."""
 
@@ -117,7 +119,7 @@ def _search(name: str, folder: Path, seconds: float, done: c_longlong) -> None:
     for number, payload in enumerate(target.seeds()):
         (corpus / str(number)).write_bytes(payload)
     limits = [f"-max_total_time={seconds:.0f}", f"-max_len={target.largest}"]
-    limits += ["-mutate_depth=2", "-timeout=0"]
+    limits += ["-mutate_depth=2", f"-timeout={WALL_S}"]
     stop_slow()
     atheris.Setup(["fuzz", *limits, str(corpus)], one, custom_mutator=mutated)
     atheris.Fuzz()
