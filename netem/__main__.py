@@ -21,7 +21,7 @@ from skytether.netem.relay import Relay
 from skytether.netem.tunnel import Tunnel
 from skytether.shared.core.endpoint import Address
 from skytether.shared.core.events import address_text
-from skytether.shared.core.line import Listen
+from skytether.shared.core.line import CONNECTIONS_MAX, Listen
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import PACKET_COLUMNS
@@ -62,7 +62,7 @@ class NetemOptions(ProcessOptions):
     """Relay TCP connections in place of UDP: latency, a rate and cuts, and no packet loss."""
     flows: Annotated[int | None, Argument(metavar="N")] = None
     """Largest number of clients at once, each of which takes a socket; by default 512, or as many
-    as the system allows. With --tcp there are at most 128 connections, always."""
+    as the system allows. With --tcp, of connections: 1 to 128, the default."""
 
 
 @dataclass(frozen=True)
@@ -106,7 +106,7 @@ def emulate(argv: Sequence[str]) -> None:
         NetemOptions(), argv, "skytether netem", emulate.__doc__, is_final=False
     )
     options = _with_directions(options)
-    flows = _flows(options.flows)
+    flows = _flows(options.flows, CONNECTIONS_MAX if options.tcp else 65_536)
     server = command.address("--server", options.server)
     bind = command.address("--bind", options.bind)
     _check_server(server, bind)
@@ -115,8 +115,9 @@ def emulate(argv: Sequence[str]) -> None:
         recorder, path = running.recorder, options.path - 1
         waiting_for = f"clients of {options.server}"
         if options.tcp:
+            listen = Listen(bind, server, flows)
             relay = Relay(running.scenario, server=server, recorder=recorder, path=path)
-            running.drive(relay, bind=None, line=Listen(bind, server), waiting_for=waiting_for)
+            running.drive(relay, bind=None, line=listen, waiting_for=waiting_for)
             return
         proxy = Proxy(running.scenario, server=server, flows=flows, recorder=recorder, path=path)
         running.drive(proxy, bind=bind, peers=[server], waiting_for=waiting_for)
@@ -214,18 +215,19 @@ def _check_server(server: Address, bind: Address) -> None:
             raise command.CommandError(message, command.CONFIGURATION)
 
 
-def _flows(requested: int | None) -> int:
+def _flows(requested: int | None, most: int) -> int:
     """Largest number of clients at once; prints a warning if the system allows few.
 
     Raises:
         CommandError: the system does not allow the requested number.
     """
-    flows = max(1, min(FLOWS_MAX, sockets_max())) if requested is None else requested
-    command.check_count("--flows", flows, 65_536)
+    usual = min(FLOWS_MAX, most)
+    flows = max(1, min(usual, sockets_max())) if requested is None else requested
+    command.check_count("--flows", flows, most)
     command.check_sockets("--flows", flows)
-    if requested is None and flows < FLOWS_MAX:
+    if requested is None and flows < usual:
         print(
-            f"netem: room for {flows} clients instead of {FLOWS_MAX}: {files_max()} files may be "
+            f"netem: room for {flows} clients instead of {usual}: {files_max()} files may be "
             "open here (ulimit -n)",
             file=sys.stderr,
         )

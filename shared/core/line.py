@@ -42,12 +42,18 @@ class Line(NamedTuple):
         return {"udp": None, "udpout": self.address}.get(self.kind, LINE)
 
 
+CONNECTIONS_MAX = 128
+"""Largest number of TCP connections at once: what they hold fits the queue of a link."""
+
+
 class Listen(NamedTuple):
     """TCP connections to relay: where clients connect, and where they are led."""
 
     bind: Address
     """Port 0 takes a free one."""
     server: Address
+    most: int = CONNECTIONS_MAX
+    """Largest number of connections at once; further ones are closed."""
 
 
 def parse_address(text: str) -> Address | None:

@@ -17,8 +17,6 @@ from skytether.shared.core.events import address_text
 from skytether.shared.core.line import CLIENT, PIECE_BYTES, SERVER, Listen
 from skytether.shell.udp import AddressError, from_kernel, to_kernel
 
-CONNECTIONS_MAX = 128
-"""Largest number of connections at once; further ones are closed."""
 HELD_MAX = 200
 """Number of pieces of an end on their way, above which it is not read from. With what one read
 brings, all connections together stay below the bounds of a link's queue."""
@@ -83,7 +81,7 @@ class Connections:
     def __init__(
         self, listen: Listen, hear: Callable[[Datagram], None], refused: Callable[[str], None]
     ) -> None:
-        self._server, self._refused = listen.server, refused
+        self._server, self._most, self._refused = listen.server, listen.most, refused
         self._hear: Hear = lambda piece, peer: hear(Datagram(piece, peer, 1))
         self._ways: dict[Address, HalfConnection] = {}
         """Ways by the peer to which they lead."""
@@ -109,7 +107,7 @@ class Connections:
         try:
             while True:
                 client, _ = await loop.sock_accept(self._socket)
-                if len(self._running) >= CONNECTIONS_MAX:
+                if len(self._running) >= self._most:
                     client.close()
                     continue
                 task = loop.create_task(self._serve(client))

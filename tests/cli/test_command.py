@@ -115,6 +115,7 @@ QUICK = [
         ("fleet --mission swap --vehicles 3", "fleet: --vehicles: got 3, expected 16 on this"),
         ("server --vehicles -1", "server: --vehicles: got -1, expected 1 to 65536"),
         ("netem --flows 0", "netem: --flows: got 0, expected 1 to 65536"),
+        ("netem --tcp --flows 129", "netem: --flows: got 129, expected 1 to 128"),
         ("client --id 65530 --vehicles 10", "client: --id: got 65530 to 65539, expected 0 to 6"),
     ],
 )

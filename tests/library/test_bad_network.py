@@ -13,8 +13,9 @@ from threading import Thread
 import pytest
 
 import skytether
+import skytether.library.bad_network
 from helpers import echo, until
-from skytether.shell.connections import CONNECTIONS_MAX
+from skytether.shared.core.line import CONNECTIONS_MAX, Listen
 from skytether.shell.udp import AddressError
 
 PATIENCE_S = 60.0
@@ -128,6 +129,20 @@ def test_a_client_that_breaks_off_is_forgotten(
 
     until(is_served)
     until(lambda: net.counts["flows"] == 0)
+
+
+def test_there_is_a_largest_number_of_connections(
+    bad_network: Opened, served: tuple[str, int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(skytether.library.bad_network, "Listen", partial(Listen, most=1))
+    net = bad_network(to=served, tcp=True)
+    with socket.create_connection(net.address) as held:
+        held.sendall(b"GET ")
+        until(lambda: net.counts["flows"] == 1)
+        with pytest.raises(OSError, match=r"reset|closed"):
+            fetched(net)
+    until(lambda: net.counts["flows"] == 0)
+    assert fetched(net)
 
 
 def test_it_runs_within_ones_own_loop(client: socket.socket) -> None:
