@@ -248,16 +248,14 @@ def test_the_tables_on_the_page_are_those_of_the_csv_files(out: Path) -> None:
 
 
 def test_packets_really_took_what_was_drawn(out: Path) -> None:
-    """Delays of netem over UDP follow (17), plus the lateness of a busy machine, which is no fault:
-    none is early, and some are in time.
-    """
+    """Delays of netem over UDP follow (17), plus the lateness of a busy machine."""
     rows = list(csv.DictReader((out / "fig2.csv").read_text().splitlines()))
     lattice = [row for row in rows if row["probability"]]
     assert float(lattice[0]["delay_ms"]) == 400.0
     assert float(lattice[0]["probability"]) == pytest.approx(math.exp(-2.0))
     assert sum(float(row["probability"]) for row in lattice) == pytest.approx(1.0, abs=1e-3)
     assert float(rows[0]["cumulative_udp"]) == 0.0  # none was early
-    assert float(rows[-1]["cumulative_udp"]) > 0.0
+    assert float(rows[-1]["cumulative_udp"]) > 0.9
 
 
 def test_the_second_time_it_only_draws(
