@@ -60,7 +60,7 @@ class NetemBenchmarkOptions:
     flows: int = 1
     """Number of the clients' addresses."""
     crowds: tuple[int, ...] = (10, 1000)
-    """Further numbers of flows, for which the runs are repeated."""
+    """Other values of `flows` that are measured too, each in as many runs."""
 
     @property
     def packets(self) -> int:

@@ -39,7 +39,7 @@ class TooSlow(BaseException):
 
 
 def limited(target: Target, payload: bytes) -> None:
-    """Feed an input to a target; call `stop_slow` first."""
+    """Feed an input to a target, within `INPUT_CPU_S`; needs `stop_slow`, once in each process."""
     signal.setitimer(signal.ITIMER_VIRTUAL, INPUT_CPU_S)
     try:
         target(payload)

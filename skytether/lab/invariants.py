@@ -248,7 +248,7 @@ class WatchedLife(Recorder):
         self._times_ns: OrderedDict[int, int] = OrderedDict()
         """Virtual time of each step that was flown [ns]."""
         self._leadership = 0
-        """Largest number of a leadership that the vehicle has told."""
+        """Largest number of a leadership (see `Lead`) that the vehicle has sent to a server."""
         self._horizons: deque[tuple[int, int, bytes]] = deque(maxlen=HORIZONS_MAX)
         """Session, number of the server's run, and message of each horizon that was received and
         not of an earlier leadership."""
