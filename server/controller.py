@@ -49,7 +49,7 @@ from skytether.shared.wire.protocol import Idle, Lead, Observation, committed_ma
 
 PLANS, OBSERVATION, DELAY, UNSOLVED, STANDBY = map(int, Idle)
 TAKEOVER_PLANS = 2
-"""Number of plans that a server sends to a vehicle when it takes over, whatever the trigger says."""
+"""Number of plans that a server sends when it takes over, whatever the trigger says."""
 BLOCK = 128
 """Number of vehicles planned for together: their data stay in the cache, and no array is so large
 (128 KiB) that the C library would get new memory from the kernel for it each time."""
@@ -158,7 +158,7 @@ class Controller:
         self._led = np.ones(capacity, dtype=np.bool_)
         """Whether this server leads each vehicle; shape (capacity,)."""
         self._owed: dict[int, int] = {}
-        """Number of plans still due after a takeover, whatever the trigger says; by vehicle's row."""
+        """Number of plans still due after a takeover, whatever the trigger says, by row."""
         self._known = 0
         """Largest number of a leadership that a vehicle has told."""
         self._takes = np.ones(capacity, dtype=np.bool_)
