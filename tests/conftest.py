@@ -51,7 +51,7 @@ os.environ["XDG_STATE_HOME"] = _STATES
 
 
 FIRST = (
-    *("test_observer.py", "test_docs.py", "test_together_autopilots.py", "test_aboard_udp.py"),
+    *("test_docs.py", "test_together_autopilots.py", "test_aboard_udp.py"),
     *("test_plugins.py", "test_reproduce.py", "test_packaging.py", "test_environments.py"),
     *("test_command.py", "test_straight.py", "test_margins.py", "test_compare.py", "test_fleet.py"),
     *("test_trajectory.py", "test_kernel.py", "test_slow.py", "test_loopback.py"),
