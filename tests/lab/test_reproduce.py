@@ -12,6 +12,7 @@ from collections.abc import Mapping
 from html.parser import HTMLParser
 from pathlib import Path
 
+import numpy as np
 import pytest
 from msgspec.structs import replace
 
@@ -248,14 +249,23 @@ def test_the_tables_on_the_page_are_those_of_the_csv_files(out: Path) -> None:
 
 
 def test_packets_really_took_what_was_drawn(out: Path) -> None:
-    """Delays of netem over UDP follow (17), plus the lateness of a busy machine."""
+    """Drawn delays follow (17), within the band of Dvoretzky, Kiefer and Wolfowitz; no packet over
+    UDP took less than was drawn for it. How much more it took is the machine's affair.
+    """
     rows = list(csv.DictReader((out / "fig2.csv").read_text().splitlines()))
     lattice = [row for row in rows if row["probability"]]
     assert float(lattice[0]["delay_ms"]) == 400.0
     assert float(lattice[0]["probability"]) == pytest.approx(math.exp(-2.0))
     assert sum(float(row["probability"]) for row in lattice) == pytest.approx(1.0, abs=1e-3)
-    assert float(rows[0]["cumulative_udp"]) == 0.0  # none was early
-    assert float(rows[-1]["cumulative_udp"]) > 0.9
+    law, shown = (
+        np.array([float(row[name]) for row in rows]) for name in ("cumulative", "cumulative_udp")
+    )
+    at_ms = np.array([float(row["delay_ms"]) for row in rows])
+    took_ms, drawn_ms = np.load(out / "delays.npy").T
+    drawn = (drawn_ms <= at_ms[:, np.newaxis] + 1e-6).mean(axis=1)
+    assert np.abs(drawn - law).max() < math.sqrt(math.log(2.0 / 1e-4) / (2.0 * len(drawn_ms)))
+    assert shown == pytest.approx((took_ms <= at_ms[:, np.newaxis]).mean(axis=1))
+    assert (took_ms >= drawn_ms).all()
 
 
 def test_the_second_time_it_only_draws(
