@@ -2,8 +2,8 @@
 
 From each place on its outline a push of some length would move and turn the block. The policy takes
 the push after which the block is closest to its goal, less the way to get there, and returns the
-path of the pusher: round the block, to the place, and through it. It depends on the observation
-only.
+path of the pusher: round the block, to the place, and through it. Where rows are committed, it
+predicts where they bring the pusher and the block, and goes on from there.
 """
 
 import numpy as np
@@ -18,6 +18,8 @@ GYRATION = 55.0
 """Radius of gyration of the block as it is simulated [px]."""
 ARM = 60.0
 """Length by which an angle counts as a distance [px]."""
+BOXES = np.array([[[-60.0, 0.0], [-15.0, 30.0]], [[60.0, 30.0], [15.0, 120.0]]])
+"""The bar and the stem of the block: least and largest coordinates in its frame [px]."""
 RADIUS, GAP = 15.0, 10.0
 """Radius of the pusher, and distance to the outline before a push [px]."""
 PUSHES = np.array([4.0, 12.0, 30.0, 60.0])
@@ -56,13 +58,47 @@ def _outline() -> tuple[Array, Array]:
 PLACES, NORMALS = _outline()
 
 
-def plan(observation: Array, rows: int) -> Array:
-    """Next positions of the pusher [px]; shape (rows, 2)."""
+def turned_by(angle: float) -> Array:
+    """Rotation matrix; shape (2, 2)."""
+    return np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+
+
+def predict(observation: Array, targets: Array) -> Array:
+    """Observation once the pusher has been at all targets, shape (n, 2).
+
+    Wherever the pusher would be in the block, this gives way along the shortest way out. The pusher
+    is taken to follow without delay.
+    """
+    pusher, block, angle = observation[:2], observation[2:4], float(observation[4])
+    for target in targets:
+        for at in pusher + np.linspace(0.1, 1.0, 10)[:, None] * (target - pusher):
+            turn = turned_by(angle)
+            place = (at - block) @ turn
+            nearest = np.clip(place, *BOXES)
+            away = np.hypot(*(place - nearest).T)
+            box = int(away.argmin())
+            if 0.0 < away[box] < RADIUS:
+                centre, normal = block + turn @ CENTRE, turn @ (nearest[box] - place) / away[box]
+                x, y = turn @ (nearest[box] - CENTRE)
+                moment = x * normal[1] - y * normal[0]
+                give = (RADIUS - away[box]) / (1.0 + (moment / GYRATION) ** 2)
+                angle += give * moment / GYRATION**2
+                block = centre + give * normal - turned_by(angle) @ CENTRE
+        pusher = target
+    return np.array([*pusher, *block, angle])
+
+
+def plan(observation: Array, committed: Array, rows: int) -> Array:
+    """Next positions of the pusher, the committed ones first [px]; shape (rows, 2)."""
+    if len(committed) < 2:  # the pusher is two rows behind its target: nothing is known of so few
+        return _push(observation, rows)
+    continued = _push(predict(observation, committed), rows)
+    return np.concatenate([committed, continued])[:rows]
+
+
+def _push(observation: Array, rows: int) -> Array:
     pusher, block, angle = observation[:2], observation[2:4], observation[4]
-    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-    goal_turn = np.array(
-        [[np.cos(GOAL_ANGLE), -np.sin(GOAL_ANGLE)], [np.sin(GOAL_ANGLE), np.cos(GOAL_ANGLE)]]
-    )
+    turn, goal_turn = turned_by(angle), turned_by(GOAL_ANGLE)
     places, normals = block + PLACES @ turn.T, NORMALS @ turn.T
     centre = block + turn @ CENTRE
     off = GOAL + goal_turn @ CENTRE - centre

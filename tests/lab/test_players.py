@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from bench import push_t
 from bench.players import TASKS, Cell, FlownCell, PlayerName, differs, fly_cell, tables
 
 
@@ -45,3 +46,28 @@ def test_the_tables_have_a_row_for_each_network(flown: dict[PlayerName, FlownCel
     shown = tables(list(flown.values()))
     assert [len(table.rows) for table in shown.values()] == [1, 1]
     assert shown["players pendulum scores"].rows[0][0] == "100 ms, 10%"
+
+
+def test_a_push_through_the_centre_of_gravity_moves_the_block_and_one_beside_it_turns_it() -> None:
+    """The block lies unturned at (200, 200); its bar is 30 px thick, its stem 120 px long."""
+    begin = np.array([100.0, 245.0, 200.0, 200.0, 0.0])
+    assert push_t.predict(begin, np.array([[170.0, 245.0]])) == pytest.approx(
+        [170.0, 245.0, 200.0, 200.0, 0.0]  # at the stem
+    )
+    assert push_t.predict(begin, np.array([[150.0, 245.0], [182.0, 245.0]])) == pytest.approx(
+        [182.0, 245.0, 212.0, 200.0, 0.0]
+    )
+    beside = push_t.predict(begin, np.array([[150.0, 300.0], [182.0, 300.0]]))
+    assert beside[4] < 0.0
+    assert beside[2] - 200.0 > 0.0
+
+
+def test_what_is_committed_to_a_pusher_is_kept_and_gone_on_from() -> None:
+    begin = np.array([100.0, 245.0, 200.0, 200.0, 0.0])
+    committed = np.array([[110.0, 245.0], [120.0, 250.0], [130.0, 255.0]])
+    rows = push_t.plan(begin, committed, 16)
+    assert rows.shape == (16, 2)
+    np.testing.assert_array_equal(rows[:3], committed)
+    assert np.hypot(*(rows[3] - rows[2])) <= push_t.TRAVEL_SPEED + 1.0
+    many = np.tile(committed, (6, 1))
+    np.testing.assert_array_equal(push_t.plan(begin, many, 16), many[:16])
