@@ -101,7 +101,7 @@ autopilot-test: setup  ## actual autopilots in simulation: ARDUCOPTER=, PX4= nam
 bench: $(BENCH_STAMP)  ## every benchmark; the tables of docs/performance.md anew
 	$(BIN)/python -m bench
 
-figures: $(BENCH_STAMP)  ## the measured numbers of README and docs/, beside those made anew; goes on after Ctrl-C (an hour)
+figures: $(BENCH_STAMP)  ## the measured numbers of README and docs/, beside those made anew; goes on after Ctrl-C (75 minutes)
 	$(BIN)/python -m bench.figures
 
 $(BENCH_STAMP): $(STAMP) locks/bench.lock

@@ -25,7 +25,7 @@ LINES = re.findall(
 def companion() -> Iterator[socket.socket]:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as own:
         own.bind(("127.0.0.1", 0))
-        own.settimeout(20.0)
+        own.settimeout(180.0)
         yield own
 
 

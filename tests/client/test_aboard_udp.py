@@ -81,10 +81,10 @@ class Processes:
 
     async def _watch(self, client: Child, end: int | None) -> int:
         if end is not None:
-            await asyncio.wait_for(self.flies.wait(), 60.0)
+            await asyncio.wait_for(self.flies.wait(), 180.0)
             await asyncio.sleep(3.0)
             client.process.send_signal(end)
-        code = await asyncio.wait_for(client.end(), 150.0)
+        code = await asyncio.wait_for(client.end(), 300.0)
         self.last_words = client.last_words()
         for _ in range(200):
             if end is None or any(said.startswith("Disarm") for said in self.autopilot):

@@ -747,7 +747,7 @@ def test_ctrl_c_ends_a_search_in_order_and_the_same_command_goes_on(
         ):
             time.sleep(0.05)
         process.send_signal(signal.SIGINT)
-        _, said = process.communicate(timeout=60)
+        _, said = process.communicate(timeout=180)
     assert process.returncode == 130, said
     assert f"of {2 * len(QUICK)} generations done; the same command goes on" in said
     assert not (tmp_path / "weights.toml").exists()

@@ -531,7 +531,7 @@ def started(*command: str) -> Iterator[str]:
         yield next(word for word in line.replace(",", " ").split() if word.startswith("127.0.0.1:"))
     finally:
         process.terminate()
-        process.communicate(timeout=30)
+        process.communicate(timeout=180)
 
 
 def listening(*flags: str) -> AbstractContextManager[str]:

@@ -287,7 +287,7 @@ def drive(
         task = loop.create_task(shell.run(events.append))
         await asyncio.sleep(0)
         await talk(shell)
-        await asyncio.wait_for(task, 5.0)
+        await asyncio.wait_for(task, 180.0)
         return shell
 
     with asyncio.Runner(loop_factory=new_event_loop) as runner:
@@ -446,7 +446,7 @@ def send_to_both(pieces: Sequence[Sequence[int]]) -> TwoSockets:
             sock.sendto(b"hello", shell.address)
             await has_heard(endpoint, 1)
             sock.setblocking(True)
-            sock.settimeout(5.0)
+            sock.settimeout(180.0)
             addresses = [shell.address, sock.recvfrom(10)[1]]
             sent = 0
             for piece in pieces:

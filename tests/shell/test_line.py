@@ -60,7 +60,7 @@ class Echo(Idle):
 
 def drive(coroutine: Any) -> Any:
     with asyncio.Runner(loop_factory=new_event_loop) as runner:
-        return runner.run(asyncio.wait_for(coroutine, 30))
+        return runner.run(asyncio.wait_for(coroutine, 180))
 
 
 def shell(endpoint: Endpoint, line: str) -> Shell:
@@ -127,7 +127,7 @@ def test_a_rate_that_no_port_has_is_refused() -> None:
 def test_udp_listens_or_speaks_first(kind: str) -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as autopilot:
         autopilot.bind(("127.0.0.1", 0))
-        autopilot.settimeout(5)
+        autopilot.settimeout(180)
         host, port = autopilot.getsockname()
 
         async def main() -> bytes:

@@ -293,7 +293,7 @@ def served() -> Iterator[Metrics]:
 
 
 def calling(served: Metrics) -> socket.socket:
-    return socket.create_connection(served.address, timeout=30.0)
+    return socket.create_connection(served.address, timeout=180.0)
 
 
 def said(sock: socket.socket) -> bytes:

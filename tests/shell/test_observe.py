@@ -84,9 +84,9 @@ async def _flown(feeds: Path) -> tuple[dict[str, set[str]], str]:
         process("netem", *here, "--server", at(server.address)) as netem,
         process("client", "--server", at(netem.address)),
     ):
-        await asyncio.wait_for(flying.wait(), 60.0)
+        await asyncio.wait_for(flying.wait(), 180.0)
         found: dict[str, set[str]] = {}
-        deadline = asyncio.get_running_loop().time() + 30.0
+        deadline = asyncio.get_running_loop().time() + 180.0
         # Figures are a second old: wait until they include the first plan.
         while "skytether_client_age_seconds" not in found:
             assert asyncio.get_running_loop().time() < deadline
@@ -112,7 +112,7 @@ def at(address: Address) -> str:
 
 
 def fetched(address: Address, path: str) -> str:
-    with urllib.request.urlopen(f"http://{at(address)}{path}", timeout=10.0) as answer:
+    with urllib.request.urlopen(f"http://{at(address)}{path}", timeout=180.0) as answer:
         return str(answer.read().decode())
 
 

@@ -70,7 +70,7 @@ def opened(port: int) -> socket.socket:
     sock = socket.socket()
     try:
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
-        sock.settimeout(5.0)
+        sock.settimeout(180.0)
         sock.connect(("127.0.0.1", port))
         lines = [
             "GET / HTTP/1.1",

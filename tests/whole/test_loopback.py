@@ -37,9 +37,6 @@ from skytether.shell.udp import AddressError, open_socket
 from skytether.sim.flight import fly as fly_virtually
 
 LOOPBACK_6: Address = ("::1", 0)
-LATE_NS = SECOND_NS // 4
-"""Longest lateness that a test accepts on a busy machine."""
-
 
 of_either_family = pytest.mark.parametrize(
     ("loopback", "family"),
@@ -99,8 +96,8 @@ async def test_datagrams_come_and_go_through_several_sockets(
         answers = []
         for number in range(4):
             await loop.sock_sendto(peer, b"%d" % number, driver.address)
-            answers.append(await asyncio.wait_for(loop.sock_recvfrom(peer, 100), 5))
-        await asyncio.wait_for(task, 5)
+            answers.append(await asyncio.wait_for(loop.sock_recvfrom(peer, 100), 180))
+        await asyncio.wait_for(task, 180)
     assert [payload for payload, _ in answers] == [b"0", b"1", b"2", b"3"]
     ports = [sender[1] for _, sender in answers]
     assert driver.address[0] == loopback[0]
@@ -120,7 +117,7 @@ async def test_wakes_come_in_time_and_never_early(
     now_ns = time.monotonic_ns()
     wakes_ns = [now_ns + step * 2_000_000 for step in range(-5, 15)]
     echo = Echo(wakes_ns, last=20)
-    await asyncio.wait_for(Shell(echo, LOOPBACK).run(), 5)
+    await asyncio.wait_for(Shell(echo, LOOPBACK).run(), 180)
     assert len(echo.woken_ns) == 20
     assert min(echo.woken_ns) >= 0
 
@@ -140,7 +137,7 @@ async def test_a_closed_port_and_an_unknown_network_are_lost_packets() -> None:
             loop = asyncio.get_running_loop()
             for _ in range(2):
                 await loop.sock_sendto(peer, b"still there?", driver.address)
-                answer, _ = await asyncio.wait_for(loop.sock_recvfrom(peer, 100), 5)
+                answer, _ = await asyncio.wait_for(loop.sock_recvfrom(peer, 100), 180)
     assert answer == b"still there?"
     assert driver.send_errors >= 1
 
@@ -225,7 +222,7 @@ async def test_a_peer_is_seen_as_it_was_written_whatever_the_kernel_calls_it(
     driver = Shell(asker, None, paths={0: NetworkPath("", peer)})
     assert driver.address[0] == loopback[0]
     async with driven(answerer):
-        await asyncio.wait_for(driver.run(), 5)
+        await asyncio.wait_for(driver.run(), 180)
     assert asker.seen == [peer]
 
 
@@ -355,9 +352,9 @@ async def test_a_patient_endpoint_is_driven_before_its_peer_is_found(
             HostMissing(host=peer[0], reason="Temporary failure in name resolution"),
         ]
         found.append(loopback[0])
-        _, sender = await asyncio.wait_for(loop.sock_recvfrom(server, 100), 5)
+        _, sender = await asyncio.wait_for(loop.sock_recvfrom(server, 100), 180)
         await loop.sock_sendto(server, b"welcome", sender)
-        await asyncio.wait_for(task, 5)
+        await asyncio.wait_for(task, 180)
     assert events[1:] == [HostFound(host=peer[0], address=loopback[0])]
     assert asking.senders == [peer]
     assert driver.is_local
@@ -489,8 +486,8 @@ async def test_both_worlds_decide_the_same_on_a_network_without_delay(
     """Over loopback and in virtual time a scenario has equal events and inputs, in one order.
 
     Steps are 0.2 s, and the server ticks in the middle of the vehicle's steps. Only a pause of the
-    machine by 0.1 s can change a decision; then the flight is repeated. Equality to the last bit
-    cannot be chance.
+    machine by 0.1 s can change a decision; then the flight is repeated, on a busy machine often.
+    Equality to the last bit cannot be chance.
     """
     none = ""
     changes = {
@@ -502,7 +499,7 @@ async def test_both_worlds_decide_the_same_on_a_network_without_delay(
     }
     flown = packaged("paper", settle=0.0, **changes)
     virtual = fly_virtually(flown)
-    for _ in range(4):
+    for _ in range(20):
         real = await fly(flown, at_phase=0.5)
         if not differences(real, virtual):
             break
