@@ -12,6 +12,7 @@ from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
+from helpers import PATIENCE_S
 from skytether.view.words import FLOWN_S
 
 if TYPE_CHECKING:
@@ -27,8 +28,6 @@ FLAGS = (
 SCHEMES: tuple[Literal["dark", "light"], ...] = ("dark", "light")
 SIZES = {"wide": (1400, 900), "narrow": (420, 860)}
 """Width and height of windows [pixels]."""
-PATIENCE_S = 180.0
-"""Time within which a page must do what it is waited for [s]; a picture may take five seconds."""
 SHOWN_S = 25.0
 """Time of flight at which pictures are taken [s]."""
 

@@ -27,6 +27,8 @@ from skytether.shell.driver import Shell
 LOOPBACK: Address = ("127.0.0.1", 0)
 SKYTETHER = (sys.executable, "-P", "-m", "skytether")
 """Command line prefix, as a user starts a command."""
+PATIENCE_S = 180.0
+"""Time within which what a test waits for must come [s]: machines are busy."""
 
 
 def packaged(name: str, *layers: Mapping[str, Any], **changes: Any) -> Scenario:
@@ -88,7 +90,7 @@ def ran(*argv: object, **keys: Any) -> "subprocess.CompletedProcess[str]":
     return done
 
 
-def until(holds: Callable[[], object], within_s: float = 180.0) -> None:
+def until(holds: Callable[[], object], within_s: float = PATIENCE_S) -> None:
     """Wait until a condition holds; fail after `within_s` [s]."""
     deadline_s = time.monotonic() + within_s
     while not holds():
@@ -196,4 +198,4 @@ def echo(host: str = "127.0.0.1") -> Iterator[int]:
         thread.start()
         yield server.getsockname()[1]
         server.sendto(b"end", server.getsockname()[:2])
-        thread.join(180.0)
+        thread.join(PATIENCE_S)

@@ -20,11 +20,10 @@ from typing import NoReturn
 
 import msgspec
 
+from helpers import PATIENCE_S
 from skytether.__main__ import main
 from skytether.shared.core.events import Event, address_text
 from skytether.shell.log import LogLine
-
-PATIENCE_S = 180.0
 
 FORK = multiprocessing.get_context("forkserver")
 FORK.set_forkserver_preload(

@@ -16,7 +16,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from helpers import refused, until
+from helpers import PATIENCE_S, refused, until
 from skytether.__main__ import COMMANDS, main
 from skytether.shared.core.endpoint import Address
 from skytether.shared.core.events import (
@@ -35,7 +35,7 @@ from skytether.shared.telemetry.record import client_columns, read
 from skytether.shared.wire.protocol import Hello, encode
 from skytether.shell import command
 from skytether.shell.log import LogLine
-from warm import PATIENCE_S, Command, Process, skytether
+from warm import Command, Process, skytether
 
 QUICK = [
     *("--network.uplink", "constant(0.03)", "--network.downlink", "constant(0.03)"),

@@ -14,12 +14,11 @@ from typing import Any
 
 import pytest
 
-from helpers import SKYTETHER, ran, until
+from helpers import PATIENCE_S, SKYTETHER, ran, until
 from skytether.__main__ import main
 
 pytestmark = pytest.mark.long
 
-PATIENCE_S = 180.0
 SIGUSR1_IGNORED = 1 << (signal.SIGUSR1 - 1)
 
 VIRTUAL = ["--virtual", "--vehicles", "2", "--duration", "1", "--settle", "0"]

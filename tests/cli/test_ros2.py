@@ -9,14 +9,13 @@ from typing import Any
 import pytest
 
 import robot
-from helpers import SKYTETHER, ran
+from helpers import PATIENCE_S, SKYTETHER, ran
 from skytether.cli.ros2 import Bridge, Ros2Options, changed
 from skytether.ros2 import messages
 from skytether.ros2.graph import Node
 from skytether.shared.core.endpoint import Datagram
 from skytether.shared.core.line import parse_line
 
-PATIENCE_S = 180.0
 GOAL = messages.topic("/skytether_1/goal_pose", messages.POSE_STAMPED)
 PLAN = messages.topic("/skytether_1/plan", messages.PATH)
 

@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from helpers import refusal, refused_before_writing, until
+from helpers import PATIENCE_S, refusal, refused_before_writing, until
 from skytether.__main__ import main
 from skytether.lab import figures
 from skytether.lab.journal import StudyJournal, sealed
@@ -29,8 +29,6 @@ from skytether.shared.scenario.dotted import value
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.summary import summarise
 from skytether.sim import flight
-
-PATIENCE_S = 30.0
 
 SWEEP = ["sweep", "paper", "--duration", "5", "--settle", "1", "--runs", "30"]
 SWEEP += ["--grid", "control.input_weight=1:3:2", "--grid", "control.trigger=state_gap,periodic"]

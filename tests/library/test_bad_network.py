@@ -14,11 +14,10 @@ import pytest
 
 import skytether
 import skytether.library.bad_network
-from helpers import echo, until
+from helpers import PATIENCE_S, echo, until
 from skytether.shared.core.line import CONNECTIONS_MAX, Listen
 from skytether.shell.udp import AddressError
 
-PATIENCE_S = 60.0
 Opened = Callable[..., skytether.bad_network]
 
 

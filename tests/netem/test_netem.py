@@ -22,7 +22,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from helpers import packaged, until
+from helpers import PATIENCE_S, packaged, until
 from skytether.__main__ import main
 from skytether.netem.__main__ import NetemOptions, _with_directions
 from skytether.netem.proxy import Proxy
@@ -45,7 +45,6 @@ BLOCKS = [
     for text in (TEXT, (ROOT / "docs" / "netem.md").read_text())
     for block in re.findall(r"```sh\n(.*?)```", text, re.DOTALL)
 ]
-PATIENCE_S = 60.0
 
 
 def block(word: str) -> list[str]:

@@ -21,7 +21,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import skytether.shell.feed
-from helpers import HandLoop, ran
+from helpers import PATIENCE_S, HandLoop, ran
 from skytether.netem.proxy import Proxy
 from skytether.server.common import splines
 from skytether.server.schemes import horizons
@@ -61,7 +61,6 @@ from skytether.sim import flight
 
 DEMO = reading.load("demo")
 OPENED = Opened(process="netem", name="demo", scenario="", parts={}, wall_ns=2, time_ns=1)
-PATIENCE_S = 30.0
 
 
 def rows(number: int, part: str = "netem", size: int = 28) -> Rows:

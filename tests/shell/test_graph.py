@@ -10,14 +10,13 @@ import pytest
 import zenoh
 
 import robot
-from helpers import Idle
+from helpers import PATIENCE_S, Idle
 from robot import CMD_VEL, ODOM, free_port, opened
 from skytether.ros2 import graph, messages
 from skytether.ros2.graph import Node
 from skytether.shared.core.endpoint import Datagram
 from skytether.shell.driver import Shell, new_event_loop
 
-PATIENCE_S = 60.0
 LAST_MPS = 9.0
 """Last command, sent when the process ends."""
 

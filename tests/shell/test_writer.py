@@ -8,9 +8,8 @@ from typing import IO
 
 import pytest
 
+from helpers import PATIENCE_S
 from skytether.shell.writer import Writer
-
-PATIENCE_S = 30.0
 
 
 @pytest.fixture

@@ -17,7 +17,7 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 from websockets.typing import Subprotocol
 
-from helpers import until
+from helpers import PATIENCE_S, until
 from skytether.shared.scenario import reading
 from skytether.sim import flight as virtual
 from skytether.view.browser import guard
@@ -26,7 +26,6 @@ from skytether.view.browser.flight import PageFlight
 from skytether.view.browser.page import Page
 from skytether.view.frames import of_flight
 
-PATIENCE_S = 30.0
 PROTOCOL = Subprotocol(f"viser-v{viser.__version__}")
 BINARY, PING = 2, 9
 CAMERA = {

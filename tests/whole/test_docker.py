@@ -24,6 +24,7 @@ from typing import Any, TypeVar
 import msgspec
 import pytest
 
+from helpers import PATIENCE_S
 from skytether.shared.scenario import reading
 from skytether.shared.telemetry.record import read
 from skytether.shared.telemetry.summary import Summary
@@ -193,7 +194,7 @@ class Containers:
         return run(*self.argv(*arguments), more_env=self.flight)
 
     def attempt(self, *arguments: str) -> tuple[int, str]:
-        return attempt(*self.argv(*arguments), within_s=150.0, more_env=self.flight)
+        return attempt(*self.argv(*arguments), within_s=300.0, more_env=self.flight)
 
     def argv(self, *arguments: str) -> list[str]:
         file = str(ROOT / "docker-compose.yml")
@@ -301,7 +302,7 @@ class Containers:
         until(
             "the end of the flight",
             lambda: self.state("client")["Status"] == "exited",
-            within_s=self.seconds + 30,
+            within_s=self.seconds + PATIENCE_S,
         )
         assert self.state("client")["ExitCode"] == 0, self.said("client")
         self.docker("cp", f"{self.id('client')}:/results/.", str(folder))
@@ -446,7 +447,7 @@ def works(*command: str) -> bool:
 
 
 def attempt(
-    *command: str, within_s: float = 60.0, more_env: Mapping[str, str] = MappingProxyType({})
+    *command: str, within_s: float = PATIENCE_S, more_env: Mapping[str, str] = MappingProxyType({})
 ) -> tuple[int, str]:
     done = subprocess.run(
         command,
@@ -482,7 +483,7 @@ def number(name: str, figures: str) -> int:
 T = TypeVar("T")
 
 
-def until(what: str, condition: Callable[[], T | None], within_s: float = 30.0) -> T:
+def until(what: str, condition: Callable[[], T | None], within_s: float = PATIENCE_S) -> T:
     deadline_s = time.monotonic() + within_s
     while not (value := condition()):
         assert time.monotonic() < deadline_s, f"in {within_s:g} s not come: {what}"
