@@ -90,4 +90,5 @@ class Tunnel(Emulator):
         return Fates(self.link(name).path, self._scenario.seed, name, flow, by_number=True)
 
     def figures(self) -> dict[str, Any]:
-        return {"flows": self._opened, "refused": self.refused} | super().figures()
+        counts = {"flows": len(self._flows), "refused": self.refused, "header_bytes": 0}
+        return counts | super().figures()
