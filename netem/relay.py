@@ -83,7 +83,6 @@ class Relay(Emulator):
         """Streams with held pieces, in the order in which they are tried."""
         self._ended: set[Address] = set()
         """Sources whose end has left."""
-        self._opened = 0
         self._retries = 0
 
     def receive(self, datagram: Datagram, *, now_ns: int) -> None:
@@ -99,13 +98,10 @@ class Relay(Emulator):
         self._forward(now_ns)
 
     def _open(self, number: int, now_ns: int) -> None:
-        flow = self._opened
-        up = Lane(flow, self.fates("uplink", flow), now_ns)
-        down = Lane(flow, self.fates("downlink", flow), now_ns)
+        up, down = self._open_lanes(now_ns)
         self._streams[SERVER, number] = HalfConnection(up, self.uplink)
         self._streams[CLIENT, number] = HalfConnection(down, self.downlink)
-        self._events.append(FlowOpened(flow=flow, host=CLIENT, port=number))
-        self._opened += 1
+        self._events.append(FlowOpened(flow=up.flow, host=CLIENT, port=number))
 
     def _admit(self, source: Address, stream: HalfConnection, now_ns: int) -> None:
         """Let the held pieces of a stream enter its link, up to one that must wait."""
