@@ -33,13 +33,10 @@ retransmission time-out."""
 
 
 class LosslessFates(Fates):
-    """Fates of the pieces of a stream: delays alone. `loses` says what a packet would have met."""
+    """Fates of the pieces of a stream: delays alone."""
 
     def at(self, slot: int, rank: int = 0) -> Fate:
         return replace(super().at(slot, rank), lost=False, copies=0, flipped=None)
-
-    def loses(self, slot: int) -> bool:
-        return super().at(slot).lost
 
 
 class HalfConnection:
@@ -54,9 +51,8 @@ class HalfConnection:
 
     def loses(self, now_ns: int) -> bool:
         """Whether a packet would be lost now."""
-        fates = self.lane.fates
-        assert isinstance(fates, LosslessFates)
-        return fates.loses((now_ns - self.lane.began_ns) // SLOT_NS)
+        slot = (now_ns - self.lane.began_ns) // SLOT_NS
+        return Fates.at(self.lane.fates, slot).lost  # those of its own lose nothing
 
 
 class Relay(Emulator):
