@@ -51,6 +51,8 @@ class Emulator(Endpoint):
             return Link(direction, mtu, recorder, of, path, header_bytes=header_bytes)
 
         self.uplink, self.downlink = make(UPLINK, "uplink"), make(DOWNLINK, "downlink")
+        self._opened = 0
+        """Number of flows so far."""
         self._faults: set[str] = set()
         """Tracebacks of errors in impairments of plug-ins: each is reported once."""
 
@@ -69,6 +71,13 @@ class Emulator(Endpoint):
     def fates(self, name: Direction, flow: int) -> Fates:
         """What the packets of one flow meet in a direction."""
         return Fates(self.link(name).path, self._scenario.seed, name, flow)
+
+    def _open_lanes(self, began_ns: int) -> tuple[Lane, Lane]:
+        """Uplink and downlink of a new flow, whose fates count from `began_ns`."""
+        flow = self._opened
+        self._opened += 1
+        up, down = self.fates("uplink", flow), self.fates("downlink", flow)
+        return Lane(flow, up, began_ns), Lane(flow, down, began_ns)
 
     def wake(self, *, now_ns: int) -> None:
         self._forward(now_ns)

@@ -58,7 +58,6 @@ class Proxy(Emulator):
         self._server = server
         self._places = Places(flows)
         self._by_socket: dict[int, Flow] = {}
-        self._opened = 0
         self._is_answered = False
         """Whether the server has ever sent a packet."""
         self._is_looped = False
@@ -130,13 +129,10 @@ class Proxy(Emulator):
             if replaced is None:
                 return None
             socket = replaced.socket
-        number = self._opened
-        self._opened += 1
         flow = Flow(
             client,
             socket,
-            Lane(number, self.fates("uplink", number), now_ns),
-            Lane(number, self.fates("downlink", number), now_ns),
+            *self._open_lanes(now_ns),
             now_ns,
             host_of(client),
             self._places.others,
@@ -144,7 +140,7 @@ class Proxy(Emulator):
         )
         flow.order.append(flow)
         self._by_socket[socket] = flow
-        self._events.append(FlowOpened(flow=number, host=host, port=port))
+        self._events.append(FlowOpened(flow=flow.uplink.flow, host=host, port=port))
         return flow
 
     def _laps(self, datagram: Datagram) -> int:

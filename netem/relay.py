@@ -33,13 +33,10 @@ retransmission time-out."""
 
 
 class LosslessFates(Fates):
-    """Fates of the pieces of a stream: delays alone. `loses` says what a packet would have met."""
+    """Fates of the pieces of a stream: delays alone."""
 
     def at(self, slot: int, rank: int = 0) -> Fate:
         return replace(super().at(slot, rank), lost=False, copies=0, flipped=None)
-
-    def loses(self, slot: int) -> bool:
-        return super().at(slot).lost
 
 
 class HalfConnection:
@@ -54,9 +51,8 @@ class HalfConnection:
 
     def loses(self, now_ns: int) -> bool:
         """Whether a packet would be lost now."""
-        fates = self.lane.fates
-        assert isinstance(fates, LosslessFates)
-        return fates.loses((now_ns - self.lane.began_ns) // SLOT_NS)
+        slot = (now_ns - self.lane.began_ns) // SLOT_NS
+        return Fates.at(self.lane.fates, slot).lost  # those of its own lose nothing
 
 
 class Relay(Emulator):
@@ -83,7 +79,6 @@ class Relay(Emulator):
         """Streams with held pieces, in the order in which they are tried."""
         self._ended: set[Address] = set()
         """Sources whose end has left."""
-        self._opened = 0
         self._retries = 0
 
     def receive(self, datagram: Datagram, *, now_ns: int) -> None:
@@ -99,13 +94,10 @@ class Relay(Emulator):
         self._forward(now_ns)
 
     def _open(self, number: int, now_ns: int) -> None:
-        flow = self._opened
-        up = Lane(flow, self.fates("uplink", flow), now_ns)
-        down = Lane(flow, self.fates("downlink", flow), now_ns)
+        up, down = self._open_lanes(now_ns)
         self._streams[SERVER, number] = HalfConnection(up, self.uplink)
         self._streams[CLIENT, number] = HalfConnection(down, self.downlink)
-        self._events.append(FlowOpened(flow=flow, host=CLIENT, port=number))
-        self._opened += 1
+        self._events.append(FlowOpened(flow=up.flow, host=CLIENT, port=number))
 
     def _admit(self, source: Address, stream: HalfConnection, now_ns: int) -> None:
         """Let the held pieces of a stream enter its link, up to one that must wait."""

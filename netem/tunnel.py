@@ -38,7 +38,6 @@ class Tunnel(Emulator):
         """Uplink and downlink of each flow by its key, that which was silent longest first.
 
         A flow is packets with the same protocol, addresses and ports, both ways."""
-        self._opened = 0
         self._began_ns = 0
         """Time of the first packet: outages and traces begin with it, for all flows."""
         self._has_ended = self._is_cut = False
@@ -57,7 +56,12 @@ class Tunnel(Emulator):
         if key is None:
             self.refused += 1
             return
-        up, down = self._flows.get(key) or self._open(key, now_ns)
+        if key not in self._flows:
+            self._began_ns = self._began_ns or now_ns
+            self._flows[key] = self._open_lanes(self._began_ns)
+            if len(self._flows) > FLOWS_MAX:
+                self._flows.popitem(last=False)
+        up, down = self._flows[key]
         self._flows.move_to_end(key)
         link, lane = (self.downlink, down) if is_outward else (self.uplink, up)
         onward = Datagram(packet, OUTSIDE if is_outward else PROGRAM, number)
@@ -72,17 +76,6 @@ class Tunnel(Emulator):
     def finished(self) -> bool:
         return self._is_cut or (self._has_ended and self.downlink.next_due_ns() is None)
 
-    def _open(self, key: bytes, now_ns: int) -> tuple[Lane, Lane]:
-        self._began_ns = self._began_ns or now_ns
-        number = self._opened
-        self._opened += 1
-        up, down = self.fates("uplink", number), self.fates("downlink", number)
-        flow = Lane(number, up, self._began_ns), Lane(number, down, self._began_ns)
-        self._flows[key] = flow
-        if len(self._flows) > FLOWS_MAX:
-            self._flows.popitem(last=False)
-        return flow
-
     def lanes(self) -> Iterable[tuple[Lane, Lane]]:
         return self._flows.values()
 
@@ -90,4 +83,5 @@ class Tunnel(Emulator):
         return Fates(self.link(name).path, self._scenario.seed, name, flow, by_number=True)
 
     def figures(self) -> dict[str, Any]:
-        return {"flows": self._opened, "refused": self.refused} | super().figures()
+        counts = {"flows": len(self._flows), "refused": self.refused, "header_bytes": 0}
+        return counts | super().figures()

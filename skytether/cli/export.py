@@ -9,6 +9,7 @@ import tyro
 
 from skytether.cli import recordings
 from skytether.shared.base import files
+from skytether.shared.base.units import HEADER_BYTES
 from skytether.shell import command
 from skytether.shell.argument import Argument
 from skytether.shell.command import CONFIGURATION, CommandError
@@ -77,7 +78,9 @@ def _traffic(options: ExportOptions, recorded: Recorded) -> None:
         for name, trace in traces.items():
             _write(options.traces / f"{name}.csv", trace.encode())
     if options.pcap:
-        _write(options.pcap, traffic.pcap(packets))
+        counted = recorded.figures.get("netem", {})
+        header_bytes = 0 if counted.get("header_bytes") == 0 else HEADER_BYTES
+        _write(options.pcap, traffic.pcap(packets, header_bytes=header_bytes))
 
 
 def _write(path: Path, content: bytes) -> None:

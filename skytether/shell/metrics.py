@@ -146,7 +146,7 @@ by_vehicle/{vehicle}/clock_m server_vehicle_clock_metres
 """) + _paths("server")
 _NETEM = _table("""
 flows netem_flows
-    Clients whose packets are forwarded.
+    Clients whose packets are forwarded; of `netem run`, the flows that it knows.
 refused netem_refused_packets_total
     Packets that were refused: of clients without a flow, or from an unknown address.
 {direction}/packets netem_packets_total

@@ -42,11 +42,12 @@ def traces(packets: Rows) -> Mapping[str, str]:
     return csv
 
 
-def pcap(packets: Rows, began_ns: int = 0) -> bytes:
+def pcap(packets: Rows, began_ns: int = 0, *, header_bytes: int = HEADER_BYTES) -> bytes:
     """Capture of the packets that netem sent, without lost ones.
 
     Args:
         began_ns: zero of the packets' clock [ns since 1970].
+        header_bytes: headers that the recorded sizes are without [B]; 0 for packets of IP.
     """
     rows = packets[~packets["lost"]]
     left_ns = rows["arrived_ns"] + rows["delay_ns"] + began_ns
@@ -54,10 +55,10 @@ def pcap(packets: Rows, began_ns: int = 0) -> bytes:
     # Magic number for nanosecond times; version 2.4; packets are cut after the headers.
     pieces = [struct.pack("<IHHiIII", 0xA1B23C4D, 2, 4, 0, 0, HEADER_BYTES, RAW_IP)]
     for row, time_ns in zip(rows[order], left_ns[order].tolist(), strict=True):
-        size = int(row["bytes"]) + HEADER_BYTES
+        size = int(row["bytes"]) + header_bytes
         seconds, rest_ns = divmod(time_ns, SECOND_NS)
-        pieces.append(struct.pack("<IIII", seconds, rest_ns, HEADER_BYTES, size))
-        pieces.append(_header(int(row["direction"]), int(row["path"]), int(row["flow"]), size))
+        header = _header(int(row["direction"]), int(row["path"]), int(row["flow"]), size)[:size]
+        pieces += struct.pack("<IIII", seconds, rest_ns, len(header), size), header
     return b"".join(pieces)
 
 

@@ -342,6 +342,15 @@ def test_a_capture_has_what_came_out() -> None:
     assert packets[1][1:3] == (traffic.SERVER, bytes((10, 0, 0, 1)))
 
 
+def test_packets_of_ip_keep_their_sizes_in_a_capture() -> None:
+    rows = np.zeros(2, PACKET_COLUMNS)
+    rows["bytes"] = [20, 1500]  # the first is shorter than the headers of IP and UDP
+    content = traffic.pcap(rows, header_bytes=0)
+    assert struct.unpack_from("<II", content, 32) == (20, 20)
+    assert struct.unpack_from("<II", content, 60 + 8) == (28, 1500)
+    assert len(content) == 24 + 16 + 20 + 16 + 28
+
+
 def test_packets_of_another_path_are_apart_in_captures_and_traces() -> None:
     rows = np.zeros(2, PACKET_COLUMNS)
     rows["direction"], rows["path"] = DOWNLINK, [0, 1]

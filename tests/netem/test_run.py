@@ -7,6 +7,7 @@ import shlex
 import shutil
 import signal
 import socket
+import struct
 import subprocess
 import sys
 import threading
@@ -19,13 +20,15 @@ from pathlib import Path
 from typing import Any
 from urllib.request import urlopen
 
+import numpy as np
 import pytest
 
 from helpers import SKYTETHER, echo, until
 from robot import free_port
 from skytether.netem.__main__ import emulate_for
 from skytether.shared.base.packets import GATEWAY, GATEWAY6
-from skytether.shared.telemetry.record import DOWNLINK, read
+from skytether.shared.base.units import SECOND_NS
+from skytether.shared.telemetry.record import DOWNLINK, UPLINK, read
 from skytether.shell.command import CommandError
 from skytether.shell.inside import ADMIN
 
@@ -46,7 +49,11 @@ def missing() -> str:
     return "" if made.returncode == 0 and Path("/dev/net/tun").exists() else "no namespaces or TUN"
 
 
-needs_ping = pytest.mark.skipif(shutil.which("ping") is None, reason="no ping here")
+def needs(name: str) -> pytest.MarkDecorator:
+    return pytest.mark.skipif(shutil.which(name) is None, reason=f"no {name} here")
+
+
+needs_ping = needs("ping")
 needs_namespaces = pytest.mark.skipif("missing()", reason="no slirp4netns, namespaces or TUN here")
 
 
@@ -357,6 +364,86 @@ class TestNetwork:
         assert run.stdout.count("b'here'") == 2, run.stderr
 
 
+@contextmanager
+def resolver() -> Iterator[int]:
+    """UDP port of a name server that knows one IPv4 address for all names, 192.0.2.7."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as server:
+        server.bind(("127.0.0.1", 0))
+
+        def answer() -> None:
+            with suppress(OSError):
+                while True:
+                    query, sender = server.recvfrom(512)
+                    question = query[12 : query.index(0, 12) + 5]
+                    counts = struct.pack(">4H", 1, 1, 0, 0)
+                    # The name is that at byte 12; an address of the Internet for 60 s, of 4 bytes.
+                    record = struct.pack(">3HIH4B", 0xC00C, 1, 1, 60, 4, 192, 0, 2, 7)
+                    server.sendto(query[:2] + b"\x85\0" + counts + question + record, sender)
+
+        threading.Thread(target=answer, daemon=True).start()
+        yield server.getsockname()[1]
+
+
+@pytest.mark.long
+@needs_namespaces
+class TestPrograms:
+    """Programs of others, as they are."""
+
+    @needs("dig")
+    def test_dig_finds_an_address(self) -> None:
+        with resolver() as port:
+            asked = ["dig", f"@{GATEWAY}", "-p", str(port), "+short", "+time=60", "a.example", "A"]
+            run = ran("--downlink", "constant(0.05)", of=asked)
+        assert (run.stdout, run.returncode) == ("192.0.2.7\n", 0), run.stderr
+
+    @needs("iperf3")
+    @pytest.mark.parametrize(
+        ("way", "options"),
+        [
+            ("downlink", ("--udp", "--bitrate", "4M", "--length", "1400")),
+            ("uplink", ("--udp", "--bitrate", "4M", "--length", "1400", "--reverse")),
+            ("downlink", ()),
+        ],
+    )
+    def test_iperf3_gets_the_rate_of_the_network(
+        self, tmp_path: Path, way: str, options: tuple[str, ...]
+    ) -> None:
+        rate, record = 125_000, tmp_path / "netem"
+        port = str(free_port())
+        serve = [
+            "iperf3",
+            "--server",
+            "--one-off",
+            "--bind",
+            "127.0.0.1",
+            "--port",
+            port,
+            "--forceflush",
+        ]
+        client = ["iperf3", "--client", str(GATEWAY), "--port", port, "--bytes", "300K", "--json"]
+        with subprocess.Popen(serve, stdout=subprocess.PIPE, text=True) as server:
+            assert server.stdout is not None
+            until(lambda: "listening" in server.stdout.readline())
+            run = ran(
+                *(f"--{way}", f"rate({rate}, queue=1000000)", "--record", str(record)),
+                of=[*client, *options],
+            )
+            server.terminate()
+        counted = json.loads(run.stdout)["end"]
+        rows = read(record)
+        rows = rows[rows["direction"] == (DOWNLINK if way == "downlink" else UPLINK)]
+        rows = rows[(rows["bytes"] > 1000) & ~rows["lost"]]
+        if options:  # it does not count what its receiver has not read when the sender ends
+            came = counted["sum"]["packets"] - counted["sum"]["lost_packets"]
+            assert 0.9 * len(rows) <= came <= len(rows)
+        else:
+            assert counted["sum_received"]["bytes"] > 0
+        left_ns = np.sort(rows["arrived_ns"] + rows["delay_ns"])
+        rates = rows["bytes"][1:] / np.diff(left_ns) * SECOND_NS
+        # Most packets have queued: the median is free of pauses of a sender on a busy machine.
+        assert np.median(rates) == pytest.approx(rate, rel=0.02)
+
+
 @pytest.mark.long
 @needs_namespaces
 class TestDocument:
@@ -397,6 +484,8 @@ class TestDocument:
         (export,) = documented("skytether export")
         subprocess.run(export, cwd=tmp_path, check=True, timeout=PATIENCE_S)
         assert (tmp_path / "tables" / "netem.csv").exists()
+        capture = (tmp_path / "pinged.pcap").read_bytes()
+        assert struct.unpack_from("<I", capture, 36) == (84,)  # an echo of ping, as IP has it
 
 
 @pytest.mark.long
