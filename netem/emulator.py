@@ -52,7 +52,7 @@ class Emulator(Endpoint):
 
         self.uplink, self.downlink = make(UPLINK, "uplink"), make(DOWNLINK, "downlink")
         self._opened = 0
-        """Number of flows so far."""
+        """Number of flows opened so far: the number of the next."""
         self._faults: set[str] = set()
         """Tracebacks of errors in impairments of plug-ins: each is reported once."""
 

@@ -376,7 +376,7 @@ def resolver() -> Iterator[int]:
                     query, sender = server.recvfrom(512)
                     question = query[12 : query.index(0, 12) + 5]
                     counts = struct.pack(">4H", 1, 1, 0, 0)
-                    # The name is that at byte 12; an address of the Internet for 60 s, of 4 bytes.
+                    # DNS record: its name is that at byte 12; type A, class IN, valid for 60 s.
                     record = struct.pack(">3HIH4B", 0xC00C, 1, 1, 60, 4, 192, 0, 2, 7)
                     server.sendto(query[:2] + b"\x85\0" + counts + question + record, sender)
 
