@@ -14,6 +14,7 @@ from typing import Any, Literal
 import tyro
 
 from bench import (
+    environments,
     flood,
     link,
     motions,
@@ -40,6 +41,7 @@ Section = Literal[
     "flood",
     "restarts",
     "starting",
+    "environments",
 ]
 SECTIONS: dict[Section, ModuleType] = {
     "netem": netem,
@@ -51,6 +53,7 @@ SECTIONS: dict[Section, ModuleType] = {
     "flood": flood,
     "restarts": restarts,
     "starting": starting,
+    "environments": environments,
 }
 
 

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 from bench import (
+    environments,
     flood,
     link,
     motions,
@@ -58,6 +59,7 @@ TINY = MappingProxyType(
         "motions": motions.MotionsCounts(fleets=(4,), shares=(0.5,), duration=8.0),
         "restarts": restarts.RestartsCounts(kills=1, stops=0, flight_s=0.5, subjects=("netem",)),
         "starting": starting.StartingCounts(warm=1, cold=0),
+        "environments": environments.EnvironmentsCounts(turns=1, seconds=0.01, robots=2),
     }
 )
 
