@@ -59,15 +59,24 @@ class NetemBenchmarkOptions:
     """UDP payload of each packet [B]."""
     flows: int = 1
     """Number of the clients' addresses."""
-    crowds: tuple[int, ...] = (10, 1000)
-    """Other values of `flows` that are measured too, each in as many runs."""
+    loads: tuple[tuple[int, int], ...] = (
+        (50_000, 1),
+        (80_000, 1),
+        (100_000, 1),
+        (20_000, 10),
+        (20_000, 1000),
+    )
+    """Other values of `rate` and `flows` that are measured too, each in as many runs."""
 
     @property
     def packets(self) -> int:
         return self.rate * self.seconds
 
 
-FULL, QUICK = NetemBenchmarkOptions(), NetemBenchmarkOptions(runs=1, seconds=1, crowds=(10,))
+FULL, QUICK = (
+    NetemBenchmarkOptions(),
+    NetemBenchmarkOptions(runs=1, seconds=1, loads=((20_000, 10),)),
+)
 
 
 @dataclass(frozen=True)
@@ -260,13 +269,19 @@ def first_missing(numbers: NDArray[np.int64]) -> int:
 
 
 def measure(options: NetemBenchmarkOptions) -> dict[str, Any]:
-    """Figures of all runs, and the median of each over the runs, also for more flows."""
+    """Figures of all runs, and the median of each over the runs, also of the other loads."""
     runs = measure_all(options)
-    more = {each: measure_all(replace(options, flows=each)) for each in options.crowds}
+    loads = [replace(options, rate=rate, flows=flows) for rate, flows in options.loads]
     return {
         "options": asdict(options),
         "median": medians(runs),
-        "flows": {flows: medians(each) for flows, each in ({options.flows: runs} | more).items()},
+        "loads": [
+            {"rate": each.rate, "flows": each.flows, **medians(measured)}
+            for each, measured in [
+                (options, runs),
+                *((each, measure_all(each)) for each in loads),
+            ]
+        ],
         "runs": [asdict(run) for run in runs],
         "wake": {
             "p50_ms": median(run.wake_ms_p50 for run in runs),
@@ -279,7 +294,8 @@ def measure(options: NetemBenchmarkOptions) -> dict[str, Any]:
 def measure_all(options: NetemBenchmarkOptions) -> list[NetemRun]:
     seeds = range(1, options.runs + 1)
     return [
-        measure_once(options, seed) for seed in progress(seeds, f"netem, {options.flows} flows")
+        measure_once(options, seed)
+        for seed in progress(seeds, f"netem, {options.rate} packets/s, {options.flows} flows")
     ]
 
 
@@ -306,24 +322,25 @@ def tables(result: Mapping[str, Any]) -> dict[str, TextTable]:
         ]
         for number, run in enumerate(runs_of(result), start=1)
     ]
-    crowds = []
-    for flows, run in result.get("flows", {}).items():  # older results have none
-        read_packets = run["sent"] - run["dropped_before"]
-        packet_s = run["netem_cpu"] * result["options"]["seconds"] / read_packets
-        crowds.append(
+    loads = []
+    for load in result.get("loads", []):  # older results have none
+        read_packets = load["sent"] - load["dropped_before"]
+        packet_s = load["netem_cpu"] * result["options"]["seconds"] / read_packets
+        loads.append(
             [
-                str(flows),
+                f"{load['rate']:.0f}",
+                f"{load['flows']:.0f}",
                 f"{packet_s * 1e6:.1f}",
-                f"{1 / packet_s:.0f}",
-                f"{run['error_ms_p50']:.2f}",
-                f"{run['error_ms_p99']:.2f}",
-                f"{run['netem_waited']:.0%}",
-                f"{1 - run['received'] / run['sent']:.1%}",
+                f"{load['error_ms_p50']:.2f}",
+                f"{load['error_ms_p99']:.2f}",
+                f"{load['netem_cpu']:.0%}",
+                f"{load['netem_waited']:.0%}",
+                f"{1 - load['received'] / load['sent']:.1%}",
             ]
         )
-    titles = ["flows", "CPU a packet [µs]", "packets a core-second", "error p50 [ms]", "p99"]
-    titles += ["netem waited", "lost"]
-    return {"netem": TextTable(headings, rows), "netem-flows": TextTable(titles, crowds)}
+    titles = ["packets/s", "flows", "CPU a packet [µs]", "error p50 [ms]", "p99"]
+    titles += ["netem CPU", "waited", "lost"]
+    return {"netem": TextTable(headings, rows), "netem-loads": TextTable(titles, loads)}
 
 
 def runs_of(result: Mapping[str, Any]) -> list[NetemRun]:

@@ -48,7 +48,7 @@ pytestmark = pytest.mark.long
 
 TINY = MappingProxyType(
     {
-        "netem": netem.NetemBenchmarkOptions(runs=1, seconds=1, rate=1000, crowds=(3,)),
+        "netem": netem.NetemBenchmarkOptions(runs=1, seconds=1, rate=1000, loads=((1000, 3),)),
         "solvers": solvers.SolversCounts(hot=6, paced=2, tuning=3),
         "tick": tick.TickCounts(6, 2, 3, 20, 2, 2, 20, 2, (1, 4, 20), 2),
         "wire": wire.WireCounts(each=10),
