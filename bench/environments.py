@@ -61,7 +61,7 @@ def over(ended: Any) -> bool:
     """Whether an episode is over; a vector environment starts its next ones itself."""
     if isinstance(ended, dict):
         return all(ended.values())
-    return bool(ended) and not isinstance(ended, np.ndarray)
+    return ended is True
 
 
 def environments(robots: int) -> dict[str, dict[str, Callable[[], Stepped]]]:

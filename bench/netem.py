@@ -335,11 +335,12 @@ def tables(result: Mapping[str, Any]) -> dict[str, TextTable]:
                 f"{load['error_ms_p99']:.2f}",
                 f"{load['netem_cpu']:.0%}",
                 f"{load['netem_waited']:.0%}",
+                f"{load['wake_ms_p99']:.2f}",
                 f"{1 - load['received'] / load['sent']:.1%}",
             ]
         )
     titles = ["packets/s", "flows", "CPU a packet [µs]", "error p50 [ms]", "p99"]
-    titles += ["netem CPU", "waited", "lost"]
+    titles += ["netem CPU", "waited", "machine p99 [ms]", "lost"]
     return {"netem": TextTable(headings, rows), "netem-loads": TextTable(titles, loads)}
 
 
