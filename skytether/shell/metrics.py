@@ -152,7 +152,7 @@ refused netem_refused_packets_total
 {direction}/packets netem_packets_total
     Packets received by netem.
 {direction}/bytes netem_bytes_total
-    UDP payload of the packets received.
+    UDP payload of the packets received; of `netem run`, packets of IP with their headers.
 {direction}/forwarded netem_forwarded_packets_total
     Packets that were sent on.
 {direction}/undelivered netem_undelivered_packets_total

@@ -95,7 +95,7 @@ def status(state: State, vehicle: int, now_ns: int, title: str = "") -> str:
 def _carried(state: State, now_ns: int, title: str) -> str:
     """Counters of netem where it carries other programs' packets."""
     counted = state.figures("netem")
-    rows = [("clients", number(told(counted, "flows"), ".0f")), *_network(state, now_ns)]
+    rows = [("flows", number(told(counted, "flows"), ".0f")), *_network(state, now_ns)]
     for way, name in (("uplink", "up"), ("downlink", "down")):
         counts = (f"{number(told(counted, way, each), '.0f')} {each}" for each in FATES)
         rows.append((f"{name}, so far", ", ".join(counts)))
