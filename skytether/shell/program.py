@@ -42,9 +42,15 @@ from skytether.shell.start import PARENT
 from skytether.shell.udp import BUFFER_BYTES
 
 SLIRP = "slirp4netns"
-GUARD = 'ulimit -n "$(ulimit -Hn)"; exec 9<&0; (read -r _ <&9; kill -9 0) & "$@" </dev/null'
-"""Shell script that runs slirp4netns, with a file for each flow, and kills it when netem ends:
-netem holds the other end of standard input. `--exit-fd` has no effect before netem is connected."""
+GUARDED = """
+ulimit -n "$(ulimit -Hn)"
+exec 9<&0 </dev/null
+(read -r _ <&9; kill -9 0) &
+exec "$@" 9<&-
+"""
+"""Shell script that becomes slirp4netns, with a file for each flow, beside a guard that kills it
+when netem ends. netem and the guard alone have the two ends of the script's standard input, so each
+knows when the other has ended. `--exit-fd` has no effect before netem is connected."""
 FRAME_BYTES_MAX = 65_536
 WAITING_MAX = 16_384
 """Largest number of packets that wait for slirp4netns; further ones are send errors."""
@@ -66,6 +72,8 @@ class Program:
     """The program's TUN device."""
     outside: socket.socket
     """Connection to slirp4netns, a frame a packet."""
+    guard: socket.socket
+    """Connection to the guard of slirp4netns."""
     control: socket.socket
     """Connection to process 1 of the program's namespaces."""
     status: int | None = None
@@ -101,7 +109,7 @@ def program(
             "needs the namespaces of Linux; elsewhere use `skytether netem --server`"
         )
     with ExitStack() as stack:
-        outside = stack.enter_context(_slirp(path_mtu, exposed))
+        outside, guard = stack.enter_context(_slirp(path_mtu, exposed))
         control, inner = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         inner.set_inheritable(True)
         # With the descriptors that a shell has opened for the program, as in `<(command)`.
@@ -116,35 +124,35 @@ def program(
             raise ProgramError(said.decode(errors="replace") or "its namespaces could not be made")
         stack.callback(os.close, devices[0])
         control.setblocking(False)
-        yield Program(devices[0], outside, control)
+        yield Program(devices[0], outside, guard, control)
 
 
 @contextmanager
-def _slirp(mtu: int, exposed: Sequence[Address]) -> Iterator[socket.socket]:
-    """Connection to slirp4netns during the block."""
+def _slirp(mtu: int, exposed: Sequence[Address]) -> Iterator[tuple[socket.socket, socket.socket]]:
+    """Connections to slirp4netns and to its guard during the block."""
     found = shutil.which(SLIRP, path=os.environ.get("PATH", "") + ADMIN)
     if found is None:
         raise ProgramError(
             f"{SLIRP} is missing, the way out of namespaces: install it (apt install {SLIRP}, "
             f"dnf install {SLIRP})"
         )
-    held_end, held = os.pipe()
+    guard, guard_end = socket.socketpair()
     with ExitStack() as stack:
+        stack.enter_context(guard)
         outside = stack.enter_context(socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET))
         with temporary.folder() as folder, (folder / "said").open("w+b") as said:
             frames, orders = folder / "frames", folder / "orders"
             command = [found, "--target-type=bess", "--enable-ipv6", f"--mtu={mtu}"]
             command += [f"--api-socket={orders}", str(frames)]
             slirp = subprocess.Popen(
-                ["sh", "-c", GUARD, "sh", *command],
-                stdin=held_end,
+                ["sh", "-c", GUARDED, "sh", *command],
+                stdin=guard_end.fileno(),
                 stdout=said,
                 stderr=said,
                 start_new_session=True,  # Ctrl-C is for the program
             )
-            stack.callback(slirp.wait)
-            stack.callback(os.close, held)
-            os.close(held_end)
+            stack.callback(_end_group, slirp)
+            guard_end.close()
             _connect(outside, frames, slirp, said)
 
             def order(execute: str, **arguments: object) -> bool:
@@ -162,8 +170,15 @@ def _slirp(mtu: int, exposed: Sequence[Address]) -> Iterator[socket.socket]:
             outside.send(each)
         outside.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, BUFFER_BYTES)
         outside.setblocking(False)
-        yield outside
+        yield outside, guard
         _flush(outside)
+
+
+def _end_group(process: "subprocess.Popen[bytes]") -> None:
+    """Kill a process that leads a group, and what else is in it."""
+    with suppress(ProcessLookupError):
+        os.killpg(process.pid, signal.SIGKILL)
+    process.wait()
 
 
 def _connect(
@@ -249,13 +264,14 @@ class ProgramLine:
         loop.add_reader(program.device, self._read_device)
         loop.add_reader(program.outside, self._read_outside)
         loop.add_reader(program.control, self._read_control)
+        loop.add_reader(program.guard, self._end, f"the guard of {SLIRP} has ended")
         program.start()
         try:
             await loop.create_future()
         finally:
             self._send_waiting()
             loop.remove_writer(program.outside)
-            for each in (program.device, program.outside, program.control, parent):
+            for each in (program.device, program.outside, program.control, program.guard, parent):
                 if each is not None:
                     loop.remove_reader(each)
             if parent is not None:
@@ -301,7 +317,7 @@ class ProgramLine:
 
     def _end(self, fault: str) -> None:
         self._program.fault = fault
-        for each in (self._program.outside, self._program.control):
+        for each in (self._program.outside, self._program.control, self._program.guard):
             self._loop.remove_reader(each)
         self._hear(Datagram(b"", OUTSIDE, 1))
 

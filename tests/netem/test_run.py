@@ -12,7 +12,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from functools import cache
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -83,18 +83,12 @@ def documented(words: str) -> list[list[str]]:
     ]
 
 
-def left(mark: str) -> list[str]:
-    """Processes whose command lines contain a mark."""
-    found = []
-    for each in Path("/proc").glob("[0-9]*/cmdline"):
-        with suppress(OSError):
-            if mark.encode() in (line := each.read_bytes()):
-                found.append(line.decode())
-    return found
-
-
 def line_of(process: int) -> str:
-    return Path(f"/proc/{process}/cmdline").read_text().replace("\0", " ")
+    """Command line of a process; empty if it has ended."""
+    try:
+        return Path(f"/proc/{process}/cmdline").read_text().replace("\0", " ")
+    except OSError:
+        return ""
 
 
 def below(process: int) -> list[int]:
@@ -104,11 +98,13 @@ def below(process: int) -> list[int]:
     return children + [each for child in children for each in below(child)]
 
 
-def gone(mark: str) -> bool:
-    until_s = time.monotonic() + PATIENCE_S
-    while left(mark) and time.monotonic() < until_s:
+def gone(processes: Iterable[int]) -> bool:
+    """Whether they end, within PATIENCE_S."""
+    left, until_s = set(processes), time.monotonic() + PATIENCE_S
+    while left and time.monotonic() < until_s:
         time.sleep(0.05)
-    return not left(mark)
+        left = {each for each in left if Path(f"/proc/{each}").exists() and line_of(each)}
+    return not left
 
 
 def test_without_slirp4netns_one_line_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -488,9 +484,11 @@ class TestEnd:
     """Whatever is killed, no process is left, and so no namespace and no device."""
 
     @contextmanager
-    def running(self, mark: str) -> Iterator["subprocess.Popen[str]"]:
-        """Program with a child that nothing but SIGKILL ends, in a session of its own."""
-        script = f"(trap '' HUP INT TERM; setsid sleep {mark}) & echo up; sleep {mark}"
+    def running(self) -> Iterator[tuple["subprocess.Popen[str]", list[int]]]:
+        """Program with a child that nothing but SIGKILL ends, in a session of its own; and all
+        processes below netem.
+        """
+        script = "(trap '' HUP INT TERM; setsid sleep 1000) & echo up; sleep 1000"
         with subprocess.Popen(
             argv(of=["sh", "-c", script]),
             stdout=subprocess.PIPE,
@@ -501,42 +499,39 @@ class TestEnd:
             assert run.stdout is not None
             assert run.stdout.readline() == "up\n"
             try:
-                yield run
+                yield run, below(run.pid)
             finally:
                 run.kill()
 
     def test_netem_is_killed(self) -> None:
-        mark = f"1000.{os.getpid()}1"
-        with self.running(mark) as run:
+        with self.running() as (run, processes):
             run.kill()
-            assert gone(mark)
+            assert gone(processes)
 
-    @pytest.mark.parametrize("name", ["skytether.shell.inside", "slirp4netns --target-type"])
-    def test_another_process_is_killed(self, name: str) -> None:
-        mark = f"1000.{os.getpid()}2"
-        with self.running(mark) as run:
-            victims = [
-                each for each in below(run.pid) if name in line_of(each).partition("sh -c")[0]
-            ]
-            os.kill(victims[0], signal.SIGKILL)
-            assert gone(mark)
+    @pytest.mark.parametrize(
+        "begins",
+        [r"\S*python\S* -P -m skytether.shell.inside", r"\S*slirp4netns", r"sh -c \nulimit"],
+    )
+    def test_another_process_is_killed(self, begins: str) -> None:
+        with self.running() as (run, processes):
+            victim = next(each for each in processes if re.match(begins, line_of(each)))
+            os.kill(victim, signal.SIGKILL)
+            assert gone(processes)
             assert run.wait(PATIENCE_S) == 1
             assert run.stderr is not None
             assert run.stderr.read().count("\n") == 1
 
     def test_ctrl_c_ends_what_the_program_left(self) -> None:
-        mark = f"1000.{os.getpid()}3"
-        with self.running(mark) as run:
+        with self.running() as (run, processes):
             until_s = time.monotonic() + PATIENCE_S
             while run.poll() is None and time.monotonic() < until_s:
                 os.killpg(run.pid, signal.SIGINT)
                 time.sleep(0.2)
             assert run.returncode == -signal.SIGINT
-            assert gone(mark)
+            assert gone(processes)
 
     def test_its_parent_ends(self) -> None:
-        mark = f"1000.{os.getpid()}4"
-        line = argv(of=["sh", "-c", f"trap '' HUP; echo up; sleep {mark}"])
+        line = argv(of=["sh", "-c", "trap '' HUP; echo up; sleep 1000"])
         with subprocess.Popen(
             python("import subprocess, sys; subprocess.run(sys.argv[1:])", *line),
             stdout=subprocess.PIPE,
@@ -544,5 +539,6 @@ class TestEnd:
         ) as parent:
             assert parent.stdout is not None
             assert parent.stdout.readline() == "up\n"
+            processes = below(parent.pid)
             parent.kill()
-            assert gone(mark)
+            assert gone(processes)
