@@ -151,7 +151,7 @@ def test_what_is_no_file_of_keys_is_refused_in_one_line(tmp_path: Path) -> None:
         (tmp_path, "cannot be read: (it is not a plain file|Is a directory)"),
         (Path("/dev/zero"), "cannot be read: it is not a plain file"),
         (long, "cannot be read: it is larger than 16000000 bytes"),
-        (Path("a\0b"), "cannot be read: embedded null byte"),
+        (Path("a\0b"), "cannot be read: .*embedded null"),
     ):
         with pytest.raises(ConfigError, match=message) as error:
             load(path)
