@@ -5,7 +5,7 @@ With --only, the figures of the other benchmarks are kept.
 
 import json
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
@@ -19,6 +19,7 @@ from bench import (
     link,
     motions,
     netem,
+    program,
     restarts,
     solvers,
     starting,
@@ -33,6 +34,7 @@ RESULTS = Path(__file__).with_name("results.json")
 DOCUMENT = ROOT / "docs" / "performance.md"
 Section = Literal[
     "netem",
+    "program",
     "solvers",
     "tick",
     "motions",
@@ -45,6 +47,7 @@ Section = Literal[
 ]
 SECTIONS: dict[Section, ModuleType] = {
     "netem": netem,
+    "program": program,
     "solvers": solvers,
     "tick": tick,
     "motions": motions,
@@ -55,6 +58,9 @@ SECTIONS: dict[Section, ModuleType] = {
     "starting": starting,
     "environments": environments,
 }
+
+LACKS: dict[Section, Callable[[], str]] = {"program": program.missing}
+"""Functions that say what a machine lacks for a benchmark."""
 
 
 @dataclass(frozen=True)
@@ -70,6 +76,9 @@ def main() -> int:
     for name in options.only:
         section = SECTIONS[name]
         CONSOLE.rule(name)
+        if name in LACKS and (lack := LACKS[name]()):
+            CONSOLE.print(f"left out: {lack}")
+            continue
         figures = section.measure(section.QUICK if options.quick else section.FULL)
         for title, table in section.tables(figures).items():
             table.show(title)
