@@ -126,6 +126,7 @@ def test_px4_stays_below_what_it_is_told() -> None:
     assert 0.03 < dead_s < 0.20
 
 
+@pytest.mark.long
 def test_px4_errs_as_measured() -> None:
     """Estimation errors over three minutes of hovering with zero velocity.
 

@@ -37,6 +37,7 @@ def heartbeat(own: socket.socket) -> object:
                 return message
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("line", LINES)
 def test_a_documented_autopilot_is_one(
     line: str, start: Callable[..., Process], tmp_path: Path

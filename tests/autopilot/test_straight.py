@@ -113,6 +113,7 @@ def test_a_number_that_is_of_no_use_is_refused(
 # -- flights -------------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("law", "measured_m"),
     [("led", 0.055), *(pytest.param(*each, marks=pytest.mark.long) for each in OTHERS)],
@@ -139,6 +140,7 @@ def _is_counted_as_flown(summary: Summary) -> None:
     assert (summary.covered, summary.event_ratio) == (1.0, None)
 
 
+@pytest.mark.long
 def test_px4_is_flown_as_well_and_the_same_seed_flies_the_same() -> None:
     one, other = flown("targets", "px4"), flown("targets", "px4")
     assert one.trace_hash() == other.trace_hash()
@@ -164,6 +166,7 @@ def test_an_age_is_known_although_clocks_differ() -> None:
     assert 0.19 < ages_s.min() <= ages_s.max() < 0.27
 
 
+@pytest.mark.long
 def test_after_a_cut_px4_is_back_by_itself() -> None:
     scene = scenario(duration=8.0)
     began_s = autopilots.began_ns(flown(duration=8.0, flavour="px4")) / 1e9
@@ -222,6 +225,7 @@ def test_a_pilot_that_takes_over_keeps_the_vehicle() -> None:
     assert sky.autopilot.flight.flying
 
 
+@pytest.mark.long
 @given(st.lists(st.binary(max_size=60), max_size=5), st.integers(0, 300))
 def test_bytes_of_anybody_change_nothing(garbage: list[bytes], system: int) -> None:
     station = Station(scenario(), laws.LAWS["led"])
@@ -317,6 +321,7 @@ def test_the_benchmark_makes_a_table_of_what_was_flown() -> None:
     ]
 
 
+@pytest.mark.long
 def test_the_scenario_px4_flies_its_flavour() -> None:
     table = reading.to_table(reading.load("px4")) | {"duration": 20.0, "settle": 8.0}
     table["vehicle"] |= {"address": "udpout:autopilot:0"}

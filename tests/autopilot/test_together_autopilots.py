@@ -94,6 +94,7 @@ def fly(flavour: FlavourName, scenarios: Mapping[int, Scenario]) -> Flown:
     return Flown(server, paths, [parse(sink.getvalue()) for sink in sinks])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("flavour", "loss"), [("ardupilot", 0.1), pytest.param("px4", 0.4, marks=pytest.mark.long)]
 )
@@ -110,6 +111,7 @@ def test_three_swap_places_within_a_fence(flavour: FlavourName, loss: float) -> 
         assert server.figures()["counts"].get("left_tube", 0) == 0
 
 
+@pytest.mark.long
 def test_three_follow_the_paths_of_a_show(tmp_path: Path) -> None:
     """At 0.84 m/s, one behind the other on a circle; without a lead they lag by their dead time."""
     rows = ["vehicle,t,x,y,z"]

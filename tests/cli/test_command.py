@@ -162,6 +162,7 @@ def test_a_port_in_use_is_named(capfd: pytest.CaptureFixture[str]) -> None:
     )
 
 
+@pytest.mark.long
 def test_an_unreachable_server_is_named() -> None:
     run = skytether("client", "demo", "--server", "127.0.0.1:9", "--link.connect-s", "0.5")
     assert run.returncode == 1
@@ -209,6 +210,7 @@ def test_help_shows_the_scenario_that_was_named(
 # -- flights -------------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_a_virtual_flight_writes_the_same_summary_twice(tmp_path: Path) -> None:
     files = [tmp_path / "one.json", tmp_path / "two.json"]
     argv = ["fly", "paper", "--virtual", "--duration", "12", "--seed", "3"]
@@ -325,6 +327,7 @@ def test_a_second_scenario_is_judged_as_it_is_flown(
     assert "fenced.toml: fence.radius_m: got 6.0, expected more" in capfd.readouterr().err
 
 
+@pytest.mark.long
 def test_a_flight_is_compared_with_several_others(
     tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
@@ -338,6 +341,7 @@ def test_a_flight_is_compared_with_several_others(
         assert f"<!-- {name}, in virtual time, seed 1" in drawn
 
 
+@pytest.mark.long
 def test_a_real_flight_with_one_command(tmp_path: Path) -> None:
     file = tmp_path / "real.json"
     run = skytether("fly", "demo-committed", *QUICK, "--duration", "3", "--json", str(file))
@@ -350,6 +354,7 @@ def test_a_real_flight_with_one_command(tmp_path: Path) -> None:
     assert summary["lost"] == 0
 
 
+@pytest.mark.long
 def test_ctrl_c_ends_the_flight_and_still_shows_it(tmp_path: Path) -> None:
     command = [sys.executable, "-P", "-m", "skytether", "fly", "demo", *QUICK]
     environment = os.environ | {"TMPDIR": str(tmp_path)}
@@ -370,6 +375,7 @@ def test_ctrl_c_ends_the_flight_and_still_shows_it(tmp_path: Path) -> None:
     assert not any(Path(f"/proc/{pid}").exists() for pid in children)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "host", ["127.0.0.1", pytest.param("[::1]", marks=pytest.mark.ipv6)], ids=["IPv4", "IPv6"]
 )
@@ -402,6 +408,7 @@ def test_three_processes_by_hand(host: str, start: Callable[..., Process], tmp_p
     assert summary["event_ratio"] is None
 
 
+@pytest.mark.long
 def test_a_client_that_is_refused_names_each_key_and_both_values(
     start: Callable[..., Process],
 ) -> None:
@@ -417,6 +424,7 @@ def test_a_client_that_is_refused_names_each_key_and_both_values(
     assert server.end() == 0
 
 
+@pytest.mark.long
 def test_a_client_too_many_and_one_under_a_number_in_flight_are_told_why(
     start: Callable[..., Process],
 ) -> None:
@@ -445,6 +453,7 @@ def test_a_client_too_many_and_one_under_a_number_in_flight_are_told_why(
     assert (flying.end(), server.end()) == (0, 0)
 
 
+@pytest.mark.long
 def test_a_log_of_json_has_an_event_a_line(start: Callable[..., Process]) -> None:
     server = start("server", "demo", "--bind", "127.0.0.1:0", *QUICK)
     argv = ["--server", server.address(), "--duration", "3", "--log", "json", *QUICK]
@@ -488,6 +497,7 @@ def unread(request: pytest.FixtureRequest) -> Iterator[int]:
         os.close(reading)
 
 
+@pytest.mark.long
 def test_a_server_whose_output_nobody_reads_flies_a_vehicle_and_ends_in_order(
     unread: int, start: Callable[..., Process], tmp_path: Path
 ) -> None:
@@ -548,6 +558,7 @@ def test_workers_that_are_told_to_end_twice_end_in_order(number: signal.Signals)
         assert f"{worker}: counted so far:" in rest
 
 
+@pytest.mark.long
 def test_a_flood_of_strangers_is_counted_in_a_line(start: Callable[..., Process]) -> None:
     server = start("server", "demo", "--bind", "127.0.0.1:0", "--log", "json")
     call_as_strangers(int(server.address().rpartition(":")[2]), 2000)
@@ -560,6 +571,7 @@ def test_a_flood_of_strangers_is_counted_in_a_line(start: Callable[..., Process]
     assert told <= 5 * (len(omitted) + 1)
 
 
+@pytest.mark.long
 def test_a_full_disk_costs_the_record_and_not_the_flight(
     start: Callable[..., Process], tmp_path: Path
 ) -> None:
@@ -593,6 +605,7 @@ def test_a_full_disk_costs_the_record_and_not_the_flight(
     assert json.loads(summary.read_text())["steps"] == len(read(parts["client"]))
 
 
+@pytest.mark.long
 def test_a_flight_whose_disk_fills_is_flown_and_shown_as_far_as_it_is_recorded(
     start: Callable[..., Process], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -611,6 +624,7 @@ def test_a_flight_whose_disk_fills_is_flown_and_shown_as_far_as_it_is_recorded(
     assert re.fullmatch(r"fly: .*: File too large: recorded up to [\d.]+ of 4 s", last)
 
 
+@pytest.mark.long
 def test_the_other_two_survive_a_kill_and_restart_of_each(start: Callable[..., Process]) -> None:
     flags = [*QUICK, "--control.trigger", "always", "--duration", "60"]
     argv = {"server": ["server", "demo", "--bind", "127.0.0.1:0", *flags]}

@@ -90,6 +90,7 @@ def test_every_command_has_its_needs_told_here() -> None:
     assert set(NEEDS) == set(COMMANDS)
 
 
+@pytest.mark.long
 def test_every_package_that_is_imported_is_asked_for() -> None:
     """Requirements name every imported package, independently of other packages' requirements."""
     asked = {re.split("[^a-z0-9_-]", one)[0] for one in metadata.requires("skytether") or ()}

@@ -145,6 +145,7 @@ def fleet_command(tmp_path: Path, *argv: str) -> dict[str, object]:
     return summary
 
 
+@pytest.mark.long
 def test_a_virtual_fleet_is_summed_up(tmp_path: Path) -> None:
     figure = tmp_path / "fleet.png"
     argv = ("--virtual", "--vehicles", "3", "--duration", "8", "--figure", str(figure))
@@ -162,6 +163,7 @@ def test_a_virtual_fleet_is_summed_up(tmp_path: Path) -> None:
     assert sum(dropped["server"].values()) > 20
 
 
+@pytest.mark.long
 def test_a_mission_is_flown_by_its_name_and_from_a_table(tmp_path: Path) -> None:
     flown = ("--virtual", "--reference.shape", "swap(4)", "--duration", "30")
     swap = fleet_command(
@@ -183,6 +185,7 @@ def test_a_mission_is_flown_by_its_name_and_from_a_table(tmp_path: Path) -> None
     assert shown["least_separation_m"] == pytest.approx(3.0, abs=0.3)
 
 
+@pytest.mark.long
 def test_a_show_is_flown_from_a_folder_of_skybrush(tmp_path: Path) -> None:
     folder = tmp_path / "show"
     folder.mkdir()

@@ -57,6 +57,7 @@ def test_what_is_light_imports_nothing_heavy(command: str) -> None:
     assert modules & (HEAVY | EXTRAS if command in FLIES else HEAVY) == set()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("scenario", ["demo", "paper"])
 def test_a_server_imports_its_own_solver_and_no_ciphers_without_keys(scenario: str) -> None:
     """The server needs numba, which imports the package scipy to ask its version."""

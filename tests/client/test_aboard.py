@@ -451,6 +451,7 @@ def test_a_disarmed_vehicle_is_never_flown_again(flavour: FlavourName) -> None:
     assert modes(air)[-1] == ("manual", str(Reason.DISARMED))
 
 
+@pytest.mark.long
 def test_a_low_battery_lands_by_the_autopilots_own_landing() -> None:
     """BRAKE, then LAND, although the autopilot itself only warns."""
     air = flying("ardupilot")

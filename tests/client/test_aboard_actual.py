@@ -32,6 +32,7 @@ from skytether.shared.telemetry.record import Reason
 # Clock
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("ppm", [-20_000.0, -8600.0, 20_000.0])
 def test_a_clock_that_runs_up_to_2_percent_wrong_is_followed(ppm: float) -> None:
     """PX4's own simulator runs 0.86 % slow; its positions are used throughout."""
@@ -69,6 +70,7 @@ def test_positions_that_cannot_be_used_are_not_called_silence() -> None:
 # Consecutive flights
 
 
+@pytest.mark.long
 def test_it_is_flown_again_and_again_in_one_power_up(flavour: FlavourName) -> None:
     """After a landing PX4 is in OFFBOARD, and without set-points it refuses to arm there."""
     air = Air(flavour, duration=5.0)
@@ -142,6 +144,7 @@ def test_a_link_that_is_cut_on_the_ground_is_told_and_that_it_is_back() -> None:
     assert heard.silent_s == pytest.approx(12.0, abs=2.0)
 
 
+@pytest.mark.long
 def test_a_lossy_link_is_no_silence_on_the_ground() -> None:
     ways = "constant(0.5) & loss(0.2)"
     air = Air(armed=False, network={"uplink": ways, "downlink": ways})
@@ -150,6 +153,7 @@ def test_a_lossy_link_is_no_silence_on_the_ground() -> None:
     assert not air.of(ServerSilent)
 
 
+@pytest.mark.long
 def test_an_autopilot_that_answers_timesync_no_more_is_told_once() -> None:
     air = Air("px4", duration=60.0)
     air.fly()

@@ -27,6 +27,7 @@ def compare(flavour: FlavourName, seed: int, duration: float) -> None:
     assert bad.foreign > 100 * duration
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("flavour", "seed"), [("ardupilot", 1), pytest.param("px4", 5, marks=pytest.mark.long)]
 )
@@ -35,6 +36,7 @@ def test_a_bad_line_changes_little(flavour: FlavourName, seed: int) -> None:
     compare(flavour, seed, SETTLE_S + 10.0)
 
 
+@pytest.mark.long
 def test_a_line_that_reorders_needs_what_was_overtaken_dropped(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -54,6 +56,7 @@ def test_a_bad_line_changes_little_for_minutes(flavour: FlavourName) -> None:
     compare(flavour, 2, 180.0)
 
 
+@pytest.mark.long
 def test_whatever_others_say_nothing_is_armed(flavour: FlavourName) -> None:
     air = OverLine(flavour, 1, armed=False)
     air.run(30.0)
@@ -66,6 +69,7 @@ def test_whatever_others_say_nothing_is_armed(flavour: FlavourName) -> None:
     assert air.client.failure is None
 
 
+@pytest.mark.long
 def test_this_line_spoils_what_it_says() -> None:
     """It loses a tenth, and nearly as many foreign frames arrive as own ones."""
     air = OverLine("ardupilot", 3, armed=False)

@@ -47,6 +47,7 @@ def flown(**sections: Any) -> tuple[Summary, Record]:
 # -- predicted state -------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 @given(
     tau_s=st.tuples(*[st.floats(0.05, 3.0)] * 2),
     gain=st.tuples(*[st.floats(0.3, 2.0)] * 2),

@@ -63,6 +63,7 @@ def test_arming_again_is_no_choice() -> None:
     air.until(lambda: air.mode is Mode.LAND, 30.0)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("choice", ["old", "new"])
 def test_a_choice_flies_on_in_the_frame_that_was_chosen(choice: str) -> None:
     """In the old frame at the old place; in the new frame figure and fence move by the jump."""
@@ -81,6 +82,7 @@ def test_a_choice_flies_on_in_the_frame_that_was_chosen(choice: str) -> None:
     assert np.linalg.norm(estimate - wanted) < 1.5
 
 
+@pytest.mark.long
 def test_one_that_stays_hovers_on() -> None:
     air = leapt()
     air.change(vehicle__after_leap="stay")

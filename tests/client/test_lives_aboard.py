@@ -85,6 +85,7 @@ def test_an_origin_of_before_the_autopilots_reboot_is_not_taken() -> None:
     assert not air.client._pilot.next_ns
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("down_s", [0.5, 30.0])
 def test_a_client_restarted_after_a_failsafe_landing_arms_nothing(
     flavour: FlavourName, down_s: float

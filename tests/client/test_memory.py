@@ -161,6 +161,7 @@ def test_what_has_not_changed_is_written_again_before_it_is_too_old_and_not_at_e
     assert writes == 3
 
 
+@pytest.mark.long
 def test_others_keep_away_from_all_of_a_motion_whose_client_has_begun_anew(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

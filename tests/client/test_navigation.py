@@ -328,6 +328,7 @@ ALONE = {
 """Committed inputs without feedback, at tight weights: noise acts only through the server."""
 
 
+@pytest.mark.long
 def test_the_filter_keeps_noise_from_being_sent_and_flown() -> None:
     """Without the filter the cost gap sends three times as many packets."""
     quiet, with_filter, without = (
@@ -346,6 +347,7 @@ def test_the_filter_keeps_noise_from_being_sent_and_flown() -> None:
     assert 0.007 < error < 0.011
 
 
+@pytest.mark.long
 def test_the_server_does_not_learn_noise_for_wind(monkeypatch: Any) -> None:
     """An observer that follows each velocity at once sends a twelfth more."""
     flown = scenario(sensor=NOISE, control=ALONE, duration=30.0)

@@ -228,6 +228,7 @@ def test_px4_stands_in_a_wind_that_drags_with_6_newtons(
     assert flown_.attitude().pitch < 0.8 * PX4.tilt_max
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("frame", "gains", "least_mps", "most_mps"),
     [(KG15, ARDUPILOT, 0.06, 0.11), (FRAMES["sih"], PX4, 0.30, 0.42)],

@@ -157,6 +157,7 @@ def waited_s(flight: Record) -> float:
     return float(flight.client["step"][flight.client["mode"] == Mode.TRACK][0]) * 0.05
 
 
+@pytest.mark.long
 def test_a_vehicle_that_reports_rarely_starts_soon(monkeypatch: pytest.MonkeyPatch) -> None:
     """Also with half of its packets lost; without repetition it waits for its next report."""
     keys = QUIET | {"vehicle.report": "periodic(80)", "network.downlink.loss": 0.5, "duration": 20}
@@ -217,6 +218,7 @@ def test_a_longer_delay_is_found(report: str, within_s: float) -> None:
     assert 13.5 < longer[0] * 0.05 < 15.0 + within_s
 
 
+@pytest.mark.long
 def test_nobody_calls_a_quiet_vehicle_lost() -> None:
     for seed in (1, 2, 3):
         flight = fly(skytether.load("demo", seed=seed))
@@ -226,6 +228,7 @@ def test_nobody_calls_a_quiet_vehicle_lost() -> None:
         assert downs(flight) < 5.0 * 38
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("name", "error_m", "share"), [("demo", 0.018, 0.19), ("demo-committed", 0.0233, 0.21)]
 )

@@ -53,6 +53,7 @@ def say(air: Air, message: Message, seconds: float, every_s: float = 0.1) -> Non
 # Detected by the motion of the vehicle
 
 
+@pytest.mark.long
 def test_a_commander_that_nobody_sees_is_noticed_and_the_vehicle_lands(
     flavour: FlavourName,
 ) -> None:

@@ -78,6 +78,7 @@ def test_a_velocity_in_the_fixed_frame_is_not_rotated() -> None:
     )
 
 
+@pytest.mark.long
 def test_the_robots_clock_is_followed_through_drift_and_jitter() -> None:
     """Clock 100 ppm fast; messages take 0.3 ms, and half of them up to 30 ms more."""
     rng, odometry = np.random.default_rng(1), OdometryFilter(robot.scenario(), 1)
@@ -235,6 +236,7 @@ def test_silent_or_wrong_odometry_stops_the_robot(payload: bytes | None) -> None
     assert ground.mode in (Mode.TRACK, Mode.COAST)
 
 
+@pytest.mark.long
 @settings(max_examples=50)
 @given(
     st.lists(
@@ -260,6 +262,7 @@ def test_any_datagrams_raise_nothing_and_move_nothing(
     assert not port.outbox()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("drive_by", "within"), [("holonomic", 0.02), ("differential", 0.1)])
 def test_identify_finds_the_model_of_a_robot(drive_by: str, within: float) -> None:
     """The lag of a differential base turns with it, so its point is only nearly of first order."""

@@ -251,6 +251,7 @@ def test_a_flights_path_is_drawn_on_axes_that_are_given(flown: skytether.Flight)
     assert np.array_equal(right.lines[1].get_xydata(), flown["position_m"])
 
 
+@pytest.mark.long
 def test_a_flight_goes_to_pandas(flown: skytether.Flight) -> None:
     pytest.importorskip("pandas")
     table = flown.to_pandas()

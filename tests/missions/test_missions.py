@@ -132,6 +132,7 @@ def test_what_cannot_be_has_no_solution() -> None:
     assert DualActiveSet(np.eye(2)).solve(np.zeros(2), columns, np.array([1.0, 1.0]), 0) is None
 
 
+@pytest.mark.long
 @given(
     st.tuples(st.floats(-0.5, 0.5), st.floats(-0.5, 0.5)),
     st.tuples(st.floats(-9, 9), st.floats(-9, 9)),
@@ -155,6 +156,7 @@ def test_a_plan_ends_at_rest_within_what_the_vehicle_can(
     assert nearer
 
 
+@pytest.mark.long
 @given(
     st.sampled_from(["swap", "sphere"]),
     st.lists(st.floats(-1.4, 1.4), min_size=3, max_size=3),
@@ -182,6 +184,7 @@ def test_far_from_others_axes_are_planned_one_by_one_to_the_last_bit(
 # -- distances of motions --------------------------------------------------------------------------
 
 
+@pytest.mark.long
 @given(st.integers(0, 2**31), st.integers(0, 60))
 def test_motions_come_too_near_where_any_of_their_pieces_does(seed: int, begin: int) -> None:
     """Also if bounding boxes exclude them; vehicles already too near must not come nearer."""
@@ -539,6 +542,7 @@ def test_who_gets_a_motion_again_says_so_again() -> None:
 # -- flights ---------------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("loss", "within_s"), [(0.0, 30.0), (0.3, 60.0)])
 def test_vehicles_swap_places_and_keep_apart(loss: float, within_s: float) -> None:
     swaps = scenario(8, loss, duration=within_s)
@@ -548,6 +552,7 @@ def test_vehicles_swap_places_and_keep_apart(loss: float, within_s: float) -> No
     assert flown.figures["server"]["counts"].get("left_tube", 0) == 0
 
 
+@pytest.mark.long
 def test_motions_that_are_sent_again_arrive_where_half_are_lost(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -649,6 +654,7 @@ def impatient(swaps: Scenario) -> Scenario:
     return msgspec.structs.replace(swaps, link=link, vehicle=vehicle)
 
 
+@pytest.mark.long
 def test_a_server_begins_anew_in_the_midst_of_a_mission() -> None:
     """It allows for unknown motions, and for vehicles that hover meanwhile."""
     swaps = impatient(scenario(8, duration=80.0))
@@ -711,6 +717,7 @@ def test_who_hovers_on_a_mission_holds_its_place(monkeypatch: pytest.MonkeyPatch
 # -- zones -----------------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("name", "within_s"),
     [
@@ -776,6 +783,7 @@ def test_the_least_distance_counts_heights_less() -> None:
     assert least_separation([one, other], [0.0, 0.0], DT_S, 0.5) == pytest.approx(0.5)
 
 
+@pytest.mark.long
 def test_a_zone_that_is_drawn_in_flight() -> None:
     swaps, zone = scenario(2, duration=30.0), "box(-0.5, 0.5, -1.5, 1.5)"
     drawn = [(3.0, {"mission.zones": zone})]
@@ -800,6 +808,7 @@ def test_a_zone_that_is_drawn_in_flight() -> None:
     assert reasons[3] == f"{got} cylinder(-4, 0, 1), which vehicle 1 hovers in, {whole}"
 
 
+@pytest.mark.long
 def test_without_routes_they_wait_before_a_wall(monkeypatch: pytest.MonkeyPatch) -> None:
     """Ablation: aimed straight at their goals, they stay where they are, and apart from it."""
     keys = scenario(2, duration=40.0)
@@ -813,6 +822,7 @@ def test_without_routes_they_wait_before_a_wall(monkeypatch: pytest.MonkeyPatch)
     assert clear_m(flown, walled.zones) > 0.0
 
 
+@pytest.mark.long
 def test_a_vehicle_at_rest_in_a_gap_is_flown_around(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

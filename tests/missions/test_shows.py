@@ -54,6 +54,7 @@ def errors_m(scenario: Scenario, flown: Record) -> Array:
     return np.array(errors)
 
 
+@pytest.mark.long
 def test_vehicles_are_where_their_paths_are_at_each_time(tmp_path: Path) -> None:
     """As goals, the same points are flown to one after the other, and metres behind."""
     shown = scenario(tmp_path, ring())
@@ -65,6 +66,7 @@ def test_vehicles_are_where_their_paths_are_at_each_time(tmp_path: Path) -> None
     assert errors_m(shown, goals).min() > 20.0 * worst_m
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seed", range(4))
 def test_vehicles_of_a_show_keep_apart_on_a_bad_network(seed: int, tmp_path: Path) -> None:
     """Twelve on a ring where the next is 1.14 m ahead, with half of all packets lost."""

@@ -57,6 +57,7 @@ def least_m(
     return float(min(nearest))
 
 
+@pytest.mark.long
 @settings(max_examples=25)
 @given(st.integers(0, 2**31), st.integers(0, 60), errors, errors, st.integers(2, 3))
 def test_a_motion_is_compared_with_all_that_another_may_be_at_each_time(
@@ -183,6 +184,7 @@ def landing_m(
     return nearest
 
 
+@pytest.mark.long
 def test_who_keeps_the_distance_goes_on_to_keep_it() -> None:
     """For any landing; only vehicles that are already too near may stay as near."""
     keep_m, accepted = 1.2, 0

@@ -113,6 +113,7 @@ def test_every_answer_is_optimal_and_within_its_box(
     assert residual(problem, inputs, gradient) < 1e-10
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("pivots", "fewest", "most"), [(True, 0, 5), (False, 100, 600)])
 def test_problems_that_cycle_are_solved_all_the_same(
     request: pytest.FixtureRequest, pivots: bool, fewest: int, most: int
@@ -169,6 +170,7 @@ def test_without_the_fallback_such_problems_fail_and_are_not_guessed(
     np.testing.assert_array_equal(inputs[solved], right[solved])
 
 
+@pytest.mark.long
 def test_a_horizon_rounded_to_float32_keeps_its_active_set() -> None:
     """Warm start of every saturated flight: one round, although 1.8 became 1.7999999."""
     problem = make((0.855, 0.855), (1.8, 1.8))

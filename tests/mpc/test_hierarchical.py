@@ -168,6 +168,7 @@ class OnPaper:
         return np.array(answers)
 
 
+@pytest.mark.long
 def test_planner_solves_the_papers_two_problems() -> None:
     planner, paper, wind = make(), OnPaper(), np.array([0.1, -0.2])
     for step in (0, 1, 2, 5, 6, 6 + H, 7 + 2 * H, 8 + 2 * H):

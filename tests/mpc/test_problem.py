@@ -89,6 +89,7 @@ def situation(seed: int, H: int, axes: int = 2, size: float = 1.0) -> tuple[Arra
     return size * x, size * target, size * rng.normal(size=(axes, H))
 
 
+@pytest.mark.long
 @quick
 @given(st.integers(0, 2**32 - 1), st.integers(1, 50), st.booleans())
 def test_qp_ranks_any_two_plans_as_the_printed_cost(
@@ -137,6 +138,7 @@ def test_first_step_has_no_change_weight() -> None:
     np.testing.assert_array_equal(one, other)
 
 
+@pytest.mark.long
 @quick
 @given(st.integers(0, 2**32 - 1), st.integers(1, 60), st.sampled_from([2, 3]))
 def test_prediction_is_the_model_flown_step_by_step(seed: int, H: int, axes: int) -> None:

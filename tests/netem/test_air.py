@@ -132,6 +132,7 @@ def test_flipped_bits_lie_anywhere(seed: int) -> None:
     assert stats.kstest(places, stats.uniform.cdf).pvalue > P_MIN
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("text", "share", "burst_s"),
     [("gilbert_elliott(0.2, 0.4)", 0.2, 0.4), ("outages(3, 1)", 0.25, 1.0)],

@@ -248,6 +248,7 @@ def test_runs_and_wraps_are_told_apart(text: str, lost: list[int]) -> None:
     assert np.diff(found.time_s).max() <= 1.0
 
 
+@pytest.mark.long
 def test_more_than_two_wraps_are_counted() -> None:
     text = answers(*(number % 65536 for number in range(1, 150_000)))
     found = recorded.recorded_in(File("it", text.encode()))

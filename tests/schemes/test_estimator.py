@@ -232,6 +232,7 @@ def test_forgotten_vehicle_begins_again_at_step_zero() -> None:
     np.testing.assert_allclose(estimate(estimator, 1), expected, rtol=0, atol=1e-13)
 
 
+@pytest.mark.long
 @quick
 @given(st.integers(0, 2**32 - 1), st.integers(1, 5), st.booleans())
 def test_batch_is_estimated_as_its_singles(seed: int, vehicles: int, compensate: bool) -> None:
@@ -342,6 +343,7 @@ def test_feedback_leads_on_from_where_the_vehicle_is_now() -> None:
     assert (gain > 1.0).all()
 
 
+@pytest.mark.long
 def test_the_paper_s_scheme_flies_better_with_observer_and_with_feedback() -> None:
     """The observer compensates steady wind, feedback compensates noise."""
 

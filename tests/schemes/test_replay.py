@@ -428,6 +428,7 @@ def test_every_step_is_planned_whatever_the_trigger(
     assert flight.server["event"].mean() < 0.2
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "vehicle",
     [{"steady_wind_mps": [0.3, -0.2]}, {"steady_wind_mps": [0.3, -0.2], "gain": 0.8}],
@@ -446,6 +447,7 @@ def test_the_disturbance_observer_leaves_no_offset(vehicle: dict[str, Any]) -> N
     assert offsets[4.0] < 0.01
 
 
+@pytest.mark.long
 def test_a_mean_loss_of_half_each_way_is_flown_through() -> None:
     """With the cost gap, under twice the error at a loss of 0.1."""
     errors = {}
@@ -458,6 +460,7 @@ def test_a_mean_loss_of_half_each_way_is_flown_through() -> None:
     assert errors[0.5] < 2.0 * errors[0.1]
 
 
+@pytest.mark.long
 def test_feedback_aboard_flies_in_wind_with_a_packet_a_second() -> None:
     """A third of the error without feedback, with fewer packets; no effect with gain 0."""
     errors, packets = {}, {}

@@ -446,6 +446,7 @@ def test_what_no_spline_follows_has_as_many_knots_as_there_may_be() -> None:
 # -- preview -------------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 @given(
     st.tuples(st.floats(-5, 5), st.floats(-1, 1)),
     st.lists(st.floats(-9, 9), min_size=21, max_size=21),
@@ -483,6 +484,7 @@ FAST = {
 """Target nearly as fast as the vehicle, which the server sees 4 s ahead."""
 
 
+@pytest.mark.long
 def test_bounds_shape_what_is_told() -> None:
     plans, told = (
         [
@@ -714,6 +716,7 @@ def test_a_packet_that_has_become_too_old_is_replaced(
     assert (rmse_m(flown, flight) < 0.5) == renewed
 
 
+@pytest.mark.long
 def test_before_a_trajectory_ends_as_many_are_sent_as_make_the_next_one_sure() -> None:
     """At 30 % loss and one trajectory every 2 s; without the rule, 19 of 20 such flights brake."""
     slow = {

@@ -118,6 +118,7 @@ phases_ms = st.none() | st.lists(st.sampled_from([0, 5, 10, 20]), min_size=4, ma
 """None leaves the phases to the seeds; the others make events coincide."""
 
 
+@pytest.mark.long
 @settings(max_examples=15)
 @given(st.one_of(scenarios, committing, guided), companies, phases_ms)
 def test_a_run_in_a_batch_equals_the_same_run_alone(
@@ -187,6 +188,7 @@ def test_a_session_expires_at_the_same_time_alone_and_in_a_batch(
     assert dt != 1.0 or flights[0].figures["server"]["dropped"]["unknown session"] > 0
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["demo", "paper"])
 def test_a_run_whose_sessions_expire_equals_the_same_run_alone(
     name: str, monkeypatch: pytest.MonkeyPatch
@@ -209,6 +211,7 @@ def test_a_run_that_finds_no_server_leaves_the_others_alone() -> None:
     assert [len(run.client) == 0 for run in flights] == gave_up
 
 
+@pytest.mark.long
 def test_a_flight_whose_trajectory_is_looked_up_anew_is_as_alone(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -55,6 +55,7 @@ class Crowd:
         return sent
 
 
+@pytest.mark.long
 @settings(max_examples=50)
 @given(
     st.lists(st.integers(40, 400), min_size=1, max_size=12),

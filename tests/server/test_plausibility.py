@@ -299,6 +299,7 @@ def believe(*_: Any) -> Belief:
     return Belief.BELIEVED
 
 
+@pytest.mark.long
 def test_a_flipped_bit_in_one_packet_of_a_hundred_costs_nothing(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

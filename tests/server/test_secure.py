@@ -813,6 +813,7 @@ def test_a_response_with_another_message_opens_no_channel() -> None:
 # -- floods ------------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_a_flood_of_initiations_takes_no_memory() -> None:
     """10^5 forged, foreign and repeated ones: the memory is bounded by the number of keys."""
     rng, server = random.Random(3), gate()

@@ -133,6 +133,7 @@ def growing_flights(dt: float, horizon: int, *, feedback: bool) -> dict[tuple[st
     return dict(zip(names, flights, strict=True))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("side", SIDES)
 @pytest.mark.parametrize("growing", GROWING)
 @pytest.mark.parametrize(
@@ -166,6 +167,7 @@ def test_a_delay_that_grows_in_flight_ends_in_hover_or_is_flown(
 SILENT = "the server is silent"
 
 
+@pytest.mark.long
 def test_a_delay_that_comes_and_goes_is_flown_again() -> None:
     flown = scenario(control={"dt": 0.02, "horizon": 20})
     (flight,) = fly_over(flown, [(short, lambda t: 6.0 if 8.0 < t < 18.0 else 0.05)])
@@ -204,11 +206,13 @@ def far_without_m(*growing: tuple[str, str]) -> list[float]:
     return [*map(far_m, fly_over(flown, [ways(side, GROWING[name]) for name, side in growing]))]
 
 
+@pytest.mark.long
 def test_without_a_bound_on_lateness_it_flies_away(monkeypatch: pytest.MonkeyPatch) -> None:
     forget_late(monkeypatch)
     assert min(far_without_m(("slowly", "uplink"), ("slowly", "both"))) > 2 * OUTSIDE_M
 
 
+@pytest.mark.long
 def test_without_echoes_a_longer_delay_is_never_flown_again(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -224,6 +228,7 @@ def test_without_echoes_a_longer_delay_is_never_flown_again(
         assert flight.failure is not None, name
 
 
+@pytest.mark.long
 def test_without_echoes_and_bound_on_lateness_it_flies_away(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -223,6 +223,7 @@ AGAIN = ("an hour apart the other way", "slower by 200 ppm", "client -1 h", "ser
 """Cases that differ from another one only in sign."""
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "name", [pytest.param(name, marks=[pytest.mark.long] * (name in AGAIN)) for name in CLOCKS]
 )

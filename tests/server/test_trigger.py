@@ -483,6 +483,7 @@ def encounters(rng: np.random.Generator, n: int, ticks: int) -> Iterator[Figures
         yield figures
 
 
+@pytest.mark.long
 @quick
 @given(trees, st.integers(0, 2**32 - 1))
 def test_combination_fires_as_its_parts_say(tree: Any, seed: int) -> None:

@@ -8,6 +8,7 @@ from typing import Any, Literal
 import hypothesis.strategies as st
 import msgspec
 import numpy as np
+import pytest
 from hypothesis import HealthCheck, given, settings
 
 from skytether.shared.base.errors import ConfigError
@@ -99,6 +100,7 @@ def fly(scenario: Scenario) -> str:
     return str(flown.failure or "")
 
 
+@pytest.mark.long
 @settings(
     max_examples=int(os.environ.get("LIMITS_EXAMPLES", "100")),
     suppress_health_check=list(HealthCheck),

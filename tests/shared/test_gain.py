@@ -3,6 +3,7 @@
 from typing import Any
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.linalg import solve_discrete_are
@@ -33,6 +34,7 @@ def test_it_is_that_of_the_riccati_equation(q: float, r: float, s: float) -> Non
         np.testing.assert_allclose(K, expected, rtol=1e-7)
 
 
+@pytest.mark.long
 @settings(max_examples=40)
 @given(st.floats(0.0, 10.0), st.floats(1e-3, 10.0), st.floats(1e-4, 10.0))
 def test_a_trajectory_s_regulator_is_that_of_the_riccati_equation_with_changes(

@@ -60,6 +60,7 @@ def test_false_losses_are_runs_of_lost_heartbeats(
     assert found == pytest.approx(per_h, rel=2e-3)
 
 
+@pytest.mark.long
 @given(st.integers(200, 10_000), st.integers(5, 200), st.floats(0.0, 1.0))
 def test_what_is_asked_for_meets_the_goal_or_is_the_shortest(
     timeout_ms: int, step_ms: int, loss: float

@@ -142,6 +142,7 @@ def run(folder: Path, file_bytes: int = resource.RLIM_INFINITY) -> str:
     return done.stdout.strip()
 
 
+@pytest.mark.long
 def test_a_kernel_is_compiled_anew_when_what_it_calls_has_changed(tmp_path: Path) -> None:
     assert run(put(tmp_path)) == "2.0 0"
     assert run(tmp_path) == "2.0 1"
@@ -169,6 +170,7 @@ def test_a_help_and_a_refusal_compile_nothing(tmp_path: Path) -> None:
     assert not (tmp_path / "kept").exists()
 
 
+@pytest.mark.long
 def test_what_is_compiled_is_said_once(tmp_path: Path) -> None:
     put(tmp_path, caller=MODULE)
     said = "compiling control loops, once on this machine: takes up to a minute\n"
@@ -176,6 +178,7 @@ def test_what_is_compiled_is_said_once(tmp_path: Path) -> None:
     assert quiet(tmp_path, PREPARED) == ""
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("helpers", ["helped", "alone"])
 def test_kernels_are_compiled_by_other_processes(tmp_path: Path, helpers: str) -> None:
     """Their machine code is read from the disk; without helpers this process compiles."""
@@ -198,6 +201,7 @@ def test_kernels_are_compiled_by_other_processes(tmp_path: Path, helpers: str) -
     ]
 
 
+@pytest.mark.long
 def test_machine_code_for_a_type_that_is_gone_is_no_reason_to_fail(tmp_path: Path) -> None:
     """The type has moved to another module, as it may between two versions."""
     assert run(put(tmp_path)) == "2.0 0"
@@ -206,6 +210,7 @@ def test_machine_code_for_a_type_that_is_gone_is_no_reason_to_fail(tmp_path: Pat
     assert run(put(tmp_path, HELPER.replace("Given", "Told"), moved)) == "2.0 0"
 
 
+@pytest.mark.long
 def test_a_folder_that_cannot_be_written_to_is_no_reason_to_fail(tmp_path: Path) -> None:
     put(tmp_path)
     (tmp_path / "__pycache__").write_text("a file, where a folder should be")
@@ -213,6 +218,7 @@ def test_a_folder_that_cannot_be_written_to_is_no_reason_to_fail(tmp_path: Path)
     assert run(tmp_path) == "2.0 0"
 
 
+@pytest.mark.long
 def test_a_full_disk_is_no_reason_to_fail(tmp_path: Path) -> None:
     put(tmp_path)
     assert run(tmp_path, file_bytes=100) == "2.0 0"
@@ -249,6 +255,7 @@ for name in sys.argv[1:]:  # each in a process that has nothing in memory, but t
 """
 
 
+@pytest.mark.long
 def test_a_server_has_all_kernels_of_its_scheme_in_memory_before_it_flies() -> None:
     """In flight no other kernel is called, and nothing is compiled, not even for figures."""
     names = ["demo", "demo-committed", "paper", "paper-no-compensation", "swap"]
@@ -273,6 +280,7 @@ def test_a_server_loads_no_kernel_of_another_scheme(scenario: str) -> None:
     assert {name.rpartition(".")[2] for name in server - own} <= ALWAYS
 
 
+@pytest.mark.long
 def test_a_kernel_refuses_other_types_than_its_own(tmp_path: Path) -> None:
     put(tmp_path, caller=MODULE)
     assert quiet(tmp_path, REFUSING) == ""

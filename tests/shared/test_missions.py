@@ -82,6 +82,7 @@ def grid(vehicles: int) -> Array:
     return np.stack(np.divmod(np.arange(vehicles), round(vehicles**0.5)), axis=1).astype(float)
 
 
+@pytest.mark.long
 def test_many_vehicles_are_checked_in_proportion() -> None:
     lines = [f"{i + 1},{t},{x},{y}" for i, (x, y) in enumerate(grid(MANY)) for t in (0, 5)]
     table = "\n".join(["vehicle,t,x,y", *lines]).encode()

@@ -83,6 +83,7 @@ def example(document: Path) -> str:
     return code
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("document", "file"),
     [
@@ -731,6 +732,7 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> str:
     return str(folder)
 
 
+@pytest.mark.long
 def test_an_installed_package_adds_a_trigger_a_reference_and_a_vehicle(
     installed: str, tmp_path: Path
 ) -> None:
@@ -748,6 +750,7 @@ def test_an_installed_package_adds_a_trigger_a_reference_and_a_vehicle(
     )
 
 
+@pytest.mark.long
 def test_an_installed_package_adds_a_scheme(installed: str, tmp_path: Path) -> None:
     listed = run("schemes", folder=tmp_path, path=installed)
     assert "beacon\n    Sends the present state of the reference" in listed
@@ -772,6 +775,7 @@ def test_a_package_whose_entry_point_leads_nowhere_is_named(
     )
 
 
+@pytest.mark.long
 def test_an_installed_package_adds_an_impairment(installed: str, tmp_path: Path) -> None:
     listed = run("impairments", folder=tmp_path, path=installed)
     assert "dark(every_s) with 1 <= every_s\n    Loses what is sent in every other" in listed

@@ -164,6 +164,7 @@ words = st.sampled_from(
 )
 
 
+@pytest.mark.long
 @settings(max_examples=1000, deadline=None)
 @given(
     st.text(max_size=60)

@@ -145,6 +145,7 @@ COMPILED = {
 }
 
 
+@pytest.mark.long
 @quick
 @given(
     st.integers(-5, 25),
@@ -227,6 +228,7 @@ def foresee(replay: Replay, step: int) -> Foresight:
     return found
 
 
+@pytest.mark.long
 @quick
 @given(
     seed=st.integers(0, 2**32 - 1),

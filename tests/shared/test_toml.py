@@ -109,6 +109,7 @@ AROUND = {
 """Scenarios that name a file of each kind."""
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", FILES)
 def test_no_file_takes_much_memory(name: str, tmp_path: Path) -> None:
     """With every parser: the command names the mistake in the file, and ends."""

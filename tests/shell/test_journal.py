@@ -70,6 +70,7 @@ def _ends(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Proxy, "finished", False)
 
 
+@pytest.mark.long
 def test_what_is_set_is_on_the_disk_when_it_is_acknowledged(tmp_path: Path) -> None:
     def ask(caller: Caller) -> Any:
         caller.ask({"network.uplink.loss": 0.25})
@@ -155,6 +156,7 @@ def test_one_of_another_flight_is_refused_in_words(
     assert refused.value.code == 2
 
 
+@pytest.mark.long
 def test_where_nothing_can_be_written_the_operator_hears_that_it_is_forgotten(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -305,6 +305,7 @@ def in_a_namespace(*argv: str) -> "subprocess.CompletedProcess[str]":
     return ran("unshare", "-rn", *argv, env=os.environ | {"PYTHONPATH": path})
 
 
+@pytest.mark.long
 @pytest.mark.skipif(sys.platform != "linux", reason="has no network namespaces")
 @pytest.mark.parametrize("local", ["modem", "198.51.100.1"])
 def test_a_path_works_again_after_its_interface_was_away(local: str) -> None:

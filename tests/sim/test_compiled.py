@@ -103,6 +103,7 @@ def test_flights_of_each_kind_of_vehicle_are_the_same(name: str, sections: dict[
     assert_same(packaged(name, SHORT, **sections))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["swap", "corridor"])
 def test_missions_are_the_same(name: str) -> None:
     lossy = {"uplink": {"loss": 0.3}, "downlink": {"loss": 0.3}}

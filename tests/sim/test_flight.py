@@ -60,6 +60,7 @@ def test_the_same_seed_flies_the_same_in_another_process_and_hash_seed() -> None
     assert fly(packaged("paper", duration=8.0, seed=6)).trace_hash() not in hashes
 
 
+@pytest.mark.long
 def test_compensation_is_worth_a_factor_of_two_and_a_half() -> None:
     error = {}
     for name in ("paper-no-compensation", "paper-every-step"):
@@ -69,6 +70,7 @@ def test_compensation_is_worth_a_factor_of_two_and_a_half() -> None:
     assert error["paper-no-compensation"] >= 2.5 * error["paper-every-step"]
 
 
+@pytest.mark.long
 def test_the_event_trigger_saves_four_packets_in_five() -> None:
     every_step, triggered = flew(), flew("paper")
     assert every_step.event_ratio == 1.0
@@ -172,6 +174,7 @@ def test_unsynchronised_clocks_change_nothing(offset_s: float) -> None:
     np.testing.assert_array_equal(plain.client["state"], offset.client["state"])
 
 
+@pytest.mark.long
 def test_a_drifting_clock_is_followed() -> None:
     plain, drifted = flew(seed=3), flew(seed=3, simulation={"clock_drift_ppm": 200.0})
     assert drifted.rmse_xy == pytest.approx(plain.rmse_xy, rel=0.05)
@@ -259,6 +262,7 @@ def test_budget_caps_a_flight_and_a_heartbeat_ends_its_silences() -> None:
     assert np.diff(sent_s("state_gap | silence(1)")).max() <= 1.0 + 1e-9 < np.diff(alone).max()
 
 
+@pytest.mark.long
 def test_what_is_never_flown_costs_no_packets() -> None:
     """Over a round trip of 1.6 s, the last 1.3 s of a plan are too old to be flown."""
     slow = "paper(0.76, 0.02, 2.0) & loss(0.1)"

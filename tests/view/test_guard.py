@@ -322,6 +322,7 @@ def test_who_never_reads_is_cut_off_once_he_pings(page: Page) -> None:
     until(lambda: not page._guard.connections)
 
 
+@pytest.mark.long
 def test_what_a_reader_leaves_unread_is_bounded(page: Page) -> None:
     with closing(opened(page.port)) as sock:
         sock.sendall(frame(BINARY, msgspec.msgpack.encode(CAMERA)))
@@ -339,6 +340,7 @@ def test_what_a_reader_leaves_unread_is_bounded(page: Page) -> None:
         assert connection.transport.get_write_buffer_size() < 1_000_000
 
 
+@pytest.mark.long
 def test_nothing_is_drawn_for_who_does_not_read(
     page: Page, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -395,6 +395,7 @@ def test_joined_alone_a_torn_recording_has_an_end_for_other_programs(
     assert any(is_named(each, "summary.json") for each in records(out.read_bytes()))
 
 
+@pytest.mark.long
 @given(data=st.data())
 @settings(max_examples=40, deadline=None)
 def test_cut_anywhere_no_whole_chunk_is_lost(
@@ -421,6 +422,7 @@ def chunked(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_in_chunks(tmp_path_factory.mktemp("chunked") / "chunked.mcap", 200, end=True)
 
 
+@pytest.mark.long
 @given(at=st.integers(0, 2**20), by=st.integers(1, 255))
 @settings(max_examples=60, deadline=None)
 def test_a_damaged_byte_is_never_believed(
@@ -486,6 +488,7 @@ while True:
 """
 
 
+@pytest.mark.long
 def test_a_killed_recorder_loses_less_than_a_second(tmp_path: Path) -> None:
     path = tmp_path / "killed.mcap"
     with subprocess.Popen(
@@ -742,6 +745,7 @@ def test_no_text_of_a_table_or_a_line_is_obeyed_by_a_terminal(
     assert b"\x1b" not in written.out
 
 
+@pytest.mark.long
 def test_a_report_is_one_page_that_needs_nothing_else(recording: Path, tmp_path: Path) -> None:
     out = tmp_path / "report.html"
     assert command.main(report, [str(recording), "--html", str(out)], "report") == 0
@@ -903,6 +907,7 @@ def test_a_chunk_that_is_far_larger_inside_is_not_opened(
     assert peak_bytes < 2**26
 
 
+@pytest.mark.long
 def test_more_messages_than_there_is_an_index_for_are_not_made(
     recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

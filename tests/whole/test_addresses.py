@@ -18,6 +18,7 @@ def test_a_server_listens_at_two_addresses(start: Callable[..., Process]) -> Non
     assert server.end() == 0
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("local", ["127.0.0.2", "lo", ""])
 def test_a_client_flies_over_the_path_that_it_is_given(
     local: str, start: Callable[..., Process]
@@ -30,6 +31,7 @@ def test_a_client_flies_over_the_path_that_it_is_given(
     assert opened.host == (local if local.startswith("127") else "127.0.0.1")
 
 
+@pytest.mark.long
 def test_a_client_flies_over_two_paths_to_two_addresses(start: Callable[..., Process]) -> None:
     """One of the paths is absent: nobody has its interface."""
     server = start("server", "demo", "--bind", "127.0.0.1:0", "--bind", "127.0.0.2:0", *QUICK)

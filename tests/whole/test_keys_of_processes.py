@@ -42,6 +42,7 @@ def test_a_flight_is_sealed_from_end_to_end(tmp_path: Path) -> None:
     assert "sealed" in ended.stdout
 
 
+@pytest.mark.long
 def test_a_wrong_key_is_one_line_at_each_end(start: Callable[..., Process], tmp_path: Path) -> None:
     server = start(*SERVER, "--keys", str(key_file(tmp_path)))
     other = key_file(tmp_path, "70" * 32, name="other")
@@ -79,6 +80,7 @@ def test_plaintext_is_said_loudly(start: Callable[..., Process]) -> None:
     assert str(told).startswith("PLAINTEXT")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "argv",
     [

@@ -434,6 +434,7 @@ FAST = {
 }
 
 
+@pytest.mark.long
 async def test_two_vehicles_fly_in_space_over_real_sockets() -> None:
     """Delays of 20 ms, an observation and a horizon per step along the circle."""
     flown = packaged("paper-every-step", settle=0.0, duration=4.0, network=FAST, model={"axes": 3})
@@ -467,6 +468,7 @@ def differences(real: Record, virtual: Record) -> list[str]:
     ]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "control",
     [
