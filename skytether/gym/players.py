@@ -8,7 +8,7 @@ A player stores tuples only: a copy of one is a snapshot of what the robot holds
 """
 
 from abc import ABC, abstractmethod
-from typing import Any, Literal, NamedTuple, Self
+from typing import Any, Literal, NamedTuple
 
 from numpy.typing import NDArray
 
@@ -48,7 +48,7 @@ class Player(ABC):
         self.last: Row | None = None
         """Row to hold when rows have run out; None before the first."""
 
-    def __copy__(self) -> Self:
+    def __copy__(self) -> "Player":
         # Three copies a step: the general way of `copy` takes ten times as long.
         made = object.__new__(type(self))
         made.__dict__.update(self.__dict__)
