@@ -429,16 +429,17 @@ def test_what_is_claimed_is_what_was_asked_for() -> None:
 # -- the command ---------------------------------------------------------------------------------
 
 TUNE = ["compare", "--quick", "--tune", "--generations", "1"]
-FLOWN_S = 8.0
+FLOWN_S = 4.0
 
 
 @pytest.fixture(scope="module")
 def fewer() -> Iterator[None]:
-    """`--quick` with two thresholds, the found one first, and short flights."""
+    """`--quick` with two thresholds, the found one first, and few, short flights."""
     real = contenders.quick
 
     def quick(scale: contenders.ComparisonSize) -> contenders.ComparisonSize:
-        return dataclasses.replace(real(scale), duration=FLOWN_S)
+        brief = {"duration": FLOWN_S, "search_duration": FLOWN_S, "scouts": 1}
+        return dataclasses.replace(real(scale), **brief)
 
     with pytest.MonkeyPatch.context() as patch:
         for name in ("NEAR", "PERIODS"):
@@ -626,16 +627,19 @@ def written(text: str, name: str = "mine") -> Path:
     return file
 
 
+@pytest.mark.usefixtures("unpainted")
 def test_a_contender_of_a_user_is_flown_within_the_same_budgets_and_reported(
-    tuned: Path, capsys: pytest.CaptureFixture[str]
+    tuned: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """From the library; the command then finds every flight in the folder."""
+    beside = (BESIDE, "trajectory-expected")
+    monkeypatch.setattr(contenders, "QUICK", beside)
     mine = written(MINE)
     weights = tuned / "weights.toml"
     found = skytether.compare(mine, cases=["target"], quick=True, weights=weights, out="own")
     own = [each for each in found if each.keys["contender"] == "mine"]
     assert own
-    assert {each.keys["contender"] for each in found} <= {*QUICK, "mine"}
+    assert {each.keys["contender"] for each in found} <= {*beside, "mine"}
     base = reading.load(f"{weights}/trajectory-expected-target")
     for each in own:
         keys = {

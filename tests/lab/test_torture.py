@@ -69,7 +69,7 @@ def fault(
 
 
 @pytest.mark.parametrize(
-    "seed", [*range(1, 5), *(pytest.param(seed, marks=pytest.mark.long) for seed in range(5, 9))]
+    "seed", [*range(2, 4), *(pytest.param(seed, marks=pytest.mark.long) for seed in (1, *range(4, 9)))]
 )
 def test_a_trial_goes_well_and_the_same_each_time(seed: int) -> None:
     outcome = fly(short_trial(seed))
