@@ -233,7 +233,7 @@ def test_a_place_of_the_box_differs_as_it_says() -> None:
 def test_the_command_says_which_vehicles_are_stable(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.undo()
+    monkeypatch.setattr(margins, "FOLLOWED_S", 24.0)  # with delays of 2 s each way
     late = "dead time 0.3 s more"
     monkeypatch.setattr(margins, "VEHICLES", {late: margins.VEHICLES[late]})
     limits = {

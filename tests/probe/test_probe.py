@@ -357,6 +357,15 @@ def test_the_law_of_delays_is_recognised(law: str) -> None:
         assert law == "uniform" or mean_s == pytest.approx(made.mean(), rel=0.1)
 
 
+def test_the_slots_of_the_papers_delays_are_found() -> None:
+    rng = np.random.default_rng(1)
+    delay_s = 0.4 + 0.02 * rng.poisson(2.0, 1000) + 1e-4 * rng.standard_normal(1000)
+    best = fits.fit_delays(delay_s, 1000.0)[0]
+    assert best.name == "paper"
+    assert best.numbers[:2] == pytest.approx((0.4, 0.02), rel=0.001)
+    assert best.numbers[2] == pytest.approx(2.0, rel=0.05)
+
+
 def test_an_interval_of_a_share_is_wilsons() -> None:
     for lost, count in ((0, 50), (3, 100), (50, 100), (999, 1000)):
         known = stats.binomtest(lost, count).proportion_ci(method="wilson")
