@@ -550,6 +550,7 @@ def test_where_the_reference_is_known_it_is_flown_without_packets(
     assert errors[ABOARD.name] < 0.5 * errors["paper-every-step"]
 
 
+@pytest.mark.long
 def test_the_second_time_it_only_draws(
     out: Path, tuned: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -630,6 +631,7 @@ def written(text: str, name: str = "mine") -> Path:
     return file
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("unpainted")
 def test_a_contender_of_a_user_is_flown_within_the_same_budgets_and_reported(
     tuned: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch

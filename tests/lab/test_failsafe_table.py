@@ -53,6 +53,7 @@ def flown(case: CaseName, flavour: FlavourName) -> FaultOutcome:
     return outcome
 
 
+@pytest.mark.long
 def test_a_lost_link_lands_after_ten_seconds_of_hovering() -> None:
     """The time to landing in docs/failsafe.md is `vehicle.land_after_s` of `autopilot`."""
     outcome = flown("link cut", "ardupilot")
