@@ -118,6 +118,12 @@ def here() -> Iterator[None]:
 
 
 @pytest.fixture
+def unpainted(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Figures are saved as empty files: painting one takes a second or two."""
+    monkeypatch.setattr("matplotlib.figure.Figure.savefig", lambda *_, **__: None)
+
+
+@pytest.fixture
 def start() -> Iterator[Callable[..., Any]]:
     """Start processes; those still running at the end of the test are killed."""
     from warm import Process

@@ -11,7 +11,6 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy import stats
 
 from skytether.figures.flights import draw_reference
 from skytether.figures.page import Picture, as_png, lettered
@@ -75,6 +74,8 @@ def delay(direction: str, delay_ms: Array) -> Plate:
     `delay_ms` has the measured delay of each packet over UDP, and the delay that netem drew [ms];
     shape (packets, 2).
     """
+    from scipy import stats  # takes a second to import
+
     took_ms, late_ms = delay_ms[:, 0], delay_ms[:, 0] - delay_ms[:, 1]
     least_s, slot_s, slots_mean, *_ = map(float, IMPAIRMENTS.calls(direction)[0].values)
     first_ms, slot_ms = least_s * 1e3, slot_s * 1e3
@@ -186,6 +187,8 @@ def maps(flown: CellSummaries, here: ControlConfig) -> Plate:
 
     A cross marks the λ and ε of `here`, the paper's own.
     """
+    from scipy import stats  # takes a second to import
+
     decay, epsilon, rmse, ratio = _grid(flown)
     here_epsilon, here_decay = TRIGGERS.one(here.trigger).values
     with lettered(PAGE, 2.8, LETTERS) as figure:

@@ -167,25 +167,25 @@ def heedless(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize(
-    ("kinds", "first", "ablation"),
+    ("kinds", "first", "flights", "ablation"),
     [
-        pytest.param("losses", 4, newest, marks=pytest.mark.long),
-        pytest.param("cuts", 2, newest, marks=pytest.mark.long),
-        ("delays", 0, certain),
-        pytest.param("client", 1, forgetful, marks=pytest.mark.long),
-        pytest.param("goals,losses", 5, newest, marks=pytest.mark.long),
-        pytest.param("server,cuts", 33, hasty, marks=pytest.mark.long),
-        ("zones", 0, heedless),
+        pytest.param("losses", 4, 7, newest, marks=pytest.mark.long),
+        pytest.param("cuts", 2, 7, newest, marks=pytest.mark.long),
+        ("delays", 2, 2, certain),
+        pytest.param("client", 1, 7, forgetful, marks=pytest.mark.long),
+        pytest.param("goals,losses", 5, 7, newest, marks=pytest.mark.long),
+        pytest.param("server,cuts", 33, 7, hasty, marks=pytest.mark.long),
+        ("zones", 0, 2, heedless),
     ],
 )
 def test_each_kind_of_move_finds_a_planted_fault(
-    kinds: str, first: int, ablation: Patch, monkeypatch: pytest.MonkeyPatch
+    kinds: str, first: int, flights: int, ablation: Patch, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     flown = replaced(FOUR, duration=80.0) if "server" in kinds else FOUR
     named = tuple(map(MoveKind, kinds.split(",")))
     with monkeypatch.context() as without:
         ablation(without)
-        climbs = (climb(Climb(flown, named, first + n, 7)).best for n in range(20))
+        climbs = (climb(Climb(flown, named, first + n, flights)).best for n in range(20))
         best = next(each for each in climbs if spare_m(flown, each) < 0.0)
     assert spare_m(flown, fly(flown, best.moves)) > 0.0
 
@@ -225,17 +225,18 @@ def test_a_flight_comes_again_to_the_last_bit() -> None:
 
 def test_the_fewest_moves_are_those_that_matter(monkeypatch: pytest.MonkeyPatch) -> None:
     heedless(monkeypatch)
-    found = fly(FOUR, (DIES, IN_THE_WAY, move(MoveKind.GOALS, 2, "", 20.0, 3.0, 1.0, -3.0)))
+    brief = replaced(FOUR, duration=14.0)
+    found = fly(brief, (DIES, IN_THE_WAY, move(MoveKind.GOALS, 2, "", 10.0, 3.0, 1.0, -3.0)))
     assert found.clear.distance_m < 0.0
-    fewest = shrunk(FOUR, found)
+    fewest = shrunk(brief, found)
     assert [each.kind for each in fewest.moves] == [MoveKind.ZONES]
     assert fewest.moves[0].length_ns < IN_THE_WAY.length_ns
-    assert spare_m(FOUR, fewest) < 0.0
+    assert spare_m(brief, fewest) < 0.0
 
 
 def test_a_search_begins_elsewhere_with_another_number_and_comes_again() -> None:
     tasks = [
-        Climb(replaced(FOUR, duration=8.0), (MoveKind.DELAYS,), number, 3) for number in (1, 2)
+        Climb(replaced(FOUR, duration=6.0), (MoveKind.DELAYS,), number, 2) for number in (1, 2)
     ]
     one, other = map(climb, tasks)
     assert one.best.moves != other.best.moves
@@ -248,7 +249,7 @@ def test_what_is_no_list_of_moves_is_refused() -> None:
             loads(line)
 
 
-SHORT = ("swap", "--reference.shape", "swap(4)", "--duration", "15")
+SHORT = ("swap", "--reference.shape", "swap(4)", "--duration", "12")
 
 
 @pytest.mark.usefixtures("here")
@@ -258,7 +259,7 @@ def test_the_command_prints_what_flies_it_again(
     heedless(monkeypatch)
     monkeypatch.setattr(commands, "shrunk", lambda _, found: found)
     kept = tmp_path / "found.json"
-    search = (*SHORT, "--with", "zones", "--runs", "4", "--json", str(kept))
+    search = (*SHORT, "--with", "zones", "--runs", "2", "--json", str(kept))
     assert main(["adversary", *search]) == 1
     printed = capsys.readouterr().out
     (again,) = (line for line in printed.splitlines() if line.startswith("    skytether "))

@@ -203,7 +203,7 @@ def test_a_search_told_the_same_proposes_the_same() -> None:
     assert proposed[0] == proposed[1]
 
 
-SHORT = ["--duration", "3", "--settle", "0", "--runs", "2", "--population", "4", "--workers", "1"]
+SHORT = ["--duration", "2", "--settle", "0", "--runs", "2", "--population", "4", "--workers", "1"]
 ARGV = ["calibrate", "paper", *SHORT, "--free", "reference.radius_m=0.5:5", "model.tau_s.0=0.2:2"]
 
 
@@ -304,7 +304,7 @@ def test_a_trajectory_edited_between_two_calls_is_refused(
     scenario = tmp_path / "mine.toml"
     scenario.write_text('extends = "paper"\nreference = { shape = "csv", file = "path.csv" }\n')
     argv = ["calibrate", str(scenario), *SHORT, "--out", str(tmp_path / "out")]
-    argv += ["--free", "model.tau_s.0=0.2:2"]
+    argv += ["--free", "model.tau_s.0=0.2:2", "--objective", "rmse", "--runs", "1"]
     assert main([*argv, "--generations", "1"]) == 0
     table.write_text("t,x,y\n0,0,0\n5,1,2\n")
     assert main([*argv, "--generations", "2"]) == 2

@@ -5,7 +5,6 @@ import dataclasses
 import json
 import math
 import re
-import shutil
 import signal
 import subprocess
 import sys
@@ -42,7 +41,6 @@ from skytether.lab.contenders import (
     BESIDE,
     CASES,
     CONTENDERS,
-    QUICK,
     REGULATED,
     Case,
     Contender,
@@ -428,17 +426,21 @@ def test_what_is_claimed_is_what_was_asked_for() -> None:
 
 # -- the command ---------------------------------------------------------------------------------
 
+REAL = {name: getattr(contenders, name) for name in ("quick", "QUICK")}
+QUICK = ("paper-every-step", BESIDE, "trajectory-expected")
+"""Contenders of `--quick` here."""
 TUNE = ["compare", "--quick", "--tune", "--generations", "1"]
-FLOWN_S = 8.0
+FLOWN_S = 4.0
 
 
 @pytest.fixture(scope="module")
 def fewer() -> Iterator[None]:
-    """`--quick` with two thresholds, the found one first, and short flights."""
+    """`--quick` with two thresholds, the found one first, and few, short flights."""
     real = contenders.quick
 
     def quick(scale: contenders.ComparisonSize) -> contenders.ComparisonSize:
-        return dataclasses.replace(real(scale), duration=FLOWN_S)
+        brief = {"duration": FLOWN_S, "search_duration": FLOWN_S, "scouts": 1}
+        return dataclasses.replace(real(scale), **brief)
 
     with pytest.MonkeyPatch.context() as patch:
         for name in ("NEAR", "PERIODS"):
@@ -446,6 +448,7 @@ def fewer() -> Iterator[None]:
             first = factors.index(1)
             patch.setattr(contenders, name, factors[first : first + 2])
         patch.setattr(contenders, "quick", quick)
+        patch.setattr(contenders, "QUICK", QUICK)
         yield
 
 
@@ -547,6 +550,7 @@ def test_where_the_reference_is_known_it_is_flown_without_packets(
     assert errors[ABOARD.name] < 0.5 * errors["paper-every-step"]
 
 
+@pytest.mark.long
 def test_the_second_time_it_only_draws(
     out: Path, tuned: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -575,6 +579,7 @@ def test_other_weights_are_another_comparison(
     assert said.endswith("] to continue there; or choose another --out\n")
 
 
+@pytest.mark.usefixtures("fewer")
 def test_weights_that_nobody_has_searched_for_are_refused(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -586,7 +591,7 @@ def test_weights_that_nobody_has_searched_for_are_refused(
     file.write_text('["paper-every-step-target"]\nextends = "target"\n')
     assert main(argv) == 2
     said = (
-        f"compare: {file}: got no table 'paper-event-target', "
+        f"compare: {file}: got no table 'feedback-gap-target', "
         "expected every contender in every case, as --tune writes them"
     )
     assert capsys.readouterr().err.strip() == said
@@ -626,16 +631,20 @@ def written(text: str, name: str = "mine") -> Path:
     return file
 
 
+@pytest.mark.long
+@pytest.mark.usefixtures("unpainted")
 def test_a_contender_of_a_user_is_flown_within_the_same_budgets_and_reported(
-    tuned: Path, capsys: pytest.CaptureFixture[str]
+    tuned: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """From the library; the command then finds every flight in the folder."""
+    beside = (BESIDE, "trajectory-expected")
+    monkeypatch.setattr(contenders, "QUICK", beside)
     mine = written(MINE)
     weights = tuned / "weights.toml"
     found = skytether.compare(mine, cases=["target"], quick=True, weights=weights, out="own")
     own = [each for each in found if each.keys["contender"] == "mine"]
     assert own
-    assert {each.keys["contender"] for each in found} <= {*QUICK, "mine"}
+    assert {each.keys["contender"] for each in found} <= {*beside, "mine"}
     base = reading.load(f"{weights}/trajectory-expected-target")
     for each in own:
         keys = {
@@ -735,8 +744,11 @@ def test_two_contenders_have_two_names(capsys: pytest.CaptureFixture[str]) -> No
 
 @pytest.mark.long
 def test_ctrl_c_ends_a_search_in_order_and_the_same_command_goes_on(
-    tuned: Path, tmp_path: Path
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    for name, real in REAL.items():  # as in the process
+        monkeypatch.setattr(contenders, name, real)
+    count = len(contenders.QUICK)
     argv = [*TUNE[:3], "--generations", "2", "--workers", "1", "--out", str(tmp_path)]
     journal = tmp_path / "searches" / "paper-every-step-target" / "journal.jsonl"
     with subprocess.Popen(
@@ -749,18 +761,12 @@ def test_ctrl_c_ends_a_search_in_order_and_the_same_command_goes_on(
         process.send_signal(signal.SIGINT)
         _, said = process.communicate(timeout=180)
     assert process.returncode == 130, said
-    assert f"of {2 * len(QUICK)} generations done; the same command goes on" in said
+    assert f"of {2 * count} generations done; the same command goes on" in said
     assert not (tmp_path / "weights.toml").exists()
     flown = journal.read_text()
-    for name in QUICK[1:]:  # one generation of these is done
-        shutil.copytree(
-            tuned / "searches" / f"{name}-target",
-            journal.parents[1] / f"{name}-target",
-            dirs_exist_ok=True,
-        )
     assert main([*TUNE, "--out", str(tmp_path)]) == 0
     assert journal.read_text().startswith(flown)
-    assert len(reading.names(str(tmp_path / "weights.toml"))) == len(QUICK)
+    assert len(reading.names(str(tmp_path / "weights.toml"))) == count
 
 
 @pytest.mark.parametrize(

@@ -109,10 +109,12 @@ def test_schemes_share_the_network_and_the_target() -> None:
 
 @pytest.mark.usefixtures("here")
 def test_it_writes_a_table_and_a_picture_and_goes_on(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     argv = ("crowd", "--out", str(tmp_path / "c"), "--schemes", "threshold", "budget", *FAST)
-    assert main([*argv, "--limit", "5", "--vehicles", "1", "2"]) == 0
+    with monkeypatch.context() as unpainted:
+        unpainted.setattr("matplotlib.figure.Figure.savefig", lambda *_, **__: None)
+        assert main([*argv, "--limit", "5", "--vehicles", "1", "2"]) == 0
     said = capsys.readouterr().out
     assert "one budget for all vehicles: 2 vehicles fly, no more were tried" in said
     journal = (tmp_path / "c" / "journal.jsonl").read_text()
@@ -124,7 +126,7 @@ def test_it_writes_a_table_and_a_picture_and_goes_on(
     assert (tmp_path / "c" / "crowd.png").stat().st_size > 10_000
 
 
-@pytest.mark.usefixtures("here")
+@pytest.mark.usefixtures("here", "unpainted")
 def test_ctrl_c_keeps_what_was_done(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -53,6 +53,7 @@ def flown(case: CaseName, flavour: FlavourName) -> FaultOutcome:
     return outcome
 
 
+@pytest.mark.long
 def test_a_lost_link_lands_after_ten_seconds_of_hovering() -> None:
     """The time to landing in docs/failsafe.md is `vehicle.land_after_s` of `autopilot`."""
     outcome = flown("link cut", "ardupilot")
@@ -65,7 +66,10 @@ def test_a_lost_link_lands_after_ten_seconds_of_hovering() -> None:
 
 @pytest.mark.parametrize(
     ("flavour", "mode", "least_s", "most_s"),
-    [("ardupilot", "LAND", 4.0, 5.1), ("px4", "AUTO.LAND", 1.1, 1.4)],
+    [
+        ("ardupilot", "LAND", 4.0, 5.1),
+        pytest.param("px4", "AUTO.LAND", 1.1, 1.4, marks=pytest.mark.long),
+    ],
 )
 def test_a_client_that_is_killed_leaves_it_to_the_autopilots_time_out(
     flavour: FlavourName, mode: str, least_s: float, most_s: float

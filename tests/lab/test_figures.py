@@ -85,7 +85,16 @@ def test_every_table_of_measurements_says_where_its_numbers_come_from(page: Path
     assert lost == []
 
 
-@pytest.mark.parametrize("name", [n for n, each in REGISTER.items() if each.kind == "fast"])
+MINUTES = {"network-two-recorded", "network-5g", "tour-bytes"}
+"""Fast figures of several flights of minutes."""
+FAST = [
+    pytest.param(name, marks=[pytest.mark.long] if name in MINUTES else [])
+    for name, each in REGISTER.items()
+    if each.kind == "fast"
+]
+
+
+@pytest.mark.parametrize("name", FAST)
 def test_a_fast_figure_is_within_its_tolerance(name: str) -> None:
     figure = REGISTER[name]
     results = {key: fly(cell) for key, cell in cells(figure).items()}

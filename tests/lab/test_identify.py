@@ -382,6 +382,7 @@ def over_mavlink(asked: Scenario, flavour: FlavourName, plan: ExperimentPlan) ->
     return endpoint
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("flavour", ["ardupilot", "px4"])
 def test_the_documented_field_flies_at_once_with_the_model_identified(
     flavour: FlavourName, tmp_path: Path

@@ -55,7 +55,7 @@ def test_a_vehicle_in_a_pocket_of_others_is_let_out(monkeypatch: pytest.MonkeyPa
 
 
 def test_what_is_kept_is_not_flown_again(tmp_path: Path) -> None:
-    out, one = tmp_path / "flights", Flags(1)
+    out, one = tmp_path / "flights", Flags(0)
     assert study(math.sqrt, [4.0, 9.0], float, {"seed": 1}, out, one) == [2.0, 3.0]
     # Another function shows which cells are flown now.
     assert study(math.fabs, [4.0, 9.0, 16.0], float, {"seed": 1}, out, one) == [2.0, 3.0, 16.0]
@@ -67,6 +67,6 @@ def test_what_is_kept_is_not_flown_again(tmp_path: Path) -> None:
 def test_a_flight_without_zones_is_kept_as_well(tmp_path: Path) -> None:
     """Its distance from a zone is None, because JSON has no infinity."""
     fly = partial(missions.fly_swap, SwapOptions(vehicles=2, duration=4.0))
-    again = [study(fly, [(1, "no loss")], MissionFlight, {}, tmp_path, Flags(1)) for _ in range(2)]
+    again = [study(fly, [(1, "no loss")], MissionFlight, {}, tmp_path, Flags(0)) for _ in range(2)]
     assert again[0] == again[1]
     assert again[1][0].clear_m is None

@@ -21,6 +21,7 @@ from msgspec.structs import replace
 from helpers import PATIENCE_S, refusal, refused_before_writing, until
 from skytether.__main__ import main
 from skytether.lab import figures
+from skytether.lab.commands import pool
 from skytether.lab.journal import StudyJournal, sealed
 from skytether.lab.sweep import CHUNK, GridAxis, Runs, Sweep, estimate, fly, parse_axis
 from skytether.shared.base.errors import ConfigError
@@ -290,8 +291,9 @@ def test_a_line_with_a_flipped_bit_is_refused(bit: int, tmp_path: Path) -> None:
 
 
 def test_a_changed_number_in_a_journal_ends_the_command_in_one_line(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(pool, "_executor", lambda _: pool._thread())
     argv = ["sweep", "paper", "--duration", "2", "--settle", "0", "--runs", "1", "--workers", "1"]
     assert main([*argv, "--out", str(tmp_path)]) == 0
     file = tmp_path / "journal.jsonl"
@@ -402,30 +404,40 @@ def running(pid: str) -> bool:
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("sweep") / "deep" / "whole"
-    with redirect_stdout(io.StringIO()) as said:
+    with redirect_stdout(io.StringIO()):
         assert main([*SWEEP, "--out", str(out), "--workers", "2"]) == 0
+    return out
+
+
+@pytest.fixture(scope="module")
+def brief(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The same sweep, of shorter flights."""
+    out = tmp_path_factory.mktemp("sweep") / "deep" / "brief"
+    argv = [*SWEEP, "--duration", "1.5", "--settle", "0.5", "--out", str(out), "--workers", "1"]
+    with redirect_stdout(io.StringIO()) as said:
+        assert main(argv) == 0
     assert "vehicle-steps" in said.getvalue()
     assert lines(out) == TASKS
     return out
 
 
-def test_the_tables_hold_every_run_and_every_cell(whole: Path) -> None:
-    runs, cells = (list(csv.DictReader((whole / name).read_text().splitlines())) for name in TABLES)
+def test_the_tables_hold_every_run_and_every_cell(brief: Path) -> None:
+    runs, cells = (list(csv.DictReader((brief / name).read_text().splitlines())) for name in TABLES)
     assert len(runs) == 4 * 30
     assert [int(row["seed"]) for row in runs[30:60]] == list(range(1, 31))
     assert {(row["control.input_weight"], row["control.trigger"]) for row in runs[30:60]} == {
         ("1", "periodic")
     }
-    assert {row["steps"] for row in runs} == {"100"}
+    assert {row["steps"] for row in runs} == {"30"}
     assert [row["flown"] for row in cells] == ["30"] * 4
     mean = np.mean([float(row["rmse_xy"]) for row in runs[30:60]])
     assert float(cells[1]["rmse_xy"]) == pytest.approx(mean)
     assert float(cells[1]["rmse_xy_ci95"]) < 0.2 * mean
 
 
-def test_two_keys_make_maps(whole: Path) -> None:
+def test_two_keys_make_maps(brief: Path) -> None:
     for name in ("rmse_xy.png", "event_ratio.png"):
-        assert (whole / name).read_bytes().startswith(b"\x89PNG")
+        assert (brief / name).read_bytes().startswith(b"\x89PNG")
 
 
 @pytest.mark.long

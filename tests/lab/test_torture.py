@@ -69,7 +69,8 @@ def fault(
 
 
 @pytest.mark.parametrize(
-    "seed", [*range(1, 5), *(pytest.param(seed, marks=pytest.mark.long) for seed in range(5, 9))]
+    "seed",
+    [2, 3, *(pytest.param(seed, marks=pytest.mark.long) for seed in (1, *range(4, 9)))],
 )
 def test_a_trial_goes_well_and_the_same_each_time(seed: int) -> None:
     outcome = fly(short_trial(seed))
@@ -113,7 +114,26 @@ def test_each_step_under_a_plan_is_held_against_the_equations() -> None:
     assert "steps along trajectories" not in planned
 
 
-@pytest.mark.parametrize("line", FAILED)
+def schedule_of(line: str) -> str:
+    return line.partition('"faults"')[2]
+
+
+NEWEST = {schedule_of(line): line for line in FAILED}
+"""Last seed with each schedule, which flies what failed with it."""
+FAULTS_MAX = 6
+"""Largest number of faults of the trials that are flown each time."""
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        pytest.param(line, marks=[] if is_brief else [pytest.mark.long])
+        for line in FAILED
+        for is_brief in [
+            line == NEWEST[schedule_of(line)] and len(loads(line).faults) <= FAULTS_MAX
+        ]
+    ],
+)
 def test_what_has_failed_once_fails_no_more(line: str) -> None:
     outcome = fly(loads(line))
     assert not outcome.failure
@@ -291,12 +311,18 @@ def no_second_try(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(skytether.client.secure, "AGAIN_NS", skytether.client.secure.ATTEMPT_NS)
 
 
+@cache
+def goes_well(trial: Trial) -> bool:
+    """Whether a trial passes with all guards; several ablations are of the same trial."""
+    return not fly(trial).failure
+
+
 def violated(trial: Trial, ablate: Patch, patch: pytest.MonkeyPatch) -> str:
     """Invariant that a trial violates after an ablation; without the ablation the trial passes.
 
     Runs in plain Python: compiled code does not call replaced functions.
     """
-    assert not fly(trial).failure
+    assert goes_well(trial)
     ablate(patch)
     with interpreted():
         return fly(trial).invariant
@@ -357,9 +383,12 @@ def test_a_guard_that_is_switched_off_is_caught(
     assert violated(Trial(PLANS, faults), switch_off, monkeypatch) == invariant
 
 
+OF_LINKS = (no_home, no_second_try, no_window, no_tag, no_steady)
+"""Guards that act on packets and clocks, whatever the packets hold."""
+
+
 @pytest.mark.parametrize(
-    ("switch_off", "invariant", "faults"),
-    [each for each in ABLATIONS if each[0] not in (no_home, no_second_try)],
+    ("switch_off", "invariant", "faults"), [each for each in ABLATIONS if each[0] not in OF_LINKS]
 )
 def test_a_guard_of_trajectories_that_is_switched_off_is_caught(
     switch_off: Patch,
@@ -369,11 +398,9 @@ def test_a_guard_of_trajectories_that_is_switched_off_is_caught(
 ) -> None:
     """As for horizons.
 
-    Two guards are left out, because they belong to the link alone. A server that accepts forgeries
-    may also violate "recovers".
+    Those of the link alone are left out.
     """
-    found = violated(Trial(FOLLOWS, faults), switch_off, monkeypatch)
-    assert found in (invariant, "recovers")
+    assert violated(Trial(FOLLOWS, faults), switch_off, monkeypatch) == invariant
 
 
 def test_a_vehicle_with_a_new_port_is_reached_behind_faster_copies(
