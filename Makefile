@@ -59,7 +59,7 @@ test: setup  ## everything but Docker and what takes long, in four minutes on tw
 
 long-test: setup  ## the commands of the documents, benchmarks, and flights of many processes
 	@$(KERNELS)
-	$(BIN)/pytest -q -m "long and not docker and not browser and not autopilot" -n 5 --dist loadfile --no-loadscope-reorder --durations=40
+	$(BIN)/pytest -q -m "long and not docker and not browser and not autopilot" -n 4 --dist loadfile --no-loadscope-reorder --durations=40
 
 check: setup  ## style, types, who imports whom, and the forge's files
 	$(BIN)/ruff format --check .
