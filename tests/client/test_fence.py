@@ -18,7 +18,6 @@ from skytether.shared.wire.protocol import Mode
 from skytether.sim.flight import fly
 
 
-@pytest.mark.long
 def test_no_input_leads_over_the_fence() -> None:
     """Time constants off by 30 %, gains by 20 %, dead times by 0.1 s, and turning wind."""
     assert max(map(furthest_m, range(30))) <= 0.0
@@ -42,7 +41,6 @@ class WithoutForesight(Fence):
         self._tau = (0.0, 0.0)
 
 
-@pytest.mark.long
 @pytest.mark.parametrize("fences", [WithoutMargin, WithoutForesight])
 def test_without_a_guard_the_fence_is_flown_over(fences: type[Fence]) -> None:
     assert max(furthest_m(seed, fences=fences) for seed in range(12)) > 0.1

@@ -58,7 +58,6 @@ def test_two_servers_never_plan_for_halves_of_a_mission(monkeypatch: pytest.Monk
     assert split().run().apart.away_m < 0.5
 
 
-@pytest.mark.long
 def test_the_mission_goes_on_when_the_first_server_dies() -> None:
     """All arrive with the standby, though the first server dies in the middle and stays away."""
     dies = Move(MoveKind.SERVER, 0, "", 6 * SECOND_NS, 3600 * SECOND_NS)

@@ -211,7 +211,6 @@ def test_a_run_that_finds_no_server_leaves_the_others_alone() -> None:
     assert [len(run.client) == 0 for run in flights] == gave_up
 
 
-@pytest.mark.long
 def test_a_flight_whose_trajectory_is_looked_up_anew_is_as_alone(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -228,7 +228,6 @@ def test_without_echoes_a_longer_delay_is_never_flown_again(
         assert flight.failure is not None, name
 
 
-@pytest.mark.long
 def test_without_echoes_and_bound_on_lateness_it_flies_away(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
