@@ -102,10 +102,12 @@ def iperf_server() -> Iterator[str]:
     line = ["iperf3", "--server", "--one-off", "--bind", HOST, "--port", port, "--forceflush"]
     with subprocess.Popen(line, stdout=subprocess.PIPE, text=True) as server:
         assert server.stdout is not None
-        while "listening" not in server.stdout.readline():
-            pass
-        yield port
-        server.terminate()
+        try:
+            if not any("listening" in line for line in server.stdout):
+                raise RuntimeError(f"iperf3 does not listen on port {port}")
+            yield port
+        finally:
+            server.terminate()
 
 
 def client(port: str, seconds: int, *more: str) -> list[str]:

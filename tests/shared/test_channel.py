@@ -273,7 +273,6 @@ FORGERS: list[Forger] = [flip_bit, change_bytes, change_header, cut, extend, spl
 REASONS = {"forged", "replayed", "length", "unknown channel", "expired"}
 
 
-@pytest.mark.long
 @pytest.mark.timeout(3600 if LONG else 120)
 def test_no_forgery_is_opened() -> None:
     rng = random.Random(2)

@@ -75,7 +75,6 @@ def test_a_process_which_builds_and_drives_an_endpoint_may_have_a_clock(copy: Pa
     assert complaints(copy, "time") == [set()]
 
 
-@pytest.mark.long
 def test_every_core_module_is_named_for_a_clock_a_socket_dice_paths_or_the_system(
     copy: Path,
 ) -> None:

@@ -65,7 +65,6 @@ def writes(call: ast.Call) -> bool:  # noqa: PLR0911 - one for each way to write
     return False
 
 
-@pytest.mark.long
 def test_nothing_else_writes_a_file() -> None:
     """Otherwise a file may be truncated before it is replaced, or an input become an output."""
     elsewhere = {
