@@ -53,7 +53,7 @@ demo: $(FLY)  ## fly the demonstration for three minutes, with a page to play wi
 reproduce: setup  ## the paper's table and figures, and more, in results/report.html (15 minutes)
 	$(BIN)/skytether reproduce --out results
 
-test: setup  ## everything but Docker and what takes long, in four minutes on two cores
+test: setup  ## everything but Docker and what takes long, in seven minutes on two cores
 	@$(KERNELS)
 	$(BIN)/pytest -q -m "not docker and not long and not browser and not autopilot" -n 3 --dist loadfile --no-loadscope-reorder --durations=40
 
