@@ -68,7 +68,7 @@ class BenchmarkOptions:
     only: tuple[Section, ...] = tuple(SECTIONS)
     """Benchmarks to run."""
     quick: bool = False
-    """Run all benchmarks in two minutes with few repetitions, and write nothing."""
+    """Run all benchmarks in three minutes with few repetitions, and write nothing."""
 
 
 def main() -> int:
