@@ -118,9 +118,11 @@ def here() -> Iterator[None]:
 
 
 @pytest.fixture
-def unpainted(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Figures are saved as empty files: painting one takes a second or two."""
-    monkeypatch.setattr("matplotlib.figure.Figure.savefig", lambda *_, **__: None)
+def unpainted() -> Iterator[None]:
+    from helpers import without_painting
+
+    with without_painting():
+        yield
 
 
 @pytest.fixture

@@ -99,6 +99,14 @@ def until(holds: Callable[[], object], within_s: float = PATIENCE_S) -> None:
 
 
 @contextmanager
+def without_painting() -> Iterator[None]:
+    """Save no figure: painting one takes a second or two."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("matplotlib.figure.Figure.savefig", lambda *_, **__: None)
+        yield
+
+
+@contextmanager
 def interpreted() -> Iterator[None]:
     """Clients run as plain Python, as aboard, until the end of the block."""
     kernel.interpret_all()

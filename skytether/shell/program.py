@@ -73,7 +73,7 @@ class Program:
     outside: socket.socket
     """Connection to slirp4netns, a frame a packet."""
     guard: socket.socket
-    """Connection to the guard of slirp4netns."""
+    """Connection to the guard of slirp4netns, see `GUARDED`: readable once it has ended."""
     control: socket.socket
     """Connection to process 1 of the program's namespaces."""
     status: int | None = None

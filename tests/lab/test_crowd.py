@@ -12,6 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import warm
+from helpers import without_painting
 from skytether.__main__ import main
 from skytether.lab.commands import crowd as command
 from skytether.lab.crowd import EXACT, Crowd, CrowdPoint, FlownScheme, Scheme, judge, points_csv
@@ -109,11 +110,10 @@ def test_schemes_share_the_network_and_the_target() -> None:
 
 @pytest.mark.usefixtures("here")
 def test_it_writes_a_table_and_a_picture_and_goes_on(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     argv = ("crowd", "--out", str(tmp_path / "c"), "--schemes", "threshold", "budget", *FAST)
-    with monkeypatch.context() as unpainted:
-        unpainted.setattr("matplotlib.figure.Figure.savefig", lambda *_, **__: None)
+    with without_painting():
         assert main([*argv, "--limit", "5", "--vehicles", "1", "2"]) == 0
     said = capsys.readouterr().out
     assert "one budget for all vehicles: 2 vehicles fly, no more were tried" in said

@@ -12,7 +12,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from helpers import demo_with, refused_before_writing
+from helpers import demo_with, refused_before_writing, without_painting
 from skytether.__main__ import main
 from skytether.cli import fly
 from skytether.client.simulated.plant import FirstOrderPlant
@@ -422,11 +422,10 @@ SHORT = ["envelope", "demo-committed", "--duration", "2", "--settle", "0", "--wo
 
 @pytest.mark.usefixtures("here")
 def test_more_points_go_on_where_fewer_ended(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     once, twice = tmp_path / "once", tmp_path / "twice"
-    with monkeypatch.context() as unpainted:
-        unpainted.setattr("matplotlib.figure.Figure.savefig", lambda *_, **__: None)
+    with without_painting():
         main([*SHORT, "--runs", "5", "--out", str(once)])
         main([*SHORT, "--runs", "2", "--out", str(twice)])
     kept = (twice / "journal.jsonl").read_bytes()

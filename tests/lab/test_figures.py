@@ -86,7 +86,7 @@ def test_every_table_of_measurements_says_where_its_numbers_come_from(page: Path
 
 
 MINUTES = {"network-two-recorded", "network-5g", "tour-bytes"}
-"""Fast figures of several flights of minutes."""
+"""Figures of the kind `fast` that need several flights of minutes: the long tests make them."""
 FAST = [
     pytest.param(name, marks=[pytest.mark.long] if name in MINUTES else [])
     for name, each in REGISTER.items()

@@ -30,9 +30,9 @@ COUNTS = {
     "sealed": 500,
     "handshake": 3_000,
     "holder": 300,
-    "control": 70,
-    "recording": 40,
-    "scenario": 80,
+    "control": 150,
+    "recording": 100,
+    "scenario": 150,
     "files": 1_000,
     "feed": 5_000,
     "page": 300,
@@ -81,7 +81,7 @@ def test_seeds_are_messages_of_every_type(scenario: Scenario) -> None:
 def test_a_flight_goes_on_whatever_is_said_to_both_ends(scenario: Scenario) -> None:
     """Payloads pass the decoder and reach session and plausibility checks."""
     flight = EndpointInFlight(scenario)
-    attack(flight, 5_000)
+    attack(flight, 8_000)
     dropped = {*flight.server.dropped, *flight.client.dropped}
     assert dropped >= {Drop.UNKNOWN_SESSION, Drop.FOR_ANOTHER_LIFE}
     assert dropped & {Drop.FROM_THE_FUTURE, Drop.OBSERVATION, Drop.TOO_OLD}

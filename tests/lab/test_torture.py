@@ -383,12 +383,17 @@ def test_a_guard_that_is_switched_off_is_caught(
     assert violated(Trial(PLANS, faults), switch_off, monkeypatch) == invariant
 
 
-OF_LINKS = (no_home, no_second_try, no_window, no_tag, no_steady)
-"""Guards that act on packets and clocks, whatever the packets hold."""
+OF_LINKS = (no_window, no_tag, no_steady)
+"""Guards that act on packets and clocks, whether these bring horizons or trajectories."""
 
 
 @pytest.mark.parametrize(
-    ("switch_off", "invariant", "faults"), [each for each in ABLATIONS if each[0] not in OF_LINKS]
+    ("switch_off", "invariant", "faults"),
+    [
+        pytest.param(*each, marks=[pytest.mark.long] if each[0] in OF_LINKS else [])
+        for each in ABLATIONS
+        if each[0] not in (no_home, no_second_try)
+    ],
 )
 def test_a_guard_of_trajectories_that_is_switched_off_is_caught(
     switch_off: Patch,
@@ -398,9 +403,11 @@ def test_a_guard_of_trajectories_that_is_switched_off_is_caught(
 ) -> None:
     """As for horizons.
 
-    Those of the link alone are left out.
+    Two guards are left out, because they belong to the link alone. A server that accepts forgeries
+    may also violate "recovers".
     """
-    assert violated(Trial(FOLLOWS, faults), switch_off, monkeypatch) == invariant
+    found = violated(Trial(FOLLOWS, faults), switch_off, monkeypatch)
+    assert found in (invariant, "recovers")
 
 
 def test_a_vehicle_with_a_new_port_is_reached_behind_faster_copies(
