@@ -21,10 +21,15 @@ INSTALL = install() { \
 # Tests start hundreds of processes; none shall compile anew what another has.
 unexport PYTHONDONTWRITEBYTECODE
 
-# pytest compiles kernels before its first test, and rewrites the tests' asserts: not by each of its workers.
-KERNELS = $(BIN)/pytest --collect-only -qq >/dev/null
+# Kernels are compiled and the tests' asserts rewritten once, side by side, before workers need both.
+READY = $(BIN)/pytest --collect-only -qq >/dev/null & $(BIN)/python -P tests/warm_kernels.py; wait
+PYTEST = $(BIN)/pytest -q -p no:rerunfailures --durations=20
+TWO = -n 2 --dist loadfile --no-loadscope-reorder
+# One test at a time, nothing beside it; only in real time a test may try again, and says why.
+ALONE = $(BIN)/pytest -q -rsR --reruns 1 --rerun-show-tracebacks --durations=20
+VIRTUAL = not realtime and not docker and not browser and not autopilot
 
-.PHONY: help setup demo reproduce test long-test check format lock dist keys docs docker-test page-test autopilot-test bench figures fuzz clean
+.PHONY: help setup demo reproduce test realtime-test long-test nightly check format lock dist keys docs docker-test page-test autopilot-test bench figures fuzz clean
 
 help:  ## what can be made
 	@sed -n 's/^\([a-z-]*\):.*  ## \(.*\)/\1\t\2/p' $(MAKEFILE_LIST) | expand -t 16
@@ -53,13 +58,20 @@ demo: $(FLY)  ## fly the demonstration for three minutes, with a page to play wi
 reproduce: setup  ## the paper's table and figures, and more, in results/report.html (15 minutes)
 	$(BIN)/skytether reproduce --out results
 
-test: setup  ## everything but Docker and what takes long, in seven minutes on two cores
-	@$(KERNELS)
-	$(BIN)/pytest -q -m "not docker and not long and not browser and not autopilot" -n 3 --dist loadfile --no-loadscope-reorder --durations=40
+test: setup  ## behaviour, values and safeguards in virtual time, in four minutes on two cores
+	@$(READY)
+	$(PYTEST) -m "not long and $(VIRTUAL)" $(TWO)
 
-long-test: setup  ## the commands of the documents, benchmarks, and flights of many processes
-	@$(KERNELS)
-	$(BIN)/pytest -q -m "long and not docker and not browser and not autopilot" -n 4 --dist loadfile --no-loadscope-reorder --durations=40
+realtime-test: setup  ## what needs a real clock or several processes
+	@$(READY)
+	$(ALONE) -m "realtime and not long and not docker and not browser and not autopilot"
+
+long-test: setup  ## the commands of the documents, benchmarks and studies, in virtual time
+	@$(READY)
+	$(PYTEST) -m "long and $(VIRTUAL)" $(TWO)
+
+nightly: $(BENCH_STAMP) $(FUZZ_STAMP) $(DOCS_STAMP)  ## all that make test leaves out, and inputs nobody has tried; a table in nightly/
+	$(BIN)/python .ci/nightly
 
 check: setup  ## style, types, who imports whom, and the forge's files
 	$(BIN)/ruff format --check .
@@ -89,13 +101,12 @@ $(DOCS_STAMP): $(STAMP) locks/docs.lock
 	touch $@
 
 docker-test: setup  ## the three containers, and what they survive; needs a Docker engine
-	$(BIN)/pytest -q -rs -m docker
+	$(ALONE) -m docker
 
 page-test: setup  ## the page in a real browser; needs Chromium, says so where there is none
-	$(BIN)/pytest -q -rs -m browser
+	$(ALONE) -m browser
 
 autopilot-test: setup  ## actual autopilots in simulation: ARDUCOPTER=, PX4= name their programs
-	@$(KERNELS)
 	$(BIN)/pytest -q -rs -m autopilot
 
 bench: $(BENCH_STAMP)  ## every benchmark; the tables of docs/performance.md anew

@@ -6,8 +6,6 @@ import os
 import shutil
 import signal
 import socket
-import subprocess
-import sys
 import tempfile
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, Future
@@ -59,20 +57,6 @@ FIRST = (
 """Slowest files: they start first, so that no worker waits for them at the end."""
 
 
-COMPILE = """
-import skytether.quadrotor.loops, skytether.server.__main__, skytether.sim.flight
-from skytether.shared.base import kernel
-from skytether.shell import terminal
-terminal.prepare(kernel.missing())
-"""
-
-
-def pytest_sessionstart(session: pytest.Session) -> None:
-    """Compile the kernels of flights before the first test, for the sake of flights over UDP."""
-    if not hasattr(session.config, "workerinput"):
-        subprocess.run([sys.executable, "-P", "-c", COMPILE], check=True)
-
-
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     place = {name: number for number, name in enumerate(FIRST)}
     items.sort(key=lambda item: place.get(item.path.name, len(FIRST)))
@@ -86,6 +70,25 @@ def has_ipv6() -> bool:
     except OSError:
         return False
     return True
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_call(item: pytest.Item) -> Iterator[None]:
+    """A failure in real time says how late this machine woke a thread that only sleeps."""
+    if item.get_closest_marker("realtime") is None:
+        return (yield)
+    from skytether.cli.fleet import metronome
+
+    with metronome(0.01) as machine:
+        try:
+            return (yield)
+        except BaseException as error:
+            load = ", ".join(f"{each:.1f}" for each in os.getloadavg())
+            error.add_note(
+                f"this machine: a thread that only sleeps was woken {machine.max_s:.3f} s late at "
+                f"worst; load {load}"
+            )
+            raise
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:

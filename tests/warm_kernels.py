@@ -1,8 +1,16 @@
-"""Imports all kernels of flights once, for all processes that are forked afterwards."""
+"""Kernels of flights: imported, for all processes that are forked afterwards.
+
+As a program it compiles those that this machine lacks, before tests share its cores.
+"""
 
 import skytether.quadrotor.loops
-import skytether.server.endpoint  # noqa: F401 - they are its kernels
+import skytether.server.__main__
+import skytether.sim.flight  # noqa: F401 - they are the kernels of flights
 from skytether.shared.base import kernel
+from skytether.shell import terminal
 
 kernel.check_types()
-kernel.load()
+if __name__ == "__main__":
+    terminal.prepare(kernel.missing())
+else:
+    kernel.load()
