@@ -71,7 +71,7 @@ long-test: setup  ## the commands of the documents, benchmarks and studies, in v
 	$(PYTEST) -m "long and $(VIRTUAL)" $(TWO)
 
 nightly: $(BENCH_STAMP) $(FUZZ_STAMP) $(DOCS_STAMP)  ## all that make test leaves out, and inputs nobody has tried; a table in nightly/
-	$(BIN)/python .ci/nightly
+	bash -c '. .ci/tools; exec $(BIN)/python .ci/nightly.py'
 
 check: setup  ## style, types, who imports whom, and the forge's files
 	$(BIN)/ruff format --check .

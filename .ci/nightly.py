@@ -42,6 +42,10 @@ class Result:
     retried: int = 0
     skipped: int = 0
 
+    def row(self) -> list[str]:
+        numbers = (self.seconds, self.passed, self.failed, self.retried, self.skipped)
+        return [self.name, *(f"{each:.0f}" for each in numbers)]
+
 
 @dataclass
 class Part:
@@ -50,7 +54,7 @@ class Part:
     name: str
     command: str
     seconds: float | None = None
-    """Time over which new inputs are tried, one command after the other, each with a new seed [s]."""
+    """Time for which the command is repeated, each time with a new seed [s]; None: once."""
     counts: str = ""
     """Pattern of the number of inputs that a command tried."""
     keep: Callable[[str], None] = lambda _: None
@@ -82,7 +86,9 @@ def keep_attacks(said: str) -> None:
 
 def keep_inputs(said: str) -> None:
     found = re.findall(r"^(\w+), seed (\d+), input (\d+): ([0-9a-f]+)$", said, re.MULTILINE)
-    appended(CORPUS, "", [f"{target}-{seed}-{number} {text}" for target, seed, number, text in found])
+    appended(
+        CORPUS, "", [f"{target}-{seed}-{number} {text}" for target, seed, number, text in found]
+    )
 
 
 def write_digest() -> None:
@@ -193,52 +199,51 @@ def told(command: str, part: Part, file: object) -> tuple[int, str]:
     return process.returncode, "".join(said)
 
 
+OUTCOMES = {"passed": "passed", "failed": "failed", "rerun": "retried", "skipped": "skipped"}
+OUTCOMES |= {"error": "failed", "errors": "failed"}
+NOTHING_SELECTED = 5
+"""Exit code of pytest if no test was selected."""
+
+
 def count(result: Result, part: Part, said: str, code: int) -> None:
-    """Add what a command's output says to a part's result; its exit code where that says nothing."""
-    last = next((line for line in reversed(said.splitlines()) if re.search(r" in [\d.]+s", line)), "")
-    if last:
-        for number, word in re.findall(r"(\d+) (\w+)", last.partition(" in ")[0]):
-            match word:
-                case "passed":
-                    result.passed += int(number)
-                case "failed" | "error" | "errors":
-                    result.failed += int(number)
-                case "rerun":
-                    result.retried += int(number)
-                case "skipped":
-                    result.skipped += int(number)
-        if code not in (0, 5) and not result.failed:  # 5: no test was selected
-            result.failed += 1
+    """Add what a command has tried to a part's result, by pytest's last line or `part.counts`."""
+    summary = re.findall(r"^(.*\b\d+ \w+.*) in [\d.]+s\b.*$", said, re.MULTILINE)
+    if summary:
+        before = result.failed
+        for number, word in re.findall(r"(\d+) (\w+)", summary[-1]):
+            if name := OUTCOMES.get(word):
+                setattr(result, name, getattr(result, name) + int(number))
+        result.failed += code not in (0, NOTHING_SELECTED) and result.failed == before
         return
     tried = sum(map(int, re.findall(part.counts, said))) if part.counts else 1
-    bad = code != 0
-    result.failed += bad
-    result.passed += max(0, tried - bad)
+    result.failed += code != 0
+    result.passed += max(0, tried - (code != 0))
 
 
 def table(results: list[Result]) -> str:
-    rows = [("part", "seconds", "passed", "failed", "second tries", "skipped")]
-    rows += [
-        (each.name, *(str(round(n)) for n in (each.seconds, each.passed, each.failed, each.retried, each.skipped)))
-        for each in results
-    ]
-    total = Result("all")
+    sums = Result("all")
     for each in results:
         for name in ("seconds", "passed", "failed", "retried", "skipped"):
-            setattr(total, name, getattr(total, name) + getattr(each, name))
-    rows.append(
-        (total.name, *(str(round(n)) for n in (total.seconds, total.passed, total.failed, total.retried, total.skipped)))
-    )
-    rows.insert(1, ("---", "---:", "---:", "---:", "---:", "---:"))
+            setattr(sums, name, getattr(sums, name) + getattr(each, name))
+    rows = [
+        ["part", "seconds", "passed", "failed", "second tries", "skipped"],
+        ["---", *["---:"] * 5],
+        *(each.row() for each in (*results, sums)),
+    ]
     return "".join(f"| {' | '.join(row)} |\n" for row in rows)
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(prog="make nightly", description=__doc__)
     parser.add_argument(
-        "--seconds", type=float, default=400.0, help="time for each kind of new inputs [s] (%(default)g)"
+        "--seconds",
+        type=float,
+        default=400.0,
+        help="time for each kind of new inputs [s] (%(default)g)",
     )
-    parser.add_argument("--only", nargs="+", metavar="PART", help="parts to run, by the beginning of their names")
+    parser.add_argument(
+        "--only", nargs="+", metavar="PART", help="parts to run, by the beginning of their names"
+    )
     options = parser.parse_args()
     OUT.mkdir(exist_ok=True)
     results = []
