@@ -17,7 +17,7 @@ from typing import Any, NoReturn
 import pytest
 
 import warm
-from helpers import SKYTETHER, ran
+from helpers import PATIENCE_S, SKYTETHER, ran
 from robot import Live, free_port
 from skytether import __main__
 from skytether.__main__ import main
@@ -282,7 +282,7 @@ def test_the_documented_pages_are_served(
                     page.send_signal(signal.SIGINT)
                     break
             said.append(page.stdout.read())
-            assert page.wait(60) in (0, command.INTERRUPTED), said
+            assert page.wait(PATIENCE_S) in (0, command.INTERRUPTED), said
 
 
 @at_night_over_udp
