@@ -175,9 +175,7 @@ def test_no_output_is_an_input(
     assert {each.name for each in out.iterdir()} == {target.name}
 
 
-@pytest.mark.parametrize(
-    "option", ["fly --json", "report --html", "join --record", "torture --json"]
-)
+@pytest.mark.parametrize("option", ["fly --json", "join --record"])
 def test_nor_by_its_own_name(
     option: str, inputs: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -229,11 +227,7 @@ def locked(path: Path) -> Iterator[None]:
     ("argv", "name"),
     [
         (("fly", "demo", *SHORT, "--record"), "it.mcap"),
-        (("fly", "demo", *SHORT, "--json"), "it"),
-        (("fly", "demo", *SHORT, "--figure"), "it.png"),
         (("server", "demo", "--record"), "it"),
-        (("sweep", "demo", "--runs", "1", "--out"), "folder"),
-        (("margins", "demo", "--maps"), "folder"),
         (("export", "FLIGHT", "--csv"), "folder"),
     ],
     ids=lambda each: each if isinstance(each, str) else " ".join((each[0], each[-1])),
@@ -273,6 +267,7 @@ def test_a_new_file_is_locked_at_once_and_gone_where_nothing_was_written(tmp_pat
 
 
 @pytest.mark.long
+@pytest.mark.realtime
 def test_a_flight_that_is_killed_leaves_the_older_recording(
     recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -312,10 +307,8 @@ def room_for(size: int) -> Iterator[None]:
     ("argv", "name"),
     [
         (("fly", "demo", *SHORT, "--record"), "it.mcap"),
-        (("fly", "demo", *SHORT, "--figure"), "it.png"),
-        (("report", "FLIGHT", "--html"), "it.html"),
-        (("join", "FLIGHT", "FLIGHT", "--record"), "it.mcap"),
         (("export", "FLIGHT", "--pcap"), "it.pcap"),
+        pytest.param(("report", "FLIGHT", "--html"), "it.html", marks=pytest.mark.long),
     ],
     ids=lambda each: each if isinstance(each, str) else " ".join((each[0], each[-1])),
 )
