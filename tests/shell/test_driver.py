@@ -1,8 +1,22 @@
 """Driver: errors of an endpoint's code are logged, and the endpoint continues."""
 
+from types import SimpleNamespace
+
+import pytest
+
 from helpers import Idle
 from skytether.shared.core.events import Event, Fault, Flying
+from skytether.shell import driver, timer
 from skytether.shell.driver import Shell, run
+from virtual_loop import VirtualLoop
+
+
+@pytest.fixture(autouse=True)
+def _virtual(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(driver, "new_event_loop", VirtualLoop)
+    monkeypatch.setattr(driver, "make_timer", timer.LoopTimer)
+    nothing = SimpleNamespace(collect=lambda: 0, freeze=lambda: None)
+    monkeypatch.setattr(driver, "gc", nothing)  # takes half a second among tests
 
 
 class Faulty(Idle):

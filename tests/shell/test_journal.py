@@ -1,25 +1,26 @@
 """Journal of keys set in flight by an operator: it outlives the process, or is refused."""
 
 import json
-import threading
 from collections.abc import Callable
 from contextlib import closing, suppress
 from pathlib import Path
 from typing import Any
 from unittest import mock
 
+import msgspec
 import pytest
 
+from helpers import HandLoop
 from skytether.netem.proxy import Proxy
-from skytether.shared.core.change import Running
+from skytether.shared.core.change import Answer, Running
 from skytether.shared.core.events import Event, NotKept
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.schema import Scenario
-from skytether.shell import journal
+from skytether.shell import control, journal
 from skytether.shell.command import CommandError
-from skytether.shell.control import Caller, ControlError, controlled
-from skytether.shell.driver import Shell, run
+from skytether.shell.control import Caller, Control, answer_of, controlled
 from skytether.shell.journal import TakenUp, take_up
+from virtual_loop import AtOnce
 
 DEMO, SWAP = reading.load("demo"), reading.load("swap")
 BOX = "box(1, 2, 5, 6)"
@@ -34,26 +35,29 @@ def kept(folder: Path) -> Path:
     return folder / "netem.set"
 
 
-def driven(folder: Path, ask: Callable[[Caller], Any]) -> tuple[list[Any], list[Event]]:
-    """Answers to requests from a thread to a driven netem, and its events."""
-    answers, events = list[Any](), list[Event]()
-    taken_up = begun(folder)
+class Loop(HandLoop):
+    def call_soon_threadsafe(self, then: Callable[..., None], *rest: object) -> None:
+        then(*rest)
+
+
+def asked(folder: Path, *requests: dict[str, Any]) -> tuple[list[Answer], list[Event]]:
+    """Answers of a netem to requests, one after the other, and its events."""
+    taken_up, answers = begun(folder), list[Answer]()
     assert taken_up.journal
-    endpoint = Proxy(taken_up.scenario, server=("127.0.0.1", 1))
-
-    def operate() -> None:
-        with closing(Caller(folder / "netem")) as caller:
-            answers.append(ask(caller))
-        endpoint.finished = True  # type: ignore[misc]
-        with suppress(ControlError), closing(Caller(folder / "netem")) as caller:
-            caller.ask({})  # it checks once more whether it has ended
-
-    with controlled(folder / "netem", taken_up.journal.running(endpoint), taken_up.journal) as it:
-        thread = threading.Thread(target=operate)
-        shell = Shell(endpoint, ("127.0.0.1", 0), control=it)
-        run([shell], on_start=thread.start, on_event=events.append)
-        thread.join()
-    return answers, events
+    endpoint, loop = Proxy(taken_up.scenario, server=("127.0.0.1", 1)), Loop()
+    running = taken_up.journal.running(endpoint)
+    with (
+        controlled(folder / "netem", running, taken_up.journal) as it,
+        closing(Caller(folder / "netem")) as caller,
+    ):
+        assert it is not None
+        it.begin(loop, lambda: None)  # type: ignore[arg-type]
+        for request in requests:
+            caller._socket.send(msgspec.json.encode(request))
+            assert loop.look()
+            loop.pass_time()
+            answers.append(answer_of(caller._socket.recv(9000)))
+    return answers, list(endpoint.events())
 
 
 LOSSY = "paper(0.4, 0.02, 2.0) & loss({})".format
@@ -66,45 +70,47 @@ def write(folder: Path, scenario: Scenario, values: dict[str, object]) -> None:
 
 
 @pytest.fixture(autouse=True)
-def _ends(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Proxy, "finished", False)
+def _writes_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without a thread of its own."""
+    monkeypatch.setattr(control.threading, "Thread", AtOnce)
 
 
-@pytest.mark.long
-def test_what_is_set_is_on_the_disk_when_it_is_acknowledged(tmp_path: Path) -> None:
-    def ask(caller: Caller) -> Any:
-        caller.ask({"network.uplink.loss": 0.25})
-        caller.ask({"network.downlink.loss": 0.5})
-        return json.loads(kept(tmp_path).read_bytes())["values"]
+def test_what_is_set_is_on_the_disk_when_it_is_acknowledged(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found, answer = [], Control._answer
 
-    answers, _ = driven(tmp_path, ask)
-    assert answers == [{"network.uplink": LOSSY(0.25), "network.downlink": LOSSY(0.5)}]
+    def watched(it: Control, text: bytes, sender: Any) -> None:
+        found.append(json.loads(kept(tmp_path).read_bytes())["values"])
+        answer(it, text, sender)
+
+    monkeypatch.setattr(Control, "_answer", watched)
+    asked(tmp_path, {"network.uplink.loss": 0.25}, {"network.downlink.loss": 0.5})
+    first = {"network.uplink": LOSSY(0.25)}
+    assert found == [first, first | {"network.downlink": LOSSY(0.5)}]
     assert kept(tmp_path).stat().st_mode & 0o777 == 0o600
 
 
 def test_what_was_set_is_in_force_again_after_a_restart_and_said(tmp_path: Path) -> None:
-    driven(tmp_path, lambda caller: caller.ask({"network.uplink.loss": 0.25}))
+    asked(tmp_path, {"network.uplink.loss": 0.25})
     _, scenario, news = begun(tmp_path)
     assert scenario.network.uplink == LOSSY(0.25)
     said = str(news[0])
     assert said.startswith("set in flight and in force again, from ")
     assert said.endswith(f": network.uplink = '{LOSSY(0.25)}'")
-    answers, _ = driven(
-        tmp_path,
-        lambda caller: (caller.ask({"network.downlink.loss": 0.5}), caller.ask({}).values)[1],
-    )
-    assert answers[0]["network.uplink"] == LOSSY(0.25)
+    (_, answer), _ = asked(tmp_path, {"network.downlink.loss": 0.5}, {})
+    assert answer.values["network.uplink"] == LOSSY(0.25)
     assert begun(tmp_path).scenario.network.downlink == LOSSY(0.5)
 
 
 def test_what_is_refused_is_not_kept(tmp_path: Path) -> None:
-    driven(tmp_path, lambda caller: caller.ask({"network.uplink.loss": 2}))
+    asked(tmp_path, {"network.uplink.loss": 2})
     assert not kept(tmp_path).exists()
     assert begun(tmp_path).news == []
 
 
 def test_a_person_begins_a_new_flight_without_it(tmp_path: Path) -> None:
-    driven(tmp_path, lambda caller: caller.ask({"network.uplink.loss": 0.25}))
+    asked(tmp_path, {"network.uplink.loss": 0.25})
     assert begun(tmp_path, new_flight=True).scenario == DEMO
     assert not kept(tmp_path).exists()
 
@@ -156,7 +162,6 @@ def test_one_of_another_flight_is_refused_in_words(
     assert refused.value.code == 2
 
 
-@pytest.mark.long
 def test_where_nothing_can_be_written_the_operator_hears_that_it_is_forgotten(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -164,12 +169,11 @@ def test_where_nothing_can_be_written_the_operator_hears_that_it_is_forgotten(
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(journal.Journal, "write", full)
-    answers, events = driven(
-        tmp_path, lambda caller: caller.ask({"network.uplink.loss": 0.25}).refused
-    )
-    assert answers == [
+    (answer, again), events = asked(tmp_path, {"network.uplink.loss": 0.25}, {})
+    assert answer.refused == (
         "it is in force, but will be lost when the process restarts: No space left on device"
-    ]
+    )
+    assert again.values["network.uplink"] == LOSSY(0.25)
     assert NotKept(reason="No space left on device") in events
 
 

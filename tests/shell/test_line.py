@@ -1,4 +1,4 @@
-"""Lines to a vehicle's own hardware: their texts, and real UDP, TCP and serial ports."""
+"""Lines to a vehicle's own hardware: their texts, and UDP, TCP and serial ports in virtual time."""
 
 import asyncio
 import os
@@ -14,8 +14,9 @@ from helpers import Idle
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.core.endpoint import Address, Datagram, Endpoint
 from skytether.shared.core.line import LINE, Line, parse_line
-from skytether.shell.driver import Shell, new_event_loop
+from skytether.shell.driver import Shell
 from skytether.shell.udp import AddressError
+from virtual_loop import run_virtually
 
 
 @pytest.mark.parametrize(
@@ -59,8 +60,10 @@ class Echo(Idle):
 
 
 def drive(coroutine: Any) -> Any:
-    with asyncio.Runner(loop_factory=new_event_loop) as runner:
-        return runner.run(asyncio.wait_for(coroutine, 180))
+    async def within_time() -> Any:
+        return await asyncio.wait_for(coroutine, 180)
+
+    return run_virtually(within_time)
 
 
 def shell(endpoint: Endpoint, line: str) -> Shell:
@@ -127,11 +130,11 @@ def test_a_rate_that_no_port_has_is_refused() -> None:
 def test_udp_listens_or_speaks_first(kind: str) -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as autopilot:
         autopilot.bind(("127.0.0.1", 0))
-        autopilot.settimeout(180)
+        autopilot.setblocking(False)
         host, port = autopilot.getsockname()
 
         async def main() -> bytes:
-            echo = Echo(b"fly")
+            echo, loop = Echo(b"fly"), asyncio.get_running_loop()
             if kind == "udp":
                 driven = shell(echo, "udp:127.0.0.1:0")
                 there = driven._sockets[1].getsockname()
@@ -140,11 +143,10 @@ def test_udp_listens_or_speaks_first(kind: str) -> None:
                 echo.send(b"hello", (host, port), 1)
             running = asyncio.create_task(driven.run())
             if kind == "udpout":
-                await asyncio.sleep(0)
-                hello, there = await asyncio.to_thread(autopilot.recvfrom, 100)
+                hello, there = await loop.sock_recvfrom(autopilot, 100)
                 assert hello == b"hello"
             autopilot.sendto(b"fly", there)
             await running
-            return autopilot.recv(100)
+            return await loop.sock_recv(autopilot, 100)
 
         assert drive(main()) == b"fly"

@@ -1,6 +1,7 @@
 """Paths: their texts, their sockets, and what becomes of interfaces and addresses that are down."""
 
 import asyncio
+import errno
 import os
 import shutil
 import socket
@@ -9,6 +10,7 @@ import sys
 from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import ExitStack, asynccontextmanager, contextmanager
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -16,9 +18,11 @@ from helpers import LOOPBACK, Idle, ran
 from skytether.shared.core.endpoint import PATH_SOCKETS, Address, Datagram
 from skytether.shared.core.events import Event, HostFound, HostMissing, PathFound, PathMissing
 from skytether.shell import driver, udp
+from skytether.shell import paths as path_sockets
 from skytether.shell.driver import Shell
 from skytether.shell.paths import NetworkPath, parse_path
 from skytether.shell.udp import AddressError
+from virtual_loop import AtOnce, virtually
 
 GROUND = ("ground", 47000)
 NONE_HERE = "none-here"
@@ -111,6 +115,7 @@ def calling(*paths: NetworkPath, is_patient: bool = False) -> tuple[Calling, She
 
 
 @pytest.mark.ipv6
+@virtually
 async def test_each_path_goes_from_its_address_to_a_socket_of_the_server() -> None:
     """Three addresses of both families at the server, three paths of the client."""
     server = Shell(Answering(), [("127.0.0.1", 0), ("::1", 0), ("127.0.0.2", 0)])
@@ -131,6 +136,7 @@ async def test_each_path_goes_from_its_address_to_a_socket_of_the_server() -> No
     assert client.failed == []
 
 
+@virtually
 async def test_a_name_is_looked_up_in_the_family_of_the_local_address(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -148,6 +154,7 @@ async def test_a_name_is_looked_up_in_the_family_of_the_local_address(
     assert {(sender, number) for _, sender, number in client.heard} == {(peer, 0), (peer, 2)}
 
 
+@virtually
 async def test_a_path_whose_interface_is_not_there_fails_alone() -> None:
     server = Shell(Answering(), LOOPBACK)
     absent = NetworkPath(NONE_HERE, server.address)
@@ -163,6 +170,39 @@ async def test_a_path_whose_interface_is_not_there_fails_alone() -> None:
     assert told.path == str(absent)
 
 
+@virtually
+async def test_a_path_gets_a_new_socket_whenever_its_interface_is_back(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Checked each second: a socket stays bound to an interface that was removed."""
+    server, real, index = Shell(Answering(), LOOPBACK), udp.open_socket, 0
+
+    def index_now(_: str) -> int:
+        if not index:
+            raise OSError(errno.ENODEV, "No such device")
+        return index
+
+    def open_socket(bind: Address, interface: str = "") -> socket.socket:
+        if interface and not index:
+            raise AddressError("No such device")
+        return real(bind)
+
+    monkeypatch.setattr(path_sockets, "open_socket", open_socket)
+    monkeypatch.setattr(path_sockets.socket, "if_nametoindex", index_now)
+    client, shell = calling(NetworkPath(NONE_HERE, server.address), NetworkPath("", server.address))
+    bound = set[Address]()
+    async with running(server, shell) as events:
+        await once(lambda: client.failed)
+        for index in (7, 0, 9):
+            await asyncio.sleep(2 * driver.CHECK_PATHS_EVERY_S)
+            client.heard.clear()
+            await asyncio.sleep(0.1)
+            assert ({number for *_, number in client.heard} >= {0, 2}) or not index
+            bound.add(shell.addresses[0])
+    assert [type(event) for event in events] == [PathMissing, PathFound, PathMissing, PathFound]
+    assert len(bound) == 2
+
+
 @pytest.mark.parametrize("local", [NONE_HERE, "192.0.2.250"])
 def test_the_only_path_must_be_there_at_the_start(local: str) -> None:
     with pytest.raises(AddressError, match=local):
@@ -175,10 +215,11 @@ def test_both_ends_of_a_path_are_of_one_family() -> None:
         calling(NetworkPath("127.0.0.1", ("::1", 9)), NetworkPath("", ("::1", 9)))
 
 
+@virtually
 async def test_a_path_with_a_name_found_late_moves_to_its_family(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("skytether.shell.driver.RESOLVE_EVERY_S", 0.05)
+    monkeypatch.setattr(driver, "threading", SimpleNamespace(Thread=AtOnce))
     server, found = Shell(Answering(), ("::1", 0)), list[Address]()
 
     def look_up(_: Address, _family: int) -> Address:
@@ -306,6 +347,7 @@ def in_a_namespace(*argv: str) -> "subprocess.CompletedProcess[str]":
 
 
 @pytest.mark.long
+@pytest.mark.realtime
 @pytest.mark.skipif(sys.platform != "linux", reason="has no network namespaces")
 @pytest.mark.parametrize("local", ["modem", "198.51.100.1"])
 def test_a_path_works_again_after_its_interface_was_away(local: str) -> None:
