@@ -17,7 +17,7 @@ checked, in any module, so that no outdated machine code is used.
 import hashlib
 import inspect
 import linecache
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
 from importlib import import_module
@@ -230,13 +230,27 @@ def _type(hint: Any) -> Any:
 
 def part(function: F) -> F:
     """Function called by kernels, for example once per vehicle or axis; it creates no arrays."""
-    compiled: F = numba.njit(error_model="numpy", _nrt=False)(function)
-    return compiled
+    return _for_any_constant(numba.njit(error_model="numpy", _nrt=False)(function))
 
 
 def making_part(function: F) -> F:
-    compiled: F = numba.njit(error_model="numpy")(function)
-    return compiled
+    return _for_any_constant(numba.njit(error_model="numpy")(function))
+
+
+def _for_any_constant(dispatcher: Any) -> Any:
+    """Part that is compiled once for all values of a constant argument.
+
+    Numba would compile it, and all that it calls, once for each constant that a caller passes,
+    which took 24 s of CPU instead of 15 for `server.mpc.hierarchical`.
+    """
+    whole = dispatcher.get_call_template
+
+    def template(args: Sequence[Any], keywords: Mapping[str, Any]) -> Any:
+        named = {name: numba.types.unliteral(kind) for name, kind in keywords.items()}
+        return whole(tuple(map(numba.types.unliteral, args)), named)
+
+    dispatcher.get_call_template = template
+    return dispatcher
 
 
 class Disjoint(compiler.Compiler):  # type: ignore[misc]
@@ -256,8 +270,8 @@ def lanes(function: F) -> F:
 
     No two of its arrays may share memory, unless both are only read.
     """
-    compiled: F = numba.njit(error_model="numpy", _nrt=False, pipeline_class=Disjoint)(function)
-    return compiled
+    options = {"error_model": "numpy", "_nrt": False, "pipeline_class": Disjoint}
+    return _for_any_constant(numba.njit(**options)(function))
 
 
 def inline(function: F) -> F:
