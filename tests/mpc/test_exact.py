@@ -1,8 +1,5 @@
 """Exact solver: accurate to rounding, independent of earlier problems, never a wrong answer."""
 
-from collections.abc import Callable
-from functools import cache
-from types import FunctionType
 from typing import Any
 
 import msgspec
@@ -25,7 +22,6 @@ from skytether.server.mpc.problem import (
     set_previous,
     simd_batch,
 )
-from skytether.shared.base.kernel import part
 from skytether.shared.law.model import Array
 from skytether.shared.scenario import reading
 
@@ -49,18 +45,17 @@ ROUGH = {"dt": 0.1, "horizon": 30, "input_weight": 1e-3, "state_weight": (10.0, 
 """Long steps and hardly any weight of the input: active sets cycle."""
 
 
-@cache
-def active_sets_with(**constants: float) -> Callable[..., int]:
-    names = {**vars(exact), **constants}
-    first = exact.lanes(FunctionType(exact._first_set.py_func.__code__, names))
-    return part(FunctionType(exact.active_sets.py_func.__code__, {**names, "_first_set": first}))
-
-
 @pytest.fixture
-def no_pivots(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Cycling active sets are given up at once."""
-    changed = {**vars(exact), "active_sets": active_sets_with(PIVOTS_MAX=0)}
-    monkeypatch.setattr(exact, "_solve", FunctionType(exact._solve.py_func.__code__, changed))
+def gives_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The active set of every third axis is given up, as if it had cycled to the end."""
+    solve = exact._solve
+
+    def impatient(*given: Any) -> None:
+        *_, settled = given
+        solve(*given)
+        settled[::3] = False
+
+    monkeypatch.setattr(exact, "_solve", impatient)
 
 
 def problems(problem: Problem, count: int, scale: float, seed: int) -> tuple[Array, Array]:
@@ -79,14 +74,13 @@ def residual(problem: Problem, inputs: Array, gradient: Array) -> float:
     return float((np.abs(wrong) / (1.0 + np.abs(gradient).max(axis=2, keepdims=True))).max())
 
 
-@pytest.mark.parametrize("horizon", [1, 2, 40, 100])
-@pytest.mark.parametrize("scale", [0.1, 1.0, 10.0])
+@pytest.mark.parametrize(("horizon", "scale"), [(1, 10.0), (2, 1.0), (40, 1.0), (100, 1.0)])
 def test_it_equals_an_independent_reference(horizon: int, scale: float) -> None:
     problem = make(horizon=horizon)
-    gradient, guess = problems(problem, 20, scale, seed=horizon)
+    gradient, guess = problems(problem, 4, scale, seed=horizon)
     inputs, solved = ExactSolver(problem).solve(gradient, guess)
     assert solved.all()
-    for n in range(20):
+    for n in range(4):
         for axis, bound in enumerate(U_MAX):
             root = np.linalg.cholesky(problem.hessian[axis])
             aim = -np.linalg.solve(root, gradient[n, axis])
@@ -113,24 +107,19 @@ def test_every_answer_is_optimal_and_within_its_box(
     assert residual(problem, inputs, gradient) < 1e-10
 
 
-@pytest.mark.long
-@pytest.mark.parametrize(("pivots", "fewest", "most"), [(True, 0, 5), (False, 100, 600)])
-def test_problems_that_cycle_are_solved_all_the_same(
-    request: pytest.FixtureRequest, pivots: bool, fewest: int, most: int
-) -> None:
-    if not pivots:
-        request.getfixturevalue("no_pivots")
+def test_problems_that_cycle_are_solved_all_the_same() -> None:
+    """By changing one input per iteration: without that, more than 100 are left to DAQP."""
     problem = make((0.4, 0.6), **ROUGH)
     gradient, guess = problems(problem, 300, 3.0, seed=1)
     solver = ExactSolver(problem)
     inputs, solved = solver.solve(gradient, guess)
     assert solved.all()
-    assert fewest <= solver.fallbacks <= most
+    assert solver.fallbacks <= 5
     assert (np.abs(inputs) <= U_MAX[:, None]).all()
     assert residual(problem, inputs, gradient) < 1e-10
 
 
-@pytest.mark.usefixtures("no_pivots")
+@pytest.mark.usefixtures("gives_up")
 def test_an_input_that_daqp_leaves_just_inside_its_bound_is_at_it(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -151,7 +140,7 @@ def test_an_input_that_daqp_leaves_just_inside_its_bound_is_at_it(
     assert residual(problem, inputs, gradient) < 1e-10
 
 
-@pytest.mark.usefixtures("no_pivots")
+@pytest.mark.usefixtures("gives_up")
 def test_without_the_fallback_such_problems_fail_and_are_not_guessed(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -172,7 +161,10 @@ def test_without_the_fallback_such_problems_fail_and_are_not_guessed(
 
 @pytest.mark.long
 def test_a_horizon_rounded_to_float32_keeps_its_active_set() -> None:
-    """Warm start of every saturated flight: one round, although 1.8 became 1.7999999."""
+    """Warm start of every saturated flight: one round, although 1.8 became 1.7999999.
+
+    From a horizon further inside its bounds it takes more.
+    """
     problem = make((0.855, 0.855), (1.8, 1.8))
     gradient, guess = problems(problem, 20, 10.0, seed=6)
     inputs, _ = ExactSolver(problem).solve(gradient, guess)
@@ -182,16 +174,15 @@ def test_a_horizon_rounded_to_float32_keeps_its_active_set() -> None:
     work, settled = workspace(problem.mpc), np.ones(1, dtype=np.bool_)
     simd = simd_batch(work.memory)
 
-    def rounds(solve: Callable[..., int], at: tuple[int, ...]) -> int:
-        set_previous(rounded[at], 0, False, simd, 0)
+    def rounds(previous: Array, at: tuple[int, ...]) -> int:
+        set_previous(previous, 0, False, simd, 0)
         simd.gradient[:, 0] = gradient[at]
-        return solve(problem.mpc, at[1], LATER, simd, work.free, settled)
+        return int(active_sets(problem.mpc, at[1], LATER, simd, work.free, settled))
 
     for at in np.ndindex(20, 2):
-        assert rounds(active_sets, at) == 1
+        assert rounds(rounded[at], at) == 1
         np.testing.assert_array_equal(simd.inputs[:, 0], inputs[at])
-    strict = active_sets_with(NEAR=1.0)
-    assert max(rounds(strict, at) for at in np.ndindex(20, 2)) > 1
+    assert max(rounds(0.9 * rounded[at], at) for at in np.ndindex(20, 2)) > 1
 
 
 def test_osqp_agrees_to_its_tolerance() -> None:

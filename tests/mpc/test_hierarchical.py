@@ -168,10 +168,9 @@ class OnPaper:
         return np.array(answers)
 
 
-@pytest.mark.long
 def test_planner_solves_the_papers_two_problems() -> None:
     planner, paper, wind = make(), OnPaper(), np.array([0.1, -0.2])
-    for step in (0, 1, 2, 5, 6, 6 + H, 7 + 2 * H, 8 + 2 * H):
+    for step in (0, 1, 3, 3 + H, 4 + 2 * H):
         found = seen(elsewhere(step)[None])
         found.disturbance[:] = wind
         made = plan(planner, np.array([0]), np.array([step]), found)
@@ -322,7 +321,7 @@ def test_figures_are_what_they_are_called(seed: int, gap: int, d: int) -> None:
     np.testing.assert_array_equal(made.horizons[:, :, d : d + H], made.tracked)
 
 
-@pytest.mark.parametrize("shares", [(0.0, 0.0), (0.1, 0.05), (0.2, 0.0), (0.3, 0.7)])
+@pytest.mark.parametrize("shares", [(0.0, 0.0), (0.1, 0.05), (0.3, 0.7)])
 def test_expected_gap_weighs_what_flying_on_costs_where_packets_are_lost(
     shares: tuple[float, float],
 ) -> None:
@@ -344,7 +343,7 @@ def test_expected_gap_weighs_what_flying_on_costs_where_packets_are_lost(
     assert figures["expected_gap"] == pytest.approx(expected, rel=1e-4)
 
 
-@pytest.mark.parametrize("flown", [0, 1, H - 3, H])
+@pytest.mark.parametrize("flown", [0, H - 3, H])
 def test_inputs_that_are_never_flown_are_not_compared(flown: int) -> None:
     rng, rows = np.random.default_rng(7), np.array([0])
     first, found = crowd(rng, np.array([0])), crowd(rng, np.array([0]))
@@ -417,9 +416,8 @@ PREDICTIVE = {**ROUGH["control"], "scheme": "predictive", "trigger": "always"}
     ],
 )
 @pytest.mark.parametrize("leaves", [False, True])
-@pytest.mark.parametrize("seed", range(3))
 def test_compiled_pass_has_the_bits_of_the_moves_around_a_solver(
-    monkeypatch: pytest.MonkeyPatch, scenario: Scenario, seed: int, leaves: bool
+    monkeypatch: pytest.MonkeyPatch, scenario: Scenario, leaves: bool
 ) -> None:
     """Over new vehicles, gaps of all lengths, disturbances, and NaN estimates.
 
@@ -427,12 +425,12 @@ def test_compiled_pass_has_the_bits_of_the_moves_around_a_solver(
     """
     if leaves:
         monkeypatch.setattr(skytether.server.mpc.hierarchical, "_plan", leaving)
-    rng, capacity = np.random.default_rng(seed), 40
+    rng, capacity = np.random.default_rng(0), 30
     compiled = make(capacity, scenario)
     with listening() as listeners:
         around = make(capacity, scenario)
     starts, unsolved, fresh = rng.integers(100, 2000, capacity), 0, 0
-    for _ in range(25):
+    for _ in range(12):
         rows = rng.permutation(capacity)[: rng.integers(1, capacity + 1)]
         starts[rows] += rng.choice([0, 1, 2, 7, H, H + 1, 40], len(rows))
         for row in rng.permutation(capacity)[:2]:

@@ -30,7 +30,7 @@ from skytether.server.mpc.problem import (
 from skytether.shared.law.model import Array, discretise
 from skytether.shared.scenario.schema import ControlConfig, ModelConfig, Scenario
 
-quick = settings(max_examples=40)
+quick = settings(max_examples=15)
 
 TAU_S = (0.81, 0.3)
 TWO_TAUS = discretise(TAU_S, 0.05)
@@ -89,7 +89,6 @@ def situation(seed: int, H: int, axes: int = 2, size: float = 1.0) -> tuple[Arra
     return size * x, size * target, size * rng.normal(size=(axes, H))
 
 
-@pytest.mark.long
 @quick
 @given(st.integers(0, 2**32 - 1), st.integers(1, 50), st.booleans())
 def test_qp_ranks_any_two_plans_as_the_printed_cost(
@@ -166,10 +165,8 @@ def test_prediction_is_the_model_flown_step_by_step(seed: int, H: int, axes: int
 
 CASES = [
     pytest.param(H, size, S, reference, id=f"H={H}-{name}-S={S}-{'E7' if reference else 'literal'}")
-    for H in (1, 40, 100)
+    for H, S, reference in ((1, 0.5, True), (40, 0.0, False), (40, 0.5, True), (100, 0.5, False))
     for name, size in (("free", 0.02), ("bound", 3.0))
-    for S in (0.0, 0.5)
-    for reference in (False, True)
 ]
 
 

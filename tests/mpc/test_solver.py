@@ -13,7 +13,7 @@ from skytether.server.mpc.solver import Solver, SolverFailed
 from skytether.shared.law.model import Array
 from skytether.shared.scenario.schema import ControlConfig, ModelConfig, Scenario
 
-quick = settings(max_examples=40)
+quick = settings(max_examples=15)
 
 H = 20
 SCENARIO = Scenario(
@@ -62,8 +62,7 @@ def test_answers_never_leave_the_box(make: type[Solver], seed: int, size: float)
     assert (np.abs(u) <= U_MAX[:, None]).all()
 
 
-@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
-@pytest.mark.parametrize("axis", [0, 1])
+@pytest.mark.parametrize(("axis", "bad"), [(0, np.nan), (1, np.inf)])
 def test_bad_gradient_fails_its_own_vehicle_alone(
     make: type[Solver], axis: int, bad: float
 ) -> None:
