@@ -12,24 +12,15 @@ from pathlib import Path
 import pytest
 
 import skytether
-from helpers import ran
+from helpers import ran, refused
 from skytether.__main__ import COMMANDS
 from skytether.shared.base import extras
 from skytether.shared.base.extras import MODULES
 
-ALL = [
-    "server",
-    "mavlink",
-    "ros2",
-    "page",
-    "plot",
-    "record",
-    "pandas",
-    "parquet",
-    "cluster",
-    "gym",
-    "lab",
-]
+ALL = (
+    *("server", "mavlink", "ros2", "page", "plot", "record", "pandas", "parquet", "cluster"),
+    *("gym", "lab"),
+)
 LAB = (
     *("crowd", "sweep", "envelope", "margins", "identify", "torture", "adversary", "reproduce"),
     *("compare", "calibrate"),
@@ -115,7 +106,7 @@ def _imports(tree: ast.AST) -> Iterator[str]:
 @pytest.mark.parametrize(
     "command",
     [
-        pytest.param(name, marks=() if name in ("client", "netem", "fly") else pytest.mark.long)
+        pytest.param(name, marks=() if name in ("client", "fly") else pytest.mark.long)
         for name in NEEDS
         if name not in LAB[1:]
     ],
@@ -129,29 +120,39 @@ def test_a_command_runs_with_what_it_needs_and_names_what_it_misses(command: str
     assert (shown.returncode, shown.stderr) == (0, "")
     if not NEEDS[command]:
         return
-    refused = run([command, "--help"], ())
+    missing = run([command, "--help"], ())
     lines = {
         refusal(command, module, extra) for extra in NEEDS[command] for module in packages(extra)
     }
-    assert (refused.returncode, refused.stdout) == (2, "")
-    assert refused.stderr in lines
+    assert (missing.returncode, missing.stdout) == (2, "")
+    assert missing.stderr in lines
 
 
 @pytest.mark.parametrize(
-    ("argv", "installed", "extra"),
+    ("argv", "module", "extra"),
     [
-        (["fly", "--virtual", "--figure", "a.png"], ("server",), "plot"),
-        (["fly", "--virtual", "--record", "a.mcap"], ("server",), "record"),
-        (["fleet", "--virtual", "--figure", "a.png"], ("server",), "plot"),
-        (["export", "a.mcap", "--parquet", "tables"], ("record",), "parquet"),
+        (["fly", "--virtual", "--figure", "a.png"], "matplotlib", "plot"),
+        (["fleet", "--virtual", "--figure", "a.png"], "matplotlib", "plot"),
+        (["export", "a.mcap", "--parquet", "tables"], "pyarrow", "parquet"),
     ],
 )
 def test_an_option_names_the_extra_that_it_misses_before_anything_flies(
-    argv: list[str], installed: tuple[str, ...], extra: str
+    argv: list[str],
+    module: str,
+    extra: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
 ) -> None:
-    refused = run(argv, installed)
-    assert (refused.returncode, refused.stdout) == (2, "")
-    assert refused.stderr in {refusal(argv[0], module, extra) for module in packages(extra)}
+    for name in [name for name in sys.modules if name.partition(".")[0] == module]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, module, None)
+    assert f"{refused(argv, capfd)}\n" == refusal(argv[0], module, extra)
+
+
+def test_a_recording_names_the_extra_that_it_misses_before_anything_flies() -> None:
+    missing = run(["fly", "--virtual", "--record", "a.mcap"], ("server",))
+    assert (missing.returncode, missing.stdout) == (2, "")
+    assert missing.stderr in {refusal("fly", module, "record") for module in packages("record")}
 
 
 def test_a_library_call_names_the_extra_too(monkeypatch: pytest.MonkeyPatch) -> None:

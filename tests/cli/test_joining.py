@@ -119,6 +119,7 @@ def test_what_is_not_of_one_flight_is_refused(
 
 
 @pytest.mark.long
+@pytest.mark.realtime
 def test_a_flight_by_hand_is_recorded_and_joined(
     start: Callable[..., Process], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -30,46 +30,45 @@ from skytether.shared.core.events import (
 )
 from skytether.shared.scenario.reading import load
 from skytether.shared.telemetry.record import PACKET_COLUMNS, Recorder, server_columns
-from skytether.shell.command import CommandError
+from skytether.shell.command import CommandError, flight_warnings
 from skytether.shell.log import LogLine
 from warm import Process
 
 
+@pytest.mark.realtime
 async def test_a_child_is_known_by_its_events() -> None:
+    """One of two servers, at an address that others reach, for a scenario without a failsafe."""
     heard: list[LogLine] = []
-    argv = ("demo", "--bind", "0.0.0.0:0", "--insecure")
-    async with started("server", *argv, on_event=heard.append) as server:
+    argv = ("paper", "--bind", "0.0.0.0:0", "--insecure", "--metrics", "0.0.0.0:0")
+    async with started("server 2", *argv, on_event=heard.append) as server:
         host, port = server.address
         assert (host, port > 0) == ("0.0.0.0", True)
-    assert [type(line.event) for line in heard] == [Listening, Plaintext, Counted]
+    kinds = [Listening, Plaintext, Measured, NoFailsafe, Counted]
+    assert [type(line.event) for line in heard] == kinds
+    assert {line.process for line in heard} == {"server 2"}
+    assert [getattr(line.event, "local", None) for line in heard[1:3]] == [False, False]
     assert server.process.returncode == 0
-    assert server.last_words().startswith("server: PLAINTEXT, no keys: anybody on the network")
+    assert server.last_words() == f"server 2: {NoFailsafe()}"
 
 
-@pytest.mark.parametrize("scenario", ["paper", "demo"])
-@pytest.mark.parametrize("name", ["server", "client", "netem"])
-def test_a_scenario_without_a_failsafe_is_warned_of(
-    name: str, scenario: str, start: Callable[..., Process]
+def test_a_scenario_without_a_failsafe_is_warned_of() -> None:
+    assert flight_warnings(load("paper")) == [NoFailsafe()]
+    assert flight_warnings(load("demo")) == []
+
+
+@pytest.mark.long
+@pytest.mark.realtime
+def test_a_vehicle_without_a_failsafe_is_warned_of_and_netem_flies_none(
+    start: Callable[..., Process],
 ) -> None:
-    """`paper` has no failsafe, `demo` has one, and netem flies nothing."""
-    place = ("--server", "127.0.0.1:9") if name == "client" else ("--bind", "127.0.0.1:0")
-    process = start(name, scenario, *place, "--log", "json")
-    process.address()
-    process.end()
-    warned = NoFailsafe() in process.events()
-    assert warned == (scenario == "paper" and name != "netem")
+    for name, expected in (("client", True), ("netem", False)):
+        process = start(name, "paper", "--server", "127.0.0.1:9", "--log", "json")
+        process.address()
+        process.end()
+        assert (NoFailsafe() in process.events()) is expected
 
 
-async def test_metrics_that_others_can_read_are_warned_of() -> None:
-    for host, local in (("127.0.0.1", True), ("0.0.0.0", False)):
-        heard: list[LogLine] = []
-        argv = ("demo", "--bind", "127.0.0.1:0", "--metrics", f"{host}:0")
-        async with started("netem", *argv, on_event=heard.append):
-            pass
-        (told,) = [line.event for line in heard if isinstance(line.event, Measured)]
-        assert (told.host, told.local) == (host, local)
-
-
+@pytest.mark.realtime
 @pytest.mark.ipv6
 async def test_a_child_may_listen_on_ipv6() -> None:
     argv = ("demo", "--bind", "[::1]:0", "--server", "[::1]:9")
@@ -83,6 +82,7 @@ async def test_a_child_that_cannot_start_says_why() -> None:
             pass
 
 
+@pytest.mark.realtime
 async def test_a_child_that_is_killed_is_said_to_be() -> None:
     async with started("netem", "demo", "--bind", "127.0.0.1:0") as netem:
         os.kill(netem.process.pid, signal.SIGKILL)
@@ -90,6 +90,7 @@ async def test_a_child_that_is_killed_is_said_to_be() -> None:
     assert netem.last_words() == "netem: ended by a signal: Killed"
 
 
+@pytest.mark.realtime
 async def test_a_child_whose_record_is_incomplete_has_told_so(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -159,14 +160,6 @@ def test_the_record_has_the_rows_of_both_servers_in_order(tmp_path: Path) -> Non
     assert record.figures == {"server": {"vehicles": 1}, "server 2": {"vehicles": 1}}
     feeds = set(feeds_in(tmp_path, scenario, standby=True))
     assert feeds == {"client", "server", "server 2", "netem", "netem 2"}
-
-
-async def test_a_second_server_is_told_from_the_first_in_what_they_say() -> None:
-    heard: list[LogLine] = []
-    async with started("server 2", "demo", "--bind", "127.0.0.1:0", on_event=heard.append) as child:
-        pass
-    assert {line.process for line in heard} == {"server 2"}
-    assert child.last_words().startswith("server 2: ")
 
 
 DEEP = b'{"process":"client","event":' + b"[" * 50_000

@@ -47,10 +47,10 @@ def imported(*argv: str) -> set[str]:
     return set(done.stdout.rpartition("imported: ")[2].split())
 
 
-FLIES = ["client demo --model.tau-s 1 1", "client paper", "netem demo --bind 127.0.0.1:0"]
+FLIES = ["client demo --model.tau-s 1 1", "netem demo --bind 127.0.0.1:0"]
 
 
-@pytest.mark.parametrize("command", ["--help", "scenarios", *FLIES])
+@pytest.mark.parametrize("command", ["scenarios", *FLIES])
 def test_what_is_light_imports_nothing_heavy(command: str) -> None:
     modules = imported(*command.split())
     assert "skytether.shell.command" in modules
@@ -67,12 +67,8 @@ def test_a_server_imports_its_own_solver_and_no_ciphers_without_keys(scenario: s
     assert modules & COMPILER == set()
 
 
-def test_a_server_with_osqp_imports_it() -> None:
-    modules = imported("server", "paper", "--bind", "127.0.0.1:0", "--control.solver", "osqp")
-    assert "osqp" in modules
-
-
 def test_a_flight_in_virtual_time_draws_encrypts_and_compiles_nothing() -> None:
     modules = imported("fly", "demo", "--virtual", "--duration", "1")
+    assert "numba" in modules
     assert modules & HEAVY <= {"numba", "rich", "scipy"}
     assert modules & COMPILER == set()
