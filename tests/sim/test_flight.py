@@ -44,7 +44,7 @@ HASH = """
 from skytether.shared.scenario import reading
 from skytether.sim.flight import fly
 import msgspec
-flown = msgspec.structs.replace(reading.load("paper"), duration=8.0, seed=5)
+flown = msgspec.structs.replace(reading.load("paper"), duration=4.0, settle=0.0, seed=5)
 print(fly(flown).trace_hash())
 """
 
@@ -55,9 +55,9 @@ def test_the_same_seed_flies_the_same_in_another_process_and_hash_seed() -> None
         [sys.executable, "-c", HASH], env=environment, capture_output=True, check=True
     )
     hashes = {run.stdout.decode().strip()}
-    hashes.add(fly(packaged("paper", duration=8.0, seed=5)).trace_hash())
+    hashes.add(fly(packaged("paper", duration=4.0, settle=0.0, seed=5)).trace_hash())
     assert len(hashes) == 1
-    assert fly(packaged("paper", duration=8.0, seed=6)).trace_hash() not in hashes
+    assert fly(packaged("paper", duration=4.0, settle=0.0, seed=6)).trace_hash() not in hashes
 
 
 @pytest.mark.long
@@ -165,19 +165,12 @@ def test_the_summary_tells_ages_effort_and_bounds_of_what_was_flown() -> None:
     assert result.saturated == pytest.approx(3 / 5)
 
 
-@pytest.mark.parametrize("offset_s", [-3600.0, 0.5, 86000.0])
-def test_unsynchronised_clocks_change_nothing(offset_s: float) -> None:
-    flown = packaged("paper-every-step", duration=15.0)
-    plain = fly(flown)
-    clocks = {"clock_offset_s": offset_s}
-    offset = fly(packaged("paper-every-step", duration=15.0, simulation=clocks))
-    np.testing.assert_array_equal(plain.client["state"], offset.client["state"])
-
-
-@pytest.mark.long
-def test_a_drifting_clock_is_followed() -> None:
-    plain, drifted = flew(seed=3), flew(seed=3, simulation={"clock_drift_ppm": 200.0})
-    assert drifted.rmse_xy == pytest.approx(plain.rmse_xy, rel=0.05)
+def test_unsynchronised_clocks_change_nothing() -> None:
+    plain = fly(packaged("paper-every-step", duration=8.0))
+    for offset_s in (-3600.0, 86000.0):
+        clocks = {"clock_offset_s": offset_s}
+        offset = fly(packaged("paper-every-step", duration=8.0, simulation=clocks))
+        np.testing.assert_array_equal(plain.client["state"], offset.client["state"])
 
 
 def test_a_server_too_slow_for_its_steps_misses_deadlines_and_says_so() -> None:
@@ -240,7 +233,7 @@ def test_a_flight_keeps_what_everybody_said() -> None:
 
 def test_wind_and_gusts_push_but_do_not_break() -> None:
     gusts = {"wind": 0.3, "gust_mps2": 0.5, "gust_every_s": 5.0}
-    calm, windy = flew(duration=30.0), flew(duration=30.0, vehicle=gusts)
+    calm, windy = flew(duration=15.0), flew(duration=15.0, vehicle=gusts)
     assert calm.rmse_xy < windy.rmse_xy < 2.0
 
 
@@ -273,18 +266,18 @@ def test_what_is_never_flown_costs_no_packets() -> None:
     assert np.median([each.rmse_xy or 1.0 for each in found]) < 0.035
 
 
-@pytest.mark.parametrize("midnight_s", [0, 4280, 4294, 2 * 10**9])
 @pytest.mark.parametrize("name", ["demo", "paper"])
 def test_a_flight_is_the_same_whenever_stamps_begin_anew(
-    name: str, midnight_s: int, monkeypatch: pytest.MonkeyPatch
+    name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Every 71 minutes of the server's clock: 15 s after its start, and where the clocks differ."""
-    flown = packaged(name, duration=25.0)
+    """Every 71 minutes of the server's clock: 5 s after its start, and where the clocks differ."""
+    flown = packaged(name, duration=8.0)
     usual = fly(flown)
-    monkeypatch.setattr(skytether.sim.flight, "MIDNIGHT_NS", midnight_s * SECOND_NS)
-    other = fly(flown)
-    assert other.client.tobytes() == usual.client.tobytes()
-    assert other.server.tobytes() == usual.server.tobytes()
+    for midnight_s in (4290, 2 * 10**9):
+        monkeypatch.setattr(skytether.sim.flight, "MIDNIGHT_NS", midnight_s * SECOND_NS)
+        other = fly(flown)
+        assert other.client.tobytes() == usual.client.tobytes()
+        assert other.server.tobytes() == usual.server.tobytes()
 
 
 def test_a_server_that_takes_stamps_as_they_are_plans_for_nobody(

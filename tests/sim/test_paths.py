@@ -65,6 +65,7 @@ def test_packets_of_a_path_meet_its_network(flown: Record) -> None:
     assert 0.05 < up["lost"].mean() < 0.5
 
 
+@pytest.mark.long
 def test_the_links_of_the_demo_are_out_a_tenth_of_the_time_and_independently() -> None:
     scenario = packaged("demo-two-links")
     out = []
