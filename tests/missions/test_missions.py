@@ -10,7 +10,7 @@ import msgspec
 import numpy as np
 import osqp
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import sparse
 
@@ -74,6 +74,7 @@ LOST = {"network.uplink.loss": 1.0, "network.downlink.loss": 1.0}
 # -- motions and their QP -------------------------------------------------------------------------
 
 
+@settings(max_examples=30)
 @given(st.integers(1, 15), st.integers(0, 2**31), st.integers(-5, 200))
 def test_a_motion_is_the_spline_that_is_sent(knots: int, seed: int, step: int) -> None:
     rng = np.random.default_rng(seed)
@@ -90,7 +91,7 @@ def test_a_motion_is_the_spline_that_is_sent(knots: int, seed: int, step: int) -
         assert p[0, 0] == pytest.approx(position[-1, 0])
 
 
-@pytest.mark.parametrize("seed", range(10))
+@pytest.mark.parametrize("seed", range(3))
 def test_the_solver_finds_what_osqp_finds(seed: int) -> None:
     """At OSQP's finest tolerance, with equalities, many constraints and few variables."""
     rng = np.random.default_rng(seed)
@@ -132,7 +133,7 @@ def test_what_cannot_be_has_no_solution() -> None:
     assert DualActiveSet(np.eye(2)).solve(np.zeros(2), columns, np.array([1.0, 1.0]), 0) is None
 
 
-@pytest.mark.long
+@settings(max_examples=15)
 @given(
     st.tuples(st.floats(-0.5, 0.5), st.floats(-0.5, 0.5)),
     st.tuples(st.floats(-9, 9), st.floats(-9, 9)),
@@ -156,7 +157,7 @@ def test_a_plan_ends_at_rest_within_what_the_vehicle_can(
     assert nearer
 
 
-@pytest.mark.long
+@settings(max_examples=15)
 @given(
     st.sampled_from(["swap", "sphere"]),
     st.lists(st.floats(-1.4, 1.4), min_size=3, max_size=3),
@@ -184,7 +185,7 @@ def test_far_from_others_axes_are_planned_one_by_one_to_the_last_bit(
 # -- distances of motions --------------------------------------------------------------------------
 
 
-@pytest.mark.long
+@settings(max_examples=25)
 @given(st.integers(0, 2**31), st.integers(0, 60))
 def test_motions_come_too_near_where_any_of_their_pieces_does(seed: int, begin: int) -> None:
     """Also if bounding boxes exclude them; vehicles already too near must not come nearer."""
@@ -291,9 +292,8 @@ def test_half_planes_keep_a_vehicle_out_from_under_one_that_may_land() -> None:
     assert times[found.time[np.abs(found.normal[:, 2]) < 1e-12]].tolist() == [120.0]
 
 
-@pytest.mark.parametrize("loss", [0.1, 0.5])
 def test_what_is_kept_from_are_all_motions_that_may_be_flown(
-    loss: float, monkeypatch: pytest.MonkeyPatch
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     real, looked_at = MissionState.update_possible, list[int]()
 
@@ -310,7 +310,7 @@ def test_what_is_kept_from_are_all_motions_that_may_be_flown(
         looked_at.append(count)
 
     monkeypatch.setattr(MissionState, "update_possible", update_possible)
-    flight.fly(scenario(6, loss, duration=20.0), vehicles=6)
+    flight.fly(scenario(6, 0.5, duration=20.0), vehicles=6)
     assert len(looked_at) > 10
     assert max(looked_at) > 6
 
@@ -570,13 +570,11 @@ def test_motions_that_are_sent_again_arrive_where_half_are_lost(
 
 
 def test_a_link_that_is_cut_leaves_them_apart() -> None:
-    for cut_s in (4.0, 6.3):
-        swaps = scenario(6, duration=25.0)
-        flown = flight.fly(swaps, vehicles=6, changes=[(cut_s, LOST)])
-        assert separation_m(flown) > 0.5
+    flown = flight.fly(scenario(6, duration=20.0), vehicles=6, changes=[(6.3, LOST)])
+    assert separation_m(flown) > 0.5
 
 
-@pytest.mark.parametrize("steps", [5, -5, 25, -25])
+@pytest.mark.parametrize("steps", [5, -25])
 def test_steps_that_are_miscounted_do_not_bring_vehicles_together(
     steps: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -591,8 +589,8 @@ def test_steps_that_are_miscounted_do_not_bring_vehicles_together(
         return real(clock, rows, now_ns) + steps * (rows % 2)
 
     monkeypatch.setattr(ClockMap, "steps", mistaken)
-    swaps = scenario(8, duration=30.0)
-    flown = flight.fly(swaps, vehicles=8)
+    swaps = scenario(6, duration=25.0)
+    flown = flight.fly(swaps, vehicles=6)
     counts = flown.figures["server"]["counts"]
     assert separation_m(flown) > 0.5
     assert "left_tube" not in counts
@@ -604,9 +602,8 @@ def test_steps_that_are_miscounted_do_not_bring_vehicles_together(
 
 @pytest.mark.long
 @pytest.mark.parametrize("losses", ["loss(0.1)", "loss(0.5)", "gilbert_elliott(0.3, 2.0)"])
-@pytest.mark.parametrize("seed", [1, 2, 3])
-def test_sixteen_swap_places_over_the_worst_networks(losses: str, seed: int) -> None:
-    flown = flight.fly(scenario(16, losses, duration=60.0, seed=seed), vehicles=16)
+def test_sixteen_swap_places_over_the_worst_networks(losses: str) -> None:
+    flown = flight.fly(scenario(16, losses, duration=60.0), vehicles=16)
     assert separation_m(flown) > 0.5
 
 
@@ -685,7 +682,7 @@ def test_who_is_silent_for_long_keeps_its_place_when_another_joins(
     monkeypatch.setattr(sessions, "SESSION_NS", 8 * SECOND_NS)
     if not keeps:
         monkeypatch.setattr("skytether.server.endpoint.Sessions", forgetful)
-    swaps = scenario(4, duration=50.0)
+    swaps = scenario(4, duration=35.0)
     server = HardOfHearing(swaps, boot_id=1, entropy=stream(1, "entropy").bytes, capacity=4)
     flown = flight.fly(swaps, vehicles=4, server=server)
     ended = [event for *_, event in flown.events if isinstance(event, SessionEnded)]
@@ -722,8 +719,8 @@ def test_who_hovers_on_a_mission_holds_its_place(monkeypatch: pytest.MonkeyPatch
     ("name", "within_s"),
     [
         ("corridor", 60.0),
-        pytest.param("rings", 75.0, marks=pytest.mark.long),
-        pytest.param("warehouse", 130.0, marks=pytest.mark.long),
+        ("rings", 75.0),
+        ("warehouse", 130.0),
     ],
 )
 def test_missions_that_come_with_it(name: str, within_s: float) -> None:
@@ -822,7 +819,6 @@ def test_without_routes_they_wait_before_a_wall(monkeypatch: pytest.MonkeyPatch)
     assert clear_m(flown, walled.zones) > 0.0
 
 
-@pytest.mark.long
 def test_a_vehicle_at_rest_in_a_gap_is_flown_around(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -831,7 +827,7 @@ def test_a_vehicle_at_rest_in_a_gap_is_flown_around(
     """
     monkeypatch.setattr(MissionPlanner, "_ask_to_yield", lambda *_: None)
     goals = "1,0,0.2,0\n2,0,2.6,-2\n2,1,2.6,2\n3,0,-0.8,-0.9\n4,0,-0.8,0.9\n"
-    swaps, zone = scenario(4, duration=40.0), "box(1, 5, -0.2, 0.2)"
+    swaps, zone = scenario(4, duration=35.0), "box(1, 5, -0.2, 0.2)"
     gap = reading.check(with_goals(tmp_path, goals, swaps, zones=zone), "gap")
 
     def left_over_m() -> float:
@@ -844,6 +840,7 @@ def test_a_vehicle_at_rest_in_a_gap_is_flown_around(
     assert left_over_m() > 1.0
 
 
+@settings(max_examples=30)
 @given(st.floats(0.0, 2.0 * np.pi), st.floats(0.05, 3.0), st.floats(0.05, 1.0))
 def test_a_way_begins_where_an_octagon_faces_a_place(
     angle: float, radius_m: float, room_m: float
@@ -883,6 +880,7 @@ def test_a_vehicle_at_its_goal_in_a_gap_yields(
     assert left_over_m > 3.0
 
 
+@settings(max_examples=40)
 @given(st.integers(0, 2**31), st.integers(2, 3))
 def test_a_place_to_yield_to_is_off_the_way(seed: int, axes: int) -> None:
     rng, apart_m, room_m = np.random.default_rng(seed), 0.9, 0.2
@@ -1077,7 +1075,7 @@ def test_a_goal_above_another_is_refused_in_flight(tmp_path: Path) -> None:
 
 
 def test_a_vehicle_is_sent_elsewhere_in_flight() -> None:
-    swaps, elsewhere = scenario(2, duration=30.0), "goal(1, 0, 3)"
+    swaps, elsewhere = scenario(2, duration=24.0), "goal(1, 0, 3)"
     sent = [(0.5, {"mission.goals": elsewhere})]
     flown = flight.fly(swaps, vehicles=2, changes=sent)
     ends = [rows["state"][-1, :, 0] for rows in each_of(flown)]
@@ -1086,7 +1084,7 @@ def test_a_vehicle_is_sent_elsewhere_in_flight() -> None:
     assert flown.server is not None
     of_one = flown.server[flown.server["vehicle"] == 1]
     assert of_one["reference"][-1, :, 0].tolist() == [0.0, 3.0]
-    flown = flight.fly(swaps, vehicles=2, changes=[*sent, (15.0, {"mission.goals": ""})])
+    flown = flight.fly(swaps, vehicles=2, changes=[*sent, (10.0, {"mission.goals": ""})])
     assert max(left_m(flown, swaps)) < 0.3
 
 
@@ -1115,7 +1113,7 @@ def test_goals_as_near_as_they_may_be_are_reached(
     dt_s: float, acceleration_mps2: float, tmp_path: Path
 ) -> None:
     """Near to each other and to a zone; also where motions curve much between knots."""
-    swaps = scenario(4, duration=60.0)
+    swaps = scenario(4, duration=30.0)
 
     def made(goals: str, **mission: Any) -> Scenario:
         mission["acceleration_mps2"] = acceleration_mps2
@@ -1228,6 +1226,7 @@ def test_a_batch_flies_each_mission_alone() -> None:
 # -- published tasks ---------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_places_of_published_tasks_are_as_their_authors_have_them(tmp_path: Path) -> None:
     """Far enough apart in the stretched distance, and the scenario can be flown."""
     for name, task in missions.TASKS.items():
@@ -1243,6 +1242,7 @@ def test_places_of_published_tasks_are_as_their_authors_have_them(tmp_path: Path
             assert made.mission.height_m == task.separation_m * task.stretch
 
 
+@pytest.mark.long
 def test_four_cross_as_published() -> None:
     cell = (1, ("Luis 2020: four cross", "20 ms"))
     done = missions.fly_published(PublishedOptions(duration=25.0), cell)

@@ -67,7 +67,7 @@ def test_vehicles_are_where_their_paths_are_at_each_time(tmp_path: Path) -> None
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_vehicles_of_a_show_keep_apart_on_a_bad_network(seed: int, tmp_path: Path) -> None:
     """Twelve on a ring where the next is 1.14 m ahead, with half of all packets lost."""
     air = "uniform(0.05, 0.6) & loss(0.5)"
@@ -89,11 +89,13 @@ def test_a_path_through_a_zone_is_refused(tmp_path: Path) -> None:
         scenario(tmp_path, through, mission={"zones": "box(-1, 1, -1, 1)"})
 
 
-def test_a_goal_set_in_flight_replaces_the_path(tmp_path: Path) -> None:
+def test_a_goal_set_in_flight_replaces_the_path_of_one_vehicle_alone(tmp_path: Path) -> None:
+    """The others are where their paths are at each time; vehicle 1 makes way for it first."""
     shown = scenario(tmp_path, ring(), mission={"goals": "goal(2, 0, 0)"})
     flown = flight.fly(shown, vehicles=VEHICLES)
     last = flown.client[flown.client["vehicle"] == 2][-1]
     assert np.abs(last["state"]).max() < 0.1
+    assert errors_m(shown, flown)[2:].max() < 0.06
 
 
 def test_a_path_faster_than_the_vehicle_is_refused(tmp_path: Path) -> None:
@@ -112,7 +114,7 @@ def test_a_show_is_not_allocated(tmp_path: Path) -> None:
         scenario(tmp_path, ring(), mission={"allocate": True})
 
 
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", range(3))
 def test_the_nearest_paths_are_those_of_a_dense_grid(
     seed: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -57,8 +57,7 @@ def least_m(
     return float(min(nearest))
 
 
-@pytest.mark.long
-@settings(max_examples=25)
+@settings(max_examples=10)
 @given(st.integers(0, 2**31), st.integers(0, 60), errors, errors, st.integers(2, 3))
 def test_a_motion_is_compared_with_all_that_another_may_be_at_each_time(
     seed: int, begin: int, mine: StepError, its: StepError, axes: int
@@ -147,7 +146,7 @@ def test_what_is_on_its_way_when_it_lands_is_so_at_its_own_time() -> None:
 def test_two_that_keep_the_distance_come_no_nearer_by_what_pieces_are_off() -> None:
     """The tolerance of the motion in force differs at another step; that is not too near."""
     rng, far = np.random.default_rng(5), resting(0, np.array([100.0, 0.0]))
-    for _ in range(200):
+    for _ in range(60):
         base, other = drawn(rng), drawn(rng)
         flown = PossibleMotions(np.ones(2), DT_S)
         flown.add(1, PossibleMotion(other))
@@ -184,11 +183,10 @@ def landing_m(
     return nearest
 
 
-@pytest.mark.long
 def test_who_keeps_the_distance_goes_on_to_keep_it() -> None:
     """For any landing; only vehicles that are already too near may stay as near."""
     keep_m, accepted = 1.2, 0
-    for seed in range(1000, 1600):
+    for seed in range(1000, 1100):
         rng = np.random.default_rng(seed)
         motion, other = (above_ground(drawn(rng, 3)) for _ in range(2))
         mine, its = (StepError(*rng.uniform(0.0, 8.0, 2)) for _ in range(2))
@@ -206,13 +204,13 @@ def test_who_keeps_the_distance_goes_on_to_keep_it() -> None:
         least = landing_m(motion, other, 0, mine, its, lands) + 0.06
         if least < keep_m:
             assert least > landing_m(base, other, 0, mine, its, lands)
-    assert accepted > 300
+    assert accepted > 50
 
 
 # -- bounds of clock offsets -----------------------------------------------------------------------
 
 
-@settings(max_examples=100)
+@settings(max_examples=50)
 @given(
     st.integers(0, 2**31),
     st.integers(-(10**15), 10**15),
@@ -394,7 +392,7 @@ def mission(name: str, shape: str = "", duration: float = 30.0) -> Scenario:
     return packaged(name, duration=duration, seed=1, reference=reference)
 
 
-SWAP = mission("swap", "swap(8)", 20.0)
+SWAP = mission("swap", "swap(8)", 14.0)
 
 
 def test_delays_that_differ_do_not_bring_vehicles_together(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -435,7 +433,6 @@ def test_with_the_time_of_day_at_both_ends_clocks_are_known(
 @pytest.mark.parametrize(
     ("name", "shape", "delays"),
     [
-        ("swap", "swap(8)", turns(0.05, 0.85)),
         ("swap", "swap(8)", turns(0.05, 1.25)),
         ("swap", "swap(8)", odd(0.05, 0.85)),
         ("rings", "", turns(0.05, 0.65)),
