@@ -51,9 +51,12 @@ def rmse_m(flown: Scenario, record: Record) -> float:
     return found.rmse_xy
 
 
-@pytest.mark.parametrize("secure", [False, True])
-@pytest.mark.parametrize("name", ["demo", "demo-committed", "demo-paper", "target"])
+@pytest.mark.parametrize(
+    ("name", "secure"),
+    [("demo", True), ("demo-committed", False), ("demo-paper", False), ("target", False)],
+)
 def test_the_server_dies_and_the_flight_goes_on(name: str, *, secure: bool) -> None:
+    """The new leader sends its first plan twice."""
     flown = scenario(name)
     record = fly(flown, standby=True, secure=secure, actions=[(DIES_S, stops(SERVER[0]))])
     (changed_s,) = changes(record)
@@ -61,23 +64,20 @@ def test_the_server_dies_and_the_flight_goes_on(name: str, *, secure: bool) -> N
     assert brakes(record) == 0
     assert record.failure is None
     assert rmse_m(flown, record) < max(2.0 * rmse_m(flown, fly(flown)), 0.05)
+    (*_, taken) = np.flatnonzero(np.diff(record.server["step"]) > 1)
+    assert record.server["event"][taken + 1 : taken + 3].all()
 
 
 def test_without_a_standby_it_brakes() -> None:
     assert brakes(fly(scenario(), actions=[(DIES_S, stops(SERVER[0]))])) == 1
 
 
-def test_both_die_and_it_brakes() -> None:
-    record = fly(
-        scenario(), standby=True, actions=[(DIES_S, stops(SERVER[0])), (DIES_S, stops(STANDBY[0]))]
-    )
-    assert brakes(record) == 1
+def test_the_standby_dies_and_nothing_happens_until_the_server_dies_too() -> None:
+    dies = [(DIES_S, stops(STANDBY[0])), (DIES_S + 6.0, stops(SERVER[0]))]
+    record = fly(scenario(), standby=True, actions=dies)
+    (braked,) = [each for each in record.events if getattr(each.event, "after", "") == "brake"]
+    assert braked.time_ns / 1e9 > DIES_S + 6.0
     assert changes(record) == []
-
-
-def test_the_standby_dies_and_nothing_happens() -> None:
-    record = fly(scenario(), standby=True, actions=[(DIES_S, stops(STANDBY[0]))])
-    assert (brakes(record), changes(record)) == (0, [])
 
 
 def test_a_vehicle_that_does_not_wait_for_the_answer_brakes(
@@ -110,7 +110,7 @@ def test_a_server_that_was_frozen_is_the_standby(monkeypatch: pytest.MonkeyPatch
 
 
 def test_a_flight_with_a_standby_that_leads_never_costs_little() -> None:
-    flown = msgspec.structs.replace(scenario(), duration=60.0)
+    flown = msgspec.structs.replace(scenario(), duration=40.0)
     alone, with_standby = fly(flown), fly(flown, standby=True)
     assert len(with_standby.netem) < 1.25 * len(alone.netem)
     assert changes(with_standby) == []
@@ -154,7 +154,9 @@ def renewed(flown: Scenario, rng: np.random.Generator) -> Callable[[str, World],
     return act
 
 
-@pytest.mark.parametrize("seed", range(1, 9))
+@pytest.mark.parametrize(
+    "seed", [pytest.param(seed, marks=[pytest.mark.long] * (seed > 3)) for seed in range(1, 9)]
+)
 def test_whatever_fails_it_flies_again_at_the_end(seed: int) -> None:
     flown, record, faults = battered(seed)
     assert record.failure is None
@@ -165,11 +167,10 @@ def test_whatever_fails_it_flies_again_at_the_end(seed: int) -> None:
     assert np.abs(record.client["state"][late] - wanted)[..., 0].max() < 0.3
 
 
-@pytest.mark.parametrize("name", ["demo", "target"])
-def test_a_leader_that_hears_nothing_is_replaced(name: str) -> None:
+def test_a_leader_that_hears_nothing_is_replaced() -> None:
     """Its heartbeats arrive, and say that it cannot plan."""
     deaf = {"network.downlink": "loss(1)"}
-    flown = msgspec.structs.replace(scenario(name), duration=30.0)
+    flown = scenario("target")
     record = fly(flown, standby=True, actions=[(DIES_S, lambda world: _deafen(world, deaf))])
     (changed_s,) = changes(record)
     assert changed_s < DIES_S + flown.link.age_max_s + 2.0 * flown.link.timeout_s
@@ -182,11 +183,10 @@ def _deafen(world: World, values: dict[str, str]) -> None:
     world.act("netem 1", partial(Running(netem, netem._scenario).change, values))
 
 
-@pytest.mark.parametrize("timeout_s", [8.0, 20.0])
-def test_a_standby_is_kept_while_the_time_out_is_long(timeout_s: float) -> None:
+def test_a_standby_is_kept_while_the_time_out_is_long() -> None:
     """The server forgets a session after 30 s of silence."""
     flown = msgspec.structs.replace(
-        scenario("demo", link={"timeout_s": timeout_s, "age_max_s": 60.0}), duration=100.0
+        scenario("demo", link={"timeout_s": 20.0, "age_max_s": 60.0}), duration=60.0
     )
     record = fly(flown, standby=True)
     told = [each for each in record.events if each.process == "standby"]
@@ -216,22 +216,10 @@ class Astray(Endpoint):
 
 
 @pytest.mark.parametrize("secure", [False, True])
-@pytest.mark.parametrize("seed", [1, 2, 3])
-def test_packets_for_the_standby_that_are_led_to_the_server_change_nothing(
-    seed: int, *, secure: bool
-) -> None:
+def test_packets_for_the_standby_that_are_led_to_the_server_change_nothing(*, secure: bool) -> None:
     """A wrong address, or somebody who holds the standby's network."""
-    flown = msgspec.structs.replace(scenario(), seed=seed)
+    flown = scenario()
     record = fly(flown, standby=Astray(), secure=secure)
     assert record.failure is None
     assert brakes(record) == 0
     assert rmse_m(flown, record) < 0.05
-
-
-@pytest.mark.parametrize("name", ["demo-committed", "demo-paper", "paper", "target"])
-def test_a_new_leader_sends_its_first_plan_twice(name: str) -> None:
-    record = fly(scenario(name), standby=True, actions=[(DIES_S, stops(SERVER[0]))])
-    by_new_leader = record.server[
-        -np.flatnonzero(np.diff(record.server["step"])[::-1] > 1)[0] - 1 :
-    ]
-    assert by_new_leader["event"][:2].all()
