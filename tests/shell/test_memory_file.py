@@ -4,12 +4,15 @@ import asyncio
 from collections.abc import Callable, Mapping
 from contextlib import closing
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from helpers import Idle
+from helpers import HandLoop, Idle
+from skytether.shared.base import files
 from skytether.shell import memory
 from skytether.shell.memory import MAGIC, MemoryFile, MemoryRefused
+from virtual_loop import AtJoin
 
 IDENTITY = {"vehicle": "1", "key": "2", "autopilot": "udpout:127.0.0.1:14551", "terms": "0a1b"}
 SECRET = bytes(range(32))
@@ -57,11 +60,6 @@ class Keeps(Idle):
         self.written += 1
 
 
-async def until(so: Callable[[], bool]) -> None:
-    while not so():
-        await asyncio.sleep(0.01)
-
-
 def test_what_was_kept_comes_back_with_its_time(path: Path) -> None:
     put(path, a_file(path))
     assert read(path) == (CONTENT, WRITTEN_NS)
@@ -83,8 +81,9 @@ def test_after_a_restart_of_the_host_its_clock_says_nothing(
 def test_a_file_that_is_cut_or_flipped_anywhere_is_refused(path: Path) -> None:
     held = a_file(path)
     kept = MemoryFile(path, IDENTITY, SECRET)
-    cut = [held[:size] for size in range(len(held))]
-    flipped = [held[:i] + bytes([held[i] ^ (1 << i % 8)]) + held[i + 1 :] for i in range(len(held))]
+    places = [*range(50), *range(50, len(held), 7), len(held) - 1]
+    cut = [held[:size] for size in places]
+    flipped = [held[:i] + bytes([held[i] ^ (1 << i % 8)]) + held[i + 1 :] for i in places]
     for wrong in (*cut, *flipped, held + b"\0"):
         put(path, wrong)
         with pytest.raises(MemoryRefused, match=r"it is damaged, or was kept with another key"):
@@ -123,14 +122,33 @@ def test_two_processes_do_not_share_a_memory(path: Path) -> None:
     MemoryFile(path, IDENTITY).close()
 
 
-async def test_a_thread_writes_the_newest_and_says_so(path: Path) -> None:
-    """Newer state during a write is written afterwards, and only the last is reported."""
+class Loop(HandLoop):
+    def call_soon_threadsafe(self, then: Callable[..., None]) -> None:
+        then()
+
+
+def begun(kept: MemoryFile, endpoint: Keeps, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(memory.threading, "Thread", AtJoin)
+    kept.begin(endpoint, Loop())  # type: ignore[arg-type]
+
+
+def work(kept: MemoryFile) -> None:
+    """What the thread does until nothing is left to write, or writing fails."""
+    kept._ends = True
+    kept._work()
+
+
+def test_the_newest_is_written_and_that_is_said(
+    path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     kept, endpoint = MemoryFile(path, IDENTITY, SECRET), Keeps()
-    kept.begin(endpoint, asyncio.get_running_loop())
+    begun(kept, endpoint, monkeypatch)
     for content in (b"one", b"two", b"three"):
         endpoint.wanted.append(content)
         kept.look()
-    await until(lambda: endpoint.written > 0)
+    assert endpoint.written == 0
+    work(kept)
+    assert endpoint.written == 1
     found = kept.read()
     assert found
     assert found[0] == b"three"
@@ -139,23 +157,63 @@ async def test_a_thread_writes_the_newest_and_says_so(path: Path) -> None:
     kept.close()
 
 
-async def test_a_disk_that_fails_is_told_once_and_tried_again(
+def test_newer_state_during_a_write_is_written_afterwards_and_only_that_is_said(
     path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    kept, endpoint, replacing = MemoryFile(path, IDENTITY, SECRET), Keeps(), files.replacing
+    begun(kept, endpoint, monkeypatch)
+    endpoint.wanted += [b"old", b"new"]
+    writes: list[int] = []
+
+    def meanwhile(*given: Any, **how: Any) -> Any:
+        writes.append(endpoint.written)
+        kept.look()
+        return replacing(*given, **how)
+
+    monkeypatch.setattr(files, "replacing", meanwhile)
+    kept.look()
+    work(kept)
+    assert writes == [0, 0]
+    assert endpoint.written == 1
+    found = kept.read()
+    assert found
+    assert found[0] == b"new"
+    kept.close()
+
+
+def test_a_disk_that_fails_is_told_once_and_tried_again(
+    path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    kept, endpoint = MemoryFile(path, IDENTITY, SECRET), Keeps()
+    elsewhere = path.parent.rename(path.parent.with_name("gone"))
+    begun(kept, endpoint, monkeypatch)
+    endpoint.wanted.append(CONTENT)
+    kept.look()
+    work(kept)
+    assert "No such file or directory" in str(kept.news())
+    assert kept.news() is None
+    work(kept)
+    assert kept.news() is None
+    assert not endpoint.written
+    elsewhere.rename(path.parent)
+    work(kept)
+    assert endpoint.written == 1
+    assert path.read_bytes().startswith(MAGIC)
+    kept.close()
+
+
+@pytest.mark.realtime
+async def test_a_thread_writes_and_tries_again(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(memory, "AGAIN_S", 0.01)
     kept, endpoint = MemoryFile(path, IDENTITY, SECRET), Keeps()
     elsewhere = path.parent.rename(path.parent.with_name("gone"))
     kept.begin(endpoint, asyncio.get_running_loop())
     endpoint.wanted.append(CONTENT)
     kept.look()
-    told: list[str] = []
-    while not told:
+    while not kept.news():
         await asyncio.sleep(0.01)
-        told += [str(news) for news in (kept.news(),) if news]
-    assert "No such file or directory" in told[0]
-    assert kept.news() is None
-    assert not endpoint.written
     elsewhere.rename(path.parent)
-    await until(lambda: endpoint.written == 1)
+    while not endpoint.written:
+        await asyncio.sleep(0.01)
     assert path.read_bytes().startswith(MAGIC)
     kept.close()

@@ -1,20 +1,27 @@
 """Writing a part of the record to a file: all rows, or as many as fit and a line about it."""
 
-import os
-import time
 from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
 import pytest
 
+from helpers import until
 from skytether.shared.base import files
 from skytether.shared.core.events import RecordIncomplete
 from skytether.shared.telemetry.record import PACKET_COLUMNS, read
-from skytether.shell import recording
+from skytether.shell import recording, writer
 from skytether.shell.command import CommandError
 from skytether.shell.process import recorded, recorded_meanwhile
 from skytether.shell.recording import RecordFile
+from virtual_loop import AtJoin
+
+
+@pytest.fixture(autouse=True)
+def _threads(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The thread writes when it is waited for."""
+    if not request.node.get_closest_marker("realtime"):
+        monkeypatch.setattr(writer.threading, "Thread", AtJoin)
 
 
 def append(to: RecordFile, count: int) -> None:
@@ -32,12 +39,12 @@ def test_rows_are_in_the_file_at_the_end(tmp_path: Path) -> None:
     np.testing.assert_array_equal(read(path)["number"], np.arange(1000))
 
 
+@pytest.mark.realtime
 def test_rows_reach_the_file_while_the_flight_goes_on(tmp_path: Path) -> None:
     path = tmp_path / "netem"
     with recorded(path, PACKET_COLUMNS) as part:
         append(part, 10)
-        while path.stat().st_size < part._header_bytes + 10 * PACKET_COLUMNS.itemsize:
-            time.sleep(0.01)
+        until(lambda: path.stat().st_size >= part._header_bytes + 10 * PACKET_COLUMNS.itemsize)
         assert read(path)["number"].tolist() == list(range(10))
 
 
@@ -90,28 +97,23 @@ def test_without_a_temporary_file_a_flight_is_flown_all_the_same(
     assert flown == []
 
 
-def test_a_disk_that_is_too_slow_loses_whole_rows(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_disk_that_is_too_slow_loses_whole_rows(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Rows beyond the memory's capacity, and those not written within the final timeout."""
     monkeypatch.setattr(recording, "ROOM_BYTES", 1000)
-    monkeypatch.setattr(recording, "PATIENCE_S", 0.01)
-    reading, writing = os.pipe()
-    os.set_blocking(writing, False)
-    filled = os.write(writing, bytes(10**6))
-    os.set_blocking(writing, True)
-    with (
-        os.fdopen(reading, "rb", buffering=0) as slow,
-        os.fdopen(writing, "wb", buffering=0) as file,
-    ):
+    monkeypatch.setattr(recording, "PATIENCE_S", 0.0)
+    with (tmp_path / "netem").open("w+b", buffering=0) as file:
         part = RecordFile("netem", PACKET_COLUMNS, file)
         append(part, 1000)
         assert part.news() == RecordIncomplete(file="netem", reason="the disk is too slow")
         part.end()
         assert "0 of 1000 rows" in part.fault()
-        slow.read(filled)
         monkeypatch.setattr(recording, "PATIENCE_S", 30.0)
         part.end()
         kept = (1000 - part._header_bytes) // PACKET_COLUMNS.itemsize
         assert part.fault() == f"netem: the disk is too slow: {kept} of 1000 rows are recorded"
+        assert len(part.rows()) == kept
 
 
 def test_a_file_of_any_name_can_be_told_of() -> None:
