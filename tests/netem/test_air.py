@@ -20,7 +20,6 @@ from skytether.shared.scenario.air.path import path
 from skytether.shared.scenario.grammar import Call, GrammarError
 from skytether.shared.scenario.registry import IMPAIRMENTS, TRIGGERS
 
-SEEDS = range(10)
 SAMPLES = 3000
 P_MIN = 0.001
 
@@ -76,28 +75,27 @@ def test_a_unit_of_something_else_is_refused(text: str) -> None:
         TRIGGERS.parse("budget(5ms)")
 
 
-@pytest.mark.parametrize("seed", SEEDS)
 @pytest.mark.parametrize("text", LAWS)
-def test_delays_follow_their_law(text: str, seed: int) -> None:
-    assert stats.kstest(delays_s(text, seed), LAWS[text].cdf).pvalue > P_MIN
-
-
-@pytest.mark.parametrize("text", LAWS)
-def test_what_a_law_says_of_itself_is_so(text: str) -> None:
+def test_delays_follow_their_law_and_what_it_says_of_itself_is_so(text: str) -> None:
     made, law = path(text), LAWS[text]
+    assert stats.kstest(delays_s(text, 1), law.cdf).pvalue > P_MIN
     assert made.mean_s == pytest.approx(law.mean(), rel=1e-6)
     assert made.least_s == pytest.approx(max(0.0, law.ppf(2.0**-54)), abs=0.01)
 
 
-@pytest.mark.parametrize("law", ["uniform(0, 1", "gamma(0, 0.5, 0.3", "paper(0, 0.1, 3"])
-def test_correlated_delays_keep_their_law_and_their_memory(law: str) -> None:
+@pytest.mark.parametrize(
+    ("law", "mean_s", "sd_s"), [("gamma(0, 0.5, 0.3", 0.5, 0.3), ("paper(0, 0.1, 3", 0.3, 0.1732)]
+)
+def test_correlated_delays_keep_their_law_and_their_memory(
+    law: str, mean_s: float, sd_s: float
+) -> None:
     """The autocorrelation falls to 1/e in the correlation time."""
     every, correlation_s = 50, 0.5
     text = f"{law}, correlation_s={correlation_s})"
-    drawn = np.concatenate([delays_s(text, seed, every, 8000) for seed in SEEDS])
-    alone = np.concatenate([delays_s(f"{law})", seed, every, 8000) for seed in SEEDS])
-    assert drawn.mean() == pytest.approx(alone.mean(), rel=0.03)
-    assert drawn.std() == pytest.approx(alone.std(), rel=0.03)
+    drawn = np.concatenate([delays_s(text, seed, every, 8000) for seed in range(10)])
+    alone = np.concatenate([delays_s(f"{law})", seed, every, 8000) for seed in range(3)])
+    assert drawn.mean() == pytest.approx(mean_s, rel=0.03)
+    assert drawn.std() == pytest.approx(sd_s, rel=0.03)
     lag = round(correlation_s * SECOND_NS / (every * SLOT_NS))
     centred = drawn - drawn.mean()
     correlation = np.mean(centred[lag:] * centred[:-lag]) / np.mean(centred**2)
@@ -106,7 +104,6 @@ def test_correlated_delays_keep_their_law_and_their_memory(law: str) -> None:
     assert abs(np.mean(centred[1:] * centred[:-1]) / np.mean(centred**2)) < 0.02
 
 
-@pytest.mark.parametrize("seed", SEEDS)
 @pytest.mark.parametrize(
     ("text", "befell", "share"),
     [
@@ -118,29 +115,27 @@ def test_correlated_delays_keep_their_law_and_their_memory(law: str) -> None:
     ],
 )
 def test_shares_are_those_asked_for(
-    text: str, befell: Callable[[Fate], bool], share: float, seed: int
+    text: str, befell: Callable[[Fate], bool], share: float
 ) -> None:
-    count = sum(befell(fate) for fate in fates(text, seed))
+    count = sum(befell(fate) for fate in fates(text))
     assert stats.binomtest(count, SAMPLES, share).pvalue > P_MIN
     if "loss" in text or "gilbert" in text:
         assert path(text).loss == pytest.approx(share)
 
 
-@pytest.mark.parametrize("seed", SEEDS)
-def test_flipped_bits_lie_anywhere(seed: int) -> None:
-    places = [fate.flipped for fate in fates("corrupt(0.5)", seed) if fate.flipped is not None]
+def test_flipped_bits_lie_anywhere() -> None:
+    places = [fate.flipped for fate in fates("corrupt(0.5)") if fate.flipped is not None]
     assert stats.kstest(places, stats.uniform.cdf).pvalue > P_MIN
 
 
-@pytest.mark.long
 @pytest.mark.parametrize(
     ("text", "share", "burst_s"),
     [("gilbert_elliott(0.2, 0.4)", 0.2, 0.4), ("outages(3, 1)", 0.25, 1.0)],
 )
 def test_bursts_last_as_long_as_asked_for(text: str, share: float, burst_s: float) -> None:
-    every, count = 20, 60_000
+    every, count = 20, 20_000
     lost = np.concatenate(
-        [[fate.lost for fate in fates(text, seed, count, every)] for seed in range(4)]
+        [[fate.lost for fate in fates(text, seed, count, every)] for seed in range(2)]
     )
     edges = np.flatnonzero(np.diff(lost.astype(int), prepend=0, append=0))
     lengths_s = np.diff(edges)[::2] * every * SLOT_NS / SECOND_NS

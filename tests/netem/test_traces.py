@@ -248,12 +248,11 @@ def test_runs_and_wraps_are_told_apart(text: str, lost: list[int]) -> None:
     assert np.diff(found.time_s).max() <= 1.0
 
 
-@pytest.mark.long
 def test_more_than_two_wraps_are_counted() -> None:
-    text = answers(*(number % 65536 for number in range(1, 150_000)))
+    text = answers(*(number % 65536 for number in range(1, 150_000, 100)))
     found = recorded.recorded_in(File("it", text.encode()))
-    assert len(found.time_s) == 149_999
-    assert not found.lost.any()
+    assert len(found.time_s) == 149_901
+    assert (~found.lost).sum() == 1500
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,7 @@ from math import prod
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from skytether.client.link import PlainLink
@@ -93,6 +93,7 @@ ROWS = st.integers(8, 40).flatmap(
 )
 
 
+@settings(max_examples=40)
 @given(ROWS, st.integers(0, 3))
 def test_common_outages_are_those_of_every_probe_counted_by_hand(
     failed: list[list[bool]], late: int
@@ -139,6 +140,7 @@ SETS = st.lists(
 )
 
 
+@settings(max_examples=50)
 @given(SETS, st.integers(1, 4))
 def test_an_overlap_is_that_of_every_moment(sets: list[Array], least: int) -> None:
     moments = np.arange(0.5, 30.0)

@@ -4,7 +4,7 @@ import math
 from contextlib import suppress
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_typestore
 
@@ -28,7 +28,7 @@ def test_type_hashes_are_the_published_ones(kind: str) -> None:
     assert messages.topic("/topic", kind).type_hash == f"RIHS01_{PUBLISHED[kind]}"
 
 
-@pytest.mark.long
+@settings(max_examples=10)
 @given(st.integers(0, 2**31 * 10**9 - 1), st.text("abc/_"), st.tuples(*[NUMBERS] * 3), NUMBERS)
 def test_a_stamped_twist_has_the_bytes_of_two_other_libraries(
     stamp_ns: int, frame: str, linear: tuple[float, float, float], turn: float
@@ -50,7 +50,7 @@ def test_a_twist_has_the_bytes_of_another_library() -> None:
     assert robot.decode(robot.TWIST, payload).angular.z == 0.25
 
 
-@pytest.mark.long
+@settings(max_examples=10)
 @given(
     st.integers(0, 2**31 * 10**9 - 1),
     st.text("abc/_"),

@@ -23,10 +23,6 @@ WRONG = {
         "sensor.filter: got 'none', expected 'kalman' with sensor.velocity_every_s = 'never'",
     ),
     "a key misspelt": ("sead = 3", "sead: no such key; did you mean seed?"),
-    "a key misspelt in a table": (
-        "control.horzon = 9",
-        "control.horzon: no such key; did you mean horizon?",
-    ),
     "a key misspelt two tables down": (
         "network.uplink.los = 0.1",
         "network.uplink.los: no such key; did you mean loss?",
@@ -34,10 +30,6 @@ WRONG = {
     "a key that reads like msgspec's own words": (
         '"x` - at `$.file" = 1',
         ("x` - at `$.file: no such key …"),
-    ),
-    "such a key in a table": (
-        'model = { "x` - at `$.file" = 1 }',
-        "model.x` - at `$.file: no such key …",
     ),
     "a key like no other": (
         "model.colour = 1",
@@ -53,12 +45,7 @@ WRONG = {
         "reference.loop = 1",
         "reference.loop: got 1, expected true or false",
     ),
-    "a number for a text": ("title = 3", "title: got 3, expected a text"),
     "a number for a list": ("model.tau_s = 0.8", "model.tau_s: got 0.8, expected a list"),
-    "a text for one number or some": (
-        "model.gain = 'one'",
-        "model.gain: got 'one', expected …",
-    ),
     "a number for a table": ("model = 3", "model: got 3, expected a table"),
     "a text within a list": (
         'control.state_weight = [1.0, "a"]',
@@ -74,23 +61,9 @@ WRONG = {
     ),
     # Out of range.
     "no time step": ("control.dt = 0.0", "control.dt: got 0.0, expected a number >= 0.001"),
-    "a negative time step": (
-        "control.dt = -0.1",
-        "control.dt: got -0.1, expected a number >= 0.001",
-    ),
-    "a time step too long": ("control.dt = 2", "control.dt: got 2, expected a number <= 1.0"),
-    "no horizon": ("control.horizon = 0", "control.horizon: got 0, expected a whole number >= 1"),
     "a horizon beyond any datagram": (
         "control.horizon = 271",
         "control.horizon: got 271, expected a whole number <= 270",
-    ),
-    "a negative weight": (
-        "control.state_weight = [1.0, -2.0]",
-        "control.state_weight[1]: got -2.0, expected a number >= 0.0",
-    ),
-    "no input weight": (
-        "control.input_weight = 0.0",
-        "control.input_weight: got 0.0, expected a number >= 1e-09",
     ),
     "a negative tolerance": (
         "control.trigger = 'state_gap(-1.0)'",
@@ -104,18 +77,10 @@ WRONG = {
         "network.uplink.paper = -0.1",
         "network.uplink: got 'paper(-0.1, 0.02, 2.0, 0.0)', expected … 0 <= minimum_s <= 3600 …",
     ),
-    "no gain": ("vehicle.gain = 0.0", "vehicle.gain: got 0.0, expected a number >= 0.001"),
     "a dead time that fills the memory": (
         "vehicle.dead_time_s = 11.0",
         "vehicle.dead_time_s: got 11.0, expected a number <= 10.0",
     ),
-    "no duration": ("duration = 0.0", "duration: got 0.0, expected a number > 0.0"),
-    "a negative seed": ("seed = -1", "seed: got -1, expected a whole number >= 0"),
-    "a seed of more than 32 bits": (
-        "seed = 4294967296",
-        "seed: got 4294967296, expected a whole number <= 4294967295",
-    ),
-    "no bound": ("model.u_max = [0.0]", "model.u_max[0]: got 0.0, expected a number >= 0.001"),
     "no number": (
         "control.observer_s = nan",
         "control.observer_s: got nan, expected a number >= 0.0",
@@ -123,14 +88,6 @@ WRONG = {
     "a time-out that no clock can count": (
         "link.timeout_s = 1e300",
         "link.timeout_s: got 1e+300, expected a number <= 3600.0",
-    ),
-    "a time constant that vanishes": (
-        "model.tau_s = [1e-300]",
-        "model.tau_s[0]: got 1e-300, expected a number >= 0.001",
-    ),
-    "a true time constant that vanishes": (
-        "vehicle.tau_s = [1e-300]",
-        "vehicle.tau_s[0]: got 1e-300, expected a number >= 0.001",
     ),
     "a circle faster than anything": (
         "reference.radius_m = 1e6\nreference.period_s = 0.1",
@@ -182,19 +139,10 @@ WRONG = {
         'control.delay_bound = "fast"',
         "control.delay_bound: got 'fast', expected a number or 'auto'",
     ),
-    "yes or no for a delay bound": (
-        "control.delay_bound = true",
-        "control.delay_bound: got True, expected a number or 'auto'",
-    ),
-    "a negative delay bound": (
-        "control.delay_bound = -0.1",
-        "control.delay_bound: got -0.1, expected a number >= 0.0",
-    ),
     "a shape that is none": (
         'reference.shape = "ring"',
         ("reference.shape: got 'ring', expected …"),
     ),
-    "a fourth dimension": ("model.axes = 4", "model.axes: got 4, expected 2 or 3"),
     # Right one by one, and impossible together.
     "three time constants in the plane": (
         "model.tau_s = [0.8, 0.8, 0.8]",
@@ -270,10 +218,6 @@ WRONG = {
         COMMITTED + "control.delay_bound = 6.0\ncontrol.dt = 0.1\ncontrol.horizon = 40",
         "link.age_max_s: got 5.0, expected … 6.64 s …",
     ),
-    "an age bound of none": (
-        "link.age_max_s = 0",
-        "link.age_max_s: got 0, expected a number > 0.0",
-    ),
     "a horizon in space that fits no datagram": (
         "model.axes = 3\ncontrol.horizon = 91",
         "control.horizon: got 91, expected … 90 … 3 …",
@@ -344,15 +288,10 @@ def test_what_is_wrong_is_said_with_file_key_given_and_expected(
 @pytest.mark.parametrize(
     ("key", "value"),
     [
-        ("reference.radius_m", "inf"),
         ("reference.altitude_m", "nan"),
         ("reference.points_m", "[[nan, 0.0]]"),
-        ("model.tau_s", "[inf]"),
         ("vehicle.start_m", "[-inf, 0.0]"),
-        ("network.downlink.paper", "inf"),
         ("network.downlink.paper.slots_mean", "inf"),
-        ("simulation.clock_offset_s", "nan"),
-        ("simulation.compute_s", "inf"),
     ],
 )
 def test_a_number_that_is_not_finite_is_refused(key: str, value: str, tmp_path: Path) -> None:
@@ -518,27 +457,16 @@ def test_what_is_left_out_is_the_default(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", reading.names())
-def test_every_scenario_that_comes_with_skytether_can_be_flown(name: str) -> None:
-    """It has a title of one line, and its reference has as many axes as its model."""
+def test_every_scenario_that_comes_with_skytether_can_be_flown(name: str, tmp_path: Path) -> None:
+    """Its reference has as many axes as its model, and it survives being written and read."""
     scenario = reading.load(name)
     assert scenario.title
     assert "\n" not in scenario.title
     start = scenario.make_reference()(np.array(0.0))
     assert start.shape == (scenario.model.axes, 2)
-
-
-@pytest.mark.parametrize("name", reading.names())
-def test_a_scenario_survives_being_written_and_read(name: str, tmp_path: Path) -> None:
-    scenario = reading.load(name)
     path = tmp_path / "copy.toml"
     path.write_bytes(reading.to_toml(scenario))
     assert reading.load(str(path)) == scenario
-
-
-def test_a_scenario_survives_being_a_table() -> None:
-    """The command line lays its flags over such a table."""
-    scenario = reading.load("demo")
-    assert reading.check(reading.to_table(scenario), "flags") == scenario
 
 
 def test_the_names_of_scenarios_are_sorted_and_the_papers_are_there() -> None:

@@ -34,7 +34,7 @@ TABLES = st.dictionaries(st.text(max_size=9), st.integers(0, 9) | st.booleans(),
 
 
 @pytest.mark.parametrize("kind", typing.get_args(Event))
-@settings(max_examples=15)
+@settings(max_examples=4)
 @given(data=st.data())
 def test_an_event_has_a_text_and_survives_its_line_of_json(
     kind: type[Event], data: st.DataObject

@@ -100,15 +100,25 @@ def fly(scenario: Scenario) -> str:
     return str(flown.failure or "")
 
 
-@pytest.mark.long
-@settings(
-    max_examples=int(os.environ.get("LIMITS_EXAMPLES", "100")),
-    suppress_health_check=list(HealthCheck),
-)
-@given(drawn())
-def test_extreme_values_are_flown_or_refused_in_one_line(flat: dict[str, Any]) -> None:
+def is_flown_or_refused_in_one_line(flat: dict[str, Any]) -> bool:
     try:
         said = fly(made(flat))
     except ConfigError as error:
         said = str(error)
-    assert len(said.splitlines()) <= 1
+    return len(said.splitlines()) <= 1
+
+
+@settings(max_examples=30, suppress_health_check=list(HealthCheck))
+@given(drawn())
+def test_extreme_values_are_flown_or_refused_in_one_line(flat: dict[str, Any]) -> None:
+    assert is_flown_or_refused_in_one_line(flat)
+
+
+@pytest.mark.long
+@settings(
+    max_examples=int(os.environ.get("LIMITS_EXAMPLES", "1000")),
+    suppress_health_check=list(HealthCheck),
+)
+@given(drawn())
+def test_many_extreme_values_are_flown_or_refused_in_one_line(flat: dict[str, Any]) -> None:
+    assert is_flown_or_refused_in_one_line(flat)

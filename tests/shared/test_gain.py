@@ -3,7 +3,6 @@
 from typing import Any
 
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.linalg import solve_discrete_are
@@ -22,7 +21,7 @@ TWO_AXES = discretise([0.81, 0.3], DT, [1.0, 0.8])
 FIRM = ControlConfig(state_weight=(7.0, 1.0), input_weight=0.01)
 
 
-@settings(max_examples=40)
+@settings(max_examples=15)
 @given(st.floats(0.0, 10.0), st.floats(1e-3, 10.0), st.floats(0.0, 10.0))
 def test_it_is_that_of_the_riccati_equation(q: float, r: float, s: float) -> None:
     weights = ControlConfig(state_weight=(7.1, q), input_weight=r, change_weight=s)
@@ -34,8 +33,7 @@ def test_it_is_that_of_the_riccati_equation(q: float, r: float, s: float) -> Non
         np.testing.assert_allclose(K, expected, rtol=1e-7)
 
 
-@pytest.mark.long
-@settings(max_examples=40)
+@settings(max_examples=10)
 @given(st.floats(0.0, 10.0), st.floats(1e-3, 10.0), st.floats(1e-4, 10.0))
 def test_a_trajectory_s_regulator_is_that_of_the_riccati_equation_with_changes(
     q: float, r: float, s: float

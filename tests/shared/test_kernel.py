@@ -3,10 +3,15 @@
 import resource
 import subprocess
 import sys
+from collections.abc import Callable
 from importlib import import_module
+from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
+from numba import config as numba_config
 
 from skytether.server.controller import other_schemes
 from skytether.shared.base import kernel
@@ -140,6 +145,97 @@ def run(folder: Path, file_bytes: int = resource.RLIM_INFINITY) -> str:
         preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (file_bytes, file_bytes)),
     )
     return done.stdout.strip()
+
+
+# -- within one process --------------------------------------------------------------------------
+
+FILLING = """
+from skytether.shared.base.kernel import F1, kernel
+
+@kernel
+def fill(values: F1) -> None:
+    values[0] = 2.0
+"""
+
+
+@pytest.fixture
+def filling(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[], Any]:
+    """Each call gives the kernel of a module as a new process would have it."""
+    monkeypatch.setattr(kernel, "KERNELS", [])
+    monkeypatch.setattr(numba_config, "CACHE_DIR", "")
+    file = tmp_path / "filling.py"
+    file.write_text(FILLING)
+
+    def imported() -> Any:
+        spec = spec_from_file_location("filling", file)
+        assert spec is not None
+        assert spec.loader is not None
+        module = module_from_spec(spec)
+        monkeypatch.setitem(sys.modules, "filling", module)
+        spec.loader.exec_module(module)
+        return module.fill
+
+    return imported
+
+
+def fills(fill: Any) -> int:
+    """Call a kernel that must work; returns whether its machine code came from the disk."""
+    values = np.ones(1)
+    fill(values)
+    assert values[0] == 2.0
+    return sum(fill.dispatcher.stats.cache_hits.values())
+
+
+def test_a_kernel_that_cannot_be_stored_works_and_is_stored_later(
+    filling: Callable[[], Any],
+) -> None:
+    """Files cannot grow beyond 100 bytes at first, as on a full disk."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100, before[1]))
+    try:
+        hits = fills(filling())
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert hits == 0
+    assert [fills(filling()), fills(filling())] == [0, 1]
+    fill = filling()
+    for wrong in (np.ones(1, np.float32), np.ones((2, 2)), np.ones(4)[::2]):
+        with pytest.raises(TypeError):
+            fill(wrong)
+
+
+def test_a_kernel_without_a_writable_folder_works(
+    filling: Callable[[], Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(kernel.CacheFolders, "_locator_classes", ())
+    assert fills(filling()) == 0
+
+
+FACTOR = 2
+
+
+def scaled(x: float) -> float:
+    return x * FACTOR
+
+
+def calls(x: float) -> float:
+    return scaled(x)
+
+
+def test_a_kernel_is_stamped_with_all_that_it_uses(monkeypatch: pytest.MonkeyPatch) -> None:
+    before = kernel.stamp(calls)
+    assert kernel.stamp(calls) == before
+    monkeypatch.setitem(globals(), "FACTOR", 3)
+    changed = kernel.stamp(calls)
+    monkeypatch.setitem(globals(), "scaled", plus_one)
+    assert len({before, changed, kernel.stamp(calls)}) == 3
+
+
+def plus_one(x: float) -> float:
+    return x * FACTOR + 1
+
+
+# -- in processes of their own -------------------------------------------------------------------
 
 
 @pytest.mark.long

@@ -1,6 +1,5 @@
 """Checks of missions: goals that are too near to each other, for any number of vehicles."""
 
-import resource
 from itertools import combinations
 
 import numpy as np
@@ -11,9 +10,7 @@ from skytether.shared.scenario.mission import Mission
 from skytether.shared.scenario.tracks import tracks
 
 Goals = dict[int, tuple[Array, Array]]
-MANY = 20_000
-CPU_S = 30.0
-"""Time limit for MANY vehicles [s]: the check takes half a second, comparing all pairs minutes."""
+MANY = 2_000
 
 
 def each_with_each(goals: Goals, apart_m: float, height: float) -> tuple[float, float] | None:
@@ -37,7 +34,7 @@ def drawn(rng: np.random.Generator, below: int) -> Goals:
     return goals
 
 
-@pytest.mark.parametrize("seed", range(20))
+@pytest.mark.parametrize("seed", range(4))
 def test_the_first_two_that_are_too_near_are_found(seed: int) -> None:
     rng = np.random.default_rng(seed)
     for _ in range(20):
@@ -57,7 +54,7 @@ def test_vehicles_that_take_turns_at_a_place_are_not_too_near() -> None:
     assert Mission(turns, 2, 1).nearest(1.0, 1.0) == (1, 2, 4.0, 0.0)
 
 
-@pytest.mark.parametrize("seed", range(20))
+@pytest.mark.parametrize("seed", range(4))
 def test_paths_that_come_too_near_are_found_between_their_points(seed: int) -> None:
     rng, grid_s = np.random.default_rng(seed), np.linspace(0.0, 12.0, 2401)
     for _ in range(10):
@@ -82,11 +79,19 @@ def grid(vehicles: int) -> Array:
     return np.stack(np.divmod(np.arange(vehicles), round(vehicles**0.5)), axis=1).astype(float)
 
 
-@pytest.mark.long
-def test_many_vehicles_are_checked_in_proportion() -> None:
+def test_many_vehicles_are_checked_in_proportion(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Distances are measured within neighbouring cells alone: some per vehicle, not all pairs."""
+    measured = 0
+    norm = np.linalg.norm
+
+    def counted(between: Array, axis: int | None = None) -> Array:
+        nonlocal measured
+        measured += len(between)
+        return norm(between, axis=axis)
+
+    monkeypatch.setattr(np.linalg, "norm", counted)
     lines = [f"{i + 1},{t},{x},{y}" for i, (x, y) in enumerate(grid(MANY)) for t in (0, 5)]
     table = "\n".join(["vehicle,t,x,y", *lines]).encode()
-    before = resource.getrusage(resource.RUSAGE_SELF)
     read = Mission(tracks(table, 2), 2, 1)
     assert read.nearest(0.99, 1.0) is None
     assert read.nearest(1.01, 1.0) == (1, 2, 0.0, 1.0)
@@ -98,8 +103,7 @@ def test_many_vehicles_are_checked_in_proportion() -> None:
         for i, at in enumerate(home)
     }
     assert Mission(in_turn, 2, 1).nearest(0.99, 1.0) is None
-    after = resource.getrusage(resource.RUSAGE_SELF)
-    assert after.ru_utime - before.ru_utime < CPU_S
+    assert MANY < measured < 100 * MANY
 
 
 def test_numbers_of_vehicles_are_those_that_fly() -> None:

@@ -164,8 +164,7 @@ words = st.sampled_from(
 )
 
 
-@pytest.mark.long
-@settings(max_examples=1000, deadline=None)
+@settings(max_examples=100)
 @given(
     st.text(max_size=60)
     | st.text(string.printable, max_size=60)

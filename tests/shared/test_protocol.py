@@ -179,6 +179,7 @@ def test_every_message_is_read_as_it_was_written(message: Message) -> None:
     assert same(decode(encode(message), TERMS), message)
 
 
+@settings(max_examples=50)
 @given(st.one_of(trajectories, leads, observed(splines=True)))
 def test_a_trajectory_and_what_is_told_of_it_are_read_as_they_were_written(
     message: Message,
@@ -317,11 +318,10 @@ def test_documented_sizes_are_the_real_ones() -> None:
     assert len(encode(Time(2**16 - 1, session, 2**32 - 1, stamp, 2**32 - 1))) == 26
 
 
-@pytest.mark.parametrize("step", [60, 60 * 20, 72_000, 360_000])
-@pytest.mark.parametrize("flown", [0, 60])
-def test_an_observation_is_small_for_an_hour(step: int, flown: int) -> None:
+@pytest.mark.parametrize("step", [60, 72_000, 360_000])
+def test_an_observation_is_small_for_an_hour(step: int) -> None:
     """At steps from 10 to 50 ms, of two axes, with a requested silence of a few seconds."""
-    assert len(encode(told_by(step, min(flown, step), splines=True, silence=255))) <= 48
+    assert len(encode(told_by(step, 60, splines=True, silence=255))) <= 48
     assert len(encode(told_by(step, step, splines=True, silence=255))) <= 48
 
 
@@ -519,6 +519,7 @@ def test_the_table_of_messages_is_complete() -> None:
         assert len(checks) + 2 < 16  # the length has one byte
 
 
+@settings(max_examples=25)
 @given(terms, terms)
 def test_terms_differ_in_keys_exactly_where_they_are_not_equal(one: Terms, other: Terms) -> None:
     assert bool(differences(one, other)) == (one != other)

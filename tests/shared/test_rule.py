@@ -228,8 +228,7 @@ def foresee(replay: Replay, step: int) -> Foresight:
     return found
 
 
-@pytest.mark.long
-@quick
+@settings(max_examples=60)
 @given(
     seed=st.integers(0, 2**32 - 1),
     feedback=st.booleans(),

@@ -7,7 +7,9 @@ from pathlib import Path
 
 import pytest
 
+from helpers import refusal
 from skytether.shared.base import toml
+from skytether.shared.scenario import reading
 
 MEMORY_MB = 600
 """Largest memory of a command for a text [MB]."""
@@ -107,6 +109,26 @@ AROUND = {
     "trace": "[network]\nuplink = 'trace(\"trace\")'\n",
 }
 """Scenarios that name a file of each kind."""
+
+
+BOUNDS = {
+    "many columns": ("way.csv", "t,x,y" + ",z" * 62 + "\n", "at most 64 columns"),
+    "long words": ("way.csv", "t,x,y\n0,0," + "9" * 200_000, "line 2: field larger than"),
+    "zones nested deeply": ("zones.json", "[" * 20_000, "a GeoJSON file"),
+    "trips nested deeply": ("trace", "{" * 20_000, "as irtt writes it"),
+    "empty trips": ("trace", '{"round_trips":[[],[]]}', "as irtt writes it"),
+}
+"""Smallest files beyond a parser's bounds."""
+
+
+@pytest.mark.parametrize("name", BOUNDS)
+def test_a_file_beyond_a_bound_is_refused(name: str, tmp_path: Path) -> None:
+    """The parsers' bounds limit their memory, as the long test measures."""
+    file, text, said = BOUNDS[name]
+    (tmp_path / file).write_text(text)
+    scenario = tmp_path / "it.toml"
+    scenario.write_text(AROUND[file])
+    assert said in refusal(lambda: reading.load(str(scenario)))
 
 
 @pytest.mark.long
