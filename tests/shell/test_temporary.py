@@ -100,6 +100,7 @@ def test_what_is_written_while_it_is_removed_is_cleared_by_the_next(
 
 
 @pytest.mark.long
+@pytest.mark.realtime
 def test_a_flight_clears_what_a_killed_one_has_left(tmp_path: Path) -> None:
     short = ("fly", "demo", "--no-page", "--duration", "0.1")
     with Command("fly", "demo", "--no-page", "--duration", "30") as killed:
