@@ -20,7 +20,7 @@ from skytether.shared.telemetry.summary import summarise
 from skytether.shared.wire.protocol import NO_HORIZON, Mode, Observation
 from skytether.sim.flight import fly
 
-quick = settings(max_examples=60, deadline=None)
+quick = settings(max_examples=20)
 
 H, REACH = 3, 12
 DT, TAU_S = 0.05, [0.81, 0.3]
@@ -90,8 +90,9 @@ def flown(x: Array, inputs: Array) -> Array:
     return x
 
 
-@pytest.mark.parametrize("now", [20, 25, 40])
-@pytest.mark.parametrize("age", range(REACH + 1))
+@pytest.mark.parametrize(
+    ("age", "now"), [(0, 20), (1, 25), (5, 40), (REACH - 1, 25), (REACH, 24), (REACH, 40)]
+)
 def test_estimate_is_the_observation_flown_on(age: int, now: int) -> None:
     """(13) for τ = 0 … reach, at any position of the ring buffer."""
     rng = np.random.default_rng(age)
@@ -232,7 +233,6 @@ def test_forgotten_vehicle_begins_again_at_step_zero() -> None:
     np.testing.assert_allclose(estimate(estimator, 1), expected, rtol=0, atol=1e-13)
 
 
-@pytest.mark.long
 @quick
 @given(st.integers(0, 2**32 - 1), st.integers(1, 5), st.booleans())
 def test_batch_is_estimated_as_its_singles(seed: int, vehicles: int, compensate: bool) -> None:

@@ -134,7 +134,7 @@ def test_the_documented_scheme_follows_the_reference(tmp_path: Path) -> None:
 )
 def test_our_schemes_fly_the_same_as_plugins(base: str, scheme: str, tmp_path: Path) -> None:
     plug(tmp_path, OURS)
-    short = {"duration": 8.0, "settle": 2.0}
+    short = {"duration": 4.0, "settle": 2.0}
     ours = packaged(base, short, {"control": {"scheme": scheme}})
     theirs = packaged(base, short, {"control": {"scheme": f"{scheme}_"}})
     assert fly(theirs).trace_hash() == fly(ours).trace_hash()
@@ -259,7 +259,6 @@ BAD_PLAN = "super().plan(*given)\nfound.horizons[rows == 1, :, :80] = {}"
         ("foresee", "raise RuntimeError('no')", "RuntimeError: no"),
         ("plan", "raise RuntimeError('no')", "RuntimeError: no"),
         ("plan", BAD_PLAN.format("np.nan"), "ValueError: expected inputs within ±model.u_max"),
-        ("plan", BAD_PLAN.format("9.0"), "ValueError: expected inputs within ±model.u_max"),
         ("plan", "found.ahead[:] = 1", "ValueError: expected delay bounds from 0 to 0"),
         ("remember", "raise RuntimeError('no')", "RuntimeError: no"),
         ("encode", "raise RuntimeError('no')", "RuntimeError: no"),

@@ -90,7 +90,7 @@ def rmse_m(flown: Scenario, flight: Record) -> float:
 numbers = st.floats(-10.0, 10.0)
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=15)
 @given(st.tuples(*[numbers] * 4), st.integers(1, 40), st.integers(2, KNOTS_MAX))
 def test_a_spline_is_exact_along_a_cubic(
     cubic: tuple[float, ...], spacing: int, count: int
@@ -105,7 +105,7 @@ def test_a_spline_is_exact_along_a_cubic(
         assert found == pytest.approx((p(stage * dt_s), v(stage * dt_s)), abs=1e-7, rel=1e-7)
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=30)
 @given(st.lists(st.tuples(numbers, numbers), min_size=1, max_size=KNOTS_MAX), st.integers(2, 40))
 def test_pieces_join_with_the_velocity_of_the_knot(
     knots: list[tuple[float, float]], spacing: int
@@ -128,6 +128,7 @@ def test_pieces_join_with_the_velocity_of_the_knot(
             assert (near - p) / (side * 1e-4) == pytest.approx(v, abs=0.02)
 
 
+@settings(max_examples=30)
 @given(numbers, numbers, st.integers(-1000, 1000), st.integers(1, 50))
 def test_one_knot_is_a_state_that_goes_on_by_itself(
     p: float, v: float, stage: int, spacing: int
@@ -371,7 +372,7 @@ def test_the_longer_an_observation_knows_nothing_of_it_the_less_likely_it_comes(
     bound = server.scheme._memory.sent.bound
     for since, later in ((0, 4), (1, 4), (2, 2), (4, 1), (8, 0)):
         share = (1.0 - loss) * ((later + 1) / 5 if since else 1.0)
-        found = trajectory._arrives(bound, 0, loss, since)
+        found = plain(trajectory._arrives)(bound, 0, loss, since)
         assert found == pytest.approx(share / (share + loss))
 
 
@@ -447,15 +448,11 @@ def test_what_no_spline_follows_has_as_many_knots_as_there_may_be() -> None:
 
 
 @pytest.mark.long
-@given(
-    st.tuples(st.floats(-5, 5), st.floats(-1, 1)),
-    st.lists(st.floats(-9, 9), min_size=21, max_size=21),
-)
-@settings(max_examples=20)
-def test_what_a_vehicle_is_told_can_be_flown(
-    start: tuple[float, float], places: list[float]
-) -> None:
+@pytest.mark.parametrize("seed", range(9))
+def test_what_a_vehicle_is_told_can_be_flown(seed: int) -> None:
     """Any reference gives motions that continue smoothly, with inputs within bounds."""
+    rng = np.random.default_rng(seed)
+    start, places = (rng.uniform(-5.0, 5.0), rng.uniform(-1.0, 1.0)), rng.uniform(-9.0, 9.0, 21)
     flown = scenario(control={"horizon": 20}, reference={"preview": "all"})
     terms = flown.terms()
     nominal = make_nominal(terms, flown.control, capacity=1)
@@ -500,10 +497,10 @@ def test_bounds_shape_what_is_told() -> None:
     assert sum(run.uplink_packets for run in told) < sum(run.uplink_packets for run in plans)
 
 
-@pytest.mark.parametrize("horizon", [1, 3, 8])
+@pytest.mark.parametrize("horizon", [1, 8])
 def test_a_horizon_too_short_for_a_plan_still_leads_along_the_trajectory(horizon: int) -> None:
     """The server then sends the reference itself; with planned motions errors are 0.3 to 2.7 m."""
-    flown = skytether.fly("demo", **{"control.horizon": horizon, "duration": 30.0})
+    flown = skytether.fly("demo", **{"control.horizon": horizon, "duration": 20.0})
     assert flown.summary.error_max < 0.28
 
 
@@ -514,8 +511,7 @@ def message(step: int, knots: Floats, *, age: int = 9, spacing: int = 5) -> Traj
     return Trajectory(65535, 2**32 - 1, step, 2**32 - 1, age, spacing, knots)
 
 
-@pytest.mark.parametrize("axes", [2, 3])
-@pytest.mark.parametrize("count", [1, 9, KNOTS_MAX])
+@pytest.mark.parametrize(("axes", "count"), [(2, 1), (3, KNOTS_MAX)])
 def test_a_packet_is_small(axes: int, count: int) -> None:
     """23 bytes typically, 36 at most, and 8 for each knot and axis."""
     knots = np.zeros((axes, count, 2), np.float32)
@@ -580,7 +576,7 @@ def test_each_scheme_takes_its_own_messages_alone() -> None:
 huge = st.floats(-(2.0**99), 2.0**99, width=32)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=30)
 @given(
     st.lists(st.tuples(*[huge] * 2), min_size=1, max_size=KNOTS_MAX),
     st.integers(1, 2**16 - 1),
@@ -716,7 +712,6 @@ def test_a_packet_that_has_become_too_old_is_replaced(
     assert (rmse_m(flown, flight) < 0.5) == renewed
 
 
-@pytest.mark.long
 def test_before_a_trajectory_ends_as_many_are_sent_as_make_the_next_one_sure() -> None:
     """At 30 % loss and one trajectory every 2 s; without the rule, 19 of 20 such flights brake."""
     slow = {
@@ -725,8 +720,8 @@ def test_before_a_trajectory_ends_as_many_are_sent_as_make_the_next_one_sure() -
         "reference.agility": 0.02,
         "reference.speed_mps": 0.3,
     }
-    flights = skytether.fly_batch("target", range(1, 7), duration=60.0, **slow)
-    assert sum("brake" in flight.summary.modes for flight in flights) <= 1
+    flights = skytether.fly_batch("target", range(1, 4), duration=40.0, **slow)
+    assert not any("brake" in flight.summary.modes for flight in flights)
 
 
 def test_only_with_feedback() -> None:
@@ -762,7 +757,7 @@ def test_acknowledgements_make_good_what_is_lost() -> None:
                     return inner(self, row, told._replace(in_force=made, since=made + 1))  # noqa: B023
 
                 patch.setattr(Guidance, "observe", observe)
-            flights = fly_batch(flown, range(5, 17))
+            flights = fly_batch(flown, range(5, 11))
         errors[trigger] = (
             np.mean([flight.client["covered"].mean() for flight in flights]),
             np.sqrt(
@@ -772,7 +767,7 @@ def test_acknowledgements_make_good_what_is_lost() -> None:
                             reading.check({**reading.to_table(flown), "seed": seed}, "seed"), flight
                         )
                         ** 2
-                        for seed, flight in zip(range(5, 17), flights, strict=True)
+                        for seed, flight in zip(range(5, 11), flights, strict=True)
                     ]
                 )
             ),

@@ -9,13 +9,10 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from helpers import packaged
-from skytether.server import sessions
 from skytether.server.common.desired import Desired
 from skytether.shared.base import chance
-from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
+from skytether.shared.base.units import MILLISECOND_NS
 from skytether.shared.core.events import NoAnswer, SessionEnded
-from skytether.shared.scenario import reading
-from skytether.shared.scenario.dotted import set_keys
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Record
 from skytether.shared.wire.protocol import Heartbeat, encode
@@ -156,9 +153,9 @@ def test_runs_are_equal_in_another_order_and_in_a_larger_batch() -> None:
     assert len({run.trace_hash() for run in many}) == 8
 
 
-@pytest.mark.parametrize("preview", ["none", 0.5, "all"])
+@pytest.mark.parametrize("preview", ["none", "all"])
 def test_each_run_follows_the_target_of_its_own_seed(
-    preview: float | str, monkeypatch: pytest.MonkeyPatch
+    preview: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     flown = scenario(reference={"shape": "target", "preview": preview})
     runs = assert_as_alone(flown, (3, 1, 2))
@@ -171,35 +168,18 @@ def test_each_run_follows_the_target_of_its_own_seed(
     ]
 
 
-@pytest.mark.parametrize(("dt", "loss", "duration"), [(1.0, 0.93, 240.0), (0.9, 0.9, 300.0)])
-def test_a_session_expires_at_the_same_time_alone_and_in_a_batch(
-    dt: float, loss: float, duration: float
-) -> None:
+def test_a_session_expires_at_the_same_time_alone_and_in_a_batch() -> None:
     """After 30 s of silence a lone server stops ticking, one with further runs continues.
 
     The server looks for expired sessions on the grid of its own clock.
     """
-    rare = {"downlink": f"loss({loss})", "uplink": ""}
-    control, link = {"dt": dt, "horizon": 3}, {"connect_s": 60.0}
-    flown = scenario(duration=duration, control=control, network=rare, link=link)
+    rare = {"downlink": "loss(0.93)", "uplink": ""}
+    control, link = {"dt": 1.0, "horizon": 3}, {"connect_s": 60.0}
+    flown = scenario(duration=240.0, control=control, network=rare, link=link)
     flights = assert_as_alone(flown, range(4))
     ended = [sum(event == SessionEnded(vehicle=1) for *_, event in run.events) for run in flights]
     assert sum(ended) >= 2
-    assert dt != 1.0 or flights[0].figures["server"]["dropped"]["unknown session"] > 0
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("name", ["demo", "paper"])
-def test_a_run_whose_sessions_expire_equals_the_same_run_alone(
-    name: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Vehicles report every few seconds, and the server forgets a session after three."""
-    monkeypatch.setattr(sessions, "SESSION_NS", 3 * SECOND_NS)
-    table = reading.to_table(reading.load(name)) | {"duration": 20.0, "settle": 0.0}
-    set_keys({"network.downlink.loss": 0.97}, table)
-    table["link"]["connect_s"] = 1000.0
-    flights = assert_as_alone(reading.check(table, "test"), range(1, 6))
-    assert sum(event == SessionEnded(vehicle=1) for run in flights for *_, event in run.events) >= 3
+    assert flights[0].figures["server"]["dropped"]["unknown session"] > 0
 
 
 def test_a_run_that_finds_no_server_leaves_the_others_alone() -> None:
@@ -226,8 +206,8 @@ def test_a_flight_whose_trajectory_is_looked_up_anew_is_as_alone(
     monkeypatch.setattr(Desired, "__init__", crowded)
     quiet = "constant(0.0)"
     flown = scenario(
-        duration=0.6,
-        control={"dt": 0.001, "horizon": 2},
+        duration=3.0,
+        control={"dt": 0.005, "horizon": 2},
         network={"uplink": quiet, "downlink": quiet},
         simulation={"compute_s": 0.0},
     )
@@ -244,11 +224,12 @@ def test_vehicles_and_sessions_take_as_many_bytes_in_any_run() -> None:
     assert len(sizes) == 1
 
 
-def test_more_runs_than_share_a_server_are_flown_in_turn() -> None:
+def test_more_runs_than_share_a_server_are_flown_in_turn(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(flight, "COMPANY_MAX", 3)
     flown = scenario(duration=0.2)
-    flights = fly_batch(flown, range(COMPANY_MAX + 1))
-    assert len(flights) == COMPANY_MAX + 1
-    assert flights[-1].trace_hash() == fly(replace(flown, seed=COMPANY_MAX)).trace_hash()
+    flights = fly_batch(flown, range(4))
+    assert len(flights) == 4
+    assert flights[-1].trace_hash() == fly(replace(flown, seed=3)).trace_hash()
     assert fly_batch(flown, ()) == []
 
 

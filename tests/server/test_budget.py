@@ -55,8 +55,7 @@ class Crowd:
         return sent
 
 
-@pytest.mark.long
-@settings(max_examples=50)
+@settings(max_examples=15)
 @given(
     st.lists(st.integers(40, 400), min_size=1, max_size=12),
     st.floats(200.0, 20_000.0),
@@ -194,7 +193,7 @@ class Air:
         return self
 
 
-@pytest.mark.parametrize("rate", [2_000.0, 12_500.0, 100_000.0])
+@pytest.mark.parametrize("rate", [2_000.0, 100_000.0])
 def test_the_rate_of_the_air_is_found(rate: float) -> None:
     air = Air(rate, jitter_s=0.03).run(240.0)
     late = slice(len(air.rates) // 4, None)
@@ -208,7 +207,7 @@ def test_without_following_the_queue_grows(monkeypatch: pytest.MonkeyPatch) -> N
     assert Air(12_500.0).run(60.0).queues_s[-1] > 10.0
 
 
-@pytest.mark.parametrize(("loss", "jitter_s"), [(0.0, 0.15), (0.5, 0.0), (0.7, 0.03)])
+@pytest.mark.parametrize(("loss", "jitter_s"), [(0.0, 0.15), (0.7, 0.03)])
 def test_neither_loss_nor_jitter_lowers_the_rate(loss: float, jitter_s: float) -> None:
     air = Air(1e9, loss=loss, jitter_s=jitter_s).run(240.0, wanted=20_000.0)
     late = slice(len(air.rates) // 2, None)
@@ -277,7 +276,6 @@ def test_random_loss_costs_no_budget() -> None:
     assert cut_m > 1.1 * threshold_m
 
 
-@pytest.mark.long
 def test_a_run_with_a_budget_equals_the_same_run_alone() -> None:
     scenario = crowd({**AUTO, "duration": 4.0, "settle": 1.0})
     for seed, together in zip((1, 2), fly_batch(scenario, (1, 2)), strict=True):

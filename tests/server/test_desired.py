@@ -60,7 +60,7 @@ def truth(start: int, sample: Reference | None = None) -> Array:
     return (sample or SCENARIO.make_reference())((start + np.arange(H + 1)) * DT_S)
 
 
-@settings(max_examples=60)
+@settings(max_examples=25)
 @given(st.lists(st.lists(st.integers(0, 9 * PAGE), min_size=1, max_size=4), min_size=1, max_size=5))
 def test_the_reference_looked_up_is_the_reference(calls: list[list[int]]) -> None:
     desired = make()
@@ -156,7 +156,7 @@ def test_the_reference_is_computed_once_for_a_page_of_steps(
 # -- preview -----------------------------------------------------------------------------------
 
 
-@settings(max_examples=40)
+@settings(max_examples=20)
 @given(
     shape=st.sampled_from(["circle", "square", "target"]),
     preview=st.sampled_from(["none", 0.3, 1.0, 2.0]),
@@ -249,7 +249,7 @@ def first_difference(flights: list[Record]) -> int:
     return int(one["step"][:n][np.any(unlike, axis=0)][0])
 
 
-@pytest.mark.parametrize(("preview", "reach"), [("none", 0), (0.5, 10), (1.0, 20)])
+@pytest.mark.parametrize(("preview", "reach"), [("none", 0), (0.5, 10)])
 def test_a_server_never_sees_ahead(
     preview: float | str, reach: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -310,7 +310,7 @@ def straight(vehicle: int) -> Reference:
     return shapes.timed_path(np.array([0.0, 1e4]), np.array([[0.0, 0.0], [1e2 * vehicle, -1e3]]))
 
 
-@pytest.mark.parametrize("preview", ["all", "none", 0.5])
+@pytest.mark.parametrize("preview", ["all", 0.5])
 def test_each_vehicle_has_a_trajectory_of_its_own(preview: float | str) -> None:
     desired = make(scenario(preview=preview), references=straight)
     rows = np.arange(BLOCK)
@@ -378,7 +378,7 @@ def led(hz: int, velocity: float, until_s: float = 2.0) -> LivePoint:
     return moved
 
 
-@pytest.mark.parametrize("hz", [2, 10, 50])
+@pytest.mark.parametrize("hz", [2, 50])
 def test_moves_tell_the_velocity(hz: int) -> None:
     state = led(hz, 0.7).at(seconds_to_ns(2.1))
     np.testing.assert_allclose(state, [[0.7 * 2.1, 0.7], [0.0, 0.0]], atol=1e-3)

@@ -30,7 +30,7 @@ from skytether.shared.wire.protocol import Mode, Observation, stamp_us, stamped_
 from skytether.sim.flight import fly, fly_batch
 from skytether.sim.world import Clock
 
-quick = settings(max_examples=60)
+quick = settings(max_examples=30)
 
 TERMS = reading.load("demo-committed").terms()
 DT_NS, H = TERMS.dt_ns, TERMS.horizon
@@ -324,19 +324,13 @@ def oddly(
         send(self, message, now_ns=now_ns)
 
     monkeypatch.setattr(ServerSession, "send", lie)
-    return fly(scenario(control={"feedback": feedback}, network=LOSSLESS))
+    keys = {"control": {"feedback": feedback}, "network": LOSSLESS}
+    return fly(scenario(duration=20.0, settle=5.0, **keys))
 
 
-@pytest.mark.parametrize("number", [0, 300])
 @pytest.mark.parametrize(
-    ("field", "value"),
-    [
-        ("step", 16),
-        ("step", 2**20),
-        ("backward_us", -10_000_000),
-        ("since", -1),
-        ("in_force", 2**30),
-    ],
+    ("number", "field", "value"),
+    [(0, "step", 16), (0, "backward_us", -10_000_000), (300, "step", 2**20)],
 )
 def test_one_odd_observation_costs_a_few_steps_at_most(
     number: int, field: str, value: int, monkeypatch: pytest.MonkeyPatch
@@ -347,7 +341,7 @@ def test_one_odd_observation_costs_a_few_steps_at_most(
     steps = steps[steps < 2**19]
     assert steps[0] <= 12 + REPEATS + 1
     assert np.diff(steps).max() <= 9  # one within the round trip, of 0.88 s, is believed
-    error = summarise(scenario(), "test", flight.client).error_max
+    error = summarise(scenario(settle=5.0), "test", flight.client).error_max
     assert error < 0.5
 
 
@@ -360,7 +354,7 @@ def test_believed_one_odd_observation_leaves_the_vehicle_alone(
     """
     monkeypatch.setattr(Plausibility, "judge", believe)
     flight = oddly(monkeypatch, 300, "step", 2**20, feedback=False)
-    error = summarise(scenario(), "test", flight.client).error_max
+    error = summarise(scenario(settle=5.0), "test", flight.client).error_max
     assert flight.failure is not None or (error or 0.0) > 0.5
 
 
@@ -393,13 +387,13 @@ def test_a_server_whose_clock_steps_goes_on_planning(
 
     def clock(*numbers: int) -> Clock | Stepped:
         made = Clock(*numbers)
-        return Stepped(made, 15 * S, by_ns) if next(ours) else made
+        return Stepped(made, 6 * S, by_ns) if next(ours) else made
 
     monkeypatch.setattr(skytether.sim.flight, "Clock", clock)
-    flight = fly(scenario(network=LOSSLESS))
+    flight = fly(scenario(network=LOSSLESS, duration=30.0))
     assert flight.failure is None
     covered = flight.client["covered"]
-    assert covered[600:].all()
+    assert covered[-150:].all()
     assert np.linalg.norm(flight.client["state"][:, :, 0], axis=1).max() < 3.0
 
 
@@ -409,11 +403,11 @@ def test_a_state_that_leaps_is_said_at_both_ends(monkeypatch: pytest.MonkeyPatch
 
     def leaping(self: FirstOrderPlant, command: Array) -> None:
         advance(self, command)
-        if next(steps) == 400:
+        if next(steps) == 200:
             self.x[:, 0] += 300.0
 
     monkeypatch.setattr(FirstOrderPlant, "advance", leaping)
-    flight = fly(packaged("demo-committed", duration=40.0))
+    flight = fly(packaged("demo-committed", duration=20.0))
     said = [event for _, _, event in flight.events]
     assert StateDoubted(vehicle=1) in said
     changes = [(each.after, each.reason) for each in said if isinstance(each, ModeChanged)]

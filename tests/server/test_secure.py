@@ -661,10 +661,9 @@ class Flight:
         raise AssertionError(f"{self.heard} {self.dropped}")
 
 
-@pytest.mark.parametrize("seeds", [range(i, i + 25) for i in range(0, 100, 25)])
-def test_a_handshake_succeeds_over_a_terrible_network(seeds: range) -> None:
+def test_a_handshake_succeeds_over_a_terrible_network() -> None:
     """Half of all packets lost, a fifth duplicated, delays of 0 to 3 s, hence reordering."""
-    for seed in seeds:
+    for seed in range(25):
         flight = Flight(seed, 0.5, lambda rng: rng.uniform(0.0, 3.0))
         flight.until(horizons=30)
         assert flight.client._current.number == live(flight.server)
@@ -722,8 +721,7 @@ def recorded(seed: int) -> Flight:
     return flight
 
 
-@pytest.mark.parametrize("later_ns", [0, 3 * COOKIE_NS])
-@pytest.mark.parametrize("peer", [HERE, ELSEWHERE])
+@pytest.mark.parametrize(("later_ns", "peer"), [(0, ELSEWHERE), (3 * COOKIE_NS, HERE)])
 def test_nothing_of_a_recorded_session_is_accepted_again(peer: Address, later_ns: int) -> None:
     """By either end, from any address; replays draw challenges at most, each shorter."""
     flight = recorded(1)
@@ -813,9 +811,10 @@ def test_a_response_with_another_message_opens_no_channel() -> None:
 # -- floods ------------------------------------------------------------------------------------
 
 
-@pytest.mark.long
-def test_a_flood_of_initiations_takes_no_memory() -> None:
-    """10^5 forged, foreign and repeated ones: the memory is bounded by the number of keys."""
+def test_a_flood_of_initiations_takes_no_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Forged, foreign and repeated ones: the memory is bounded by the number of keys."""
+    assert OUT_MAX == 1024
+    monkeypatch.setattr(server_secure, "OUT_MAX", 64)
     rng, server = random.Random(3), gate()
     clients = [link(seed, key) for seed in range(20) for key in KEYS.values()]
     good = []
@@ -823,8 +822,8 @@ def test_a_flood_of_initiations_takes_no_memory() -> None:
         challenged(client, server)
         good.append(client.hello(HELLO, now_ns=0))
     reasons = Counter[str]()
-    for i in range(100_000):
-        now_ns = i * 10**6
+    for i in range(4000):
+        now_ns = i * 5 * 10**6
         datagram = rng.choice(good)
         peer = HERE if rng.random() < 0.5 else (f"stranger {i}", i % 65_536)
         if i % 4:
@@ -840,7 +839,7 @@ def test_a_flood_of_initiations_takes_no_memory() -> None:
     assert set(reasons) == {"forged", "unknown key", "too many handshakes"}
     assert len(server._vehicles) == len(KEYS)
     assert all(len(each.pending) == PENDING_MAX for each in server._vehicles.values())
-    assert len(server.outbox()) == OUT_MAX == 1024
+    assert len(server.outbox()) == 64
     assert server.outbox() == []
 
 
@@ -849,7 +848,7 @@ def test_hostile_datagrams_give_protocol_errors_alone() -> None:
     flight.client.hello(HELLO, now_ns=flight.now_ns)
     reasons, accepted = Counter[str](), 0
     datagrams = [datagram for _, datagram in flight.sent]
-    for _ in range(20_000):
+    for _ in range(4000):
         if rng.random() < 0.3:
             datagram = bytes([VERSION, rng.randrange(6)]) + rng.randbytes(rng.randrange(600))
         else:

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from helpers import packaged
@@ -252,7 +252,7 @@ def test_the_first_tick_sends_a_horizon_for_the_step_it_is_aboard() -> None:
     assert (later.step, later.age) == (101, 1)
 
 
-@pytest.mark.parametrize("minutes", [36, 71, 71.6, 72, 143.2, 1000])
+@pytest.mark.parametrize("minutes", [36, 71.6, 1000])
 def test_an_observation_that_was_held_back_is_no_new_one(minutes: float) -> None:
     """However often stamps have wrapped since: its round trip would be negative."""
     vehicles, welcome = live()
@@ -529,6 +529,7 @@ def test_welcomed_vehicles_count_as_present_until_they_are_overdue() -> None:
     assert vehicles.server.dropped[Drop.UNKNOWN_SESSION] == 1
 
 
+@settings(max_examples=40)
 @given(
     st.lists(
         st.tuples(

@@ -196,16 +196,13 @@ def usual_rmse() -> list[float]:
 
 
 STEPS = {
-    f"{host} {step_ns // HOUR_NS:+} h": [(15.0, host, step_ns)]
-    for host in ("client", "server")
-    for step_ns in (HOUR_NS, -HOUR_NS)
+    "client + 1 h": [(15.0, "client", HOUR_NS)],
+    "server - 1 h": [(15.0, "server", -HOUR_NS)],
 }
 
 CLOCKS: dict[str, dict[str, Any]] = {
     "an hour apart": {"client_clock": Clock(MIDNIGHT_NS + HOUR_NS)},
-    "an hour apart the other way": {"client_clock": Clock(MIDNIGHT_NS - HOUR_NS)},
     "faster by 200 ppm": {"client_clock": Clock(MIDNIGHT_NS, 200_000)},
-    "slower by 200 ppm": {"client_clock": Clock(MIDNIGHT_NS, -200_000)},
     **{name: {"steps": steps} for name, steps in STEPS.items()},
     "all of it": {
         "client_clock": Clock(MIDNIGHT_NS + HOUR_NS, 200_000),
@@ -219,14 +216,8 @@ CLOCKS: dict[str, dict[str, Any]] = {
 }
 
 
-AGAIN = ("an hour apart the other way", "slower by 200 ppm", "client -1 h", "server -1 h")
-"""Cases that differ from another one only in sign."""
-
-
 @pytest.mark.long
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=[pytest.mark.long] * (name in AGAIN)) for name in CLOCKS]
-)
+@pytest.mark.parametrize("name", CLOCKS)
 def test_the_error_is_the_same_whatever_the_clocks_do(name: str) -> None:
     """Within 5 % of the error with equal clocks, as far as six seeds can show.
 
@@ -243,5 +234,7 @@ def test_the_error_is_the_same_whatever_the_clocks_do(name: str) -> None:
 @pytest.mark.parametrize("name", STEPS)
 def test_without_steady_time_a_step_loses_the_flight(name: str) -> None:
     """The error doubles at least, or the vehicle stands still until its clock has returned."""
+    (usual,), (steady,) = rmse(2), rmse(2, steps=STEPS[name])
     (error,) = rmse(2, wrap=lambda endpoint: endpoint, steps=STEPS[name])
-    assert error > 2.0 * mean(usual_rmse())
+    assert steady < 1.5 * usual
+    assert error > 2.0 * usual

@@ -26,7 +26,7 @@ from skytether.shared.scenario.triggers import (
     make_trigger,
 )
 
-quick = settings(max_examples=60)
+quick = settings(max_examples=25)
 
 CONTROL = ControlConfig(
     scheme="committed",
@@ -233,7 +233,7 @@ def test_a_horizon_takes_the_place_of_a_heartbeat() -> None:
             flight.summary
             for flight in skytether.fly_batch(
                 "target",
-                range(3, 7),
+                range(3, 5),
                 duration=20.0,
                 **{"control.scheme": "trajectory", "control.trigger": trigger},
             )
@@ -302,7 +302,7 @@ def packets(trigger: Trigger, walk: list[tuple[int, bool]]) -> list[int]:
     return sent
 
 
-@settings(max_examples=300)
+@settings(max_examples=60)
 @given(gaps, st.floats(0.01, 60.0), st.floats(1.0, 20.0), st.sampled_from([0.02, 0.05, 1.0]))
 def test_budget_is_kept_in_every_window(
     walk: list[tuple[int, bool]], rate: float, burst: float, dt: float
@@ -483,7 +483,6 @@ def encounters(rng: np.random.Generator, n: int, ticks: int) -> Iterator[Figures
         yield figures
 
 
-@pytest.mark.long
 @quick
 @given(trees, st.integers(0, 2**32 - 1))
 def test_combination_fires_as_its_parts_say(tree: Any, seed: int) -> None:
