@@ -53,6 +53,7 @@ def fetched(net: skytether.bad_network) -> bytes:
         return bytes(answer.read())
 
 
+@pytest.mark.realtime
 def test_a_udp_client_meets_losses_and_changes(bad_network: Opened, client: socket.socket) -> None:
     with echo() as port:
         net = bad_network(to=("127.0.0.1", port))
@@ -70,6 +71,7 @@ def test_a_udp_client_meets_losses_and_changes(bad_network: Opened, client: sock
         assert client.recv(2048) == b"again"
 
 
+@pytest.mark.realtime
 def test_seeds_decide_the_fates(client: socket.socket) -> None:
     def lost(seed: int) -> int:
         with (
@@ -84,6 +86,7 @@ def test_seeds_decide_the_fates(client: socket.socket) -> None:
     assert 16 < lost(1) < 48
 
 
+@pytest.mark.realtime
 def test_an_http_client_is_delayed_slowed_and_cut(
     bad_network: Opened, served: tuple[str, int]
 ) -> None:
@@ -103,6 +106,7 @@ def test_an_http_client_is_delayed_slowed_and_cut(
     until(lambda: net.counts["flows"] == 0)
 
 
+@pytest.mark.realtime
 def test_a_server_that_is_not_there_breaks_the_connection_off(bad_network: Opened) -> None:
     with socket.socket() as closed:
         closed.bind(("127.0.0.1", 0))
@@ -111,6 +115,7 @@ def test_a_server_that_is_not_there_breaks_the_connection_off(bad_network: Opene
             fetched(net)
 
 
+@pytest.mark.realtime
 def test_a_client_that_breaks_off_is_forgotten(
     bad_network: Opened, served: tuple[str, int]
 ) -> None:
@@ -130,6 +135,7 @@ def test_a_client_that_breaks_off_is_forgotten(
     until(lambda: net.counts["flows"] == 0)
 
 
+@pytest.mark.realtime
 def test_there_is_a_largest_number_of_connections(
     bad_network: Opened, served: tuple[str, int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -144,6 +150,7 @@ def test_there_is_a_largest_number_of_connections(
     assert fetched(net)
 
 
+@pytest.mark.realtime
 def test_it_runs_within_ones_own_loop(client: socket.socket) -> None:
     client.setblocking(False)
 
@@ -170,6 +177,7 @@ def test_wrong_arguments_are_told() -> None:
             skytether.bad_network(to=("127.0.0.1", 5000), bind=taken.getsockname())
 
 
+@pytest.mark.realtime
 def test_nothing_is_left_behind(served: tuple[str, int]) -> None:
     with skytether.bad_network(to=served, tcp=True) as net:
         assert fetched(net)

@@ -228,8 +228,8 @@ def test_a_batch_is_its_single_flights(flown: skytether.Flight) -> None:
 def test_each_flight_of_a_batch_has_its_own_drops() -> None:
     damaged = "paper(0.1, 0.02, 2.0) & corrupt(0.3) & loss(0.1)"
     keys = {**SHORT, "network.uplink": damaged, "network.downlink": damaged}
-    together = [each.summary.drops for each in fly_batch("demo", range(1, 4), **keys)]
-    assert together == [fly("demo", seed=seed, **keys).summary.drops for seed in range(1, 4)]
+    together = [each.summary.drops for each in fly_batch("demo", (1, 2), **keys)]
+    assert together == [fly("demo", seed=seed, **keys).summary.drops for seed in (1, 2)]
     assert all(drops and drops.keys() == {"server", "netem", "client"} for drops in together)
 
 
@@ -268,6 +268,7 @@ def test_a_flight_goes_to_pandas(flown: skytether.Flight) -> None:
     assert "input_x_mps_79" in flown.to_pandas("plan")
 
 
+@pytest.mark.long  # pandas takes a second to import
 def test_flights_are_rows_of_a_table(flown: skytether.Flight) -> None:
     pytest.importorskip("pandas")
     swept = skytether.Swept({"control.trigger": "always"}, flown.scenario, (flown.summary,) * 2)
@@ -308,6 +309,7 @@ def test_a_server_of_ones_own_is_flown() -> None:
 
 
 @pytest.mark.long
+@pytest.mark.realtime
 def test_a_flight_over_udp_is_a_flight(tmp_path: Path) -> None:
     at_once = {"network.uplink": "loss(0.1)", "network.downlink": "loss(0.1)"}
     flown = fly("demo", udp=True, secure=True, duration=5, settle=0, **at_once)

@@ -11,6 +11,7 @@ from warm import Process
 QUICK = ("--settle", "0", "--duration", "2")
 
 
+@pytest.mark.realtime
 def test_a_server_listens_at_two_addresses(start: Callable[..., Process]) -> None:
     server = start("server", "demo", "--bind", "127.0.0.1:0", "--bind", "127.0.0.2:0", *QUICK)
     hosts = [server.address().partition(":")[0] for _ in range(2)]
@@ -19,6 +20,7 @@ def test_a_server_listens_at_two_addresses(start: Callable[..., Process]) -> Non
 
 
 @pytest.mark.long
+@pytest.mark.realtime
 @pytest.mark.parametrize("local", ["127.0.0.2", "lo", ""])
 def test_a_client_flies_over_the_path_that_it_is_given(
     local: str, start: Callable[..., Process]
@@ -32,6 +34,7 @@ def test_a_client_flies_over_the_path_that_it_is_given(
 
 
 @pytest.mark.long
+@pytest.mark.realtime
 def test_a_client_flies_over_two_paths_to_two_addresses(start: Callable[..., Process]) -> None:
     """One of the paths is absent: nobody has its interface."""
     server = start("server", "demo", "--bind", "127.0.0.1:0", "--bind", "127.0.0.2:0", *QUICK)
@@ -41,9 +44,3 @@ def test_a_client_flies_over_two_paths_to_two_addresses(start: Callable[..., Pro
         run = warm.skytether("client", "demo", *flags, *QUICK)
         assert run.returncode == 0, run.stderr
     assert server.end() == 0
-
-
-def test_plaintext_is_refused_over_any_path_to_another_machine() -> None:
-    run = warm.skytether("client", "demo", "--path", "127.0.0.1=192.0.2.1:9")
-    assert run.returncode == 2
-    assert "no keys" in run.stderr

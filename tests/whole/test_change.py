@@ -153,7 +153,7 @@ def test_what_is_no_request_is_refused_and_changes_nothing() -> None:
     deep = b'{"vehicle.wind":' + b"[" * 2000 + b"]" * 2000 + b"}"
     good = b'{"vehicle.wind":-1,"network.uplink.loss":[0.5]}'
     requests = [b"", b"[]", b"null", b"\xff", deep, b'{"vehicle.wind":null}', good * 100]
-    for _ in range(2000):
+    for _ in range(500):
         requests.append(rng.randbytes(rng.randrange(200)))
         at, size = rng.randrange(len(good)), rng.randrange(9)
         requests.append(good[:at] + rng.randbytes(size) + good[at + size :])

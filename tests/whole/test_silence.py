@@ -70,11 +70,6 @@ def complaints(copy: Path, *imported: str) -> list[set[str]]:
     return found
 
 
-def test_a_process_which_builds_and_drives_an_endpoint_may_have_a_clock(copy: Path) -> None:
-    append("import time", copy.glob("*/__main__.py"))
-    assert complaints(copy, "time") == [set()]
-
-
 def test_every_core_module_is_named_for_a_clock_a_socket_dice_paths_or_the_system(
     copy: Path,
 ) -> None:
