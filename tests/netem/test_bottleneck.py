@@ -61,10 +61,10 @@ def test_too_much_passes_at_the_rate(serve: str) -> None:
     assert np.mean(waits_ns) == pytest.approx(0.505 * SECOND_NS, rel=0.01)
 
 
-@pytest.mark.parametrize("load", [0.3, 0.6, 0.8])
+@pytest.mark.parametrize("load", [0.3, 0.7])
 def test_random_arrivals_wait_as_in_m_d_1(load: float) -> None:
     """Mean wait of Pollaczek and Khinchine: load / (2 (1 - load)) times the service."""
-    service_ns, count = MILLISECOND_NS, 60_000
+    service_ns, count = MILLISECOND_NS, 30_000
     gaps = np.random.default_rng(7).exponential(service_ns / load, count)
     entered = np.cumsum(gaps).astype(int).tolist()
     out, dropped = passed("rate(100000, queue=1000000)", [(at, 100, 0) for at in entered])

