@@ -543,16 +543,6 @@ def test_who_gets_a_motion_again_says_so_again() -> None:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(("loss", "within_s"), [(0.0, 30.0), (0.3, 60.0)])
-def test_vehicles_swap_places_and_keep_apart(loss: float, within_s: float) -> None:
-    swaps = scenario(8, loss, duration=within_s)
-    flown = flight.fly(swaps, vehicles=8)
-    assert separation_m(flown) > 0.5
-    assert max(left_m(flown, swaps)) < 0.3
-    assert flown.figures["server"]["counts"].get("left_tube", 0) == 0
-
-
-@pytest.mark.long
 def test_motions_that_are_sent_again_arrive_where_half_are_lost(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -714,30 +704,6 @@ def test_who_hovers_on_a_mission_holds_its_place(monkeypatch: pytest.MonkeyPatch
 # -- zones -----------------------------------------------------------------------------------------
 
 
-@pytest.mark.long
-@pytest.mark.parametrize(
-    ("name", "within_s"),
-    [
-        ("corridor", 60.0),
-        ("rings", 75.0),
-        ("warehouse", 130.0),
-    ],
-)
-def test_missions_that_come_with_it(name: str, within_s: float) -> None:
-    shorter = msgspec.structs.replace(reading.load(name), duration=within_s)
-    flown = flight.fly(shorter, vehicles=len(mission_of(name).vehicles))
-    assert separation_m(flown) > 0.5
-    assert clear_m(flown, reading.load(name).zones) > 0.0
-    assert max(left_m(flown, shorter)) < 0.3
-    assert flown.figures["server"]["counts"].get("left_tube", 0) == 0
-
-
-def mission_of(name: str) -> Mission:
-    found = reading.load(name).make_reference()
-    assert isinstance(found, Mission)
-    return found
-
-
 def test_in_space_they_keep_further_apart_one_above_the_other(tmp_path: Path) -> None:
     """Because of downwash; a zone is flown around only at its own heights."""
     rows = "1,0,-3,0,1\n1,2,3,0,1\n2,0,3,0,2.2\n2,2,-3,0,2.2\n"
@@ -827,7 +793,7 @@ def test_a_vehicle_at_rest_in_a_gap_is_flown_around(
     """
     monkeypatch.setattr(MissionPlanner, "_ask_to_yield", lambda *_: None)
     goals = "1,0,0.2,0\n2,0,2.6,-2\n2,1,2.6,2\n3,0,-0.8,-0.9\n4,0,-0.8,0.9\n"
-    swaps, zone = scenario(4, duration=35.0), "box(1, 5, -0.2, 0.2)"
+    swaps, zone = scenario(4, duration=40.0), "box(1, 5, -0.2, 0.2)"
     gap = reading.check(with_goals(tmp_path, goals, swaps, zones=zone), "gap")
 
     def left_over_m() -> float:

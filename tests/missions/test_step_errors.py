@@ -31,7 +31,7 @@ from skytether.shared.scenario.air.path import path
 from skytether.shared.scenario.mission import Mission
 from skytether.shared.scenario.schema import Scenario
 from skytether.sim import flight
-from two_vehicles import drawn, left_m, separation_m
+from two_vehicles import clear_m, drawn, left_m, separation_m
 
 DT_S, DT_NS = 0.05, 50 * MS
 SCALE, ROWS = np.array([1.0, 0.7]), np.array([0])
@@ -450,6 +450,8 @@ def test_missions_over_delays_that_differ(
     assert isinstance(goals, Mission)
     flown = flight.fly(scenario, vehicles=len(goals.vehicles))
     assert separation_m(flown) >= scenario.mission.separation_m
+    if scenario.mission.zones:
+        assert clear_m(flown, scenario.zones) > 0.0
     assert "left_tube" not in flown.figures["server"]["counts"]
     if name != "warehouse":  # goals change there until 150 s
         assert max(left_m(flown, scenario)) < 0.3

@@ -429,25 +429,6 @@ def test_every_step_is_planned_whatever_the_trigger(
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(
-    "vehicle",
-    [{"steady_wind_mps": [0.3, -0.2]}, {"steady_wind_mps": [0.3, -0.2], "gain": 0.8}],
-    ids=["steady wind", "and a wrong gain"],
-)
-def test_the_disturbance_observer_leaves_no_offset(vehicle: dict[str, Any]) -> None:
-    """Hovering in constant wind, in the last twenty seconds; an offset without the observer."""
-    offsets = {}
-    for observer_s in (0.0, 4.0):
-        control = {"trigger": "cost_gap(0.01)", "observer_s": observer_s}
-        reference = {"shape": "hover", "points_m": [[0.0, 0.0]]}
-        flown = scenario(control=control, reference=reference, vehicle=vehicle, duration=60.0)
-        flight = fly(flown)
-        offsets[observer_s] = np.abs(flight.client["state"][-400:, :, 0].mean(axis=0)).max()
-    assert offsets[0.0] > 0.05
-    assert offsets[4.0] < 0.01
-
-
-@pytest.mark.long
 def test_a_mean_loss_of_half_each_way_is_flown_through() -> None:
     """With the cost gap, under twice the error at a loss of 0.1."""
     errors = {}
@@ -503,7 +484,7 @@ def test_the_observer_sees_past_feedback_aboard() -> None:
         "observer_s": 2.0,
     }
     vehicle = {"steady_wind_mps": [0.3, -0.2], "gain": 0.8}
-    flown = scenario(control=control | FIRM, reference=reference, vehicle=vehicle, duration=60.0)
+    flown = scenario(control=control | FIRM, reference=reference, vehicle=vehicle, duration=45.0)
     flight = fly(flown)
     away = np.abs(flight.client["state"][-400:, :, 0])
     assert away.max() < 0.005

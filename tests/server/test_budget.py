@@ -55,7 +55,7 @@ class Crowd:
         return sent
 
 
-@settings(max_examples=15)
+@settings(max_examples=6)
 @given(
     st.lists(st.integers(40, 400), min_size=1, max_size=12),
     st.floats(200.0, 20_000.0),
@@ -195,7 +195,7 @@ class Air:
 
 @pytest.mark.parametrize("rate", [2_000.0, 100_000.0])
 def test_the_rate_of_the_air_is_found(rate: float) -> None:
-    air = Air(rate, jitter_s=0.03).run(240.0)
+    air = Air(rate, jitter_s=0.03).run(160.0)
     late = slice(len(air.rates) // 4, None)
     assert 0.75 * rate < np.mean(air.rates[late]) <= 1.02 * rate
     assert np.quantile(air.queues_s[late], 0.95) < 0.35
@@ -209,7 +209,7 @@ def test_without_following_the_queue_grows(monkeypatch: pytest.MonkeyPatch) -> N
 
 @pytest.mark.parametrize(("loss", "jitter_s"), [(0.0, 0.15), (0.7, 0.03)])
 def test_neither_loss_nor_jitter_lowers_the_rate(loss: float, jitter_s: float) -> None:
-    air = Air(1e9, loss=loss, jitter_s=jitter_s).run(240.0, wanted=20_000.0)
+    air = Air(1e9, loss=loss, jitter_s=jitter_s).run(120.0, wanted=20_000.0)
     late = slice(len(air.rates) // 2, None)
     assert np.mean(air.rates[late]) > 0.9 * 20_000.0
 
@@ -263,17 +263,6 @@ def test_a_budget_flies_where_thresholds_fill_the_queue() -> None:
     assert rmse_m < 0.8
     flies, _ = flown({"control.shared_bytes_per_s": 2700.0}, vehicles)
     assert flies
-
-
-@pytest.mark.long
-def test_random_loss_costs_no_budget() -> None:
-    """The error equals that of thresholds; a rate reduced by losses is far worse."""
-    lossy = "paper(0.4, 0.02, 2) & loss(0.5)"
-    _, threshold_m = flown({}, 8, lossy)
-    _, budget_m = flown(AUTO, 8, lossy)
-    _, cut_m = flown({"control.shared_bytes_per_s": 400.0}, 8, lossy)
-    assert budget_m < 1.05 * threshold_m
-    assert cut_m > 1.1 * threshold_m
 
 
 def test_a_run_with_a_budget_equals_the_same_run_alone() -> None:
