@@ -155,6 +155,18 @@ Ping-Statistik für 192.0.2.1:
 Ca. Zeitangaben in Millisek.:
     Minimum = 0ms, Maximum = 20ms, Mittelwert = 10ms
 """
+WINDOWS_FRENCH = """
+Envoi d’une requête 'Ping'  192.0.2.1 avec 32 octets de données :
+Réponse de 192.0.2.1 : octets=32 temps=20 ms TTL=117
+Délai d’attente de la demande dépassé.
+Réponse de 192.0.2.9 : Impossible de joindre l’hôte de destination.
+Réponse de 192.0.2.1 : octets=32 temps<1ms TTL=117
+
+Statistiques Ping pour 192.0.2.1:
+    Paquets : envoyés = 4, reçus = 3, perdus = 1 (perte 25%),
+Durée approximative des boucles en millisecondes :
+    Minimum = 0ms, Maximum = 20ms, Moyenne = 10ms
+"""
 FPING = """[1700000000.02000] 192.0.2.1 : [0], 64 bytes, 20.0 ms (20.0 avg, 0% loss)
 [1700000000.43050] 192.0.2.1 : [2], 64 bytes, 30.5 ms (25.3 avg, 0% loss)
 [1700000000.43100] 192.0.2.1 : duplicate for [2], 64 bytes, 31.0 ms
@@ -176,6 +188,7 @@ FPING_BARE = "$ fping -c 4 -p 200 192.0.2.1\n" + "".join(
         (BUSYBOX, 1.0, [20, None, None, 30.5, None], 0),
         (WINDOWS, 1.0, [20, None, None, 0.5], 0),
         (WINDOWS_GERMAN, 1.0, [20, None, None, 0.5], 0),
+        (WINDOWS_FRENCH, 1.0, [20, None, None, 0.5], 0),
         (FPING, 0.2, [20, None, 30.5, None], 1),
         (FPING_BARE, 0.2, [20, None, 30.5, None], 1),
     ],

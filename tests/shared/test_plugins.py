@@ -430,6 +430,10 @@ WRONG = {
         "@trigger\ndef slip():\n    return 1\n",
         "policy slip: got 0 parameters, expected at least 1",
     ),
+    "any number of numbers": (
+        "@trigger\ndef slip(now, *numbers: float):\n    return 1\n",
+        "policy slip: *numbers: float: expected a number, as in numbers: float",
+    ),
     "a default out of bounds": (
         "@trigger\ndef slip(now, N: int = 1.5):\n    return 1\n",
         "policy slip: got the default N = 1.5, expected N (whole)",
@@ -563,6 +567,10 @@ UNFLYABLE = {
     "another shape": (
         "return lambda t: np.zeros(3)",
         "ValueError: got float64 of shape (3,) at 1 times, expected floats of shape (2, 2)",
+    ),
+    "whole numbers": (
+        "return lambda t: np.zeros((*t.shape, 2, 2), dtype=np.int64)",
+        "ValueError: got int64 of shape (2, 2) at 1 times, expected floats of shape (2, 2)",
     ),
     "no number": (
         "return lambda t: np.full((*t.shape, 2, 2), np.nan)",

@@ -262,6 +262,9 @@ def test_the_origin_of_the_scenario_counts_more_than_the_plans() -> None:
         (plan(item(16, 0, 0, 0, 0, NORTH, 8, 9), hoverSpeed=0), "hoverSpeed above 0, got 0"),
         (plan({"type": "ComplexItem", "complexItemType": "fwLandingPattern"}), "fwLandingPattern"),
         (plan(item(16), plannedHomePosition=[1]), "a plan with plannedHomePosition"),
+        (plan({}).replace(b"[{}]", b"5"), "a plan with mission items"),
+        (plan(item(16, 10**400)), "mission item 1: hold time a smaller number"),
+        (plan({"type": "ComplexItem", "TransectStyleComplexItem": [1]}), "got None"),
         (plan(item(93, -1, 12)), "mission item 1: a hold time from 0 to 1e+06 s, got -1"),
         (plan(item(16, 0, 0, 0, 0, 47, 8, 1e999)), "mission item 1: coordinates of at most"),
         (plan(item(1e999)), "mission item 1: expected a command and its params"),
@@ -280,6 +283,11 @@ def test_crazyswarms_tools_write_the_header_in_other_ways() -> None:
     for header in (b"# duration", b"Duration"):
         _, points_m = only(tracks.tracks(text.replace(b"duration", header), 2))
         assert points_m[-1] == pytest.approx([1.0, 0.0])
+
+
+def test_a_column_given_twice_is_refused() -> None:
+    with pytest.raises(ValueError, match="line 1: expected the columns t, x, y"):
+        tracks.tracks(b"t,x,y,x\n0,0,0,9\n", 2)
 
 
 def test_a_zip_made_by_macos_is_read_without_its_attributes() -> None:
