@@ -432,30 +432,6 @@ async def fly(flown: Scenario, *, vehicles: int = 1, at_phase: float | None = No
     return Record(client_rows, server_rows, netem_rows)
 
 
-FAST = {
-    "uplink": "constant(0.02)",
-    "downlink": "constant(0.02)",
-}
-
-
-@pytest.mark.long
-@pytest.mark.realtime
-async def test_two_vehicles_fly_in_space_over_real_sockets() -> None:
-    """Delays of 20 ms, an observation and a horizon per step along the circle."""
-    flown = packaged("paper-every-step", settle=0.0, duration=4.0, network=FAST, model={"axes": 3})
-    flight = await fly(flown, vehicles=2)
-    for vehicle in (1, 2):
-        rows = flight.client[flight.client["vehicle"] == vehicle]
-        assert rows["step"][-1] == 79
-        assert len(rows) + rows["missed"][-1] == 80
-        assert rows["state"].shape[1:] == (3, 2)
-        assert rows["in_force"][-1] > 0
-    assert flight.server["solved"].all()
-    assert flight.server["event"].all()
-    assert not flight.netem["lost"].any()
-    assert set(flight.netem["flow"]) == {0, 1}
-
-
 def differences(real: Record, virtual: Record) -> list[str]:
     """Columns in which two flights of one scenario are not equal to the last bit."""
     steps = min(len(real.server), len(virtual.server))

@@ -282,20 +282,3 @@ def test_rooms_of_a_checkout_run_as_processes(name: str) -> None:
     done = ran(sys.executable, "-m", name, "--help", cwd=ROOT)
     assert (done.returncode, done.stderr) == (0, "")
     assert f"skytether {name}" in done.stdout
-
-
-@pytest.mark.long
-@pytest.mark.realtime
-def test_folders_with_our_names_are_not_taken_for_ours(tmp_path: Path) -> None:
-    """Folders in the user's directory are ignored by commands, processes, and `python -P`."""
-    strangers(tmp_path, *OLD_NAMES, "skytether")
-    skytether = str(Path(sys.executable).with_name("skytether"))
-    flags = ["--duration", "3", "--settle", "0"]
-    flags += ["--network.uplink", "loss(0.1)", "--network.downlink", "loss(0.1)"]
-    for argv in (
-        [skytether, "fly", "demo", *flags],
-        [skytether, "sweep", "demo", *flags, "--runs", "1", "--workers", "1", "--out", "swept"],
-        [sys.executable, "-P", "-m", "skytether.server", "--help"],
-    ):
-        done = ran(*argv, cwd=tmp_path)
-        assert done.returncode == 0, done.stderr
