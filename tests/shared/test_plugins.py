@@ -714,30 +714,26 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> str:
     return str(folder)
 
 
+INSTALLED = {
+    "triggers": (
+        "slip(mps=0.3) with 0 <= mps",
+        "--control.trigger slip&silence(1) --reference.shape slope(0.4)",
+    ),
+    "vehicles": ("rail\n", "--vehicle.kind rail"),
+    "schemes": ("beacon\n", "--control.scheme beacon --control.trigger deviation(0.1)"),
+    "impairments": ("dark(every_s) with 1 <= every_s", "--network.uplink constant(0.2)&dark(2)"),
+}
+"""List in which an entry of the package is, the entry, and flags that fly with it."""
+
+
 @pytest.mark.long
-def test_an_installed_package_adds_a_trigger_a_reference_and_a_vehicle(
-    installed: str, tmp_path: Path
+@pytest.mark.parametrize("table", INSTALLED)
+def test_an_installed_package_adds_entries_that_fly(
+    table: str, installed: str, tmp_path: Path
 ) -> None:
-    about = (
-        "Sends if the velocity differs from its plan by more than so many m/s. (from my_package)"
-    )
-    listed = run("triggers", folder=tmp_path, path=installed)
-    assert f"slip(mps=0.3) with 0 <= mps\n    {about}\n" in listed
-    trigger = ("--control.trigger", "slip & budget(5, 2) | silence(1)")
-    flies = ("--vehicle.kind", "rail")
-    argv = (*trigger, *flies)
-    assert "RMSE" in run(f"fly demo --virtual {SHORT}", *argv, folder=tmp_path, path=installed)
-    assert "rail\n    Vehicle that reaches any velocity" in run(
-        "vehicles", folder=tmp_path, path=installed
-    )
-
-
-@pytest.mark.long
-def test_an_installed_package_adds_a_scheme(installed: str, tmp_path: Path) -> None:
-    listed = run("schemes", folder=tmp_path, path=installed)
-    assert "beacon\n    Sends the present state of the reference" in listed
-    control = "--control.scheme beacon --control.trigger deviation(0.1)"
-    line = f"fly demo --virtual --settle 0 --duration 8 {control}"
+    entry, flags = INSTALLED[table]
+    assert f"\n{entry}" in "\n" + run(table, folder=tmp_path, path=installed)
+    line = f"fly demo --virtual --settle 0 --duration 8 {flags}"
     assert "RMSE" in run(line, folder=tmp_path, path=installed)
 
 
@@ -755,17 +751,6 @@ def test_a_package_whose_entry_point_leads_nowhere_is_named(
         "triggers: entry point slip = no_such_module:slip of broken 2.0: "
         "ModuleNotFoundError: No module named 'no_such_module'\n"
     )
-
-
-@pytest.mark.long
-def test_an_installed_package_adds_an_impairment(installed: str, tmp_path: Path) -> None:
-    listed = run("impairments", folder=tmp_path, path=installed)
-    assert "dark(every_s) with 1 <= every_s\n    Loses what is sent in every other" in listed
-    network = ("--network.uplink", "constant(0.2) & dark(2)")
-    said = run(
-        "fly demo --virtual --settle 0 --duration 8", *network, folder=tmp_path, path=installed
-    )
-    assert "RMSE" in said
 
 
 @pytest.mark.parametrize(
