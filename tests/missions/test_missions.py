@@ -785,6 +785,7 @@ def test_without_routes_they_wait_before_a_wall(monkeypatch: pytest.MonkeyPatch)
     assert clear_m(flown, walled.zones) > 0.0
 
 
+@pytest.mark.long
 def test_a_vehicle_at_rest_in_a_gap_is_flown_around(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -1,5 +1,7 @@
 """Safeguards of missions, one by one: each test fails if its safeguard is removed."""
 
+from itertools import islice
+
 import numpy as np
 import pytest
 
@@ -9,9 +11,12 @@ from skytether.server.missions.mission_state import LONGEST
 from skytether.server.missions.possible_motions import NEVER, PossibleMotion, PossibleMotions
 from skytether.server.missions.separation import too_near
 from skytether.server.missions.vehicle_motions import SentMotion, VehicleMotions
+from skytether.server.missions.waypoints import Waypoints
+from skytether.shared.base.chance import stream
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
 from skytether.shared.law.motion import Motion, resting
 from skytether.shared.scenario import zone_texts
+from skytether.shared.scenario.zones import Zones
 from skytether.shared.wire.protocol import NO_HORIZON
 from two_vehicles import DT_S, alone, along, planned, ready, scenario
 
@@ -254,6 +259,25 @@ def test_a_new_goal_opens_what_was_closed_on_the_way_to_the_old_one() -> None:
     vehicle.is_stuck(1, np.array([-4.0, 0.0]), 9.0)
     assert not vehicle.closed
     assert vehicle.detour is None
+
+
+@pytest.mark.parametrize(("rests_x", "is_around"), [(2.0, True), (-4.0, False)])
+def test_who_is_stuck_flies_for_a_while_around_one_that_rests_on_its_way(
+    rests_x: float, is_around: bool
+) -> None:
+    """But not around one that rests at its goal."""
+    place, goal = np.array([4.0, 0.0]), np.array([-4.0, 0.0])
+    vehicle, around = VehicleMotions(), Waypoints(Zones([]), 0.2, 0.9, 400, stream(1, "test"))
+
+    def first(k: int, count: int) -> list[list[float]]:
+        found = around.candidates(vehicle, k, place, goal, lambda: [np.array([rests_x, 0.0])])
+        return [waypoint.tolist() for waypoint in islice(found, count)]
+
+    assert first(101, 2)[0] == goal.tolist()  # the direct way is tried first
+    vehicle.turned_rad = 0.0
+    assert (first(500, 1) != [goal.tolist()]) == is_around
+    vehicle.turned_rad = 0.0
+    assert first(501, 1) == [goal.tolist()]
 
 
 @pytest.mark.parametrize("late", [0.0, 1e11, np.inf])
