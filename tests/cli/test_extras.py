@@ -149,6 +149,7 @@ def test_an_option_names_the_extra_that_it_misses_before_anything_flies(
     assert f"{refused(argv, capfd)}\n" == refusal(argv[0], module, extra)
 
 
+@pytest.mark.long
 def test_a_recording_names_the_extra_that_it_misses_before_anything_flies() -> None:
     missing = run(["fly", "--virtual", "--record", "a.mcap"], ("server",))
     assert (missing.returncode, missing.stdout) == (2, "")

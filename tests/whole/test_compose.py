@@ -42,6 +42,8 @@ def test_a_profile_adds_services_and_changes_none() -> None:
         assert set(SERVICES[name].get("depends_on", {})) <= ALWAYS
 
 
+@pytest.mark.docker
+@pytest.mark.long
 def test_compose_understands_its_file() -> None:
     docker = shutil.which("docker")
     if docker is None or ran(docker, "compose", "version").returncode:

@@ -70,6 +70,7 @@ def complaints(copy: Path, *imported: str) -> list[set[str]]:
     return found
 
 
+@pytest.mark.long
 def test_every_core_module_is_named_for_a_clock_a_socket_dice_paths_or_the_system(
     copy: Path,
 ) -> None:

@@ -130,7 +130,7 @@ def test_without_the_choice_of_paths_the_vehicle_brakes(monkeypatch: pytest.Monk
 
 
 def test_dear_link_carries_at_most_a_tenth_while_the_cheap_one_is_well() -> None:
-    record = fly(two((GOOD, GOOD, 1.0), (GOOD, GOOD, 10.0), duration=60.0))
+    record = fly(two((GOOD, GOOD, 1.0), (GOOD, GOOD, 10.0), duration=40.0))
     assert 0.0 < shares(record)[1] <= 0.1
 
 
