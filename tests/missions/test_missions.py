@@ -722,15 +722,15 @@ def test_in_space_they_keep_further_apart_one_above_the_other(tmp_path: Path) ->
 
 
 def test_vehicles_on_a_sphere_swap_places_through_its_centre() -> None:
-    """Six vehicles; the distance is that of the ellipsoid of `mission.height_m`."""
-    sphere = packaged("sphere", duration=25.0, reference={"shape": "sphere(6)"})
+    """Four vehicles; the distance is that of the ellipsoid of `mission.height_m`."""
+    sphere = packaged("sphere", duration=25.0, reference={"shape": "sphere(4)"})
     goals = sphere.make_reference()
     assert isinstance(goals, Mission)
     centre = np.array([0.0, 0.0, sphere.reference.altitude_m])
     assert np.linalg.norm(goals.places - centre, axis=1) == pytest.approx(4.0)
     begins, ends = (np.stack([goals.goals(n)[at] for n in goals.vehicles]) for at in (0, 1))
-    assert begins + ends == pytest.approx(np.tile(2.0 * centre, (6, 1)))
-    flown = flight.fly(sphere, vehicles=6)
+    assert begins + ends == pytest.approx(np.tile(2.0 * centre, (4, 1)))
+    flown = flight.fly(sphere, vehicles=4)
     assert separation_m(flown, sphere.mission.height_scale) > 0.5
     assert max(left_m(flown, sphere)) < 0.3
     assert "model.axes: got 2, expected 3" in refusal(lambda: packaged("sphere", model={"axes": 2}))
@@ -1073,19 +1073,14 @@ def test_a_goal_that_cannot_be_is_refused(goals: str, said: str) -> None:
     assert said in refusal(lambda: reading.check(table, "mission"))
 
 
-@pytest.mark.parametrize(
-    ("dt_s", "acceleration_mps2"), [(DT_S, 0.6), (0.1, 2.0)], ids=["usual", "coarse"]
-)
-def test_goals_as_near_as_they_may_be_are_reached(
-    dt_s: float, acceleration_mps2: float, tmp_path: Path
-) -> None:
-    """Near to each other and to a zone; also where motions curve much between knots."""
+def test_goals_as_near_as_they_may_be_are_reached(tmp_path: Path) -> None:
+    """Near to each other and to a zone, where motions curve much between knots."""
     swaps = scenario(4, duration=30.0)
 
     def made(goals: str, **mission: Any) -> Scenario:
-        mission["acceleration_mps2"] = acceleration_mps2
+        mission["acceleration_mps2"] = 2.0
         table = with_goals(tmp_path, goals, swaps, **mission)
-        table["control"]["dt"] = dt_s
+        table["control"]["dt"] = 0.1
         table["link"] |= {"timeout_s": 20.0, "age_max_s": 20.0}
         return reading.check(table, "near")
 
@@ -1183,11 +1178,9 @@ def test_the_least_distance_is_of_one_time() -> None:
 
 def test_a_batch_flies_each_mission_alone() -> None:
     """Runs of a batch share a server, and must not keep apart from each other."""
-    swaps = scenario(2, duration=8.0)
-    one = flight.fly(msgspec.structs.replace(swaps, seed=2), vehicles=2)
-    batch = flight.fly_batch(swaps, [1, 2])
-    assert len(batch) == 2
-    assert len(np.unique(one.client["vehicle"])) == 2
+    swaps = scenario(2, duration=4.0)
+    alone = flight.fly(msgspec.structs.replace(swaps, seed=2))
+    assert flight.fly_batch(swaps, [1, 2])[1].trace_hash() == alone.trace_hash()
 
 
 # -- published tasks ---------------------------------------------------------------------------

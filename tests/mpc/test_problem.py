@@ -165,7 +165,7 @@ def test_prediction_is_the_model_flown_step_by_step(seed: int, H: int, axes: int
 
 CASES = [
     pytest.param(H, size, S, reference, id=f"H={H}-{name}-S={S}-{'E7' if reference else 'literal'}")
-    for H, S, reference in ((1, 0.5, True), (40, 0.0, False), (40, 0.5, True), (100, 0.5, False))
+    for H, S, reference in ((1, 0.5, True), (40, 0.0, False), (40, 0.5, True))
     for name, size in (("free", 0.02), ("bound", 3.0))
 ]
 

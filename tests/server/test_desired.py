@@ -264,6 +264,7 @@ def test_a_server_that_sees_all_plans_for_what_comes(monkeypatch: pytest.MonkeyP
 # -- prediction --------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_a_prediction_that_turns_round_at_the_bounds_is_better() -> None:
     """By the gain in docs/schemes.md; an acceleration estimated from the past is far worse."""
     ahead_s, times = 2.0, np.arange(1.0, 300.0, 0.5)

@@ -1,7 +1,6 @@
 """The server as an endpoint: sessions, ticks, and messages."""
 
 import io
-import math
 from contextlib import suppress
 from functools import partial
 from typing import Any
@@ -663,28 +662,6 @@ def test_a_heartbeat_is_due_as_soon_as_the_vehicle_has_asked_for_it() -> None:
     assert sessions.heartbeats_due(DAY_NS + SECOND_NS) == [session]
     session.number_next(DAY_NS + SECOND_NS)
     assert sessions.heartbeats_due(DAY_NS + SECOND_NS) == []
-
-
-def test_two_vehicles_fly_as_each_would_alone() -> None:
-    def horizons(numbers: tuple[int, ...]) -> dict[int, list[bytes]]:
-        vehicles = Vehicles(scenario())
-        sent: dict[int, list[bytes]] = {number: [] for number in numbers}
-        welcomes = {number: vehicles.open(vehicle=number, sender=("v", number)) for number in sent}
-        for step in range(20):
-            for number, welcome in welcomes.items():
-                angle = 0.1 * step + number
-                state = ((math.cos(angle), 0.2), (math.sin(angle), number))
-                vehicles.observe(welcome, 10 * number + step, state, ("v", number))
-            for message, (_, number) in vehicles.tick():
-                assert isinstance(message, Horizon)
-                sent[number].append(message.inputs.tobytes())
-        return sent
-
-    together = horizons((1, 2))
-    assert together[1] == horizons((1,))[1]
-    assert together[2] == horizons((2,))[2]
-    assert together[1] != together[2]
-    assert [len(sent) for sent in together.values()] == [20, 20]
 
 
 def test_a_row_that_was_left_is_used_again_as_if_it_were_new() -> None:

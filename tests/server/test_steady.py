@@ -231,10 +231,10 @@ def test_the_error_is_the_same_whatever_the_clocks_do(name: str) -> None:
     assert max(errors) < 1.5 * max(usual)
 
 
-@pytest.mark.parametrize("name", STEPS)
-def test_without_steady_time_a_step_loses_the_flight(name: str) -> None:
+def test_without_steady_time_a_step_loses_the_flight() -> None:
     """The error doubles at least, or the vehicle stands still until its clock has returned."""
-    (usual,), (steady,) = rmse(2), rmse(2, steps=STEPS[name])
-    (error,) = rmse(2, wrap=lambda endpoint: endpoint, steps=STEPS[name])
+    steps = STEPS["server - 1 h"]
+    (usual,), (steady,) = rmse(2), rmse(2, steps=steps)
+    (error,) = rmse(2, wrap=lambda endpoint: endpoint, steps=steps)
     assert steady < 1.5 * usual
     assert error > 2.0 * usual
