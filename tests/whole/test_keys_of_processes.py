@@ -1,7 +1,5 @@
 """Keys as a user meets them: real processes, sealed packets, and one line for each mistake."""
 
-import os
-import socket
 from collections.abc import Callable
 from pathlib import Path
 
@@ -9,8 +7,6 @@ import pytest
 
 from helpers import refused
 from skytether.shared.core.events import Plaintext, Unauthenticated
-from skytether.shared.scenario import reading
-from skytether.shared.wire.protocol import Hello, encode
 from warm import Process, skytether
 
 QUICK = [
@@ -43,22 +39,6 @@ def test_a_wrong_key_is_one_line_at_each_end(start: Callable[..., Process], tmp_
     (told,) = [event for event in server.events() if isinstance(event, Unauthenticated)]
     assert told.reason == "forged"
     assert not any(isinstance(event, Plaintext) for event in server.events())
-
-
-@pytest.mark.realtime
-def test_a_server_with_keys_answers_nothing_in_plaintext(
-    start: Callable[..., Process], tmp_path: Path
-) -> None:
-    server = start(*SERVER, "--keys", str(key_file(tmp_path)))
-    host, _, port = server.address().partition(":")
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
-        stranger.settimeout(0.5)
-        hello = encode(Hello(1, 1, reading.load("demo").terms()))
-        for payload in (hello, b"\0", os.urandom(512)):
-            stranger.sendto(payload, (host, int(port)))
-        with pytest.raises(TimeoutError):
-            stranger.recv(2048)
-    assert server.end() == 0
 
 
 def test_plaintext_is_said_loudly() -> None:

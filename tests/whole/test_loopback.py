@@ -20,7 +20,7 @@ from skytether.server.endpoint import Server
 from skytether.shared.base.chance import stream
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.core.endpoint import Address, Datagram, Endpoint
-from skytether.shared.core.events import Event, FlowOpened, HostFound, HostMissing, Unreachable
+from skytether.shared.core.events import Event, FlowOpened, Unreachable
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import (
@@ -301,66 +301,6 @@ def test_an_ipv6_socket_hears_ipv6_alone() -> None:
         port = six.getsockname()[1]
         with open_socket(("0.0.0.0", port)) as four:
             assert four.getsockname()[1] == port
-
-
-class Asking(Echo):
-    """Endpoint that sends HELLO to a peer every 20 ms until an answer arrives."""
-
-    def __init__(self, peer: Address) -> None:
-        super().__init__(last=10**6)
-        self.peer, self.due_ns, self.senders = peer, 0, list[Address]()
-
-    @property
-    def finished(self) -> bool:
-        return bool(self.senders)
-
-    def receive(self, datagram: Datagram, *, now_ns: int) -> None:  # noqa: ARG002
-        self.senders.append(datagram.peer)
-
-    def wake(self, *, now_ns: int) -> None:
-        self.due_ns = now_ns + 20_000_000
-        self._out.append(Datagram(b"hello", self.peer))
-
-    def next_wake_ns(self) -> int | None:
-        return self.due_ns
-
-
-@pytest.mark.realtime
-async def test_a_patient_endpoint_is_driven_before_its_peer_is_found(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr("skytether.shell.driver.RESOLVE_EVERY_S", 0.05)
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as server:
-        server.setblocking(False)
-        server.bind(LOOPBACK)
-        port = server.getsockname()[1]
-        peer, found = ("ground.example", port), list[str]()
-
-        def look_up(asked: Address, _family: int) -> Address:
-            assert asked == peer
-            if not found:
-                raise OSError(-3, "Temporary failure in name resolution")
-            return (found[0], port)
-
-        monkeypatch.setattr(udp, "look_up", look_up)
-        asking, events = Asking(peer), list[Event]()
-        driver = Shell(asking, None, paths={0: NetworkPath("", peer)}, is_patient=True)
-        assert not driver.is_local  # as far as is known
-        loop = asyncio.get_running_loop()
-        task = asyncio.create_task(driver.run(events.append))
-        async with asyncio.timeout(PATIENCE_S):
-            while not driver.send_errors:
-                await asyncio.sleep(0.01)
-        assert events == [
-            HostMissing(host=peer[0], reason="Temporary failure in name resolution"),
-        ]
-        found.append(LOOPBACK[0])
-        _, sender = await asyncio.wait_for(loop.sock_recvfrom(server, 100), 180)
-        await loop.sock_sendto(server, b"welcome", sender)
-        await asyncio.wait_for(task, 180)
-    assert events[1:] == [HostFound(host=peer[0], address=LOOPBACK[0])]
-    assert asking.senders == [peer]
-    assert driver.is_local
 
 
 @pytest.mark.realtime
