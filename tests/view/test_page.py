@@ -1,5 +1,6 @@
 """The page without a browser: access, requests of sliders, and answers."""
 
+import asyncio
 import contextlib
 import re
 import socket
@@ -7,6 +8,7 @@ import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import msgspec
 import numpy as np
@@ -22,7 +24,7 @@ from skytether.shared.scenario.schema import Scenario
 from skytether.shell.command import CommandError
 from skytether.sim import flight as virtual
 from skytether.view import plots
-from skytether.view.browser import serve
+from skytether.view.browser import panel, serve
 from skytether.view.browser.access import Visitor, is_loopback, may_play
 from skytether.view.browser.flight import PageFlight
 from skytether.view.browser.page import stop
@@ -203,6 +205,78 @@ def test_a_path_is_cut_and_healed_alone(tmp_path: Path) -> None:
     flight.close()
 
 
+class Handle:
+    """Element of a browser, which the test uses in place of a person."""
+
+    def __init__(self, value: Any = None) -> None:
+        self.value, self.uses = value, list[Any]()
+
+    def on_click(self, act: Any) -> Any:
+        self.uses.append(act)
+        return act
+
+    on_update = on_click
+
+    def use(self, value: Any = None) -> None:
+        self.value = value
+        for act in self.uses:
+            done = act(mock.Mock(client=1))
+            if done is not None:
+                asyncio.run(done)
+
+    def __enter__(self) -> "Handle":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Nothing to leave."""
+
+    def close(self) -> None:
+        """Nothing to close."""
+
+
+class Gui:
+    """Elements by their labels, of viser's methods `add_...`."""
+
+    def __init__(self) -> None:
+        self.elements: dict[str, Handle] = {}
+
+    def __getattr__(self, _: str) -> Any:
+        def add(label: str, *_: Any, **__: Any) -> Handle:
+            self.elements[label] = Handle()
+            return self.elements[label]
+
+        return add
+
+
+@pytest.mark.parametrize(
+    ("label", "value", "yes", "expected"),
+    [
+        ("Cut the link", True, "Yes, cut it", "netem"),
+        ("Loss [%]", 100.0, "Yes, cut it", "netem"),
+        ("Armed", False, "Yes, disarm", "client"),
+    ],
+)
+def test_what_may_end_a_flight_is_asked_once_more(
+    label: str, value: object, yes: str, expected: str
+) -> None:
+    """One click changes nothing; a second one, elsewhere, does, unless it says to leave it."""
+    scenario = msgspec.structs.replace(reading.load("demo"), duration=1.0, settle=0.0)
+    flight, asked = PageFlight(), list[tuple[str, dict[str, Any]]]()
+    for _, process, frame in of_flight(scenario, "demo", virtual.fly(scenario)):
+        flight.take(process, frame)
+    flight.operator = mock.Mock(ask=lambda *request: asked.append(request))
+    flight.values = {"netem": NETWORK, "client": {"armed": True}}
+    gui = Gui()
+    panel.Controls(mock.Mock(gui=gui), [flight], lambda: 1)
+    gui.elements[label].use(value)
+    assert asked == []
+    gui.elements["Leave it"].use()
+    assert asked == []
+    gui.elements[label].use(value)
+    gui.elements[yes].use()
+    assert [process for process, _ in asked] == [expected]
+
+
 def test_a_page_that_came_later_heals_as_well() -> None:
     cuts = {"network.uplink": "rate(5000) & loss(1)", "network.downlink": "loss(1.0)"}
     assert is_cut(cuts)
@@ -214,10 +288,10 @@ def test_a_page_that_came_later_heals_as_well() -> None:
 def test_that_nobody_answers_is_said_in_words(tmp_path: Path) -> None:
     """Once a change was requested; not for the page's own question about changeable keys."""
     flight = PageFlight("", tmp_path)
-    flight.ask("netem", {})
-    flight.ask("client", {"armed": False})
-    until(lambda: flight.answer)
-    assert flight.refused
+    assert flight.operator
+    for process, values in (("netem", {}), ("client", {"armed": False})):
+        flight._answered(process, values, flight.operator._ask(process, values))
+        assert flight.refused == bool(values)
     assert flight.answer.startswith("client ")
     flight.close()
 
@@ -343,6 +417,9 @@ def test_a_fence_is_drawn_as_far_as_it_has_bounds() -> None:
     assert len(fence(fenced(speed_mps=2.0), 2.0)) == 0
 
 
+# -- a process that serves a page ------------------------------------------------------------------
+
+
 def heard(at: str, folder: Path) -> list[str]:
     said: list[str] = []
     with pytest.MonkeyPatch.context() as patch, page_process.beside([folder], at):
@@ -371,6 +448,7 @@ def neighbours() -> Iterator[int]:
             return
 
 
+@pytest.mark.realtime
 def test_a_page_is_served_on_the_next_free_port_where_its_own_is_taken(
     tmp_path: Path, neighbours: int
 ) -> None:
