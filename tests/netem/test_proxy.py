@@ -337,6 +337,14 @@ def test_what_one_host_holds_against_others_is_bounded() -> None:
     assert siege.run(2, *others) > 0.95
 
 
+def test_a_crowd_gives_way_before_a_single_client_that_came_earlier() -> None:
+    proxy = make_proxy(flows=HOST_FLOWS + 2)
+    assert pass_on(proxy, b"alone", CAROL) == 1
+    for port in range(HOST_FLOWS + 1):
+        pass_on(proxy, b"%d" % port, (ATTACKER, port))
+    assert pass_on(proxy, b"new", ALICE) == 2
+
+
 def test_a_fleet_of_one_host_keeps_its_places_from_strangers() -> None:
     fleet = [("192.0.2.1", port) for port in range(HOST_FLOWS)]
     siege = Siege(make_proxy(flows=HOST_FLOWS), spread(5), 5, rate_hz=0)
