@@ -16,6 +16,7 @@ import pytest
 from matplotlib.figure import Figure
 
 import skytether
+from helpers import PATIENCE_S
 from skytether import ConfigError, check, fly, fly_batch, load, sweep
 from skytether.cli import processes
 from skytether.shared.core.events import NoAnswer, ReferenceTooFast
@@ -336,6 +337,7 @@ async def test_a_process_that_fails_is_an_error(monkeypatch: pytest.MonkeyPatch)
         fly("demo", udp=True)
 
 
+@pytest.mark.realtime
 def test_ctrl_c_ends_the_processes_first(monkeypatch: pytest.MonkeyPatch) -> None:
     ended = threading.Event()
 
@@ -354,7 +356,7 @@ def test_ctrl_c_ends_the_processes_first(monkeypatch: pytest.MonkeyPatch) -> Non
             fly("demo", udp=True)
     finally:
         signal.signal(signal.SIGINT, before)
-    assert ended.wait(10)
+    assert ended.wait(PATIENCE_S)
 
 
 # -- sweeps ----------------------------------------------------------------------------------
