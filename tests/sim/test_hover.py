@@ -3,17 +3,15 @@
 from typing import Any
 
 import numpy as np
+import pytest
 
+from bench.missions import fly_with_deaths
 from helpers import packaged
-from skytether.server.endpoint import Server
-from skytether.shared.base.chance import stream
-from skytether.shared.base.units import SECOND_NS
-from skytether.shared.core.endpoint import Datagram
+from skytether.server.tick import Ticker
 from skytether.shared.core.events import Finished, ModeChanged, NotFlown
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Reason, Record
-from skytether.shared.wire.protocol import Heartbeat, Horizon, Idle, decode, encode
-from skytether.sim.flight import MIDNIGHT_NS, fly
+from skytether.sim.flight import fly
 
 
 def scenario(**sections: Any) -> Scenario:
@@ -31,60 +29,17 @@ def said(flight: Record, host: str = "client") -> list[Any]:
     return [event for _, name, event in flight.events if name.split()[0] == host]
 
 
-class Interrupted(Server):
-    """Server that is down for a while, and may return as another life."""
-
-    gone_s = 0.0, 0.0
-    """Begin and end of the server's absence, from the start of the world [s]."""
-    mute = False
-    """Whether the server is up during the absence but sends no horizons."""
-
-    def __init__(self, flown: Scenario, **keys: Any) -> None:
-        super().__init__(flown, **keys)
-        self._terms = flown.terms()
-        self._made: tuple[Scenario, dict[str, Any]] | None = flown, keys
-
-    def gone(self, now_ns: int) -> bool:
-        """Whether the server is down; the first datagram afterwards is received by another life."""
-        begin, end = (MIDNIGHT_NS + round(each * SECOND_NS) for each in self.gone_s)
-        if now_ns >= end and self._made is not None and not self.mute:
-            flown, keys = self._made
-            Server.__init__(self, flown, **keys | {"boot_id": keys["boot_id"] + 1})
-            self._made = None
-        return begin <= now_ns < end
-
-    def muted(self, payload: bytes) -> bytes:
-        message = decode(payload, self._terms)
-        if not isinstance(message, Horizon):
-            return payload
-        vehicle, session, _, server_us, *_ = message
-        return encode(Heartbeat(vehicle, session, server_us, Idle.PLANS, 0))
-
-    def receive(self, datagram: Datagram, *, now_ns: int) -> None:
-        if self.mute or not self.gone(now_ns):
-            super().receive(datagram, now_ns=now_ns)
-
-    def wake(self, *, now_ns: int) -> None:
-        if not self.gone(now_ns):
-            super().wake(now_ns=now_ns)
-        elif self.mute:
-            super().wake(now_ns=now_ns)
-            self._out[:] = [each._replace(payload=self.muted(each.payload)) for each in self._out]
-        else:
-            self._grid.rest()
+def interrupted(flown: Scenario, begin_s: float, end_s: float = 1e6) -> Record:
+    """Flight with a server that is down from one time to another, and returns as another life."""
+    flight, _ = fly_with_deaths(flown, 1, [(begin_s, end_s)])
+    return flight
 
 
-def interrupted(
-    flown: Scenario, begin_s: float, end_s: float = 1e6, *, mute: bool = False
-) -> Record:
-    """Flight with a server that is down, or sends no horizon, from one time to another."""
-    server = Interrupted(flown, boot_id=1, entropy=stream(1, "entropy").bytes)
-    server.gone_s, server.mute = (begin_s, end_s), mute
-    return fly(flown, server=server)
-
-
-def test_a_vehicle_that_never_had_a_horizon_was_never_flown() -> None:
-    flight = interrupted(scenario(), 0.0, mute=True)
+def test_a_vehicle_that_never_had_a_horizon_was_never_flown(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(Ticker, "_send_plans", lambda *_: None)
+    flight = fly(scenario())
     why = str(Reason.OLD)
     assert flight.failure == NotFlown(vehicle=1, covered=0, steps=400, why=why)
     assert said(flight)[-1] == flight.failure
