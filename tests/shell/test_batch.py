@@ -1,6 +1,6 @@
 """`shell.batch`: many datagrams in one system call, and the driver with it.
 
-The driver runs in virtual time; three tests are of the kernel's stamps and the loop of flights.
+The driver runs in virtual time; two tests are of the kernel's stamps and the loop of flights.
 """
 
 import asyncio
@@ -454,7 +454,7 @@ class TwoSockets(Answering):
             self._out.append(Datagram(b"here", datagram.peer, 1))
 
 
-def send_to_both(pieces: Sequence[Sequence[int]], run: Any = run_virtually) -> TwoSockets:
+def send_to_both(pieces: Sequence[Sequence[int]]) -> TwoSockets:
     """Send numbered datagrams to an endpoint; `pieces` has the sockets of each burst."""
     endpoint = TwoSockets(1 + sum(map(len, pieces)), lambda _: [])
 
@@ -470,37 +470,8 @@ def send_to_both(pieces: Sequence[Sequence[int]], run: Any = run_virtually) -> T
                     sent += 1
                 await has_heard(endpoint, sent + 1)
 
-    drive(endpoint, talk, run)
+    drive(endpoint, talk)
     return endpoint
-
-
-@pytest.fixture
-def arrivals_are_stamped() -> Iterator[None]:
-    """The kernel stamps datagrams on arrival: it begins some time after it was asked to."""
-    with open_socket(("127.0.0.1", 0)) as sock:
-        batch = DatagramBatch(sock.family)
-        batch.stamp(sock)
-
-        def is_stamped() -> bool:
-            sock.sendto(b"x", sock.getsockname())
-            time.sleep(0.002)
-            _, _, came_ns = batch.receive(sock)
-            return bool(came_ns) and time.monotonic_ns() - came_ns[0] > MILLISECOND_NS
-
-        until(is_stamped)
-        yield
-
-
-@pytest.mark.realtime
-@pytest.mark.usefixtures("arrivals_are_stamped")
-def test_two_crowded_sockets_are_heard_in_the_order_of_arrival() -> None:
-    endpoint = send_to_both([[0, 1] * 10] * 4, run_really)
-    assert sorted(endpoint.stamps_ns) == endpoint.stamps_ns
-    assert heard_last(endpoint, 40) == list(range(40, 80))
-
-
-def heard_last(endpoint: Answering, count: int) -> list[int]:
-    return [int(each.payload) for each in endpoint.heard[-count:]]
 
 
 @pytest.mark.parametrize("stamped", [True, False])
@@ -519,7 +490,8 @@ def test_crowded_sockets_are_heard_in_the_order_of_their_stamps(
     monkeypatch.setattr(DatagramBatch, "receive", receive)
     endpoint = send_to_both([[0, 1] * 10] * 4)
     assert sorted(endpoint.stamps_ns) == endpoint.stamps_ns
-    assert (heard_last(endpoint, 40) == list(range(40, 80))) == stamped
+    last = [int(each.payload) for each in endpoint.heard[-40:]]
+    assert (last == list(range(40, 80))) == stamped
 
 
 def test_a_quiet_socket_beside_a_crowded_one_shows_no_earlier_time() -> None:

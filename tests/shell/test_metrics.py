@@ -5,7 +5,7 @@ import re
 import socket
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import closing, suppress
 from pathlib import Path
 from time import perf_counter_ns
@@ -113,6 +113,7 @@ def test_every_figure_is_told_or_left_out(process: str, figures: dict[str, dict[
     assert unknown == []
     known = {(PREFIX + each.name).removesuffix("_total") for each in TABLES[kind]}
     assert {family.name for family in told} <= known
+    assert {name for name, _ in numbers(kind, figures[process])} <= names()
 
 
 def test_a_figure_that_is_not_known_is_found(figures: dict[str, dict[str, Any]]) -> None:
@@ -490,13 +491,6 @@ def test_an_address_that_is_taken_is_said_in_a_line(
     assert capsys.readouterr().err == said_
     with pytest.raises(MetricsError):
         Metrics(("no.such.invalid", 0), Collected("netem", "demo", 0.05))
-
-
-def test_all_names_can_be_listed(figures: dict[str, dict[str, Any]]) -> None:
-    told: Callable[[str], set[str]] = lambda process: {  # noqa: E731
-        name for name, _ in numbers(process, figures[process])
-    }
-    assert told("server") | told("netem") | told("client") <= names()
 
 
 def test_the_documented_metrics_exist() -> None:

@@ -137,25 +137,6 @@ def test_cutting_the_link_leads_to_braking_and_hovering_and_healing_it_back(
 
 
 @pytest.mark.long
-def test_what_may_end_a_flight_is_asked_once_more(browser: "sync_api.Browser", flight: str) -> None:
-    with opened(browser, flight) as page:
-        until(lambda: "TRACK" in status(page), "it flies a plan")
-        armed = page.get_by_label("Armed")
-        armed.dispatch_event("click")
-        page.get_by_role("button", name="Leave it").click()
-        until(armed.is_checked, "it is shown as armed again")
-        armed.dispatch_event("click")
-        page.get_by_role("button", name="Yes, disarm").click()
-        until(lambda: "TRACK" not in status(page), "it is disarmed")
-        armed.dispatch_event("click")
-        until(lambda: "TRACK" in status(page), "it flies again, and nobody asks")
-        put(page, "Loss [%]", 100)
-        page.get_by_role("button", name="Leave it").click()
-        page.wait_for_timeout(2500)
-        assert "link cut" not in status(page)
-
-
-@pytest.mark.long
 def test_a_website_cannot_show_the_page_in_a_frame_and_catch_a_click(
     browser: "sync_api.Browser", flight: str
 ) -> None:

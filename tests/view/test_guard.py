@@ -466,36 +466,3 @@ def test_viser_hands_on_only_what_the_guard_accepts(page: Page) -> None:
         for _ in range(2):
             assert told(other, "GuiUpdateMessage")
     assert page._thread.is_alive()
-
-
-@pytest.mark.long
-@pytest.mark.realtime
-def test_what_a_reader_leaves_unread_is_bounded(page: Page) -> None:
-    with closing(deaf(page.port)) as sock:
-        sock.sendall(frame(BINARY, msgspec.msgpack.encode(CAMERA)))
-        until(lambda: page._panels)
-        (panel,) = page._panels.values()
-        buffer = panel._client._websock_connection.get_message_buffer()
-        (connection,) = page._connections.values()
-        until(lambda: connection.paused)
-        kept = []
-        for _ in range(3):
-            for _ in range(10):
-                panel.show(0)
-            kept.append((len(buffer.message_from_id), len(buffer.id_from_redundancy_key)))
-        assert kept[0] == kept[1] == kept[2]
-        assert connection.transport.get_write_buffer_size() < 1_000_000
-
-
-def deaf(port: int) -> socket.socket:
-    """Open the page's websocket on a raw socket with a small receive buffer."""
-    sock = socket.socket()
-    sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
-    sock.settimeout(180.0)
-    sock.connect(("127.0.0.1", port))
-    key = base64.b64encode(os.urandom(16)).decode()
-    head = f"GET / HTTP/1.1\r\nHost: 127.0.0.1:{port}\r\nUpgrade: websocket\r\nConnection: Upgrade"
-    head += f"\r\nSec-WebSocket-Key: {key}\r\nSec-WebSocket-Version: 13"
-    sock.sendall(f"{head}\r\nSec-WebSocket-Protocol: {PROTOCOL}\r\n\r\n".encode())
-    assert b" 101 " in sock.recv(64)
-    return sock

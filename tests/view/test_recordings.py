@@ -4,9 +4,6 @@ import csv
 import io
 import json
 import re
-import signal
-import subprocess
-import sys
 import tracemalloc
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import closing, suppress
@@ -32,7 +29,6 @@ from mcap.writer import CompressionType, Writer
 from fuzz.recordings import frames_of, put, records, written
 from skytether.cli import page_process, recorder
 from skytether.cli.export import export
-from skytether.cli.fleet import metronome
 from skytether.cli.fly import fly
 from skytether.cli.join import join
 from skytether.cli.recorder import Live
@@ -501,52 +497,6 @@ def test_without_its_checksum_a_changed_number_would_be_believed(
         container, "StreamReader", lambda file, **_: StreamReader(file, emit_chunks=True)
     )
     assert recorded_steps(path)[:9] == [0, 1, 2, 3, 4, 5, 6, 9, 8]
-
-
-KILLED = """
-import sys, time
-from pathlib import Path
-import numpy as np
-from skytether.shared.scenario import reading
-from skytether.shared.telemetry.feed import Opened, Rows, described
-from skytether.shared.telemetry.record import client_columns
-from skytether.cli.recorder import Live
-scenario, columns = reading.load("demo"), client_columns(2)
-path, feeds = Path(sys.argv[1]), {"client": Path("nobody")}
-live = Live(path, feeds, scenario, "demo", secure=False, tell=print)
-row, begin_ns = np.zeros(1, columns), time.monotonic_ns()
-row["vehicle"] = 1
-live._take("client", Opened(process="client", name="demo", scenario="", wall_ns=0, time_ns=begin_ns,
-                            parts=described({"client": columns})))
-while True:
-    row["step"] += 1
-    now_ns = time.monotonic_ns()
-    live._take("client", Rows(part="client", time_ns=now_ns, rows=row.tobytes()))
-    print(now_ns - begin_ns, flush=True)
-    time.sleep(0.002)
-"""
-
-
-@pytest.mark.long
-@pytest.mark.realtime
-def test_a_killed_recorder_loses_less_than_a_second(tmp_path: Path) -> None:
-    path = tmp_path / "killed.mcap"
-    with (
-        metronome(0.01) as machine,
-        subprocess.Popen(
-            [sys.executable, "-c", KILLED, str(path)], stdout=subprocess.PIPE, text=True
-        ) as process,
-    ):
-        assert process.stdout is not None
-        told_ns = next(int(line) for line in process.stdout if int(line) > 2_000_000_000)
-        process.send_signal(signal.SIGKILL)
-        told_ns = max([told_ns, *(int(line) for line in process.stdout if line.endswith("\n"))])
-    back = read(path)
-    assert back.lost_bytes is not None
-    assert back.summary is not None
-    assert back.summary.steps == len(back.parts["client"])
-    # Beside what a thread that only sleeps has lost on this machine.
-    assert told_ns - back.frames[-1][0] < 1_000_000_000 + 2e9 * machine.max_s
 
 
 class Closed:
