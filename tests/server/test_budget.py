@@ -15,7 +15,6 @@ from skytether.server import rate as rates
 from skytether.server.budget import BURST_S, GUESS_BYTES, WAIT_S, SharedBudget
 from skytether.server.common.clock import ClockMap
 from skytether.server.rate import RateControl
-from skytether.shared.base.errors import ConfigError
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
 from skytether.shared.law.model import Array
 from skytether.shared.scenario import reading
@@ -297,8 +296,3 @@ def test_vehicles_of_a_fleet_start_one_after_the_other() -> None:
     netem = record.netem[np.unique(record.netem["flow"], return_index=True)[1]]
     assert np.diff(netem["arrived_ns"]).tolist() == [DT_NS, DT_NS]
     assert apart_ns(1000, DT_NS) * 1000 == 5 * SECOND_NS
-
-
-def test_a_rate_below_nothing_is_refused() -> None:
-    with pytest.raises(ConfigError, match=r"control\.shared_bytes_per_s: got -1"):
-        crowd({"control.shared_bytes_per_s": -1.0})

@@ -20,7 +20,7 @@ from skytether.shared.core.endpoint import Address, Datagram
 from skytether.shared.scenario import reading
 from skytether.shared.wire import channel as channels
 from skytether.shared.wire import handshake, noise_nnpsk0
-from skytether.shared.wire.channel import DATA, FRESH_NS, LIFE_NS, OVERLAP_NS, VERSION
+from skytether.shared.wire.channel import DATA, FRESH_NS, OVERLAP_NS, VERSION
 from skytether.shared.wire.drop import ProtocolError
 from skytether.shared.wire.handshake import (
     CHALLENGE,
@@ -537,13 +537,6 @@ def test_keys_are_exchanged_under_way_without_a_lost_packet() -> None:
     assert refusal(client, down[3], 2 * FRESH_NS) == "unknown channel"
 
 
-def test_without_a_successor_a_channel_ends() -> None:
-    client, server = joined()
-    line = called(server, client.seal(OBSERVATION)).line
-    assert refusal(server, client.seal(OBSERVATION), LIFE_NS + 1) == "expired"
-    assert refusal(client, line.seal(HORIZON), LIFE_NS + 1) == "expired"
-
-
 def test_a_hello_that_is_repeated_ends_no_flight() -> None:
     client, server = joined()
     called(server, client.seal(OBSERVATION))
@@ -560,16 +553,6 @@ def test_a_hello_that_is_repeated_ends_no_flight() -> None:
         called(server, client.seal(OBSERVATION), now_ns)
     assert live(server) == before
     assert len(server._vehicles[1].pending) == PENDING_MAX
-
-
-def test_a_closed_attempt_is_not_answered() -> None:
-    client, server = apart()
-    hello = client.hello(HELLO, now_ns=0)
-    welcomed(client, server)
-    client.adopt(now_ns=0)
-    assert called(server, hello).payload == HELLO
-    called(server, client.seal(OBSERVATION))
-    assert refusal(server, hello) == "replayed"
 
 
 # -- bad networks ------------------------------------------------------------------------------
