@@ -444,7 +444,7 @@ def test_a_packet_under_way_still_reaches_a_client_whose_place_was_given_away() 
     assert proxy.outbox() == [Datagram(b"!", ALICE, 0)]
 
 
-@pytest.mark.parametrize("length", [0, 1, 600, 65_507])
+@pytest.mark.parametrize("length", [0, 65_507])
 def test_payloads_pass_unread(length: int) -> None:
     payload = random.Random(length).randbytes(length)
     proxy = make_proxy(mtu=65_507)

@@ -367,38 +367,11 @@ class TestNetwork:
         assert run.stdout.count("b'here'") == 2, run.stderr
 
 
-@contextmanager
-def resolver() -> Iterator[int]:
-    """UDP port of a name server that knows one IPv4 address for all names, 192.0.2.7."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as server:
-        server.bind(("127.0.0.1", 0))
-
-        def answer() -> None:
-            with suppress(OSError):
-                while True:
-                    query, sender = server.recvfrom(512)
-                    question = query[12 : query.index(0, 12) + 5]
-                    counts = struct.pack(">4H", 1, 1, 0, 0)
-                    # DNS record: its name is that at byte 12; type A, class IN, valid for 60 s.
-                    record = struct.pack(">3HIH4B", 0xC00C, 1, 1, 60, 4, 192, 0, 2, 7)
-                    server.sendto(query[:2] + b"\x85\0" + counts + question + record, sender)
-
-        threading.Thread(target=answer, daemon=True).start()
-        yield server.getsockname()[1]
-
-
 @pytest.mark.realtime
 @pytest.mark.long
 @needs_namespaces
 class TestPrograms:
     """Programs of others, as they are."""
-
-    @needs("dig")
-    def test_dig_finds_an_address(self) -> None:
-        with resolver() as port:
-            asked = ["dig", f"@{GATEWAY}", "-p", str(port), "+short", "+time=60", "a.example", "A"]
-            run = ran("--downlink", "constant(0.05)", of=asked)
-        assert (run.stdout, run.returncode) == ("192.0.2.7\n", 0), run.stderr
 
     @needs("iperf3")
     @pytest.mark.parametrize(

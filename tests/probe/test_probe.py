@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
@@ -373,6 +373,7 @@ def test_an_interval_of_a_share_is_wilsons() -> None:
 POINTS = st.tuples(st.integers(0, 1000), st.floats(0, 1))
 
 
+@settings(max_examples=40)
 @given(st.lists(POINTS, min_size=2, max_size=40, unique_by=lambda point: point[0]))
 def test_a_lower_hull_lies_below_all_points(points: list[tuple[int, float]]) -> None:
     x, y = (np.array(each) for each in zip(*points, strict=True))

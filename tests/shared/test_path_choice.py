@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from itertools import count
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
@@ -206,6 +206,7 @@ def test_unused_path_is_tried_now_and_then_and_a_doubted_one_more_often() -> Non
     assert new.looks(AGAIN_NS) == [0, 1]
 
 
+@settings(max_examples=40)
 @given(
     st.lists(st.floats(1.0, 100.0), min_size=2, max_size=4),
     st.floats(0.0, 1e9),

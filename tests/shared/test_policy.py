@@ -209,6 +209,7 @@ def written(tree: Expression) -> str:
     return f"({written(tree.left)} {tree.operator} {written(tree.right)})"
 
 
+@settings(max_examples=40)
 @given(trees)
 def test_every_combination_can_be_written(tree: Expression) -> None:
     assert TRIGGERS.parse(written(tree)) == tree
