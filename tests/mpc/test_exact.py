@@ -74,7 +74,7 @@ def residual(problem: Problem, inputs: Array, gradient: Array) -> float:
     return float((np.abs(wrong) / (1.0 + np.abs(gradient).max(axis=2, keepdims=True))).max())
 
 
-@pytest.mark.parametrize(("horizon", "scale"), [(1, 10.0), (2, 1.0), (40, 1.0), (100, 1.0)])
+@pytest.mark.parametrize(("horizon", "scale"), [(1, 10.0), (2, 1.0), (40, 1.0)])
 def test_it_equals_an_independent_reference(horizon: int, scale: float) -> None:
     problem = make(horizon=horizon)
     gradient, guess = problems(problem, 4, scale, seed=horizon)

@@ -206,7 +206,7 @@ def test_a_flight_whose_trajectory_is_looked_up_anew_is_as_alone(
     monkeypatch.setattr(Desired, "__init__", crowded)
     quiet = "constant(0.0)"
     flown = scenario(
-        duration=12.0,
+        duration=6.0,
         control={"dt": 0.02, "horizon": 2},
         network={"uplink": quiet, "downlink": quiet},
         simulation={"compute_s": 0.0},
