@@ -167,15 +167,6 @@ def test_another_impairment_changes_no_draw_of_the_others() -> None:
     assert lost == [fate.lost for fate in fates("corrupt(0.3) & loss(0.3) & duplicate(0.3)")]
 
 
-def test_a_network_is_met_whatever_was_sent_before() -> None:
-    text = "gamma(0, 0.1, 0.05, correlation_s=0.3) & gilbert_elliott(0.2, 0.2) & duplicate(0.2)"
-    made = Fates(path(text), 3, "uplink", 0)
-    order = np.random.default_rng(1).permutation(500)
-    shuffled = {int(slot): made.at(int(slot)) for slot in order}
-    again = Fates(path(text), 3, "uplink", 0)
-    assert [again.at(slot) for slot in range(500)] == [shuffled[slot] for slot in range(500)]
-
-
 @pytest.mark.parametrize(
     ("text", "said"),
     [

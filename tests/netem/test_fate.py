@@ -58,8 +58,11 @@ def test_losses_are_independent_of_delays() -> None:
 
 def test_a_fate_does_not_depend_on_what_was_asked_before() -> None:
     fates, bursty = (
-        Fates(path(f"{PAPER} & {losses}"), 1, "uplink", 0)
-        for losses in ("loss(0.1)", "gilbert_elliott(0.1, 0.5)")
+        Fates(path(text), 1, "uplink", 0)
+        for text in (
+            LOSSY,
+            "gamma(0, 0.1, 0.05, correlation_s=0.3) & gilbert_elliott(0.1, 0.5) & duplicate(0.2)",
+        )
     )
     year = 365 * 86_400 * SECOND_NS // SLOT_NS
     for each in (fates, bursty):
@@ -152,12 +155,6 @@ def test_losses_change_no_delay(loss: float, burst_s: float) -> None:
     losses = f"gilbert_elliott({loss}, {burst_s})" if burst_s else f"loss({loss})"
     drawn = first_fates(f"{PAPER} & {losses}")
     assert [fate.delay_ns for fate in drawn] == [fate.delay_ns for fate in first_fates()]
-
-
-@pytest.mark.parametrize("delay", ["constant(0.4)", "none"])
-def test_the_delay_model_changes_no_loss(delay: str) -> None:
-    lost = [fate.lost for fate in first_fates(f"{delay} & loss(0.1)")]
-    assert lost == [fate.lost for fate in first_fates()]
 
 
 def test_a_higher_loss_rate_loses_the_same_packets_and_more() -> None:

@@ -5,7 +5,7 @@ import re
 import sys
 import typing
 from collections.abc import Iterator
-from contextlib import closing, contextmanager, suppress
+from contextlib import contextmanager, suppress
 from datetime import datetime, timedelta
 from typing import IO
 
@@ -123,20 +123,6 @@ def test_two_groups_of_a_kind_share_the_lines() -> None:
         "delays_ms 20       7         0",
         "delays_ms 40       0      1234",
     ]
-
-
-@pytest.mark.parametrize("count", [2, 3])
-def test_paths_of_a_session_are_numbered(count: int) -> None:
-    paths = [{"packets": 10 + each, "delay_ms": None} for each in range(count)]
-    with closing(Log("client", "text")) as log:
-        lines = log._lines(Counted(figures={"by_vehicle": {"1": {"paths": paths}}}))
-    words = [line.decode().split()[3:] for line in lines]
-    said = {
-        2: [["1", "2"], ["packets", "10", "11"], ["delay_ms", "none", "none"]],
-        3: [[str(each + 1)] for each in range(3)],
-    }
-    assert ["paths"] in words
-    assert all(line in words for line in said[count])
 
 
 AT = re.compile(r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d\.\d{3} server\.1: ")

@@ -1,6 +1,5 @@
 """Plug-ins: triggers and references from files and packages in all processes; mistakes."""
 
-import csv
 import importlib.util
 import os
 import re
@@ -675,23 +674,6 @@ def test_commands_of_the_laboratory_take_the_flag_several_times(
         assert main([*argv, *given]) == 2
     assert said in capsys.readouterr().err
     assert plugins.flags() == given
-
-
-@pytest.mark.usefixtures("here")
-def test_a_sweep_flies_with_the_triggers_of_several_files(tmp_path: Path) -> None:
-    """A cell for each: one never sends except by `silence`, one whenever possible."""
-    other = NEVER.replace("never", "ever").replace("zeros", "ones")
-    given = []
-    for name, code in (("one.py", NEVER), ("two.py", other)):
-        (tmp_path / name).write_text(HEAD + code)
-        given += ["--plugin", str(tmp_path / name)]
-    grid = ["--grid", "control.trigger=never | silence(1),ever"]
-    short = ["--runs", "1", "--duration", "3", "--settle", "0", "--out", str(tmp_path / "out")]
-    assert main(["sweep", "demo", *given, *grid, *short]) == 0
-    rows = csv.DictReader((tmp_path / "out" / "cells.csv").read_text().splitlines())
-    ratios = {row["control.trigger"]: float(row["event_ratio"]) for row in rows}
-    assert ratios["ever"] > 0.5
-    assert 0.0 < ratios["never | silence(1)"] < 0.2
 
 
 SHORT = "--settle 0 --duration 4 --reference.shape slope(0.4)"
