@@ -92,6 +92,7 @@ def test_a_step_of_1_mps_is_as_measured(ardupilot: Companion) -> None:
     assert dead_s == pytest.approx(0.27, abs=0.02)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("size", "tau_s", "dead_s"), [(0.3, 0.40, 0.16), (2.0, 0.50, 0.36), (4.0, 0.78, 0.50)]
 )
@@ -104,6 +105,7 @@ def test_larger_steps_are_slower_as_measured(
     assert dead == pytest.approx(dead_s, abs=0.04)
 
 
+@pytest.mark.long
 def test_a_vertical_step_is_as_measured(ardupilot: Companion) -> None:
     """Measured for 0.5 m/s: gain 1.01, time constant 0.21 s, dead time 0.24 s."""
     gain, tau_s, dead_s = fitted(*step(ardupilot, 0.5, axis=2))
@@ -152,6 +154,7 @@ def test_px4_errs_as_measured() -> None:
     assert 0.8 < np.sqrt(np.mean((at[500:] - at[:-500]) ** 2)) < 1.8
 
 
+@pytest.mark.long
 def test_10_setpoints_a_second_answer_as_50_do() -> None:
     often, seldom = climbed(), climbed()
     often.velocity = (1.0, 0.0, 0.0)
@@ -216,6 +219,7 @@ def test_px4_does_what_its_parameter_says(value: int, name: str) -> None:
     assert companion.flight.mode_name == name
 
 
+@pytest.mark.long
 def test_a_shorter_time_out_stops_ardupilot_sooner() -> None:
     companion = climbed()
     set_parameter(companion, "GUID_TIMEOUT", 0.5)
@@ -350,9 +354,7 @@ def test_it_lands_where_it_does_not_know_its_place(flavour: FlavourName) -> None
     ("flavour", "keys", "mode"),
     [
         ("ardupilot", {}, FlightMode.GUIDED),
-        ("ardupilot", {"BATT_FS_LOW_ACT": 1}, FlightMode.LAND),
         ("ardupilot", {"BATT_FS_LOW_ACT": 2}, FlightMode.RETURN),
-        ("px4", {}, FlightMode.GUIDED),
         ("px4", {"COM_LOW_BAT_ACT": 2}, FlightMode.LAND),
     ],
 )
@@ -461,7 +463,7 @@ def test_parameters_are_read_listed_and_set(flavour: FlavourName) -> None:
     assert len(companion.all("PARAM_VALUE")) == count
 
 
-@pytest.mark.parametrize("rate", [10.0, 20.0, 50.0, 100.0, 200.0])
+@pytest.mark.parametrize("rate", [10.0, 200.0])
 def test_a_stream_is_exact_by_its_own_stamp(rate: float) -> None:
     companion = Companion()
     companion.run(1.0)
@@ -503,7 +505,6 @@ def test_time_is_told_at_once() -> None:
     assert len(companion.all("TIMESYNC")) == count
 
 
-@pytest.mark.parametrize("flavour", BOTH)
 @pytest.mark.parametrize(
     "name",
     [
@@ -517,8 +518,8 @@ def test_time_is_told_at_once() -> None:
         "AUTOPILOT_VERSION",
     ],
 )
-def test_a_message_is_sent_on_request(flavour: FlavourName, name: str) -> None:
-    companion = Companion(flavour)
+def test_a_message_is_sent_on_request(name: str) -> None:
+    companion = Companion("px4")
     companion.run(1.0)
     number = getattr(dialect, f"MAVLINK_MSG_ID_{name}")
     companion.heard.clear()
@@ -630,7 +631,7 @@ def test_whom_it_is_told_of_hears_it_from_the_start() -> None:
     assert {peer for _, peer, _ in autopilot.outbox()} == {address}
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=15, deadline=None)
 @given(st.lists(st.binary(max_size=80), max_size=20))
 def test_garbage_is_counted(garbage: list[bytes]) -> None:
     autopilot = Autopilot(Scenario(), "ardupilot", ready_s=0.0)
@@ -642,7 +643,7 @@ def test_garbage_is_counted(garbage: list[bytes]) -> None:
     assert autopilot.outbox() == []
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=20, deadline=None)
 @given(st.data())
 def test_any_message_with_any_fields_is_survived(data: st.DataObject) -> None:
     numbers = st.floats(width=32)
@@ -686,7 +687,7 @@ def test_the_same_seed_is_the_same_flight() -> None:
     for seed in (1, 1, 2):
         companion = Companion(seed=seed, turbulence_mps=6.0, steady_wind_mps=[6.0, 0.0])
         companion.climb()
-        companion.run(10.0)
+        companion.run(4.0)
         places.append(companion.flight.position())
         assert abs(companion.flight.quadrotor.attitude().yaw) < 0.05
         assert math.hypot(*places[-1][:2]) < 2.0

@@ -38,6 +38,7 @@ def heartbeat(own: socket.socket) -> object:
 
 
 @pytest.mark.long
+@pytest.mark.realtime
 @pytest.mark.parametrize("line", LINES)
 def test_a_documented_autopilot_is_one(
     line: str, start: Callable[..., Process], tmp_path: Path
@@ -76,6 +77,7 @@ def test_what_cannot_be_is_refused_in_a_line(
     assert said in refused(["autopilot", *argv], capfd)
 
 
+@pytest.mark.realtime
 def test_an_insecure_one_may_be_reached(start: Callable[..., Process]) -> None:
     autopilot = start("autopilot", "--bind", "0.0.0.0:0", "--insecure", "--log", "json")
     assert autopilot.address().startswith("0.0.0.0:")

@@ -42,8 +42,7 @@ def boot(local_ns: int, drift: float, offset_ns: int = 7 * SECOND) -> int:
     return round((local_ns - offset_ns) * (1.0 - drift))
 
 
-@pytest.mark.long
-@settings(max_examples=100)
+@settings(max_examples=30)
 @given(
     st.floats(-DRIFT_MAX, DRIFT_MAX),
     st.lists(

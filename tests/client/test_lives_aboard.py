@@ -36,9 +36,9 @@ def farthest_m(air: Air, seconds: float) -> float:
     return most
 
 
-def test_a_client_restarted_in_the_air_flies_on_in_the_frame_it_had(flavour: FlavourName) -> None:
+def test_a_client_restarted_in_the_air_flies_on_in_the_frame_it_had() -> None:
     """Figure and fence stay where they were: the saved origin outlives the process."""
-    air = away(flavour)
+    air = away("px4")
     air.restart(0.3)
     assert farthest_m(air, 12.0) < 3.5
     assert air.client._pilot.step > 300, "steps go on counting"
@@ -86,16 +86,13 @@ def test_an_origin_of_before_the_autopilots_reboot_is_not_taken() -> None:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("down_s", [0.5, 30.0])
-def test_a_client_restarted_after_a_failsafe_landing_arms_nothing(
-    flavour: FlavourName, down_s: float
-) -> None:
+def test_a_client_restarted_after_a_failsafe_landing_arms_nothing() -> None:
     """A new process does not replace a person: it waits for one, and then takes off."""
-    air = away(flavour)
+    air = away("px4")
     air.world.stop("client")
     air.lands(40.0)
     arms = len(air.commands(ARM))
-    air.restart(down_s)
+    air.restart(30.0)
     air.run(20.0)
     assert len(air.commands(ARM)) == arms
     assert not air.flight.armed
@@ -128,6 +125,7 @@ def test_a_word_counts_on_the_ground_alone() -> None:
     air.restart(1.0)
     air.run(10.0)
     assert not air.flight.armed
+    assert air.of(ArmingAwaited)[-1].why == "an earlier run of its client has armed it"
 
 
 def test_a_first_life_takes_off_as_before() -> None:

@@ -16,7 +16,7 @@ from skytether.shared.core.events import address_text as text
 from skytether.shared.scenario.reading import to_toml
 from skytether.shell.control import Caller
 
-pytestmark = pytest.mark.long
+pytestmark = [pytest.mark.long, pytest.mark.realtime]
 
 
 class Service:

@@ -361,19 +361,18 @@ def test_the_server_does_not_learn_noise_for_wind(monkeypatch: Any) -> None:
     assert share() > 1.05 * with_it
 
 
-@pytest.mark.parametrize("feedback", [False, True])
-def test_a_vehicle_with_positions_alone_is_flown_through_steady_wind(feedback: bool) -> None:
+def test_a_vehicle_with_positions_alone_is_flown_through_steady_wind() -> None:
     """At 5 Hz and 0.1 s late: the server estimates the wind from the filter's states."""
     flown = scenario(
         sensor=POSITIONS | {"delay_s": 0.1},
         vehicle={"steady_wind_mps": [0.3, 0.0]},
-        control={"feedback": feedback},
+        control={"feedback": False},
         duration=40.0,
         settle=10.0,
     )
     flight = fly(flown)
     rmse = summarise(flown, "demo", flight.client, flight.server).rmse_xy
-    assert rmse < (0.05 if feedback else 0.12)
+    assert rmse < 0.12
     measured = flight.client["measured"]
     assert np.isnan(measured[:, :, 1]).all()
     assert np.isfinite(measured[:, :, 0]).all(axis=1).sum() == flown.steps // 4

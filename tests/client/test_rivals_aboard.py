@@ -9,6 +9,7 @@ from airborne import SECOND, Air, flying, modes
 from bench.autopilots import MODELS
 from skytether.autopilot.faults import COMMANDED
 from skytether.autopilot.flavours import FlavourName
+from skytether.client.mavlink.rivals import GUIDED_ITEM, QUIET_NS, Rivals
 from skytether.mavlink.codec import Codec, Message
 from skytether.mavlink.dialect import dialect
 from skytether.shared.core.aboard import SecondCommander, Strays
@@ -54,13 +55,11 @@ def say(air: Air, message: Message, seconds: float, every_s: float = 0.1) -> Non
 
 
 @pytest.mark.long
-def test_a_commander_that_nobody_sees_is_noticed_and_the_vehicle_lands(
-    flavour: FlavourName,
-) -> None:
+def test_a_commander_that_nobody_sees_is_noticed_and_the_vehicle_lands() -> None:
     """The other commander sends at 50 Hz and wins; braking fails, so the vehicle lands in a mode
     that ignores set-points.
     """
-    air = tracking(flavour)
+    air = tracking("ardupilot")
     began, began_ns = np.array(air.flight.position()), air.world.now_ns
     air.autopilot.script._commands = True
     noticed_s = air.run(5.0, lambda: bool(air.of(Strays)))
@@ -115,9 +114,47 @@ def test_neither_wind_nor_a_wrong_model_is_taken_for_a_commander(
 # Detected on the line
 
 
+def repeated(message: Message, every_ns: int = SECOND // 10) -> Rivals:
+    """Detector that has heard another commander's message twice."""
+    rivals = Rivals()
+    for now_ns in (SECOND, SECOND + every_ns):
+        rivals.hear(message, 1, now_ns=now_ns)
+    return rivals
+
+
 @pytest.mark.parametrize("message", [velocity(), sticks(400), channels(1700)])
-def test_set_points_of_others_are_noticed_within_a_second(message: Message) -> None:
-    air = tracking()
+def test_two_set_points_within_a_second_are_a_second_commander(message: Message) -> None:
+    rivals = repeated(message, every_ns=SECOND)
+    assert rivals.newest[2] == message.get_type()
+    assert rivals.are_there(now_ns=2 * SECOND + QUIET_NS)
+    assert not rivals.are_there(now_ns=2 * SECOND + QUIET_NS + 1)
+    assert not repeated(message, every_ns=SECOND + 1).are_there(now_ns=3 * SECOND)
+
+
+@pytest.mark.parametrize("current", [1, 2, 3])
+def test_a_mission_item_that_is_flown_to_at_once_counts_alone(current: int) -> None:
+    rivals = Rivals()
+    item = dialect.MAVLink_mission_item_int_message(1, 1, 0, 6, 16, current, 1, 0, 0, 0, 0, 0, 0, 0)
+    rivals.hear(item, 1, now_ns=SECOND)
+    assert rivals.are_there(now_ns=SECOND) == (current in GUIDED_ITEM)
+
+
+@pytest.mark.parametrize(
+    "message",
+    [
+        velocity(target=2),
+        sticks(50),
+        channels(1550),
+        channels(65535),
+        dialect.MAVLink_param_request_list_message(1, 1),
+    ],
+)
+def test_what_others_say_that_moves_nothing_is_no_command(message: Message) -> None:
+    assert not repeated(message).are_there(now_ns=SECOND + SECOND // 10)
+
+
+def test_set_points_of_others_are_noticed_within_a_second() -> None:
+    air, message = tracking(), velocity()
     say(air, message, 0.5)
     (told,) = air.of(SecondCommander)
     assert (told.system, told.component, told.said) == (255, 190, message.get_type())
@@ -130,28 +167,6 @@ def test_a_command_to_go_somewhere_counts_at_once() -> None:
     air = tracking()
     say(air, goto(), 0.1)
     assert modes(air)[-1] == ("brake", str(Reason.RIVAL))
-
-
-@pytest.mark.parametrize(
-    "message",
-    [
-        velocity(target=2),
-        sticks(0),
-        channels(1500),
-        dialect.MAVLink_param_request_list_message(1, 1),
-    ],
-)
-def test_what_others_say_that_moves_nothing_is_left_to_them(message: Message) -> None:
-    air = tracking()
-    say(air, message, 2.0)
-    assert air.mode is Mode.TRACK
-    assert not air.of(SecondCommander)
-
-
-def test_one_stray_set_point_is_none() -> None:
-    air = tracking()
-    say(air, velocity(), 2.4, every_s=1.2)
-    assert air.mode is Mode.TRACK
 
 
 def test_a_vehicle_may_yield_to_a_second_commander_as_to_a_pilot() -> None:
@@ -168,9 +183,9 @@ def test_a_vehicle_may_yield_to_a_second_commander_as_to_a_pilot() -> None:
     assert air.mode is Mode.TRACK
 
 
-def test_a_vehicle_that_yields_sends_nothing_while_it_is_led_away(flavour: FlavourName) -> None:
+def test_a_vehicle_that_yields_sends_nothing_while_it_is_led_away() -> None:
     """No foreign message is on the line, but the vehicle moves despite a command to stand."""
-    air = tracking(flavour, mavlink={"second_commander": "yield"})
+    air = tracking("ardupilot", mavlink={"second_commander": "yield"})
     air.autopilot.script._commands = True
     air.run(3.0, lambda: bool(air.of(Strays)))
     assert modes(air)[-1] == ("manual", str(Reason.TAKEN))
