@@ -79,8 +79,8 @@ FRAMES: list[Frame] = [
 ]
 
 
-@given(st.lists(st.sampled_from(FRAMES), max_size=5), st.data())
-@settings(max_examples=40)
+@given(st.lists(st.sampled_from(FRAMES), max_size=4), st.data())
+@settings(max_examples=25)
 def test_frames_are_read_however_they_are_cut(frames: list[Frame], data: st.DataObject) -> None:
     stream, reader, read = b"".join(map(encode, frames)), Reader(), []
     while stream:

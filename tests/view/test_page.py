@@ -7,6 +7,7 @@ import socket
 import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 from unittest import mock
 
@@ -422,12 +423,13 @@ def test_a_fence_is_drawn_as_far_as_it_has_bounds() -> None:
 
 def heard(at: str, folder: Path) -> list[str]:
     said: list[str] = []
-    with pytest.MonkeyPatch.context() as patch, page_process.beside([folder], at):
+    with pytest.MonkeyPatch.context() as patch:
         patch.setattr(page_process, "say", said.append)
-        until(lambda: said)
-        if found := re.search(r"http://\S*", said[0]):
-            with urllib.request.urlopen(found[0]) as page:
-                said.append(page.read().decode())
+        with page_process.beside([folder], at):
+            until(lambda: said)
+            if found := re.search(r"http://\S*", said[0]):
+                with urllib.request.urlopen(found[0]) as page:
+                    said.append(page.read().decode())
     return said
 
 
@@ -471,6 +473,9 @@ def test_where_no_port_is_free_that_is_said(
         serve.next_free("192.0.2.1", neighbours)
 
 
-def test_a_flight_goes_on_without_a_page(tmp_path: Path) -> None:
+def test_a_flight_goes_on_without_a_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Here the page's process prints what it was asked for, and ends."""
+    monkeypatch.setattr(page_process, "sys", SimpleNamespace(executable="/bin/echo"))
     (line,) = heard("192.0.2.1:8080", tmp_path)
     assert "192.0.2.1:8080" in line
+    assert line.endswith("; the flight goes on without a page")
