@@ -208,6 +208,41 @@ def test_a_zone_is_refused_where_a_late_vehicle_still_passes() -> None:
     assert "vehicle 1" in made.objection(zone)
 
 
+def test_no_zone_is_taken_before_it_is_known_where_all_vehicles_are() -> None:
+    made, zone = alone(), zone_texts.parse("cylinder(20, 20, 1)", 2)
+    made.hear(0, 100, NO_HORIZON, 4.0)
+    made.align(101)
+    assert made.objection(zone) == "zones before it is known where vehicle 2 is"
+    assert not made.objection(zone_texts.parse("", 2))
+
+
+def test_a_vehicle_that_rests_in_a_zone_leaves_it_the_shortest_way() -> None:
+    """It has been there since the server started; the goal counts once it is out."""
+    made, zone = ready(), zone_texts.parse("box(3, 4.2, -9, 9)", 2)
+    made.change_zones(zone)
+    end = planned(made).position[-1]
+    assert zone.clearance(end[None]).min() >= scenario(2).clearances.tube_m
+    assert 4.2 < end[0] < 5.5
+    ((number, name),) = made.inside
+    assert (number, name.startswith("box")) == (1, True)
+
+
+def test_a_way_that_is_closed_is_left_for_another_as_long_as_there_is_one() -> None:
+    """A wall between a vehicle and its goal ends to both sides; beyond them there is a fence."""
+    place, goal, vehicle = np.array([2.0, 0.0]), np.array([-2.0, 0.0]), VehicleMotions()
+    walls = zone_texts.parse("fence(-5, 5, -5, 5) & box(-0.3, 0.3, -4, 3.5)", 2)
+    ways = Waypoints(walls, 0.2, 0.9, 400, stream(1, "test"))
+    above = ways.routes.way(place, goal)
+    assert above[:, 1].max() > 3.0
+    assert ways.close_way(vehicle, 101, place, goal)
+    assert len(vehicle.closed) == 1
+    assert np.abs(vehicle.detour.way(place, goal)[0] - above[0]).max() > 0.1
+    corridor = zone_texts.parse("fence(-5, 5, -0.5, 0.5)", 2)
+    ways, vehicle = Waypoints(corridor, 0.2, 0.9, 400, stream(1, "test")), VehicleMotions()
+    assert not ways.close_way(vehicle, 101, place, goal)
+    assert not vehicle.closed
+
+
 # -- clocks --------------------------------------------------------------------------------------
 
 

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from helpers import packaged
 from skytether.server.endpoint import VEHICLES_MAX, Server
-from skytether.server.gate import PlainGate
+from skytether.server.gate import GateCall, PlainGate
 from skytether.server.secure import SecureGate
 from skytether.server.sessions import WELCOME_NS, Session, Sessions
 from skytether.server.tick import Grid
@@ -704,6 +704,29 @@ def test_an_unsolved_problem_sends_nothing_and_is_counted() -> None:
         sent = vehicles.tick()
     assert [peer for _, peer in sent] == [("v", 1)]
     assert vehicles.server.controller.counts["unsolved"] == 1
+
+
+def test_a_message_that_names_another_vehicle_than_its_key_is_dropped() -> None:
+    class OfVehicle2(PlainGate):
+        def open(self, datagram: Datagram, *, now_ns: int) -> GateCall:
+            return super().open(datagram, now_ns=now_ns)._replace(vehicle=2)
+
+    entropy, terms = stream(1, "entropy").bytes, scenario().terms()
+    server = Server(scenario(), boot_id=1, entropy=entropy, gate=OfVehicle2())
+    for vehicle, answers in ((1, 0), (2, 1)):
+        server.receive(Datagram(encode(Hello(vehicle, 5, terms)), HERE), now_ns=DAY_NS)
+        assert len(server.outbox()) == answers
+    assert server.dropped == {Drop.OF_ANOTHER_VEHICLE: 1}
+
+
+def test_an_observation_that_is_dropped_keeps_no_session_alive() -> None:
+    vehicles, welcome = live()
+    for step in range(20, 20 * 31, 20):  # once a second
+        vehicles.observe(welcome, step, ((1e3 * step, 0.0), (0.0, 0.0)))
+    assert vehicles.server.dropped == {Drop.IMPLAUSIBLE_JUMP: 30}
+    vehicles.now_ns += vehicles.dt_ns
+    vehicles.tick()
+    assert len(vehicles.server.sessions) == 0
 
 
 def test_figures_of_many_vehicles_stay_readable() -> None:
