@@ -54,7 +54,6 @@ SECONDS = 20.0
 LINE = {"shape": "waypoints", "points_m": [[0.0, 0.0], [80.0, 60.0]], "speed_mps": 1.0}
 """Target of constant velocity, 0.8 and 0.6 m/s."""
 STILL: dict[str, Any] = ""
-FAR: dict[str, Any] = "constant(0.4)"
 
 
 def scenario(**sections: Any) -> Scenario:
