@@ -112,10 +112,8 @@ def test_a_number_that_is_of_no_use_is_refused(
 # -- flights -------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("law", "measured_m"),
-    [("led", 0.055), *(pytest.param(*each, marks=pytest.mark.long) for each in OTHERS)],
-)
+@pytest.mark.long
+@pytest.mark.parametrize(("law", "measured_m"), [("led", 0.055), *OTHERS])
 def test_it_flies_as_an_arducopter_was_measured_to(law: str, measured_m: float) -> None:
     """RMSE xy of a whole figure eight over the paper's network, within a tenth."""
     whole = flown(law, duration=40.0, settle=10.0)

@@ -152,16 +152,7 @@ def test_figures_have_what_a_pilot_looks_at(flown: Air) -> None:
     ("flavour", "wrong"),
     [
         ("ardupilot", {"GUID_TIMEOUT": 3.0}),
-        ("ardupilot", {"GUID_TIMEOUT": 0.0}),
-        ("ardupilot", {"FS_GCS_ENABLE": 0}),
-        ("ardupilot", {"FS_GCS_ENABLE": 7}),
-        ("ardupilot", {"SYSID_MYGCS": 255}),
-        ("ardupilot", {"FS_GCS_TIMEOUT": 60.0}),
-        ("px4", {"COM_OF_LOSS_T": 2.0}),
-        ("px4", {"COM_OBL_RC_ACT": 0}),
-        ("px4", {"COM_OBL_RC_ACT": 5}),
         ("px4", {"COM_OBL_RC_ACT": 7}),
-        ("px4", {"NAV_DLL_ACT": 6}),
     ],
 )
 def test_an_unsafe_parameter_is_a_line_and_nothing_is_armed(

@@ -137,7 +137,7 @@ def messages() -> st.SearchStrategy[bytes]:
     return st.builds(frame, numbers, st.binary(max_size=255), st.sampled_from([1, 1, 2]))
 
 
-@settings(max_examples=100)
+@settings(max_examples=40)
 @given(
     st.lists(
         st.tuples(st.binary(max_size=80) | messages(), st.integers(0, 2 * SECOND)), max_size=12
@@ -169,7 +169,7 @@ def test_any_bytes_raise_nothing_and_arm_nothing(
 
 
 @given(st.lists(st.binary(max_size=300), max_size=30))
-@settings(max_examples=50)
+@settings(max_examples=20)
 def test_a_line_of_bytes_is_bounded(pieces: list[bytes]) -> None:
     flies = vehicles.make(scenario(vehicle={"address": "tcp:127.0.0.1:5760"}), 1)
     for piece in pieces:
@@ -186,6 +186,25 @@ def test_what_is_set_is_what_is_safe(rules: tuple[safety.Rule, ...]) -> None:
             assert f"set {rule.value:g}" in rule.wanted
         for value in (-1.0, *range(10), 0.5, 1e9):
             assert rule.meaning(value)
+
+
+@pytest.mark.parametrize(
+    ("rules", "name", "unsafe"),
+    [
+        (safety.ardupilot(245), "GUID_TIMEOUT", (0.0, 3.0)),
+        (safety.ardupilot(245), "FS_GCS_ENABLE", (0, 7)),
+        (safety.ardupilot(245), "SYSID_MYGCS", (244, 255)),
+        (safety.ardupilot(245), "FS_GCS_TIMEOUT", (60.0,)),
+        (safety.px4(), "COM_OF_LOSS_T", (2.0,)),
+        (safety.px4(), "COM_OBL_RC_ACT", (0, 5, 7)),
+        (safety.px4(), "NAV_DLL_ACT", (6,)),
+    ],
+)
+def test_a_value_with_which_silence_is_no_landing_is_unsafe(
+    rules: tuple[safety.Rule, ...], name: str, unsafe: tuple[float, ...]
+) -> None:
+    (rule,) = (each for each in rules if name in each.names)
+    assert not any(map(rule.is_safe, unsafe))
 
 
 def test_the_extra_is_named_where_it_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -54,9 +54,10 @@ def test_a_bad_line_changes_little_for_minutes() -> None:
     compare("px4", 2, 180.0)
 
 
+@pytest.mark.long
 def test_whatever_others_say_nothing_is_armed() -> None:
     air = OverLine("ardupilot", 1, armed=False)
-    air.run(10.0)
+    air.run(30.0)
     assert air.client._session.number is not None
     assert air.flight.armed_ns is None
     assert not air.sent(ARM)

@@ -14,7 +14,7 @@ from skytether.shared.scenario.reading import check
 from skytether.shared.wire.drop import Drop, ProtocolError
 from skytether.shared.wire.protocol import FEEDBACK, NO_HORIZON, Horizon, Trajectory
 
-quick = settings(max_examples=60)
+quick = settings(max_examples=20)
 
 H = 10
 INPUTS = np.array([np.linspace(0.1, 1.0, H), np.linspace(-0.5, 0.5, H)])
@@ -69,7 +69,7 @@ def test_vehicle_hovers_before_its_first_horizon() -> None:
 
 
 @pytest.mark.parametrize("exhausted", ["hold", "brake"])
-@pytest.mark.parametrize("stage", range(-4, H))
+@pytest.mark.parametrize("stage", [-4, 0, 1, H - 1])
 def test_stage_is_the_step_since_the_horizon_was_made(stage: int, exhausted: str) -> None:
     """Input u(k|k_h); if the server's step is ahead, the first input."""
     compensator = Compensator(terms(exhausted=exhausted))
@@ -219,9 +219,7 @@ def test_chosen_input_is_the_caller_s_own() -> None:
         (100, 99, None),
         (100, 50, None),  # its first input is 50 steps younger
         (100, 49, "too old"),
-        (100, 0, "too old"),
         (100, 101, "observation"),
-        (100, 102, "observation"),
         (100, -1, "observation"),  # observation before step 0
     ],
 )
@@ -309,7 +307,7 @@ def test_without_compensation_the_age_bound_ends_the_first_input(
 
 
 @pytest.mark.parametrize("scheme", ["predictive", "committed"])
-@pytest.mark.parametrize("d", [0, 3, 20])
+@pytest.mark.parametrize("d", [0, 20])
 def test_a_horizon_that_comes_long_after_its_committed_steps_is_refused(
     scheme: str, d: int
 ) -> None:

@@ -147,9 +147,9 @@ def test_a_known_dead_time_costs_hardly_anything(scheme: str) -> None:
     model = {"tau_s": [0.47], "gain": 1.0, "dead_time_s": [0.27, 0.24], "u_max": [3.0]}
     without = model | {"dead_time_s": 0.0}
     late = {"dead_time_s": model["dead_time_s"]}
-    network = PERFECT
+    keys = {"control": control, "network": PERFECT, "duration": 9.0}
     errors = [
-        flown(model=each, vehicle=vehicle, control=control, network=network)[0].rmse_xy
+        flown(model=each, vehicle=vehicle, **keys)[0].rmse_xy
         for each, vehicle in ((model, {}), (without, {}), (without, late))
     ]
     known_m, none_m, unknown_m = (each or np.nan for each in errors)

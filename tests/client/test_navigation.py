@@ -381,7 +381,7 @@ def test_a_vehicle_with_positions_alone_is_flown_through_steady_wind() -> None:
 def test_noisy_observations_are_all_plausible() -> None:
     loud = {"position_noise_m": 0.1, "velocity_noise_mps": 0.25}
     for name in ("kalman", "none"):
-        flight = fly(scenario(sensor=loud | {"filter": name}, duration=20.0, settle=1.0))
+        flight = fly(scenario(sensor=loud | {"filter": name}, duration=10.0, settle=1.0))
         assert not flight.figures["server"]["dropped"]
 
 
@@ -475,7 +475,7 @@ def test_a_vehicle_that_measures_when_it_likes_flies_as_one_that_keeps_step(
 ) -> None:
     """If stamps are ignored, old measurements count as present ones."""
     monkeypatch.setitem(VEHICLES, "restless", Entry(Restless, (), ""))
-    flown = scenario(duration=20.0, settle=5.0, vehicle={"wind": 0.0, "steady_wind_mps": []})
+    flown = scenario(duration=10.0, settle=5.0, vehicle={"wind": 0.0, "steady_wind_mps": []})
     flown = msgspec.structs.replace(
         flown, vehicle=msgspec.structs.replace(flown.vehicle, kind="restless")
     )
