@@ -128,11 +128,17 @@ def unpainted() -> Iterator[None]:
         yield
 
 
+ALONE = ("realtime", "docker", "browser", "autopilot")
+"""Marks of tests that run with nothing beside them."""
+
+
 @pytest.fixture
-def start() -> Iterator[Callable[..., Any]]:
+def start(request: pytest.FixtureRequest) -> Iterator[Callable[..., Any]]:
     """Start processes; those still running at the end of the test are killed."""
     from warm import Process
 
+    marked = any(map(request.node.get_closest_marker, ALONE))
+    assert marked, f"{request.node.name} starts processes: expected @pytest.mark.realtime"
     with ExitStack() as stack:
         yield partial(Process, stack)
 

@@ -17,7 +17,7 @@ from skytether.sim.flight import fly
 
 GOOD = "uniform(0.05, 0.15)"
 DIES = f"{GOOD} & outage(8, 3600)"
-SECONDS = 25.0
+SECONDS = 20.0
 STRANGER = ("stranger", 9)
 
 
