@@ -1,5 +1,6 @@
 """Cache of compiled kernels: valid as long as all sources of a kernel are unchanged."""
 
+import linecache
 import resource
 import subprocess
 import sys
@@ -132,21 +133,24 @@ def fill(values: F1) -> None:
 
 
 @pytest.fixture
-def filling(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[], Any]:
-    """Each call gives the kernel of a module as a new process would have it."""
+def imported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str], Any]:
+    """Each call imports a text as a new process would, always under the same name."""
     monkeypatch.setattr(kernel, "KERNELS", [])
     monkeypatch.setattr(numba_config, "CACHE_DIR", "")
+    # On a full disk Python would leave a truncated .pyc.
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)
     file = tmp_path / "filling.py"
-    file.write_text(FILLING)
 
-    def imported() -> Any:
+    def imported(text: str) -> Any:
+        file.write_text(text)
+        linecache.checkcache(str(file))
         spec = spec_from_file_location("filling", file)
         assert spec is not None
         assert spec.loader is not None
         module = module_from_spec(spec)
         monkeypatch.setitem(sys.modules, "filling", module)
         spec.loader.exec_module(module)
-        return module.fill
+        return module
 
     return imported
 
@@ -160,52 +164,52 @@ def fills(fill: Any) -> int:
 
 
 def test_a_kernel_that_cannot_be_stored_works_and_is_stored_later(
-    filling: Callable[[], Any],
+    imported: Callable[[str], Any],
 ) -> None:
     """Files cannot grow beyond 100 bytes at first, as on a full disk."""
+    first, second, third, fourth = (imported(FILLING).fill for _ in range(4))
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (100, before[1]))
     try:
-        hits = fills(filling())
+        hits = fills(first)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
     assert hits == 0
-    assert [fills(filling()), fills(filling())] == [0, 1]
-    fill = filling()
+    assert [fills(second), fills(third)] == [0, 1]
     for wrong in (np.ones(1, np.float32), np.ones((2, 2)), np.ones(4)[::2]):
         with pytest.raises(TypeError):
-            fill(wrong)
+            fourth(wrong)
 
 
 def test_a_kernel_without_a_writable_folder_works(
-    filling: Callable[[], Any], monkeypatch: pytest.MonkeyPatch
+    imported: Callable[[str], Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(kernel.CacheFolders, "_locator_classes", ())
-    assert fills(filling()) == 0
+    assert fills(imported(FILLING).fill) == 0
 
 
+CALLING = """
 FACTOR = 2
-
 
 def scaled(x: float) -> float:
     return x * FACTOR
 
-
 def calls(x: float) -> float:
     return scaled(x)
+"""
 
 
-def test_a_kernel_is_stamped_with_all_that_it_uses(monkeypatch: pytest.MonkeyPatch) -> None:
-    before = kernel.stamp(calls)
-    assert kernel.stamp(calls) == before
-    monkeypatch.setitem(globals(), "FACTOR", 3)
-    changed = kernel.stamp(calls)
-    monkeypatch.setitem(globals(), "scaled", plus_one)
-    assert len({before, changed, kernel.stamp(calls)}) == 3
+def test_a_kernel_is_stamped_with_all_that_it_uses(imported: Callable[[str], Any]) -> None:
+    """A constant and the source of a function that it calls."""
 
+    def stamp(text: str) -> str:
+        return kernel.stamp(imported(text).calls)
 
-def plus_one(x: float) -> float:
-    return x * FACTOR + 1
+    same, *others = map(
+        stamp, (CALLING, CALLING.replace("= 2", "= 37"), CALLING.replace("*", "+ 1 *"))
+    )
+    assert stamp(CALLING) == same
+    assert len({same, *others}) == 3
 
 
 # -- in processes of their own -------------------------------------------------------------------
