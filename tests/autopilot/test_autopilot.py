@@ -153,19 +153,6 @@ def test_px4_errs_as_measured() -> None:
     assert 0.8 < np.sqrt(np.mean((at[500:] - at[:-500]) ** 2)) < 1.8
 
 
-@pytest.mark.long
-def test_10_setpoints_a_second_answer_as_50_do() -> None:
-    often, seldom = climbed(), climbed()
-    often.velocity = (1.0, 0.0, 0.0)
-    often.run(2.0)
-    for _ in range(20):
-        seldom.velocity = (1.0, 0.0, 0.0)
-        seldom.setpoint()
-        seldom.velocity = None
-        seldom.run(0.1)
-    assert often.flight.velocity()[0] == pytest.approx(seldom.flight.velocity()[0], abs=0.01)
-
-
 # Silence
 
 
@@ -216,17 +203,6 @@ def test_px4_does_what_its_parameter_says(value: int, name: str) -> None:
     past_s = companion.run(5.0, lambda: companion.flight.mode is not FlightMode.GUIDED)
     assert past_s == pytest.approx(0.7, abs=0.05)
     assert companion.flight.mode_name == name
-
-
-@pytest.mark.long
-def test_a_shorter_time_out_stops_ardupilot_sooner() -> None:
-    companion = climbed()
-    set_parameter(companion, "GUID_TIMEOUT", 0.5)
-    companion.velocity = (1.0, 0.0, 0.0)
-    companion.run(3.0)
-    companion.velocity = None
-    companion.run(2.0)
-    assert abs(companion.flight.velocity()[0]) < 0.1
 
 
 def test_px4_is_not_guided_without_a_stream() -> None:

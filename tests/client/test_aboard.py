@@ -347,16 +347,6 @@ def test_a_vehicle_that_somebody_else_flies_is_left_to_him() -> None:
     assert not air.commands(SET_MODE)
 
 
-def test_a_vehicle_that_somebody_has_armed_is_left_to_him() -> None:
-    air = Air("ardupilot", mavlink={"patience_s": 1.0})
-    air.run(1.5)
-    air.flight.enter(5)
-    air.flight.arm()
-    air.run(10.0, lambda: air.client.failure is not None)
-    assert "armed, in LOITER" in why(air)[1]
-    assert not air.commands(SET_MODE)
-
-
 def test_a_pilot_who_takes_over_in_the_climb_has_it(flavour: FlavourName) -> None:
     air = Air(flavour)
     air.run(30.0, lambda: air.flight.armed and air.flight.position()[2] > 0.5)
@@ -562,14 +552,6 @@ def test_who_ends_on_the_ground_begins_nothing() -> None:
     assert not air.flight.armed
 
 
-def test_who_ends_while_a_pilot_flies_says_nothing() -> None:
-    air = flying("ardupilot")
-    air.take_over()
-    air.run(1.0)
-    assert air.close() == 0
-    assert air.flight.mode is FlightMode.PILOT
-
-
 # Other traffic
 
 
@@ -596,7 +578,7 @@ def test_others_are_not_the_autopilot() -> None:
     assert not air.of(AutopilotRefused)
 
 
-def late_heartbeat(air: Air, until: Callable[[], bool] = lambda: False) -> None:
+def late_heartbeat(air: Air, until: Callable[[], bool]) -> None:
     """Run until a condition holds; an old heartbeat arrives again 0.3 s later."""
     heartbeats: list[bytes] = []
 
@@ -621,13 +603,6 @@ def test_a_late_heartbeat_does_not_take_the_vehicle_back_from_a_pilot() -> None:
     assert modes(air)[-1] == ("manual", str(Reason.TAKEN))
     assert air.of(AutopilotMode)[-1].mode == "LOITER"
     assert sum(each.mode == "LOITER" for each in air.of(AutopilotMode)) == 1
-
-
-def test_a_late_heartbeat_does_not_end_the_climb() -> None:
-    air = Air("ardupilot")
-    late_heartbeat(air, lambda: air.flight.armed)
-    air.fly()
-    assert air.client.failure is None
 
 
 def test_an_autopilot_that_counts_anew_is_heard_after_a_pause() -> None:
@@ -723,14 +698,12 @@ def test_a_line_of_bytes_may_come_in_any_pieces() -> None:
     assert air.figures()["heard"] > 400
 
 
-@pytest.mark.parametrize(("dt", "least", "most"), [(0.1, 18, 20), (0.02, 50, 50)])
-def test_setpoints_come_at_the_rate_of_steps_or_more(dt: float, least: int, most: int) -> None:
-    """The last velocity is repeated between steps, at 50 per second at most."""
-    control = {"dt": dt, "horizon": 40}
-    air = flying("ardupilot", control=control)
+def test_setpoints_come_more_often_than_slow_steps() -> None:
+    """The last velocity is repeated between steps of 0.1 s."""
+    air = flying("ardupilot", control={"dt": 0.1, "horizon": 40})
     began_ns = air.world.now_ns
     air.run(2.0)
-    assert 2 * least - 1 <= len(air.setpoints(began_ns)) <= 2 * most + 1
+    assert 2 * 18 - 1 <= len(air.setpoints(began_ns)) <= 2 * 20 + 1
 
 
 def test_a_stream_that_stops_is_asked_for_again() -> None:

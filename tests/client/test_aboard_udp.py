@@ -15,7 +15,7 @@ import pytest
 from airborne import FIGURE, SAFE, documented, scenario
 from skytether.autopilot.flavours import FlavourName
 from skytether.cli.processes import Child, started
-from skytether.shared.core.aboard import AutopilotMode, ParametersSet, ParametersUnsafe
+from skytether.shared.core.aboard import AutopilotMode, ParametersSet
 from skytether.shared.core.endpoint import Address
 from skytether.shared.core.events import Flying
 from skytether.shared.core.events import address_text as text
@@ -157,18 +157,6 @@ def test_fly_has_everything_but_the_autopilot(tmp_path: Path) -> None:
     assert refused.returncode == 1
     assert refused.stderr.splitlines()[-1].endswith("SYSID_MYGCS; --set-parameters sets them")
     assert flown.returncode == 0, flown.stderr
-
-
-async def test_unsafe_parameters_end_with_a_line_each(tmp_path: Path) -> None:
-    processes = Processes(tmp_path, "ardupilot")
-    assert await processes.run() == 2
-    (failure,) = processes.events(ParametersUnsafe)
-    lines = str(failure).splitlines()
-    names = [line.split(": ")[1].split(" = ")[0] for line in lines]
-    assert names == ["GUID_TIMEOUT", "FS_GCS_ENABLE", "SYSID_MYGCS"]
-    assert all(word in processes.last_words for word in (*names, "--set-parameters"))
-    modes = processes.events(AutopilotMode)
-    assert not any(each.armed for each in modes if isinstance(each, AutopilotMode))
 
 
 @pytest.mark.parametrize("end", [signal.SIGTERM, signal.SIGKILL])

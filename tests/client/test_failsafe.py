@@ -642,6 +642,16 @@ def test_a_state_that_no_vehicle_can_have_ends_in_hover_until_somebody_has_chose
         assert hand.mode is Mode.TRACK
 
 
+def test_one_that_is_to_stay_after_a_leap_hovers_on() -> None:
+    hand = tracking()
+    hand.flies.plant.x[:, 0] += 300.0
+    hand.fly(1.0, plans=True)
+    running = Running(hand.client, hand.scenario)
+    running.change({"vehicle.after_leap": "stay"}, now_ns=hand.now_ns)
+    hand.fly(15.0, plans=True)
+    assert (hand.mode, hand.takes) == (Mode.HOVER, False)
+
+
 def test_a_link_that_is_lost_meanwhile_changes_nothing_in_that() -> None:
     hand = tracking()
     hand.flies.plant.x[:, 0] += 300.0

@@ -72,16 +72,6 @@ def test_a_choice_flies_on_in_the_frame_that_was_chosen() -> None:
     assert np.linalg.norm(estimate - wanted) < 1.5
 
 
-def test_one_that_stays_hovers_on() -> None:
-    air = leapt()
-    air.change(vehicle__after_leap="stay")
-    air.run(14.0)
-    assert air.mode is Mode.HOVER
-    air.change(vehicle__after_leap="old")
-    air.run(3.0)
-    assert air.mode is Mode.TRACK
-
-
 def test_the_next_leap_asks_again() -> None:
     air = leapt()
     air.run(2.0)

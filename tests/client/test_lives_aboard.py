@@ -4,11 +4,10 @@ from math import dist
 
 import pytest
 
-from airborne import ARM, Air, scenario
+from airborne import ARM, Air
 from skytether.autopilot.flavours import FlavourName, FlightMode
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.core.aboard import ArmingAwaited, NotTakenOff, OriginAwaited
-from skytether.shared.core.events import Flying
 from skytether.shared.wire.protocol import Mode
 
 NORTH_M, EAST_M = 20.0, -12.0
@@ -125,11 +124,3 @@ def test_a_word_counts_on_the_ground_alone() -> None:
     air.run(10.0)
     assert not air.flight.armed
     assert air.of(ArmingAwaited)[-1].why == "an earlier run of its client has armed it"
-
-
-def test_a_first_life_takes_off_as_before() -> None:
-    air = Air("ardupilot", duration=3.0)
-    air.fly()
-    assert air.of(Flying)
-    assert not air.of(ArmingAwaited)
-    assert scenario().armed

@@ -9,7 +9,7 @@ from airborne import SECOND, Air, flying, modes
 from bench.autopilots import MODELS
 from skytether.autopilot.faults import COMMANDED
 from skytether.autopilot.flavours import FlavourName
-from skytether.client.mavlink.rivals import GUIDED_ITEM, QUIET_NS, Rivals
+from skytether.client.mavlink.rivals import QUIET_NS, Rivals
 from skytether.mavlink.codec import Codec, Message
 from skytether.mavlink.dialect import dialect
 from skytether.shared.core.aboard import SecondCommander, Strays
@@ -131,12 +131,17 @@ def test_two_set_points_within_a_second_are_a_second_commander(message: Message)
     assert not repeated(message, every_ns=SECOND + 1).are_there(now_ns=3 * SECOND)
 
 
-@pytest.mark.parametrize("current", [1, 2, 3])
-def test_a_mission_item_that_is_flown_to_at_once_counts_alone(current: int) -> None:
+def item(current: int) -> Message:
+    return dialect.MAVLink_mission_item_int_message(1, 1, 0, 6, 16, current, 1, *[0] * 7)
+
+
+@pytest.mark.parametrize(
+    ("message", "moves"), [(goto(), True), (item(1), False), (item(2), True), (item(3), True)]
+)
+def test_a_command_to_go_somewhere_counts_at_once(message: Message, *, moves: bool) -> None:
     rivals = Rivals()
-    item = dialect.MAVLink_mission_item_int_message(1, 1, 0, 6, 16, current, 1, 0, 0, 0, 0, 0, 0, 0)
-    rivals.hear(item, 1, now_ns=SECOND)
-    assert rivals.are_there(now_ns=SECOND) == (current in GUIDED_ITEM)
+    rivals.hear(message, 1, now_ns=SECOND)
+    assert rivals.are_there(now_ns=SECOND) == moves
 
 
 @pytest.mark.parametrize(
@@ -161,12 +166,6 @@ def test_set_points_of_others_are_noticed_within_a_second() -> None:
     assert modes(air)[-1] == ("brake", str(Reason.RIVAL))
     say(air, message, 3.0)
     assert modes(air)[-1] == ("land", str(Reason.RIVAL))
-
-
-def test_a_command_to_go_somewhere_counts_at_once() -> None:
-    air = tracking()
-    say(air, goto(), 0.1)
-    assert modes(air)[-1] == ("brake", str(Reason.RIVAL))
 
 
 def test_a_vehicle_may_yield_to_a_second_commander_as_to_a_pilot() -> None:

@@ -128,7 +128,7 @@ def test_odometry_in_another_frame_is_dropped() -> None:
 )
 def test_a_robot_follows_its_reference(table: dict[str, Any]) -> None:
     ground = Ground(heading=0.7, drift_ppm=50.0, **table)
-    ground.run(18.0)
+    ground.run(14.0)
     rows = ground.rows()
     wanted = ground.scenario.make_reference()(rows["step"] * STEP)[:, :2, 0]
     error = np.linalg.norm(rows["state"][:, :2, 0] - wanted, axis=1)[200:]
@@ -180,11 +180,11 @@ def test_a_minute_with_losses_and_a_link_that_dies_twice() -> None:
 def test_a_restarted_client_keeps_the_origin() -> None:
     ground = Ground(heading=0.5, duration=40.0)
     ground.robot.place[:2] = 30.0, -20.0
-    ground.run(12.0)
+    ground.run(7.0)
     origin = ground.flies._positions.origin
     assert origin == pytest.approx((30.0, -20.0, 0.0))
     ground.restart()
-    ground.run(6.0)
+    ground.run(4.0)
     assert ground.flies._positions.origin == pytest.approx(origin)
     assert ground.mode in (Mode.TRACK, Mode.COAST)
 
