@@ -26,6 +26,8 @@ LOOK_EVERY = 100
 GUIDED_SHARE = 0.5
 """Share of inputs mutated by the target's own mutator, which keeps to the format; atheris mutates
 the rest."""
+GUIDED_SEED = 0
+"""Seed printed with an input that a guided search found, which has none."""
 INPUT_CPU_S = 60.0
 """CPU time that one input may take [s]. Wall time would blame the input for a busy machine."""
 WALL_S = 86_400
@@ -45,6 +47,16 @@ def limited(target: Target, payload: bytes) -> None:
         target(payload)
     finally:
         signal.setitimer(signal.ITIMER_VIRTUAL, 0.0)
+
+
+def told(target: Target, payload: bytes, name: str, seed: int, number: int) -> None:
+    """Feed an input as `limited` does; one that finds a fault is printed, to be recorded."""
+    try:
+        limited(target, payload)
+    except BaseException:
+        said = f"{name}, seed {seed}, input {number}: {payload.hex()}"
+        print(said, file=sys.stderr, flush=True)
+        raise
 
 
 def stop_slow() -> None:
@@ -67,12 +79,7 @@ def attack(name: str, folder: Path, seed: int, count: int, seconds: float) -> st
     begin_s, done, before_mb = time.monotonic(), 0, 0.0
     while done < count and time.monotonic() - begin_s < seconds:
         for _ in range(min(LOOK_EVERY, count - done)):
-            payload = target.next(rng)
-            try:
-                limited(target, payload)
-            except BaseException:
-                print(f"{name}, seed {seed}, input {done}: {payload.hex()}", file=sys.stderr)
-                raise
+            told(target, target.next(rng), name, seed, done)
             done += 1
         before_mb = before_mb or memory_mb()  # allocations made once are complete by now
     took_s, grown_mb = time.monotonic() - begin_s, memory_mb() - before_mb
@@ -106,7 +113,7 @@ def _search(name: str, folder: Path, seconds: float, done: c_longlong) -> None:
 
     def one(payload: bytes) -> None:
         done.value += 1
-        limited(target, payload)
+        told(target, payload, name, GUIDED_SEED, done.value)
 
     def mutated(payload: bytes, size: int, seed: int) -> bytes:
         rng = Random(seed)
@@ -119,7 +126,7 @@ def _search(name: str, folder: Path, seconds: float, done: c_longlong) -> None:
     for number, payload in enumerate(target.seeds()):
         (corpus / str(number)).write_bytes(payload)
     limits = [f"-max_total_time={seconds:.0f}", f"-max_len={target.largest}"]
-    limits += ["-mutate_depth=2", f"-timeout={WALL_S}"]
+    limits += ["-mutate_depth=2", f"-timeout={WALL_S}", f"-artifact_prefix={folder}{os.sep}"]
     stop_slow()
     atheris.Setup(["fuzz", *limits, str(corpus)], one, custom_mutator=mutated)
     atheris.Fuzz()

@@ -202,6 +202,30 @@ def test_a_server_that_begins_anew_takes_no_zone_before_it_has_heard_all(
     assert spare_m(FOUR, fly(FOUR, moves)) < 0.0
 
 
+# -- recorded attacks --------------------------------------------------------------------------
+
+ATTACKS = Path(__file__).parents[1] / "adversary_attacks.txt"
+LONG_ATTACKS = ("sphere", "rings", "corridor", "warehouse")
+"""Missions whose flight takes more than 1.5 s of CPU time."""
+
+
+def recorded() -> list[str]:
+    return [line for line in ATTACKS.read_text().splitlines() if not line.startswith("#")]
+
+
+@pytest.mark.usefixtures("here")
+@pytest.mark.parametrize(
+    "line",
+    [
+        pytest.param(line, marks=[pytest.mark.long] if line.split()[1] in LONG_ATTACKS else [])
+        for line in recorded()
+    ],
+)
+def test_attacks_that_succeeded_once_succeed_no_more(line: str) -> None:
+    """The command ends with 1 if a required distance is violated."""
+    assert main(shlex.split(line)) == 0
+
+
 # -- reproducibility -----------------------------------------------------------------------------
 
 DIES = move(MoveKind.CUTS, 0, "", 3.0, 2.0)

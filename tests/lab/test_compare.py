@@ -742,6 +742,7 @@ def test_two_contenders_have_two_names(capsys: pytest.CaptureFixture[str]) -> No
     assert "got it with --tune" in capsys.readouterr().err
 
 
+@pytest.mark.realtime
 @pytest.mark.long
 def test_ctrl_c_ends_a_search_in_order_and_the_same_command_goes_on(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch

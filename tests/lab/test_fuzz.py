@@ -1,6 +1,8 @@
 """`fuzz`: hostile inputs raise only documented errors, and bounds hold."""
 
 import math
+from collections.abc import Callable
+from ctypes import c_longlong
 from pathlib import Path
 from random import Random
 
@@ -25,18 +27,18 @@ from skytether.shell import log
 from skytether.view import container
 
 COUNTS = {
-    "decoder": 10_000,
-    "flight": 500,
-    "sealed": 500,
-    "handshake": 3_000,
-    "holder": 300,
-    "control": 150,
-    "recording": 100,
-    "scenario": 150,
-    "files": 1_000,
-    "feed": 5_000,
-    "page": 300,
-    "log": 5_000,
+    "decoder": 4_000,
+    "flight": 200,
+    "sealed": 200,
+    "handshake": 1_000,
+    "holder": 150,
+    "control": 60,
+    "recording": 40,
+    "scenario": 60,
+    "files": 400,
+    "feed": 2_000,
+    "page": 120,
+    "log": 2_000,
 }
 BY_AXES = pytest.mark.parametrize("scenario", SCENARIOS, ids=["2-D", "3-D", "splines"])
 
@@ -187,6 +189,32 @@ def test_a_fault_is_told_with_the_input_that_makes_it_again(
     assert told.startswith("fussy, seed 1, input ")
     with pytest.raises(ZeroDivisionError):
         Fussy(tmp_path)(bytes.fromhex(payload))
+
+
+class Guide:
+    """Stands for atheris, which need not be installed: feeds two inputs to the target."""
+
+    def Setup(self, argv: list[str], one: Callable[[bytes], None], **_: object) -> None:
+        self.argv, self.one = argv, one
+
+    def Fuzz(self) -> None:
+        for payload in (b"\x01", b"\xff\x02"):
+            self.one(payload)
+
+    def instrument_func(self, _: object) -> None:
+        pass
+
+
+def test_a_fault_of_a_guided_search_is_told_like_one_of_a_random_search(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    guide = Guide()
+    monkeypatch.setattr(command, "atheris", guide)
+    monkeypatch.setattr(command, "TARGETS", {"fussy": Fussy})
+    with pytest.raises(ZeroDivisionError):
+        command._search("fussy", tmp_path, 1.0, c_longlong(0))
+    assert capsys.readouterr().err == "fussy, seed 0, input 2: ff02\n"
+    assert f"-artifact_prefix={tmp_path}/" in guide.argv
 
 
 class Endless(Fussy):

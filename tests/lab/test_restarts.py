@@ -118,6 +118,7 @@ def test_a_new_life_has_to_stand_until_it_flies() -> None:
     )
 
 
+@pytest.mark.realtime
 def test_processes_that_are_killed_under_way_come_back() -> None:
     counts = RestartsCounts(kills=1, stops=0, flight_s=0.5, subjects=("server", "client"))
     result = restarts.measure(counts)
