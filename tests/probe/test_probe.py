@@ -288,6 +288,7 @@ def test_every_packet_is_measured_as_it_was() -> None:
     assert both.unreported == 0
 
 
+@pytest.mark.long
 def test_gaps_of_a_picture_are_the_trains() -> None:
     """A grey span for each."""
     text = "gamma(0.05, 0.09, 0.03) & loss(0.1)"

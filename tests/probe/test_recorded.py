@@ -221,6 +221,8 @@ def test_a_pair_of_captures_is_measured_each_way(
     assert told.round_trip_mean_s == pytest.approx(0.14, abs=1e-5)
     assert told.offset_s == pytest.approx(3600.0 - 0.02, abs=1e-5)
     assert (told.bytes, told.every_s, told.unreported) == (11, pytest.approx(0.1), 0)
+    if written is not pcap:
+        return
     swapped = recorded.of_captures(written(far), written(near))
     assert swapped.downlink.came.tolist() == measured.uplink.came.tolist()
 

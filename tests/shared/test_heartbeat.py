@@ -165,7 +165,7 @@ def test_both_ends_keep_a_link_alive_and_notice_its_end() -> None:
     assert kept.false_per_h <= 1.0
     assert len(kept.noticed_s) == 6
     assert 1.2 < min(kept.noticed_s) <= max(kept.noticed_s) < 2.1
-    assert keep("paper(0.4, 0.02, 2.0) & loss(0.6)", 6).false_per_h > 0
+    assert keep("paper(0.4, 0.02, 2.0) & loss(0.6)", 2).false_per_h > 0
     calm = keep("paper(0.4, 0.02, 2.0)", 1)
     assert (calm.false_per_h, calm.noticed_s) == (0, pytest.approx([1.75], abs=0.35))
 

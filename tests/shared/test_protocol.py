@@ -547,6 +547,7 @@ def verdict(payload: bytes) -> Message | Drop:
         return error.reason
 
 
+@settings(max_examples=60)
 @given(observations, st.integers(0, 12), anything, st.binary(max_size=2))
 def test_an_observation_is_read_at_once_as_it_is_field_by_field(
     observation: Observation, field: int, value: object, more: bytes
