@@ -8,6 +8,7 @@ from skytether.server.paths import Place, ServerPaths
 from skytether.shared.base.chance import stream
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.core.endpoint import Address, Datagram
+from skytether.shared.wire.drop import Drop
 from skytether.shared.wire.paths import Paths, split
 from skytether.shared.wire.protocol import (
     NO_HORIZON,
@@ -132,6 +133,18 @@ def test_path_is_asked_for_a_proof_as_soon_as_it_is_heard_at_another_address() -
     assert isinstance(question, PathProof)
     assert vehicle.say(question._replace(path=0), MOVED) == []
     assert {*vehicle.server.sessions.at_place} == {MOVED, SECOND}
+
+
+def test_copy_over_another_path_is_dropped_as_a_copy() -> None:
+    vehicle = Vehicle()
+    vehicle.observe(FIRST)
+    vehicle.prove(0, FIRST)
+    vehicle.prove(1, SECOND)
+    sent, send = [], vehicle.send
+    vehicle.send = lambda payload, place: sent.append(payload) or send(payload, place)  # type: ignore[method-assign,func-returns-value]
+    vehicle.observe(FIRST)
+    assert send(sent[-1], SECOND) == []
+    assert vehicle.server.dropped == {Drop.COPY: 1}
 
 
 def test_client_that_was_started_again_with_a_single_path_is_answered_there() -> None:

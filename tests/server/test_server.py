@@ -20,6 +20,7 @@ from skytether.shared.base.chance import stream
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
 from skytether.shared.core.endpoint import Address, Datagram, Events
 from skytether.shared.core.events import (
+    BegunAnew,
     Degraded,
     NumberTaken,
     PlanningResumed,
@@ -39,6 +40,7 @@ from skytether.shared.wire.drop import Drop, ProtocolError
 from skytether.shared.wire.keys import Keyring
 from skytether.shared.wire.protocol import (
     NO_HORIZON,
+    NO_INPUT,
     Close,
     Heartbeat,
     Hello,
@@ -727,6 +729,19 @@ def test_an_observation_that_is_dropped_keeps_no_session_alive() -> None:
     vehicles.now_ns += vehicles.dt_ns
     vehicles.tick()
     assert len(vehicles.server.sessions) == 0
+
+
+def test_a_client_that_begins_anew_on_a_mission_is_known_by_its_hello() -> None:
+    """Although it is refused as long as its earlier run may be flying: others keep away."""
+    vehicles = Vehicles(packaged("swap"))
+    welcome = vehicles.open()
+    vehicles.epochs_ns[welcome.session] = vehicles.now_ns
+    vehicles.say(vehicles.told(welcome, 0)._replace(input=NO_INPUT))
+    vehicles.server.events()
+    assert vehicles.ask().refusal == Refusal.ACCEPTED
+    assert vehicles.server.events() == ()
+    assert vehicles.ask(boot_id=6).refusal == Refusal.TAKEN
+    assert vehicles.server.events()[0] == BegunAnew(vehicle=1)
 
 
 def test_figures_of_many_vehicles_stay_readable() -> None:
