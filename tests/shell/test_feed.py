@@ -532,6 +532,10 @@ async def test_a_process_tells_its_readers_while_it_is_driven(tmp_path: Path) ->
             await once(lambda: seen.frames["netem"])
             change(0.25)
             await once(lambda: 0.25 in seen.losses())
+            frames = len(seen.frames["netem"])
+            recorder.append(1, number=77)  # no event comes with it
+            driver.changed()
+            await once(lambda: len(seen.frames["netem"]) > frames)
             async with late.reading(netem=path):
                 await once(lambda: len(late.frames["netem"]) >= 3)
                 change(1.0)
@@ -550,7 +554,7 @@ async def test_a_process_tells_its_readers_while_it_is_driven(tmp_path: Path) ->
     columns = columns_of(before.parts["netem"])
     told = [table(frame.rows, columns) for frame in seen.frames["netem"] if type(frame) is Rows]
     np.testing.assert_array_equal(np.concatenate(told), parse(sink.getvalue()))
-    assert np.concatenate(told)["number"].tolist() == [25, 100]
+    assert np.concatenate(told)["number"].tolist() == [25, 77, 100]
     assert seen.losses() == [0.25, 1.0]
 
 

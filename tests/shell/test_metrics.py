@@ -293,7 +293,7 @@ def served() -> Iterator[Metrics]:
 
 
 @pytest.fixture
-def metrics_(monkeypatch: pytest.MonkeyPatch) -> Iterator[Metrics]:
+def by_hand(monkeypatch: pytest.MonkeyPatch) -> Iterator[Metrics]:
     """Server without its thread: requests are handled where the test asks."""
     monkeypatch.setattr(Metrics, "serve_forever", lambda *_: None)
     one = Metrics(("127.0.0.1", 0), Collected("netem", "demo", 0.05))
@@ -331,15 +331,15 @@ def asked(one: Metrics, request: bytes) -> tuple[bytes, bytes]:
     return head.split(b"\r\n")[0], body
 
 
-def test_metrics_and_health_are_served(metrics_: Metrics) -> None:
+def test_metrics_and_health_are_served(by_hand: Metrics) -> None:
     request = b"GET %s HTTP/1.1\r\nHost: netem:9464\r\nAccept: */*\r\n\r\n"
-    status, text = asked(metrics_, request % b"/metrics")
+    status, text = asked(by_hand, request % b"/metrics")
     assert status == b"HTTP/1.0 200 OK"
     assert b"\nskytether_netem_flows 1.0\n" in text
-    status, body = asked(metrics_, request % b"/healthz")
+    status, body = asked(by_hand, request % b"/healthz")
     assert (status, json.loads(body)["healthy"]) == (b"HTTP/1.0 200 OK", True)
-    metrics_.take({"flows": 2, **PROCESS})
-    assert b"\nskytether_netem_flows 2.0\n" in asked(metrics_, request % b"/metrics?name=x")[1]
+    by_hand.take({"flows": 2, **PROCESS})
+    assert b"\nskytether_netem_flows 2.0\n" in asked(by_hand, request % b"/metrics?name=x")[1]
 
 
 @pytest.mark.parametrize(
@@ -353,8 +353,8 @@ def test_metrics_and_health_are_served(metrics_: Metrics) -> None:
         (b"GET / HTTP/1.1\r\n" + b"a: b\r\n" * 101, b"431 Too many headers"),
     ],
 )
-def test_anything_else_is_refused(metrics_: Metrics, request_: bytes, status: bytes) -> None:
-    assert asked(metrics_, request_)[0].startswith(b"HTTP/1.0 " + status)
+def test_anything_else_is_refused(by_hand: Metrics, request_: bytes, status: bytes) -> None:
+    assert asked(by_hand, request_)[0].startswith(b"HTTP/1.0 " + status)
 
 
 @pytest.mark.parametrize(
@@ -375,25 +375,25 @@ def test_anything_else_is_refused(metrics_: Metrics, request_: bytes, status: by
     ],
 )
 def test_who_comes_by_the_name_of_a_website_is_refused(
-    metrics_: Metrics, host: str, status: bytes
+    by_hand: Metrics, host: str, status: bytes
 ) -> None:
     """A stranger's name may resolve to this machine; an address or a container's name is safe."""
     request = f"GET /metrics HTTP/1.1\r\nHost: {host}\r\n\r\n".encode("latin-1")
-    said_, text = asked(metrics_, request)
+    said_, text = asked(by_hand, request)
     assert said_ == b"HTTP/1.0 " + status
     assert (b"skytether_netem_flows" in text) == (status == b"200 OK")
 
 
-def test_the_name_that_the_user_has_given_may_be_used(metrics_: Metrics) -> None:
-    metrics_._name = "vehicle.fleet.example"
+def test_the_name_that_the_user_has_given_may_be_used(by_hand: Metrics) -> None:
+    by_hand._name = "vehicle.fleet.example"
     request = b"GET /metrics HTTP/1.1\r\nHost: %s\r\n\r\n"
-    assert asked(metrics_, request % b"Vehicle.fleet.example:9464")[0] == b"HTTP/1.0 200 OK"
-    assert asked(metrics_, request % b"other.fleet.example:9464")[0] == b"HTTP/1.0 403 Forbidden"
+    assert asked(by_hand, request % b"Vehicle.fleet.example:9464")[0] == b"HTTP/1.0 200 OK"
+    assert asked(by_hand, request % b"other.fleet.example:9464")[0] == b"HTTP/1.0 403 Forbidden"
 
 
 @pytest.mark.parametrize("path", ["/metrics", "/healthz", "/", "/ HTTP/2"])
-def test_no_answer_may_be_shown_in_a_frame(metrics_: Metrics, path: str) -> None:
-    answer = answered(metrics_, f"GET {path} HTTP/1.1\r\n\r\n".encode())
+def test_no_answer_may_be_shown_in_a_frame(by_hand: Metrics, path: str) -> None:
+    answer = answered(by_hand, f"GET {path} HTTP/1.1\r\n\r\n".encode())
     head = answer.partition(b"\r\n\r\n")[0].split(b"\r\n")
     assert b"Content-Security-Policy: frame-ancestors 'none'" in head
     assert b"X-Frame-Options: DENY" in head
@@ -402,8 +402,8 @@ def test_no_answer_may_be_shown_in_a_frame(metrics_: Metrics, path: str) -> None
 @pytest.mark.parametrize(
     "request_", [b"GET /" + b"x" * 8200, b"GET / HTTP/1.1\r\n" + b"a: %100d\r\n" % 1 * 90]
 )
-def test_a_request_that_is_too_long_is_not_answered(metrics_: Metrics, request_: bytes) -> None:
-    assert answered(metrics_, request_) == b""
+def test_a_request_that_is_too_long_is_not_answered(by_hand: Metrics, request_: bytes) -> None:
+    assert answered(by_hand, request_) == b""
 
 
 def test_processes_without_a_table_serve_what_every_process_has() -> None:
@@ -413,15 +413,15 @@ def test_processes_without_a_table_serve_what_every_process_has() -> None:
 
 
 def test_the_oldest_of_too_many_connections_is_closed(
-    metrics_: Metrics, monkeypatch: pytest.MonkeyPatch
+    by_hand: Metrics, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(exporter.ThreadingMixIn, "process_request", lambda *_: None)
     pairs = [socket.socketpair() for _ in range(CONNECTIONS_MAX + 2)]
     for _, there in pairs:
         there.setblocking(False)
     for here, _ in pairs:
-        metrics_.process_request(here, ("127.0.0.1", 1))
-        assert len(metrics_._connections) <= CONNECTIONS_MAX
+        by_hand.process_request(here, ("127.0.0.1", 1))
+        assert len(by_hand._connections) <= CONNECTIONS_MAX
     assert [is_closed(there) for _, there in pairs] == [True] * 2 + [False] * CONNECTIONS_MAX
     for pair in pairs:
         for each in pair:
@@ -436,7 +436,7 @@ def is_closed(there: socket.socket) -> bool:
 
 
 def test_a_connection_is_closed_after_its_time_whether_it_was_answered_or_not(
-    metrics_: Metrics, monkeypatch: pytest.MonkeyPatch
+    by_hand: Metrics, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     now_s = 1000.0
     monkeypatch.setattr(exporter.time, "monotonic", lambda: now_s)
@@ -444,20 +444,20 @@ def test_a_connection_is_closed_after_its_time_whether_it_was_answered_or_not(
     here, there = socket.socketpair()
     there.setblocking(False)
     with here, there:
-        metrics_.process_request(here, ("127.0.0.1", 1))
+        by_hand.process_request(here, ("127.0.0.1", 1))
         for after_s, ends in ((exporter.PATIENCE_S - 0.1, False), (exporter.PATIENCE_S, True)):
             now_s = 1000.0 + after_s
-            metrics_.service_actions()
+            by_hand.service_actions()
             assert is_closed(there) == ends
 
 
 def test_connections_are_accepted_with_a_rest_before_each(
-    metrics_: Metrics, monkeypatch: pytest.MonkeyPatch
+    by_hand: Metrics, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     rests: list[float] = []
     monkeypatch.setattr(exporter.time, "sleep", rests.append)
-    with calling(metrics_):
-        connection, _ = metrics_.get_request()
+    with calling(by_hand):
+        connection, _ = by_hand.get_request()
         connection.close()
     assert rests == [exporter.REST_S]
 
