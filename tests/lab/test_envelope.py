@@ -426,19 +426,19 @@ def test_more_points_go_on_where_fewer_ended(
 ) -> None:
     once, twice = tmp_path / "once", tmp_path / "twice"
     with without_painting():
-        main([*SHORT, "--runs", "5", "--out", str(once)])
+        main([*SHORT, "--runs", "3", "--out", str(once)])
         main([*SHORT, "--runs", "2", "--out", str(twice)])
     kept = (twice / "journal.jsonl").read_bytes()
     assert len((twice / "points.csv").read_text().splitlines()) == 3
     capsys.readouterr()
-    main([*SHORT, "--runs", "5", "--out", str(twice)])
+    main([*SHORT, "--runs", "3", "--out", str(twice)])
     assert (twice / "journal.jsonl").read_bytes().startswith(kept)
     assert (twice / "points.csv").read_bytes() == (once / "points.csv").read_bytes()
     assert (twice / "envelope.png").read_bytes().startswith(b"\x89PNG")
     rows = list(csv.DictReader((once / "points.csv").read_text().splitlines()))
-    assert [int(row["number"]) for row in rows] == list(range(5))
+    assert [int(row["number"]) for row in rows] == list(range(3))
     assert [float(row["control.dt"]) for row in rows] == [
-        draw(1, number)["control.dt"] for number in range(5)
+        draw(1, number)["control.dt"] for number in range(3)
     ]
     refused = sum(row["outcome"] == "refused" for row in rows)
     assert re.search(rf"refused +│ +{refused} │", capsys.readouterr().out)

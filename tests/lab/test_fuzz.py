@@ -194,10 +194,10 @@ def test_a_fault_is_told_with_the_input_that_makes_it_again(
 class Guide:
     """Stands for atheris, which need not be installed: feeds two inputs to the target."""
 
-    def Setup(self, argv: list[str], one: Callable[[bytes], None], **_: object) -> None:
+    def Setup(self, argv: list[str], one: Callable[[bytes], None], **_: object) -> None:  # noqa: N802 -- atheris's
         self.argv, self.one = argv, one
 
-    def Fuzz(self) -> None:
+    def Fuzz(self) -> None:  # noqa: N802 -- atheris's
         for payload in (b"\x01", b"\xff\x02"):
             self.one(payload)
 

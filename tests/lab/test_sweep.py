@@ -505,6 +505,7 @@ def dask(stack: ExitStack, argv: list[str], folder: Path) -> subprocess.Popen[st
     return process
 
 
+@pytest.mark.realtime
 @pytest.mark.long
 @needs_dask
 def test_a_cluster_gives_the_same_though_a_worker_is_killed(whole: Path, tmp_path: Path) -> None:
@@ -536,6 +537,7 @@ def test_a_cluster_gives_the_same_though_a_worker_is_killed(whole: Path, tmp_pat
 
 
 @needs_dask
+@pytest.mark.long
 def test_a_scheduler_that_is_not_there_is_named(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
