@@ -310,6 +310,22 @@ def test_answers_follow_the_vehicle_to_its_new_address() -> None:
     assert [peer for _, peer in vehicles.tick()] == [("elsewhere", 9)]
 
 
+def test_where_repeats_of_a_packet_come_from_is_answered_too() -> None:
+    """Whoever forwards copies that arrive first must not keep the answers from the vehicle."""
+
+    class Repeating(PlainGate):
+        def open(self, datagram: Datagram, *, now_ns: int) -> GateCall:  # noqa: ARG002
+            raise ProtocolError(Drop.REPLAYED)
+
+        def repeated(self, _: Datagram) -> int:
+            return 1
+
+    vehicles, _ = live()
+    vehicles.server._reception._gate = Repeating()
+    vehicles.server.receive(Datagram(b"?", ("elsewhere", 9)), now_ns=vehicles.now_ns)
+    assert [peer for _, peer in vehicles.tick()] == [HERE, ("elsewhere", 9)]
+
+
 def test_a_new_life_of_a_vehicle_takes_over_with_its_first_observation() -> None:
     vehicles, old = live(50)
     vehicles.now_ns += SILENCE_NS + 1
