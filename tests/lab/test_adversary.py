@@ -249,8 +249,8 @@ def test_a_flight_comes_again_to_the_last_bit() -> None:
 
 def test_the_fewest_moves_are_those_that_matter(monkeypatch: pytest.MonkeyPatch) -> None:
     heedless(monkeypatch)
-    brief = replaced(FOUR, duration=14.0)
-    found = fly(brief, (DIES, IN_THE_WAY, move(MoveKind.GOALS, 2, "", 10.0, 3.0, 1.0, -3.0)))
+    brief = replaced(FOUR, duration=10.0)
+    found = fly(brief, (DIES, IN_THE_WAY, move(MoveKind.GOALS, 2, "", 8.0, 2.0, 1.0, -3.0)))
     assert found.clear.distance_m < 0.0
     fewest = shrunk(brief, found)
     assert [each.kind for each in fewest.moves] == [MoveKind.ZONES]
