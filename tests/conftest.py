@@ -1,7 +1,6 @@
 """Settings of the tests, and requirements on the machine."""
 
 import atexit
-import fcntl
 import os
 import shutil
 import signal
@@ -49,10 +48,9 @@ os.environ["XDG_STATE_HOME"] = _STATES
 
 
 FIRST = (
-    *("test_docs.py", "test_together_autopilots.py", "test_aboard_udp.py"),
-    *("test_plugins.py", "test_reproduce.py", "test_packaging.py", "test_environments.py"),
-    *("test_command.py", "test_straight.py", "test_margins.py", "test_compare.py", "test_fleet.py"),
-    *("test_trajectory.py", "test_kernel.py", "test_slow.py", "test_loopback.py"),
+    *("test_torture.py", "test_compare.py", "test_aboard.py", "test_margins.py"),
+    *("test_missions.py", "test_adversary.py", "test_autopilot.py", "test_probe.py"),
+    *("test_standby.py", "test_experiment.py", "test_docs.py"),
 )
 """Slowest files: they start first, so that no worker waits for them at the end."""
 
@@ -141,16 +139,6 @@ def start(request: pytest.FixtureRequest) -> Iterator[Callable[..., Any]]:
     assert marked, f"{request.node.name} starts processes: expected @pytest.mark.realtime"
     with ExitStack() as stack:
         yield partial(Process, stack)
-
-
-@pytest.fixture
-def documented_ports() -> Iterator[None]:
-    """Exclusive use of the fixed ports of commands in the documents."""
-    with (Path(tempfile.gettempdir()) / f"skytether-documented-ports-{os.getuid()}").open(
-        "a"
-    ) as file:
-        fcntl.flock(file, fcntl.LOCK_EX)  # released with the file, even if the process dies
-        yield
 
 
 @pytest.fixture

@@ -136,7 +136,6 @@ def test_three_follow_the_paths_of_a_show(tmp_path: Path) -> None:
     assert server.figures()["counts"].get("left_tube", 0) == 0
 
 
-@pytest.mark.usefixtures("documented_ports")
 @pytest.mark.long
 @pytest.mark.realtime
 def test_the_documented_autopilots_swap_places_over_udp(tmp_path: Path) -> None:

@@ -71,7 +71,6 @@ def test_options_that_lead_nowhere_are_refused(
 
 @pytest.mark.long
 @pytest.mark.realtime
-@pytest.mark.usefixtures("documented_ports")
 def test_a_flight_is_seen_and_led_over_zenoh(tmp_path: Path) -> None:
     """A vehicle at a live point is sent elsewhere, and a path that comes then ends there."""
     port = robot.free_port()

@@ -45,11 +45,17 @@ from skytether.shared.wire.protocol import Mode
 
 @pytest.fixture(scope="module", params=BOTH)
 def flown(request: pytest.FixtureRequest) -> Air:
-    """Flight of 12 s to its end; the client knows the dead time, and its clock drifts."""
-    air = Air(request.param, duration=12.0, drift_ppm=50.0, model={"dead_time_s": [0.27]})
+    """Flight of 8 s to its end; the client knows the dead time, and its clock drifts."""
+    air = Air(request.param, duration=8.0, drift_ppm=50.0, model={"dead_time_s": [0.27]})
     air.fly()
     air.end()
     return air
+
+
+@pytest.fixture(scope="module")
+def aloft() -> Air:
+    """Vehicle in the air; each test that takes it leaves it flying a plan."""
+    return flying("ardupilot")
 
 
 def why(air: Air) -> tuple[str, str]:
@@ -390,8 +396,9 @@ def test_who_arms_it_while_we_are_about_to_has_it() -> None:
     assert len(air.commands(SET_MODE)) == asked
 
 
-def test_a_pilot_wins_at_once_and_is_told_nothing_more() -> None:
-    air = flying("px4")
+def test_a_pilot_wins_at_once_and_whoever_is_given_back_hovers_and_flies_on() -> None:
+    """Nothing is sent meanwhile. It flies on once the link has been good for a second."""
+    air = flying("ardupilot")
     air.take_over()
     asked = len(air.commands(SET_MODE))
     air.run(0.3)
@@ -400,13 +407,6 @@ def test_a_pilot_wins_at_once_and_is_told_nothing_more() -> None:
     assert len(air.commands(SET_MODE)) == asked
     assert air.flight.mode is FlightMode.PILOT
     assert modes(air)[-1] == ("manual", str(Reason.TAKEN))
-
-
-def test_a_vehicle_that_is_given_back_hovers_and_flies_on() -> None:
-    """Once the link has been good for a second. PX4 needs set-points first, and gets none."""
-    air = flying("ardupilot")
-    air.take_over()
-    air.run(1.0)
     air.flight.enter(air.flight.flavour.number(FlightMode.GUIDED))
     back_ns = air.world.now_ns
     air.run(3.0)
@@ -487,9 +487,9 @@ def test_a_lost_estimate_lands_where_the_autopilot_does_not(flavour: FlavourName
     assert air.flight.mode is FlightMode.LAND
 
 
-def test_a_silent_autopilot_makes_it_brake_and_hover() -> None:
+def test_a_silent_autopilot_makes_it_brake_and_hover(aloft: Air) -> None:
     """After mavlink.silence_s set-points fall to zero, until the autopilot answers again."""
-    air = flying("px4")
+    air = aloft
     air.tap.dumb = True
     silent_ns = air.world.now_ns
     air.run(3.0)
@@ -555,8 +555,8 @@ def test_who_ends_on_the_ground_begins_nothing() -> None:
 # Other traffic
 
 
-def test_others_are_not_the_autopilot() -> None:
-    air = flying("ardupilot")
+def test_others_are_not_the_autopilot(aloft: Air) -> None:
+    air = aloft
     others = Codec(2, 1), Codec(255, 190), Codec(1, 100), Codec(245, 191)
     heartbeat = dialect.MAVLink_heartbeat_message(2, 3, 81, 9, 4, 3)
     lands = dialect.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3)
@@ -617,9 +617,9 @@ def test_an_autopilot_that_counts_anew_is_heard_after_a_pause() -> None:
     assert modes(air)[-1] == ("manual", str(Reason.TAKEN))
 
 
-def test_stamps_that_cannot_be_are_dropped_and_counted() -> None:
+def test_stamps_that_cannot_be_are_dropped_and_counted(aloft: Air) -> None:
     """Duplicate, out of order, ahead, old, far and non-finite stamps; the state stays right."""
-    air = flying("ardupilot")
+    air = aloft
     codec = Codec(1, 1)
     now_ms = air.flight.now_ns // 1_000_000
 
@@ -706,8 +706,8 @@ def test_setpoints_come_more_often_than_slow_steps() -> None:
     assert 2 * 18 - 1 <= len(air.setpoints(began_ns)) <= 2 * 20 + 1
 
 
-def test_a_stream_that_stops_is_asked_for_again() -> None:
-    air = flying("ardupilot")
+def test_a_stream_that_stops_is_asked_for_again(aloft: Air) -> None:
+    air = aloft
     (peer,) = air.autopilot._peers.values()
     number = int(dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED)
     del peer.streams[number]
@@ -717,7 +717,7 @@ def test_a_stream_that_stops_is_asked_for_again() -> None:
 
 
 def test_an_autopilot_that_never_speaks_again_is_left_to_its_own_failsafe() -> None:
-    air = flying("ardupilot", vehicle={"land_after_s": 4.0})
+    air = flying("ardupilot", vehicle={"land_after_s": 2.0})
     air.autopilot.script.silent = True
     silent_ns = air.world.now_ns
     down_s = air.run(60.0, lambda: not air.flight.armed)
@@ -731,11 +731,11 @@ def test_an_autopilot_that_never_speaks_again_is_left_to_its_own_failsafe() -> N
 def test_a_vehicle_that_drifts_over_its_fence_lands_when_its_link_is_lost() -> None:
     """Its accelerometers have failed, so the fence's corrections have no effect."""
     fence = {"low_m": [-9.0, -9.0, 0.5], "high_m": [8.0, 9.0, 9.0], "wind_mps": 0.5}
-    air = flying("ardupilot", "drift@1", fence=fence, vehicle={"land_after_s": 4.0})
+    air = flying("ardupilot", "drift@1", fence=fence, vehicle={"land_after_s": 2.0})
     air.until(lambda: air.flight.position()[0] > 8.2, 30.0)
     air.world.stop("server")
     lost_s = air.run(30.0, lambda: air.mode is Mode.LAND)
     assert [after for after, _ in modes(air)][-3:] == ["brake", "hover", "land"]
     # The timeout, braking from 3 m/s on all axes at 2 m/s², hovering, and landing.
-    assert lost_s < 1.5 + 3.1 + 4.0 + 0.2
+    assert lost_s < 1.5 + 3.1 + 2.0 + 0.2
     assert air.setpoints()[-1][1].vx < -1.0

@@ -120,7 +120,6 @@ def field_in(folder: Path) -> list[str]:
     return commands
 
 
-@pytest.mark.usefixtures("documented_ports")
 def test_the_documented_terminals_fly_together(tmp_path: Path) -> None:
     blocks = field_in(tmp_path)
     (block,) = (each for each in blocks if "skytether client field.toml" in each)
@@ -137,7 +136,6 @@ def test_the_documented_terminals_fly_together(tmp_path: Path) -> None:
     assert "flies a plan" in run.stdout
 
 
-@pytest.mark.usefixtures("documented_ports")
 def test_fly_has_everything_but_the_autopilot(tmp_path: Path) -> None:
     field_in(tmp_path)
     skytether = [sys.executable, "-P", "-m", "skytether"]

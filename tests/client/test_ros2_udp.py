@@ -38,7 +38,6 @@ downlink = "{LOSSY}"
 
 @pytest.mark.long
 @pytest.mark.realtime
-@pytest.mark.usefixtures("documented_ports")
 def test_a_minute_over_zenoh_with_losses_and_a_link_that_dies_twice(tmp_path: Path) -> None:
     port, marks = free_port(), []
 

@@ -560,7 +560,7 @@ def test_motions_that_are_sent_again_arrive_where_half_are_lost(
 
 
 def test_a_link_that_is_cut_leaves_them_apart() -> None:
-    flown = flight.fly(scenario(6, duration=20.0), vehicles=6, changes=[(6.3, LOST)])
+    flown = flight.fly(scenario(6, duration=14.0), vehicles=6, changes=[(6.3, LOST)])
     assert separation_m(flown) > 0.5
 
 
@@ -579,7 +579,7 @@ def test_steps_that_are_miscounted_do_not_bring_vehicles_together(
         return real(clock, rows, now_ns) + steps * (rows % 2)
 
     monkeypatch.setattr(ClockMap, "steps", mistaken)
-    swaps = scenario(6, duration=25.0)
+    swaps = scenario(6, duration=25.0 if steps == 5 else 15.0)
     flown = flight.fly(swaps, vehicles=6)
     counts = flown.figures["server"]["counts"]
     assert separation_m(flown) > 0.5
@@ -1152,7 +1152,7 @@ def test_the_fleet_tells_how_near_they_came(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     file = tmp_path / "s.json"
-    shape = ["--reference.shape", "swap(4)", "--duration", "12", "--settle", "1"]
+    shape = ["--reference.shape", "swap(4)", "--duration", "8", "--settle", "1"]
     assert main(["fleet", "swap", "--virtual", *shape, "--json", str(file)]) == 0
     told = json.loads(file.read_text())
     assert told["vehicles"] == 4

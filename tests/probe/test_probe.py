@@ -329,7 +329,7 @@ def test_a_finite_rate_is_found_where_there_is_one(text: str, rate: float | None
 
 def test_the_models_are_those_of_the_network_and_fly() -> None:
     text = "gamma(0.02, 0.06, 0.03) & gilbert_elliott(0.2, 0.5)"
-    measured, _ = measure(text, text, seconds=180.0)
+    measured, _ = measure(text, text, seconds=60.0)
     told = outcome(measured, "x", secure=False).told
     for way in (told.uplink, told.downlink):
         assert models(way.text) == models(text)

@@ -44,7 +44,7 @@ HASH = """
 from skytether.shared.scenario import reading
 from skytether.sim.flight import fly
 import msgspec
-flown = msgspec.structs.replace(reading.load("paper"), duration=4.0, settle=0.0, seed=5)
+flown = msgspec.structs.replace(reading.load("paper"), duration=2.0, settle=0.0, seed=5)
 print(fly(flown).trace_hash())
 """
 
@@ -55,9 +55,9 @@ def test_the_same_seed_flies_the_same_in_another_process_and_hash_seed() -> None
         [sys.executable, "-c", HASH], env=environment, capture_output=True, check=True
     )
     hashes = {run.stdout.decode().strip()}
-    hashes.add(fly(packaged("paper", duration=4.0, settle=0.0, seed=5)).trace_hash())
+    hashes.add(fly(packaged("paper", duration=2.0, settle=0.0, seed=5)).trace_hash())
     assert len(hashes) == 1
-    assert fly(packaged("paper", duration=4.0, settle=0.0, seed=6)).trace_hash() not in hashes
+    assert fly(packaged("paper", duration=2.0, settle=0.0, seed=6)).trace_hash() not in hashes
 
 
 @pytest.mark.long

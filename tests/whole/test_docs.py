@@ -166,7 +166,6 @@ def test_a_documented_flight_flies(
 
 
 @at_night_over_udp
-@pytest.mark.usefixtures("documented_ports")
 def test_the_three_documented_terminals_fly_together(tmp_path: Path) -> None:
     on_one, _ = terminals()
     said = fly_together(on_one, tmp_path)
@@ -175,7 +174,6 @@ def test_the_three_documented_terminals_fly_together(tmp_path: Path) -> None:
 
 
 @at_night_over_udp
-@pytest.mark.usefixtures("documented_ports")
 def test_the_three_documented_machines_fly_together(tmp_path: Path) -> None:
     _, on_three = terminals()
     keygen, *processes = on_three
@@ -193,7 +191,6 @@ def terminals() -> list[list[str]]:
 
 
 @at_night_over_udp
-@pytest.mark.usefixtures("documented_ports")
 def test_the_documented_links_carry_one_flight(tmp_path: Path) -> None:
     (keygen, *processes), *_ = blocks(ROOT / "docs" / "two-links.md")
     assert ran(*skytether(keygen), cwd=tmp_path).returncode == 0
@@ -204,7 +201,6 @@ def test_the_documented_links_carry_one_flight(tmp_path: Path) -> None:
 
 
 @at_night_over_udp
-@pytest.mark.usefixtures("documented_ports")
 def test_the_documented_robot_is_driven(tmp_path: Path) -> None:
     document, port = ROOT / "docs" / "ros2.md", free_port()
     (table,) = re.findall(r"```toml\n(.*?)```", document.read_text(), re.DOTALL)
