@@ -29,6 +29,16 @@ from skytether.shared.core.events import (
 )
 from skytether.shared.telemetry.record import Reason
 
+
+@pytest.fixture(scope="module")
+def aloft() -> Air:
+    """Vehicle in the air; each test that takes it leaves it flying a plan."""
+    air = Air("px4", duration=60.0)
+    air.fly()
+    air.run(3.0)
+    return air
+
+
 # Clock
 
 
@@ -53,10 +63,8 @@ def test_a_simulator_that_runs_faster_than_time_is_not_flown_and_its_speed_is_to
     assert not air.flight.armed
 
 
-def test_positions_that_cannot_be_used_are_not_called_silence() -> None:
-    air = Air("px4", duration=30.0)
-    air.fly()
-    air.run(3.0)
+def test_positions_that_cannot_be_used_are_not_called_silence(aloft: Air) -> None:
+    air = aloft
     air.tap.alter = altered("LOCAL_POSITION_NED", time_boot_ms=lambda ms: ms + 60_000)
     air.run(2.0)
     assert ("brake", str(Reason.UNUSABLE)) in modes(air)
@@ -150,12 +158,11 @@ def test_a_lossy_link_is_no_silence_on_the_ground() -> None:
     assert not air.of(ServerSilent)
 
 
-def test_an_autopilot_that_answers_timesync_no_more_is_told_once() -> None:
-    air = Air("px4", duration=60.0)
-    air.fly()
-    air.run(3.0)
+def test_an_autopilot_that_answers_timesync_no_more_is_told_once(aloft: Air) -> None:
+    air = aloft
     air.tap.alter = lambda message: b"" if message.get_type() == "TIMESYNC" else None
     air.run(12.5)
+    air.tap.alter = None
     (silent,) = air.of(ClockSilent)
     assert 10.0 < silent.silent_s < 12.0
     assert modes(air)[-1][0] == "track"

@@ -128,7 +128,7 @@ def test_odometry_in_another_frame_is_dropped() -> None:
 )
 def test_a_robot_follows_its_reference(table: dict[str, Any]) -> None:
     ground = Ground(heading=0.7, drift_ppm=50.0, **table)
-    ground.run(14.0)
+    ground.run(12.0)
     rows = ground.rows()
     wanted = ground.scenario.make_reference()(rows["step"] * STEP)[:, :2, 0]
     error = np.linalg.norm(rows["state"][:, :2, 0] - wanted, axis=1)[200:]

@@ -17,7 +17,7 @@ from skytether.sim.flight import fly
 
 GOOD = "uniform(0.05, 0.15)"
 DIES = f"{GOOD} & outage(8, 3600)"
-SECONDS = 20.0
+SECONDS = 16.0
 STRANGER = ("stranger", 9)
 
 
@@ -130,13 +130,13 @@ def test_without_the_choice_of_paths_the_vehicle_brakes(monkeypatch: pytest.Monk
 
 
 def test_dear_link_carries_at_most_a_tenth_while_the_cheap_one_is_well() -> None:
-    record = fly(two((GOOD, GOOD, 1.0), (GOOD, GOOD, 10.0), duration=40.0))
+    record = fly(two((GOOD, GOOD, 1.0), (GOOD, GOOD, 10.0), duration=24.0))
     assert 0.0 < shares(record)[1] <= 0.1
 
 
 def test_equal_links_share_the_packets_and_cost_few_more() -> None:
-    alone = fly(two((GOOD, GOOD, 1.0), duration=40.0))
-    record = fly(two((GOOD, GOOD, 1.0), (GOOD, GOOD, 1.0), duration=40.0))
+    alone = fly(two((GOOD, GOOD, 1.0), duration=24.0))
+    record = fly(two((GOOD, GOOD, 1.0), (GOOD, GOOD, 1.0), duration=24.0))
     assert 0.35 < shares(record)[1] < 0.65
     assert len(record.netem) < 1.25 * len(alone.netem)
 
