@@ -65,7 +65,7 @@ def test_without_its_origin_a_vehicle_in_the_air_hovers_until_somebody_says_wher
 
 
 def test_where_nobody_says_where_the_origin_is_it_lands_where_it_is() -> None:
-    air = away("ardupilot", mavlink={"patience_s": 9.0})
+    air = away("ardupilot", 4.0, mavlink={"patience_s": 9.0})
     air.restart(1.0, remembers=False)
     air.end(60.0)
     assert isinstance(air.client.failure, NotTakenOff)
