@@ -300,21 +300,21 @@ def fly_with(fault: str, flavour: FlavourName, seconds: float, **keys: float) ->
         set_parameter(companion, name, value)
     companion.climb()
     companion.velocity = (1.0, 0.0, 0.0)
-    companion.run(60.0, lambda: companion.flight.now_ns >= companion.flight.armed_ns + 15e9)
+    companion.run(60.0, lambda: companion.flight.now_ns >= companion.flight.armed_ns + 10e9)
     companion.run(seconds)
     return companion
 
 
 @pytest.mark.parametrize("flavour", BOTH)
 def test_a_pilot_takes_over(flavour: FlavourName) -> None:
-    companion = fly_with("pilot@15", flavour, 3.0)
+    companion = fly_with("pilot@10", flavour, 3.0)
     assert companion.flight.mode is FlightMode.PILOT
     assert math.hypot(*companion.flight.velocity()) < 0.2
 
 
 @pytest.mark.parametrize("flavour", BOTH)
 def test_it_lands_where_it_does_not_know_its_place(flavour: FlavourName) -> None:
-    companion = fly_with("estimate@15", flavour, 3.0)
+    companion = fly_with("estimate@10", flavour, 3.0)
     assert companion.flight.mode is FlightMode.LAND
     assert companion.mode(FlightMode.GUIDED) == companion.flight.refusal
     before = len(companion.all("LOCAL_POSITION_NED"))
@@ -336,7 +336,7 @@ def test_it_lands_where_it_does_not_know_its_place(flavour: FlavourName) -> None
 def test_a_low_battery_is_told_and_does_what_the_parameter_says(
     flavour: FlavourName, keys: dict[str, float], mode: FlightMode
 ) -> None:
-    companion = fly_with("battery@15", flavour, 1.0, **keys)
+    companion = fly_with("battery@10", flavour, 1.0, **keys)
     assert companion.flight.mode is mode
     assert any("attery" in text for text in companion.texts())
     companion.command(512, dialect.MAVLINK_MSG_ID_SYS_STATUS)
@@ -687,7 +687,7 @@ def test_its_place_on_the_globe_is_that_of_its_local_frame(flavour: FlavourName)
     ask = dialect.MAV_DATA_STREAM_POSITION
     companion.send(dialect.MAVLink_request_data_stream_message(1, 1, ask, 10, 1))
     companion.velocity = (1.0, -2.0, 0.5)
-    companion.run(8.0)
+    companion.run(3.0)
     place, local = companion.last("GLOBAL_POSITION_INT"), companion.last("LOCAL_POSITION_NED")
     latitude, longitude, altitude_m = companion.flavour.home
     north_m = (place.lat * 1e-7 - latitude) * 111_319.49
