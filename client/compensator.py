@@ -142,6 +142,13 @@ class Compensator:
         knot[:, 0, 0] = state[:, 0]
         self.follower = SplineFollower(self._constants, knot, 1, UNENDING)
 
+    def goes_on(self, step: int) -> bool:
+        """Whether the last knot of the spline in force lies after `step`."""
+        flown = self.follower
+        if self.in_force == NO_HORIZON or not isinstance(flown, SplineFollower):
+            return False
+        return step < self.begins + flown.last
+
     @property
     def rests(self) -> bool:
         return self.in_force == NO_HORIZON and isinstance(self.follower, SplineFollower)

@@ -60,7 +60,22 @@ CLOSING = frozenset({Reason.CLOSED, Reason.RESYNC})
 DROPPING = LOCKING | {Reason.STALLED, Reason.NOT_FINITE, Reason.UNARMED, Reason.LEAPT}
 """Causes that drop the horizon in force."""
 
+AT_ONCE = YIELDING | {
+    Reason.NOT_FINITE,
+    Reason.UNARMED,
+    Reason.LEAPT,
+    Reason.MUTE,
+    Reason.UNUSABLE,
+    Reason.ASTRAY,
+    Reason.RIVAL,
+    Reason.STRAYED,
+}
+"""Causes that take a vehicle off a mission's motion before its last knot: the vehicle itself cannot
+follow it, or a person says so. Every other cause waits for the last knot, see `Failsafe.meet`."""
+
 HANGING = frozenset({Mode.SYNC, Mode.READY, Mode.HOVER})
+FOLLOWING = frozenset({Mode.TRACK, Mode.COAST})
+"""Modes in which a horizon or a motion is flown."""
 KEPT = frozenset({Reason.BRAKED, Reason.WAITED})
 """Causes that do not replace the reason for braking or hovering."""
 
@@ -201,6 +216,10 @@ class Failsafe:
         operator."""
         self._future: deque[int] = deque(maxlen=FUTURE_MAX)
         """Times of the newest horizons from the future."""
+        self.keeps_motion = False
+        """Whether a mission's motion is in force whose last knot lies ahead."""
+        self.postponed: Reason | None = None
+        """First cause that waits for the last knot of that motion; None if there is none."""
 
     @property
     def heard_ns(self) -> int | None:
@@ -210,6 +229,9 @@ class Failsafe:
     def takes(self) -> bool:
         """Whether a horizon that arrives now is flown."""
         may = (self.mode, Reason.HORIZON) in self._table
+        # After a stall a newer motion is the better one; after any other cause it comes from a
+        # server that cannot be relied on.
+        may = may and self.postponed in (None, Reason.STALLED)
         return may and self.armed and not self.has_leapt and self.reason not in LOCKING
 
     @property
@@ -260,6 +282,7 @@ class Failsafe:
 
     def horizon_taken(self, *, now_ns: int) -> None:
         self._horizon_ns = now_ns
+        self.postponed = None  # a stall, which the newer motion makes good
         self.meet(Reason.HORIZON, now_ns=now_ns)
 
     def malformed(self, *, now_ns: int) -> None:
@@ -331,9 +354,28 @@ class Failsafe:
     def decide(self) -> None:
         self.has_leapt = self.stays = False
 
+    def motion_goes_on(self, goes_on: bool, *, now_ns: int) -> None:
+        """Note at each step whether a mission's motion is in force whose last knot lies ahead; at
+        the last knot the postponed cause acts.
+        """
+        self.keeps_motion = goes_on
+        if not goes_on and self.postponed is not None:
+            cause, self.postponed = self.postponed, None
+            self.meet(cause, now_ns=now_ns)
+
     def meet(self, cause: Reason, *, now_ns: int) -> None:
+        """Act on a cause: change mode and reason, as the table says.
+
+        The other vehicles of a mission keep clear of the motion in force, and of nothing else. So
+        what arrives from the network, or does not, takes no vehicle off its motion: such a cause
+        acts at the last knot, where the vehicle rests, and until then no other motion is accepted.
+        """
         after = self._table.get((self.mode, cause))
         if after is None:
+            return
+        if self.keeps_motion and after not in FOLLOWING and cause not in AT_ONCE:
+            if self.postponed in (None, Reason.STALLED):
+                self.postponed = cause
             return
         if cause in LOCKING or cause is Reason.OPENED:
             # From now on the link has to be good for GOOD_NS.

@@ -148,6 +148,8 @@ class SplineFollower:
         terms = constants.terms
         self.length = length
         self.spacing, self.sent = spacing, knots
+        self.last = spacing * (knots.shape[1] - 1)
+        """Stage of the last knot."""
         self._knots = np.array(knots, np.float64, order="C").reshape(len(knots), -1)
         axes = zip(constants.model.axes(), self._knots, terms.u_max, strict=True)
         last = [

@@ -154,6 +154,11 @@ class Pilot:
             raise
         if is_held:
             self._failsafe.horizon_taken(now_ns=now_ns)
+            self._failsafe.motion_goes_on(self._goes_on(self.step), now_ns=now_ns)
+
+    def _goes_on(self, step: int) -> bool:
+        """Whether the vehicle follows a mission's motion whose last knot lies after `step`."""
+        return self._is_mission and self.compensator.goes_on(step)
 
     def mode_changed(self, cause: Reason) -> None:
         if not self._failsafe.takes:
@@ -178,6 +183,7 @@ class Pilot:
         self.flown = self.step = present
         self._flown_ns = self._epoch_ns + present * self._dt_ns
         hindrance = self._vehicle.hindrance(now_ns=now_ns)
+        self._failsafe.motion_goes_on(self._goes_on(present), now_ns=now_ns)
         self._failsafe.step(late_ns=late_ns, hindrance=hindrance, now_ns=now_ns)
         self._input = self._choose(now_ns)
         self._vehicle.fly(self._input)
