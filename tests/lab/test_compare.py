@@ -430,7 +430,7 @@ REAL = {name: getattr(contenders, name) for name in ("quick", "QUICK")}
 QUICK = ("paper-every-step", BESIDE, "trajectory-expected")
 """Contenders of `--quick` here."""
 TUNE = ["compare", "--quick", "--tune", "--generations", "1"]
-FLOWN_S = 3.0
+FLOWN_S = 4.0
 
 
 @pytest.fixture(scope="module")
