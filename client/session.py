@@ -161,6 +161,8 @@ class ServerSession:
         self._events = events
         self.hello_ns = 0
         """Time before which no further HELLO is sent."""
+        self._awaits_welcome = False
+        """Whether a HELLO is out, and nothing else has been heard in a session since."""
         self._began_ns: int | None = None
         self._is_unanswered = False
         self.number: int | None = None
@@ -270,6 +272,10 @@ class ServerSession:
     def _welcome(self, welcome: Welcome, now_ns: int) -> None:
         if (welcome.vehicle, welcome.boot_id) != (self._vehicle, self._boot_id):
             raise ProtocolError(Drop.FOR_ANOTHER_LIFE)
+        if not self._awaits_welcome:
+            # A late copy, or an answer to a late copy of a HELLO: it would lead to a session that
+            # has ended, or that nobody asked for.
+            raise ProtocolError(Drop.UNASKED)
         if welcome.terms != self._terms:
             # Only before the first session: in flight the vehicle keeps its horizon, and the
             # failsafe decides.
@@ -296,6 +302,7 @@ class ServerSession:
         self._is_open = True
         self.link.adopt(now_ns=now_ns)
         self._heard(welcome, now_ns)
+        self._awaits_welcome = True  # another HELLO may be answered by a session that lives longer
         if restarted:
             self._watch.meet(Reason.RESTARTED, now_ns=now_ns)
 
@@ -340,6 +347,7 @@ class ServerSession:
             self.hearing.hear(message.number, server_ns)
 
     def _note_heard(self, now_ns: int) -> None:
+        self._awaits_welcome = False
         self.heard_ns = self.useful_ns = now_ns
         self._watch.heard(now_ns=now_ns)
 
@@ -354,6 +362,7 @@ class ServerSession:
             unheard = self.number is None and self._refusal is None
             again_ns = self.link.hello_ns if unheard else AGAIN_NS
             self.hello_ns = now_ns + again_ns * (1 if self.leads else RARE_TIMES)
+            self._awaits_welcome = True
             hello = encode(Hello(self._vehicle, self._boot_id, self._terms))
             self._put(self.link.hello(hello, now_ns=now_ns), (self._greeted,))
             self._greeted = (self._greeted + 1) % len(self._addresses)

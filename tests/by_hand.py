@@ -72,8 +72,10 @@ class ByHand:
         server_boot_id: int = 1,
         refusal: int = Refusal.ACCEPTED,
         terms: Terms | None = None,
+        asked: bool = True,
     ) -> None:
-        """Open a session, or refuse it."""
+        """Open a session, or refuse it; `asked`: as if the client had sent a HELLO."""
+        self.client._session._awaits_welcome |= asked
         session, terms = self.session if refusal == Refusal.ACCEPTED else 0, terms or self.terms
         self.say(Welcome(4, session, boot_id, server_boot_id, 1234, refusal, terms))
 

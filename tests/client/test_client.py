@@ -171,9 +171,25 @@ def test_a_restarted_server_whose_clock_is_ahead_is_no_sleep_of_the_vehicle() ->
         server.horizon(step, 0.5)
     server.client.events()
     ahead_ns = server.now_ns + 10_000 * SECOND_NS
-    server.say(Welcome(4, 8, 99, 2, ahead_ns, Refusal.ACCEPTED, server.terms))
+    restarted = Welcome(4, 8, 99, 2, ahead_ns, Refusal.ACCEPTED, server.terms)
+    server.say(restarted)
+    assert server.client.dropped[Drop.UNASKED] == 1
+    server.client._session._awaits_welcome = True
+    server.say(restarted)
     told = [event.reason for event in server.client.events() if isinstance(event, ModeChanged)]
     assert told == [str(Reason.RESTARTED)]
+
+
+def test_a_welcome_that_no_hello_asked_for_changes_nothing() -> None:
+    """A late copy of an old WELCOME would lead the vehicle to a session that has ended."""
+    server, beat = flying(vehicle={"exhausted": "brake"}), Heartbeat(4, 7, 0, 0, 0, 1, 25)
+    server.say(beat)
+    server.client.events()
+    server.session = 8
+    server.welcome(server_boot_id=2, asked=False)
+    assert server.client.dropped == {Drop.UNASKED: 1}
+    assert server.client._session.number == 7
+    assert not server.client.events()
 
 
 def test_packets_are_numbered_anew_in_each_session() -> None:

@@ -27,6 +27,7 @@ def test_report_of_an_earlier_session_is_not_taken_for_one_of_this() -> None:
         reports = [report for each in client.outbox() if (report := split(each.payload)[0])]
         return reports[-1]
 
+    client.wake(now_ns=now_ns)  # says HELLO
     client.receive(Datagram(encode(welcome), SERVER), now_ns=now_ns)
     newest()
     for session, heard in ((6, 0), (7, 2)):
