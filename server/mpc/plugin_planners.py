@@ -60,8 +60,8 @@ class PluginPlanners:
 
     def __init__(self, fleet: Fleet, counts: Counter[str], *, states: bool) -> None:
         self._text = text = fleet.scenario.control.planner
+        self._scenario, self._named = fleet.scenario, PLANNERS.one(text)
         self._problem = Problem.of(fleet.scenario)
-        self._make = partial(PLANNERS.make, PLANNERS.one(text), (), self._problem)
         self._states, self._tell, self._planning = states, fleet.tell, fleet.planning
         self._counts = counts
         self._numbers = count()
@@ -73,6 +73,9 @@ class PluginPlanners:
         except Exception as error:
             wrong = f"a planner that can be made ({type(error).__name__}: {error})"
             raise ConfigError(f"control.planner: got {text!r}, expected {wrong}") from error
+
+    def _make(self) -> Any:
+        return PLANNERS.make(self._named, (), Problem.of(self._scenario))
 
     def forget(self, row: int) -> None:
         self._own.pop(row, None)
@@ -111,13 +114,16 @@ class PluginPlanners:
         return self._own[row]
 
     def _plan(self, own: VehiclePlanner, start: int, state: Array, reference: Array) -> Any:
-        if own.planner is None:
-            own.planner = self._make()
         gap, H = start - own.start, self._problem.horizon
         previous = np.zeros_like(own.inputs)
         if own.start >= 0 and 0 <= gap <= H:
             previous = own.inputs[:, np.minimum(np.arange(H) + gap, H - 1)]
-        return own.planner.plan(state, reference, previous)
+        try:
+            if own.planner is None:
+                own.planner = self._make()
+            return own.planner.plan(state, reference, previous)
+        except SystemExit as error:  # of its library: it shall not end the others' flights
+            raise RuntimeError(f"got SystemExit: {error}") from error
 
     def _checked(self, own: VehiclePlanner, start: int, answer: Any) -> Array | None:
         problem = self._problem

@@ -38,8 +38,15 @@ class Problem(NamedTuple):
     @classmethod
     def of(cls, scenario: Scenario) -> Self:
         terms = scenario.terms()
-        axes, u_max = terms.axes, scenario.u_max
-        return cls(terms.model, terms.dt_s, terms.horizon, axes, u_max, scenario)
+        model, u_max = Model(*map(_read_only, terms.model)), _read_only(scenario.u_max)
+        return cls(model, terms.dt_s, terms.horizon, terms.axes, u_max, scenario)
+
+
+def _read_only(array: Array) -> Array:
+    """Copy that cannot be written to, so that no planner changes what others are made from."""
+    copy = array.copy()
+    copy.setflags(write=False)
+    return copy
 
 
 class Planner(Protocol):

@@ -243,10 +243,15 @@ class Scripted:
         return self.answers.pop(0)
 
 
-@pytest.mark.parametrize("scheme", ["committed", "trajectory"])
-def test_a_mistake_costs_its_vehicle_the_plan_and_nobody_else(scheme: str) -> None:
+@pytest.mark.parametrize(
+    ("scheme", "raised"),
+    [("committed", RuntimeError), ("trajectory", RuntimeError), ("committed", SystemExit)],
+)
+def test_a_mistake_costs_its_vehicle_the_plan_and_nobody_else(
+    scheme: str, raised: type[BaseException]
+) -> None:
     """The other vehicle's flight is the same to the last bit, though the planner has also
-    overwritten its arguments.
+    overwritten its arguments, and has tried to overwrite the problem.
     """
 
     @planner(name="mine")
@@ -257,7 +262,10 @@ def test_a_mistake_costs_its_vehicle_the_plan_and_nobody_else(scheme: str) -> No
             plan = super().plan(state, reference, previous)
             if self.fails and self.number == 2:
                 state[:] = reference[:] = previous[:] = np.nan
-                raise RuntimeError("no")
+                for array in (self.problem.u_max, *self.problem.model):
+                    with pytest.raises(ValueError, match="read-only"):
+                        array *= 0.9
+                raise raised("no")
             return plan
 
     flown = msgspec.structs.replace(scenario(scheme), duration=3.0)
@@ -265,7 +273,7 @@ def test_a_mistake_costs_its_vehicle_the_plan_and_nobody_else(scheme: str) -> No
     Wrong.made, Wrong.fails = 0, True
     wrong = fly(flown, vehicles=2)
     (told,) = faults(wrong)
-    assert told.startswith("the planner mine: RuntimeError: no; a vehicle for which it fails")
+    assert told.startswith("the planner mine: RuntimeError: ")
     counts = wrong.figures["server"]["counts"]
     assert counts["planner_errors"] == counts["unsolved"] > 20
     (failing,) = set(wrong.server["vehicle"][~wrong.server["solved"]].tolist())

@@ -86,6 +86,20 @@ def planners(monkeypatch: pytest.MonkeyPatch) -> ByHand:
     return ByHand()
 
 
+@pytest.mark.parametrize("raised", [SystemExit, KeyboardInterrupt, RuntimeError])
+def test_whatever_a_planner_raises_is_its_answer_and_its_thread_goes_on(
+    raised: type[BaseException],
+) -> None:
+    def fails() -> None:
+        raise raised("no")
+
+    planners = ByHand()
+    for _ in range(2):
+        wrong, right = planners([(1, fails), (2, lambda: "a plan")])
+        assert isinstance(wrong, RuntimeError)
+        assert right == "a plan"
+
+
 def test_answers_are_in_the_order_of_the_calls(planners: ByHand) -> None:
     for tick in range(3):
         calls = [(row, lambda row=row, tick=tick: (row, tick)) for row in (3, 1, 2)]
