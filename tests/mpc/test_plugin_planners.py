@@ -264,7 +264,7 @@ def test_a_mistake_costs_its_vehicle_the_plan_and_nobody_else(
                 state[:] = reference[:] = previous[:] = np.nan
                 for array in (self.problem.u_max, *self.problem.model):
                     with pytest.raises(ValueError, match="read-only"):
-                        array *= 0.9
+                        array[:] = 0.9
                 raise raised("no")
             return plan
 
