@@ -342,6 +342,15 @@ def test_the_flight_ends_after_its_duration() -> None:
     assert server.rows()["step"].tolist() == list(range(200))
 
 
+def test_a_client_that_wakes_after_the_end_flies_the_last_step() -> None:
+    server = flying(duration=2.0)
+    server.wake()
+    server.now_ns += 60 * SECOND_NS
+    server.wake()
+    assert server.client.finished
+    assert server.rows()["step"].tolist() == [0, 39]
+
+
 def test_an_exhausted_horizon_brakes_or_holds() -> None:
     speeds = {}
     for exhausted in ("hold", "brake"):

@@ -257,6 +257,30 @@ def test_braking_ends_after_its_longest_time(short_ns: int, mode: Mode) -> None:
     assert guard.mode is mode
 
 
+@pytest.mark.parametrize("cause", [Reason.LOST, Reason.CLOSED, Reason.RESTARTED])
+def test_a_link_that_breaks_while_the_vehicle_brakes_has_to_be_good_again(cause: Reason) -> None:
+    guard = tracking_alone(SECOND_NS)
+    guard.meet(Reason.ENDED, now_ns=SECOND_NS)
+    assert (guard.mode, guard.takes) == (Mode.BRAKE, True)
+    guard.meet(cause, now_ns=SECOND_NS)
+    assert (guard.mode, guard.takes) == (Mode.BRAKE, False)
+
+
+@pytest.mark.parametrize("cause", failsafe.CLOSING)
+def test_the_link_of_a_session_that_has_ended_is_lost_at_once(cause: Reason) -> None:
+    guard = tracking_alone(SECOND_NS)
+    assert not guard.is_lost(SECOND_NS)
+    guard.meet(cause, now_ns=SECOND_NS)
+    assert guard.is_lost(SECOND_NS)
+
+
+def test_the_silence_of_the_server_goes_on_over_a_restart_of_the_client() -> None:
+    guard = aboard(timeout=1.0)
+    guard.resume(Reason.RESUMED, heard_ns=SECOND_NS, now_ns=3 * SECOND_NS)
+    assert guard.mode is Mode.TRACK
+    assert guard.is_lost(3 * SECOND_NS)
+
+
 @pytest.mark.parametrize(("over_ns", "mode"), [(0, Mode.BRAKE), (1, Mode.TRACK)])
 def test_malformed_messages_count_within_window_ns(over_ns: int, mode: Mode) -> None:
     guard = tracking_alone(SECOND_NS)
@@ -395,8 +419,25 @@ def test_what_is_told_while_braking_never_speeds_up_whatever_feedback_adds(
     braked = hand.speed
     assert (hand.mode, 0.2 < braked < 0.8) == (Mode.BRAKE, True)
     monkeypatch.setattr(rule, "remaining", lambda *_: 1.0)
-    hand.fly(0.02)
-    assert hand.speed == pytest.approx(braked - 2.0 * 0.02, abs=1e-6)
+    for step in (1, 2):
+        hand.fly(0.02)
+        assert hand.speed == pytest.approx(braked - step * 2.0 * 0.02, abs=1e-6)
+
+
+def test_a_horizon_whose_last_step_was_missed_is_braked_from_the_speed_flown() -> None:
+    """Not from its last input, which is faster."""
+    hand = Hand(control={"horizon": 20})
+    hand.fly(1.2)
+    inputs = np.zeros((hand.terms.axes, 20), np.float32)
+    inputs[0] = [*[0.5] * 19, SPEED]
+    made_for = hand.step
+    hand.say(Horizon(4, hand.session, made_for, 1, 0, inputs))
+    while hand.step < made_for + 18:
+        hand.fly(0.02)
+    hand.now_ns += 2 * hand.dt_ns
+    for flown in (0.5, 0.5 - 2.0 * 0.02):
+        hand.fly(0.02)
+        assert hand.speed == pytest.approx(flown)
 
 
 def test_a_silent_server_ends_in_brake_with_horizon_left() -> None:
@@ -461,16 +502,23 @@ def test_horizons_that_come_late_for_half_a_second_end_in_brake() -> None:
 
 
 def test_one_horizon_in_time_among_late_ones_is_enough() -> None:
-    hand = tracking()
-    hand.fly((D + 0.75 * H) / STEPS_PER_S + 0.04)
-    for _ in range(5):
-        hand.plan(hand.step - D - 76)
-        hand.fly(0.1)
-        hand.plan(hand.step - D - 76)
-        hand.fly(0.3)
-        hand.plan(hand.step - D - 74)
+    guard = tracking_alone(SECOND_NS)
+    for at_s, late in ((1.0, True), (1.2, False), (1.5, True), (1.9, True)):
+        guard.horizon_arrived(late=late, now_ns=round(at_s * SECOND_NS))
+        assert guard.mode is Mode.TRACK
+    guard.horizon_arrived(late=True, now_ns=2 * SECOND_NS)
+    assert (guard.mode, guard.reason) == (Mode.BRAKE, Reason.LATE)
+
+
+def test_an_old_horizon_that_comes_again_and_again_is_no_late_one() -> None:
+    """Half a second of overtaken copies says nothing about the newest."""
+    hand = Hand(control={"horizon": 40})
+    hand.fly(1.2)
+    hand.plan()
+    for _ in range(30):
         hand.fly(0.02)
-    assert ("brake", str(Reason.LATE)) not in hand.changes
+        hand.plan(10, observed=10)
+    assert hand.mode is Mode.TRACK
 
 
 def test_a_restarted_server_s_horizons_wait_for_a_second_of_good_link() -> None:
@@ -640,6 +688,21 @@ def test_a_state_that_no_vehicle_can_have_ends_in_hover_until_somebody_has_chose
         assert hand.takes
         hand.fly(0.1, plans=True)
         assert hand.mode is Mode.TRACK
+
+
+def test_in_a_new_frame_the_estimate_begins_anew() -> None:
+    """With a filter, which would else go on from the place in the old frame."""
+    server = ByHand(packaged("swap"))
+    server.wake()
+    server.welcome()
+    server.wake()
+    server.flies.plant.x[:, 0] += 300.0
+    server.wake()
+    running = Running(server.client, server.scenario)
+    running.change({"vehicle.after_leap": "new"}, now_ns=server.now_ns)
+    server.wake()
+    row = server.rows()[-1]
+    assert row["estimate"][:, 0] == pytest.approx(row["state"][:, 0], abs=1.0)
 
 
 def test_one_that_is_to_stay_after_a_leap_hovers_on() -> None:
@@ -851,6 +914,35 @@ def test_a_link_that_comes_back_just_before_the_landing_has_its_second() -> None
     assert hand.mode is Mode.HOVER
     hand.fly(1.3)
     assert (hand.mode, hand.takes) == (Mode.HOVER, True)
+
+
+@pytest.mark.parametrize("cause", [None, *PILOTS])
+def test_a_fence_does_not_steer_a_vehicle_that_a_pilot_flies(cause: Reason | None) -> None:
+    """It stands beyond the fence."""
+    fence = {"low_m": [-9.0, -9.0], "high_m": [9.0, 9.0], "wind_mps": 0.2}
+    server = ByHand(scenario(fence=fence))
+    server.flies.plant.x[:, 0] = 20.0
+    server.flies.hindrance = lambda *, now_ns: cause  # noqa: ARG005
+    server.wake()
+    server.welcome()
+    server.wake()
+    assert server.rows()["input"].any() == (cause is None)
+
+
+def test_a_fence_keeps_no_vehicle_from_landing() -> None:
+    """Its lowest altitude lies above the vehicle."""
+    fence = {"low_m": [-9.0, -9.0, 0.5], "high_m": [9.0, 9.0, 9.0], "wind_mps": 0.2}
+    space = {"model": {"axes": 3}, "reference": {"altitude_m": 2.0}}
+    server = ByHand(scenario(fence=fence, control={"horizon": 60}, **space))
+    server.flies.plant.x[2, 0] = 0.4
+    server.wake()
+    server.welcome()
+    server.wake()
+    server.client._failsafe.mode = Mode.LAND
+    server.wake()
+    climbs, descends = server.rows()["input"][:, 2]
+    assert climbs > 0.0
+    assert descends < 0.0
 
 
 # -- time limits of modes ----------------------------------------------------------------------

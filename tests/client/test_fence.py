@@ -129,12 +129,39 @@ def test_wind_that_a_weak_vehicle_cannot_fly_against_is_refused() -> None:
         scenario(fence={"radius_m": 20.0, "wind_mps": 1.0}, model={"u_max": [1.6], "gain": 0.5})
 
 
-def test_near_a_bound_the_speed_towards_it_is_the_distance_over_t() -> None:
-    """T = τ + 2 Δt: without τ, a vehicle with a large time constant would come too close."""
-    flown = scenario(fence={"low_m": [-9.0, -9.0], "high_m": [9.0, 9.0]})
-    terms, (_, high, _) = flown.terms(), inner_bounds(flown)
+FAR_M = {"low_m": [-9.0, -9.0], "high_m": [9.0, 9.0]}
+WEAK = {"gain": [1.25, 0.8]}
+"""Gains of the two axes."""
+
+
+@pytest.mark.parametrize(("squares", "speed"), [(0.1, 0.1), (1.0, 1.0), (2.5, 2.0)])
+@pytest.mark.parametrize("way", [-1.0, 1.0])
+def test_the_speed_towards_a_bound_lets_the_vehicle_stop(
+    way: float, squares: float, speed: float
+) -> None:
+    """At a distance of so many b T² so many b T, where T = τ + 2 Δt: without τ, a vehicle with a
+    large time constant would come too close.
+    """
+    flown = scenario(fence=FAR_M, model=WEAK)
+    terms, (low, high, _) = flown.terms(), inner_bounds(flown)
     T = terms.tau_s[0] + SLOW_STEPS * flown.control.dt
-    distance = 0.1 * flown.vehicle.brake_mps2 * T * T
-    places = [(high[0] - distance, 0.0), *[(0.0, 0.0)] * (len(high) - 1)]
-    told = Fence(flown).limited([9.0, *[0.0] * (len(high) - 1)], places, [9.0] * len(high))
-    assert told[0] == pytest.approx(distance / T / terms.gain[0])
+    b, bound = flown.vehicle.brake_mps2, high[0] if way > 0.0 else low[0]
+    places = [(bound - way * squares * b * T * T, 0.0), (0.0, 0.0)]
+    told = Fence(flown).limited([way * 99.0, 0.0], places, [99.0, 99.0])
+    assert told == pytest.approx([way * speed * b * T / terms.gain[0], 0.0])
+
+
+def test_the_radius_is_kept_for_the_strongest_axis_from_where_the_vehicle_began() -> None:
+    flown = scenario(fence={"radius_m": 9.0}, model=WEAK)
+    terms, (_, _, radius) = flown.terms(), inner_bounds(flown)
+    fence, u_max = Fence(flown), [99.0, 99.0]
+    assert fence.limited([1.0, 0.0], [(50.0, 0.0), (0.0, 0.0)], u_max) == [1.0, 0.0]
+    T = max(terms.tau_s) + SLOW_STEPS * flown.control.dt
+    near = [(50.0 + radius - 0.1, 0.0), (0.0, 0.0)]
+    assert fence.limited([9.0, 0.0], near, u_max) == pytest.approx([0.1 / T / max(WEAK["gain"]), 0])
+
+
+def test_the_way_back_inside_is_no_faster_than_the_fence_allows() -> None:
+    flown = scenario(fence=FAR_M | {"speed_mps": 1.0, "wind_mps": 0.2})
+    told = Fence(flown).limited([0.0, 0.0], [(30.0, 0.0), (0.0, 0.0)], flown.u_max.tolist())
+    assert told == pytest.approx([-1.0, 0.0])

@@ -53,6 +53,16 @@ def test_the_number_only_rises(
         assert lead.number == before or lead.leader == server % servers
 
 
+def test_no_number_follows_the_largest() -> None:
+    """A larger one fits into no message."""
+    lead = Leadership(2, NUMBER_MAX, TIMEOUT_NS)
+    lead.hand_over(1 - lead.leader)
+    assert lead.number == NUMBER_MAX
+    lead = Leadership(2, 0, TIMEOUT_NS)
+    lead.exceed(NUMBER_MAX, 1)
+    assert lead.number == 0
+
+
 @given(numbers, times, times, st.integers(0, 10 * SECOND_NS))
 def test_another_leads_only_if_it_was_heard_since_the_leader_was_doubted(
     number: int, heard_ns: int, other_ns: int, now_ns: int

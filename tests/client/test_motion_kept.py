@@ -185,6 +185,19 @@ def test_without_the_rule_the_vehicle_brakes_off_its_motion(
     assert Mode.BRAKE in set(rows["mode"])
 
 
+def test_only_the_vehicle_itself_or_a_person_takes_it_off_its_motion_at_once() -> None:
+    """Network, server and clock wait for the last knot, and so does a battery that runs low."""
+    off = {
+        cause
+        for (mode, cause), after in TABLE.items()
+        if mode in FOLLOWING and after not in FOLLOWING
+    }
+    assert off - AT_ONCE == {
+        *(Reason.LOST, Reason.CLOSED, Reason.RESTARTED, Reason.MALFORMED, Reason.RESYNC),
+        *(Reason.LATE, Reason.ENDED, Reason.STALLED, Reason.BATTERY),
+    }
+
+
 @pytest.mark.parametrize("cause", Reason)
 def test_each_cause_takes_effect_at_once_or_at_the_last_knot(cause: Reason) -> None:
     def made(keeps: bool) -> Failsafe:
@@ -226,3 +239,16 @@ def test_after_a_close_the_vehicle_rests_and_takes_no_motion_until_it_hovers() -
         flight.step()
     assert flight.client._failsafe.reason is Reason.CLOSED
     assert flight.client._pilot.step < flight.last + 10
+
+
+def test_a_vehicle_that_rests_or_lands_on_a_mission_holds_its_place_in_wind() -> None:
+    blown = packaged("swap", duration=30.0, vehicle={"steady_wind_mps": [0.3, 0.0], "wind": 0.0})
+    server = ByHand(blown)
+    server.wake()
+    server.welcome()
+    for mode in (Mode.SYNC, Mode.LAND):
+        server.client._failsafe.mode = mode
+        for _ in range(60):
+            server.wake()
+    places = server.rows()["state"][:, :, 0]
+    assert np.abs(places - places[0]).max() < 0.1
