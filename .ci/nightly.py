@@ -238,7 +238,7 @@ def main() -> int:
     parser.add_argument(
         "--seconds",
         type=float,
-        default=400.0,
+        default=300.0,
         help="time for each kind of new inputs [s] (%(default)g)",
     )
     parser.add_argument(

@@ -28,8 +28,6 @@ from skytether.shared.scenario.registry import IMPAIRMENTS
 from skytether.shared.telemetry.summary import Summary, summarise
 from skytether.sim import flight
 
-pytestmark = pytest.mark.long
-
 ROOT = Path(__file__).parents[2]
 PAPER = reading.load("paper")
 
@@ -206,6 +204,7 @@ class Page(HTMLParser):
             self.tables[self.ids[-1]][-1].append(data)
 
 
+@pytest.mark.long
 def test_every_figure_is_there_three_times_and_in_a_size_to_look_at(out: Path) -> None:
     """As PNG, PDF and CSV; the PNG is one or two columns wide at 220 dots per inch."""
     assert {path.stem for path in out.glob("*.png")} == FIGURES
@@ -220,6 +219,7 @@ def test_every_figure_is_there_three_times_and_in_a_size_to_look_at(out: Path) -
         assert {len(row) for row in rows} == {len(header)}
 
 
+@pytest.mark.long
 def test_the_page_opens_offline_and_shows_all(out: Path) -> None:
     text = (out / "report.html").read_text()
     page = Page(text)
@@ -232,6 +232,7 @@ def test_the_page_opens_offline_and_shows_all(out: Path) -> None:
     assert LINE in text
 
 
+@pytest.mark.long
 def test_the_tables_on_the_page_are_those_of_the_csv_files(out: Path) -> None:
     page = Page((out / "report.html").read_text())
     entries = list(csv.DictReader((out / "table1.csv").read_text().splitlines()))
@@ -248,6 +249,7 @@ def test_the_tables_on_the_page_are_those_of_the_csv_files(out: Path) -> None:
     assert page.tables["real"][1][:2] == [EVERY, f"{float(udp['rmse_xy_udp']):.4f}"]
 
 
+@pytest.mark.long
 def test_packets_really_took_what_was_drawn(out: Path) -> None:
     """Drawn delays follow (17), within the band of Dvoretzky, Kiefer and Wolfowitz; no packet over
     UDP took less than was drawn for it. How much more it took is the machine's affair.
@@ -268,6 +270,7 @@ def test_packets_really_took_what_was_drawn(out: Path) -> None:
     assert (took_ms >= drawn_ms).all()
 
 
+@pytest.mark.long
 def test_the_second_time_it_only_draws(
     out: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -281,6 +284,7 @@ def test_the_second_time_it_only_draws(
     assert [call["runs"] for call in calls] == [178, 0]
 
 
+@pytest.mark.long
 def test_a_folder_of_another_reproduction_is_refused(
     out: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
