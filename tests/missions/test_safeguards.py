@@ -9,12 +9,14 @@ from skytether.server.common.clock import EXACT, ClockMap, Contradiction, StepEr
 from skytether.server.missions.half_planes import half_planes
 from skytether.server.missions.mission_state import LONGEST
 from skytether.server.missions.possible_motions import NEVER, PossibleMotion, PossibleMotions
-from skytether.server.missions.separation import too_near
+from skytether.server.missions.separation import _distance_from_parallelogram, too_near
 from skytether.server.missions.vehicle_motions import SentMotion, VehicleMotions
 from skytether.server.missions.waypoints import Waypoints
+from skytether.server.missions.zone_clearance import comes_near
 from skytether.shared.base.chance import stream
+from skytether.shared.base.kernel import plain
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
-from skytether.shared.law.motion import Motion, resting
+from skytether.shared.law.motion import SAMPLES, SPACING, Motion, bend_m, resting
 from skytether.shared.scenario import zone_texts
 from skytether.shared.scenario.zones import Zones
 from skytether.shared.wire.protocol import NO_HORIZON
@@ -71,6 +73,49 @@ def test_the_bend_of_a_motion_is_taken_off_its_distances() -> None:
         np.array([[0.8, 0.0], [-0.8, 0.0], [0.0, 0.0]]),
     )
     assert is_too_near(turns, resting(0, np.array([1.1, 0.0])), 1.002, begin=1)
+
+
+def test_a_motion_that_is_too_near_already_comes_no_nearer_within_the_error_of_its_pieces() -> None:
+    """By 5 mm; pieces are off by up to 6 mm."""
+    turns, there = (
+        Motion(
+            0,
+            np.array([[0.0, 0.0], [0.0, 0.0], [-0.2, 0.0]]),
+            np.array([[0.8, 0.0], [-0.8, 0.0], [0.0, 0.0]]),
+        ),
+        PossibleMotions(np.ones(2), DT_S),
+    )
+    there.add(1, PossibleMotion(resting(0, np.array([1.1, 0.0]))))
+    nearer = turns._replace(position=turns.position + np.array([0.005, 0.0]))
+    for motion, is_hit in ((turns, False), (nearer, True)):
+        assert too_near(PossibleMotion(motion), turns, 1, 0, there, 1.2)[0] == is_hit
+
+
+@pytest.mark.parametrize(
+    ("middle", "twist", "distance_m"),
+    [
+        ((0.3, -0.2), 0.0, 0.0),
+        ((2.0, 0.0), 0.0, 1.0),
+        ((-2.0, 0.0), 0.0, 1.0),
+        ((0.0, 2.0), 0.0, 1.0),
+        ((0.0, -2.0), 0.0, 1.0),
+        ((2.0, 2.0), 0.0, 2.0**0.5),
+        ((-2.0, 0.0), 0.4, 0.9),
+    ],
+)
+def test_a_swept_piece_is_as_near_as_its_nearest_side_or_point_less_its_twist(
+    middle: tuple[float, float], twist: float, distance_m: float
+) -> None:
+    """A square of 2 m."""
+    square = np.array([middle, (2.0, 0.0), (0.0, 2.0), (twist, 0.0)])
+    assert plain(_distance_from_parallelogram)(square) == pytest.approx(distance_m)
+
+
+def test_straight_pieces_are_off_a_motion_by_no_more_than_its_bend() -> None:
+    """In the middle of a piece by just as much, at 1.6 m/s²."""
+    motion = Motion(0, np.array([[0.0], [0.2]]), np.array([[0.8], [0.0]]))
+    (begin, middle, end), _ = motion.at(SPACING / SAMPLES * np.array([0.0, 0.5, 1.0]), DT_S)
+    assert bend_m(1.6, DT_S) == pytest.approx(middle[0] - 0.5 * (begin[0] + end[0]))
 
 
 def test_half_planes_keep_away_from_one_outside_its_tube() -> None:
@@ -154,6 +199,29 @@ def test_a_motion_is_sent_again_before_it_ends_aboard() -> None:
     assert 2 * ready()._resend_after + terms.join < terms.age_max
 
 
+def test_every_motion_that_was_sent_may_be_flown() -> None:
+    vehicle, motions = VehicleMotions(), [resting(step, np.zeros(2)) for step in (0, 10, 20)]
+    vehicle.in_force = SentMotion(0, motions[0])
+    vehicle.sent.extend(SentMotion(motion.first, motion) for motion in motions[1:])
+    assert [motion.first for motion in vehicle.motions()] == [0, 10, 20]
+
+
+def test_the_newest_motion_is_the_one_that_is_repeated() -> None:
+    vehicle = VehicleMotions()
+    vehicle.copies = 2
+    vehicle.sent.extend(SentMotion(step, resting(step, np.zeros(2))) for step in (100, 110))
+    assert vehicle.repeat_at(114) is vehicle.sent[1]
+
+
+def test_only_eight_prompt_acknowledgements_in_a_row_make_motions_be_sent_less_often() -> None:
+    vehicle = VehicleMotions()
+    for prompt in [False, *[True] * 7, False, *[True] * 7]:
+        vehicle.adapt_copies(prompt)
+    assert vehicle.copies == 3
+    vehicle.adapt_copies(True)
+    assert vehicle.copies == 2
+
+
 # -- restarted clients ---------------------------------------------------------------------------
 
 
@@ -186,6 +254,14 @@ def test_an_observation_of_its_earlier_life_does_not_end_that() -> None:
 
 
 # -- zones ---------------------------------------------------------------------------------------
+
+
+def test_a_line_that_climbs_or_sinks_into_a_zone_comes_near_it() -> None:
+    """The zone is from 2 m to 3 m high."""
+    above, line = zone_texts.parse("cylinder(0, 0, 1, 2, 3)", 3), np.zeros((2, 3))
+    for ends_m, is_near in (((0.0, 1.0), False), ((0.0, 2.5), True), ((2.5, 0.0), True)):
+        line[:, 2] = ends_m
+        assert comes_near(above, line, 0.5) == is_near
 
 
 def test_no_zone_is_taken_while_a_vehicle_flies_a_motion_of_an_earlier_server() -> None:

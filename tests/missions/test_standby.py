@@ -126,6 +126,22 @@ def test_a_motion_that_was_told_is_known_once_all_were_observed() -> None:
     assert not made.vehicles[0].is_foreign
 
 
+def test_what_is_taken_over_is_what_was_told_and_no_motion_sent_before() -> None:
+    made = ready()
+    made.state.note_sent(0, 101, along([4.0, 0.0], [-0.8, 0.0], first=110))
+    made.follow(0, told(0, 200, motion=resting(200, np.array([2.0, 0.0]))))
+    assert [motion.position.tolist() for motion in made.vehicles[0].motions()] == [[[2.0, 0.0]]]
+
+
+def test_an_observation_of_before_a_vehicle_was_taken_over_does_not_count() -> None:
+    made = ready()
+    made.follow(0, told(0, 200, motion=resting(200, np.array([2.0, 0.0]))))
+    made.hear(0, 199, 90, 4.0)
+    assert made.vehicles[0].in_force.step == 200
+    made.hear(0, 200, NO_HORIZON, 2.0)
+    assert made.state.observed_step[0] == 200
+
+
 def test_vehicles_of_two_numbers_are_not_planned_for() -> None:
     made = ready()
     for row, number in ((0, 1), (1, 3)):

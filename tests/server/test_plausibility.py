@@ -98,6 +98,10 @@ ODD: dict[str, tuple[dict[str, Any], Belief]] = {
         {"backward_us": stamp_us(-BEGAN_NS - S)},
         Belief.CLOCK,
     ),
+    "a round trip of its own below zero": (
+        {"step": 115, "backward_us": stamp_us(BACKWARD_NS - S // 2)},
+        Belief.CLOCK,
+    ),
     "a horizon from far ahead": ({"in_force": 105 + H + 1}, Belief.HORIZON),
     "a horizon of before": ({"in_force": 91}, Belief.HORIZON),
     "in force since a later step": ({"since": 106}, Belief.HORIZON),

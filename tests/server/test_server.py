@@ -46,6 +46,7 @@ from skytether.shared.wire.protocol import (
     Hello,
     Horizon,
     Idle,
+    Lead,
     Message,
     Mode,
     Observation,
@@ -194,6 +195,22 @@ def test_other_terms_open_no_session() -> None:
     assert vehicles.server.dropped[Drop.UNKNOWN_SESSION] == 1
 
 
+def test_who_is_refused_gets_no_channel() -> None:
+    admitted = []
+
+    class Listing(PlainGate):
+        def admit(self, call: GateCall, *, now_ns: int) -> None:  # noqa: ARG002
+            admitted.append(call)
+
+    vehicles = Vehicles(scenario())
+    vehicles.server._reception._gate = Listing()
+    other = vehicles.terms._replace(dt_ns=vehicles.dt_ns + 1)
+    vehicles.say(Hello(1, 5, other))
+    assert not admitted
+    vehicles.open()
+    assert len(admitted) == 1
+
+
 def test_of_the_refusals_that_were_told_the_newest_64_are_remembered() -> None:
     vehicles = Vehicles(scenario())
     other = vehicles.terms._replace(horizon=20)
@@ -310,6 +327,17 @@ def test_answers_follow_the_vehicle_to_its_new_address() -> None:
     assert [peer for _, peer in vehicles.tick()] == [("elsewhere", 9)]
 
 
+def test_a_newer_observation_in_an_older_packet_does_not_move_the_address() -> None:
+    class Overtaken(PlainGate):
+        def open(self, datagram: Datagram, *, now_ns: int) -> GateCall:
+            return super().open(datagram, now_ns=now_ns)._replace(moves=False)
+
+    vehicles, welcome = live()
+    vehicles.server._reception._gate = Overtaken()
+    vehicles.observe(welcome, 1, sender=("elsewhere", 9))
+    assert [peer for _, peer in vehicles.tick()] == [HERE]
+
+
 def test_where_repeats_of_a_packet_come_from_is_answered_too() -> None:
     """Whoever forwards copies that arrive first must not keep the answers from the vehicle."""
 
@@ -393,6 +421,14 @@ def test_a_new_life_that_comes_when_the_old_one_was_just_forgotten_flies() -> No
     assert vehicles.ask(vehicle=2).refusal == Refusal.FULL
     vehicles.observe(new, 0)
     assert [session.boot_id for session in vehicles.server.sessions] == [6]
+
+
+def test_an_overtaken_message_gives_the_leadership_to_no_earlier_server() -> None:
+    vehicles, welcome = live()
+    for number, leads in ((3, 0), (2, 1)):
+        ((answer, _),) = vehicles.say(Lead(1, welcome.session, number, leads))
+        assert isinstance(answer, Lead)
+        assert (answer.number, answer.leads) == (3, 0)
 
 
 def test_an_observation_from_before_a_restart_of_the_server_is_dropped() -> None:
@@ -605,21 +641,46 @@ def test_whoever_was_welcomed_last_and_comes_in_time_gets_a_row(
         assert len(sessions.rows) == len(sessions)
 
 
-def test_a_time_of_day_that_was_under_way_for_2_s_narrows_a_clock_by_2_ms_less() -> None:
+def told_time_ms(*, late_ns: int = 0, error_us: int = 1000) -> float:
+    """Bound of a clock whose vehicle has told its time of day, after a round trip of 200 ms."""
+    vehicles = Vehicles(scenario())
+    welcome, epoch_ns = vehicles.open(), vehicles.now_ns
+    vehicles.epochs_ns[welcome.session] = epoch_ns
+    slow_us = stamp_us(200 * MILLISECOND_NS - epoch_ns)
+    vehicles.say(vehicles.told(welcome, 0)._replace(backward_us=slow_us))
+    vehicles.now_ns += late_ns
+    vehicles.server.learn_time(vehicles.now_ns, 0, now_ns=vehicles.now_ns)
+    vehicles.say(Time(1, welcome.session, 0, stamp_us(epoch_ns), error_us=error_us))
+    return bound_ms(vehicles)
+
+
+def bound_ms(vehicles: Vehicles) -> float:
+    vehicles.tick()
+    bound: float = vehicles.server.figures()["by_vehicle"]["1"]["clock_bound_ms"]
+    return bound
+
+
+def test_a_time_of_day_narrows_a_clock_to_its_error_and_1_ms_for_each_second_under_way() -> None:
+    prompt_ms = told_time_ms()
+    assert prompt_ms < 2.0
+    assert told_time_ms(late_ns=2 * SECOND_NS) - prompt_ms == pytest.approx(2.0, abs=0.1)
+    # 5 ms on one side: the other is known from delays.
+    assert told_time_ms(error_us=6000) - prompt_ms == pytest.approx(2.5, abs=0.1)
+
+
+def test_an_echo_in_an_overtaken_observation_does_not_narrow_a_clock() -> None:
+    """Since when the vehicle has known it is unknown."""
     bounds_ms = []
-    for late_ns in (0, 2 * SECOND_NS):
+    for overtaken in (False, True):
         vehicles = Vehicles(scenario())
         welcome, epoch_ns = vehicles.open(), vehicles.now_ns
         vehicles.epochs_ns[welcome.session] = epoch_ns
-        slow_us = stamp_us(200 * MILLISECOND_NS - epoch_ns)  # a round trip of 200 ms
-        vehicles.say(vehicles.told(welcome, 0)._replace(backward_us=slow_us))
-        vehicles.now_ns += late_ns
-        vehicles.server.learn_time(vehicles.now_ns, 0, now_ns=vehicles.now_ns)
-        vehicles.say(Time(1, welcome.session, 0, stamp_us(epoch_ns), error_us=1000))
-        vehicles.tick()
-        bounds_ms.append(vehicles.server.figures()["by_vehicle"]["1"]["clock_bound_ms"])
-    assert bounds_ms[0] < 2.0
-    assert bounds_ms[1] - bounds_ms[0] == pytest.approx(2.0, abs=0.1)
+        vehicles.now_ns += 5 * vehicles.dt_ns
+        for step, trip_ms in ((5, 200), (4, 20))[: 1 + overtaken]:
+            backward_us = stamp_us(trip_ms * MILLISECOND_NS - epoch_ns)
+            vehicles.say(vehicles.told(welcome, step)._replace(backward_us=backward_us))
+        bounds_ms.append(bound_ms(vehicles))
+    assert bounds_ms[1] == pytest.approx(bounds_ms[0])
 
 
 def test_each_series_of_impossible_states_is_reported_once() -> None:
