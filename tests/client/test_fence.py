@@ -151,14 +151,20 @@ def test_the_speed_towards_a_bound_lets_the_vehicle_stop(
     assert told == pytest.approx([way * speed * b * T / terms.gain[0], 0.0])
 
 
-def test_the_radius_is_kept_for_the_strongest_axis_from_where_the_vehicle_began() -> None:
-    flown = scenario(fence={"radius_m": 9.0}, model=WEAK)
+def test_the_radius_is_kept_for_the_strongest_and_slowest_axis_from_where_the_vehicle_began() -> (
+    None
+):
+    flown = scenario(fence={"radius_m": 9.0}, model=WEAK | {"tau_s": [0.4, 0.8]})
     terms, (_, _, radius) = flown.terms(), inner_bounds(flown)
     fence, u_max = Fence(flown), [99.0, 99.0]
     assert fence.limited([1.0, 0.0], [(50.0, 0.0), (0.0, 0.0)], u_max) == [1.0, 0.0]
+    assert not fence.holds
     T = max(terms.tau_s) + SLOW_STEPS * flown.control.dt
     near = [(50.0 + radius - 0.1, 0.0), (0.0, 0.0)]
     assert fence.limited([9.0, 0.0], near, u_max) == pytest.approx([0.1 / T / max(WEAK["gain"]), 0])
+    assert fence.holds
+    fence.limited([-1.0, 0.0], near, u_max)
+    assert not fence.holds
 
 
 def test_the_way_back_inside_is_no_faster_than_the_fence_allows() -> None:
