@@ -8,7 +8,12 @@ import pytest
 from skytether.server.common.clock import EXACT, ClockMap, Contradiction, StepError
 from skytether.server.missions.half_planes import half_planes
 from skytether.server.missions.mission_state import LONGEST
-from skytether.server.missions.possible_motions import NEVER, PossibleMotion, PossibleMotions
+from skytether.server.missions.possible_motions import (
+    NEVER,
+    PossibleMotion,
+    PossibleMotions,
+    shifts,
+)
 from skytether.server.missions.separation import _distance_from_parallelogram, too_near
 from skytether.server.missions.vehicle_motions import SentMotion, VehicleMotions
 from skytether.server.missions.waypoints import Waypoints
@@ -57,6 +62,11 @@ def test_clocks_that_drift_over_the_time_looked_ahead_count() -> None:
     one = along([0.0, 0.0], [0.8, 0.0], first=2000)
     other = along([1.0, 0.0], [0.8, 0.0], first=2000)
     assert is_too_near(one, other, 0.92)
+
+
+def test_another_is_ahead_by_its_own_earliness_and_by_how_late_the_first_is() -> None:
+    one, other = StepError(early=1.0, late=2.0), StepError(early=10.0, late=20.0)
+    assert plain(shifts)(one, other, 0.5) == (-21.5, 12.5)
 
 
 def test_one_that_may_be_down_is_kept_away_from_by_one_that_is_late() -> None:
