@@ -127,9 +127,12 @@ def test_a_motion_that_was_told_is_known_once_all_were_observed() -> None:
 
 
 def test_what_is_taken_over_is_what_was_told_and_no_motion_sent_before() -> None:
-    made = ready()
-    made.state.note_sent(0, 101, along([4.0, 0.0], [-0.8, 0.0], first=110))
+    """Nor is one sent that the server had planned when it led last."""
+    made, earlier = ready(), along([4.0, 0.0], [-0.8, 0.0], first=110)
+    made.state.note_sent(0, 101, earlier)
+    made.vehicles[0].next = earlier
     made.follow(0, told(0, 200, motion=resting(200, np.array([2.0, 0.0]))))
+    assert made.vehicles[0].next is None
     assert [motion.position.tolist() for motion in made.vehicles[0].motions()] == [[[2.0, 0.0]]]
 
 
