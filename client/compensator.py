@@ -112,6 +112,10 @@ class Compensator:
         """
         self._put_in_force(made_for, observed)
         length = lasting(self._age_max + self._H, made_for, observed, self._age_max)
+        if self._join:
+            # A mission's motion is flown to its last knot, however old its observation is by then:
+            # other vehicles keep clear of all of it, and of nothing else.
+            length = max(length, spacing * (knots.shape[1] - 1) + 1)
         self.follower = SplineFollower(self._constants, knots, spacing, length)
 
     def _put_in_force(self, made_for: int, observed: int) -> None:
@@ -142,12 +146,13 @@ class Compensator:
         knot[:, 0, 0] = state[:, 0]
         self.follower = SplineFollower(self._constants, knot, 1, UNENDING)
 
-    def goes_on(self, step: int) -> bool:
-        """Whether the last knot of the spline in force lies after `step`."""
+    @property
+    def last_step(self) -> int:
+        """Step of the last knot of the spline in force, or NO_HORIZON."""
         flown = self.follower
         if self.in_force == NO_HORIZON or not isinstance(flown, SplineFollower):
-            return False
-        return step < self.begins + flown.last
+            return NO_HORIZON
+        return self.begins + flown.last
 
     @property
     def rests(self) -> bool:

@@ -36,6 +36,7 @@ from skytether.shared.core.events import (
     FenceHolds,
     Finished,
     Flying,
+    Leaving,
     ModeChanged,
     NotFlown,
     StateLeapt,
@@ -57,6 +58,8 @@ VEHICLE_SOCKET = 1
 """Socket used by the vehicle's own port; the server's is 0."""
 ARMED = keys_of(InFlight.ARMED)
 """Key with which an operator allows plans to be flown."""
+LATEST_NS = SECOND_NS
+"""Time after the end of its motion within which a client that is asked to end does so [ns]."""
 HELD_AGAIN_NS = 5 * SECOND_NS
 """Time after which the log repeats that the fence limits the vehicle."""
 AFTER_LEAP = "vehicle.after_leap"
@@ -187,6 +190,8 @@ class Client(Endpoint):
         self._time: TimeOfDay | None = None
         self._time_due_ns = 0
         self.horizons = 0
+        self._leaves = False
+        """Whether an operator has asked the client to end."""
         self.dropped: Counter[Drop] = Counter()
 
     @property
@@ -201,6 +206,8 @@ class Client(Endpoint):
     @property
     def finished(self) -> bool:
         pilot = self._pilot
+        if self._leaves and not pilot.is_moving:
+            return True
         if pilot.next_ns is not None:
             return pilot.step >= pilot.steps and self._flies.is_down
         return self.failure is not None and self._flies.is_down
@@ -457,6 +464,16 @@ class Client(Endpoint):
             self._servers.name(NAMES.index(scenario.link.leader), now_ns=now_ns)
         if keys & self._flies.changeable:
             self._flies.change(scenario)
+
+    def leave(self, *, now_ns: int) -> int:
+        """A vehicle on a mission's motion flies it to its end first."""
+        self._leaves = True
+        if not self._pilot.is_moving:
+            return now_ns
+        rests_ns = self._pilot.rest(now_ns=now_ns) + LATEST_NS
+        most_s = (rests_ns - now_ns) / SECOND_NS
+        self._events.append(Leaving(vehicles=(self.vehicle,), most_s=most_s))
+        return rests_ns
 
     def close(self, *, now_ns: int) -> None:
         """Tell the server that the vehicle leaves, and let it land by itself if it can."""

@@ -108,6 +108,8 @@ TABLE: Table = MappingProxyType(
         (Mode.READY, Reason.HORIZON): Mode.TRACK,
         (Mode.TRACK, Reason.HORIZON): Mode.TRACK,
         (Mode.TRACK, Reason.OLD): Mode.COAST,
+        (Mode.TRACK, Reason.OVER): Mode.HOVER,
+        (Mode.COAST, Reason.OVER): Mode.HOVER,
         (Mode.COAST, Reason.HORIZON): Mode.TRACK,
         (Mode.BRAKE, Reason.HORIZON): Mode.TRACK,
         (Mode.BRAKE, Reason.BRAKED): Mode.HOVER,

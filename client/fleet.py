@@ -84,6 +84,12 @@ class ClientFleet(Endpoint):
         for client in self._clients:
             client.change(scenario, keys, now_ns=now_ns)
 
+    def leave(self, *, now_ns: int) -> int:
+        latest_ns = max(client.leave(now_ns=now_ns) for client in self._clients)
+        for n in range(len(self._clients)):
+            self._after(n)
+        return latest_ns
+
     def close(self, *, now_ns: int) -> None:
         for n, client in enumerate(self._clients):
             client.close(now_ns=now_ns)

@@ -144,7 +144,8 @@ class Pilot:
                 passed -= horizon.inputs.shape[1] - terms.planned
             self._failsafe.horizon_arrived(late=passed > LATE_SHARE * terms.reach, now_ns=now_ns)
         observed = horizon.step - horizon.age
-        if self._takes_from is None or 0 <= observed < self._takes_from:
+        takes_from = self._takes_from if self._failsafe.takes else None
+        if takes_from is None or 0 <= observed < takes_from:
             raise ProtocolError(Drop.NOT_TAKEN)
         try:
             is_held = self.compensator.offer(horizon, self.step, observed)
@@ -158,7 +159,18 @@ class Pilot:
 
     def _goes_on(self, step: int) -> bool:
         """Whether the vehicle follows a mission's motion whose last knot lies after `step`."""
-        return self._is_mission and self.compensator.goes_on(step)
+        return self._is_mission and step < self.compensator.last_step
+
+    @property
+    def is_moving(self) -> bool:
+        """Whether the last knot of a mission's motion lies ahead."""
+        return self._goes_on(self.step)
+
+    def rest(self, *, now_ns: int) -> int:
+        """Accept no further motion; returns the time by which the vehicle is at rest [ns]."""
+        self._failsafe.meet(Reason.OVER, now_ns=now_ns)
+        last = self.compensator.last_step
+        return self.starts_ns(last) if self._goes_on(self.step) else now_ns
 
     def mode_changed(self, cause: Reason) -> None:
         if not self._failsafe.takes:
@@ -185,6 +197,10 @@ class Pilot:
         hindrance = self._vehicle.hindrance(now_ns=now_ns)
         self._failsafe.motion_goes_on(self._goes_on(present), now_ns=now_ns)
         self._failsafe.step(late_ns=late_ns, hindrance=hindrance, now_ns=now_ns)
+        if present == self.steps - 1 and self._goes_on(present):
+            # Where the flight ends on the way, the vehicle would stop off its motion.
+            self._failsafe.meet(Reason.OVER, now_ns=now_ns)
+            self.steps = self.compensator.last_step + 1
         self._input = self._choose(now_ns)
         self._vehicle.fly(self._input)
         if not self._failsafe.takes:

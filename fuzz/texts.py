@@ -248,7 +248,7 @@ class ControlTarget(Text, EndpointInFlight):
             assert not (parsed.refused and parsed.changed), payload.hex()
             table = reading.to_table(running.scenario)
             reading.check(table, known=running.scenario, any_network=True)
-        running._endpoint.events()  # empties the list of netem's events
+        running.endpoint.events()  # empties the list of netem's events
 
 
 class LogLines(Text):

@@ -20,7 +20,7 @@ from skytether.server.sessions import Session, Sessions
 from skytether.server.tick import Grid, Ticker
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS, seconds_to_ns
 from skytether.shared.core.endpoint import VEHICLES_TOLD_MAX, Datagram, Endpoint, by_name
-from skytether.shared.core.events import ReferenceTooFast, SessionEnded
+from skytether.shared.core.events import Leaving, ReferenceTooFast, SessionEnded
 from skytether.shared.core.stopwatch import Stopwatch
 from skytether.shared.core.time_of_day import TimeOfDay
 from skytether.shared.law.heartbeat import Hearing
@@ -37,6 +37,9 @@ from skytether.shared.wire.protocol import CLOSES, Close, Refusal, encode
 
 VEHICLES_MAX = 64
 """Default largest number of vehicles at once."""
+LATEST_NS = 2 * SECOND_NS
+"""Time after the end of all motions within which a server that is asked to end does so [ns]; a
+vehicle's observation of it takes a round trip."""
 TICK_EDGES_MS = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0)
 """Bin edges of the histogram of tick durations [ms]."""
 
@@ -131,6 +134,9 @@ class Server(Endpoint):
             recorder=recorder,
             plans=plans,
         )
+        self._leaves = False
+        """Whether an operator has asked the server to end."""
+        self._dt_ns = terms.dt_ns
         self._ticked_ns = 0
         self._expire_ns = 0
         """Time of the next search for silent vehicles."""
@@ -165,6 +171,24 @@ class Server(Endpoint):
             number = session.leadership
             if number is not None and (known := self.controller.known(number)) > number:
                 self._out += session.sealed(encode(session.lead(known)), now_ns)
+
+    def leave(self, *, now_ns: int) -> int:
+        """On a mission, wait until all vehicles rest, or follow another server."""
+        self._leaves = True
+        steps = self.controller.scheme.leave()
+        moving = tuple(each.vehicle for each in self.sessions if not self._rests(each))
+        if not moving:
+            return now_ns
+        most_ns = steps * self._dt_ns + LATEST_NS
+        self._events.append(Leaving(vehicles=moving, most_s=most_ns / SECOND_NS))
+        return now_ns + most_ns
+
+    def _rests(self, session: Session) -> bool:
+        return self.controller.scheme.rests(session.row)
+
+    @property
+    def finished(self) -> bool:
+        return self._leaves and all(map(self._rests, self.sessions))
 
     def close(self, *, now_ns: int) -> None:
         for _ in range(CLOSES):

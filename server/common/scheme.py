@@ -310,6 +310,18 @@ class Scheme(ABC):
     def follow(self, row: int, told: Lead | None) -> None:  # noqa: B027
         """Note who leads a vehicle, and its motion in force; None if it has no other server."""
 
+    def leave(self) -> int:
+        """Plan no further motion: the server ends. Returns the longest time until all motions have
+        ended [steps]; 0 without a mission.
+        """
+        return 0
+
+    def rests(self, row: int) -> bool:  # noqa: ARG002
+        """Whether a vehicle is at the end of every motion that it may fly, or another server leads
+        it; True without a mission.
+        """
+        return True
+
     def waits(self, row: int) -> str:  # noqa: ARG002
         """Reason why a vehicle waits; empty if it does not."""
         return ""

@@ -39,7 +39,7 @@ from skytether.server.common.splines import SplineScheme
 from skytether.server.missions import yielding
 from skytether.server.missions.compiled_motion import pieces_of, states
 from skytether.server.missions.half_planes import HalfPlanes, half_planes
-from skytether.server.missions.mission_state import PLAN_DUE, REPEAT_DUE, MissionState
+from skytether.server.missions.mission_state import LONGEST, PLAN_DUE, REPEAT_DUE, MissionState
 from skytether.server.missions.possible_motions import PossibleMotion
 from skytether.server.missions.separation import too_near
 from skytether.server.missions.trajectory_qp import TrajectoryQP
@@ -104,6 +104,8 @@ class MissionPlanner(SplineScheme):
             round(DETOUR_S / terms.dt_s),
             stream(scenario.seed, "together"),
         )
+        self._leaves = False
+        """Whether the server ends, and plans no further motion."""
         self._repeating: list[VehicleMotions] = []
         """Vehicles whose latest motion is repeated at this step."""
         self._scale = state.possible.metric.scale.copy()
@@ -217,6 +219,13 @@ class MissionPlanner(SplineScheme):
                     return f"{zone}, which vehicle {number} {does}, tube included"
         return ""
 
+    def leave(self) -> int:
+        self._leaves = True
+        return LONGEST
+
+    def rests(self, row: int) -> bool:
+        return self._state.rests(row)
+
     def waits(self, row: int) -> str:
         return self._state.vehicles[row].waits_for if row in self._state.vehicles else ""
 
@@ -255,6 +264,8 @@ class MissionPlanner(SplineScheme):
 
     def _own_wait(self, row: int, vehicle: VehicleMotions) -> str:
         """Reason why this vehicle has to wait before it is sent a motion, in words; or empty."""
+        if self._leaves:
+            return "another server: this one ends"
         if row in self._state.restarted:
             return "its restarted client"
         if self._state.awaits(row):

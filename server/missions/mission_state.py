@@ -197,6 +197,17 @@ class MissionState:
         """Whether nothing was observed of a vehicle since this server began to lead it."""
         return row in self._awaited
 
+    def rests(self, row: int) -> bool:
+        """Whether the vehicle was observed at the end of every motion that it may fly, or another
+        server leads it.
+        """
+        vehicle = self.vehicles.get(row)
+        if vehicle is None or self._leaderships.get(row, 0) is None:
+            return True
+        k = int(self.observed_step[row])
+        ends = [motion.last for motion in vehicle.motions()]
+        return k > self.rows.unknown_until[row] and all(last <= k for last in ends)
+
     def _find_unled(self) -> None:
         newest = max((each or 0 for each in self._leaderships.values()), default=0)
         self.unled = next(

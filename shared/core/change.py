@@ -53,7 +53,7 @@ class Running:
         scenario: Scenario,
         settings: Mapping[str, Any] = MappingProxyType({}),
     ) -> None:
-        self._endpoint = endpoint
+        self.endpoint = endpoint
         self._scenario = scenario
         self.settings = settings
         """All values that were set in flight, by key; replaced by a new object at each change."""
@@ -64,7 +64,7 @@ class Running:
 
     @property
     def changeable(self) -> frozenset[str]:
-        return self._endpoint.changeable
+        return self.endpoint.changeable
 
     def change(self, values: Mapping[str, Any], *, now_ns: int) -> tuple[Changed, ...]:
         """Change the values of keys, and report the change by events of the endpoint.
@@ -83,13 +83,13 @@ class Running:
         try:
             values = self._whole(values)
             scenario = with_values(self._scenario, values)
-            if objection := self._endpoint.objection(scenario, frozenset(values)):
+            if objection := self.endpoint.objection(scenario, frozenset(values)):
                 raise ConfigError(objection)
         except ConfigError as error:
             self.refuse(str(error))
             raise
         # Only after checking the whole scenario: a change is made completely, or not at all.
-        self._endpoint.change(scenario, frozenset(values), now_ns=now_ns)
+        self.endpoint.change(scenario, frozenset(values), now_ns=now_ns)
         self._scenario, after = scenario, reading.to_table(scenario)
         lasting = {key: value for key, value in values.items() if key not in ONCE}
         if lasting:
@@ -101,14 +101,14 @@ class Running:
             != (after_text := _text(value(after, key)))
         )
         for event in changed:
-            self._endpoint.tell(event)
+            self.endpoint.tell(event)
         return changed
 
     def tell(self, event: Event) -> None:
-        self._endpoint.tell(event)
+        self.endpoint.tell(event)
 
     def refuse(self, reason: str) -> None:
-        self._endpoint.tell(ChangeRefused(reason=reason))
+        self.endpoint.tell(ChangeRefused(reason=reason))
 
     def answer(self, request: bytes, *, now_ns: int) -> bytes:
         """Carry out a request, valid or not, and return the encoded answer.

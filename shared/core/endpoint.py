@@ -128,6 +128,14 @@ class Endpoint(ABC):
     def next_wake_ns(self) -> int | None:
         """Time of the next wake, or None to wait for datagrams only."""
 
+    def leave(self, *, now_ns: int) -> int:
+        """Begin to end, as an operator asks.
+
+        The driver goes on until the endpoint has `finished`, or until the time that is returned
+        [ns], by default now, and then calls `close`. An operator who asks twice does not wait.
+        """
+        return now_ns
+
     def close(self, *, now_ns: int) -> None:  # noqa: B027 - optional
         """Send the last datagrams before the driver ends; nothing else is called after it."""
 

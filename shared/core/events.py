@@ -264,6 +264,20 @@ class SessionOpened(PeerEvent, frozen=True, kw_only=True):
         return f"vehicle {self.vehicle} flies, from {self.peer}"
 
 
+class Leaving(msgspec.Struct, frozen=True, tag=True, kw_only=True):
+    """The process is asked to end while vehicles of a mission are on their motions."""
+
+    vehicles: tuple[int, ...]
+    most_s: float
+    """Longest time until it ends [s]."""
+
+    def __str__(self) -> str:
+        named = ", ".join(map(str, self.vehicles))
+        who = f"vehicle {named} has" if len(self.vehicles) == 1 else f"vehicles {named} have"
+        waits = f"waits for at most {self.most_s:.0f} s until {who} come to rest"
+        return f"asked to end: no new motion begins; {waits} (ask again to end at once)"
+
+
 class SessionEnded(VehicleEvent, frozen=True, kw_only=True):
     """A session has ended: the vehicle has closed it, or was silent for too long."""
 
@@ -583,6 +597,7 @@ Event = (
     | Changed
     | ChangeRefused
     | SessionOpened
+    | Leaving
     | SessionEnded
     | SessionRefused
     | ServerFull

@@ -65,6 +65,9 @@ class Steady(Endpoint):
         due_ns = self._inner.next_wake_ns()
         return due_ns if due_ns is None else due_ns + self._jumps_ns
 
+    def leave(self, *, now_ns: int) -> int:
+        return self._inner.leave(now_ns=self._steady(now_ns)) + self._jumps_ns
+
     def close(self, *, now_ns: int) -> None:
         self._inner.close(now_ns=self._steady(now_ns))
 

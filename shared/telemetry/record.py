@@ -66,6 +66,7 @@ class Reason(IntEnum):
     RIVAL = 27
     STRAYED = 28
     UNUSABLE = 29
+    OVER = 30
 
     def __str__(self) -> str:
         return REASON_TEXTS[self]
@@ -102,6 +103,7 @@ REASON_TEXTS = {
     Reason.WAITED: "it has waited too long",
     Reason.RESUMED: "its process has restarted, and it continues its motion",
     Reason.UNUSABLE: "its measured positions cannot be used",
+    Reason.OVER: "its flight is over",
 }
 
 

@@ -61,8 +61,8 @@ START_S = 120.0
 """Longest time until a process listens [s]; it may have to compile first."""
 GRACE_S = 30.0
 """Longest time that a flight may take beyond its duration and the time to connect [s]."""
-STOP_S = 5.0
-"""Longest time for a process to end after SIGTERM."""
+ASKED_S, STOP_S = 1.0, 5.0
+"""Longest time for a process to end after SIGTERM, before another is sent, and after that [s]."""
 POLL_S = 0.2
 """Interval at which Ctrl-C is checked."""
 LINES_MAX = 20
@@ -162,14 +162,17 @@ async def started(
         child.address = listening.result()
         yield child
     finally:
-        if process.returncode is None:
-            with contextlib.suppress(ProcessLookupError):
-                process.terminate()
-            try:
-                await asyncio.wait_for(process.wait(), STOP_S)
-            except TimeoutError:
-                process.kill()
-                await process.wait()
+        # Asked twice, an endpoint does not wait for its vehicles, which are simulated here.
+        for stop, most_s in (
+            (process.terminate, ASKED_S),
+            (process.terminate, STOP_S),
+            (process.kill, None),
+        ):
+            if process.returncode is None:
+                with contextlib.suppress(ProcessLookupError):
+                    stop()
+                with contextlib.suppress(TimeoutError):
+                    await asyncio.wait_for(process.wait(), most_s)
         await child.reader
 
 

@@ -68,9 +68,18 @@ class MoveKind(StrEnum):
     PARTITIONS = "partitions"
     """There is a standby server; all packets between the vehicle and it are lost, or the first one
     if the amount is below 0.5."""
+    STOPS = "stops"
+    """The first server ends in order, and restarts: at once, sending CLOSE, if the amount is below
+    0.5, otherwise once its vehicles rest."""
     CLIENT = "client"
     """The client of a vehicle is down, and restarts with its saved state; with
     `vehicle.memory = "none"` it has none."""
+    ENDS = "ends"
+    """The client of a vehicle ends once the vehicle rests, and restarts with its saved state."""
+    STALLS = "stalls"
+    """The client's process stands still, and then goes on with the packets that it has missed."""
+    JOINS = "joins"
+    """The client of a vehicle is only started at the end of the move, whenever that begins."""
     GOALS = "goals"
     """The vehicle's goal is moved to the place in the amounts [m], and back at the end."""
     ZONES = "zones"
@@ -81,9 +90,11 @@ NETWORK = (
     *(MoveKind.DELAYS, MoveKind.LOSSES, MoveKind.CUTS, MoveKind.COPIES),
     MoveKind.PARTITIONS,
 )
+AGED = frozenset({MoveKind.DELAYS, MoveKind.COPIES})
+"""Moves whose amounts are times [s]."""
 LED = frozenset({MoveKind.STANDBY, MoveKind.FREEZES, MoveKind.PARTITIONS})
 """Moves for which there is a standby server."""
-OF_ALL = (MoveKind.SERVER, MoveKind.STANDBY, MoveKind.FREEZES)
+OF_ALL = (MoveKind.SERVER, MoveKind.STOPS, MoveKind.STANDBY, MoveKind.FREEZES)
 """Moves that concern no single vehicle."""
 OPERATOR = (MoveKind.GOALS, MoveKind.ZONES)
 LENGTHS_S = {
@@ -92,15 +103,22 @@ LENGTHS_S = {
     MoveKind.STANDBY: (0.2, 20.0),
     MoveKind.FREEZES: (0.2, 20.0),
     MoveKind.PARTITIONS: (0.2, 40.0),
+    MoveKind.STOPS: (0.05, 20.0),
     MoveKind.CLIENT: (0.2, 3.0),
+    MoveKind.ENDS: (0.2, 30.0),
+    MoveKind.STALLS: (0.05, 0.3),
+    MoveKind.JOINS: (0.5, 30.0),
 }
 """Shortest and longest move of a kind [s]."""
 LENGTH_S = (1.0, 60.0)
 """Shortest and longest move of other kinds [s]."""
+AGE_S = (0.03, 60.0)
+"""Smallest and largest extra delay of a single packet, or age of a single copy [s]."""
 AMOUNTS = {
     MoveKind.DELAYS: ((0.0, 1.2), (0.0, 1.2)),
     MoveKind.LOSSES: ((0.1, 1.0),),
     MoveKind.COPIES: ((0.0, 1.5),),
+    MoveKind.STOPS: ((0.0, 1.0),),
     MoveKind.FREEZES: ((0.0, 1.0),),
     MoveKind.PARTITIONS: ((0.0, 1.0),),
 }
@@ -234,7 +252,7 @@ class Raid:
             moves,
             AdversaryNetwork(moves, scenario.seed),
         )
-        mortal = {move.vehicle for move in moves if move.kind is MoveKind.CLIENT}
+        mortal = {move.vehicle for move in moves if move.kind in (MoveKind.CLIENT, MoveKind.ENDS)}
         self._lives = Lives(
             scenario,
             self._air,
@@ -262,6 +280,20 @@ class Raid:
             case MoveKind.FREEZES:
                 name, _ = (SERVER, STANDBY)[round(move.amounts[0])]
                 begin, end = [partial(self._world.freeze, name)], [partial(self._world.thaw, name)]
+            case MoveKind.STOPS:
+                begin = [lives.end_server if round(move.amounts[0]) else lives.close_server]
+                end = [partial(lives.start_server, {})]
+            case MoveKind.ENDS:
+                begin = [partial(lives.end_client, number) for number in hit]
+                end = [partial(lives.start_client, number) for number in hit]
+            case MoveKind.STALLS:
+                begin = [partial(self._world.freeze, f"client {number}") for number in hit]
+                end = [partial(self._world.thaw, f"client {number}") for number in hit]
+            case MoveKind.JOINS:
+                for number in hit:
+                    lives.stop_client(number)
+                begin = []
+                end = [partial(lives.start_client, number, remembers=False) for number in hit]
             case MoveKind.CLIENT:
                 begin = [partial(lives.stop_client, number) for number in hit]
                 end = [partial(lives.start_client, number) for number in hit]
@@ -305,7 +337,9 @@ class Raid:
             look_ns = self._world.now_ns + SECOND_NS
             return self._has_arrived()
 
-        self._world.run(over, limit_ns=seconds_to_ns(scenario.duration + scenario.link.connect_s))
+        begins_ns = max((m.end_ns for m in later if m.kind is MoveKind.JOINS), default=0)
+        limit_ns = begins_ns + seconds_to_ns(scenario.duration + scenario.link.connect_s)
+        self._world.run(over, limit_ns=limit_ns)
         tracks = self._lives.tracks()
         counts = (server.figures()["counts"] for server in self._lives.servers)
         left = sum(each.get("left_tube", 0) for each in counts)
@@ -450,6 +484,8 @@ class MoveSampler:
             ]
         if MoveKind.PARTITIONS in self._kinds and rng.random() < 0.5:
             moves += self._split()
+        if MoveKind.STOPS in self._kinds and rng.random() < 0.5:
+            moves += self._stop()
         if kinds:
             moves += [self._one(kinds) for _ in range(1 + rng.poisson(2.0))]
         return tuple(moves[-self._most :])
@@ -463,6 +499,24 @@ class MoveSampler:
             replace(move, vehicle=number, way="", amounts=(each,))
             for number, each in zip(self._vehicles, lost, strict=True)
         )
+
+    def _stop(self) -> Moves:
+        """The server closes its sessions, and some of its vehicles hear so, each at its time."""
+        rng, stop = self._rng, replace(self._one([MoveKind.STOPS]), amounts=(0.0,))
+        moves = [stop]
+        for number in self._vehicles:
+            told = Move(MoveKind.CUTS, number, "uplink", stop.start_ns, ONE_NS)
+            match rng.integers(3):
+                case 1:
+                    moves.append(told)
+                case 2:
+                    late_s = self._age_s()
+                    moves.append(replace(told, kind=MoveKind.DELAYS, amounts=(late_s, late_s)))
+        return tuple(moves)
+
+    def _age_s(self) -> float:
+        low_s, high_s = AGE_S
+        return float(low_s * (high_s / low_s) ** self._rng.random())
 
     def _one(self, kinds: Sequence[MoveKind]) -> Move:
         rng, kind = self._rng, kinds[int(self._rng.integers(len(kinds)))]
@@ -539,7 +593,12 @@ class MoveSampler:
             if each.vehicle in candidates and at_ns - AIMED_NS <= each.time_ns <= at_ns
         ]
         if move.kind in NETWORK and mine and rng.random() < 0.7:
-            time_ns, way, vehicle = mine[int(rng.integers(len(mine)))]
+            # An old packet, as a HELLO, may be any of the flight.
+            among = packets if move.kind is MoveKind.COPIES else mine
+            time_ns, way, vehicle = among[int(rng.integers(len(among)))]
+            amounts = tuple(self._age_s() for _ in move.amounts)
+            if move.kind in AGED:
+                move = replace(move, amounts=amounts)
             return replace(move, vehicle=vehicle, way=way, start_ns=time_ns, length_ns=ONE_NS)
         return replace(move, vehicle=vehicle, start_ns=start_ns)
 

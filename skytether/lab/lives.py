@@ -5,7 +5,7 @@ then rests, as with an autopilot. Keys set by the operator survive a restart of 
 """
 
 import io
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from contextlib import suppress
 from functools import partial
 from typing import Any, NamedTuple
@@ -183,6 +183,46 @@ class Lives:
         if running := self._running.pop(name, None):
             self._settings[name] = running.settings
         self.world.stop(name)
+
+    def end_server(self, name: str = SERVER[0]) -> None:
+        """Ask a server to end, as SIGTERM does."""
+        if running := self._running.get(name):
+            stop = partial(self.stop_server, name)
+            self._end(name, running.endpoint, lambda: self._running.get(name) is running, stop)
+
+    def end_client(self, number: int) -> None:
+        """Ask a client to end, as SIGTERM does."""
+        client, lives = self._lives[number][-1].client, self._lives[number]
+        stop = partial(self.stop_client, number)
+        self._end(f"client {number}", client, lambda: lives[-1].client is client, stop)
+
+    def _end(
+        self, name: str, endpoint: Endpoint, is_up: Callable[[], bool], stop: Callable[[], None]
+    ) -> None:
+        """Let an endpoint end; nothing happens once it is not up any more."""
+        latest_ns = 0
+
+        def leave(*, now_ns: int) -> None:
+            nonlocal latest_ns
+            latest_ns = endpoint.leave(now_ns=now_ns)
+
+        def look() -> None:
+            if not is_up():
+                return
+            if endpoint.finished or CLOCK.local(self.world.now_ns) >= latest_ns:
+                self.world.act(name, endpoint.close)
+                stop()
+            else:
+                self.world.at(self.world.now_ns + self.scenario.dt_ns, look)
+
+        self.world.act(name, leave)
+        look()
+
+    def close_server(self, name: str = SERVER[0]) -> None:
+        """Let a server close its sessions and end at once, as a second SIGTERM does."""
+        if running := self._running.get(name):
+            self.world.act(name, running.endpoint.close)
+        self.stop_server(name)
 
     def start_server(
         self, changes: Mapping[str, Any], *, remembers: bool = True, name: str = SERVER[0]

@@ -21,6 +21,7 @@ from types import MappingProxyType
 from typing import Any
 
 from skytether.ros2.graph import Node
+from skytether.shared.base.units import SECOND_NS
 from skytether.shared.core.endpoint import Address, Datagram, Endpoint, Form, make_datagram
 from skytether.shared.core.events import (
     Event,
@@ -435,6 +436,12 @@ class Shell:
         finally:
             self._after()
 
+    def leave(self) -> int:
+        """Let the endpoint begin to end; returns the time to end it at the latest [ns]."""
+        latest_ns = self.endpoint.leave(now_ns=time.monotonic_ns())
+        self._after()
+        return latest_ns
+
     def changed(self) -> None:
         """To be called after the endpoint was changed, by whoever changed it."""
         self._heard_ns = time.monotonic_ns()
@@ -582,7 +589,9 @@ def run(
     on_second: Callable[[], None] = lambda: None,
     on_signal: Callable[[int], None] | None = None,
 ) -> None:
-    """Drive several endpoints in this process until all have finished, or SIGINT or SIGTERM comes.
+    """Drive several endpoints in this process until all have finished.
+
+    At SIGINT or SIGTERM they are asked to end, see `Endpoint.leave`; a second signal ends them.
 
     Args:
         on_start: called once signals are handled, before the endpoints run.
@@ -598,8 +607,18 @@ def run(
     async def main() -> None:
         loop = asyncio.get_running_loop()
         task = asyncio.gather(*(shell.run(on_event) for shell in shells))
+        leaves = False
+
+        def leave() -> None:
+            nonlocal leaves
+            left_ns = 0
+            if not leaves:
+                leaves = True
+                left_ns = max(shell.leave() for shell in shells) - time.monotonic_ns()
+            loop.call_later(max(left_ns, 0) / SECOND_NS, task.cancel)
+
         for number in (signal.SIGINT, signal.SIGTERM):
-            loop.add_signal_handler(number, task.cancel)
+            loop.add_signal_handler(number, leave)
         if on_signal:
             for number in ENDING:
                 loop.add_signal_handler(number, on_signal, number)

@@ -17,6 +17,7 @@ from skytether.client import failsafe
 from skytether.client.failsafe import AT_ONCE, FOLLOWING, TABLE, Failsafe
 from skytether.client.link import PlainLink
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
+from skytether.shared.core.events import Leaving
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Reason, Rows
 from skytether.shared.wire.protocol import (
@@ -48,7 +49,7 @@ class Sealed(PlainLink):
 class OnMission(ByHand):
     """Client that has just accepted a motion."""
 
-    def __init__(self, flown: Scenario = SWAP) -> None:
+    def __init__(self, flown: Scenario = SWAP, age: int = 1) -> None:
         super().__init__(flown, link=Sealed())
         self.wake()
         self.welcome()
@@ -57,7 +58,10 @@ class OnMission(ByHand):
         """Whether heartbeats arrive."""
         while self.mode is not Mode.READY or self.observed is None or not self.observed.takes:
             self.step()
-        self.made_for = self.observed.step + 1
+        observed = self.observed
+        for _ in range(age - 1):
+            self.step()
+        self.observed, self.made_for = observed, observed.step + age
         self.send_motion(self.made_for, self.observed.state[:, 0])
 
     @property
@@ -194,7 +198,7 @@ def test_only_the_vehicle_itself_or_a_person_takes_it_off_its_motion_at_once() -
     }
     assert off - AT_ONCE == {
         *(Reason.LOST, Reason.CLOSED, Reason.RESTARTED, Reason.MALFORMED, Reason.RESYNC),
-        *(Reason.LATE, Reason.ENDED, Reason.STALLED, Reason.BATTERY),
+        *(Reason.LATE, Reason.ENDED, Reason.STALLED, Reason.BATTERY, Reason.OVER),
     }
 
 
@@ -239,6 +243,65 @@ def test_after_a_close_the_vehicle_rests_and_takes_no_motion_until_it_hovers() -
         flight.step()
     assert flight.client._failsafe.reason is Reason.CLOSED
     assert flight.client._pilot.step < flight.last + 10
+
+
+def test_a_motion_is_flown_to_its_end_however_old_its_observation(undisturbed: Rows) -> None:
+    """`link.age_max_s` bounds what is accepted, not what other vehicles keep clear of."""
+    old = OnMission(packaged("swap", duration=30.0, link={"age_max_s": 7.5}), age=110)
+    rows = old.fly()
+    assert set(rows["mode"]) <= {int(each) for each in FOLLOWING}
+    assert rows["covered"].all()
+    way_m = np.ptp(rows["state"][:, 0, 0])
+    assert way_m == pytest.approx(np.ptp(undisturbed["state"][:, 0, 0]), abs=0.1)
+
+
+def finish(flight: OnMission) -> Rows:
+    """Fly until the client has nothing left to do."""
+    while not flight.client.finished:
+        flight.step()
+    return flight.rows()
+
+
+@pytest.mark.parametrize("stage", [5, 40, 79])
+def test_a_flight_whose_time_is_up_on_the_way_ends_at_the_last_knot(stage: int) -> None:
+    """And accepts no motion meanwhile; without the rule it ends at once."""
+    made_for = OnMission().made_for
+    flight = OnMission(packaged("swap", duration=(made_for + stage) * 0.05))
+    while flight.client._pilot.step < made_for + stage + 1:
+        flight.step()
+    flight.send_motion(flight.client._pilot.step, np.zeros(flight.terms.axes))
+    rows = finish(flight)
+    assert rows["step"][-1] == flight.last
+    assert set(rows["in_force"][rows["step"] > made_for]) == {made_for}
+    speeds = np.abs(rows["state"][:, :, 1]).max(axis=1)
+    assert speeds[-1] < 0.1 < speeds.max()
+
+
+def test_a_flight_whose_time_is_up_at_rest_ends_then() -> None:
+    last = OnMission().last
+    flight = OnMission(packaged("swap", duration=(last + 20) * 0.05))
+    assert finish(flight)["step"][-1] == last + 19
+
+
+def test_a_client_that_is_asked_to_end_flies_its_motion_first() -> None:
+    """And accepts no other; at rest it ends at once."""
+    flight = OnMission()
+    for _ in range(20):
+        flight.step()
+    latest_ns = flight.client.leave(now_ns=flight.now_ns)
+    (told,) = (each for each in flight.client.events() if isinstance(each, Leaving))
+    assert told.vehicles == (4,)
+    flight.send_motion(flight.client._pilot.step, np.zeros(flight.terms.axes))
+    rows = finish(flight)
+    assert flight.last - 1 <= rows["step"][-1] <= flight.last
+    assert set(rows["in_force"][rows["step"] > flight.made_for]) == {flight.made_for}
+    assert flight.now_ns < latest_ns < flight.now_ns + 2 * SECOND_NS
+
+    rests = OnMission()
+    rests.fly()
+    rests.step()
+    assert rests.client.leave(now_ns=rests.now_ns) == rests.now_ns
+    assert rests.client.finished
 
 
 def test_a_vehicle_that_rests_or_lands_on_a_mission_holds_its_place_in_wind() -> None:

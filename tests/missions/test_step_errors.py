@@ -14,6 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from helpers import packaged
+from skytether.lab.lives import Lives
 from skytether.netem.fate import Fates
 from skytether.netem.proxy import Proxy
 from skytether.server.common.clock import EXACT, ClockMap, Contradiction, StepError
@@ -355,12 +356,13 @@ def test_a_word_that_the_time_of_day_contradicts_is_dropped() -> None:
 def test_the_figures_tell_what_a_clock_costs(monkeypatch: pytest.MonkeyPatch) -> None:
     """In flight the uncertainty of the place; at rest 0, for any clock."""
     delay(monkeypatch, turns(0.05, 0.85))
-    for duration, at_least_m, at_most_m in ((7.0, 0.2, 0.7), (2.0, 0.0, 0.01)):
-        flown = flight.fly(mission("swap", "swap(2)", duration), vehicles=2)
-        told = flown.figures["server"]["by_vehicle"]["1"]
+    lives = Lives(mission("swap", "swap(2)", 30.0))
+    for at_s, at_least_m, at_most_m in ((2.0, 0.0, 0.01), (7.0, 0.2, 0.7)):
+        lives.run(at_s)
+        told = lives.server.figures()["by_vehicle"]["1"]
         assert 440.0 < told["clock_bound_ms"] < 500.0
         assert at_least_m <= told["clock_m"] <= at_most_m
-    assert "clock_steps" not in flown.figures["server"]["counts"]
+    assert "clock_steps" not in lives.server.figures()["counts"]
 
 
 # -- flights with asymmetric delays ----------------------------------------------------------------
@@ -419,13 +421,15 @@ def test_with_steps_taken_for_exact_delays_bring_vehicles_together(
 def test_with_the_time_of_day_at_both_ends_clocks_are_known(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """To within the stated accuracy of both, with delays that differ by 0.8 s."""
+    """To within the stated accuracy of both, with delays that differ by 0.8 s; a vehicle that has
+    left, to within 0.1 % more of the time since.
+    """
     delay(monkeypatch, turns(0.05, 0.85))
     simulation = msgspec.structs.replace(SWAP.simulation, time_error_s=0.01)
     flown = flight.fly(msgspec.structs.replace(SWAP, simulation=simulation), vehicles=8)
     assert separation_m(flown) > 0.5
     told = flown.figures["server"]["by_vehicle"]
-    assert max(each["clock_bound_ms"] for each in told.values()) < 25.0
+    assert max(each["clock_bound_ms"] for each in told.values()) < 30.0
     assert not [each for each in flown.events if isinstance(each.event, ClockContradicted)]
 
 

@@ -1,10 +1,12 @@
 """Driver: errors of an endpoint's code are logged, and the endpoint continues."""
 
+import signal
 from types import SimpleNamespace
 
 import pytest
 
 from helpers import Idle
+from skytether.shared.base.units import SECOND_NS
 from skytether.shared.core.events import Event, Fault, Flying
 from skytether.shell import driver, timer
 from skytether.shell.driver import Shell, run
@@ -62,3 +64,52 @@ def test_a_log_that_fails_does_not_stop_the_endpoints_clock() -> None:
     run([Shell(endpoint, ("127.0.0.1", 0))], on_event=fail)
     assert endpoint.wakes == 2
     assert failed == [Flying(vehicle=1), Flying(vehicle=2)]
+
+
+class Leaves(Idle):
+    """Endpoint that is asked to end at its first wakes, and has finished some wakes later."""
+
+    def __init__(self, asked: int, finishes: int) -> None:
+        super().__init__()
+        self.wakes, self._asked, self._finishes = 0, asked, finishes
+        self.left, self.closed = 0, False
+
+    @property
+    def finished(self) -> bool:
+        return self.wakes >= self._finishes
+
+    def wake(self, *, now_ns: int) -> None:  # noqa: ARG002
+        self.wakes += 1
+        if self.wakes <= self._asked:
+            signal.raise_signal(signal.SIGTERM)
+
+    def next_wake_ns(self) -> int | None:
+        return 0 if self.wakes < min(self._finishes, WAKES) else None
+
+    def leave(self, *, now_ns: int) -> int:
+        self.left += 1
+        return now_ns + 1000 * SECOND_NS
+
+    def close(self, *, now_ns: int) -> None:  # noqa: ARG002
+        self.closed = True
+
+
+WAKES = 50
+"""Number of wakes of an endpoint that never finishes."""
+
+
+@pytest.mark.parametrize(
+    ("asked", "finishes", "wakes"),
+    [
+        pytest.param(1, 20, (20, 20), id="it has finished"),
+        pytest.param(1, WAKES + 1, (WAKES, WAKES), id="its time is up"),
+        pytest.param(2, WAKES + 1, (2, WAKES - 1), id="it is asked again"),
+    ],
+)
+def test_a_signal_asks_an_endpoint_to_end_and_a_second_one_ends_it(
+    asked: int, finishes: int, wakes: tuple[int, int]
+) -> None:
+    endpoint = Leaves(asked, finishes)
+    run([Shell(endpoint, ("127.0.0.1", 0))])
+    assert (endpoint.left, endpoint.closed) == (1, True)
+    assert wakes[0] <= endpoint.wakes <= wakes[1]

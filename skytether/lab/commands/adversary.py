@@ -60,8 +60,8 @@ class AdversaryOptions:
     scenario: ScenarioName = "swap"
     """Name of a mission (swap, sphere, rings, corridor, warehouse) or a .toml file."""
     kinds: Annotated[str, Argument(name="with", metavar="KINDS")] = "delays,losses,cuts,copies"
-    """Kinds of moves, with commas: delays, losses, cuts, copies, server, client, goals, zones; and
-    with a standby server: standby, freezes, partitions."""
+    """Kinds of moves, with commas: delays, losses, cuts, copies, server, stops, client, ends,
+    joins, stalls, goals, zones; and with a standby server: standby, freezes, partitions."""
     runs: Annotated[int, Argument(metavar="N")] = 200
     """Number of flights."""
     moves: Annotated[int, Argument(metavar="N")] = MOVES_MAX

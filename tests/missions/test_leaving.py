@@ -1,0 +1,115 @@
+"""Missions that somebody leaves: servers and clients that are asked to end, late joiners, and
+flights whose time is up. Vehicles keep apart, and each stays on its motion.
+"""
+
+import numpy as np
+import pytest
+
+from helpers import packaged
+from skytether.client import failsafe
+from skytether.client.failsafe import FOLLOWING
+from skytether.lab.adversary import Move, MoveKind, Raid, spare_m
+from skytether.lab.lives import Lives
+from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS, seconds_to_ns
+from skytether.shared.core.events import Leaving
+from skytether.shared.scenario.schema import Scenario
+from skytether.shared.telemetry.record import Reason, parse
+
+FOUR = packaged("swap", duration=40.0, reference={"shape": "swap(4)"})
+EIGHT = packaged("swap", duration=40.0, reference={"shape": "swap(8)"})
+
+
+def move(
+    kind: MoveKind, vehicle: int, way: str, start_s: float, length_s: float, *amounts: float
+) -> Move:
+    return Move(kind, vehicle, way, seconds_to_ns(start_s), seconds_to_ns(length_s), amounts)
+
+
+def attacked(scenario: Scenario, *moves: Move) -> float:
+    """Spare distance between vehicles [m], without the scenario's network."""
+    return spare_m(scenario, Raid(scenario, moves).run())
+
+
+def test_a_server_that_is_asked_to_end_waits_until_its_vehicles_rest() -> None:
+    """It plans nothing meanwhile; after its restart all fly on."""
+    lives = Lives(FOUR)
+    lives.run(7.0)
+    before = [int(lives.track(number)[1].shape[0]) for number in lives.bodies]
+    assert all(before)
+    lives.end_server()
+    (told,) = (each for _, _, each in lives.events if isinstance(each, Leaving))
+    assert set(told.vehicles) == {1, 2, 3, 4}
+    while lives.running and lives.world.now_ns < 30 * SECOND_NS:
+        lives.run(lives.world.now_ns / SECOND_NS + 0.05)
+    assert lives.world.now_ns < (7.0 + told.most_s) * SECOND_NS
+    for each in lives.bodies.values():
+        assert np.hypot(*each.plant.state()[:, 1]) < 0.3  # wind
+    for (client, sink), *_ in lives._lives.values():
+        rows = parse(sink.getvalue())
+        assert rows["in_force"].max() * 0.05 <= 7.0 + FOUR.link.join_s
+        assert client.finished is False
+    lives.start_server({})
+    lives.run(45.0)
+    for number, body in lives.bodies.items():
+        goal = lives.mission.of(number)(np.array(40.0))[:, 0]
+        assert np.linalg.norm(body.plant.state()[:, 0] - goal) < 0.3
+
+
+def test_a_server_whose_vehicles_rest_ends_at_once() -> None:
+    lives = Lives(FOUR)
+    lives.run(35.0)
+    lives.end_server()
+    assert lives.running is None
+
+
+@pytest.mark.parametrize("vehicle", [2, 6])
+@pytest.mark.parametrize("at_s", [5.0, 6.2])
+def test_a_close_that_reaches_one_vehicle_only_takes_it_off_no_motion(
+    vehicle: int, at_s: float
+) -> None:
+    stop = move(MoveKind.STOPS, 0, "", at_s, 20.0, 0.0)
+    deaf = [
+        move(MoveKind.CUTS, number, "uplink", at_s, 1e-3)
+        for number in range(1, 9)
+        if number != vehicle
+    ]
+    assert attacked(EIGHT, stop, *deaf) > 0.3
+
+
+def test_without_the_rule_the_others_meet_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(failsafe, "AT_ONCE", frozenset(Reason))
+    stop = move(MoveKind.STOPS, 0, "", 6.2, 20.0, 0.0)
+    deaf = [move(MoveKind.CUTS, each, "uplink", 6.2, 1e-3) for each in range(1, 9) if each != 2]
+    assert attacked(EIGHT, stop, *deaf) < 0.0
+
+
+@pytest.mark.parametrize("at_s", [5.5, 7.0])
+def test_a_stall_of_one_step_takes_a_vehicle_off_no_motion(at_s: float) -> None:
+    stalls = (move(MoveKind.STALLS, number, "", at_s, 0.12) for number in (1, 5))
+    assert attacked(EIGHT, *stalls) > 0.3
+
+
+def test_vehicles_that_start_apart_end_at_rest_and_keep_apart() -> None:
+    """The first ones' time is up while they are still on their way."""
+    scenario = packaged("swap", duration=26.0, reference={"shape": "swap(4)"})
+    joins = [move(MoveKind.JOINS, number, "", 0.0, 6.0 * number - 5.9) for number in range(1, 5)]
+    raid = Raid(scenario, tuple(joins))
+    found = raid.run()
+    assert spare_m(scenario, found) > 0.3
+    for number, lives in raid._lives._lives.items():
+        rows = parse(lives[-1].sink.getvalue())
+        flown = rows[rows["in_force"] >= 0]
+        assert len(flown), number
+        assert set(flown["mode"]) <= {int(each) for each in FOLLOWING} | {rows["mode"][-1]}
+        assert np.hypot(*rows["state"][-1, :, 1]) < 0.3  # wind
+
+
+def test_a_client_that_is_asked_to_end_rests_and_comes_back() -> None:
+    ends = move(MoveKind.ENDS, 3, "", 6.0, 12.0)
+    raid = Raid(FOUR, (ends,))
+    assert spare_m(FOUR, raid.run()) > 0.3
+    first, second = raid._lives._lives[3]
+    rows = parse(first.sink.getvalue())
+    assert np.hypot(*rows["state"][-1, :, 1]) < 0.3
+    assert len(parse(second.sink.getvalue()))
+    assert raid._lives.world.now_ns > 18 * SECOND_NS + MILLISECOND_NS
