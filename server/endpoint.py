@@ -264,5 +264,6 @@ class Server(Endpoint):
             "dropped": by_name(self.dropped),
             "refused": by_name(self.refused),
             "by_vehicle": vehicle_figures,
+            **({"margins": dict(margins)} if (margins := self.controller.scheme.margins) else {}),
             **({"budget": self.controller.budget.figures()} if self.controller.budget else {}),
         }

@@ -17,8 +17,6 @@ from skytether.shared.core.endpoint import Datagram, Events
 from skytether.shared.core.events import (
     Degraded,
     Fault,
-    InZone,
-    LeftTube,
     PlanningResumed,
     PlanningStopped,
 )
@@ -137,12 +135,9 @@ class Ticker:
         if controller.faults:
             self._events += [Fault(traceback=fault) for fault in controller.faults]
             controller.faults.clear()
-        if left := controller.scheme.left_tube:
-            self._events += [LeftTube(vehicle=each, off_m=off_m) for each, off_m in left]
-            left.clear()
-        if inside := controller.scheme.inside:
-            self._events += [InZone(vehicle=each, zone=zone) for each, zone in inside]
-            inside.clear()
+        if events := controller.scheme.events:
+            self._events += events
+            events.clear()
         # Last, since a horizon sent at this tick replaces a heartbeat.
         if heartbeats:
             self._send_heartbeats(heartbeats, now_ns)

@@ -6,7 +6,7 @@ scheme.
 
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from typing import Annotated, Any, ClassVar, NamedTuple
 
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from skytether.server.common.clock import ClockMap
 from skytether.server.common.desired import Desired
 from skytether.shared.base.kernel import F2, F3, F4, I1, S3, record, records
+from skytether.shared.core.events import Event
 from skytether.shared.core.stopwatch import Stopwatch
 from skytether.shared.law.model import Array, Flags, Indices
 from skytether.shared.law.terms import Terms
@@ -228,6 +229,8 @@ class Scheme(ABC):
         self.observed_step: Indices = np.full(fleet.capacity, -1, dtype=np.int64)
         """Step of the newest observation of each vehicle, or -1; shape (capacity,)."""
         self.counts: Counter[str] = Counter()
+        self.events: list[Event] = []
+        """What the operator is to be told; the caller empties the list."""
         self.figures: Figures = np.zeros(fleet.block, dtype=FIGURES)
         """Figures of the newest plans, in the first rows."""
         self.planned: Array = np.zeros((fleet.block, fleet.terms.axes, 2))
@@ -291,14 +294,11 @@ class Scheme(ABC):
     # -- missions only -----------------------------------------------------------------------------
 
     @property
-    def left_tube(self) -> list[tuple[int, float]]:
-        """Vehicles that have left their tube, and by how much [m]; the caller empties the list."""
-        return []
-
-    @property
-    def inside(self) -> list[tuple[int, str]]:
-        """Vehicles that rest inside a zone, and the zone's name; the caller empties the list."""
-        return []
+    def margins(self) -> Mapping[str, float]:
+        """How near vehicles have come to what the theorem of docs/together.md assumes, each as a
+        share: 1 is the bound. Empty without a mission.
+        """
+        return {}
 
     def change_zones(self, zones: Zones) -> None:  # noqa: B027 - most schemes fly no missions
         """Replace the zones that vehicles keep out of."""

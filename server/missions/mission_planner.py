@@ -28,6 +28,7 @@ vehicle, and `yielding` which vehicle makes way for another.
 """
 
 import math
+from collections.abc import Mapping
 from functools import partial
 from itertools import chain
 from operator import sub
@@ -48,6 +49,7 @@ from skytether.server.missions.waypoints import DETOUR_S, TURN_BACK, Waypoints
 from skytether.server.missions.yielding import YIELD_S, Yielding
 from skytether.server.missions.zone_clearance import comes_near
 from skytether.shared.base.chance import stream
+from skytether.shared.core.events import InZone
 from skytether.shared.law.model import ALTITUDE, Array, Flags, Indices
 from skytether.shared.law.motion import INTERVALS, SPACING, Motion
 from skytether.shared.scenario.zones import Zones
@@ -87,8 +89,7 @@ class MissionPlanner(SplineScheme):
         scenario, terms = fleet.scenario, fleet.terms
         self.figures = np.repeat(SILENT, fleet.block)
         self._state = state
-        self.counts = state.counts
-        self._inside: list[tuple[int, str]] = []
+        self.counts, self.events = state.counts, state.events
         self.observed_step = state.observed_step
         mission = scenario.mission
         clearances = self._clearances = scenario.clearances
@@ -113,12 +114,8 @@ class MissionPlanner(SplineScheme):
         """Factors of the coordinates in distances between vehicles at rest; shape (axes,)."""
 
     @property
-    def left_tube(self) -> list[tuple[int, float]]:
-        return self._state.left_tube
-
-    @property
-    def inside(self) -> list[tuple[int, str]]:
-        return self._inside
+    def margins(self) -> Mapping[str, float]:
+        return self._state.margins
 
     def forget(self, row: int) -> None:
         self._state.forget(row)
@@ -330,7 +327,7 @@ class MissionPlanner(SplineScheme):
         if not vehicle.in_zone:
             vehicle.in_zone = True
             zone = self._zones.in_the_way(place[None], clearance_m)
-            self._inside.append((self._state.number_of(row), zone))
+            self.events.append(InZone(vehicle=self._state.number_of(row), zone=zone))
         around = np.zeros((len(AROUND), len(place)))
         around[:, :2] = AROUND
         for far_m in np.arange(1, OUT_STEPS) * OUT_M:

@@ -15,6 +15,7 @@ from skytether.server.common.clock import ClockMap, StepError
 from skytether.server.missions.possible_motions import NEVER, PossibleMotion, PossibleMotions
 from skytether.server.missions.vehicle_motions import SentMotion, VehicleMotions, repeats_after
 from skytether.shared.base.kernel import B1, F1, I1, kernel
+from skytether.shared.core.events import Event, LeftMotion, LeftTube
 from skytether.shared.law.model import ALTITUDE, Array, Indices
 from skytether.shared.law.motion import INTERVALS, JOIN_MAX, SPACING, Motion, resting
 from skytether.shared.law.terms import Terms
@@ -93,9 +94,11 @@ class MissionState:
     ) -> None:
         self._clock, self._dt_ns = clock, terms.dt_ns
         self.counts: Counter[str] = Counter()
-        self.left_tube: list[tuple[int, float]] = []
-        """Vehicles that have left their tube since the list was emptied, and their distance to it
-        [m]."""
+        self.events: list[Event] = []
+        """What the operator is to be told; the caller empties the list."""
+        self.margins = {"tube": 0.0, "join": 0.0}
+        """Largest distance of a vehicle from its motion, and largest time after a motion's first
+        knot at which one was accepted, each as a share of what the theorem assumes."""
         self.state = np.zeros((capacity, terms.axes, 2))
         """Newest observed states; shape (capacity, axes, 2)."""
         self.vehicles: dict[int, VehicleMotions] = {}
@@ -117,7 +120,6 @@ class MissionState:
         self.now = 0
         """Present step on the common grid: whole steps of the server's clock."""
         self.rows = VehicleRows.of(capacity)
-        self._all = np.arange(capacity)
         self.observed_step: Indices = self.rows.observed_step
         self.due, self._moved_by = np.zeros((2, block), dtype=np.int64)
         """Scratch of `align`: PLAN_DUE and REPEAT_DUE of each vehicle, and the change of its offset
@@ -273,6 +275,7 @@ class MissionState:
         self.state[row] = observation.state
         vehicle = self.vehicles.setdefault(row, VehicleMotions())
         self.rows.number[row] = self.number_of(row)
+        self._watch(row, vehicle, observation)
         if observation.in_force == NO_HORIZON:
             # The vehicle hovers or comes to rest where it is: no motion was accepted, or all have
             # ended.
@@ -314,6 +317,23 @@ class MissionState:
         self._mark_changed(row, vehicle)
         return True
 
+    def _watch(self, row: int, vehicle: VehicleMotions, observation: Observation) -> None:
+        """Check what the theorem assumes of motions: each is accepted in time, and flown to its
+        end.
+        """
+        before = vehicle.in_force
+        if before is None or not self.rows.heard[row] or observation.in_force == before.step:
+            return
+        if observation.in_force != NO_HORIZON:
+            share = (observation.since - observation.in_force) / self._join
+            self.margins["join"] = max(self.margins["join"], share)
+            if share > 1.0:
+                self.counts["joined_late"] += 1
+        elif before.step >= 0 and before.motion.last > observation.step:
+            self.counts["left_motion"] += 1
+            left_s = (before.motion.last - observation.step) * self._dt_s
+            self.events.append(LeftMotion(vehicle=self.number_of(row), left_s=left_s))
+
     def _mark_changed(self, row: int, vehicle: VehicleMotions) -> None:
         self._changed.add(row)
         vehicle.repeat = None
@@ -340,6 +360,8 @@ class MissionState:
         assert vehicle.in_force is not None
         outside_m = float(np.linalg.norm(expected - state[:, 0])) - self._tube_m
         vehicle.speed_mps = float(np.linalg.norm(state[:, 1]))
+        if vehicle.in_force.step >= 0 and number not in self.absent:
+            self.margins["tube"] = max(self.margins["tube"], 1.0 + outside_m / self._tube_m)
         if vehicle.in_force.step < 0:
             outside_m = max(outside_m, self.brakes_m(vehicle))
         elif outside_m <= 0.0:
@@ -347,7 +369,7 @@ class MissionState:
         elif number not in self.absent:
             self.counts["left_tube"] += 1
             if not vehicle.outside_m:
-                self.left_tube.append((number, outside_m))
+                self.events.append(LeftTube(vehicle=number, off_m=outside_m))
         vehicle.outside_m = 0.0 if number in self.absent else max(outside_m, 0.0)
 
     def _stopping_m(self, vehicle: VehicleMotions) -> float:
@@ -368,7 +390,7 @@ class MissionState:
         moved, foreign = _align(rows, step, self.now, self.rows, self.due, self._moved_by)
         # All rows, since others keep away from silent vehicles too.
         counted = self.now + self.rows.ahead
-        self._clock.step_errors(self._all, counted, self.rows.early, self.rows.late)
+        self._clock.step_errors(np.arange(len(counted)), counted, self.rows.early, self.rows.late)
         for row in self.restarted:
             self.rows.late[row] = max(self.rows.late[row], float(LONGEST))
         if moved:

@@ -463,6 +463,17 @@ class LeftTube(VehicleEvent, frozen=True, kw_only=True):
         return f"vehicle {self.vehicle} is {off}: the others keep further away"
 
 
+class LeftMotion(VehicleEvent, frozen=True, kw_only=True):
+    """A vehicle on a mission has left its motion before its end."""
+
+    left_s: float
+    """Time until the motion would have ended [s]."""
+
+    def __str__(self) -> str:
+        left = f"has left its motion {self.left_s:.1f} s before its end"
+        return f"vehicle {self.vehicle} {left}: the others keep away from where it is"
+
+
 def metres(leap_m: tuple[float, ...]) -> str:
     return f"({', '.join(f'{each:+.2f}' for each in leap_m)}) m"
 
@@ -621,6 +632,7 @@ Event = (
     | InZone
     | ClockContradicted
     | TimeUnknown
+    | LeftMotion
     | LeftTube
     | StateLeapt
     | FenceHolds

@@ -9,6 +9,7 @@ distances, bit for bit.
 """
 
 import math
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
@@ -41,6 +42,8 @@ AIMED_NS = 10 * SECOND_NS
 """Targeted changes begin within this time before the nearest approach [ns]."""
 ONE_NS = MILLISECOND_NS
 """Length of a targeted move, which hits a single packet [ns]."""
+APART, CLEAR, ASSUMED = "apart", "clear", ("tube", "join")
+"""What a climb may minimise, see `Climb.seeks`."""
 MOVES_MAX = 64
 DRAWN = 10
 """Number of random attacks before a climb, which starts from the best of them."""
@@ -184,6 +187,10 @@ class Approach(msgspec.Struct, frozen=True, kw_only=True):
     """Smallest distance of a vehicle from a zone; negative inside."""
     left: int
     """Number of observations outside a tube."""
+    strays: int = 0
+    """Number of motions left before their end, or accepted too late."""
+    margins: dict[str, float] = {}
+    """How near vehicles came to what the theorem assumes, see `Scheme.margins`."""
 
 
 class AdversaryNetwork(Endpoint):
@@ -341,10 +348,19 @@ class Raid:
         limit_ns = begins_ns + seconds_to_ns(scenario.duration + scenario.link.connect_s)
         self._world.run(over, limit_ns=limit_ns)
         tracks = self._lives.tracks()
-        counts = (server.figures()["counts"] for server in self._lives.servers)
-        left = sum(each.get("left_tube", 0) for each in counts)
-        apart, clear = self._apart(tracks), self._clear(tracks)
-        return Approach(moves=self._moves, apart=apart, clear=clear, left=left)
+        counts, margins = Counter[str](), dict.fromkeys(ASSUMED, 0.0)
+        for server in self._lives.servers:
+            told = server.figures()
+            counts.update(told["counts"])
+            margins = {each: max(near, told["margins"][each]) for each, near in margins.items()}
+        return Approach(
+            moves=self._moves,
+            apart=self._apart(tracks),
+            clear=self._clear(tracks),
+            left=counts["left_tube"],
+            strays=counts["left_motion"] + counts["joined_late"],
+            margins=margins,
+        )
 
     @property
     def packets(self) -> Sequence[Packet]:
@@ -409,17 +425,22 @@ class Climb:
     """Tries without improvement after which the climb restarts; 0: all moves are random."""
 
     @property
-    def seeks_zones(self) -> bool:
-        """Whether the climb minimises the distance from zones: every second climb does, if there
-        are zones.
+    def seeks(self) -> str:
+        """What the climb minimises, by its number: the distance between vehicles or from zones, or
+        what is left to the bound of something that the theorem assumes.
         """
         has_zones = bool(self.scenario.zones) or MoveKind.ZONES in self.kinds
-        return has_zones and bool(self.number % 2)
+        goals = (APART, *([CLEAR] if has_zones else []), *ASSUMED)
+        return goals[self.number % len(goals)]
 
 
 class Climbed(NamedTuple):
     best: Approach
     spares_m: list[float]
+    margins: dict[str, float]
+    """Largest of all flights, see `Approach.margins`."""
+    strays: int
+    """Sum of all flights, see `Approach.strays`."""
 
 
 def fly(scenario: Scenario, moves: Moves) -> Approach:
@@ -435,12 +456,15 @@ def climb(task: Climb) -> Climbed:
     """Search for the moves that bring two vehicles, or a vehicle and a zone, nearest together."""
     scenario, rng = task.scenario, stream(task.scenario.seed, "climb", task.number)
     draws, spares_m = MoveSampler(task, rng), list[float]()
+    margins, strays = dict.fromkeys(ASSUMED, 0.0), 0
     best: Approach | None = None
     current: Approach | None = None
     drawn, since, packets = 0, 0, list[Packet]()
 
     def value(tried: Approach) -> float:
-        return (tried.clear if task.seeks_zones else tried.apart).away_m
+        if task.seeks in ASSUMED:
+            return 1.0 - tried.margins[task.seeks]
+        return (tried.clear if task.seeks == CLEAR else tried.apart).away_m
 
     for _ in range(task.tries):
         if since >= task.patience:
@@ -448,7 +472,7 @@ def climb(task: Climb) -> Climbed:
         if current is None or drawn < DRAWN:
             moves, drawn = draws.some(), drawn + 1
         else:
-            near, since = current.clear if task.seeks_zones else current.apart, since + 1
+            near, since = current.clear if task.seeks == CLEAR else current.apart, since + 1
             moves = draws.changed(current.moves, near, packets)
         raid = Raid(scenario, moves)
         tried = raid.run()
@@ -457,8 +481,10 @@ def climb(task: Climb) -> Climbed:
         if best is None or spare_m(scenario, tried) < spare_m(scenario, best):
             best = tried
         spares_m.append(spare_m(scenario, tried))
+        margins = {each: max(near, tried.margins[each]) for each, near in margins.items()}
+        strays += tried.strays
     assert best is not None
-    return Climbed(best, spares_m)
+    return Climbed(best, spares_m, margins, strays)
 
 
 class MoveSampler:

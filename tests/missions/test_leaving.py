@@ -2,6 +2,9 @@
 flights whose time is up. Vehicles keep apart, and each stays on its motion.
 """
 
+from functools import partial
+
+import msgspec
 import numpy as np
 import pytest
 
@@ -11,7 +14,7 @@ from skytether.client.failsafe import FOLLOWING
 from skytether.lab.adversary import Move, MoveKind, Raid, spare_m
 from skytether.lab.lives import Lives
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS, seconds_to_ns
-from skytether.shared.core.events import Leaving
+from skytether.shared.core.events import Leaving, LeftMotion
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Reason, parse
 
@@ -87,6 +90,32 @@ def test_without_the_rule_the_others_meet_it(monkeypatch: pytest.MonkeyPatch) ->
 def test_a_stall_of_one_step_takes_a_vehicle_off_no_motion(at_s: float) -> None:
     stalls = (move(MoveKind.STALLS, number, "", at_s, 0.12) for number in (1, 5))
     assert attacked(EIGHT, *stalls) > 0.3
+
+
+def test_the_server_tells_how_near_a_flight_came_to_what_the_theorem_assumes() -> None:
+    lives = Lives(FOUR)
+    lives.run(40.0)
+    told = lives.server.figures()
+    assert 0.05 < told["margins"]["tube"] < 1.0
+    assert 0.1 < told["margins"]["join"] <= 1.0
+    assert not {"left_motion", "joined_late", "left_tube"} & told["counts"].keys()
+
+
+@pytest.mark.parametrize("at_s", [5.0, 6.0])
+def test_a_vehicle_that_a_person_takes_off_its_motion_is_kept_away_from_and_named(
+    at_s: float,
+) -> None:
+    """The others come no nearer to where it can be."""
+    lives = Lives(FOUR)
+    lives.run(at_s)
+    client = lives._lives[2][-1].client
+    disarmed = msgspec.structs.replace(FOUR, armed=False)
+    lives.world.act("client 2", partial(client.change, disarmed, frozenset({"armed"})))
+    lives.run(at_s + 2.0)
+    (left,) = (each for _, _, each in lives.events if isinstance(each, LeftMotion))
+    assert left.vehicle == 2
+    assert left.left_s > 0.5
+    assert lives.server.figures()["counts"]["left_motion"] == 1
 
 
 def test_vehicles_that_start_apart_end_at_rest_and_keep_apart() -> None:

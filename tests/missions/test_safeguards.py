@@ -21,6 +21,7 @@ from skytether.server.missions.zone_clearance import comes_near
 from skytether.shared.base.chance import stream
 from skytether.shared.base.kernel import plain
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
+from skytether.shared.core.events import InZone
 from skytether.shared.law.motion import SAMPLES, SPACING, Motion, bend_m, resting
 from skytether.shared.scenario import zone_texts
 from skytether.shared.scenario.zones import Zones
@@ -309,7 +310,9 @@ def test_a_vehicle_that_rests_in_a_zone_leaves_it_the_shortest_way() -> None:
     end = planned(made).position[-1]
     assert zone.clearance(end[None]).min() >= scenario(2).clearances.tube_m
     assert 4.2 < end[0] < 5.5
-    ((number, name),) = made.inside
+    (told,) = made.events
+    assert isinstance(told, InZone)
+    number, name = told.vehicle, told.zone
     assert (number, name.startswith("box")) == (1, True)
 
 

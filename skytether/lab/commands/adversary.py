@@ -38,6 +38,11 @@ from skytether.shell.argument import Argument
 from skytether.shell.command import CommandError, ScenarioFlags, ScenarioName
 
 TRIES_MAX = 10**6
+ASSUMES = {
+    "tube": "largest distance from a motion",
+    "join": "latest acceptance of a motion",
+}
+"""What the theorem assumes, by the names of `Approach.margins`."""
 
 
 class Kept(msgspec.Struct, frozen=True):
@@ -99,17 +104,19 @@ def adversary(argv: Sequence[str]) -> None:
         raise CommandError(message, command.CONFIGURATION)
     title = f"{options.scenario}, seed {options.config.seed}"
     if options.attack is not None:
-        found, spares_m = fly(options.config, _moves(options.attack)), list[float]()
+        found = fly(options.config, _moves(options.attack))
+        searched = Climbed(found, [], found.margins, found.strays)
     else:
-        found, spares_m = _search(options, title)
-    _finish(options, argv, title, found, spares_m)
+        searched = _search(options, title)
+    _finish(options, argv, title, searched)
+    spares_m = searched.spares_m
     if spares_m and len(spares_m) < options.runs:
         message = f"interrupted with {len(spares_m)} of {options.runs} flights done"
         raise CommandError(message, command.INTERRUPTED)
 
 
-def _search(options: AdversaryOptions, title: str) -> tuple[Approach, list[float]]:
-    """Flight with the least spare distance, and the spare distances of all flights [m].
+def _search(options: AdversaryOptions, title: str) -> Climbed:
+    """All climbs together.
 
     Raises CommandError if interrupted before any climb was done.
     """
@@ -151,7 +158,8 @@ def _search(options: AdversaryOptions, title: str) -> tuple[Approach, list[float
             raise
     spares_m = [each for climbed in done for each in climbed.spares_m]
     best = min((each.best for each in done), key=lambda each: spare_m(options.config, each))
-    return best, spares_m
+    margins = {name: max(each.margins[name] for each in done) for name in best.margins}
+    return Climbed(best, spares_m, margins, sum(each.strays for each in done))
 
 
 def _moves(text: str) -> Moves:
@@ -184,10 +192,10 @@ def _finish(
     options: AdversaryOptions,
     argv: Sequence[str],
     title: str,
-    found: Approach,
-    spares_m: Sequence[float],
+    searched: Climbed,
 ) -> None:
     """Write and print the result; raises CommandError if a required distance was violated."""
+    found, spares_m = searched.best, searched.spares_m
     if options.json is not None:
         command.write(options.json, msgspec.json.encode(Kept(found, spares_m)))
     failed, apart, clear = sum(each < 0.0 for each in spares_m), found.apart, found.clear
@@ -202,6 +210,9 @@ def _finish(
     if clear.vehicles:
         rows.append(("least distance from a zone [m]", clear.distance_m))
         rows.append(("  at [s], of vehicle", f"{clear.at_s:.2f}, {clear.vehicles[0]}"))
+    for name, share in searched.margins.items():
+        rows.append((f"{ASSUMES[name]}, as a share of what is assumed", f"{share:.3f}"))
+    rows.append(("motions left before their end, or begun too late", searched.strays))
     rows.append(("observations outside a tube", found.left))
     rows.append(("moves", ", ".join(sorted({each.kind for each in found.moves})) or "none"))
     tables.show(f"adversary against {title}", (), rows)
