@@ -265,7 +265,7 @@ class MissionPlanner(SplineScheme):
             return "another server: this one ends"
         if row in self._state.restarted:
             return "its restarted client"
-        if self._state.awaits(row):
+        if self._state.led.awaits(row):
             return "its first observation"
         if vehicle.sent:
             return "an acknowledgement"  # before it, the motion flown is unknown
@@ -274,8 +274,8 @@ class MissionPlanner(SplineScheme):
 
     def _common_wait(self) -> str:
         """Reason why no motion is planned for any vehicle, in words; empty if there is none."""
-        if self._state.unled is not None:
-            return f"vehicle {self._state.number_of(self._state.unled)} to follow this server"
+        if (missing := self._state.led.missing) is not None:
+            return f"vehicle {self._state.number_of(missing)} to follow this server"
         if self._state.absent:
             return f"vehicle {min(self._state.absent)} to begin"
         if self._state.foreign is not None:

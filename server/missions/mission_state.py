@@ -12,6 +12,7 @@ from typing import NamedTuple, Self
 import numpy as np
 
 from skytether.server.common.clock import ClockMap, StepError
+from skytether.server.missions.led_vehicles import LedVehicles
 from skytether.server.missions.possible_motions import NEVER, PossibleMotion, PossibleMotions
 from skytether.server.missions.vehicle_motions import SentMotion, VehicleMotions, repeats_after
 from skytether.shared.base.kernel import B1, F1, I1, kernel
@@ -120,6 +121,7 @@ class MissionState:
         self.now = 0
         """Present step on the common grid: whole steps of the server's clock."""
         self.rows = VehicleRows.of(capacity)
+        self._all = np.arange(capacity)
         self.observed_step: Indices = self.rows.observed_step
         self.due, self._moved_by = np.zeros((2, block), dtype=np.int64)
         """Scratch of `align`: PLAN_DUE and REPEAT_DUE of each vehicle, and the change of its offset
@@ -140,15 +142,7 @@ class MissionState:
         its motions until it is observed after the restart."""
         self.foreign: int | None = None
         """Row of a vehicle that may still fly a motion of another server; None if there is none."""
-        self._leaderships: dict[int, int | None] = {}
-        """Number of the leadership with which each row is led by this server; None if another
-        server leads it."""
-        self._awaited: dict[int, int] = {}
-        """Rows that this server has begun to lead, until it has an observation of them from under
-        its lead: the step from which on an observation is one."""
-        self.unled: int | None = None
-        """Row because of which no motion may be planned: not all vehicles follow this server with
-        one number, or this one was not observed since. None if there is none."""
+        self.led = LedVehicles()
 
     def forget(self, row: int) -> None:
         """End a session; motions stay, since the vehicle continues on them."""
@@ -174,18 +168,15 @@ class MissionState:
         A vehicle that this server leads has told its motion in force, and flies no plan of an
         earlier leadership any more, so it may fly nothing else.
         """
-        leads = told is None or bool(told.leads)
-        self._leaderships[row] = (told.number if told else 0) if leads else None
-        if told is not None and leads:
+        if self.led.follow(row, told):
+            assert told is not None
             self._take_over(row, told)
-        self._find_unled()
 
     def _take_over(self, row: int, told: Lead) -> None:
         vehicle = self.vehicles.setdefault(row, VehicleMotions())
         self.rows.number[row] = self.number_of(row)
         vehicle.sent.clear()
         vehicle.next = None
-        self._awaited[row] = told.step
         self.observed_step[row] = told.step - 1  # older observations show an earlier motion
         knots = np.asarray(told.knots, dtype=np.float64)
         if told.in_force is not None and told.spacing == SPACING and knots.size:
@@ -195,31 +186,16 @@ class MissionState:
             self.rows.unknown_until[row] = -1
         self._mark_changed(row, vehicle)
 
-    def awaits(self, row: int) -> bool:
-        """Whether nothing was observed of a vehicle since this server began to lead it."""
-        return row in self._awaited
-
     def rests(self, row: int) -> bool:
         """Whether the vehicle was observed at the end of every motion that it may fly, or another
         server leads it.
         """
         vehicle = self.vehicles.get(row)
-        if vehicle is None or self._leaderships.get(row, 0) is None:
+        if vehicle is None or not self.led.leads(row):
             return True
         k = int(self.observed_step[row])
         ends = [motion.last for motion in vehicle.motions()]
         return k > self.rows.unknown_until[row] and all(last <= k for last in ends)
-
-    def _find_unled(self) -> None:
-        newest = max((each or 0 for each in self._leaderships.values()), default=0)
-        self.unled = next(
-            (
-                row
-                for row, number in self._leaderships.items()
-                if number != newest or row in self._awaited
-            ),
-            None,
-        )
 
     def brakes_m(self, vehicle: VehicleMotions) -> float:
         """Braking distance from the observed position, without a motion [m]; 0 with a motion."""
@@ -390,16 +366,12 @@ class MissionState:
         moved, foreign = _align(rows, step, self.now, self.rows, self.due, self._moved_by)
         # All rows, since others keep away from silent vehicles too.
         counted = self.now + self.rows.ahead
-        self._clock.step_errors(np.arange(len(counted)), counted, self.rows.early, self.rows.late)
+        self._clock.step_errors(self._all, counted, self.rows.early, self.rows.late)
         for row in self.restarted:
             self.rows.late[row] = max(self.rows.late[row], float(LONGEST))
         if moved:
             self._changed.update(rows[self._moved_by[:n] != 0].tolist())
-        if self._awaited:
-            for row in self._awaited.keys() & set(rows.tolist()):
-                if self.observed_step[row] >= self._awaited[row]:
-                    del self._awaited[row]
-            self._find_unled()
+        self.led.observed(rows.tolist(), self.observed_step)
         if self.decided:
             for row in self.decided.intersection(rows.tolist()):
                 self.vehicles[row].next = None

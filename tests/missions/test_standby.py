@@ -6,11 +6,13 @@ import pytest
 
 from helpers import packaged
 from skytether.lab.adversary import Climb, Move, MoveKind, Raid, climb, spare_m
-from skytether.server.missions.mission_state import MissionState
+from skytether.lab.lives import Lives
+from skytether.server.missions.led_vehicles import LedVehicles
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.law.motion import SPACING, Motion, resting
 from skytether.shared.scenario.mission import Mission
 from skytether.shared.scenario.schema import Scenario
+from skytether.shared.telemetry.summary import nearest
 from skytether.shared.wire.protocol import NO_HORIZON, Lead
 from two_vehicles import along, ready
 
@@ -54,7 +56,7 @@ def split() -> Raid:
 @pytest.mark.long
 def test_two_servers_never_plan_for_halves_of_a_mission(monkeypatch: pytest.MonkeyPatch) -> None:
     assert split().run().apart.away_m > 0.8
-    monkeypatch.setattr(MissionState, "_find_unled", lambda self: setattr(self, "unled", None))
+    monkeypatch.setattr(LedVehicles, "_look", lambda _: None)
     assert split().run().apart.away_m < 0.5
 
 
@@ -113,13 +115,13 @@ def test_a_motion_that_was_told_is_known_once_all_were_observed() -> None:
     flown = along([4.0, 0.0], [-0.8, 0.0], first=190)
     for row, motion in ((0, flown), (1, resting(200, np.array([-4.0, 0.0])))):
         made.follow(row, told(row, 200, motion=motion))
-        assert made.state.unled is not None
+        assert made.state.led.missing is not None
     for row, x in ((0, 3.9), (1, -4.0)):
         in_force = made.vehicles[row].in_force
         assert in_force is not None
         made.hear(row, 200, in_force.step, x)
     made.align(201)
-    assert made.state.unled is None
+    assert made.state.led.missing is None
     (kept, *_) = made.vehicles[0].motions()
     assert np.allclose(kept.position, flown.position, atol=1e-6)
     assert np.allclose(kept.velocity, flown.velocity, atol=1e-6)
@@ -151,10 +153,39 @@ def test_vehicles_of_two_numbers_are_not_planned_for() -> None:
         made.follow(row, told(row, 200, number))
         made.hear(row, 200, NO_HORIZON, 4.0 - 8.0 * row)
     made.align(201)
-    assert made.state.unled == 0
+    assert made.state.led.missing == 0
     made.follow(0, told(0, 210, 3))
     made.hear(0, 210, NO_HORIZON, 4.0)
     made.align(211)
-    assert made.state.unled is None
+    assert made.state.led.missing is None
     made.follow(1, Lead(2, 7, 4, 0))
-    assert made.state.unled == 1
+    assert made.state.led.missing == 1
+
+
+def test_a_vehicle_that_names_another_leader_stops_no_vehicle_that_has_none() -> None:
+    """The other server never hears all of them, so it plans nothing for the first either."""
+    made = ready()
+    made.follow(1, None)
+    for number, leads in ((1, 0), (4, 1), (5, 0)):
+        made.follow(0, told(0, 200, number)._replace(leads=leads))
+        assert made.state.led.missing is None
+    made.follow(1, told(1, 200, 0))
+    assert made.state.led.missing is not None
+
+
+def test_a_stolen_vehicle_that_speaks_of_a_standby_costs_the_others_its_room_only() -> None:
+    scenario = packaged("swap", duration=40.0, reference={"shape": "swap(4)"})
+    lives = Lives(scenario)
+    lives.run(4.0)
+    client = lives._lives[1][-1].client
+    session = client._servers.leading
+    assert session.number is not None
+    lead = Lead(1, session.number, 1, 0)
+    lives.world.act("client 1", lambda *, now_ns: session.tell_leader(lead, 0, now_ns=now_ns))
+    lives.run(40.0)
+    for number in (2, 3, 4):
+        goal = lives.mission.of(number)(np.array(40.0))[:, 0]
+        assert np.linalg.norm(lives.bodies[number].plant.state()[:, 0] - goal) < 0.3
+    times, apart_m = nearest(list(lives.tracks().values()), scenario.control.dt)
+    assert np.nanmin(apart_m) > 0.7
+    assert len(times)
