@@ -263,14 +263,15 @@ class Client(Endpoint):
                 return
         elif before.began_ns is None or not flies.is_up(now_ns=now_ns):
             return
+        is_new = before.began_ns is None or flies.took_off
+        if (motion := before.motion) and not is_new:
+            knots = motion.knots(self._axes)
+            self._pilot.compensator.go_on_along(motion.step, motion.observed, motion.spacing, knots)
         self._pilot.begin(now_ns=now_ns, began_ns=before.began_ns)
-        if before.began_ns is None or flies.took_off:
+        if is_new:
             self._events.append(Flying(vehicle=self.vehicle))
             self._failsafe.meet(Reason.OPENED, now_ns=now_ns)
             return
-        if motion := before.motion:
-            knots = motion.knots(self._axes)
-            self._pilot.compensator.go_on_along(motion.step, motion.observed, motion.spacing, knots)
         cause = Reason.RESUMED if motion else Reason.LOST
         for session in self._sessions:
             session.heard_ns = before.heard_ns

@@ -123,6 +123,8 @@ class Pilot:
         self._epoch_ns = began_ns
         self.step = self._covered_last = -(-(now_ns - began_ns) // self._dt_ns)
         self.flown, self.next_ns = self.step - 1, self.starts_ns(self.step)
+        if self._goes_on(self.step):
+            self.steps = max(self.steps, self.compensator.last_step + 1)
 
     # -- horizons ----------------------------------------------------------------------------
 

@@ -1,7 +1,8 @@
 """Missions in virtual time in which server and clients stop and restart.
 
 A life is one run of a process. Without its client a vehicle keeps its last velocity for HOLD_NS and
-then rests, as with an autopilot. Keys set by the operator survive a restart of the server.
+then drifts with the wind; one whose client has ended in order holds its place, as with an
+autopilot. Keys set by the operator survive a restart of the server.
 """
 
 import io
@@ -52,6 +53,8 @@ class Body(SimulatedVehicle):
         weather = Weather(scenario, stream(scenario.seed, "wind", number))
         plant = FirstOrderPlant(scenario, weather, number)
         super().__init__(scenario.dt_ns, plant, _sensor(scenario, number, 0))
+        self.holds = False
+        """Whether it holds its place without a client, as one that was left at rest."""
         self.unflown: list[tuple[float, list[float]]] = []
         """Times [s; client's clock] and positions [m] of steps without a client."""
 
@@ -59,11 +62,13 @@ class Body(SimulatedVehicle):
         measurements, lost, velocity = list[Measurement](), self._step, self._velocity
         while lost >= 0 and self._began_ns + (self._step + 1) * self._dt_ns <= now_ns:
             is_held = (self._step - lost) * self._dt_ns < HOLD_NS
-            self.plant.advance(velocity if is_held else 0.0 * velocity)
+            if not self.holds:
+                self.plant.advance(velocity if is_held else 0.0 * velocity)
             self._step += 1
             self._measure(measurements)
             time_s = (self._began_ns + self._step * self._dt_ns) / SECOND_NS
             self.unflown.append((time_s, self.plant.state()[:, 0].tolist()))
+        self.holds = False
 
     def reset(self, sensor: Sensor) -> None:
         """Rest until the next client, which counts its steps from 0."""
@@ -192,8 +197,16 @@ class Lives:
 
     def end_client(self, number: int) -> None:
         """Ask a client to end, as SIGTERM does."""
-        client, lives = self._lives[number][-1].client, self._lives[number]
-        stop = partial(self.stop_client, number)
+        client, lives, body = (
+            self._lives[number][-1].client,
+            self._lives[number],
+            self.bodies[number],
+        )
+
+        def stop() -> None:
+            body.holds = True
+            self.stop_client(number)
+
         self._end(f"client {number}", client, lambda: lives[-1].client is client, stop)
 
     def _end(
