@@ -5,7 +5,7 @@ A message has one sequence number and one seal, and travels over any set of path
 counts; later copies are equal byte for byte, so they are recognised before anything is opened. In
 front of each message stands a report, sealed with it:
 
-    report = bin [sequence u8 | newest u8 | arrived u16, for each path]
+    report = bin [sequence u16 | newest u16 | arrived u16, for each path]
 
 `newest` is the newest sequence number that has come from the other end, and bit i of `arrived` says
 whether the number `newest` - i has come over that path. So each end knows the loss, delay and
@@ -35,8 +35,9 @@ from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
 from skytether.shared.wire.drop import Drop, ProtocolError
 
 PATHS_MAX = 4
-SEQUENCES = 256
-"""Modulus of sequence numbers."""
+SEQUENCES = 2**16
+"""Modulus of sequence numbers: half of them are more than may be under way, so that a packet that
+is late, by however much, is never taken for one that is ahead."""
 WINDOW = 16
 """Number of newest packets whose arrival is reported for each path."""
 COPIES = 32
@@ -83,7 +84,7 @@ ALIVE_WORTH = 40.0
 EVERYWHERE = 1e9
 """Worth of a message that goes over every path."""
 
-_HEAD, _BIN8 = Struct("<BB"), 0xC4
+_HEAD, _BIN8 = Struct("<HH"), 0xC4
 _SETS = {
     count: [*chain.from_iterable(combinations(range(count), size) for size in range(1, count + 1))]
     for count in range(1, PATHS_MAX + 1)
@@ -116,7 +117,7 @@ def split(payload: bytes) -> tuple[Report | None, bytes]:
 
 
 def _ahead(sequence: int, of: int) -> int:
-    """Number of packets by which a sequence number is ahead of another, from -128 to 127."""
+    """Number of packets by which a sequence number is ahead of another; negative if behind."""
     half = SEQUENCES // 2
     return (sequence - of + half) % SEQUENCES - half
 
@@ -295,6 +296,8 @@ class Paths:
         """Newest times from one message of the other end to the next."""
         self.peer_may_restart = False
         """Whether the other end may begin its sequence numbers anew."""
+        self._before: int | None = None
+        """Newest sequence number before it did so; None if it has not."""
         self._copies: dict[bytes, int] = {}
         """Sequence numbers of the newest datagrams of the other end, oldest first."""
 
@@ -465,12 +468,12 @@ class Paths:
         """
         if len(report.arrived) != len(self.each):
             raise ProtocolError(Drop.FIELD)
+        ahead = self._progress(report.sequence)
+        if ahead <= -WINDOW:  # too late to tell anything
+            return
         self._copies[datagram] = report.sequence
         if len(self._copies) > COPIES:
             del self._copies[next(iter(self._copies))]
-        ahead = WINDOW if self._heard is None else _ahead(report.sequence, self._heard)
-        if self.peer_may_restart and ahead <= -WINDOW:
-            self.peer_may_restart, ahead = False, WINDOW
         if ahead > 0:
             self._masks = [mask << min(ahead, WINDOW) & 0xFFFF for mask in self._masks]
             self._await(report.sequence, ahead, now_ns)
@@ -492,6 +495,20 @@ class Paths:
             _names(report, each, self._newest.sequence) for each in report.arrived
         ):
             self._newest = None
+
+    def _progress(self, sequence: int) -> int:
+        """Number of packets by which a packet is ahead of the newest that has come; WINDOW if it is
+        the first, -WINDOW if it is of the other end's earlier run.
+        """
+        ahead = WINDOW if self._heard is None else _ahead(sequence, self._heard)
+        if self.peer_may_restart and ahead <= -WINDOW:
+            self.peer_may_restart, ahead, self._before = False, WINDOW, self._heard
+        elif self._before is not None and abs(_ahead(sequence, self._before)) <= IN_FLIGHT_MAX:
+            if ahead >= WINDOW:
+                return -WINDOW
+            if _ahead(sequence, self._before) > 0:  # this run's own numbers have come there
+                self._before = None
+        return ahead
 
     def _await(self, sequence: int, ahead: int, now_ns: int) -> None:
         """Note the packets that a packet with this sequence number has overtaken."""

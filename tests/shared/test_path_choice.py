@@ -260,6 +260,34 @@ def test_end_that_begins_its_numbers_anew_is_understood_at_once() -> None:
     assert max(path.failure(ends.now_ns) for path in ends.near.each) < 0.2
 
 
+@given(st.integers(WINDOW, 1000))
+def test_a_message_that_is_late_by_however_much_changes_nothing(late: int) -> None:
+    ends = Ends()
+    ends.exchange(20)
+    datagrams = [sender.report() + b"\x93late" for sender in (ends.near, ends.far)]
+    for _ in range(late):
+        ends.send(on=BOTH)
+        ends.send(on=BOTH, back=True)
+    for datagram, receiver in zip(datagrams, (ends.far, ends.near), strict=True):
+        before, report = receiver.figures(ends.now_ns), receiver.report()[4:]
+        ends.arrive(receiver, datagram, 0)
+        assert receiver.figures(ends.now_ns) == before
+        assert receiver.report()[4:] == report
+
+
+@given(st.integers(20, 600))
+def test_a_late_message_of_an_earlier_run_is_not_taken_for_a_newer_one(steps: int) -> None:
+    ends = Ends()
+    ends.exchange(steps)
+    late = ends.near.report() + b"\x93late"
+    ends.near = Paths((1.0, 1.0), SECOND_NS)
+    ends.far.peer_may_restart = True
+    ends.exchange(2)
+    ends.arrive(ends.far, late, 0)
+    ends.exchange(2 * steps)
+    assert max(path.failure(ends.now_ns) for path in ends.near.each) < 0.2
+
+
 def test_clock_set_back_makes_no_message_precious() -> None:
     ends = Ends()
     ends.exchange(20)
