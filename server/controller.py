@@ -173,7 +173,11 @@ class Controller:
 
     def change_trigger(self, control: ControlConfig) -> None:
         """Use the trigger of a scenario from the next step on, see `use_trigger`."""
-        self.use_trigger(make_trigger(control, self._capacity, self.faults.append))
+        self.use_trigger(make_trigger(control, self._capacity, self._note_trigger_error))
+
+    def _note_trigger_error(self, fault: str) -> None:
+        self._counts["trigger_errors"] += 1
+        self.faults += filter(None, [fault])
 
     def use_trigger(self, trigger: Trigger) -> None:
         """Use another trigger from the next step on; it starts without a memory of sent plans."""

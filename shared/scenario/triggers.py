@@ -508,7 +508,7 @@ class Guarded(Trigger):
     Args:
         name: name of the policy, for messages.
         inner: the policy.
-        tell: called with the traceback of its first error.
+        tell: called at each error, at the first one with its traceback, later with nothing.
     """
 
     def __init__(self, name: str, inner: Trigger, tell: Callable[[str], None]) -> None:
@@ -545,11 +545,13 @@ class Guarded(Trigger):
             self._fail(error)
 
     def _fail(self, error: Exception) -> None:
-        if not self._has_failed:
-            self._has_failed = True
-            what = f"the trigger {self._name}: {type(error).__name__}: {error}"
-            trace = "".join(traceback.format_exception(error))
-            self._tell(f"{trace}{what}; when it fails, a horizon is sent")
+        if self._has_failed:
+            self._tell("")
+            return
+        self._has_failed = True
+        what = f"the trigger {self._name}: {type(error).__name__}: {error}"
+        trace = "".join(traceback.format_exception(error))
+        self._tell(f"{trace}{what}; when it fails, a horizon is sent")
 
 
 def _read_only(array: NDArray[Any]) -> NDArray[Any]:
@@ -580,7 +582,7 @@ def make_trigger(
     Args:
         control: `trigger`, and the keys that policies use.
         capacity: largest number of vehicles.
-        tell: called with the traceback of each plug-in's first error in flight.
+        tell: called at each error of a plug-in in flight, see `Guarded`.
     """
 
     def make(expression: Expression) -> Trigger:

@@ -1,6 +1,7 @@
 """Summary of a flight, computed from its record."""
 
 import math
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -82,6 +83,9 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
     """Number of packets that server, netem and client dropped, by reason (docs/operating.md);
     server and netem count the packets of all vehicles. None without the figures of the
     processes."""
+    plugin_errors: dict[str, int] | None = None
+    """Number of failures of a plug-in's code at the server, by its kind; for all vehicles. None
+    without the figures of the processes."""
     age_ms_p50: float | None
     """Age of the observation from which the input being flown was computed [ms], over all steps."""
     age_ms_p99: float | None
@@ -186,6 +190,7 @@ def summarise(
         reordered=None if netem is None else int(netem["overtaken"].sum()),
         stale=stale,
         drops=drops(figures, int(client["vehicle"][0])) if figures and len(client) else None,
+        plugin_errors=plugin_errors(figures) if figures else None,
         age_ms_p50=_quantile(age_ms, 0.5),
         age_ms_p99=_quantile(age_ms, 0.99),
         aoi_s_mean=_mean(aoi_s),
@@ -200,6 +205,16 @@ def summarise(
         estimate_error_m=_rms(off) if off.any() and np.isfinite(off).all() else None,
         secure=secure,
     )
+
+
+def plugin_errors(figures: Mapping[str, Any]) -> dict[str, int]:
+    """Number of failures of a plug-in's code, by its kind; empty if there was none."""
+    found = Counter[str]()
+    for process, told in figures.items():
+        if process.startswith("server"):
+            for kind in ("trigger", "planner", "scheme"):
+                found[kind] += told["counts"].get(f"{kind}_errors", 0)
+    return dict(+found)
 
 
 def desired(scenario: Scenario, client: Rows, server: Rows | None = None) -> Array:

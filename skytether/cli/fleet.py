@@ -27,7 +27,7 @@ from skytether.shared.scenario.mission import Mission
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.drops import drops
 from skytether.shared.telemetry.record import Record
-from skytether.shared.telemetry.summary import separations, summarise
+from skytether.shared.telemetry.summary import plugin_errors, separations, summarise
 from skytether.shell import command, plugins, terminal
 from skytether.shell.argument import Argument
 from skytether.shell.command import CommandError, ScenarioName, ScenarioOptions
@@ -103,6 +103,8 @@ class FleetSummary(msgspec.Struct, frozen=True, kw_only=True):
     """Packets dropped because a queue of the kernels or of netem was full."""
     drops: dict[str, dict[str, int]]
     """Packets that server, netem and vehicles dropped, by reason, see `Summary.drops`."""
+    plugin_errors: dict[str, int]
+    """See `Summary.plugin_errors`."""
     tick_ms_p50: float
     """Median duration of a server's tick, all vehicles together, in the slowest worker [ms]."""
     tick_ms_p99: float
@@ -181,6 +183,7 @@ def fleet(argv: Sequence[str]) -> None:
         figures.fleet(options.figure, title, options.config, flown.client, server, apart)
     if flown.failure:
         raise CommandError(str(flown.failure))
+    command.refuse_errors(summary.plugin_errors)
 
 
 def _with_mission(argv: Sequence[str]) -> list[str]:
@@ -376,6 +379,7 @@ def _summarise(options: FleetOptions, flight: FleetFlight, least_m: float | None
         dropped=sum(link["overflowed"] for link in links)
         + sum(counters["kernel_drops"] + counters["send_errors"] for counters in measured),
         drops=drops(counted),
+        plugin_errors=plugin_errors(counted),
         tick_ms_p50=max(server["tick_ms_p50"] for server in servers),
         tick_ms_p99=max(server["tick_ms_p99"] for server in servers),
         server_missed=sum(server["missed"] for server in servers),
@@ -411,6 +415,7 @@ def _show(summary: FleetSummary, title: str) -> None:
         ),
         ("packets lost, dropped by full queues", f"{s.lost}, {s.dropped}"),
         *terminal.drops(s.drops),
+        ("errors of plug-ins", terminal.listed(s.plugin_errors) or None),
         ("tick p50, p99 [ms]", f"{s.tick_ms_p50:.2f}, {s.tick_ms_p99:.2f}"),
         ("deadlines missed by server, clients", f"{s.server_missed}, {s.client_missed}"),
         (

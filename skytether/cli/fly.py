@@ -169,6 +169,7 @@ def _show(
         raise CommandError(missing)
     if flown.failure:
         raise CommandError(str(flown.failure))
+    command.refuse_errors(summary.plugin_errors)
 
 
 def _make_folder(folder: Path, *, virtual: bool) -> None:

@@ -8,7 +8,7 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from errno import EMFILE
@@ -228,6 +228,12 @@ def _claim(claim: Callable[[Path], object], flag: str, path: Path | None) -> Non
     except OSError as error:
         message = f"{flag}: {path}: cannot be written: {error.strerror}"
         raise CommandError(message, CONFIGURATION) from None
+
+
+def refuse_errors(plugin_errors: Mapping[str, int] | None) -> None:
+    """Raise CommandError if a plug-in's code has failed in flight, see `Summary.plugin_errors`."""
+    for kind, count in (plugin_errors or {}).items():
+        raise CommandError(f"the plug-in's {kind} failed {count} times; the log has the first")
 
 
 @contextmanager

@@ -127,6 +127,14 @@ counts/horizons_lost server_lost_horizons_total
     Horizons that were sent but did not come into force in time.
 counts/scheme_errors server_scheme_errors_total
     Steps of vehicles for which a plug-in's scheme failed.
+counts/left_tube server_left_tube_total
+    On a mission: observations of vehicles outside their tube.
+counts/left_motion server_left_motion_total
+    On a mission: motions that a vehicle has left before their end.
+margins/{assumed} server_margin_ratio
+    On a mission: how near vehicles came to what the theorem assumes; 1 is the bound.
+counts/trigger_errors server_trigger_errors_total
+    Steps at which a plug-in's trigger failed; a horizon is sent then.
 counts/planner_errors server_planner_errors_total
     Steps of vehicles for which a plug-in's planner failed.
 counts/planner_late server_planner_late_total

@@ -125,6 +125,7 @@ def summary_rows(summary: Summary) -> list[tuple[str, str]]:
         ("lost, reordered packets", _values("d", s.lost, s.reordered)),
         ("stale packets", _values("d", s.stale)),
         *drops(s.drops or {}),
+        ("errors of plug-ins", listed(s.plugin_errors or {})),
         ("link", "sealed" if s.secure else "plaintext"),
         ("age p50, p99 [ms]", _values(".0f", s.age_ms_p50, s.age_ms_p99)),
         ("mean age, its peaks, age of the plan [s]", ages),
@@ -136,10 +137,11 @@ def summary_rows(summary: Summary) -> list[tuple[str, str]]:
 
 
 def drops(by_end: Mapping[str, Mapping[str, int]]) -> list[tuple[str, str]]:
-    return [
-        (f"dropped by {end}", ", ".join(f"{reason} {count}" for reason, count in reasons.items()))
-        for end, reasons in by_end.items()
-    ]
+    return [(f"dropped by {end}", listed(reasons)) for end, reasons in by_end.items()]
+
+
+def listed(counts: Mapping[str, int]) -> str:
+    return ", ".join(f"{name} {count}" for name, count in counts.items())
 
 
 def _uplink(s: Summary) -> tuple[int, ...]:

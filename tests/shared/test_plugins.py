@@ -543,6 +543,23 @@ def test_a_class_may_fail_anywhere(always: Record, tmp_path: Path) -> None:
     assert flight.client.tobytes() == always.client.tobytes()
 
 
+@pytest.mark.parametrize("command", ["fly demo", "fleet demo --vehicles 2"])
+def test_errors_of_a_trigger_are_counted_in_the_summary_and_the_exit_code(
+    command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "mine.py").write_text(
+        HEAD + "@trigger\ndef bad(now):\n    raise RuntimeError('no')\n"
+    )
+    kept = tmp_path / "flown.json"
+    asked = f"--virtual --duration 3 --settle 0 --plugin {tmp_path}/mine.py --json {kept}"
+    assert main([*shlex.split(f"{command} {asked}"), "--control.trigger", "bad"]) == 1
+    errors = msgspec.json.decode(kept.read_bytes())["plugin_errors"]
+    assert errors["trigger"] > 30
+    shown = capsys.readouterr()
+    assert f"trigger {errors['trigger']}" in shown.out
+    assert "the plug-in's trigger failed" in shown.err
+
+
 def test_a_batch_with_a_trigger_that_fails_is_no_measurement(tmp_path: Path) -> None:
     plug(tmp_path, "@trigger\ndef bad(now):\n    raise RuntimeError('no')\n")
     said = refusal(lambda: fly_batch(scenario(control={"trigger": "bad"}), [1, 2]))
@@ -679,11 +696,11 @@ def test_commands_of_the_laboratory_take_the_flag_several_times(
 SHORT = "--settle 0 --duration 4 --reference.shape slope(0.4)"
 
 
-def run(line: str, *more: str, folder: Path, path: str = "") -> str:
+def run(line: str, *more: str, folder: Path, path: str = "", code: int = 0) -> str:
     argv = [sys.executable, "-P", "-m", "skytether", *line.split(), *more]
     env = os.environ | {"PYTHONPATH": path}
     done = subprocess.run(argv, cwd=folder, env=env, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
+    assert done.returncode == code, done.stderr
     return done.stdout + done.stderr
 
 
@@ -762,7 +779,8 @@ def test_every_process_of_a_flight_knows_the_plugin(tmp_path: Path) -> None:
     bad = "@trigger\ndef bad(now):\n    raise RuntimeError('no')\n"
     (tmp_path / "mine.py").write_text(HEAD + SLOPE + bad)
     plugged = f"{SHORT} --plugin mine.py --record flight.mcap"
-    said = run(f"fly demo --page 127.0.0.1:0 {plugged} --control.trigger bad", folder=tmp_path)
+    bad = f"fly demo --page 127.0.0.1:0 {plugged} --control.trigger bad"
+    said = run(bad, folder=tmp_path, code=1)
     assert said.count("the trigger bad: RuntimeError: no; when it fails, a horizon is sent") == 1
     assert "goes on without a page" not in said
     run("report flight.mcap --plugin mine.py", folder=tmp_path)

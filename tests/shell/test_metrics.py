@@ -129,6 +129,10 @@ def test_no_line_of_the_tables_is_about_nothing(figures: dict[str, dict[str, Any
         "counts/horizons_lost",
         "counts/scheme_errors",  # of a plug-in
         "counts/planner_errors",
+        "counts/trigger_errors",
+        "counts/left_tube",  # on missions
+        "counts/left_motion",
+        "margins/{assumed}",
         "counts/planner_late",
         "counts/planner_not_called",
         "by_vehicle/{vehicle}/age_ms",
