@@ -69,6 +69,13 @@ class Terms(NamedTuple):
     loop: bool
     table: str
     """Digest of the content of the trajectory's CSV file."""
+    separation_m: float
+    """Distance that vehicles of a mission keep [m]. Like the next two it is for the servers: two
+    servers of one vehicle plan with the same."""
+    height_m: float
+    """Distance that they keep above one another [m]; 0: `separation_m`."""
+    tube_m: float
+    """Largest distance of a vehicle from its motion [m]."""
 
     @property
     def dt_s(self) -> float:

@@ -281,11 +281,11 @@ class MissionConfig(Section, frozen=True):
     docs/together.md.
     """
 
-    separation_m: OfServer[Annotated[float, Meta(ge=1e-3, le=1e3)]] = 0.5
+    separation_m: Term[Annotated[float, Meta(ge=1e-3, le=1e3)]] = 0.5
     """Smallest distance between two vehicles [m]."""
-    height_m: OfServer[Annotated[float, Meta(ge=0, le=1e3)]] = 0.0
+    height_m: Term[Annotated[float, Meta(ge=0, le=1e3)]] = 0.0
     """Smallest distance between two vehicles, one above the other [m]; 0: `separation_m`."""
-    tube_m: OfServer[Annotated[float, Meta(ge=0, le=1e3)]] = 0.15
+    tube_m: Term[Annotated[float, Meta(ge=0, le=1e3)]] = 0.15
     """Largest distance of a vehicle from its motion, by wind and tracking errors [m]."""
     speed_mps: OfServer[Strength] = 0.0
     """Largest speed of a motion over all axes [m/s]; 0: only `model.u_max`."""
@@ -625,6 +625,9 @@ class Scenario(Section, frozen=True):
             speed_mps=reference.speed_mps,
             loop=reference.loop,
             table=self._table_digest(),
+            separation_m=self.mission.separation_m,
+            height_m=self.mission.height_m,
+            tube_m=self.mission.tube_m,
         )
 
     def make_reference(self, vehicle: int = 1) -> shapes.Reference:

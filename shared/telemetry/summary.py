@@ -213,7 +213,7 @@ def plugin_errors(figures: Mapping[str, Any]) -> dict[str, int]:
     for process, told in figures.items():
         if process.startswith("server"):
             for kind in ("trigger", "planner", "scheme"):
-                found[kind] += told["counts"].get(f"{kind}_errors", 0)
+                found[kind] += told.get("counts", {}).get(f"{kind}_errors", 0)
     return dict(+found)
 
 

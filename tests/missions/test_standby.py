@@ -5,15 +5,17 @@ import numpy as np
 import pytest
 
 from helpers import packaged
-from skytether.lab.adversary import Climb, Move, MoveKind, Raid, climb, spare_m
+from skytether.lab.adversary import AdversaryNetwork, Climb, Move, MoveKind, Raid, climb, spare_m
 from skytether.lab.lives import Lives
 from skytether.server.missions.led_vehicles import LedVehicles
 from skytether.shared.base.units import SECOND_NS
+from skytether.shared.core.events import SessionRefused
 from skytether.shared.law.motion import SPACING, Motion, resting
 from skytether.shared.scenario.mission import Mission
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.summary import nearest
 from skytether.shared.wire.protocol import NO_HORIZON, Lead
+from skytether.sim.flight import STANDBY
 from two_vehicles import along, ready
 
 SPLIT_S = 30
@@ -189,3 +191,16 @@ def test_a_stolen_vehicle_that_speaks_of_a_standby_costs_the_others_its_room_onl
     times, apart_m = nearest(list(lives.tracks().values()), scenario.control.dt)
     assert np.nanmin(apart_m) > 0.7
     assert len(times)
+
+
+def test_a_standby_that_would_keep_another_distance_is_refused_with_both() -> None:
+    scenario = packaged("swap", duration=30.0, reference={"shape": "swap(4)"})
+    lives = Lives(scenario, AdversaryNetwork((), 1), has_standby=True)
+    lives.start_server({"mission.separation_m": 0.1}, name=STANDBY[0])
+    lives.run(8.0)
+    refused = [each for _, _, each in lives.events if isinstance(each, SessionRefused)]
+    assert {each.vehicle for each in refused} == {1, 2, 3, 4}
+    (differs,) = refused[0].differences
+    assert differs.key == "mission.separation_m"
+    assert {differs.here, differs.there} == {"0.1", "0.5"}
+    assert lives.running is not None

@@ -544,7 +544,8 @@ def test_the_terms_hold_what_both_ends_must_agree_on() -> None:
     assert terms[5:7] == ((0.0, 0.0), (1.6, 1.6))
     assert terms[7:11] == ("trajectory", True, "brake", 2.0)
     assert terms[11:14] == (5.0, 0.0, 10.0)
-    assert terms[14:] == ("circle", 1.55, 27.5, 0.0, "none", 1.0, False, "none")
+    assert terms[14:22] == ("circle", 1.55, 27.5, 0.0, "none", 1.0, False, "none")
+    assert terms[22:] == (0.5, 0.0, 0.15)
 
 
 @pytest.mark.parametrize(("duration", "steps"), [(60.0, 1200), (0.12, 2), (0.001, 1)])
