@@ -316,8 +316,8 @@ class Client(Endpoint):
     def _may_tell(self, now_ns: int) -> bool:
         return not self.keeps or self._memory.may_tell(self._to_keep(), now_ns=now_ns)
 
-    def kept(self) -> None:
-        self._memory.kept()
+    def kept(self, *, nothing: bool = False) -> None:
+        self._memory.kept(nothing=nothing)
 
     def next_wake_ns(self) -> int | None:
         due_ns = self._due_ns()
@@ -385,7 +385,8 @@ class Client(Endpoint):
             self._end(now_ns)
         # Nothing is sent before the state is saved: otherwise the server would not know which
         # motion the next run flies.
-        if not self._may_tell(now_ns):
+        self.waits_for_disk = not self._may_tell(now_ns)
+        if self.waits_for_disk:
             return
         self._servers.follow(step=pilot.flown, on_ground=False, now_ns=now_ns)
         for session in self._sessions:

@@ -144,6 +144,8 @@ class ClientMemory:
         """State returned last for writing, and when."""
         self._written: tuple[SavedState, int] | None = None
         """State that was written last, and when it was returned."""
+        self._finds_nothing = False
+        """Whether the next run will find no state, because none can be written."""
 
     def keep(self, state: SavedState, *, now_ns: int) -> bytes | None:
         """Bytes to be written, if the state has changed or the bytes returned last are old."""
@@ -155,16 +157,20 @@ class ClientMemory:
         self._handed = state, now_ns
         return state.encode(now_ns)
 
-    def kept(self) -> None:
-        self._written = self._handed
+    def kept(self, *, nothing: bool) -> None:
+        self._finds_nothing = nothing
+        if not nothing:
+            self._written = self._handed
 
     def may_tell(self, state: SavedState, *, now_ns: int) -> bool:
         """Whether messages may be sent: the next run will follow the same motion as this state, or
         none.
 
-        If the file cannot be written any more, the next run follows the saved motion until it is
-        too old.
+        If the file can neither be written nor removed, the next run follows the saved motion until
+        it is too old.
         """
+        if self._finds_nothing:
+            return True
         if self._written is None:
             if self.before.boot_id is None:  # no earlier state that a next run could follow
                 return True

@@ -105,6 +105,8 @@ class Endpoint(ABC):
     """Keys of the scenario that may change in flight, see `shared.core.change`."""
     keeps = False
     """Whether the endpoint has state for the next run of the process, see `keep`."""
+    waits_for_disk = False
+    """Whether the endpoint sends nothing until its newest state is written."""
     patience_ns = 0
     """Longest time for which datagrams are collected on busy sockets [ns].
 
@@ -191,8 +193,10 @@ class Endpoint(ABC):
         """
         return None
 
-    def kept(self) -> None:  # noqa: B027 - optional
-        """Note that the latest bytes from `keep` were written."""
+    def kept(self, *, nothing: bool = False) -> None:  # noqa: B027 - optional
+        """Note that the latest bytes from `keep` were written; or, with `nothing`, that they cannot
+        be, and that the next run will find no earlier ones either.
+        """
 
     @property
     def finished(self) -> bool:

@@ -568,9 +568,12 @@ class SettingsRecalled(msgspec.Struct, frozen=True, tag=True, kw_only=True):
 
 class NotKept(msgspec.Struct, frozen=True, tag=True, kw_only=True):
     reason: str
+    removed: bool = False
+    """Whether the file of an earlier state was removed: the next run would follow it."""
 
     def __str__(self) -> str:
-        return f"the state for the next run of this process cannot be saved: {self.reason}"
+        hovers = "; a client that is restarted now hovers where it is" if self.removed else ""
+        return f"the state for the next run of this process cannot be saved: {self.reason}{hovers}"
 
 
 class Finished(VehicleEvent, frozen=True, kw_only=True):

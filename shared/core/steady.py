@@ -84,8 +84,12 @@ class Steady(Endpoint):
         """Saved times are relative to the time of writing."""
         return self._inner.keep(now_ns=self._steady(now_ns))
 
-    def kept(self) -> None:
-        self._inner.kept()
+    def kept(self, *, nothing: bool = False) -> None:
+        self._inner.kept(nothing=nothing)
+
+    @property
+    def waits_for_disk(self) -> bool:  # type: ignore[override]
+        return self._inner.waits_for_disk
 
     def tell(self, event: Event) -> None:
         self._inner.tell(event)

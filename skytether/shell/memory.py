@@ -3,8 +3,10 @@
     MAGIC | digest of the rest, with the vehicle's key | host, time and identity | content
 
 A thread writes a new file beside it and renames that, so that no step waits for a disk and the file
-is always whole. The file need not survive a reboot, which outlasts any motion. A file that is
-damaged, or of another vehicle, key or flight, is refused with the reason.
+is always whole. Where it cannot be written and the endpoint waits for that, it is removed: the next
+run must not follow what is long past, and the endpoint goes on. The file need not survive a reboot,
+which outlasts any motion. A file that is damaged, or of another vehicle, key or flight, is refused
+with the reason.
 """
 
 import asyncio
@@ -90,6 +92,8 @@ class MemoryFile:
         self._thread: threading.Thread | None = None
         self._failure = self._told = ""
         """Reason why the newest content could not be written, and reason reported last."""
+        self._is_removed = False
+        """Whether the file was removed, because it could not be written."""
 
     @property
     def path(self) -> Path:
@@ -158,7 +162,9 @@ class MemoryFile:
         """Event that says why the file cannot be written; None if it can, or that was reported."""
         failure, reported = self._failure, self._told
         self._told = failure
-        return NotKept(reason=failure) if failure and failure != reported else None
+        if not failure or failure == reported:
+            return None
+        return NotKept(reason=failure, removed=self._is_removed)
 
     def close(self) -> None:
         """Write the rest, within a bounded time, and release the file's lock."""
@@ -183,9 +189,12 @@ class MemoryFile:
                     self._path, is_input=True, mode=0o600, is_synced=False
                 ) as file:
                     file.write(content)
-                self._failure = ""
+                self._failure, self._is_removed = "", False
             except OSError as error:
-                self._failure = f"{self._path}: {error.strerror or error}"
+                failure = f"{self._path}: {error.strerror or error}"
+                if self._endpoint.waits_for_disk and not self._is_removed:
+                    self._remove()
+                self._failure = failure
             with self._changed:
                 is_newest = self._wanted is content
                 if is_newest and not self._failure:
@@ -197,6 +206,13 @@ class MemoryFile:
             if is_newest and not self._failure:
                 with contextlib.suppress(RuntimeError):  # the loop has closed meanwhile
                     self._loop.call_soon_threadsafe(self._tell)
+
+    def _remove(self) -> None:
+        with contextlib.suppress(OSError):  # of a disk that is read-only
+            self._path.unlink(missing_ok=True)
+            self._is_removed, self._told = True, ""
+            with contextlib.suppress(RuntimeError):  # the loop has closed meanwhile
+                self._loop.call_soon_threadsafe(lambda: self._endpoint.kept(nothing=True))
 
     def _tell(self) -> None:
         if self._wanted is None:

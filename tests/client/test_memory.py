@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from lives import Lives, Restart
 from skytether.client.memory import ClientMemory, FlownMotion, SavedState, age_max_ns, recall
 from skytether.client.vehicle import VehicleMemory
+from skytether.lab.lives import Lives as LabLives
 from skytether.server.missions.mission_state import MissionState
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.core.events import BegunAnew, ModeChanged
@@ -129,13 +130,13 @@ def test_nothing_is_told_to_the_server_before_it_is_kept() -> None:
     memory = ClientMemory(TERMS, 1, None)
     assert memory.may_tell(KEPT, now_ns=NOW_NS)  # no saved motion yet
     assert memory.keep(KEPT, now_ns=NOW_NS) is not None
-    memory.kept()
+    memory.kept(nothing=False)
     assert memory.may_tell(KEPT, now_ns=NOW_NS)
     newer = msgspec.structs.replace(KEPT, motion=msgspec.structs.replace(MOTION, step=230))
     assert not memory.may_tell(newer, now_ns=NOW_NS)
     assert memory.keep(newer, now_ns=NOW_NS) is not None
     assert not memory.may_tell(newer, now_ns=NOW_NS)
-    memory.kept()
+    memory.kept(nothing=False)
     assert memory.may_tell(newer, now_ns=NOW_NS)
 
 
@@ -156,7 +157,7 @@ def test_what_has_not_changed_is_written_again_before_it_is_too_old_and_not_at_e
         now_ns = NOW_NS + step * TERMS.dt_ns
         heard = msgspec.structs.replace(KEPT, heard_ns=now_ns)
         if memory.keep(heard, now_ns=now_ns) is not None:
-            memory.kept()
+            memory.kept(nothing=False)
             writes += 1
     assert writes == 3
 
@@ -174,3 +175,21 @@ def test_others_keep_away_from_all_of_a_motion_whose_client_has_begun_anew(
     assert BegunAnew(vehicle=7) in [event for _, _, event in flight.events]
     monkeypatch.setattr(MissionState, "restart", lambda *_: False)
     assert flown(restart).least_m() < SWAP.mission.separation_m
+
+
+@pytest.mark.parametrize("removes", [True, False])
+def test_a_disk_that_is_full_ends_no_mission(
+    monkeypatch: pytest.MonkeyPatch, *, removes: bool
+) -> None:
+    """The shell removes the file that it cannot replace; without that the vehicles fall silent."""
+    flight = LabLives(swap(1))
+    flight.run(4.0)
+    monkeypatch.setattr(ClientMemory, "keep", lambda *_, **__: None)
+    clients = [lives[-1].client for lives in flight._lives.values()]
+    while flight.world.now_ns < 19 * SECOND_NS:
+        flight.run(flight.world.now_ns / SECOND_NS + 0.5)
+        for client in clients:
+            if removes and client.waits_for_disk:
+                client.kept(nothing=True)
+    heard_s = flight.server.controller.observed_step.min() * SWAP.control.dt
+    assert (heard_s > 15.0) == removes

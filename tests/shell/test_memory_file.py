@@ -1,6 +1,7 @@
 """File of a client's saved state: complete or refused, of this vehicle, used by one process."""
 
 import asyncio
+import errno
 from collections.abc import Callable, Mapping
 from contextlib import closing
 from pathlib import Path
@@ -51,13 +52,14 @@ class Keeps(Idle):
     def __init__(self) -> None:
         super().__init__()
         self.wanted: list[bytes] = []
-        self.written = 0
+        self.written = self.told_nothing = 0
 
     def keep(self, *, now_ns: int) -> bytes | None:  # noqa: ARG002
         return self.wanted.pop(0) if self.wanted else None
 
-    def kept(self) -> None:
-        self.written += 1
+    def kept(self, *, nothing: bool = False) -> None:
+        self.written += not nothing
+        self.told_nothing += nothing
 
 
 def test_what_was_kept_comes_back_with_its_time(path: Path) -> None:
@@ -199,6 +201,39 @@ def test_a_disk_that_fails_is_told_once_and_tried_again(
     work(kept)
     assert endpoint.written == 1
     assert path.read_bytes().startswith(MAGIC)
+    kept.close()
+
+
+@pytest.mark.parametrize("waits", [False, True])
+def test_on_a_full_disk_the_file_is_removed_if_the_endpoint_waits_for_it(
+    path: Path, monkeypatch: pytest.MonkeyPatch, *, waits: bool
+) -> None:
+    """What it holds is refreshed now and then: that alone is no reason."""
+    kept, endpoint = MemoryFile(path, IDENTITY, SECRET), Keeps()
+    begun(kept, endpoint, monkeypatch)
+    endpoint.wanted.append(b"old")
+    kept.look()
+    work(kept)
+
+    def full(*_: Any, **__: Any) -> Any:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with monkeypatch.context() as disk:
+        disk.setattr(files, "replacing", full)
+        endpoint.waits_for_disk = waits
+        endpoint.wanted.append(b"new")
+        kept.look()
+        work(kept)
+    told = kept.news()
+    assert told
+    assert told.removed is waits
+    assert path.exists() is not waits
+    assert endpoint.told_nothing == waits
+    work(kept)
+    assert endpoint.written == 2
+    found = kept.read()
+    assert found
+    assert found[0] == b"new"
     kept.close()
 
 
