@@ -226,6 +226,7 @@ def _several(paths: Sequence[NetworkPath], scenario: Scenario) -> dict[str, Any]
     return {
         "paths": [path.peer for path in paths],
         "prices": prices if len(prices) > 1 else (),
+        "path_names": [str(path) for path in paths],
     }
 
 

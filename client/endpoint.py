@@ -82,6 +82,7 @@ class Client(Endpoint):
         server: address of the server, or of the netem in front of it.
         paths: the same on each path, if there are several; `server` is then not used.
         prices: price of a packet on each path; default: all alike.
+        path_names: what the log calls each path; default: its address.
         standby: the same as `paths` for a second server, which leads when the first does not.
         vehicle: number of the vehicle, unique among the vehicles of the server.
         boot_id: number unique to this run of the client.
@@ -97,6 +98,7 @@ class Client(Endpoint):
         server: Address = NOWHERE,
         paths: Sequence[Address] = (),
         prices: Sequence[float] = (),
+        path_names: Sequence[str] = (),
         standby: Sequence[Address] = (),
         vehicle: int,
         boot_id: int,
@@ -166,6 +168,7 @@ class Client(Endpoint):
                     sockets=sockets,
                     leadership=self._servers.leadership,
                     paths=addresses,
+                    names=() if i else path_names,
                     prices=prices if len(prices) == len(addresses) else (1.0,) * len(addresses),
                     spread=scenario.link.spread,
                     timeout_ns=self._timeout_ns,

@@ -14,7 +14,16 @@ from skytether.client.leadership import Leadership
 from skytether.client.link import AGAIN_NS, ClientLink
 from skytether.shared.base.units import SECOND_NS, seconds_to_ns
 from skytether.shared.core.endpoint import PATH_SOCKETS, Address, Datagram, Events
-from skytether.shared.core.events import Failure, NoAnswer, NoSession, SessionRefused, Unanswered
+from skytether.shared.core.events import (
+    Failure,
+    NoAnswer,
+    NoSession,
+    PathDied,
+    PathHealed,
+    SessionRefused,
+    Unanswered,
+    address_text,
+)
 from skytether.shared.core.steady import JUMP_NS
 from skytether.shared.law.heartbeat import NUMBERS, RARE_TIMES, SESSION_NS, STANDBY_TIMES, Hearing
 from skytether.shared.law.terms import Terms
@@ -96,6 +105,7 @@ class ServerSession:
         sockets: number of the socket of each path.
         leadership: which server leads.
         paths: address of the server, or of the netem in front of it, on each path.
+        names: what the log calls each path; its address unless given.
         prices: price of a packet on each path.
         spread: `link.spread`.
         timeout_ns: time without a packet after which an end takes the link for lost [ns].
@@ -115,6 +125,7 @@ class ServerSession:
         sockets: Sequence[int] = PATH_SOCKETS,
         leadership: Leadership,
         paths: Sequence[Address],
+        names: Sequence[str] = (),
         prices: Sequence[float],
         spread: str,
         timeout_ns: int,
@@ -130,6 +141,7 @@ class ServerSession:
         self._vehicle = vehicle
         self._boot_id = boot_id
         self._addresses, self._prices, self._spread = paths, prices, spread
+        self._names = names or [address_text(*each) for each in paths]
         self._server, self._timeout_ns = paths[0], timeout_ns
         self.paths: Paths | None = None
         """Knowledge of the paths of the present session; None with a single path."""
@@ -401,6 +413,9 @@ class ServerSession:
             self._put(datagram, (path,))
         for path in self.paths.looks(now_ns):
             self._name(path, now_ns)
+        for path, is_dead in self.paths.turned(now_ns):
+            turned = PathDied if is_dead else PathHealed
+            self._events.append(turned(vehicle=self._vehicle, path=path, via=self._names[path]))
 
     def _name(self, path: int, now_ns: int) -> None:
         """Tell the server which path this is."""

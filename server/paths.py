@@ -1,11 +1,12 @@
 """Paths from the server to a vehicle: the proven addresses, and what is sent to each."""
 
 import hashlib
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from typing import NamedTuple
 
 from skytether.server.gate import ReplyPath
 from skytether.shared.core.endpoint import Address, Datagram
+from skytether.shared.core.events import PathDied, PathHealed, address_text
 from skytether.shared.wire.paths import Paths
 from skytether.shared.wire.protocol import PathProof, encode
 
@@ -95,6 +96,12 @@ class ServerPaths:
                 payload = encode(PathProof(vehicle, session, path, 0, self.prices))
                 due += self._put(payload, line, (path,), now_ns, is_probe=True)
         return due
+
+    def turned(self, vehicle: int, now_ns: int) -> Iterator[PathDied | PathHealed]:
+        """Paths that have died, or are well again, since the last call."""
+        for path, is_dead in self.paths.turned(now_ns):
+            via = address_text(*self._places[path].peer) if path in self._places else "unproven"
+            yield (PathDied if is_dead else PathHealed)(vehicle=vehicle, path=path, via=via)
 
     def _put(
         self,

@@ -151,6 +151,7 @@ class Ticker:
                     now_ns,
                 )
                 self._put(session.row, due, is_plan=False)
+                self._events += session.paths.turned(session.vehicle, now_ns)
         self._stopwatch.lap("encode")
         self.durations.add(self._stopwatch.total_ns - before_ns)
 

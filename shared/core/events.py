@@ -61,6 +61,26 @@ class PathFound(msgspec.Struct, frozen=True, tag=True, kw_only=True):
         return f"the path {self.path} is up"
 
 
+class PathDied(VehicleEvent, frozen=True, kw_only=True):
+    """Nothing arrives any more over one of a session's paths."""
+
+    path: int
+    """Number of the path, from 0."""
+    via: str
+    """Its interface or address."""
+
+    def __str__(self) -> str:
+        return f"vehicle {self.vehicle}: nothing arrives over path {self.path} ({self.via})"
+
+
+class PathHealed(VehicleEvent, frozen=True, kw_only=True):
+    path: int
+    via: str
+
+    def __str__(self) -> str:
+        return f"vehicle {self.vehicle}: path {self.path} ({self.via}) is well again"
+
+
 class PageServed(msgspec.Struct, frozen=True, tag=True, kw_only=True):
     address: str
     """Address for a browser; includes a token if the page may change the flight."""
@@ -612,6 +632,8 @@ Event = (
     | ChangeRefused
     | SessionOpened
     | Leaving
+    | PathDied
+    | PathHealed
     | SessionEnded
     | SessionRefused
     | ServerFull

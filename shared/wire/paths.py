@@ -75,6 +75,9 @@ TRIES_MAX = 4
 """Number of tries after which a path that brings packets and takes none is tried no more rarely."""
 DOUBT = 0.5
 """Probability that a packet does not arrive above which a path is doubted."""
+DEAD, DEAD_NS = 0.9, SECOND_NS
+"""Probability that a packet does not arrive, and time without an arrival, above which a path is
+reported as dead, until it is not even doubted."""
 PATIENCE = 3
 """Largest factor by which a path that stays down is tried more rarely."""
 ALIKE = 1.25
@@ -163,6 +166,8 @@ class PathState:
     """Number of later copies that this path brought."""
     has_brought: bool = False
     """Whether it has brought a packet since one was last sent on it."""
+    is_dead: bool = False
+    """Whether it is reported as dead."""
     tries: int = 0
     """Number of tries since the last arrival, because it had brought a packet."""
 
@@ -439,6 +444,24 @@ class Paths:
         if self._awaited and newest is not None and newest not in due and self._misses(now_ns):
             due.append(newest)
         return due
+
+    def turned(self, now_ns: int) -> list[tuple[int, bool]]:
+        """Paths that have died, or are well again, since the last call; and whether each is dead.
+
+        A path over which nothing has arrived yet is neither.
+        """
+        turned = []
+        for one, path in enumerate(self.each):
+            if path.arrived_ns is None or not (path.missing or path.is_dead):
+                continue
+            if path.is_dead:
+                is_dead = path.failure(now_ns) > DOUBT
+            else:
+                is_dead = path.failure(now_ns) > DEAD and now_ns - path.arrived_ns >= DEAD_NS
+            if is_dead != path.is_dead:
+                path.is_dead = is_dead
+                turned.append((one, is_dead))
+        return turned
 
     def _misses(self, now_ns: int) -> bool:
         """Whether to tell the other end that a packet was overtaken and has not come."""

@@ -410,3 +410,30 @@ def test_packets_that_are_always_overtaken_are_soon_awaited_for_longer() -> None
         ends.send(on=BOTH, back=True)
     assert told[0]
     assert not any(told[10:])
+
+
+def test_a_path_that_dies_and_one_that_is_well_again_are_told_once() -> None:
+    """One over which nothing has arrived yet is not, nor one that loses single packets."""
+    ends = Ends()
+    assert ends.near.turned(ends.now_ns) == []
+    told = []
+
+    def go_on(steps: int) -> None:
+        for _ in range(steps):
+            ends.now_ns += STEP_NS
+            ends.send(on=BOTH)
+            ends.send(on=BOTH, back=True)
+            told.extend(ends.near.turned(ends.now_ns))
+
+    go_on(40)
+    ends.dead = {1}
+    go_on(1)
+    ends.dead = set()
+    go_on(20)
+    assert told == []
+    ends.dead = {1}
+    go_on(40)
+    assert told == [(1, True)]
+    ends.dead = set()
+    go_on(40)
+    assert told == [(1, True), (1, False)]
