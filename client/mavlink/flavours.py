@@ -41,8 +41,8 @@ class Flavour:
     back: int
     """Number of the mode that returns home and lands there."""
     hold: int
-    own: frozenset[int]
-    """Numbers of the modes allowed between arming and following set-points."""
+    lift: int
+    """Number of the mode that a take-off command leads to."""
     steps: tuple[LaunchStep, ...]
     streams_first: bool
     """Whether the autopilot needs set-points before it enters its guided mode; set-points also
@@ -78,7 +78,7 @@ ARDUPILOT = Flavour(
     land=9,
     back=6,
     hold=17,
-    own=frozenset({4}),
+    lift=4,
     steps=(LaunchStep.GUIDE, LaunchStep.ARM, LaunchStep.LIFT, LaunchStep.CLIMB),
     streams_first=False,
     words_for_stations=False,
@@ -112,7 +112,7 @@ PX4 = Flavour(
     land=_px4(4, 6),
     back=_px4(4, 5),
     hold=_px4(4, 3),
-    own=frozenset({_px4(4, 1), _px4(4, 2), _px4(4, 3), _px4(6)}),
+    lift=_px4(4, 2),
     steps=(LaunchStep.HOLD, LaunchStep.ARM, LaunchStep.LIFT, LaunchStep.CLIMB, LaunchStep.GUIDE),
     streams_first=True,
     words_for_stations=True,

@@ -3,8 +3,9 @@
     GROUND → CLIMBING (the steps of its flavour, one after another) → FLYING → LANDING → down
 
 A step is done when the autopilot's own state says so; until then its command is repeated. A vehicle
-is armed only on the ground and only if `armed` is set in the scenario. A mode chosen by a pilot is
-not changed: once the vehicle is armed, only a mode of `Flavour.own` is replaced.
+is armed only on the ground and only if `armed` is set in the scenario. A mode chosen by somebody
+else is not changed: once the vehicle is armed, the client replaces only the mode that it has set
+itself, or that its take-off command led to. The mode that follows set-points gives it back.
 
 A vehicle that an earlier run of the client, or somebody else, has armed is not armed again before
 an operator allows it: a process restarted after a landing must not take off. A vehicle in the air
@@ -13,6 +14,7 @@ whose origin is unknown hovers until an operator gives the origin.
 
 from enum import Enum, auto
 
+from skytether.client.mavlink.condition import FRESH_NS as HEARTBEAT_MAX_NS
 from skytether.client.mavlink.condition import Condition
 from skytether.client.mavlink.flavours import Flavour, LaunchStep
 from skytether.client.positions import Positions
@@ -43,6 +45,9 @@ SILENT_MAX_NS = 10 * SECOND_NS
 """Silence of the autopilot after which the end of a landing is no longer awaited."""
 THERE_M = 0.3
 """Largest difference from the take-off altitude at which the climb is over."""
+LIFTED_M = 1.0
+"""Distance below the take-off altitude from which the autopilot may end the climb by itself: PX4
+does at NAV_MC_ALT_RAD, by default 0.8 m."""
 STILL_MPS = 0.3
 """Vertical speed below which the climb is over."""
 SET_MODE = int(dialect.MAV_CMD_DO_SET_MODE)
@@ -104,6 +109,10 @@ class Launch:
         self._asked_ns: int | None = None
         """Time at which the command of the current step was last sent."""
         self._accepted = False
+        self._own_mode: int | None = None
+        """Number of the mode that is the client's own beside the guided one; None if there is
+        none, as in flight or after somebody else has changed it."""
+        self._lift_asked = False
         self.why_not_armed = ""
         """Why an operator has to allow arming; empty if not needed."""
         self._asked_to_arm = False
@@ -166,7 +175,7 @@ class Launch:
             self.why_not_armed = "it was in the air when this client began"
             expected = f"expected it on the ground, or in {guided}"
             self._wait("not flown", f"it is in the air in {mode}; {expected}", now_ns)
-        elif condition.armed and condition.mode not in flavour.own:
+        elif condition.armed and condition.mode != flavour.guided:
             self.why_not_armed = self.why_not_armed or "it was armed by somebody else"
             expected = f"expected it disarmed, or in {guided}"
             self._wait("not flown", f"it is armed, in {mode}; {expected}", now_ns)
@@ -209,6 +218,8 @@ class Launch:
 
     def _enter(self, phase: Phase, now_ns: int) -> None:
         self.phase, self.waits_for = phase, ""
+        if phase is not Phase.LANDING:
+            self._own_mode, self._lift_asked = None, False
         self._begin_step(0, now_ns)
 
     def _begin_step(self, step: int, now_ns: int) -> None:
@@ -223,8 +234,8 @@ class Launch:
             if armed_before and not condition.armed:
                 self._fail("not taken off", self._stated_reason or "it was disarmed", now_ns)
                 return
-            begun = self._step > 0 or condition.armed
-            if begun and condition.mode not in self._flavour.own:
+            is_own = self._has_own_mode(now_ns)
+            if (self._step > 0 or condition.armed) and not is_own:
                 mode = self._flavour.mode_name(condition.mode)
                 self._fail("not taken off", f"it was taken over: it is in {mode}", now_ns)
                 return
@@ -242,7 +253,7 @@ class Launch:
         condition = self._condition
         match step:
             case LaunchStep.HOLD:
-                return condition.mode in self._flavour.own - {self._flavour.guided}
+                return condition.mode == self._flavour.hold
             case LaunchStep.GUIDE:
                 return condition.mode == self._flavour.guided
             case LaunchStep.ARM:
@@ -309,12 +320,45 @@ class Launch:
         return [self._mode_command(self._flavour.land)]
 
     def _is_ours(self, now_ns: int) -> bool:
-        """Whether the vehicle is armed and in a mode of `Flavour.own`, as far as is currently
+        """Whether the vehicle is armed and in a mode of the client, as far as is currently
         known.
         """
         condition = self._condition
-        in_ours = condition.mode in self._flavour.own and condition.armed
-        return in_ours and condition.is_fresh(now_ns=now_ns)
+        return self._has_own_mode(now_ns) and condition.armed and condition.is_fresh(now_ns=now_ns)
+
+    def _has_own_mode(self, now_ns: int) -> bool:
+        """Whether nobody else has chosen the present mode; follows the changes of mode to which the
+        client's own commands lead.
+        """
+        mode, flavour = self._condition.mode, self._flavour
+        is_high = self._positions.altitude >= self._altitude - LIFTED_M
+        if self._holds_first(mode):
+            self._own_mode = mode
+        elif self._own_mode == flavour.hold and self._lift_asked and not is_high:
+            # The mode before the command is reported until the next heartbeat.
+            if mode == flavour.lift or self._is_late_to_lift(now_ns):
+                self._own_mode = flavour.lift
+        elif self._own_mode == flavour.lift and is_high and mode == flavour.hold:
+            self._own_mode = mode
+        if mode in (self._own_mode, flavour.guided):
+            return True
+        self._own_mode = None
+        return False
+
+    def _holds_first(self, mode: int) -> bool:
+        """Whether the vehicle is in the mode that the first step waits for."""
+        if self.phase is not Phase.CLIMBING or mode != self._flavour.hold:
+            return False
+        is_asked = self._asked_ns is not None or not self._condition.armed
+        return is_asked and self._flavour.steps[self._step] is LaunchStep.HOLD
+
+    def _is_late_to_lift(self, now_ns: int) -> bool:
+        """Whether the mode of an accepted take-off should have been reported long ago."""
+        climbs = self.phase is Phase.CLIMBING and self._accepted
+        if not climbs or self._flavour.steps[self._step] is not LaunchStep.CLIMB:
+            return False
+        assert self._since_ns is not None
+        return now_ns - self._since_ns > HEARTBEAT_MAX_NS
 
     def is_down(self, *, now_ns: int) -> bool:
         """Whether the vehicle needs no more control, or is out of our control."""
@@ -325,7 +369,8 @@ class Launch:
             return False
         assert self._since_ns is not None
         lost = condition.heard_ns is None or now_ns - condition.heard_ns > SILENT_MAX_NS
-        obeys = condition.mode in (*self._flavour.own, self._flavour.land, self._landing_mode)
+        lands = condition.mode in (self._flavour.land, self._landing_mode)
+        obeys = lands or self._has_own_mode(now_ns)
         most_ns = LAND_MAX_NS if self._landing_mode == self._flavour.land else RETURN_MAX_NS
         return lost or not obeys or now_ns - self._since_ns > most_ns
 
@@ -373,6 +418,7 @@ class Launch:
             # Home was set a while ago, and the height estimate has drifted since.
             ground = self._positions.origin[2] - self._condition.home_up
             altitude += self._condition.home[2] + ground
+        self._lift_asked = True
         nan = float("nan")
         return self._long(TAKE_OFF, 0.0, 0.0, 0.0, nan, nan, nan, altitude)
 

@@ -365,6 +365,71 @@ def test_a_pilot_who_takes_over_in_the_climb_has_it(flavour: FlavourName) -> Non
     assert air.flight.mode is FlightMode.PILOT
 
 
+def operator_holds(air: Air) -> int:
+    """Let an operator choose the mode that holds; returns how often we have requested a mode."""
+    air.flight.enter(air.flight.flavour.number(FlightMode.HOLD))
+    return len(air.commands(SET_MODE))
+
+
+@pytest.mark.parametrize("altitude", [0.5, 1.2])
+def test_an_operator_who_holds_in_the_climb_has_it(flavour: FlavourName, altitude: float) -> None:
+    air = Air(flavour, mavlink={"takeoff_m": 3.0})
+    air.run(30.0, lambda: air.flight.armed and air.flight.position()[2] > altitude)
+    asked = operator_holds(air)
+    air.end(10.0)
+    assert "taken over" in why(air)[1]
+    assert len(air.commands(SET_MODE)) == asked
+    assert air.close() == 0
+    assert air.flight.mode is FlightMode.HOLD
+
+
+def test_an_operator_who_holds_as_soon_as_it_lifts_has_it() -> None:
+    """No heartbeat has told the mode that climbs."""
+    air = Air("px4", mavlink={"takeoff_m": 3.0})
+    air.run(30.0, lambda: air.flight.mode is FlightMode.TAKEOFF)
+    asked = operator_holds(air)
+    air.end(10.0)
+    assert "taken over" in why(air)[1]
+    assert len(air.commands(SET_MODE)) == asked
+    assert air.flight.mode is FlightMode.HOLD
+
+
+def test_a_climb_that_takes_too_long_lands(flavour: FlavourName) -> None:
+    air = Air(flavour, mavlink={"takeoff_m": 30.0, "patience_s": 6.0})
+    air.end(90.0)
+    assert not air.flight.armed
+    assert why(air)[0] == "not at the altitude of take-off in 6 s"
+
+
+@pytest.mark.parametrize("on_loss", ["land", "return"])
+def test_an_operator_who_holds_during_a_landing_has_it(flavour: FlavourName, on_loss: str) -> None:
+    air = flying(flavour, seconds=8.0, vehicle={"on_loss": on_loss})
+    air.world.stop("server")
+    down = FlightMode.RETURN if on_loss == "return" else FlightMode.LAND
+    air.until(lambda: air.flight.mode is down, 30.0)
+    air.run(1.2)
+    asked = operator_holds(air)
+    air.run(8.0)
+    assert len(air.commands(SET_MODE)) == asked
+    assert air.flight.mode is FlightMode.HOLD
+
+
+def test_an_operator_who_holds_before_the_end_keeps_it(flavour: FlavourName) -> None:
+    air = flying(flavour)
+    operator_holds(air)
+    air.run(8.0)
+    assert air.close() == 0
+    assert air.flight.mode is FlightMode.HOLD
+
+
+def test_an_operator_who_holds_before_the_duration_ends_keeps_it(flavour: FlavourName) -> None:
+    air = flying(flavour, duration=8.0)
+    asked = operator_holds(air)
+    air.until(lambda: air.client.finished, 15.0)
+    assert len(air.commands(SET_MODE)) == asked
+    assert air.flight.mode is FlightMode.HOLD
+
+
 def test_a_take_off_that_does_not_climb_ends_in_a_landing() -> None:
     air = Air("ardupilot", mavlink={"patience_s": 2.0})
     air.end(60.0)
