@@ -8,7 +8,7 @@ from skytether.view.recorded import Recorded, read
 
 
 def opened(path: Path) -> Recorded:
-    """Read a recording; if it has no end, print a line on stderr.
+    """Read a recording; if something of it is missing, print a line on stderr.
 
     Raises:
         CommandError: the file cannot be read.
@@ -22,4 +22,6 @@ def opened(path: Path) -> Recorded:
     if recorded.lost_bytes is not None:
         lost = f"{recorded.lost_bytes} bytes at the end are lost"
         say(f"{path}: the recording has no end, as after a killed flight: {lost}")
+    if recorded.damaged_bytes:
+        say(f"{path}: {recorded.damaged_bytes} bytes are damaged: what they held is missing")
     return recorded

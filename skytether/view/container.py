@@ -17,7 +17,7 @@ from typing import Any
 import zstandard
 from mcap.exceptions import McapError
 from mcap.records import Channel, Chunk, DataEnd, McapRecord, Message
-from mcap.stream_reader import StreamReader, breakup_chunk
+from mcap.stream_reader import CRCValidationError, StreamReader, breakup_chunk
 
 from skytether.shared.base import files
 from skytether.shared.base.errors import ConfigError, RecordingError
@@ -89,6 +89,8 @@ class Container:
         self._size = status.st_size
         self.lost_bytes = 0
         """Bytes lost at the end of a file that was not completed; valid after `messages`."""
+        self.damaged_bytes = 0
+        """Bytes of damaged records, which are left out; valid after `messages`."""
         try:
             files.note(path, self._file)
             if self._file.read(len(MAGIC)) != MAGIC:
@@ -111,10 +113,11 @@ class Container:
     def messages(self) -> Iterator[tuple[str, bytes]]:
         """Topics and contents of messages in the encoding that is read back, in file order.
 
-        A file that was not completed is read up to the first record that is not whole.
+        A file that was not completed is read up to the first record that is not whole. Of a
+        completed one damaged chunks are left out, and everything after a damaged length.
 
         Raises:
-            BROKEN: a completed file is damaged.
+            BROKEN: the file holds what no flight writes.
         """
         self._file.seek(0)
         whole_bytes = len(MAGIC)
@@ -128,17 +131,25 @@ class Container:
                     case Channel(message_encoding=encoding):
                         topics[record.id] = record.topic if encoding == ENCODING else ""
                     case Message(channel_id=number) if number not in topics:
-                        raise ValueError(f"a message before its channel {number}")
+                        if not self.damaged_bytes:
+                            raise ValueError(f"a message before its channel {number}")
+                        self.damaged_bytes += len(record.data)
                     case Message(channel_id=number) if topic := topics[number]:
                         messages_left -= 1
                         if messages_left < 0:
                             raise ValueError("it has more messages than fit into its size")
                         yield topic, record.data
                 whole_bytes = self._file.tell()
-        except BROKEN:
-            if self.is_whole:
+        except CRCValidationError:  # of all data: what is read of it has checksums of its own
+            self.damaged_bytes = max(self.damaged_bytes, 1)
+        except BROKEN as error:
+            lost_bytes = self._size - whole_bytes
+            if not self.is_whole:
+                self.lost_bytes = lost_bytes
+            elif isinstance(error, McapError):
+                self.damaged_bytes += lost_bytes
+            else:
                 raise
-            self.lost_bytes = self._size - whole_bytes
 
     def _unpacked(self) -> Iterator[McapRecord]:
         left_bytes = SPARE_BYTES + RATIO_MAX * self._size
@@ -159,4 +170,9 @@ class Container:
             packed = zstandard.frame_content_size if record.compression else len
             if packed(record.data) not in {-1, size}:
                 raise ValueError("a chunk's content has another size than it says")
-            yield from breakup_chunk(record, validate_crc=True)
+            try:
+                records = breakup_chunk(record, validate_crc=True)
+            except (CRCValidationError, zstandard.ZstdError):
+                self.damaged_bytes += len(record.data)
+            else:
+                yield from records

@@ -50,6 +50,8 @@ class Recorded:
     """Time of each row of `parts`, counted from the first frame [ns]."""
     lost_bytes: int | None
     """Bytes lost at the end of a file that was not completed; None for a completed one."""
+    damaged_bytes: int = 0
+    """Bytes of damaged records of a completed file, which are left out."""
 
     @cached_property
     def summary(self) -> Summary | None:
@@ -92,11 +94,12 @@ def summary_of(
 
 
 def read(path: Path) -> Recorded:
-    """Recording in a file; if its writer was killed, everything up to the last whole record.
+    """Recording in a file; if its writer was killed, everything up to the last whole record, and of
+    a damaged one everything but the damaged records.
 
     Raises:
         OSError: the file cannot be read.
-        RecordingError: the file is not a recording, or is damaged.
+        RecordingError: the file is not a recording, or its first record is damaged.
     """
     with closing(Container(path)) as file, reading(path):
         messages = file.messages()
@@ -111,9 +114,14 @@ def read(path: Path) -> Recorded:
         frames = _Frames(scenario)
         for topic, data in messages:
             if topic.startswith(FEED):
-                frames.add(topic.removeprefix(FEED), feed.unpack(data))
+                process, frame = topic.removeprefix(FEED), feed.unpack(data)
+                if file.damaged_bytes and not frames.knows(process, frame):
+                    file.damaged_bytes += len(data)
+                else:
+                    frames.add(process, frame)
         lost_bytes = None if file.is_whole else file.lost_bytes
-        return Recorded(path, begun.about, scenario, *frames.together(), lost_bytes)
+        together = frames.together()
+        return Recorded(path, begun.about, scenario, *together, lost_bytes, file.damaged_bytes)
 
 
 class _Frames:
@@ -130,6 +138,10 @@ class _Frames:
         self._begun_ns: dict[str, int] = {}
         self._rows: dict[str, list[tuple[int, Table]]] = {}
         """Time [ns] and rows of each frame with rows of a part, by the part's name."""
+
+    def knows(self, process: str, frame: Frame) -> bool:
+        """Whether the columns of a frame's rows have come."""
+        return not isinstance(frame, Rows) or (process, frame.part) in self._columns
 
     def add(self, process: str, frame: Frame) -> None:
         """Add a frame.

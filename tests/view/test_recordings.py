@@ -440,10 +440,9 @@ def believed(file: Path, at: int, by: int, path: Path) -> int:
         back = read(path)
     except RecordingError:
         return 0
-    undamaged = frames_in(file)
-    assert back.frames == undamaged[: len(back.frames)]
-    if file.name == "chunked.mcap" and back.lost_bytes is None:
-        assert len(back.frames) == len(undamaged)  # in the index, which is for other programs
+    rest = iter(frames_in(file))
+    assert all(frame in rest for frame in back.frames)  # in their order
+    assert back.damaged_bytes or back.lost_bytes is not None or next(rest, None) is None
     return len(back.frames)
 
 
@@ -453,17 +452,23 @@ def frames_in(file: Path) -> list[Timed]:
 
 
 def test_a_damaged_byte_is_never_believed(chunked: Path, torn: Path, tmp_path: Path) -> None:
-    """A complete file is refused; of one without an end, the part before the byte is read."""
+    """What is not damaged is read."""
     path = tmp_path / "damaged.mcap"
     assert believed(torn, 3, 8, path) == 0
     chunks = [each for each in pairwise(ends(torn)) if each[0][1] < each[1][1]]
     for (before, count), (after, whole) in (chunks[1], chunks[-1]):
         for at in (before + 1, before + 9, before + 33, before + 60):
             # Its length, and times that nobody reads.
-            assert believed(torn, at, 1 << at % 8, path) in (count, whole, len(frames_in(torn)))
-        assert believed(torn, (before + after) // 2, 1, path) == count
-    for share in (0.1, 0.3, 0.5, 0.7):
-        assert believed(chunked, round(share * chunked.stat().st_size), 8, path) == 0
+            assert believed(torn, at, 1 << at % 8, path) >= count
+        left = believed(torn, (before + after) // 2, 1, path)
+        # The second chunk has the columns of the client's rows.
+        most = len(frames_in(torn)) - (whole - count)
+        assert count < left < most if before == chunks[1][0][0] else left == most
+    found = [
+        believed(chunked, round(share * chunked.stat().st_size), 8, path)
+        for share in (0.1, 0.3, 0.5, 0.7)
+    ]
+    assert min(found[1:]) >= len(frames_in(chunked)) - 200
     for at in (-9, -60):
         believed(chunked, at, 8, path)
 
@@ -490,8 +495,8 @@ def test_without_its_checksum_a_changed_number_would_be_believed(
     changed = flown().client[7:8].copy()
     changed["step"] = 9
     path.write_bytes(path.read_bytes().replace(row, changed.tobytes(), 1))
-    with pytest.raises(RecordingError, match=r"it\.mcap: it is damaged: crc"):
-        read(path)
+    assert read(path).damaged_bytes > len(row)
+    assert recorded_steps(path) == []
     monkeypatch.setattr(container, "breakup_chunk", lambda chunk, **_: breakup_chunk(chunk))
     monkeypatch.setattr(
         container, "StreamReader", lambda file, **_: StreamReader(file, emit_chunks=True)
