@@ -140,6 +140,10 @@ class Condition:
         )
 
     @property
+    def is_on_ground(self) -> bool:
+        return self.landed == dialect.MAV_LANDED_STATE_ON_GROUND
+
+    @property
     def is_flying(self) -> bool:
         return self.armed and self.landed == dialect.MAV_LANDED_STATE_IN_AIR
 

@@ -45,6 +45,8 @@ class Hindrances:
         self.rivals, self._obedience = Rivals(), Obedience(scenario)
         self._yields = False
         """Whether a second commander flies the vehicle, so that nothing is sent."""
+        self._is_taken = False
+        """Whether somebody else flies the vehicle, or has landed it and not lifted it since."""
         self._was_disarmed = False
         """Whether the vehicle was disarmed since it flew, so that it is not flown again."""
         self._reported_ns: dict[Reason, int] = {}
@@ -53,10 +55,8 @@ class Hindrances:
 
     @property
     def bar_setpoints(self) -> bool:
-        """Whether no set-point may be sent: the vehicle was disarmed, or a second commander flies
-        it.
-        """
-        return self._was_disarmed or self._yields
+        """Whether no set-point may be sent: the vehicle was disarmed, or somebody else flies it."""
+        return self._was_disarmed or self._yields or self._is_taken
 
     def command(self, velocity: Vector, *, now_ns: int) -> None:
         """Compare the vehicle's velocity with its commands; `velocity` is commanded from now on, in
@@ -77,7 +77,8 @@ class Hindrances:
             self._was_disarmed = True
             return Reason.DISARMED
         self._yields = False
-        if condition.mode != guided:
+        self._is_taken = condition.mode != guided or (self._is_taken and condition.is_on_ground)
+        if self._is_taken:
             self._obedience.begin()
             return Reason.TAKEN
         if rival := self._rival(now_ns):

@@ -129,6 +129,9 @@ def altitude(scenario: Scenario, number: int = 1) -> float:
         return PLANE_ALTITUDE_M
     start = float(scenario.unallocated_reference(number)(np.zeros(()))[2, 0])
     if start < ALTITUDE_MIN_M:
-        expected = f"a desired trajectory that begins {ALTITUDE_MIN_M:g} m or more above the ground"
+        expected = (
+            f"a desired trajectory that begins {ALTITUDE_MIN_M:g} m or more above the ground, or "
+            f"the altitude of take-off: --mavlink.takeoff-m {PLANE_ALTITUDE_M:g}"
+        )
         raise ConfigError(f"mavlink.takeoff_m: got 'auto' at altitude {start:g} m, {expected}")
     return start

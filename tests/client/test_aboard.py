@@ -439,7 +439,8 @@ def test_a_take_off_that_does_not_climb_ends_in_a_landing() -> None:
 
 def test_the_flight_must_not_begin_on_the_ground() -> None:
     """In space the altitude of take-off is that of the reference, unless given."""
-    with pytest.raises(ConfigError, match=r"mavlink.takeoff_m: got 'auto' at altitude 0 m"):
+    said = r"mavlink.takeoff_m: got 'auto' at altitude 0 m.* --mavlink.takeoff-m"
+    with pytest.raises(ConfigError, match=said):
         vehicles.make(scenario(reference={"altitude_m": 0.0}), 1)
     vehicles.make(scenario(reference={"altitude_m": 0.0}, mavlink={"takeoff_m": 1.0}), 1)
 
@@ -478,6 +479,24 @@ def test_a_pilot_wins_at_once_and_whoever_is_given_back_hovers_and_flies_on() ->
     assert ("hover", str(Reason.RETURNED)) in modes(air)
     assert air.setpoints(back_ns)
     assert air.mode in (Mode.HOVER, Mode.TRACK)
+
+
+def test_what_its_pilot_has_landed_follows_no_plan_on_the_ground() -> None:
+    """Still armed, and given back in GUIDED; once the pilot has lifted it, it flies on."""
+    air = flying("ardupilot")
+    air.flight.enter(air.flight.flavour.number(FlightMode.LAND))
+    air.until(lambda: not air.flight.flying, 30.0)
+    air.take_over()
+    air.run(1.5)
+    assert air.flight.armed
+    air.flight.enter(air.flight.flavour.number(FlightMode.GUIDED))
+    back_ns = air.world.now_ns
+    air.run(4.0)
+    assert air.flight.armed
+    assert air.mode is Mode.MANUAL
+    assert not air.setpoints(back_ns)
+    air.flight.take_off(2.0)
+    air.until(lambda: air.mode is Mode.TRACK, 15.0)
 
 
 def test_a_disarmed_vehicle_is_never_flown_again() -> None:
