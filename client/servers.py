@@ -67,8 +67,9 @@ class Servers:
         """Number of the leadership that was last reported."""
         self._now_ns = NEVER_NS
         self._named_ns: int | None = None
-        """Time from which the silence of the leader counts at most: a server that did not lead
-        speaks rarely. None before the first wake."""
+        """Time from which the silence of the leader counts at most: a server that did not lead,
+        or leads a vehicle on the ground, speaks rarely. None before the first wake."""
+        self._was_on_ground = False
         self._doubted_ns = NEVER_NS
         """When the leader that is, or was last, doubted had been heard last."""
 
@@ -91,8 +92,9 @@ class Servers:
         if not self.are_told:
             return
         lead, self._now_ns = self.leadership, now_ns
-        if self._named_ns is None:
+        if self._named_ns is None or (self._was_on_ground and not on_ground):
             self._named_ns = now_ns
+        self._was_on_ground = on_ground
         heard_ns = [NEVER_NS if each.heard_ns is None else each.heard_ns for each in self.sessions]
         useful_ns = self.leading.useful_ns
         leader_ns = max(NEVER_NS if useful_ns is None else useful_ns, self._named_ns)

@@ -259,6 +259,35 @@ def test_a_vehicle_that_waits_on_the_ground_keeps_its_leader() -> None:
     assert vehicle.client.vehicle_figures()["leadership"]["number"] == 0
 
 
+def test_the_silence_of_the_ground_does_not_count_in_flight() -> None:
+    """On the ground the leader speaks rarely: it has three quarters of a time-out from the first
+    step, and after them another leads.
+    """
+    scenario = packaged("demo")
+    flies, may_fly = simulated(scenario, 1), [False]
+    flies.take_off = lambda *, now_ns: may_fly[0]  # type: ignore[method-assign] # noqa: ARG005
+    vehicle = Vehicle(scenario, flies=flies)
+
+    def number(seconds: float) -> int:
+        end_ns = vehicle.now_ns + seconds_to_ns(seconds)
+        while vehicle.now_ns < end_ns:
+            vehicle.step()
+            if vehicle.told(1, Lead):
+                vehicle.answer(1)
+            vehicle.beat(1)
+        return int(vehicle.client.vehicle_figures()["leadership"]["number"])
+
+    vehicle.step(0.3)
+    for server in (0, 1):
+        vehicle.answer(server)
+        vehicle.beat(server)
+    assert number(3.0) == 0
+    may_fly[0] = True
+    assert number(1.0) == 0
+    assert vehicle.client._pilot.step
+    assert number(1.0) == 1
+
+
 def test_a_vehicle_that_has_no_standby_any_more_is_led_by_its_server() -> None:
     """The server may know that another led; it is told a larger number."""
     vehicle = Vehicle(packaged("paper-every-step"), SavedState(leadership=3), has_standby=False)
