@@ -100,7 +100,13 @@ class Compensator:
         return True
 
     def go_on_along(
-        self, made_for: int, observed: int, spacing: int, knots: NDArray[np.float32]
+        self,
+        made_for: int,
+        observed: int,
+        spacing: int,
+        knots: NDArray[np.float32],
+        *,
+        since: int | None = None,
     ) -> None:
         """Put a spline in force: a new one, or one that an earlier run of this client accepted.
 
@@ -109,8 +115,11 @@ class Compensator:
             observed: step of the observation that the spline was planned from.
             spacing: steps from one knot to the next.
             knots: position [m] and velocity [m/s] of each knot; shape (axes, knots, 2).
+            since: first step whose input came from it, in the earlier run.
         """
         self._put_in_force(made_for, observed)
+        if since is not None:
+            self.since, self._new = since, False
         length = lasting(self._age_max + self._H, made_for, observed, self._age_max)
         if self._join:
             # A mission's motion is flown to its last knot, however old its observation is by then:
@@ -186,6 +195,10 @@ class Compensator:
             step - self.begins, state, disturbance, before
         ).tolist()
         return flown, without_feedback
+
+    def flown_since(self, step: int) -> int:
+        """First step whose input comes from the horizon in force, if `step` is the next one."""
+        return step if self._new else self.since
 
     def _covers(self, step: int) -> bool:
         return self.in_force != NO_HORIZON and step - self.begins < self.follower.length

@@ -269,7 +269,9 @@ class Client(Endpoint):
         is_new = before.began_ns is None or flies.took_off
         if (motion := before.motion) and not is_new:
             knots = motion.knots(self._axes)
-            self._pilot.compensator.go_on_along(motion.step, motion.observed, motion.spacing, knots)
+            self._pilot.compensator.go_on_along(
+                motion.step, motion.observed, motion.spacing, knots, since=motion.since
+            )
         self._pilot.begin(now_ns=now_ns, began_ns=before.began_ns)
         if is_new:
             self._events.append(Flying(vehicle=self.vehicle))
@@ -309,6 +311,7 @@ class Client(Endpoint):
         return FlownMotion(
             step=compensator.in_force,
             observed=compensator.observed,
+            since=compensator.flown_since(self._pilot.step),
             spacing=flown.spacing,
             numbers=flown.sent.tobytes(),
         )

@@ -39,6 +39,8 @@ Step = Annotated[int, msgspec.Meta(ge=0, lt=STEP_MAX)]
 class FlownMotion(msgspec.Struct, frozen=True, kw_only=True):
     step: Step
     observed: Step
+    since: Step = 0
+    """First step whose input came from it."""
     spacing: Annotated[int, msgspec.Meta(ge=1, le=2**16)]
     numbers: Annotated[bytes, msgspec.Meta(max_length=4 * 3 * 2 * KNOTS_MAX)]
     """Position [m] and velocity [m/s] of each knot, float32 of shape (axes, knots, 2)."""
