@@ -34,6 +34,8 @@ class Timesync:
 
     def hear(self, message: Message, *, now_ns: int) -> bool:
         """Process an answer; returns whether it shows that the autopilot has restarted."""
+        if message.tc1 == 0:  # a request of the autopilot: PX4 sends ten a second
+            return False
         clock = self._clock
         self.untimely += not clock.hear(message.tc1, message.ts1, now_ns=now_ns)
         if clock.jumps == self._jumps or clock.rate_fault:

@@ -158,6 +158,19 @@ def test_a_lossy_link_is_no_silence_on_the_ground() -> None:
     assert not air.of(ServerSilent)
 
 
+def test_an_autopilot_that_asks_for_our_time_is_no_untimely_answer(aloft: Air) -> None:
+    """PX4 asks ten times a second."""
+    before = aloft.figures()["dropped"]["untimely"]
+    for stamp_ns in range(1, 11):
+        request = dialect.MAVLink_timesync_message(0, stamp_ns)
+        aloft.tap.extra.append(Codec(1, 1).encode(request))
+        aloft.run(0.1)
+    assert aloft.figures()["dropped"]["untimely"] == before
+    aloft.tap.extra.append(Codec(1, 1).encode(dialect.MAVLink_timesync_message(7, 7)))
+    aloft.run(0.1)
+    assert aloft.figures()["dropped"]["untimely"] == before + 1
+
+
 def test_an_autopilot_that_answers_timesync_no_more_is_told_once(aloft: Air) -> None:
     air = aloft
     air.tap.alter = lambda message: b"" if message.get_type() == "TIMESYNC" else None
