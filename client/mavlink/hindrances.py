@@ -66,7 +66,7 @@ class Hindrances:
         if came_ns is not None and now_ns - came_ns <= FRESH_NS:
             self._obedience.step(velocity, self._positions.velocity, now_ns=now_ns)
         else:
-            self._obedience.begin()
+            self._obedience.pause()
 
     def reason(self, guided: int, *, now_ns: int) -> Reason | None:
         """Reason that forbids following a plan now; `guided` is the number of the mode that follows
@@ -99,7 +99,7 @@ class Hindrances:
             event = SecondCommander(
                 vehicle=self._vehicle, system=system, component=component, said=content
             )
-        elif self._obedience.strays(now_ns=now_ns):
+        elif self._obedience.strays:
             cause = Reason.STRAYED
             event = Strays(vehicle=self._vehicle, off_mps=self._obedience.off_mps)
         else:

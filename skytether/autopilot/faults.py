@@ -61,6 +61,8 @@ class Script:
         self._waiting = sorted(faults, key=lambda fault: fault.from_ns)
         self._lasting: list[ScriptedFault] = []
         self._commands = False
+        self.commanded = COMMANDED
+        """Velocity that the second commander sends [m/s]."""
         self.silent = False
 
     def play(self, flight: PilotedVehicle) -> None:
@@ -73,7 +75,7 @@ class Script:
             if fault.until_ns is not None:
                 self._lasting.append(fault)
         if self._commands and flight.now_ns % COMMANDED_NS == 0:
-            flight.want(COMMANDED, None)
+            flight.want(self.commanded, None)
         for fault in list(self._lasting):
             if fault.until_ns is not None and fault.until_ns <= past_ns:
                 self._lasting.remove(fault)

@@ -5,15 +5,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from airborne import SECOND, Air, flying, modes
+from airborne import SECOND, Air, flying, modes, scenario
 from bench.autopilots import MODELS
 from skytether.autopilot.faults import COMMANDED
 from skytether.autopilot.flavours import FlavourName
+from skytether.autopilot.flight import Vector
+from skytether.client.mavlink.obedience import Obedience
 from skytether.client.mavlink.rivals import QUIET_NS, Rivals
 from skytether.mavlink.codec import Codec, Message
 from skytether.mavlink.dialect import dialect
 from skytether.shared.core.aboard import SecondCommander, Strays
-from skytether.shared.telemetry.record import Reason
+from skytether.shared.telemetry.record import Reason, parse
 from skytether.shared.wire.protocol import Mode
 
 FENCE = {"low_m": [-8.0, -8.0, 0.5], "high_m": [8.0, 8.0, 9.0]}
@@ -70,6 +72,59 @@ def test_a_commander_that_nobody_sees_is_noticed_and_the_vehicle_lands() -> None
     assert modes(air)[-1] == ("land", str(Reason.STRAYED))
     air.lands()
     assert np.linalg.norm(np.array(air.flight.position())[:2] - began[:2]) < 12.0
+
+
+@pytest.mark.parametrize("commanded", [(0.4, 0.0, 0.0), (0.7, 0.0, 0.0), (0.0, 1.0, 0.0)])
+def test_a_slow_commander_is_noticed_and_the_fence_holds(
+    flavour: FlavourName, commanded: Vector
+) -> None:
+    """Once noticed, the vehicle is not flown again: it lands, within its fence."""
+    air = tracking(flavour)
+    air.autopilot.script.commanded, air.autopilot.script._commands = commanded, True
+    air.until(lambda: air.mode is Mode.LAND, 8.0)
+    assert modes(air)[-1] == ("land", str(Reason.STRAYED))
+    noticed = modes(air).index(("brake", str(Reason.STRAYED)))
+    assert "track" not in [after for after, _ in modes(air)[noticed:]]
+    air.lands()
+    places = parse(air.truth.getvalue())["state"][:, :2, 0]
+    assert np.abs(places).max() < 8.0
+
+
+def test_a_vehicle_that_is_commanded_to_stand_and_moves_lands(flavour: FlavourName) -> None:
+    air = tracking(flavour, vehicle={"land_after_s": 60.0})
+    air.world.stop("server")
+    air.until(lambda: air.mode is Mode.HOVER, 10.0)
+    air.run(3.0)
+    air.autopilot.script.commanded, air.autopilot.script._commands = (1.0, 0.0, 0.0), True
+    air.until(lambda: air.mode is Mode.LAND, 8.0)
+    assert modes(air)[-1] == ("land", str(Reason.STRAYED))
+
+
+def test_who_disobeys_twice_within_a_minute_is_obedient_no_more() -> None:
+    """Until somebody else has flown it."""
+    obedience = Obedience(scenario(model=SLOW, fence=FENCE))
+    now_ns = 0
+
+    def fly(north_mps: float, seconds: float) -> bool:
+        nonlocal now_ns
+        for _ in range(round(seconds / 0.05)):
+            now_ns += SECOND // 20
+            obedience.step((0.0, 0.0, 0.0), (north_mps, 0.0, 0.0), now_ns=now_ns)
+        return obedience.strays
+
+    assert not fly(0.0, 1.0)
+    assert fly(3.0, 1.0)
+    assert fly(0.35, 3.0)
+    assert not fly(0.0, 2.0)
+    assert fly(3.0, 1.0)
+    obedience.pause()
+    assert fly(0.0, 100.0)
+    obedience.begin()
+    assert not fly(0.0, 1.0)
+    assert fly(3.0, 1.0)
+    assert not fly(0.0, 61.0)
+    assert fly(3.0, 1.0)
+    assert not fly(0.0, 1.0)
 
 
 WEATHER: dict[str, dict[str, Any]] = {
