@@ -102,6 +102,20 @@ def test_a_motion_that_is_too_near_already_comes_no_nearer_within_the_error_of_i
         assert too_near(PossibleMotion(motion), turns, 1, 0, there, 1.2)[0] == is_hit
 
 
+def test_vehicles_that_pass_where_two_pieces_meet_are_seen() -> None:
+    """At 12 m/s against each other they are 0.85 m apart then, and 1.1 m in the pieces' middles."""
+    one = along([-13.5, 0.85], [6.0, 0.0])
+    other = along([13.5, 0.0], [-6.0, 0.0])
+    assert is_too_near(one, other, 0.9)
+
+
+def test_a_motion_of_which_only_the_bound_is_near_passes_under_none_that_begins_to_land() -> None:
+    """It is below as the other begins to land; 0.1 s later, when that counts, 0.75 m further on."""
+    under, there = along([-13.5, 0.0, 2.0], [6.0, 0.0, 0.0]), PossibleMotions(np.ones(3), DT_S)
+    there.add(1, PossibleMotion(resting(0, np.array([0.0, 0.0, 6.0])), 51))
+    assert too_near(PossibleMotion(under), under, 0, 0, there, 0.9)[0]
+
+
 @pytest.mark.parametrize(
     ("middle", "twist", "distance_m"),
     [
