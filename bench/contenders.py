@@ -20,6 +20,7 @@ README = (
     "paper-event",
     "feedback-periodic",
     "feedback-gap",
+    "trajectory-periodic",
     "trajectory-expected",
 )
 RUNS, SCOUTS, ROUNDS = 30, 8, 3

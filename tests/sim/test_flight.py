@@ -100,6 +100,20 @@ def test_a_flight_that_is_over_before_it_has_settled_has_an_error() -> None:
 HORIZONS = "uplink horizons, other packets"
 
 
+@pytest.mark.parametrize(
+    ("trigger", "least", "most"),
+    [
+        ("periodic(10)", 0.0, 0.0),
+        ("state_gap(3.6, 1.5)", 0.9, 1.0),
+        ("state_gap(3.6, 1.5) | silence(0.2)", 0.1, 0.8),
+    ],
+)
+def test_horizons_are_counted_by_what_sent_them(trigger: str, least: float, most: float) -> None:
+    flown = packaged("paper", duration=20.0, control={"trigger": trigger})
+    result = summary(flown, fly(flown))
+    assert least <= result.uplink_above / result.uplink_horizons <= most
+
+
 def test_the_summary_counts_what_the_network_saw() -> None:
     flown = packaged("paper", duration=20.0)
     flight = fly(flown)
