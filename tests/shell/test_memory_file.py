@@ -237,6 +237,32 @@ def test_on_a_full_disk_the_file_is_removed_if_the_endpoint_waits_for_it(
     kept.close()
 
 
+def test_what_is_written_between_two_failures_is_removed_too(
+    path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The endpoint has been told that the next run finds nothing, and tells newer states since."""
+    kept, endpoint, replacing = MemoryFile(path, IDENTITY, SECRET), Keeps(), files.replacing
+    begun(kept, endpoint, monkeypatch)
+    fails = [True, False, True]
+
+    def now_and_then(*given: Any, **how: Any) -> Any:
+        kept.look()  # a newer state is wanted by then
+        if not fails or fails.pop(0):
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return replacing(*given, **how)
+
+    monkeypatch.setattr(files, "replacing", now_and_then)
+    endpoint.wanted += [b"one", b"two", b"three", b"four"]
+    kept.look()
+    endpoint.waits_for_disk = True
+    work(kept)
+    endpoint.waits_for_disk = False
+    work(kept)
+    assert not fails
+    assert not path.exists()
+    kept.close()
+
+
 @pytest.mark.realtime
 async def test_a_thread_writes_and_tries_again(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(memory, "AGAIN_S", 0.01)
