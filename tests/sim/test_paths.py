@@ -12,7 +12,7 @@ from skytether.client.endpoint import Client
 from skytether.netem.fate import Fates
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.core.endpoint import Address
-from skytether.shared.core.events import FlowOpened
+from skytether.shared.core.events import FlowOpened, PathDied, PathHealed
 from skytether.shared.scenario.air.draws import SLOT_NS
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import DOWNLINK, UPLINK, Record
@@ -134,3 +134,19 @@ def test_the_demo_with_two_links_flies_over_both() -> None:
     record = fly(packaged("demo-two-links", duration=10.0, settle=0.0))
     assert np.unique(record.netem["path"]).tolist() == [0, 1]
     assert record.client["covered"][-1]
+
+
+def test_both_ends_say_when_a_path_dies_and_is_well_again_and_which_it_is() -> None:
+    told = [each for each in fly(packaged("demo-two-links", duration=12.0)).events]
+    for process, via in (
+        ("client", {"netem 1:0", "netem 1/2:0"}),
+        ("server", {"netem 1:1", "netem 1/2:1"}),
+    ):
+        for kind in (PathDied, PathHealed):
+            found = [
+                each.event
+                for each in told
+                if isinstance(each.event, kind) and each.process == process
+            ]
+            assert found
+            assert {each.via for each in found} <= via
