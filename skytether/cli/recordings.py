@@ -23,7 +23,6 @@ def opened(path: Path) -> Recorded:
         lost = f"{recorded.lost_bytes} bytes at the end are lost"
         say(f"{path}: the recording has no end, as after a killed flight: {lost}")
     if recorded.damaged_bytes:
-        say(
-            f"{path}: it is damaged, by {recorded.damaged_bytes} B at most: what they held is missing"
-        )
+        missing = f"at most {recorded.damaged_bytes} B of it are missing"
+        say(f"{path}: it is damaged, and {missing}")
     return recorded

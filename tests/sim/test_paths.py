@@ -137,7 +137,7 @@ def test_the_demo_with_two_links_flies_over_both() -> None:
 
 
 def test_both_ends_say_when_a_path_dies_and_is_well_again_and_which_it_is() -> None:
-    told = [each for each in fly(packaged("demo-two-links", duration=12.0)).events]
+    told = fly(packaged("demo-two-links", duration=12.0)).events
     for process, via in (
         ("client", {"netem 1:0", "netem 1/2:0"}),
         ("server", {"netem 1:1", "netem 1/2:1"}),
