@@ -376,7 +376,7 @@ def test_a_sweep_flies_every_combination() -> None:
     keys = {"control.trigger": "cost_gap", "network.uplink.loss": 0.5}
     assert last.scenario == load("demo", seed=3, **SHORT, **keys)
     alone = fly("demo", seed=4, **SHORT, **keys).summary
-    assert last.runs[1] == msgspec.structs.replace(alone, drops=None)
+    assert last.runs[1] == msgspec.structs.replace(alone, drops=None, plugin_errors=None)
     one, other = (run.rmse_xy for run in last.runs)
     assert one is not None
     assert other is not None
