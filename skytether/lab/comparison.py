@@ -134,7 +134,7 @@ def compared(
 
 def ratio(ours: ContenderRuns, theirs: ContenderRuns) -> tuple[float, float, float] | None:
     """Ratio of the mean RMSE xy of our contender to that of the other, and its 95 % interval, see
-    `jackknife`.
+    `jackknife`; computed for the logarithm, because a ratio is positive.
 
     None if fewer than two seeds have flown in both.
     """
@@ -145,8 +145,10 @@ def ratio(ours: ContenderRuns, theirs: ContenderRuns) -> tuple[float, float, flo
     ]
     if len(errors) < 2:
         return None
-    value, half = jackknife(lambda pairs: float(np.divide(*pairs.mean(axis=0))), np.array(errors))
-    return value, value - half, value + half
+    value, half = jackknife(
+        lambda pairs: float(np.log(np.divide(*pairs.mean(axis=0)))), np.array(errors)
+    )
+    return math.exp(value), math.exp(value - half), math.exp(value + half)
 
 
 @dataclass(frozen=True, slots=True)
@@ -197,10 +199,17 @@ def draw(results: Sequence[ComparedCase]) -> Drawn:
     own = [each for each in results if not each.case.weights]
     judged = [found for claim in CLAIMS for each in results if (found := judge(claim, each))]
     asked = [each.holds for each in judged if each.holds is not None]
-    verdict = (
-        f"{sum(asked)} of the {len(asked)} claimed ratios hold with the whole of their 95 % "
-        "interval."
-    )
+    flights = min((len(each.ours.runs) for each in judged), default=0)
+    if flights < FLIGHTS_MIN:
+        verdict = (
+            f"A first look: {flights} flights of each contender tell little. The claimed ratios "
+            f"are judged from {FLIGHTS_MIN} flights on."
+        )
+    else:
+        verdict = (
+            f"{sum(asked)} of the {len(asked)} claimed ratios hold with the whole of their 95 % "
+            "interval."
+        )
     tables = [
         budgets_table(results),
         leaders_table(results),
@@ -210,6 +219,8 @@ def draw(results: Sequence[ComparedCase]) -> Drawn:
     return Drawn(TITLE, ABOUT, tables, list(map(curves, results)), verdict)
 
 
+FLIGHTS_MIN = 10
+"""Number of flights from which on claimed ratios are judged."""
 TITLES = {each.name: each.title for each in CONTENDERS}
 CASE_TITLES = {each.name: each.title for each in CASES}
 TITLE = "Schemes and triggers compared"
@@ -239,13 +250,15 @@ def budgets_table(results: Sequence[ComparedCase]) -> Table:
                     as_text(value, ".4f") for value in (*runs.estimate(RMSE), runs.median())
                 )
                 text = f"{mean} ± {half} ({median}) @ {as_text(runs.mean(PACKETS), '.1f')}"
+                text += "!" if runs.mean(PACKETS) > budget else ""
                 cells.append(f"{text} *" if runs in best[budget] else text)
             lines.append((each.case.title, contender.title, *cells))
     says = (
         "Mean RMSE xy [m] with its 95 % interval, and median, @ packets a second. Within a budget "
         "each contender flies at the threshold and with the reporting policy that had the smallest "
         "error on other seeds. * marks the smallest mean, and means that do not differ from it "
-        "significantly: the interval of their ratio on the same seeds contains 1. – means that no "
+        "significantly: the interval of their ratio on the same seeds contains 1. ! marks what has "
+        "sent more than the budget, which was kept on the other seeds. – means that no "
         "flown setting was within the budget and the case's limit on effort. The CSV has bytes and "
         "all other figures."
     )
@@ -283,26 +296,29 @@ def leaders_table(results: Sequence[ComparedCase]) -> Table:
     titles = {one.name: one.title for each in results for one in each.contenders}
     for each in results:
         for budget in BUDGETS:
-            ours = each.bought.get((OURS, budget))
-            others = [
-                runs
-                for runs in _ranked(each, budget)
-                if runs is not ours and runs.what.contender is not ABOARD
-            ]
-            if ours is not None and others:
-                other = {
-                    "best_other": others[0].what.contender.name,
-                    "rmse_xy_other": others[0].mean(RMSE),
-                }
-                about = {"case": each.case.name, "budget": budget, "rmse_xy": ours.mean(RMSE)}
-                rows.append(about | other | _ratio_row(ratio(ours, others[0])))
+            for name in (OURS, *(one.name for one in each.contenders if one.keys)):
+                ours = each.bought.get((name, budget))
+                others = [
+                    runs
+                    for runs in _ranked(each, budget)
+                    if runs is not ours and runs.what.contender is not ABOARD
+                ]
+                if ours is not None and others:
+                    other = {
+                        "best_other": others[0].what.contender.name,
+                        "rmse_xy_other": others[0].mean(RMSE),
+                    }
+                    about = {"case": each.case.name, "budget": budget, "contender": name}
+                    about |= {"rmse_xy": ours.mean(RMSE)}
+                    rows.append(about | other | _ratio_row(ratio(ours, others[0])))
     says = (
-        f"Mean RMSE xy of “{TITLES[OURS]}” divided by that of the best other contender within the "
-        "same budget, with its 95 % interval."
+        f"Mean RMSE xy of “{TITLES[OURS]}”, and of each contender of your own, divided by that of "
+        "the best other contender within the same budget, with its 95 % interval."
     )
     shown: dict[str, Cell] = {
         "case": lambda row: CASE_TITLES[row["case"]],
         "budget": lambda row: f"≤ {row['budget']:g}/s",
+        "contender": lambda row: titles[row["contender"]],
         "RMSE xy [m]": ("rmse_xy", ".4f"),
         "best of the others": lambda row: titles[row["best_other"]],
         "its RMSE xy [m]": ("rmse_xy_other", ".4f"),

@@ -400,10 +400,29 @@ def test_the_best_within_a_budget_is_marked_and_ours_is_measured_against_it() ->
         *(dash, dash, "0.3050 ± 0.0635 (0.3050) @ 3.0"),
         *(dash, dash, dash),
     )
-    ((_, budget, error, other, their_error, value, _),) = leaders_table([compared]).rows
+    ((_, budget, _, error, other, their_error, value, _),) = leaders_table([compared]).rows
     assert (budget, error, their_error) == ("≤ 5/s", "0.3050", "0.2050")
     assert other == "committed with feedback, cost gap"
     assert float(value) == pytest.approx(0.305 / 0.205, abs=1e-3)
+
+
+def test_what_has_sent_more_than_its_budget_is_marked() -> None:
+    """Its threshold was within the budget on other seeds."""
+    runs = flew("paper-event", [0.3, 0.31], packets_per_s=2.3)
+    (row,) = budgets_table([within(TARGET, (2.0, runs))]).rows
+    assert "@ 2.3! *" in row[3]
+
+
+def test_a_contender_of_ones_own_is_measured_against_the_best_as_well() -> None:
+    own = Contender("mine", "mine", "", {}, keys={"control.horizon": 20})
+    mine = ContenderRuns(
+        FlownContender(own, 3.0, "", True, {}), flew("paper-event", [0.1, 0.1]).runs
+    )
+    best = flew("feedback-gap", [0.2, 0.2])
+    table = leaders_table([within(TARGET, (5.0, mine), (5.0, best))])
+    ((_, _, contender, error, _, their_error, value, _),) = table.rows
+    assert (error, their_error, value) == ("0.1000", "0.2000", "0.500")
+    assert contender == own.title
 
 
 def test_a_contender_that_cannot_be_told_from_the_best_is_marked_as_well() -> None:
@@ -559,7 +578,7 @@ def test_the_second_time_it_only_draws(
     assert main(["compare", "--quick", "--weights", weights, "--out", str(out)]) == 0
     said = capsys.readouterr().out
     assert "2 figures; 0 runs flown" in said
-    assert "claimed ratios hold" in said
+    assert "A first look: 3 flights" in said
     changed = {path.name for path, content in kept.items() if path.read_bytes() != content}
     assert changed == {"report.html", "calls.jsonl"}
     calls = [json.loads(line)["runs"] for line in (out / "calls.jsonl").read_text().splitlines()]
