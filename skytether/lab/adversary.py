@@ -622,9 +622,8 @@ class MoveSampler:
             # An old packet, as a HELLO, may be any of the flight.
             among = packets if move.kind is MoveKind.COPIES else mine
             time_ns, way, vehicle = among[int(rng.integers(len(among)))]
-            amounts = tuple(self._age_s() for _ in move.amounts)
             if move.kind in AGED:
-                move = replace(move, amounts=amounts)
+                move = replace(move, amounts=tuple(self._age_s() for _ in move.amounts))
             return replace(move, vehicle=vehicle, way=way, start_ns=time_ns, length_ns=ONE_NS)
         return replace(move, vehicle=vehicle, start_ns=start_ns)
 
