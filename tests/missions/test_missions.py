@@ -547,7 +547,7 @@ def test_motions_that_are_sent_again_arrive_where_half_are_lost(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Sent only once, most motions or their acknowledgements are lost, and vehicles are slow."""
-    swaps = scenario(4, 0.5, duration=40.0)
+    swaps = scenario(4, 0.5, duration=32.0)
 
     def left_over_m() -> float:
         flown = flight.fly(swaps, vehicles=4)
