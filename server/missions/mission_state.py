@@ -367,8 +367,10 @@ class MissionState:
         # All rows, since others keep away from silent vehicles too.
         counted = self.now + self.rows.ahead
         self._clock.step_errors(self._all, counted, self.rows.early, self.rows.late)
-        for row in self.restarted:
-            self.rows.late[row] = max(self.rows.late[row], float(LONGEST))
+        for row, since in self.restarted.items():
+            # It may have stopped anywhere on its motion, and be there still.
+            stands = float(LONGEST + counted[row] - since)
+            self.rows.late[row] = max(self.rows.late[row], stands)
         if moved:
             self._changed.update(rows[self._moved_by[:n] != 0].tolist())
         self.led.observed(rows.tolist(), self.observed_step)

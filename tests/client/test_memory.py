@@ -66,7 +66,7 @@ def test_a_vehicle_whose_process_restarts_goes_on_along_its_motion_and_others_ke
 
 
 def test_without_its_memory_two_vehicles_come_nearer_than_asked_for() -> None:
-    flight = flown(Restart(5, 7.6, remembers=False))
+    flight = flown(Restart(6, 7.5, remembers=False))
     assert flight.least_m() < SWAP.mission.separation_m
 
 
