@@ -213,12 +213,16 @@ def summarise(
     )
 
 
+PLUGINS = ("trigger", "planner", "scheme")
+"""Kinds of plug-ins whose failures a server counts."""
+
+
 def plugin_errors(figures: Mapping[str, Any]) -> dict[str, int]:
     """Number of failures of a plug-in's code, by its kind; empty if there was none."""
     found = Counter[str]()
     for process, told in figures.items():
         if process.startswith("server"):
-            for kind in ("trigger", "planner", "scheme"):
+            for kind in PLUGINS:
                 found[kind] += told.get("counts", {}).get(f"{kind}_errors", 0)
     return dict(+found)
 

@@ -10,6 +10,7 @@ import numpy as np
 from skytether.figures.colours import css
 from skytether.shared.base.units import MILLISECOND_NS
 from skytether.shared.telemetry.record import DOWNLINK, UPLINK
+from skytether.shared.telemetry.summary import PLUGINS
 from skytether.view.scene import FENCE_RGB, FLIGHT_RGB, GOAL_RGB
 from skytether.view.state import LOSS_S, State, Word, group, told
 
@@ -83,6 +84,10 @@ def status(state: State, vehicle: int, now_ns: int, title: str = "") -> str:
     if len(solved):
         p99 = np.quantile(solved, 0.99)
         rows.append(("solving, p99", f"{p99:.2f} of {deadline_ms:g} ms"))
+    server = state.figures("server")
+    failed = {kind: told(server, "counts", f"{kind}_errors") for kind in PLUGINS}
+    if errors := ", ".join(f"{kind} {count:.0f}" for kind, count in failed.items() if count > 0):
+        rows.append(("errors of plug-ins", errors))
     return (
         f'<div style="{_BODY}" class="skytether-status" {FLOWN_S}="{track.time_s:.0f}">{head}'
         f"<div>{badge(track.does)}</div>"

@@ -281,6 +281,10 @@ def test_a_mission_s_zones_waits_and_distances_are_shown() -> None:
     assert f"{away:.2f} m, at least 0.5 m" in page
     state.take("server", Figures(time_ns=0, figures={"by_vehicle": {"1": {"waits": "vehicle 3"}}}))
     assert "vehicle 3" in words.status(state, 1, state.newest_ns)
+    assert "errors of plug-ins" not in words.status(state, 1, state.newest_ns)
+    failed = {"counts": {"trigger_errors": 3}}
+    state.take("server", Figures(time_ns=0, figures=failed))
+    assert "trigger 3" in words.status(state, 1, state.newest_ns)
     known = {"clock_bound_ms": 412.3, "clock_m": 0.487}
     state.take("server", Figures(time_ns=0, figures={"by_vehicle": {"1": known}}))
     assert "412 ms, 0.49 m" in words.status(state, 1, state.newest_ns)
