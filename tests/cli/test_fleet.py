@@ -181,7 +181,8 @@ def test_a_mission_is_flown_by_its_name_and_from_a_table(tmp_path: Path) -> None
     shown = fleet_command(tmp_path, "--mission", str(show), *drawn)
     with Image.open(film) as frames:
         # Four times as fast as flown, in 12 frames a second.
-        assert frames.n_frames == pytest.approx(6 / 4 * 12, abs=2)
+        assert frames.n_frames == pytest.approx(shown["duration_s"] / 4 * 12, abs=2)
+    assert 6.0 <= shown["duration_s"] < 14.0  # to the ends of the motions under way
     assert shown["vehicles"] == 2
     assert shown["least_separation_m"] == pytest.approx(3.0, abs=0.3)
 
