@@ -61,7 +61,7 @@ START_S = 120.0
 """Longest time until a process listens [s]; it may have to compile first."""
 GRACE_S = 30.0
 """Longest time that a flight may take beyond its duration and the time to connect [s]."""
-ASKED_S, STOP_S = 1.0, 5.0
+ASKED_S, STOP_S = 3.0, 5.0
 """Longest time for a process to end after SIGTERM, before another is sent, and after that [s]."""
 POLL_S = 0.2
 """Interval at which Ctrl-C is checked."""
