@@ -88,6 +88,14 @@ class VehicleClock:
     """Upper bound of the true offset at `bounded` [ns]; UNSEEN before the first sample."""
     bounded: int
     """Server's time at which `low` and `high` hold [ns]; they widen before and after it."""
+    sent: int
+    """Earliest server's time at which the newest observation can have been sent [ns]; UNSEEN before
+    the first."""
+    echo: int
+    """`Observation.heard` of the newest observation, of those that came in order; -1 before the
+    first."""
+    echoed: int
+    """Earliest server's time at which that packet can have come aboard [ns]."""
     steps: int
     """Number of times that a sample contradicted the bounds: a clock was set, or runs wrong."""
     other_low: int
@@ -102,7 +110,7 @@ class VehicleClock:
     """1 if the operator's bound on the delays was contradicted; then it is not used."""
 
 
-FORGOTTEN = ("newest", "heard", "echoes", "adopted")
+FORGOTTEN = ("newest", "heard", "echoes", "adopted", "sent", "echo")
 """Fields of `VehicleClock` that are reset with each session."""
 
 
@@ -168,7 +176,7 @@ class ClockMap:
         self.seen.minimum[row], self.seen.samples[row] = UNSEEN, 0
         self.seen.echoes[row] = -UNSEEN
         vehicle = self.seen.vehicles[row]
-        for name, value in zip(FORGOTTEN, (0, -1, 0, UNSEEN), strict=True):
+        for name, value in zip(FORGOTTEN, (0, -1, 0, UNSEEN, UNSEEN, -1), strict=True):
             vehicle[name] = value
         if life is None or life != self._lives[row]:
             for name in ("low", "other_low"):
@@ -351,24 +359,34 @@ def _narrow_by_asymmetry(seen: Seen, row: int, asymmetry: int, now: int) -> int:
 
 
 @part
-def _bound(seen: Seen, row: int, forward: int, backward: int, is_new: bool, now: int) -> int:
-    """Narrow the bounds by F and G [ns]; `is_new` if no earlier observation contained the echo."""
+def _bound(
+    seen: Seen, row: int, forward: int, backward: int, heard: int, is_newest: bool, now: int
+) -> int:
+    """Narrow the bounds by F and G [ns]."""
     vehicle = seen.vehicles[row]
     low, high = _by_delays(seen, row, now)
-    # F is as old as the observation, which is no older than the round trip. An echo is newer than
-    # the previous observation, which did not contain it; the first echo is no older than a session
-    # lasts without packets.
-    trip = max(forward + backward, 0) // DRIFT + 1
-    since = now - vehicle.bounded if vehicle.high < UNSEEN else SESSION_NS
-    low = max(low, -forward - trip)
+    # An echo came aboard after the observation before was sent, which did not contain it; the first
+    # echo is no older than a session lasts without packets, nor is that of an overtaken one.
+    is_new = is_newest and heard != vehicle.echo
     if is_new:
-        high = min(high, backward + trip + max(since, 0) // DRIFT)
+        vehicle.echoed = vehicle.sent if vehicle.sent < UNSEEN else now - SESSION_NS
+        vehicle.echo = heard
+    age = max(now - vehicle.echoed, 0) if heard == vehicle.echo else SESSION_NS
+    # F is as old as the observation, which is no older than the round trip, as far as clocks of
+    # this age tell it.
+    trip = max(forward + backward, 0) + age // DRIFT + 1
+    low = max(low, -forward - trip // DRIFT - 1)
+    if is_new:
+        high = min(high, backward + age // DRIFT + 1)
+    if is_newest:
+        vehicle.sent = now - trip
     contradiction = CLOCK if low > high else NOTHING
     if contradiction == CLOCK:
         # Nothing earlier holds any more. If a clock was set in between, the round trip of the
         # newest sample may be negative.
         vehicle.steps += 1
-        low, high = min(-forward, backward) - trip, max(-forward, backward) + trip
+        drift = max(age, trip) // DRIFT + 1
+        low, high = min(-forward, backward) - drift, max(-forward, backward) + drift
         vehicle.other_low, vehicle.other_high = -UNSEEN, UNSEEN
     vehicle.low, vehicle.high, vehicle.bounded = low, high, now
     return contradiction
@@ -386,8 +404,7 @@ def _observe(
     now: int,
 ) -> int:
     vehicle, bucket = seen.vehicles[row], now // BUCKET_NS
-    is_new = is_newest and heard != vehicle.heard
-    contradiction = _bound(seen, row, forward, backward, is_new, now)
+    contradiction = _bound(seen, row, forward, backward, heard, is_newest, now)
     # A repeated echo is not a new sample of the delay.
     if heard != vehicle.heard:
         vehicle.heard = heard

@@ -10,7 +10,7 @@ from typing import Literal
 import msgspec
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from helpers import packaged
@@ -212,6 +212,9 @@ def test_who_keeps_the_distance_goes_on_to_keep_it() -> None:
 
 
 @settings(max_examples=50)
+@example(  # an echo that came just after an observation that was under way for a second
+    0, 0, 0.0006185726470246367, [(1.0, 0.0, 0.0)] * 4 + [(1.0, 1.0, 0.0), (1.0, 0.125, 0.0)]
+)
 @given(
     st.integers(0, 2**31),
     st.integers(-(10**15), 10**15),
