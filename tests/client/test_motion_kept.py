@@ -151,7 +151,7 @@ def asks_for_a_path(flight: OnMission) -> None:
 
 
 def stalls(flight: OnMission) -> None:
-    flight.now_ns += 450 * MILLISECOND_NS
+    flight.now_ns += 105 * MILLISECOND_NS
 
 
 HAPPENINGS = (
