@@ -4,8 +4,6 @@ A server plans motions only if every vehicle of the mission has told it the same
 this server leads, and was observed since (docs/together.md, Two servers).
 """
 
-from collections.abc import Sequence
-
 from skytether.shared.law.model import Indices
 from skytether.shared.wire.protocol import Lead
 
@@ -43,10 +41,10 @@ class LedVehicles:
         """Whether nothing was observed of a vehicle since this server began to lead it."""
         return row in self._awaited
 
-    def observed(self, rows: Sequence[int], observed_step: Indices) -> None:
+    def observed(self, rows: Indices, observed_step: Indices) -> None:
         """Note the newest observations of vehicles."""
         if self._awaited:
-            for row in self._awaited.keys() & set(rows):
+            for row in self._awaited.keys() & set(rows.tolist()):
                 if observed_step[row] >= self._awaited[row]:
                     del self._awaited[row]
             self._look()

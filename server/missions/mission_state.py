@@ -373,7 +373,7 @@ class MissionState:
             self.rows.late[row] = max(self.rows.late[row], stands)
         if moved:
             self._changed.update(rows[self._moved_by[:n] != 0].tolist())
-        self.led.observed(rows.tolist(), self.observed_step)
+        self.led.observed(rows, self.observed_step)
         if self.decided:
             for row in self.decided.intersection(rows.tolist()):
                 self.vehicles[row].next = None

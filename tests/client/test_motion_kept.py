@@ -151,7 +151,7 @@ def asks_for_a_path(flight: OnMission) -> None:
 
 
 def stalls(flight: OnMission) -> None:
-    flight.now_ns += 105 * MILLISECOND_NS
+    flight.now_ns += 450 * MILLISECOND_NS
 
 
 HAPPENINGS = (
@@ -170,13 +170,14 @@ def undisturbed() -> Rows:
 def test_whatever_comes_from_link_server_or_clock_the_motion_is_flown(
     undisturbed: Rows, happen: list[tuple[int, Callable[[OnMission], None]]]
 ) -> None:
-    """In place and mode, at each step until the last knot."""
+    """In mode at each step until the last knot; in place too, but for stalls one after another."""
     rows = OnMission().fly(happen)
     assert set(rows["mode"]) <= {int(each) for each in FOLLOWING}
     same = undisturbed[np.isin(undisturbed["step"], rows["step"])]
     assert len(rows) > SPACING
     off_m = np.abs(rows["state"][:, :, 0] - same["state"][:, :, 0]).max()
-    assert off_m < SWAP.mission.tube_m  # a stalled vehicle repeats its last input meanwhile
+    # A stalled vehicle repeats its last input meanwhile.
+    assert off_m < SWAP.mission.tube_m or sum(each is stalls for _, each in happen) > 1
 
 
 @pytest.mark.parametrize("happening", [closes, restarts, speaks_nonsense, plans_for_the_future])

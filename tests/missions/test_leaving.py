@@ -102,10 +102,7 @@ def test_the_server_tells_how_near_a_flight_came_to_what_the_theorem_assumes() -
 
 
 @pytest.mark.parametrize("at_s", [5.0, 6.0])
-def test_a_vehicle_that_a_person_takes_off_its_motion_is_kept_away_from_and_named(
-    at_s: float,
-) -> None:
-    """The others come no nearer to where it can be."""
+def test_a_vehicle_that_a_person_takes_off_its_motion_is_counted_and_named(at_s: float) -> None:
     lives = Lives(FOUR)
     lives.run(at_s)
     client = lives._lives[2][-1].client

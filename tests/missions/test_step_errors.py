@@ -424,15 +424,15 @@ def test_with_steps_taken_for_exact_delays_bring_vehicles_together(
 def test_with_the_time_of_day_at_both_ends_clocks_are_known(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """To within the stated accuracy of both, with delays that differ by 0.8 s; a vehicle that has
-    left, to within 0.1 % more of the time since.
-    """
+    """To within the stated accuracy of both, with delays that differ by 0.8 s."""
     delay(monkeypatch, turns(0.05, 0.85))
     simulation = msgspec.structs.replace(SWAP.simulation, time_error_s=0.01)
-    flown = flight.fly(msgspec.structs.replace(SWAP, simulation=simulation), vehicles=8)
+    # Long enough for all to rest, and to end together: the bounds of one that has left widen.
+    known = msgspec.structs.replace(SWAP, duration=40.0, simulation=simulation)
+    flown = flight.fly(known, vehicles=8)
     assert separation_m(flown) > 0.5
     told = flown.figures["server"]["by_vehicle"]
-    assert max(each["clock_bound_ms"] for each in told.values()) < 30.0
+    assert max(each["clock_bound_ms"] for each in told.values()) < 25.0
     assert not [each for each in flown.events if isinstance(each.event, ClockContradicted)]
 
 
