@@ -58,7 +58,7 @@ def coordinates(points: Any) -> Array:
 
 
 def local(degrees: Array, origin: Origin) -> Array:
-    """Metres east and north of the origin, from longitude and latitude [degrees]; shape (n, 2).
+    """Metres north and east of the origin, from longitude and latitude [degrees]; shape (n, 2).
 
     A degree of longitude has its length at the mean of the two latitudes, as in ArduPilot.
 
@@ -78,7 +78,7 @@ def local(degrees: Array, origin: Origin) -> Array:
     degree = math.radians(1.0) * EARTH_M
     scale = np.cos(np.radians((latitude + north) / 2.0))
     return within(
-        np.stack([degree * scale * away, degree * (latitude - north)], axis=1), DEGREES_MAX_M
+        np.stack([degree * (latitude - north), degree * scale * away], axis=1), DEGREES_MAX_M
     )
 
 

@@ -45,7 +45,7 @@ class Home(NamedTuple):
     """Altitude of the planned home above the sea [m]; None: not known."""
 
     def local(self, latitude: Any, longitude: Any) -> Array:
-        """Metres east and north [m]; shape (2,)."""
+        """Metres north and east [m]; shape (2,)."""
         place = np.array([[number(longitude, "longitude"), number(latitude, "latitude")]])
         return local(place, self.origin)[0]
 
@@ -115,7 +115,9 @@ def route(content: bytes, axes: int, origin: Origin) -> tuple[Array, Array]:
     """Mission of a plan for one vehicle: times [s; shape (n,)] and places [m; shape (n, axes)].
 
     The vehicle flies straight from place to place, at the plan's speed, and holds where an item
-    says so. It starts at the planned home, takes off straight up, and ends where it would land.
+    says so. It starts above the planned home at the altitude of the plan's take-off, as an
+    autopilot's own take-off leaves it, and ends above the place where it would land. A plan that
+    begins with another item starts on the ground; a later take-off is straight up.
 
     Raises:
         ValueError: the file is not a plan, or an item cannot be flown; the message names it.
@@ -140,15 +142,14 @@ def route(content: bytes, axes: int, origin: Origin) -> tuple[Array, Array]:
             if command == SPEED:
                 speed_mps = _speed(params, speed_mps)
                 continue
-            holds = command in (WAYPOINT, LOITER_TIME, DELAY)
-            hold_s = number(params[0] or 0.0, "hold time") if holds else 0.0
-            if not hold_s <= LONG_S or (command == DELAY and hold_s < 0.0):
-                raise ValueError(f"a hold time from 0 to {LONG_S:g} s, got {hold_s:g}")
+            hold_s = _hold_s(command, params)
             place = _place(command, item, params, places[-1], start, home)
         except ValueError as error:
             raise ValueError(f"mission item {count}: {error}") from None
         except (*WRONG, OverflowError):
             raise ValueError(f"mission item {count}: expected a command and its params") from None
+        if command == TAKEOFF and all(np.array_equal(at, start) for at in places):
+            places = [np.append(start[:2], place[2]) for _ in places]
         above = np.append(places[-1][:2], place[2])
         for at in (above, place) if command == TAKEOFF else (place,):
             away_m = float(np.linalg.norm(at - places[-1]))
@@ -178,6 +179,16 @@ def _items(items: Any, depth: int = 0) -> Iterator[Any]:
             expected = "expected a simple item, a survey or a corridor scan"
             raise ValueError(f"mission item {i + 1}: {expected}, got {kind}")
         yield from _items(inner, depth + 1)
+
+
+def _hold_s(command: int, params: list[Any]) -> float:
+    """Time for which an item holds the vehicle [s]."""
+    if command not in (WAYPOINT, LOITER_TIME, DELAY):
+        return 0.0
+    hold_s = number(params[0] or 0.0, "hold time")
+    if not hold_s <= LONG_S or (command == DELAY and hold_s < 0.0):
+        raise ValueError(f"a hold time from 0 to {LONG_S:g} s, got {hold_s:g}")
+    return hold_s
 
 
 def _speed(params: list[Any], before_mps: float) -> float:

@@ -2,7 +2,7 @@
 
 | file | content |
 |---|---|
-| CSV with t, x, y (and z) | seconds, and metres east, north and up |
+| CSV with t, x, y (and z) | seconds, and metres north, east and up |
 | CSV with t, lat, lon (and alt) | seconds, degrees, and metres above the origin |
 | CSV of Skybrush | `Time [msec]`, `x [m]`, `y [m]`, `z [m]` |
 | CSV of MAVSDK's drone show | t, px, py, pz: metres north, east and down |
@@ -48,7 +48,7 @@ Tracks = dict[int, tuple[Array, Array]]
 
 
 class TableForm(NamedTuple):
-    """Columns of a table, and what makes metres east, north and up of its coordinates."""
+    """Columns of a table, and what makes metres north, east and up of its coordinates."""
 
     columns: tuple[str, str, str, str]
     """Time and three coordinates, the last for flights with three axes."""
@@ -57,12 +57,12 @@ class TableForm(NamedTuple):
     place: Callable[[Array, Origin | None], Array]
 
 
-def _east_north_up(coordinates: Array, _: Origin | None) -> Array:
+def _north_east_up(coordinates: Array, _: Origin | None) -> Array:
     return coordinates
 
 
 def _from_ned(coordinates: Array, _: Origin | None) -> Array:
-    return np.concatenate([coordinates[:, 1::-1], -coordinates[:, 2:]], axis=1)
+    return np.concatenate([coordinates[:, :2], -coordinates[:, 2:]], axis=1)
 
 
 def _from_globe(coordinates: Array, origin: Origin | None) -> Array:
@@ -71,9 +71,9 @@ def _from_globe(coordinates: Array, origin: Origin | None) -> Array:
 
 
 FORMS = (
-    TableForm(("t", "x", "y", "z"), 1.0, _east_north_up),
+    TableForm(("t", "x", "y", "z"), 1.0, _north_east_up),
     TableForm(("t", "lat", "lon", "alt"), 1.0, _from_globe),
-    TableForm(("Time [msec]", "x [m]", "y [m]", "z [m]"), 1e-3, _east_north_up),
+    TableForm(("Time [msec]", "x [m]", "y [m]", "z [m]"), 1e-3, _north_east_up),
     TableForm(("t", "px", "py", "pz"), 1.0, _from_ned),
 )
 

@@ -26,7 +26,7 @@ from skytether.shared.scenario.zones import CORNERS_MAX, Zone, around, ring
 CRS84 = {"type": "name", "properties": {"name": "urn:ogc:def:crs:OGC:1.3:CRS84"}}
 """The only value of the member `crs` that is accepted: the coordinates of RFC 7946."""
 Frame = Callable[[Any], Array]
-"""Function from a list of coordinates to metres east and north of the origin; shape (n, 2)."""
+"""Function from a list of coordinates to metres north and east of the origin; shape (n, 2)."""
 RING = "LinearRing"
 SHAPES = ("Polygon", "Point", "LineString", RING, "Track", "Model")
 """Geometries that a placemark of a KML file may have."""
@@ -165,7 +165,7 @@ def _features(file: str, collection: Any, origin: Origin) -> Iterator[Zone]:
 
 
 def _frame(collection: dict[str, Any], known: Origin) -> Frame:
-    """Function from coordinates to metres east and north of the scenario's origin.
+    """Function from coordinates to metres north and east of the scenario's origin.
 
     Args:
         known: `reference.origin`, which counts more than the collection's member.

@@ -121,7 +121,7 @@ def test_a_skybrush_table_is_in_milliseconds() -> None:
 def test_a_mavsdk_table_is_north_east_down() -> None:
     text = "idx,t,px,py,pz,vx,vy,vz,yaw\n0,0,5,-2,0,0,0,0,0\n1,0.5,6,-2,-10,0,0,0,0\n"
     _, points_m = only(tracks.tracks(text.encode(), 3))
-    assert points_m.tolist() == [[-2.0, 5.0, 0.0], [-2.0, 6.0, 10.0]]
+    assert points_m.tolist() == [[5.0, -2.0, 0.0], [6.0, -2.0, 10.0]]
 
 
 def test_a_table_of_the_globe_is_metres_from_the_origin() -> None:
@@ -129,7 +129,7 @@ def test_a_table_of_the_globe_is_metres_from_the_origin() -> None:
     _, points_m = only(tracks.tracks(text.encode(), 3, ORIGIN))
     east_m = 0.001 * DEGREE_M * np.cos(np.radians(47.0005))
     assert points_m[0].tolist() == [0.0, 0.0, 0.0]
-    assert points_m[1] == pytest.approx([east_m, 0.001 * DEGREE_M, 30.0], abs=0.01)
+    assert points_m[1] == pytest.approx([0.001 * DEGREE_M, east_m, 30.0], abs=0.01)
 
 
 def polynomials(*pieces: tuple[float, list[float], list[float]]) -> bytes:
@@ -240,14 +240,14 @@ def test_a_plan_is_flown_from_place_to_place_at_its_speed() -> None:
         item(20),
     )
     times_s, points_m = only(tracks.tracks(flown, 3))
-    assert times_s == pytest.approx([0.0, 4.0, 24.0, 27.0, 37.0], abs=0.01)
-    home, over, north = [0, 0, 0], [0, 0, 20], [0, 100, 20]
-    assert points_m == pytest.approx(np.array([home, over, north, north, over]), abs=0.01)
+    assert times_s == pytest.approx([0.0, 20.0, 23.0, 33.0], abs=0.01)
+    over, north = [0, 0, 20], [100, 0, 20]
+    assert points_m == pytest.approx(np.array([over, north, north, over]), abs=0.01)
 
 
 def test_the_origin_of_the_scenario_counts_more_than_the_plans() -> None:
     _, points_m = only(tracks.tracks(plan(item(16, 0, 0, 0, 0, NORTH, 8.0, 9)), 3, (NORTH, 8.0)))
-    assert points_m == pytest.approx(np.array([[0, -100, 0], [0, 0, 9]]), abs=0.01)
+    assert points_m == pytest.approx(np.array([[-100, 0, 0], [0, 0, 9]]), abs=0.01)
 
 
 @pytest.mark.parametrize(
@@ -319,21 +319,38 @@ def test_a_zip_with_another_compression_is_refused(compression: int) -> None:
         tracks.tracks(content.getvalue()[:60] + b"x" + content.getvalue()[61:], 2)
 
 
-def test_a_vehicle_takes_off_straight_up() -> None:
-    _, points_m = only(tracks.tracks(plan(item(22, 0, 0, 0, None, NORTH, 8.0, 20)), 3))
-    assert points_m == pytest.approx(np.array([[0, 0, 0], [0, 0, 20], [0, 100, 20]]), abs=0.01)
+def test_a_plan_begins_where_its_take_off_ends() -> None:
+    """An autopilot takes off by itself, to the altitude at which the flight begins."""
+    times_s, points_m = only(tracks.tracks(plan(item(22, 0, 0, 0, None, NORTH, 8.0, 20)), 3))
+    assert times_s == pytest.approx([0.0, 20.0], abs=0.01)
+    assert points_m == pytest.approx(np.array([[0, 0, 20], [100, 0, 20]]), abs=0.01)
+    waits = plan(
+        item(93, 7, frame=2),
+        item(22, 0, 0, 0, None, 0, 0, 20),
+        item(16, 0, 0, 0, 0, NORTH, 8.0, 30),
+    )
+    _, points_m = only(tracks.tracks(waits, 3))
+    assert points_m == pytest.approx(np.array([[0, 0, 20], [0, 0, 20], [100, 0, 30]]), abs=0.01)
+
+
+def test_a_later_take_off_is_straight_up() -> None:
+    up = item(16, 0, 0, 0, 0, NORTH, 8.0, 9), item(22, 0, 0, 0, None, 47.0, 8.0, 20)
+    _, points_m = only(tracks.tracks(plan(*up), 3))
+    wanted = [[0, 0, 0], [100, 0, 9], [100, 0, 20], [0, 0, 20]]
+    assert points_m == pytest.approx(np.array(wanted), abs=0.01)
 
 
 def test_a_delay_in_a_plan_holds_the_vehicle() -> None:
     flown = plan(item(22, 0, 0, 0, 0, 0, 0, 20), item(93, 7, frame=2))
     times_s, points_m = only(tracks.tracks(flown, 3))
-    assert times_s == [0.0, 4.0, 11.0]
-    assert points_m[:, 2].tolist() == [0.0, 20.0, 20.0]
+    assert times_s == [0.0, 7.0]
+    assert points_m[:, 2].tolist() == [20.0, 20.0]
 
 
 def test_a_speed_of_minus_one_leaves_the_speed_as_it_is() -> None:
-    times_s, _ = only(tracks.tracks(plan(item(178, 1, -1), item(22, 0, 0, 0, 0, 0, 0, 20)), 3))
-    assert times_s == [0.0, 4.0]
+    north = item(16, 0, 0, 0, 0, NORTH, 8.0, 0)
+    times_s, _ = only(tracks.tracks(plan(item(178, 1, -1), north), 3))
+    assert times_s == pytest.approx([0.0, 20.0])
 
 
 def test_the_homes_altitude_matters_only_for_altitudes_above_the_sea() -> None:

@@ -181,7 +181,7 @@ def test_zones_from_a_map(tmp_path: Path) -> None:
     kept = parsed(f'geojson("{file}")', 3)
     (zone,) = kept.zones
     assert zone.corners[2] == pytest.approx(
-        [degree_m * 1e-3 * np.cos(np.radians(50.0005)), 111.3195]
+        [111.3195, degree_m * 1e-3 * np.cos(np.radians(50.0005))]
     )
     assert (zone.low_m, zone.high_m, zone.is_fence) == (0.0, 30.0, False)
     fence = polygon(field, kind="fence", name="field")
@@ -256,13 +256,13 @@ def test_a_map_is_the_same_however_rfc_7946_lets_it_be_written(tmp_path: Path) -
 
     square = [[0.0, 0.0], [0.001, 0.0], [0.001, 0.001], [0.0, 0.001]]
     expected = corners(square, [0.0, 0.0])
-    assert expected[1] == pytest.approx([111.319491, 0.0])
+    assert expected[1] == pytest.approx([0.0, 111.319491])
     assert corners([*square, square[0]], [0.0, 0.0]) == expected
     assert corners([[*point, 0.0] for point in square], [0, 0], crs=CRS84) == expected
     assert sorted(corners(square[::-1], [0.0, 0.0])) == sorted(expected)
     east = [[-179.9995, y] if x else [179.9995, y] for x, y in square]
     assert corners(east, [179.9995, 0.0]) == expected
-    assert corners(east, [-179.9995, 0.0])[0] == pytest.approx([-111.319491, 0.0])
+    assert corners(east, [-179.9995, 0.0])[0] == pytest.approx([0.0, -111.319491])
 
 
 def test_neither_winding_nor_hole_changes_where_a_vehicle_may_be(tmp_path: Path) -> None:
@@ -388,7 +388,7 @@ def test_polygons_of_a_kml_file_are_kept_out_of_or_stayed_within(tmp_path: Path)
         ("area.kml: roof", False, 4),
         ("area.kml: pond", False, 3),
     ]
-    assert out.zones[0].corners[2] == pytest.approx([759.1, 1113.2], abs=0.2)
+    assert out.zones[0].corners[2] == pytest.approx([1113.2, 759.1], abs=0.2)
     within = kml(tmp_path, placemark(polygon_of(OUTER, INNER)), ", fence")
     assert [(each.is_fence, len(each.corners)) for each in within.zones] == [(True, 4), (False, 3)]
 
@@ -446,7 +446,7 @@ def test_a_geofence_of_a_plan_is_stayed_within_and_kept_out_of(tmp_path: Path) -
         circles=[{"inclusion": inclusion, "circle": circle} for inclusion in (True, False)],
     )
     assert [zone.is_fence for zone in found.zones] == [True, True, False]
-    centre = np.array([[75.9, 111.3]])
+    centre = np.array([[111.3, 75.9]])
     within, around = (
         np.linalg.norm(zone.corners - centre, axis=1).max() for zone in found.zones[1:]
     )
