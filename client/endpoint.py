@@ -389,10 +389,11 @@ class Client(Endpoint):
             self._tell_leap(pilot.leap_m)
         if pilot.step >= pilot.steps:
             self._end(now_ns)
-        # Nothing is sent before the state is saved: otherwise the server would not know which
-        # motion the next run flies.
-        self.waits_for_disk = not self._may_tell(now_ns)
-        if self.waits_for_disk:
+        # Nothing is sent before the state is saved, or the disk has failed: otherwise the server
+        # would not know which motion the next run flies.
+        may_tell = self._may_tell(now_ns)
+        self.waits_for_disk = self._memory.is_stale
+        if not may_tell:
             return
         self._servers.follow(step=pilot.flown, on_ground=False, now_ns=now_ns)
         for session in self._sessions:
@@ -405,6 +406,8 @@ class Client(Endpoint):
             elif session.is_observation_due(pilot.flown):
                 observation = pilot.observe(session)
             if observation is not None:
+                if self.keeps and self._memory.unsaved:
+                    observation = observation._replace(unsaved=1)
                 session.send(observation, now_ns=now_ns)
                 self._tell_time(session, now_ns)
             session.watch_paths(now_ns)

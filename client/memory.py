@@ -11,8 +11,10 @@ saves, outside the process:
     whether the vehicle was armed         starting a process must not arm it
 
 A core opens no file: `Client.keep` returns bytes when they have changed, the shell writes them
-(`shell.memory`) and confirms by `Client.kept`. **Nothing is sent to the server before the state is
-saved**: otherwise the next run might fly a motion that the server no longer counts with.
+(`shell.memory`) and confirms by `Client.kept`. **Nothing is sent to a server before the state is
+saved**: otherwise the next run might fly a motion that the server no longer counts with. Where it
+cannot be saved, because a disk is full, read-only or stuck, the client goes on after `WAIT_NS`, and
+each observation says so: to the servers, a restart of the client is then one without saved state.
 """
 
 from typing import Annotated, Self
@@ -23,6 +25,7 @@ from numpy.typing import NDArray
 
 from skytether.client.leadership import NUMBER_MAX
 from skytether.client.vehicle import VehicleMemory
+from skytether.shared.base.units import MILLISECOND_NS
 from skytether.shared.law.terms import Terms
 from skytether.shared.wire.protocol import KNOTS_MAX
 
@@ -30,6 +33,9 @@ TIME_MAX_NS = 2**62
 STEP_MAX = 2**40
 REFRESHES = 3
 """Number of times that the state is written again before it would be too old."""
+WAIT_NS = 500 * MILLISECOND_NS
+"""Time after which a client does not wait any longer for its state to be saved [ns]: less than the
+silence after which it asks a standby server."""
 
 Time = Annotated[int, msgspec.Meta(ge=-TIME_MAX_NS, le=TIME_MAX_NS)]
 """Time on the host's clock [ns]; in the encoded bytes, relative to the time of writing."""
@@ -144,10 +150,20 @@ class ClientMemory:
         self.boot_id = boot_id if self.before.boot_id is None else self.before.boot_id
         self._handed: tuple[SavedState, int] | None = None
         """State returned last for writing, and when."""
-        self._written: tuple[SavedState, int] | None = None
-        """State that was written last, and when it was returned."""
-        self._finds_nothing = False
-        """Whether the next run will find no state, because none can be written."""
+        self._saved = None if self.before.boot_id is None else self.before
+        """State that the next run would follow; None without one."""
+        self._is_removed = False
+        """Whether that state was removed, because it could not be replaced."""
+        self._differs_ns: int | None = None
+        """Time since which another state has to be saved; None once it is saved."""
+        self.unsaved = False
+        """Whether the next run would not go on from the state that `may_tell` was asked about last.
+        """
+
+    @property
+    def is_stale(self) -> bool:
+        """Whether the next run would follow an earlier state."""
+        return self._saved is not None and self._differs_ns is not None
 
     def keep(self, state: SavedState, *, now_ns: int) -> bytes | None:
         """Bytes to be written, if the state has changed or the bytes returned last are old."""
@@ -160,26 +176,21 @@ class ClientMemory:
         return state.encode(now_ns)
 
     def kept(self, *, nothing: bool) -> None:
-        self._finds_nothing = nothing
-        if not nothing:
-            self._written = self._handed
+        """Note that the bytes returned last were written, or that the file was removed."""
+        self._is_removed = nothing
+        self._saved = self._handed[0] if self._handed and not nothing else None
 
     def may_tell(self, state: SavedState, *, now_ns: int) -> bool:
         """Whether messages may be sent: the next run will follow the same motion as this state, or
-        none.
-
-        If the file can neither be written nor removed, the next run follows the saved motion until
-        it is too old.
+        none, or the messages say that it cannot be known, by `unsaved`.
         """
-        if self._finds_nothing:
+        if self._saved is not None and _is_same(state, self._saved):
+            self._differs_ns, self.unsaved = None, False
             return True
-        if self._written is None:
-            if self.before.boot_id is None:  # no earlier state that a next run could follow
-                return True
-            # The earlier state was written now at the latest.
-            self._written = self.before, now_ns
-        written, written_ns = self._written
-        return _is_same(state, written) or now_ns - written_ns > self._age_max_ns
+        if self._differs_ns is None:
+            self._differs_ns = now_ns
+        self.unsaved = self._is_removed or now_ns - self._differs_ns > WAIT_NS
+        return self.unsaved or self._saved is None
 
 
 def _is_same(one: SavedState, other: SavedState) -> bool:

@@ -18,6 +18,7 @@ from skytether.shared.base.units import MICROSECOND_NS, SECOND_NS, seconds_to_ns
 from skytether.shared.core.endpoint import Address, Datagram, Events
 from skytether.shared.core.events import (
     BegunAnew,
+    CannotResume,
     ClockContradicted,
     Event,
     NumberTaken,
@@ -341,6 +342,9 @@ class Reception:
         # elsewhere does not, once the original has arrived.
         if call.moves:
             session.move(datagram.peer, call.line, now_ns, datagram.socket)
+        if observation.unsaved > session.unsaved:
+            self._events.append(CannotResume(vehicle=session.vehicle))
+        session.unsaved = bool(observation.unsaved)
         self._grid.arm(now_ns)
 
     def _hear_time(self, message: Time, now_ns: int) -> None:

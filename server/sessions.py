@@ -55,6 +55,8 @@ class Session:
     """Time of the newest packet to the vehicle."""
     doubted: bool = False
     """Whether the newest observation was rejected."""
+    unsaved: bool = False
+    """Whether a restart of the client would not continue its flight, as the vehicle last told."""
     stale: int = 0
     """Number of observations that arrived after a newer one."""
     asked_ns: int = 0
@@ -199,11 +201,15 @@ class Sessions:
         return welcomed if _is_expected(welcomed, now_ns) else None
 
     def row_of_other_life(self, hello: Hello) -> int | None:
-        """Row of the HELLO's vehicle, if the row belongs to another run of its client."""
+        """Row of the HELLO's vehicle, if the row belongs to another run of its client, or may.
+
+        A client that cannot save its state may have restarted with an older one, which contains the
+        same boot id.
+        """
         live = self._live.get(hello.vehicle)
         if live is None:
             return self._reserved.get(hello.vehicle)
-        return None if live.boot_id == hello.boot_id else live.row
+        return None if live.boot_id == hello.boot_id and not live.unsaved else live.row
 
     def is_full(self, hello: Hello, now_ns: int) -> bool:
         """Whether there is no row for the vehicle that sends this HELLO."""

@@ -106,7 +106,8 @@ class Endpoint(ABC):
     keeps = False
     """Whether the endpoint has state for the next run of the process, see `keep`."""
     waits_for_disk = False
-    """Whether the endpoint sends nothing until its newest state is written."""
+    """Whether the next run would follow an earlier state until the newest is written, or the
+    earlier one removed."""
     patience_ns = 0
     """Longest time for which datagrams are collected on busy sockets [ns].
 

@@ -337,6 +337,16 @@ class BegunAnew(VehicleEvent, frozen=True, kw_only=True):
         )
 
 
+class CannotResume(VehicleEvent, frozen=True, kw_only=True):
+    """A client has told its server that it cannot save the state for its next run."""
+
+    def __str__(self) -> str:
+        return (
+            f"vehicle {self.vehicle}: its client cannot save its state; if it restarts, the "
+            "vehicle stops where it is"
+        )
+
+
 class NumberTaken(PeerEvent, frozen=True, kw_only=True):
     holder: str
     """HOST:PORT of the vehicle that already uses this number."""
@@ -638,6 +648,7 @@ Event = (
     | SessionRefused
     | ServerFull
     | BegunAnew
+    | CannotResume
     | NumberTaken
     | NoSession
     | NoAnswer

@@ -149,10 +149,7 @@ class Mode(IntEnum):
 
 
 class Observation(NamedTuple):
-    """The vehicle's state at the start of a step, and the input flown from there on.
-
-    A new field has to be appended here, and its check to the row of `_TYPES`.
-    """
+    """The vehicle's state at the start of a step, and the input flown from there on."""
 
     vehicle: int
     session: int
@@ -179,6 +176,9 @@ class Observation(NamedTuple):
     """Number of packets that the vehicle has sent in the session before, modulo NUMBERS."""
     silence: int = 0
     """Longest silence that the vehicle allows the server [half steps]; 0 for no bound."""
+    unsaved: int = 0
+    """1 if a restart of the client would not continue this flight, since its state cannot be saved,
+    else 0."""
 
 
 class Horizon(NamedTuple):
@@ -501,6 +501,8 @@ _NUMBER = range(NUMBERS)
 # observation.
 _AGE = range(-(2**15), 2**32)
 _SPACING = range(1, 2**16)
+_DOES = 2 * len(Mode)
+"""Number of pairs of an observation's mode and `takes`."""
 
 _TYPES: tuple[tuple[type[Message], tuple[_Check, ...]], ...] = (
     (Hello, (_U16, _U64, _terms)),
@@ -509,7 +511,7 @@ _TYPES: tuple[tuple[type[Message], tuple[_Check, ...]], ...] = (
         Observation,
         (
             *(_U16, _U32, _U32, _AGE, _OrNone(_AGE), _STAMP, _NUMBER),
-            *(range(2 * len(Mode)), _motion, _NUMBER, _U16),
+            *(range(2 * _DOES), _motion, _NUMBER, _U16),
         ),
     ),
     (Horizon, (_U16, _U32, _U32, _STAMP, _AGE, _inputs, _feedback, _NUMBER, _U16, _U32)),
@@ -551,9 +553,10 @@ _PACKER = msgpack.Packer(default=np.ndarray.tobytes)
 
 def _observation_fields(sent: Observation) -> list[object]:
     vehicle, session, step, made_for, since, backward_us, heard, mode, takes, state, u, *rest = sent
+    number, silence, unsaved = rest
     numbers = state.ravel().tolist() + u.tolist()
     return [
-        # Steps are sent as differences, mode and `takes` as one number: usually a byte each instead
+        # Steps are sent as differences, mode and flags as one number: usually a byte each instead
         # of up to five.
         VERSION,
         _OBSERVATION,
@@ -564,22 +567,38 @@ def _observation_fields(sent: Observation) -> list[object]:
         None if made_for == NO_HORIZON else since - made_for,
         backward_us,
         heard,
-        2 * mode + takes,
+        unsaved * _DOES + 2 * mode + takes,
         _FLOATS[len(numbers)].pack(*numbers),
-        *rest,
+        number,
+        silence,
     ]
 
 
 def _observation(fields: Iterable[Any]) -> Observation:
-    vehicle, session, step, flown, delay, backward_us, heard, does, (state, u), *rest = fields
+    vehicle, session, step, flown, delay, backward_us, heard, does, motion, number, silence = fields
     since = step - flown
     in_force = NO_HORIZON if delay is None else since - delay
     # Differences may lead below step 0 even if each of them is within its range.
     if since < 0 or (delay is not None and in_force < 0):
         raise ProtocolError(Drop.FIELD)
+    unsaved, does = divmod(does, _DOES)
     mode, takes = divmod(does, 2)
-    return Observation._make(
-        (vehicle, session, step, in_force, since, backward_us, heard, mode, takes, state, u, *rest)
+    state, u = motion
+    return Observation(
+        vehicle,
+        session,
+        step,
+        in_force,
+        since,
+        backward_us,
+        heard,
+        mode,
+        takes,
+        state,
+        u,
+        number,
+        silence,
+        unsaved,
     )
 
 

@@ -4,9 +4,9 @@
 
 A thread writes a new file beside it and renames that, so that no step waits for a disk and the file
 is always whole. Where it cannot be written and the endpoint waits for that, it is removed: the next
-run must not follow what is long past, and the endpoint goes on. The file need not survive a reboot,
-which outlasts any motion. A file that is damaged, or of another vehicle, key or flight, is refused
-with the reason.
+run must not follow what is long past, and the endpoint goes on. A file that can be neither written
+nor removed, on a disk that is read-only, is refused by the next run, as is one that is damaged, or
+of another vehicle, key or flight. The file need not survive a reboot, which outlasts any motion.
 """
 
 import asyncio
@@ -104,7 +104,9 @@ class MemoryFile:
     def read(self) -> tuple[bytes, int | None] | None:
         """Content that the previous run has kept, and the time of writing; None without a file.
 
-        The time is of the monotonic clock [ns]; None if the host was rebooted since.
+        The time is of the monotonic clock [ns]; None if the host was rebooted since. The file is
+        written again with the same content: one that cannot be replaced may be older than the
+        flight.
 
         Raises:
             MemoryRefused: the file must not be used.
@@ -121,6 +123,11 @@ class MemoryFile:
             if written != expected:
                 mismatch = f"{name}: got {written or 'nothing'}, expected {expected}"
                 raise MemoryRefused(f"{self._path}: it was kept by another flight: {mismatch}")
+        try:
+            self._write(content)
+        except OSError as error:
+            reason = f"it cannot be replaced, so it may be too old: {error.strerror or error}"
+            raise MemoryRefused(f"{self._path}: {reason}") from None
         is_now = bool(self._host) and envelope.host == self._host
         return envelope.content, envelope.written_ns if is_now else None
 
@@ -187,10 +194,7 @@ class MemoryFile:
                     return
                 content = self._wanted
             try:
-                with files.replacing(
-                    self._path, is_input=True, mode=0o600, is_synced=False
-                ) as file:
-                    file.write(content)
+                self._write(content)
                 self._failure, self._is_removed = "", False
             except OSError as error:
                 failure = f"{self._path}: {error.strerror or error}"
@@ -209,6 +213,10 @@ class MemoryFile:
             if is_newest and not self._failure:
                 with contextlib.suppress(RuntimeError):  # the loop has closed meanwhile
                     self._loop.call_soon_threadsafe(self._tell)
+
+    def _write(self, content: bytes) -> None:
+        with files.replacing(self._path, is_input=True, mode=0o600, is_synced=False) as file:
+            file.write(content)
 
     def _remove(self) -> None:
         with contextlib.suppress(OSError):  # of a disk that is read-only

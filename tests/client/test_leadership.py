@@ -317,6 +317,22 @@ def test_a_number_is_saved_before_it_is_told(vehicle: Vehicle) -> None:
     assert {each.number for each in vehicle.told(1, Lead)} == {0, 1}  # type: ignore[union-attr]
 
 
+def test_on_a_failed_disk_the_standby_is_asked_and_both_are_told(vehicle: Vehicle) -> None:
+    for server in (0, 1):
+        vehicle.step(0.1)
+        vehicle.answer(server)
+    vehicle.saves = False
+    for _ in range(40):
+        vehicle.step(0.1)
+        vehicle.answer(1)
+        vehicle.beat(1)
+    assert 1 in {each.number for each in vehicle.told(1, Lead)}  # type: ignore[union-attr]
+    for server in (0, 1):
+        observed = vehicle.told(server, Observation)
+        assert [each.unsaved for each in observed[:1]] == [0]  # type: ignore[union-attr]
+        assert [each.unsaved for each in observed[-1:]] == [1]  # type: ignore[union-attr]
+
+
 def test_a_server_that_was_told_more_by_an_earlier_run_leads(vehicle: Vehicle) -> None:
     """The earlier run has not saved its number, and nobody would lead."""
     vehicle.step(0.1)

@@ -9,16 +9,23 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lives import Lives, Restart
-from skytether.client.memory import ClientMemory, FlownMotion, SavedState, age_max_ns, recall
+from skytether.client.memory import (
+    WAIT_NS,
+    ClientMemory,
+    FlownMotion,
+    SavedState,
+    age_max_ns,
+    recall,
+)
 from skytether.client.vehicle import VehicleMemory
-from skytether.lab.lives import Lives as LabLives
 from skytether.server.missions.mission_state import MissionState
 from skytether.shared.base.units import SECOND_NS
-from skytether.shared.core.events import BegunAnew, ModeChanged
+from skytether.shared.core.events import BegunAnew, CannotResume, ModeChanged
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Reason
 from skytether.shared.wire.protocol import KNOTS_MAX, Mode
+from skytether.sim.flight import SERVER
 
 SWAP = reading.load("swap")
 TERMS = SWAP.terms()
@@ -140,14 +147,33 @@ def test_nothing_is_told_to_the_server_before_it_is_kept() -> None:
     assert memory.may_tell(newer, now_ns=NOW_NS)
 
 
-def test_a_disk_that_fails_keeps_a_vehicle_silent_only_until_the_file_on_it_is_too_old() -> None:
+def test_a_disk_that_fails_keeps_a_vehicle_silent_for_half_a_second_and_no_longer() -> None:
+    """Afterwards its messages say that the next run will not go on from this state."""
     memory = ClientMemory(TERMS, 1, KEPT)
     assert memory.boot_id == KEPT.boot_id
     newer = msgspec.structs.replace(KEPT, motion=None)
     assert memory.may_tell(KEPT, now_ns=NOW_NS)
-    assert not memory.may_tell(newer, now_ns=NOW_NS)
-    assert not memory.may_tell(newer, now_ns=NOW_NS + age_max_ns(TERMS))
-    assert memory.may_tell(newer, now_ns=NOW_NS + age_max_ns(TERMS) + 1)
+    for waited_ns in (0, WAIT_NS):
+        assert not memory.may_tell(newer, now_ns=NOW_NS + waited_ns)
+        assert (memory.is_stale, memory.unsaved) == (True, False)
+    for later_ns in (1, SECOND_NS):
+        assert memory.may_tell(newer, now_ns=NOW_NS + WAIT_NS + later_ns)
+        assert (memory.is_stale, memory.unsaved) == (True, True)
+    memory.kept(nothing=True)
+    assert memory.may_tell(newer, now_ns=NOW_NS)
+    assert (memory.is_stale, memory.unsaved) == (False, True)
+    assert memory.keep(newer, now_ns=NOW_NS) is not None
+    memory.kept(nothing=False)
+    assert memory.may_tell(newer, now_ns=NOW_NS)
+    assert (memory.is_stale, memory.unsaved) == (False, False)
+
+
+def test_a_disk_that_never_takes_a_state_is_told_as_well() -> None:
+    """Nothing is there that a next run could follow, so nothing waits."""
+    memory = ClientMemory(TERMS, 1, None)
+    for waited_ns in (0, WAIT_NS, WAIT_NS + 1):
+        assert memory.may_tell(KEPT, now_ns=NOW_NS + waited_ns)
+        assert memory.unsaved == (waited_ns > WAIT_NS)
 
 
 def test_what_has_not_changed_is_written_again_before_it_is_too_old_and_not_at_each_step() -> None:
@@ -178,11 +204,11 @@ def test_others_keep_away_from_all_of_a_motion_whose_client_has_begun_anew(
 
 
 @pytest.mark.parametrize("removes", [True, False])
-def test_a_disk_that_is_full_ends_no_mission(
+def test_a_disk_that_is_full_or_read_only_ends_no_mission(
     monkeypatch: pytest.MonkeyPatch, *, removes: bool
 ) -> None:
-    """The shell removes the file that it cannot replace; without that the vehicles fall silent."""
-    flight = LabLives(swap(1))
+    """The shell removes the file that it cannot replace, where it can; the server is told."""
+    flight = Lives(swap(1))
     flight.run(4.0)
     monkeypatch.setattr(ClientMemory, "keep", lambda *_, **__: None)
     clients = [lives[-1].client for lives in flight._lives.values()]
@@ -192,4 +218,28 @@ def test_a_disk_that_is_full_ends_no_mission(
             if removes and client.waits_for_disk:
                 client.kept(nothing=True)
     heard_s = flight.server.controller.observed_step.min() * SWAP.control.dt
-    assert (heard_s > 15.0) == removes
+    assert heard_s > 15.0
+    assert flight.least_m() > SWAP.mission.separation_m
+    told = [event for _, host, event in flight.events if host == SERVER[0]]
+    assert [CannotResume(vehicle=number) in told for number in flight.bodies] == [True] * 8
+
+
+def test_to_a_server_that_was_told_a_restart_with_an_old_file_is_one_without(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The file could be neither replaced nor removed, and has the boot id of the flight."""
+    flight, begun = Lives(swap(1)), BegunAnew(vehicle=7)
+    flight.run(4.0)
+    with monkeypatch.context() as disk:
+        disk.setattr(ClientMemory, "keep", lambda *_, **__: None)
+        flight.run(7.5)
+        flight.stop_client(7)
+        flight.run(7.7)
+        flight.start_client(7)
+    flight.run(9.5)
+    assert [host for _, host, event in flight.events if event == begun] == [SERVER[0]]
+    flight.stop_client(7)  # its state is saved again
+    flight.run(9.7)
+    flight.start_client(7)
+    flight.run(12.0)
+    assert [event for _, _, event in flight.events].count(begun) == 1

@@ -111,6 +111,7 @@ def observed(draw: st.DrawFn, *, splines: bool = False) -> Observation:
         NO_INPUT if splines else draw(arrays("<f8", 2, elements=st.floats(-1.75, 1.75, width=32))),
         draw(number),
         draw(u16),
+        draw(st.integers(0, 1)),
     )
 
 
@@ -395,7 +396,7 @@ def terms_with(**wrong: object) -> list[object]:
         (OBSERVATION, 7, -1, "field"),
         (OBSERVATION, 7, 2**32, "field"),
         (OBSERVATION, 8, NUMBERS, "field"),
-        (OBSERVATION, 9, 2 * len(Mode), "field"),
+        (OBSERVATION, 9, 4 * len(Mode), "field"),
         (OBSERVATION, 9, True, "field"),
         (OBSERVATION, 10, b"", "shape"),
         (OBSERVATION, 10, [1.0, 2.0, 3.0, 4.0, 0.0, 0.0], "shape"),
@@ -511,10 +512,10 @@ def test_random_bytes_are_refused_or_are_a_message(payload: bytes) -> None:
 
 
 def test_the_table_of_messages_is_complete() -> None:
-    """Every message has as many checks as fields; an observation has two fewer on the wire."""
+    """Every message has as many checks as fields; an observation has three fewer on the wire."""
     for message, checks in protocol._TYPES:
-        # Mode and takes are one number, and so are state and input.
-        fewer = 2 if message is Observation else 0
+        # Mode, takes and unsaved are one number, and so are state and input.
+        fewer = 3 if message is Observation else 0
         assert len(checks) == len(message._fields) - fewer
         assert len(checks) + 2 < 16  # the length has one byte
 

@@ -237,6 +237,22 @@ def test_on_a_full_disk_the_file_is_removed_if_the_endpoint_waits_for_it(
     kept.close()
 
 
+def test_a_file_that_cannot_be_replaced_is_refused(
+    path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """On a read-only disk the earlier run could neither replace nor remove it."""
+    put(path, a_file(path))
+    assert read(path) is not None
+
+    def read_only(*_: Any, **__: Any) -> Any:
+        raise OSError(errno.EROFS, "Read-only file system")
+
+    monkeypatch.setattr(files, "replacing", read_only)
+    with pytest.raises(MemoryRefused, match="Read-only file system"):
+        read(path)
+    assert path.exists()
+
+
 def test_what_is_written_between_two_failures_is_removed_too(
     path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
