@@ -116,8 +116,8 @@ class Tap(Endpoint):
 
     def _altered(self, datagram: Datagram) -> Datagram:
         assert self.alter is not None
-        (message,) = self._reader.decode(datagram.payload)
-        altered = self.alter(message)
+        messages = self._reader.decode(datagram.payload)  # none of a type that the dialect lacks
+        altered = self.alter(messages[0]) if messages else None
         return datagram if altered is None else datagram._replace(payload=altered)
 
     def _take(self) -> list[bytes]:

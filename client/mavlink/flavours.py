@@ -49,6 +49,8 @@ class Flavour:
     bring it back there."""
     words_for_stations: bool
     """Whether the autopilot sends status texts to ground stations only."""
+    fixed_heartbeats: bool
+    """Whether the rate of its heartbeats cannot be set, so that each one is requested."""
     time_out: str
     """Name of the parameter of the set-point time-out [s]."""
     above_sea: bool
@@ -82,6 +84,7 @@ ARDUPILOT = Flavour(
     steps=(LaunchStep.GUIDE, LaunchStep.ARM, LaunchStep.LIFT, LaunchStep.CLIMB),
     streams_first=False,
     words_for_stations=False,
+    fixed_heartbeats=False,
     time_out="GUID_TIMEOUT",
     above_sea=False,
     bytewise=False,
@@ -116,6 +119,7 @@ PX4 = Flavour(
     steps=(LaunchStep.HOLD, LaunchStep.ARM, LaunchStep.LIFT, LaunchStep.CLIMB, LaunchStep.GUIDE),
     streams_first=True,
     words_for_stations=True,
+    fixed_heartbeats=True,
     time_out="COM_OF_LOSS_T",
     above_sea=True,
     bytewise=True,

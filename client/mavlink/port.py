@@ -187,7 +187,7 @@ class Port(Endpoint):
     # -- figures -----------------------------------------------------------------------------
 
     def figures(self) -> dict[str, Any]:
-        autopilot, counts = self.autopilot, self._connection.counts
+        autopilot, counts, codec = self.autopilot, self._connection.counts, self._connection.codec
         condition, clock, parts = autopilot.condition, autopilot.clock, autopilot.parts
         port_figures: dict[str, Any] = {
             "mode": autopilot.flavour.mode_name(condition.mode),
@@ -196,10 +196,11 @@ class Port(Endpoint):
             "measurements": autopilot.positions.taken,
             "heard": counts["heard"],
             "setpoints": self._setpoints.count,
-            "dropped": {name: counts[name] for name in ("foreign", "for_others", "elsewhere")}
-            | {"untimely": autopilot.timesync.untimely}
+            "ignored": {name: counts[name] for name in ("foreign", "for_others")}
+            | {"unknown": codec.unknown},
+            "dropped": {"elsewhere": counts["elsewhere"], "untimely": autopilot.timesync.untimely}
             | by_name(autopilot.positions.dropped),
-            "garbage_bytes": self._connection.codec.garbage_bytes,
+            "garbage_bytes": codec.garbage_bytes,
             "drift_ppm": 1e6 * clock.drift,
         }
         if clock.round_trip_ns is not None:

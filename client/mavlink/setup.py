@@ -11,6 +11,7 @@ from collections.abc import Mapping
 from skytether.client.mavlink import safety
 from skytether.client.mavlink.flavours import ARDUPILOT, Flavour
 from skytether.client.mavlink.safety import Rule
+from skytether.client.mavlink.streams import request
 from skytether.mavlink import parameters
 from skytether.mavlink.codec import Message
 from skytether.mavlink.dialect import dialect
@@ -152,13 +153,7 @@ class Setup:
         self._version_tries += 1
         if self._version_tries > TRIES:
             self._parameter_answered(f"{self._flavour.name} of an unknown version")
-        command = dialect.MAV_CMD_REQUEST_MESSAGE
-        number = float(VERSION)
-        return [
-            dialect.MAVLink_command_long_message(
-                *self._target, command, 0, number, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-            )
-        ]
+        return [request(self._target, VERSION)]
 
     def _question(self, name: str) -> Message:
         """Message that reads a parameter, or sets it; the answer is its value in both cases."""

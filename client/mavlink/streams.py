@@ -1,4 +1,7 @@
-"""Streams of messages, requested again if they do not arrive."""
+"""Streams of messages, requested again if they do not arrive.
+
+An autopilot that sends heartbeats at its own rate only is asked for each of them instead.
+"""
 
 from collections.abc import Mapping
 
@@ -8,6 +11,7 @@ from skytether.mavlink.dialect import dialect
 from skytether.shared.base.units import SECOND_NS
 
 SET_INTERVAL = int(dialect.MAV_CMD_SET_MESSAGE_INTERVAL)
+HEARTBEAT = int(dialect.MAVLINK_MSG_ID_HEARTBEAT)
 SHARE = 0.7
 """Share of the requested rate at which a stream counts as present."""
 WINDOW_NS = 2 * SECOND_NS
@@ -15,15 +19,16 @@ WINDOW_NS = 2 * SECOND_NS
 LEAST = 3.0
 BACK_OFF_MAX = 8
 """Longest window, as a multiple of the shortest: some streams are silent for long."""
+HEARTBEAT_HZ = 5.0
+"""Rate of heartbeats: they show a pilot's mode switch."""
 RATES = {
-    int(dialect.MAVLINK_MSG_ID_HEARTBEAT): 5.0,  # so that a pilot's mode switch is seen at once
     int(dialect.MAVLINK_MSG_ID_EXTENDED_SYS_STATE): 5.0,
     int(dialect.MAVLINK_MSG_ID_ATTITUDE): 10.0,
     int(dialect.MAVLINK_MSG_ID_SYS_STATUS): 2.0,
     int(dialect.MAVLINK_MSG_ID_BATTERY_STATUS): 1.0,
     int(dialect.MAVLINK_MSG_ID_HOME_POSITION): 0.5,
 }
-"""Requested rates [Hz], beside those of positions and of the estimator status."""
+"""Requested rates [Hz], beside those of heartbeats, positions and the estimator status."""
 
 
 def rates(flavour: Flavour, positions_hz: float) -> dict[int, float]:
@@ -34,7 +39,16 @@ def rates(flavour: Flavour, positions_hz: float) -> dict[int, float]:
         else dialect.MAVLINK_MSG_ID_ESTIMATOR_STATUS
     )
     position = int(dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED)
-    return RATES | {position: positions_hz, int(estimate): 5.0}
+    requested = RATES | {position: positions_hz, int(estimate): 5.0}
+    return requested if flavour.fixed_heartbeats else {HEARTBEAT: HEARTBEAT_HZ} | requested
+
+
+def request(target: tuple[int, int], number: int) -> Message:
+    """Request for one message of a type; `target` are the numbers of system and component."""
+    command, wanted = dialect.MAV_CMD_REQUEST_MESSAGE, float(number)
+    return dialect.MAVLink_command_long_message(
+        *target, command, 0, wanted, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    )
 
 
 class _Stream:
@@ -60,13 +74,21 @@ class Streams:
         self._target = target
         self.newest = ""
         self._streams = {number: _Stream(rate) for number, rate in rates.items()}
+        self._heartbeat_ns = 0
+        """Time of the next request for a heartbeat, if they are no stream."""
 
     def hear(self, number: int) -> None:
         if number in self._streams:
             self._streams[number].count += 1
 
     def ask(self, *, now_ns: int) -> list[Message]:
-        """Request for the next missing stream, if there is one."""
+        """Requests for a heartbeat, if one is due, and for the next missing stream."""
+        if HEARTBEAT in self._streams or now_ns < self._heartbeat_ns:
+            return self._ask_stream(now_ns)
+        self._heartbeat_ns = now_ns + round(SECOND_NS / HEARTBEAT_HZ)
+        return [request(self._target, HEARTBEAT), *self._ask_stream(now_ns)]
+
+    def _ask_stream(self, now_ns: int) -> list[Message]:
         for number, stream in self._streams.items():
             if now_ns < stream.until_ns:
                 continue

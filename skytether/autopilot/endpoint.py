@@ -278,6 +278,9 @@ class Autopilot(Endpoint):
 
     def _on_heartbeat(self, message: Message, peer: Peer, now_ns: int) -> None:  # noqa: ARG002
         peer.is_station |= message.type == dialect.MAV_TYPE_GCS
+        for other in self._peers.values() if self._flavour.forwards else ():
+            if other is not peer and not self.script.silent:
+                self.send(bytes(message.get_msgbuf()), other.address)
         if self.flight.is_station(message.get_srcSystem(), message.type):
             self.flight.station_ns = self.flight.now_ns
 
@@ -415,6 +418,8 @@ class Autopilot(Endpoint):
         """Set the interval of a message to a peer; 0 restores the default, below 0 stops it."""
         if number not in STREAMS or not isfinite(interval_us):
             return Result.DENIED
+        if number == HEARTBEAT and self._flavour.fixed_heartbeats:
+            return Result.FAILED
         if interval_us == 0.0:
             rate = {HEARTBEAT: 1.0, **self._flavour.streams}.get(number)
             interval_us = 1e6 / rate if rate else -1.0

@@ -50,6 +50,10 @@ class SimulatedFlavour:
     """Time from the start until arming is allowed, in which position and filters settle."""
     words_for_stations: bool
     """Whether texts go only to ground stations, as PX4's do."""
+    fixed_heartbeats: bool
+    """Whether the rate of its heartbeats cannot be set."""
+    forwards: bool
+    """Whether heartbeats of each peer go to the others."""
     spool_s: float
     """Time from the take-off command until the vehicle climbs."""
     wander_mps: float
@@ -73,6 +77,8 @@ def _px4(main: int, sub: int = 0) -> int:
 
 
 LOCAL_POSITION = int(dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED)
+CURRENT_MODE = 436
+"""Number of a message that PX4 sends and the dialect does not have."""
 FLAVOURS: dict[FlavourName, SimulatedFlavour] = {
     "ardupilot": SimulatedFlavour(
         title="ArduCopter",
@@ -83,6 +89,8 @@ FLAVOURS: dict[FlavourName, SimulatedFlavour] = {
         frame="1.5kg",
         ready_s=41.5,
         words_for_stations=False,
+        fixed_heartbeats=False,
+        forwards=False,
         spool_s=3.4,
         wander_mps=0.0,
         home=(-35.363262, 149.165237, 584.0),
@@ -144,6 +152,8 @@ FLAVOURS: dict[FlavourName, SimulatedFlavour] = {
         frame="sih",
         ready_s=4.6,
         words_for_stations=True,
+        fixed_heartbeats=True,
+        forwards=True,
         spool_s=1.0,
         wander_mps=0.16,
         home=(47.397742, 8.545594, 489.4),
@@ -163,6 +173,8 @@ FLAVOURS: dict[FlavourName, SimulatedFlavour] = {
             int(dialect.MAVLINK_MSG_ID_EXTENDED_SYS_STATE): 1.0,
             int(dialect.MAVLINK_MSG_ID_ATTITUDE): 15.0,
             LOCAL_POSITION: 30.0,
+            int(dialect.MAVLINK_MSG_ID_TIMESYNC): 10.0,
+            CURRENT_MODE: 0.5,
         },
         parameters={
             "BAT_CRIT_THR": 0.07,

@@ -2,7 +2,9 @@
 
 import math
 from collections.abc import Callable
+from struct import pack
 
+from skytether.autopilot.flavours import CURRENT_MODE
 from skytether.autopilot.flight import Landed, PilotedVehicle
 from skytether.mavlink import parameters
 from skytether.mavlink.codec import Message
@@ -23,8 +25,24 @@ KNOWS_ALL, KNOWS_ATTITUDE = 831, 167
 """Flags of an estimate with position, and of one without, as sent by ArduPilot and PX4."""
 UNKNOWN_MV = 65535
 """Voltage sent for a missing cell [mV]."""
+CURRENT_MODE_EXTRA = 193
+"""Byte that the checksum of CURRENT_MODE includes."""
 UNKNOWN = 65535
 """Value of a quantity that is not known."""
+
+
+class CurrentMode:
+    """CURRENT_MODE, which the dialect does not have; `mode` is the number of the mode."""
+
+    def __init__(self, mode: int) -> None:
+        self._payload = pack("<IIB", mode, mode, 0)
+
+    def pack(self, mavlink: dialect.MAVLink) -> bytes:
+        ids = mavlink.seq, mavlink.srcSystem, mavlink.srcComponent
+        head = bytes([len(self._payload), 0, 0, *ids])
+        checked = head + CURRENT_MODE.to_bytes(3, "little") + self._payload
+        crc = dialect.x25crc(checked + bytes([CURRENT_MODE_EXTRA])).crc
+        return b"\xfd" + checked + pack("<H", crc)
 
 
 class Telemetry:
@@ -126,6 +144,12 @@ class Telemetry:
 
     def system_time(self) -> Message:
         return dialect.MAVLink_system_time_message(0, self._boot_ms)
+
+    def time_request(self) -> Message:
+        return dialect.MAVLink_timesync_message(0, self._flight.now_ns)
+
+    def current_mode(self) -> Message:
+        return CurrentMode(self._flight.number)
 
     def attitude(self) -> Message:
         roll, pitch, yaw, rates = self._flight.quadrotor.attitude()
@@ -238,6 +262,8 @@ STREAMS: dict[int, Callable[[Telemetry], Message | None]] = {
     int(dialect.MAVLINK_MSG_ID_GPS_RAW_INT): Telemetry.gps,
     int(dialect.MAVLINK_MSG_ID_VFR_HUD): Telemetry.hud,
     int(dialect.MAVLINK_MSG_ID_SYSTEM_TIME): Telemetry.system_time,
+    int(dialect.MAVLINK_MSG_ID_TIMESYNC): Telemetry.time_request,
+    CURRENT_MODE: Telemetry.current_mode,
     int(dialect.MAVLINK_MSG_ID_ATTITUDE): Telemetry.attitude,
     int(dialect.MAVLINK_MSG_ID_SYS_STATUS): Telemetry.system_status,
     int(dialect.MAVLINK_MSG_ID_BATTERY_STATUS): Telemetry.battery_status,

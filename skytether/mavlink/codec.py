@@ -2,6 +2,10 @@
 
 A frame begins with 0xFD (MAVLink 2) or 0xFE (MAVLink 1), and has its length and a checksum. Bytes
 that fit no frame are skipped one at a time, so a truncated frame does not lose the frames after it.
+
+The checksum includes a byte that depends on the type of the message. A frame of a type that the
+dialect does not have, as PX4 sends several a second, counts as such a frame if one value of this
+byte fits; of damaged frames that happens to one in 256.
 """
 
 from typing import Any
@@ -30,6 +34,8 @@ class Codec:
         self._rest = bytearray()
         self.garbage_bytes = 0
         """Bytes so far that belong to no frame."""
+        self.unknown = 0
+        """Frames so far of types that the dialect does not have."""
 
     def encode(self, message: Message) -> bytes:
         """Frame of a message, with the next sequence number."""
@@ -46,22 +52,22 @@ class Codec:
             length = _length(waiting, at)
             if length and at + length > end and self._stream:
                 break  # the rest is still to come
-            message = self._one(waiting[at : at + length]) if length <= end - at else None
-            if message is None:
-                self.garbage_bytes += 1
-                at += 1
-            else:
+            frame = waiting[at : at + length] if length <= end - at else b""
+            message = self._one(frame)
+            if message is not None:
                 messages.append(message)
                 at += length
+            elif _is_unknown(frame):
+                self.unknown += 1
+                at += length
+            else:
+                self.garbage_bytes += 1
+                at += 1
         self._rest = waiting[at:]
         return messages
 
-    def _one(self, frame: bytearray) -> Message | None:
-        if not frame:
-            return None
-        number = int.from_bytes(frame[7:10], "little") if frame[0] == 0xFD else frame[5]
-        # without the message's type its checksum cannot be verified
-        if number not in dialect.mavlink_map:
+    def _one(self, frame: bytes | bytearray) -> Message | None:
+        if not frame or _number(frame) not in dialect.mavlink_map:
             return None
         try:
             return self._mavlink.decode(frame)
@@ -82,3 +88,21 @@ def _length(data: bytearray, at: int) -> int:
     if data[at] == 0xFE:
         return FRAME_BYTES_MAX if remaining < 2 else 8 + data[at + 1]
     return 0
+
+
+def _number(frame: bytes | bytearray) -> int:
+    """Number of the type of a frame's message."""
+    return int.from_bytes(frame[7:10], "little") if frame[0] == 0xFD else frame[5]
+
+
+def _is_unknown(frame: bytes | bytearray) -> bool:
+    """Whether this is a frame of a type that the dialect does not have."""
+    if not frame or _number(frame) in dialect.mavlink_map:
+        return False
+    ends = (10 if frame[0] == 0xFD else 6) + frame[1]
+    wanted = int.from_bytes(frame[ends : ends + 2], "little")
+    # One more byte, mixed to t, makes the checksum c of the bytes before
+    # (c >> 8) ^ (t << 8) ^ (t << 3) ^ (t >> 4); its high byte gives t, and the low one has to fit.
+    mixed = wanted ^ dialect.x25crc(frame[1:ends]).crc >> 8
+    t = mixed >> 8 ^ mixed >> 13
+    return mixed & 0xFF == (t << 3 ^ t >> 4) & 0xFF

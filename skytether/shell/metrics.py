@@ -235,8 +235,10 @@ by_vehicle/{vehicle}/autopilot/heard autopilot_messages_total
     Messages received from the autopilot.
 by_vehicle/{vehicle}/autopilot/setpoints autopilot_setpoints_total
     Velocity set-points sent to the autopilot.
+by_vehicle/{vehicle}/autopilot/ignored/{reason} autopilot_ignored_messages_total
+    Messages that are usual on a line but not used: from or for other systems, or of unknown types.
 by_vehicle/{vehicle}/autopilot/dropped/{reason} autopilot_dropped_messages_total
-    Messages that were dropped: from or for other systems, or with an impossible time, by reason.
+    Messages that were dropped: from an unknown address, or with an impossible time, by reason.
 by_vehicle/{vehicle}/autopilot/garbage_bytes autopilot_garbage_bytes_total
     Bytes on the autopilot's line that belong to no valid message.
 by_vehicle/{vehicle}/autopilot/round_trip_ms autopilot_round_trip_seconds

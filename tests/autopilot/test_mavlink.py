@@ -140,3 +140,22 @@ def test_texts_that_never_end_are_bounded() -> None:
 def test_down_is_altitude_with_the_other_sign() -> None:
     assert turned((1.0, 2.0, -5.0)) == (1.0, 2.0, 5.0)
     assert turned(turned((1.0, 2.0, -5.0))) == (1.0, 2.0, -5.0)
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.binary(max_size=60), st.integers(0, 255), st.data())
+def test_a_frame_of_an_unknown_type_is_no_garbage_unless_it_is_damaged(
+    payload: bytes, extra: int, data: st.DataObject
+) -> None:
+    number = 436  # CURRENT_MODE of PX4
+    assert number not in dialect.mavlink_map
+    head = bytes([len(payload), 0, 0, 0, 1, 1]) + number.to_bytes(3, "little")
+    crc = dialect.x25crc(head + payload + bytes([extra])).crc
+    frame = b"\xfd" + head + payload + crc.to_bytes(2, "little")
+    (before, after), codec = frames(2), Codec(255, 190)
+    assert names(codec.decode(before + frame + after)) == ["HEARTBEAT", "LOCAL_POSITION_NED"]
+    assert (codec.unknown, codec.garbage_bytes) == (1, 0)
+    damaged = bytearray(frame)
+    damaged[data.draw(st.integers(10, len(frame) - 1))] ^= 1 << data.draw(st.integers(0, 7))
+    assert names(codec.decode(before + damaged + after)) == ["HEARTBEAT", "LOCAL_POSITION_NED"]
+    assert (codec.unknown, codec.garbage_bytes) == (1, len(frame))
