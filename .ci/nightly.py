@@ -27,8 +27,6 @@ ATTACKS = ROOT / "tests" / "adversary_attacks.txt"
 CORPUS = ROOT / "fuzz" / "corpus.txt"
 DIGEST = ROOT / ".ci" / "containers.digest"
 MISSIONS = ("swap", "sphere", "rings", "corridor", "warehouse")
-MOVES = "delays,losses,cuts,copies,server,stops,ends,joins,stalls"
-"""Moves of the adversary, with which the distances must hold."""
 ALONE = "pytest -q -rsR --reruns 1 --rerun-show-tracebacks --durations=20"
 TWO = "pytest -q -p no:rerunfailures -n 2 --dist loadfile --no-loadscope-reorder --durations=20"
 NO_OTHERS = "not docker and not browser and not autopilot"
@@ -123,7 +121,7 @@ def parts(seconds: float) -> list[Part]:
         ),
         Part(
             "adversary",
-            f"{BIN}skytether adversary MISSION --seed SEED --runs 20 --with {MOVES}",
+            f"{BIN}skytether adversary MISSION --seed SEED --runs 20 --with covered",
             seconds,
             r"│ flights +│ +(\d+)",
             keep_attacks,

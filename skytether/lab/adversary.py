@@ -1,11 +1,11 @@
 """Adversary: a search for events in a mission that bring two vehicles together, in virtual time.
 
 A flight is determined by its scenario and the adversary's moves: delays, losses, cuts and copies of
-packets, restarts of the server and of clients, and goals and zones set in flight. The search is a
-hill climb with restarts: it changes the best moves so far, and keeps a change that brings two
-vehicles nearer to each other, or one nearer to a zone. Some changes target single packets of the
-nearest two vehicles, shortly before they are nearest. A flight with the same moves gives the same
-distances, bit for bit.
+packets, forged claims of leadership, restarts of servers and of clients, and goals and zones set in
+flight. The search is a hill climb with restarts: it changes the best moves so far, and keeps a
+change that brings two vehicles nearer to each other, or one nearer to a zone. Some changes target
+single packets of the nearest two vehicles, shortly before they are nearest. A flight with the same
+moves gives the same distances, bit for bit.
 """
 
 import math
@@ -16,22 +16,24 @@ from enum import StrEnum
 from functools import partial
 from heapq import heappop, heappush
 from itertools import combinations
-from typing import Annotated, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import msgspec
 import numpy as np
 
 from skytether.lab.faults import shrink
-from skytether.lab.lives import CLOCK, STANDBY_FLOWS, Lives, world_s
+from skytether.lab.lives import CLOCK, STANDBY_FLOWS, Lives, Saved, world_s
 from skytether.shared.base.chance import stream
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS, seconds_to_ns
 from skytether.shared.core.endpoint import STANDBY_SOCKETS, Datagram, Endpoint
+from skytether.shared.law.terms import Terms
 from skytether.shared.scenario import mission
 from skytether.shared.scenario.mission import Mission
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.scenario.zones import Zones
 from skytether.shared.telemetry.summary import Track, nearest
+from skytether.shared.wire.protocol import Lead, Observation, decode, encode
 from skytether.sim.flight import SERVER, STANDBY
 
 BASE_NS = 50 * MILLISECOND_NS
@@ -72,17 +74,26 @@ class MoveKind(StrEnum):
     """There is a standby server; all packets between the vehicle and it are lost, or the first one
     if the amount is below 0.5."""
     STOPS = "stops"
-    """The first server ends in order, and restarts: at once, sending CLOSE, if the amount is below
-    0.5, otherwise once its vehicles rest."""
+    """A server ends in order, and restarts: at once, sending CLOSE, if the first amount is below
+    0.5, otherwise once its vehicles rest. It is the first server unless the second amount is above
+    0.5."""
     CLIENT = "client"
     """The client of a vehicle is down, and restarts with its saved state; with
     `vehicle.memory = "none"` it has none."""
+    RESTORES = "restores"
+    """The client of a vehicle is down, and restarts with the state that it had saved the first
+    amount before [s]; of vehicle 0 a server with the keys of then, the first one unless the second
+    amount is above 0.5."""
     ENDS = "ends"
     """The client of a vehicle ends once the vehicle rests, and restarts with its saved state."""
     STALLS = "stalls"
     """The client's process stands still, and then goes on with the packets that it has missed."""
     JOINS = "joins"
     """The client of a vehicle is only started at the end of the move, whenever that begins."""
+    LEADS = "leads"
+    """With each packet goes a forged claim of leadership: the first amount is its number, the
+    second, rounded, whether the server leads. Over the downlink it is the vehicle that lies, so
+    its own distances do not count."""
     GOALS = "goals"
     """The vehicle's goal is moved to the place in the amounts [m], and back at the end."""
     ZONES = "zones"
@@ -91,14 +102,20 @@ class MoveKind(StrEnum):
 
 NETWORK = (
     *(MoveKind.DELAYS, MoveKind.LOSSES, MoveKind.CUTS, MoveKind.COPIES),
-    MoveKind.PARTITIONS,
+    *(MoveKind.PARTITIONS, MoveKind.LEADS),
 )
 AGED = frozenset({MoveKind.DELAYS, MoveKind.COPIES})
 """Moves whose amounts are times [s]."""
+MORTAL = frozenset({MoveKind.CLIENT, MoveKind.RESTORES, MoveKind.ENDS})
+"""Moves after which a client finds its saved state."""
 LED = frozenset({MoveKind.STANDBY, MoveKind.FREEZES, MoveKind.PARTITIONS})
 """Moves for which there is a standby server."""
 OF_ALL = (MoveKind.SERVER, MoveKind.STOPS, MoveKind.STANDBY, MoveKind.FREEZES)
 """Moves that concern no single vehicle."""
+OF_SOME = frozenset({*NETWORK, MoveKind.RESTORES}) - {MoveKind.LEADS}
+"""Moves that may concern vehicle 0."""
+COVERED = tuple(each for each in MoveKind if each not in (MoveKind.CLIENT, MoveKind.RESTORES))
+"""Moves against which distances must hold, see docs/together.md."""
 OPERATOR = (MoveKind.GOALS, MoveKind.ZONES)
 LENGTHS_S = {
     MoveKind.CUTS: (0.2, 40.0),
@@ -108,6 +125,7 @@ LENGTHS_S = {
     MoveKind.PARTITIONS: (0.2, 40.0),
     MoveKind.STOPS: (0.05, 20.0),
     MoveKind.CLIENT: (0.2, 3.0),
+    MoveKind.RESTORES: (0.2, 0.9),
     MoveKind.ENDS: (0.2, 30.0),
     MoveKind.STALLS: (0.05, 0.3),
     MoveKind.JOINS: (0.5, 30.0),
@@ -121,7 +139,9 @@ AMOUNTS = {
     MoveKind.DELAYS: ((0.0, 1.2), (0.0, 1.2)),
     MoveKind.LOSSES: ((0.1, 1.0),),
     MoveKind.COPIES: ((0.0, 1.5),),
-    MoveKind.STOPS: ((0.0, 1.0),),
+    MoveKind.STOPS: ((0.0, 1.0), (0.0, 1.0)),
+    MoveKind.RESTORES: ((0.0, 90.0), (0.0, 1.0)),
+    MoveKind.LEADS: ((0.0, 9.0), (0.0, 1.0)),
     MoveKind.FREEZES: ((0.0, 1.0),),
     MoveKind.PARTITIONS: ((0.0, 1.0),),
 }
@@ -153,6 +173,8 @@ class Move:
 
 
 Moves = tuple[Move, ...]
+HAS_STANDBY = Move(MoveKind.PARTITIONS, 0, "", 0, 1, (1.0,))
+"""No packet is lost, but there is a standby server."""
 
 
 class Packet(NamedTuple):
@@ -194,10 +216,13 @@ class Approach(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class AdversaryNetwork(Endpoint):
-    def __init__(self, moves: Moves, seed: int) -> None:
+    def __init__(self, moves: Moves, seed: int, terms: Terms | None = None) -> None:
         super().__init__()
         self._moves = [move for move in moves if move.kind in NETWORK]
+        self._terms = terms
+        """Terms of the flight, needed for `MoveKind.LEADS`."""
         self._seed, self._chance = seed, dict[tuple[str, int], np.random.Generator]()
+        self._sent = 0
         self._in_flight: list[tuple[int, int, Datagram]] = []
         """Heap of the packets in flight: time of arrival, order, and packet."""
         self.packets: list[Packet] = []
@@ -215,7 +240,7 @@ class AdversaryNetwork(Endpoint):
         self.packets.append(Packet(now_ns, way, vehicle))
         # Drawn for every packet: a packet's number does not depend on the other moves.
         drawn = self._draw(way, vehicle)
-        late_s, copies_s = 0.0, []
+        late_s, copies_s, more = 0.0, list[float](), list[Datagram]()
         for move in self._moves:
             if move.vehicle not in (0, vehicle) or move.way not in ("", way):
                 continue
@@ -233,9 +258,27 @@ class AdversaryNetwork(Endpoint):
                     return
                 case MoveKind.LOSSES if drawn < move.amounts[0]:
                     return
-        for each_s in (0.0, *copies_s):
-            due_ns = now_ns + BASE_NS + seconds_to_ns(late_s + each_s)
-            heappush(self._in_flight, (due_ns, len(self.packets), onward))
+                case MoveKind.LEADS if lead := self._forged(payload, *move.amounts):
+                    more.append(onward._replace(payload=lead))
+        due_ns = now_ns + BASE_NS + seconds_to_ns(late_s)
+        for each in (onward, *more):
+            self._send(due_ns, each)
+        for each_s in copies_s:
+            self._send(due_ns + seconds_to_ns(each_s), onward)
+
+    def _send(self, due_ns: int, onward: Datagram) -> None:
+        self._sent += 1
+        heappush(self._in_flight, (due_ns, self._sent, onward))
+
+    def _forged(self, payload: bytes, number: float, leads: float) -> bytes | None:
+        """Claim of leadership in the session of a packet; None if the packet has none."""
+        assert self._terms is not None
+        packet = decode(payload, self._terms)
+        if (session := getattr(packet, "session", None)) is None:
+            return None
+        step = packet.step if isinstance(packet, Observation) else 0
+        claimed = int(number)
+        return encode(Lead(packet.vehicle, session, claimed, round(leads), claimed, step))
 
     def _draw(self, way: str, vehicle: int) -> float:
         if (way, vehicle) not in self._chance:
@@ -254,17 +297,15 @@ class Raid:
     """Flight of a mission with the adversary's moves; the scenario's network is not used."""
 
     def __init__(self, scenario: Scenario, moves: Moves) -> None:
-        self._scenario, self._moves, self._air = (
-            scenario,
-            moves,
-            AdversaryNetwork(moves, scenario.seed),
-        )
-        mortal = {move.vehicle for move in moves if move.kind in (MoveKind.CLIENT, MoveKind.ENDS)}
+        self._scenario, self._moves = scenario, moves
+        self._air = AdversaryNetwork(moves, scenario.seed, scenario.terms())
+        mortal = {move.vehicle for move in moves if move.kind in MORTAL}
+        self._has_standby = any(move.kind in LED for move in moves)
         self._lives = Lives(
             scenario,
             self._air,
             None if 0 in mortal else mortal,
-            has_standby=any(move.kind in LED for move in moves),
+            has_standby=self._has_standby,
         )
         self._world, self._vehicles = self._lives.world, self._lives.mission.vehicles
         self._zones: list[tuple[float, Zones]] = [(0.0, scenario.zones)]
@@ -279,17 +320,28 @@ class Raid:
         begin: list[Callable[[], None]] = [self._set]
         end: list[Callable[[], None]] = [self._set]
         match move.kind:
-            case MoveKind.SERVER:
-                begin, end = [lives.stop_server], [partial(lives.start_server, {})]
-            case MoveKind.STANDBY:
-                begin = [partial(lives.stop_server, STANDBY[0])]
-                end = [partial(lives.start_server, {}, name=STANDBY[0])]
+            case MoveKind.SERVER | MoveKind.STANDBY:
+                name, _ = SERVER if move.kind is MoveKind.SERVER else STANDBY
+                begin = [partial(lives.stop_server, name)]
+                end = [partial(lives.start_server, {}, name=name)]
             case MoveKind.FREEZES:
-                name, _ = (SERVER, STANDBY)[round(move.amounts[0])]
+                name = self._server(move.amounts)
                 begin, end = [partial(self._world.freeze, name)], [partial(self._world.thaw, name)]
             case MoveKind.STOPS:
-                begin = [lives.end_server if round(move.amounts[0]) else lives.close_server]
-                end = [partial(lives.start_server, {})]
+                name = self._server(move.amounts[1:])
+                stop = lives.end_server if round(move.amounts[0]) else lives.close_server
+                begin, end = [partial(stop, name)], [partial(lives.start_server, {}, name=name)]
+            case MoveKind.RESTORES if move.vehicle == 0:
+                name, settings = self._server(move.amounts[1:]), dict[str, Any]()
+                self._before(move, lambda: settings.update(lives.settings(name)))
+                begin = [partial(lives.stop_server, name)]
+                start = partial(lives.start_server, {}, settings=settings, name=name)
+                end = [start, self._note_zones]
+            case MoveKind.RESTORES:
+                saved = list[Saved]()
+                self._before(move, lambda: saved.extend(lives.saved(move.vehicle)))
+                begin = [partial(lives.stop_client, move.vehicle)]
+                end = [partial(lives.start_client, move.vehicle, saved=saved)]
             case MoveKind.ENDS:
                 begin = [partial(lives.end_client, number) for number in hit]
                 end = [partial(lives.start_client, number) for number in hit]
@@ -307,6 +359,16 @@ class Raid:
         for time_ns, actions in ((move.start_ns, begin), (move.end_ns, end)):
             for action in actions:
                 self._world.at(time_ns, action)
+
+    def _server(self, amounts: Sequence[float]) -> str:
+        """Name of the server that an amount chooses: the standby, if there is one, above 0.5."""
+        is_standby = self._has_standby and any(each > 0.5 for each in amounts[:1])
+        return (STANDBY if is_standby else SERVER)[0]
+
+    def _before(self, move: Move, action: Callable[[], None]) -> None:
+        """Act the first amount before a move, at the earliest at the beginning."""
+        at_ns = move.start_ns - seconds_to_ns(move.amounts[0])
+        self._world.at(max(at_ns, self._world.now_ns), action)
 
     def _set(self) -> None:
         """Set goals and zones of the active moves; the server may refuse them."""
@@ -328,7 +390,12 @@ class Raid:
         }
         for key, text in texts.items():
             lives.set({key: text})
-        self._zones.append((CLOCK.local(now_ns) / SECOND_NS, lives.running.scenario.zones))
+        self._note_zones()
+
+    def _note_zones(self) -> None:
+        if running := self._lives.running:
+            since_s = CLOCK.local(self._world.now_ns) / SECOND_NS
+            self._zones.append((since_s, running.scenario.zones))
 
     # -- flight ------------------------------------------------------------------------------------
 
@@ -377,7 +444,10 @@ class Raid:
         return True
 
     def _apart(self, tracks: Mapping[int, Track]) -> Near:
-        flown = {number: each for number, each in tracks.items() if len(each[0])}
+        liars = {m.vehicle for m in self._moves if m.kind is MoveKind.LEADS and m.way != "uplink"}
+        flown = {
+            number: each for number, each in tracks.items() if len(each[0]) and number not in liars
+        }
         times, apart_m = nearest(list(flown.values()), self._scenario.control.dt)
         if not np.isfinite(apart_m).any():
             return NOWHERE
@@ -514,6 +584,8 @@ class MoveSampler:
             moves += self._stop()
         if kinds:
             moves += [self._one(kinds) for _ in range(1 + rng.poisson(2.0))]
+        if LED & {*kinds} and rng.random() < 0.5:
+            moves.append(HAS_STANDBY)
         return tuple(moves[-self._most :])
 
     def _split(self) -> Moves:
@@ -550,7 +622,7 @@ class MoveSampler:
         length_ns = seconds_to_ns(low_s * (high_s / low_s) ** rng.random())
         start_ns = int(rng.integers(self._last_ns))
         vehicle, way = int(rng.choice(self._vehicles)), ""
-        if kind in OF_ALL or (kind in NETWORK and rng.random() < 0.2):
+        if kind in OF_ALL or (kind in OF_SOME and rng.random() < 0.2):
             vehicle = 0
         if kind in NETWORK:
             way = ("uplink", "downlink", "")[rng.integers(3)]

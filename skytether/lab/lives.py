@@ -6,7 +6,7 @@ autopilot. Keys set by the operator survive a restart of the server.
 """
 
 import io
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
 from typing import Any, NamedTuple
@@ -36,6 +36,8 @@ from skytether.shared.wire.protocol import Mode
 from skytether.sim.flight import SERVER, STANDBY
 from skytether.sim.world import Clock, World
 
+Saved = tuple[bytes, int]
+"""State that a client has saved, and when [ns; host's clock]."""
 NETWORK: Address = ("netem", 0)
 STANDBY_FLOWS = 1000
 """Number of the network's socket to which vehicles send for the standby server; vehicle n is heard
@@ -115,7 +117,7 @@ class Lives:
         self.bodies = {number: Body(scenario, number) for number in mission.vehicles}
         for number in mission.vehicles:
             start_ns = int(stream(scenario.seed, "phase", number).integers(scenario.dt_ns))
-            client = self._client(number, remembers=False)
+            client = self._client(number)
             self.world.add(f"client {number}", client, clock=CLOCK, start_ns=start_ns)
         self.servers: list[Server] = []
         """All runs of all servers."""
@@ -148,9 +150,9 @@ class Lives:
         self._running[name] = Running(server, scenario, self._settings.get(name, {}))
         return server
 
-    def _client(self, number: int, *, remembers: bool) -> Client:
+    def _client(self, number: int, kept: Saved | None = None) -> Client:
         lives, before, sink = self._lives[number], None, io.BytesIO()
-        if remembers and (kept := self.world.memory(f"client {number}")):
+        if kept is not None:
             before = recall(*kept, CLOCK.local(self.world.now_ns), self.scenario.terms())
         client = Client(
             self.scenario,
@@ -174,15 +176,26 @@ class Lives:
     def stop_client(self, number: int) -> None:
         self.world.stop(f"client {number}")
 
-    def start_client(self, number: int, *, remembers: bool = True) -> None:
-        """Start the next run of a vehicle's client; `remembers` tells whether it finds the saved
-        state.
+    def start_client(
+        self, number: int, *, remembers: bool = True, saved: Sequence[Saved] | None = None
+    ) -> None:
+        """Start the next run of a vehicle's client.
+
+        Args:
+            remembers: whether it finds a saved state.
+            saved: the state that it finds, if any, in place of the newest.
         """
         body, remembers = self.bodies[number], remembers and self._keeps(number)
         body.fly_alone(CLOCK.local(self.world.now_ns))
-        if not remembers:
+        found = (self.saved(number) if saved is None else saved) if remembers else ()
+        if not found:
             body.reset(_sensor(self.scenario, number, len(self._lives[number])))
-        self.world.restart(f"client {number}", self._client(number, remembers=remembers))
+        self.world.restart(f"client {number}", self._client(number, *found))
+
+    def saved(self, number: int) -> Sequence[Saved]:
+        """The state that a vehicle's client has saved last, if any."""
+        saved = self.world.memory(f"client {number}")
+        return () if saved is None else (saved,)
 
     def stop_server(self, name: str = SERVER[0]) -> None:
         if running := self._running.pop(name, None):
@@ -237,17 +250,30 @@ class Lives:
             self.world.act(name, running.endpoint.close)
         self.stop_server(name)
 
+    def settings(self, name: str) -> Mapping[str, Any]:
+        """Keys set in flight, as the journal of a server has them."""
+        running = self._running.get(name)
+        return running.settings if running else self._settings.get(name, {})
+
     def start_server(
-        self, changes: Mapping[str, Any], *, remembers: bool = True, name: str = SERVER[0]
+        self,
+        changes: Mapping[str, Any],
+        *,
+        remembers: bool = True,
+        settings: Mapping[str, Any] | None = None,
+        name: str = SERVER[0],
     ) -> None:
         """Start the next run of a server.
 
         Args:
             changes: keys that differ from the scenario, and their values.
             remembers: whether keys that were set in flight are kept.
+            settings: the keys that it finds in place of those.
         """
         if not remembers:
             self._settings.pop(name, None)
+        if settings is not None:
+            self._settings[name] = settings
         scenario = with_values(with_values(self.scenario, changes), self._settings.get(name, {}))
         self.world.restart(name, self._server(scenario, name))
 

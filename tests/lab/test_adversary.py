@@ -15,11 +15,14 @@ import pytest
 import skytether.lab.commands.adversary as commands
 from skytether.__main__ import main
 from skytether.lab.adversary import (
+    COVERED,
+    HAS_STANDBY,
     AdversaryNetwork,
     Climb,
     Climbed,
     Move,
     MoveKind,
+    MoveSampler,
     Raid,
     climb,
     dumps,
@@ -38,11 +41,14 @@ from skytether.server.missions.vehicle_motions import VehicleMotions
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.base.units import SECOND_NS, seconds_to_ns
 from skytether.shared.core.endpoint import Datagram
+from skytether.shared.core.events import LeaderChanged
 from skytether.shared.law.model import Array, Indices
 from skytether.shared.law.motion import Motion
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.schema import Scenario
+from skytether.shared.telemetry.record import parse
 from skytether.shell import command
+from skytether.sim.flight import SERVER, STANDBY
 from skytether.sim.world import World
 
 Patch = Callable[[pytest.MonkeyPatch], None]
@@ -121,6 +127,75 @@ def test_a_vehicle_without_a_client_flies_on_and_is_seen() -> None:
     assert times[0] == pytest.approx(4.05)
     assert x[19] - began == pytest.approx(0.5, abs=0.2)
     assert abs(x[99] - x[60]) < 0.3  # stopped, except for wind
+
+
+EARLY_S, LATE_S = 5.0, 7.0
+"""Times at which vehicles are on their way."""
+
+
+def test_a_client_is_restarted_with_the_state_that_it_had_some_time_before() -> None:
+    """It flies the motion of then; in time the whole flight is known."""
+    raid = Raid(FOUR, (move(MoveKind.RESTORES, 2, "", LATE_S, 0.2, LATE_S - EARLY_S, 0.0),))
+    raid.run()
+    first, second = (parse(life.sink.getvalue()) for life in raid._lives._lives[2])
+    before = first["in_force"][first["step"] == round(EARLY_S / FOUR.control.dt)]
+    assert second["in_force"][0] <= before[0] < first["in_force"][-1]
+
+
+@pytest.mark.parametrize("is_standby", [False, True])
+def test_a_server_is_restarted_with_the_keys_that_it_had_some_time_before(
+    is_standby: bool,
+) -> None:
+    moves = (
+        move(MoveKind.GOALS, 1, "", EARLY_S, 60.0, 0.0, 3.0),
+        move(MoveKind.RESTORES, 0, "", LATE_S, 0.2, 1.9, float(is_standby)),
+        move(MoveKind.RESTORES, 0, "", LATE_S + 1.0, 0.2, 5.0, float(is_standby)),
+        HAS_STANDBY,
+    )
+    raid, goals = Raid(FOUR, moves), []
+    for until_s in (LATE_S + 0.5, LATE_S + 1.5):
+        raid._lives.run(until_s)
+        own, other = SERVER[0], STANDBY[0]
+        restored = raid._lives._running[other if is_standby else own]
+        goals.append(restored.scenario.mission.goals)
+        assert (
+            "goal(1," in raid._lives._running[own if is_standby else other].scenario.mission.goals
+        )
+    assert "goal(1," in goals[0]
+    assert not goals[1]
+
+
+def test_a_standby_server_is_stopped_too() -> None:
+    raid = Raid(FOUR, (HAS_STANDBY, move(MoveKind.STOPS, 0, "", EARLY_S, 60.0, 0.0, 1.0)))
+    raid._lives.run(EARLY_S + 1.0)
+    assert {*raid._lives._running} == {SERVER[0]}
+
+
+def test_a_server_that_claims_to_lead_is_followed_and_all_arrive() -> None:
+    """Vehicle 3 tells both servers of the larger number, and all others follow."""
+    claims = move(MoveKind.LEADS, 3, "uplink", EARLY_S, 0.5, 5.0, 1.0)
+    raid = Raid(FOUR, (HAS_STANDBY, claims))
+    assert spare_m(FOUR, raid.run()) > 0.3
+    changed = [each for _, _, each in raid._lives.events if isinstance(each, LeaderChanged)]
+    assert {each.vehicle for each in changed} == {1, 2, 3, 4}
+    assert raid._has_arrived()
+
+
+@pytest.mark.parametrize("leads", [0.0, 1.0])
+def test_a_stolen_vehicle_that_names_a_leader_brings_no_others_together(leads: float) -> None:
+    """Its own distances are not asked for."""
+    claims = move(MoveKind.LEADS, 3, "downlink", EARLY_S, 20.0, 5.0, leads)
+    for servers in ((), (HAS_STANDBY,)):
+        found = fly(FOUR, (*servers, claims))
+        assert 3 not in found.apart.vehicles
+        assert spare_m(FOUR, found) > 0.3
+
+
+def test_with_moves_of_two_servers_flights_of_other_moves_have_two_as_well() -> None:
+    sampler = MoveSampler(Climb(FOUR, COVERED, 1, 1), np.random.default_rng(1))
+    drawn = [sampler.some() for _ in range(50)]
+    assert 10 < sum(HAS_STANDBY in moves for moves in drawn) < 40
+    assert {each.kind for moves in drawn for each in moves} == {*COVERED}
 
 
 # -- planted faults ------------------------------------------------------------------------------
@@ -338,7 +413,10 @@ def test_a_search_that_is_interrupted_shows_what_was_flown_and_goes_on(
     ("options", "said"),
     [
         (("demo",), "demo: expected a mission, such as swap"),
-        (("swap", "--with", "rain"), "--with: got rain, expected some of delays,losses"),
+        (
+            ("swap", "--with", "rain"),
+            "--with: got rain, expected covered, or some of delays,losses",
+        ),
         (("swap", "--runs", "0"), "--runs: got 0, expected 1 to"),
         (("swap", "--attack", "nowhere.json"), "--attack: nowhere.json: No such file"),
     ],

@@ -11,6 +11,7 @@ import msgspec
 
 from skytether.lab.adversary import (
     CLIMB,
+    COVERED,
     MOVES_MAX,
     PATIENCE,
     Approach,
@@ -65,8 +66,8 @@ class AdversaryOptions:
     scenario: ScenarioName = "swap"
     """Name of a mission (swap, sphere, rings, corridor, warehouse) or a .toml file."""
     kinds: Annotated[str, Argument(name="with", metavar="KINDS")] = "delays,losses,cuts,copies"
-    """Kinds of moves, with commas: delays, losses, cuts, copies, server, stops, client, ends,
-    joins, stalls, goals, zones; and with a standby server: standby, freezes, partitions."""
+    """Kinds of moves, with commas, see docs/together.md; `covered` stands for all against which the
+    distances must hold."""
     runs: Annotated[int, Argument(metavar="N")] = 200
     """Number of flights."""
     moves: Annotated[int, Argument(metavar="N")] = MOVES_MAX
@@ -182,9 +183,11 @@ def _moves(text: str) -> Moves:
 
 def _kinds(text: str) -> tuple[MoveKind, ...]:
     try:
-        return tuple(map(MoveKind, dict.fromkeys(text.split(","))))
+        return (
+            COVERED if text == "covered" else tuple(map(MoveKind, dict.fromkeys(text.split(","))))
+        )
     except ValueError:
-        expected = f"expected some of {','.join(MoveKind)}"
+        expected = f"expected covered, or some of {','.join(MoveKind)}"
         raise CommandError(f"--with: got {text}, {expected}", command.CONFIGURATION) from None
 
 
