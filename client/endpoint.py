@@ -11,7 +11,7 @@ from typing import Any
 
 import msgspec
 
-from skytether.client.failsafe import CLOSING, GOOD_NS, HOLD, TABLE, Failsafe, brake_ns
+from skytether.client.failsafe import CLOSING, GOOD_NS, HOLD, STALL_NS, TABLE, Failsafe, brake_ns
 from skytether.client.followers import SplineFollower
 from skytether.client.ground import GroundReports
 from skytether.client.link import ClientLink, PlainLink
@@ -40,6 +40,7 @@ from skytether.shared.core.events import (
     ModeChanged,
     NotFlown,
     StateLeapt,
+    SteppedLate,
     address_text,
     metres,
 )
@@ -380,8 +381,10 @@ class Client(Endpoint):
         ground.wait(waits_for, now_ns=now_ns)
 
     def _fly(self, now_ns: int) -> None:
-        pilot = self._pilot
+        pilot, latest_ns = self._pilot, self._pilot.latest_ns
         pilot.fly(now_ns=now_ns)
+        if self._is_mission and pilot.late_ns > max(STALL_NS, latest_ns):
+            self._events.append(SteppedLate(vehicle=self.vehicle, late_s=pilot.late_ns / SECOND_NS))
         if pilot.is_held and now_ns >= self._fence_report_ns:
             self._fence_report_ns = now_ns + HELD_AGAIN_NS
             self._events.append(FenceHolds(vehicle=self.vehicle))
@@ -532,6 +535,7 @@ class Client(Endpoint):
             "step": pilot.step,
             "steps": pilot.steps,
             "missed": pilot.missed,
+            "late_ms": pilot.latest_ns / MILLISECOND_NS,
             "began_s": pilot.began_ns / SECOND_NS,
             "horizons": self.horizons,
             "dropped": by_name(self.dropped),

@@ -94,6 +94,8 @@ class Pilot:
         self._covered_last = 0
         """Step after the last one with a planned input."""
         self.missed = 0
+        self.late_ns = self.latest_ns = 0
+        """Time by which the present step began late, and the largest so far [ns]."""
         self.leap_m: tuple[float, ...] | None = None
         """Leap about which the operator has not decided: displacement on each axis [m], or empty if
         only the velocity has leapt. None without a leap."""
@@ -193,12 +195,13 @@ class Pilot:
         # Missed steps are navigated one by one: the filter predicts one step at a time.
         for step in range(self.flown, present):
             self._navigate(step + 1)
-        late_ns = now_ns - self.next_ns
+        self.late_ns = now_ns - self.next_ns
+        self.latest_ns = max(self.latest_ns, self.late_ns)
         self.flown = self.step = present
         self._flown_ns = self._epoch_ns + present * self._dt_ns
         hindrance = self._vehicle.hindrance(now_ns=now_ns)
         self._failsafe.motion_goes_on(self._goes_on(present), now_ns=now_ns)
-        self._failsafe.step(late_ns=late_ns, hindrance=hindrance, now_ns=now_ns)
+        self._failsafe.step(late_ns=self.late_ns, hindrance=hindrance, now_ns=now_ns)
         if present == self.steps - 1 and self._goes_on(present):
             # Where the flight ends on the way, the vehicle would stop off its motion.
             self._failsafe.meet(Reason.OVER, now_ns=now_ns)

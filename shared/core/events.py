@@ -504,6 +504,19 @@ class LeftMotion(VehicleEvent, frozen=True, kw_only=True):
         return f"vehicle {self.vehicle} {left}: the others keep away from where it is"
 
 
+class SteppedLate(VehicleEvent, frozen=True, kw_only=True):
+    """A step of a vehicle on a mission began later than any before, and too late: until then the
+    last input was flown.
+    """
+
+    late_s: float
+    """Time by which it began late [s]."""
+
+    def __str__(self) -> str:
+        late = f"{self.late_s:.2f} s late: its computer was busy or stood still"
+        return f"a step of vehicle {self.vehicle} began {late}"
+
+
 def metres(leap_m: tuple[float, ...]) -> str:
     return f"({', '.join(f'{each:+.2f}' for each in leap_m)}) m"
 
@@ -670,6 +683,7 @@ Event = (
     | TimeUnknown
     | LeftMotion
     | LeftTube
+    | SteppedLate
     | StateLeapt
     | FenceHolds
     | PlanningResumed

@@ -113,6 +113,8 @@ class FleetSummary(msgspec.Struct, frozen=True, kw_only=True):
     """Ticks that the server's workers missed because they woke too late."""
     client_missed: int
     """Steps that vehicles missed because their process woke too late."""
+    client_late_ms_max: float
+    """Longest delay with which a vehicle's step began [ms]."""
     machine_missed: int | None
     """Steps that a thread which only sleeps missed in the same time: the machine's share."""
     machine_late_ms_max: float | None
@@ -384,6 +386,9 @@ def _summarise(options: FleetOptions, flight: FleetFlight, least_m: float | None
         tick_ms_p99=max(server["tick_ms_p99"] for server in servers),
         server_missed=sum(server["missed"] for server in servers),
         client_missed=sum(int(rows["missed"][-1]) for rows in rows_by_vehicle),
+        client_late_ms_max=max(
+            vehicle["late_ms"] for vehicle in counted["client"]["by_vehicle"].values()
+        ),
         machine_missed=machine.missed if machine else None,
         machine_late_ms_max=machine.max_s * 1e3 if machine else None,
         server_cpu_us=spent_us,
@@ -417,7 +422,10 @@ def _show(summary: FleetSummary, title: str) -> None:
         *terminal.drops(s.drops),
         ("errors of plug-ins", terminal.listed(s.plugin_errors) or None),
         ("tick p50, p99 [ms]", f"{s.tick_ms_p50:.2f}, {s.tick_ms_p99:.2f}"),
-        ("deadlines missed by server, clients", f"{s.server_missed}, {s.client_missed}"),
+        (
+            "deadlines missed by server, clients",
+            f"{s.server_missed}, {s.client_missed}; {s.client_late_ms_max:.1f} ms late at worst",
+        ),
         (
             "  by a process that only sleeps",
             None

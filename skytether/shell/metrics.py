@@ -203,6 +203,8 @@ by_vehicle/{vehicle}/step client_step
     Number of the vehicle's next step.
 by_vehicle/{vehicle}/steps client_steps
     Steps of the whole flight.
+by_vehicle/{vehicle}/late_ms client_step_lateness_seconds
+    Largest time by which a step began late.
 by_vehicle/{vehicle}/age_ms client_age_seconds
     Age of the observation from which the input in force was planned.
 by_vehicle/{vehicle}/plan_age_ms client_plan_age_seconds

@@ -129,6 +129,7 @@ def test_a_datagram_reaches_the_vehicle_whose_socket_it_came_to_and_no_other() -
         "step": 0,
         "steps": 200,
         "missed": 0,
+        "late_ms": 0.0,
         "began_s": 0.0,
         "horizons": 0,
         "dropped": {"not a message": 1},
@@ -158,6 +159,7 @@ def test_a_virtual_fleet_is_summed_up(tmp_path: Path) -> None:
     assert 0.05 < smallest <= median <= largest < 0.8
     assert set(summary["server_cpu_us"]) == set(STAGES) - {"receive", "send"}
     assert summary["machine_missed"] is None
+    assert summary["client_late_ms_max"] == 0.0
     assert summary["vehicle_steps_per_core_s"] > 0
     dropped = summary["drops"]
     assert sum(dropped["netem"].values()) == summary["lost"]

@@ -14,7 +14,7 @@ from skytether.client.failsafe import FOLLOWING
 from skytether.lab.adversary import Move, MoveKind, Raid, spare_m
 from skytether.lab.lives import Lives
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS, seconds_to_ns
-from skytether.shared.core.events import Leaving, LeftMotion
+from skytether.shared.core.events import Leaving, LeftMotion, SteppedLate
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Reason, parse
 
@@ -90,6 +90,23 @@ def test_without_the_rule_the_others_meet_it(monkeypatch: pytest.MonkeyPatch) ->
 def test_a_stall_of_one_step_takes_a_vehicle_off_no_motion(at_s: float) -> None:
     stalls = (move(MoveKind.STALLS, number, "", at_s, 0.12) for number in (1, 5))
     assert attacked(EIGHT, *stalls) > 0.3
+
+
+def test_a_step_that_begins_too_late_is_told_and_the_latest_is_a_figure() -> None:
+    lives = Lives(FOUR)
+    stalls_s = {5.0: 0.08, 6.0: 0.32, 8.0: 0.2}
+    for at_s, length_s in stalls_s.items():
+        lives.world.at(seconds_to_ns(at_s), partial(lives.world.freeze, "client 2"))
+        lives.world.at(seconds_to_ns(at_s + length_s), partial(lives.world.thaw, "client 2"))
+    lives.run(10.0)
+    (told,) = (each for _, _, each in lives.events if isinstance(each, SteppedLate))
+    assert told.vehicle == 2
+    assert stalls_s[6.0] - FOUR.control.dt < told.late_s <= stalls_s[6.0]
+    late_ms = {
+        number: life[-1].client.vehicle_figures()["late_ms"]
+        for number, life in lives._lives.items()
+    }
+    assert late_ms == {1: 0.0, 2: 1000.0 * told.late_s, 3: 0.0, 4: 0.0}
 
 
 def test_the_server_tells_how_near_a_flight_came_to_what_the_theorem_assumes() -> None:
