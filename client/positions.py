@@ -78,7 +78,7 @@ class Positions:
         self._newest_ns: int | None = None
         """Stamp of the newest measurement [ns; the client's clock]."""
         self._leaps = leaps
-        self._is_flown = False
+        self.is_flown = False
         """Whether the vehicle is flown by its measurements, so that a leap counts."""
         self.leap_m: Vector | None = None
         """Displacement of the position about which the operator has not decided, in our axes [m];
@@ -147,10 +147,16 @@ class Positions:
         """After a leap of the position, displace the origin by the same vector: the vehicle has not
         moved so far.
         """
-        if leaps.leaps(measured, measured.numbers()) and leaps.off_m and self._is_flown:
+        if leaps.leaps(measured, measured.numbers()) and leaps.off_m and self.is_flown:
             dx, dy, dz = leaps.off_m
-            (x, y, z), before = self.origin, self.leap_m or (0.0, 0.0, 0.0)
-            self.origin = x + dx, y + dy, z + dz
+            self.displace((dx, dy, dz))
+
+    def displace(self, by_m: Vector, *, asks: bool = True) -> None:
+        """Displace the origin together with the position; `asks` an operator to decide about it."""
+        dx, dy, dz = by_m
+        (x, y, z), before = self.origin, self.leap_m or (0.0, 0.0, 0.0)
+        self.origin = x + dx, y + dy, z + dz
+        if asks:
             self.leap_m = before[0] + dx, before[1] + dy, before[2] + dz
 
     def decide(self, *, keeps_frame: bool) -> None:
@@ -232,7 +238,7 @@ class Positions:
 
     def take(self, *, now_ns: int) -> list[Measurement]:
         """Measurements up to now that have not been returned before, oldest first."""
-        self._is_flown = True
+        self.is_flown = True
         due = []
         while self._waiting and self._waiting[0].stamp_ns <= now_ns:
             due.append(self._waiting.popleft())

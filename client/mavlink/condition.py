@@ -2,6 +2,7 @@
 
 from math import isfinite
 
+from skytether.client.mavlink.receiver import UNHEARD_NS, Receiver
 from skytether.mavlink.codec import Message
 from skytether.mavlink.dialect import dialect
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
@@ -63,6 +64,9 @@ class Condition:
         """Whether the battery is low, according to each message that reports it, by the type of the
         message."""
         self._low_ns: int | None = None
+        self.receiver = Receiver()
+        self.has_new_fix = False
+        """Whether the newest message had a usable fix of the receiver that is new."""
 
     def hear(self, message: Message, *, now_ns: int) -> None:
         """Process a message of the autopilot, unless a newer one arrived before it.
@@ -70,7 +74,9 @@ class Condition:
         These messages have no time stamps: an overtaken heartbeat would undo the mode that a pilot
         has just chosen.
         """
-        self.heard_ns = now_ns
+        if self.heard_ns is not None and now_ns - self.heard_ns > UNHEARD_NS:
+            self.receiver.unheard(now_ns=now_ns)
+        self.heard_ns, self.has_new_fix = now_ns, False
         if self._is_overtaken(message.get_seq(), now_ns):
             return
         self._number, self._number_ns = message.get_seq(), now_ns
@@ -89,6 +95,8 @@ class Condition:
                 flags = message.flags
                 knows = flags & KNOWS and flags & PLACED and not flags & STANDS_IN
                 self._bad("ESTIMATE", not knows, now_ns)
+            case "GPS_RAW_INT":
+                self.has_new_fix = self.receiver.hear(message, now_ns=now_ns)
             case "HOME_POSITION":
                 self.home = message.latitude / 1e7, message.longitude / 1e7, message.altitude / 1e3
                 self.home_up = -message.z if isfinite(message.z) else 0.0
@@ -125,6 +133,9 @@ class Condition:
         return self._low_ns is not None and now_ns - self._low_ns >= LOW_NS
 
     def is_astray(self, *, now_ns: int) -> bool:
+        """Whether the estimate is bad, or will soon be: the receiver has lost its fix."""
+        if self.heard_ns is not None and self.receiver.is_lost(now_ns=self.heard_ns):
+            return True
         return self._astray_ns is not None and now_ns - self._astray_ns >= ASTRAY_NS
 
     def is_fresh(self, *, now_ns: int) -> bool:

@@ -1,6 +1,9 @@
 """Measurements from LOCAL_POSITION_NED, in our axes."""
 
+from typing import Any
+
 from skytether.client import positions
+from skytether.client.navigation import Plane, Slides
 from skytether.client.positions import Vector
 from skytether.mavlink.codec import Message
 from skytether.mavlink.frames import turned
@@ -21,9 +24,34 @@ def given_origin(scenario: Scenario) -> Vector | None:
 
 
 class Positions(positions.Positions):
+    _origin_before: Vector | None = None
+    """Origin at the newest fix of the receiver."""
+
+    def __init__(self, *args: Any, **keys: Any) -> None:
+        super().__init__(*args, **keys)
+        self._slides = Slides()
+
     def hear(self, message: Message, *, now_ns: int) -> None:
         # The stamp is in whole milliseconds: its middle is the best guess.
         boot_ns = message.time_boot_ms * MILLISECOND_NS + MILLISECOND_NS // 2
         position = turned((message.x, message.y, message.z))
         velocity = turned((message.vx, message.vy, message.vz))
         self.take_in(boot_ns, position, velocity, now_ns=now_ns)
+
+    def hear_fix(self, velocity: Plane | None, stamp_ns: int) -> None:
+        """Compare the position with a fix of the receiver.
+
+        Args:
+            velocity: the receiver's velocity, north and east [m/s]; None if it measures none.
+            stamp_ns: time of the fix, by the autopilot's clock [ns].
+        """
+        if velocity is None or self.position is None or not self.is_flown:
+            return
+        if self.origin != self._origin_before:
+            self._slides.begin()
+        (north, east, _), (x, y, _) = self.position, self.origin
+        slide = self._slides.slid((north - x, east - y), velocity, stamp_ns)
+        if slide is not None:
+            # An operator who has decided about a slide is not asked about the rest of it.
+            self.displace((*slide.by_m, 0.0), asks=slide.begins or self.leap_m is not None)
+        self._origin_before = self.origin

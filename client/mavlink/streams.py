@@ -24,6 +24,7 @@ HEARTBEAT_HZ = 5.0
 RATES = {
     int(dialect.MAVLINK_MSG_ID_EXTENDED_SYS_STATE): 5.0,
     int(dialect.MAVLINK_MSG_ID_ATTITUDE): 10.0,
+    int(dialect.MAVLINK_MSG_ID_GPS_RAW_INT): 5.0,
     int(dialect.MAVLINK_MSG_ID_SYS_STATUS): 2.0,
     int(dialect.MAVLINK_MSG_ID_BATTERY_STATUS): 1.0,
     int(dialect.MAVLINK_MSG_ID_HOME_POSITION): 0.5,

@@ -11,10 +11,19 @@ from skytether.shared.base.hint import hint
 from skytether.shared.base.units import MILLISECOND_NS, seconds_to_ns
 
 FaultName = Literal[
-    "silence", "pilot", "disarm", "battery", "estimate", "drift", "leap", "commander"
+    "silence",
+    "pilot",
+    "disarm",
+    "battery",
+    "estimate",
+    "drift",
+    "leap",
+    "shift",
+    "fix",
+    "commander",
 ]
 NAMES: tuple[str, ...] = get_args(FaultName)
-LASTING = ("silence", "estimate", "drift", "leap", "commander")
+LASTING = ("silence", "estimate", "drift", "leap", "shift", "fix", "commander")
 DRIFT: Vector = (3.5, 0.0, 0.0)
 """True velocity of the fault `drift`, which the estimate does not show [m/s]."""
 COMMANDED: Vector = (3.0, 0.0, 0.0)
@@ -23,6 +32,8 @@ COMMANDED_NS = 20 * MILLISECOND_NS
 """Interval of the second commander's set-points [ns]."""
 LEAP: Vector = (-12.0, 0.0, 0.0)
 """Displacement of the reported position with the fault `leap` [m]."""
+SHIFT: Vector = (3.0, 0.0, 0.0)
+"""Shift of the receiver's position with the fault `shift` [m]."""
 LOW_CHARGE = 0.05
 """Remaining charge after the fault `battery`."""
 
@@ -102,5 +113,9 @@ class Script:
                 self._commands = wrong
             case "leap":
                 flight.displaced = LEAP if wrong else REST
+            case "shift":
+                flight.shift = SHIFT if wrong else REST
+            case "fix":
+                flight.fixes = not wrong
             case _:
                 flight.estimates = not wrong

@@ -58,6 +58,8 @@ class SimulatedFlavour:
     """Time from the take-off command until the vehicle climbs."""
     wander_mps: float
     """Standard deviation, along each axis, of the error of the velocity that the loops use."""
+    blind_s: float
+    """Time after the last fix from which the estimate counts as lost, and the vehicle lands."""
     home: tuple[float, float, float]
     """Latitude and longitude [°], and altitude above the sea [m], of the start."""
     modes: dict[int, tuple[str, FlightMode]]
@@ -93,6 +95,7 @@ FLAVOURS: dict[FlavourName, SimulatedFlavour] = {
         forwards=False,
         spool_s=3.4,
         wander_mps=0.0,
+        blind_s=7.9,
         home=(-35.363262, 149.165237, 584.0),
         modes={
             5: ("LOITER", FlightMode.PILOT),
@@ -156,6 +159,7 @@ FLAVOURS: dict[FlavourName, SimulatedFlavour] = {
         forwards=True,
         spool_s=1.0,
         wander_mps=0.16,
+        blind_s=5.8,
         home=(47.397742, 8.545594, 489.4),
         modes={
             _px4(3): ("POSCTL", FlightMode.PILOT),

@@ -5,7 +5,7 @@ from collections.abc import Callable
 from struct import pack
 
 from skytether.autopilot.flavours import CURRENT_MODE
-from skytether.autopilot.flight import Landed, PilotedVehicle
+from skytether.autopilot.flight import Landed, PilotedVehicle, Vector
 from skytether.mavlink import parameters
 from skytether.mavlink.codec import Message
 from skytether.mavlink.dialect import dialect
@@ -77,9 +77,9 @@ class Telemetry:
             velocity[2],
         )
 
-    def _globe(self) -> tuple[int, int, int]:
+    def _globe(self, place: Vector) -> tuple[int, int, int]:
         """Latitude and longitude [1e-7 degrees], and altitude above the sea [mm]."""
-        north, east, up = self._flight.estimate()
+        north, east, up = place
         latitude, longitude, altitude = self._flight.flavour.home
         degree_m = math.radians(1.0) * EARTH_M
         longitude += east / (degree_m * math.cos(math.radians(latitude)))
@@ -92,7 +92,7 @@ class Telemetry:
     def global_position(self) -> Message | None:
         if not self._flight.ready:
             return None
-        latitude, longitude, altitude_mm = self._globe()
+        latitude, longitude, altitude_mm = self._globe(self._flight.estimate())
         *_, up = self._flight.estimate()
         north, east, down = (round(100.0 * each) for each in turned(self._flight.velocity()))
         heading = round(100.0 * self._heading) % 36000
@@ -111,11 +111,10 @@ class Telemetry:
     def gps(self) -> Message:
         """Fix of the receiver: none before the estimate is ready."""
         flight = self._flight
-        fix = dialect.GPS_FIX_TYPE_3D_FIX if flight.ready else dialect.GPS_FIX_TYPE_NO_FIX
-        latitude, longitude, altitude_mm = self._globe() if flight.ready else (0, 0, 0)
-        north, east, _ = flight.velocity()
-        speed = round(100.0 * math.hypot(north, east))
-        satellites = 10 if flight.ready else 0
+        has_fix = flight.ready and flight.fixes
+        fix = dialect.GPS_FIX_TYPE_3D_FIX if has_fix else dialect.GPS_FIX_TYPE_NO_FIX
+        place, (north, east, _) = flight.received()
+        latitude, longitude, altitude_mm = self._globe(place) if has_fix else (0, 0, 0)
         return dialect.MAVLink_gps_raw_int_message(
             1000 * self._boot_ms,
             fix,
@@ -124,9 +123,10 @@ class Telemetry:
             altitude_mm,
             121,
             200,
-            speed,
-            UNKNOWN,
-            satellites,
+            round(100.0 * math.hypot(north, east)),
+            round(100.0 * math.degrees(math.atan2(east, north))) % 36000,
+            10 if has_fix else 0,
+            h_acc=300,
         )
 
     def hud(self) -> Message:

@@ -1,0 +1,63 @@
+"""Position receiver of an autopilot, from GPS_RAW_INT: whether it has a fix, and its velocity.
+
+An autopilot flies on for seconds after the last fix, by its accelerometers alone, before its own
+flags say so. A vehicle whose receiver never had a fix since the client began has another source.
+"""
+
+import math
+
+from skytether.mavlink.codec import Message
+from skytether.mavlink.dialect import dialect
+from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
+
+LOST_NS = 1500 * MILLISECOND_NS
+"""Time without a usable fix after which the receiver counts as lost, unless fixes are rare."""
+FEWEST = 3
+"""Number of intervals between fixes without one after which the receiver counts as lost."""
+INTERVAL_MAX_NS = 2 * SECOND_NS
+"""Largest interval that counts as one between fixes."""
+UNHEARD_NS = SECOND_NS // 2
+"""Pause of all messages after which the time without a fix counts anew."""
+ACCURACY_MM = 5000
+"""Largest horizontal error of a usable fix [mm], as both autopilots' own checks have it."""
+UNKNOWN = 65535
+US_NS = 1000
+
+
+class Receiver:
+    def __init__(self) -> None:
+        self.stamp_ns = -1
+        """Time of the newest usable fix, on the autopilot's clock [ns]; -1 before the first."""
+        self.velocity: tuple[float, float] | None = None
+        """Velocity of that fix, north and east [m/s]; None if it has none."""
+        self._fix_ns: int | None = None
+        """Arrival of that fix, or a later time from which the time without one counts [ns]."""
+        self._interval_ns = 0
+
+    def hear(self, message: Message, *, now_ns: int) -> bool:
+        """Process a GPS_RAW_INT; returns whether it has a usable fix that is new."""
+        stamp_ns = message.time_usec * US_NS
+        if not _is_usable(message) or stamp_ns == self.stamp_ns:
+            return False
+        if self._fix_ns is not None and now_ns - self._fix_ns <= INTERVAL_MAX_NS:
+            self._interval_ns = now_ns - self._fix_ns
+        self.stamp_ns, self._fix_ns = stamp_ns, now_ns
+        self.velocity = None
+        if UNKNOWN not in (message.vel, message.cog):
+            speed, course = message.vel / 100.0, math.radians(message.cog / 100.0)
+            self.velocity = speed * math.cos(course), speed * math.sin(course)
+        return True
+
+    def unheard(self, *, now_ns: int) -> None:
+        """Note that all messages have paused: the time without a fix counts from now on."""
+        if self._fix_ns is not None:
+            self._fix_ns = now_ns
+
+    def is_lost(self, *, now_ns: int) -> bool:
+        if self._fix_ns is None:
+            return False
+        return now_ns - self._fix_ns > max(LOST_NS, FEWEST * self._interval_ns)
+
+
+def _is_usable(message: Message) -> bool:
+    return bool(message.fix_type >= dialect.GPS_FIX_TYPE_3D_FIX and message.h_acc <= ACCURACY_MM)
