@@ -42,6 +42,8 @@ ARRIVED_M, RESTS_MPS = 0.3, 0.1
 """Distance from its goal, and speed, below which a vehicle has arrived [m, m/s]."""
 AIMED_NS = 10 * SECOND_NS
 """Targeted changes begin within this time before the nearest approach [ns]."""
+FIRST = 2
+"""Number of packets per vehicle that count as the beginning of a flight: HELLO and WELCOME."""
 ONE_NS = MILLISECOND_NS
 """Length of a targeted move, which hits a single packet [ns]."""
 APART, CLEAR, ASSUMED = "apart", "clear", ("tube", "join")
@@ -691,10 +693,15 @@ class MoveSampler:
             if each.vehicle in candidates and at_ns - AIMED_NS <= each.time_ns <= at_ns
         ]
         if move.kind in NETWORK and mine and rng.random() < 0.7:
-            # An old packet, as a HELLO, may be any of the flight.
-            among = packets if move.kind is MoveKind.COPIES else mine
+            among = mine
+            if move.kind is MoveKind.COPIES:
+                # Any packet of the flight; every second time of its beginning, as a HELLO is.
+                first = packets[: FIRST * len(self._vehicles)]
+                among = first if rng.random() < 0.5 else packets
             time_ns, way, vehicle = among[int(rng.integers(len(among)))]
-            if move.kind in AGED:
+            if move.kind is MoveKind.COPIES and time_ns < start_ns:
+                move = replace(move, amounts=((start_ns - time_ns) / SECOND_NS,))
+            elif move.kind in AGED:
                 move = replace(move, amounts=tuple(self._age_s() for _ in move.amounts))
             return replace(move, vehicle=vehicle, way=way, start_ns=time_ns, length_ns=ONE_NS)
         return replace(move, vehicle=vehicle, start_ns=start_ns)

@@ -17,12 +17,15 @@ from skytether.__main__ import main
 from skytether.lab.adversary import (
     COVERED,
     HAS_STANDBY,
+    ONE_NS,
     AdversaryNetwork,
     Climb,
     Climbed,
     Move,
     MoveKind,
     MoveSampler,
+    Near,
+    Packet,
     Raid,
     climb,
     dumps,
@@ -196,6 +199,19 @@ def test_with_moves_of_two_servers_flights_of_other_moves_have_two_as_well() -> 
     drawn = [sampler.some() for _ in range(50)]
     assert 10 < sum(HAS_STANDBY in moves for moves in drawn) < 40
     assert {each.kind for moves in drawn for each in moves} == {*COVERED}
+
+
+def test_copies_of_the_first_packets_arrive_shortly_before_the_nearest_approach() -> None:
+    """Among them are HELLO and WELCOME, which are few."""
+    task = Climb(FOUR, (MoveKind.COPIES,), 1, 1)
+    sampler, near = MoveSampler(task, np.random.default_rng(1)), Near(0.6, 20.0, (1, 3))
+    packets = [Packet(seconds_to_ns(0.1 * n), "uplink", 1 + n % 4) for n in range(400)]
+    drawn = [each for _ in range(200) for each in sampler.changed((), near, packets)]
+    early = [each for each in drawn if each.length_ns == ONE_NS and each.start_ns < SECOND_NS]
+    arrive_s = [each.start_ns / SECOND_NS + each.amounts[0] for each in early]
+    assert len(early) > 10
+    assert min(arrive_s) > 10.0
+    assert max(arrive_s) <= 20.0
 
 
 # -- planted faults ------------------------------------------------------------------------------
