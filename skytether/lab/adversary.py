@@ -602,7 +602,8 @@ class MoveSampler:
 
     def _stop(self) -> Moves:
         """The server closes its sessions, and some of its vehicles hear so, each at its time."""
-        rng, stop = self._rng, replace(self._one([MoveKind.STOPS]), amounts=(0.0,))
+        rng, stop = self._rng, self._one([MoveKind.STOPS])
+        stop = replace(stop, amounts=(0.0, *stop.amounts[1:]))
         moves = [stop]
         for number in self._vehicles:
             told = Move(MoveKind.CUTS, number, "uplink", stop.start_ns, ONE_NS)
@@ -658,7 +659,7 @@ class MoveSampler:
                 case 3 if now and now[i].vehicle:
                     now[i] = replace(now[i], vehicle=int(rng.choice(self._vehicles)))
                 case 4:
-                    now.append(self._aimed(near, packets))
+                    now.extend(self._aimed(near, packets))
                 case _:
                     now.append(self._one(self._kinds))
         # Keep the newest moves: otherwise an added move could be cut off at once.
@@ -681,7 +682,7 @@ class MoveSampler:
                 pairs = zip(move.amounts, other, strict=True)
                 return replace(move, amounts=tuple(a + share * (b - a) for a, b in pairs))
 
-    def _aimed(self, near: Near, packets: Sequence[Packet]) -> Move:
+    def _aimed(self, near: Near, packets: Sequence[Packet]) -> Moves:
         """Random move shortly before the nearest approach, against one of the nearest vehicles."""
         rng, at_ns = self._rng, seconds_to_ns(near.at_s)
         move, candidates = self._one(self._kinds), near.vehicles or self._vehicles
@@ -693,18 +694,30 @@ class MoveSampler:
             if each.vehicle in candidates and at_ns - AIMED_NS <= each.time_ns <= at_ns
         ]
         if move.kind in NETWORK and mine and rng.random() < 0.7:
-            among = mine
-            if move.kind is MoveKind.COPIES:
-                # Any packet of the flight; every second time of its beginning, as a HELLO is.
-                first = packets[: FIRST * len(self._vehicles)]
-                among = first if rng.random() < 0.5 else packets
+            if move.kind is MoveKind.COPIES and rng.random() < 0.5:
+                return self._greeting(start_ns, candidates, packets)
+            among = packets if move.kind is MoveKind.COPIES else mine
             time_ns, way, vehicle = among[int(rng.integers(len(among)))]
-            if move.kind is MoveKind.COPIES and time_ns < start_ns:
-                move = replace(move, amounts=((start_ns - time_ns) / SECOND_NS,))
-            elif move.kind in AGED:
+            if move.kind in AGED:
                 move = replace(move, amounts=tuple(self._age_s() for _ in move.amounts))
-            return replace(move, vehicle=vehicle, way=way, start_ns=time_ns, length_ns=ONE_NS)
-        return replace(move, vehicle=vehicle, start_ns=start_ns)
+            return (replace(move, vehicle=vehicle, way=way, start_ns=time_ns, length_ns=ONE_NS),)
+        return (replace(move, vehicle=vehicle, start_ns=start_ns),)
+
+    def _greeting(
+        self, arrives_ns: int, vehicles: Sequence[int], packets: Sequence[Packet]
+    ) -> Moves:
+        """A vehicle's HELLO or WELCOME comes again; if servers may die, as one has restarted."""
+        first = [
+            each for each in packets[: FIRST * len(self._vehicles)] if each.vehicle in vehicles
+        ]
+        time_ns, way, vehicle = first[int(self._rng.integers(len(first)))]
+        age_s = max(arrives_ns - time_ns, 0) / SECOND_NS
+        copy = Move(MoveKind.COPIES, vehicle, way, time_ns, ONE_NS, (age_s,))
+        if MoveKind.SERVER not in self._kinds:
+            return (copy,)
+        dies = self._one([MoveKind.SERVER])
+        dies = replace(dies, length_ns=min(dies.length_ns, arrives_ns + 1))
+        return replace(dies, start_ns=arrives_ns + 1 - dies.length_ns), copy
 
 
 def shrunk(scenario: Scenario, found: Approach) -> Approach:

@@ -17,7 +17,6 @@ from skytether.__main__ import main
 from skytether.lab.adversary import (
     COVERED,
     HAS_STANDBY,
-    ONE_NS,
     AdversaryNetwork,
     Climb,
     Climbed,
@@ -201,17 +200,34 @@ def test_with_moves_of_two_servers_flights_of_other_moves_have_two_as_well() -> 
     assert {each.kind for moves in drawn for each in moves} == {*COVERED}
 
 
-def test_copies_of_the_first_packets_arrive_shortly_before_the_nearest_approach() -> None:
-    """Among them are HELLO and WELCOME, which are few."""
-    task = Climb(FOUR, (MoveKind.COPIES,), 1, 1)
+def test_a_copy_of_a_hello_arrives_when_the_server_has_restarted() -> None:
+    task = Climb(FOUR, (MoveKind.COPIES, MoveKind.SERVER), 1, 1)
     sampler, near = MoveSampler(task, np.random.default_rng(1)), Near(0.6, 20.0, (1, 3))
-    packets = [Packet(seconds_to_ns(0.1 * n), "uplink", 1 + n % 4) for n in range(400)]
-    drawn = [each for _ in range(200) for each in sampler.changed((), near, packets)]
-    early = [each for each in drawn if each.length_ns == ONE_NS and each.start_ns < SECOND_NS]
-    arrive_s = [each.start_ns / SECOND_NS + each.amounts[0] for each in early]
-    assert len(early) > 10
-    assert min(arrive_s) > 10.0
-    assert max(arrive_s) <= 20.0
+    packets = [Packet(seconds_to_ns(0.1 * n), "downlink", 1 + n % 4) for n in range(400)]
+    drawn = [sampler.changed((), near, packets) for _ in range(400)]
+    found = [
+        (server, copy)
+        for server, copy in (moves for moves in drawn if len(moves) == 2)
+        if copy.kind is MoveKind.COPIES
+        and copy.start_ns + seconds_to_ns(copy.amounts[0]) + 1 == server.end_ns
+    ]
+    assert len(found) > 10
+    for server, copy in found:
+        assert server.kind is MoveKind.SERVER
+        assert copy.vehicle in near.vehicles
+        assert copy.start_ns < SECOND_NS
+        assert 10 * SECOND_NS < server.end_ns <= 20 * SECOND_NS + 1
+
+
+def test_every_move_that_is_drawn_can_be_changed() -> None:
+    sampler = MoveSampler(Climb(FOUR, tuple(MoveKind), 1, 1), np.random.default_rng(1))
+    for _ in range(50):
+        moves = sampler.some()
+        for _ in range(5):
+            moves = tuple(map(sampler._tuned, moves))
+        assert [len(each.amounts) for each in moves] == [
+            len(sampler._amounts(each.kind)) for each in moves
+        ]
 
 
 # -- planted faults ------------------------------------------------------------------------------
