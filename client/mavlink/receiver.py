@@ -27,7 +27,8 @@ US_NS = 1000
 class Receiver:
     def __init__(self) -> None:
         self.stamp_ns = -1
-        """Time of the newest usable fix, on the autopilot's clock [ns]; -1 before the first."""
+        """Time of the newest usable fix, on the autopilot's clock, or of its arrival if it has no
+        time [ns]; -1 before the first."""
         self.velocity: tuple[float, float] | None = None
         """Velocity of that fix, north and east [m/s]; None if it has none."""
         self._fix_ns: int | None = None
@@ -36,7 +37,7 @@ class Receiver:
 
     def hear(self, message: Message, *, now_ns: int) -> bool:
         """Process a GPS_RAW_INT; returns whether it has a usable fix that is new."""
-        stamp_ns = message.time_usec * US_NS
+        stamp_ns = message.time_usec * US_NS or now_ns  # 0: PX4, if the receiver knows no date
         if not _is_usable(message) or stamp_ns == self.stamp_ns:
             return False
         if self._fix_ns is not None and now_ns - self._fix_ns <= INTERVAL_MAX_NS:

@@ -52,6 +52,8 @@ class SimulatedFlavour:
     """Whether texts go only to ground stations, as PX4's do."""
     fixed_heartbeats: bool
     """Whether the rate of its heartbeats cannot be set."""
+    stamps_fixes: bool
+    """Whether fixes of its receiver have a time: PX4 sends 0 where the receiver knows no date."""
     forwards: bool
     """Whether heartbeats of each peer go to the others."""
     spool_s: float
@@ -92,6 +94,7 @@ FLAVOURS: dict[FlavourName, SimulatedFlavour] = {
         ready_s=41.5,
         words_for_stations=False,
         fixed_heartbeats=False,
+        stamps_fixes=True,
         forwards=False,
         spool_s=3.4,
         wander_mps=0.0,
@@ -156,6 +159,7 @@ FLAVOURS: dict[FlavourName, SimulatedFlavour] = {
         ready_s=4.6,
         words_for_stations=True,
         fixed_heartbeats=True,
+        stamps_fixes=False,
         forwards=True,
         spool_s=1.0,
         wander_mps=0.16,

@@ -116,7 +116,7 @@ class Telemetry:
         place, (north, east, _) = flight.received()
         latitude, longitude, altitude_mm = self._globe(place) if has_fix else (0, 0, 0)
         return dialect.MAVLink_gps_raw_int_message(
-            1000 * self._boot_ms,
+            1000 * self._boot_ms if flight.flavour.stamps_fixes else 0,
             fix,
             latitude,
             longitude,
