@@ -42,6 +42,8 @@ STOPPED = (Mode.FAULT, Mode.MANUAL)
 """Modes in which the input is zero at once."""
 HOVERING = frozenset({Mode.INIT, Mode.SYNC, Mode.READY, Mode.HOVER, Mode.LAND})
 """Modes in which a vehicle holds its position, or descends from it."""
+UNPLACED = frozenset({Reason.MUTE, Reason.UNUSABLE, Reason.ASTRAY})
+"""Reasons for hovering with which nobody knows where the vehicle is."""
 IMPOSSIBLE = frozenset({Drop.FROM_THE_FUTURE, Drop.OBSERVATION})
 """Reasons for dropping a horizon from the future."""
 
@@ -64,7 +66,10 @@ class Pilot:
         self._navigation = Navigation(scenario)
         self._failsafe = failsafe
         self._recorder = recorder
-        along = regulator(scenario) if self._terms.splines else None
+        self._holds = scenario.is_mission or (vehicle.drifts and failsafe.brakes)
+        """Whether a hovering vehicle holds its place: velocities alone let it drift, and other
+        vehicles of a mission keep clear of that place."""
+        along = regulator(scenario) if self._terms.splines or self._holds else None
         self.compensator = Compensator(self._terms, along)
         self._reporter = Reporter(self._terms, scenario.vehicle.report, self.compensator)
         self._fence = Fence(scenario) if scenario.fence.is_there else None
@@ -180,8 +185,12 @@ class Pilot:
         if not self._failsafe.takes:
             self._takes_from = None
         if cause in DROPPING:
-            self.compensator.drop(self.step - 1, self._input)
-            self._speed = math.hypot(*self._input.tolist())
+            self._drop()
+
+    def _drop(self) -> None:
+        """Drop the horizon, or the place that is held, and brake from the present input."""
+        self.compensator.drop(self.step - 1, self._input)
+        self._speed = math.hypot(*self._input.tolist())
 
     # -- steps -------------------------------------------------------------------------------
 
@@ -234,6 +243,8 @@ class Pilot:
         elif self._navigation.leapt:
             self.leap_m = tuple(self._navigation.leaps.off_m)
             failsafe.leapt(now_ns=now_ns)
+            if compensator.rests:
+                self._drop()
         # Before `choose`, which advances the compensator to this step.
         had_plan = compensator.covered
         self._rest()
@@ -292,16 +303,22 @@ class Pilot:
         return np.array(flown)
 
     def _rest(self) -> None:
-        """Hold the position of a vehicle that hovers on a mission: other vehicles keep clear of
-        that position.
-        """
+        """Hold the place of a vehicle that hovers without a plan: where it comes to rest."""
         if self._is_to_rest() and self._navigation.is_known:
-            self.compensator.rest(self.step, self._navigation.predicted)
+            place = self._navigation.predicted.copy()
+            if not self._is_mission:
+                place[:, 0] += np.array(self._terms.tau_s) * place[:, 1]
+            self.compensator.rest(self.step, place)
 
     def _is_to_rest(self) -> bool:
-        hovers = self._is_mission and self._failsafe.mode in HOVERING
-        compensator = self.compensator
-        return hovers and compensator.in_force == NO_HORIZON and not compensator.rests
+        failsafe, compensator = self._failsafe, self.compensator
+        hovers = self._holds and failsafe.mode in HOVERING
+        is_free = compensator.in_force == NO_HORIZON and not compensator.rests
+        if not (hovers and is_free):
+            return False
+        # After a change of the frame the estimate is of the old one until a position comes.
+        is_measured = bool(np.isfinite(self._navigation.measured[:, 0]).all())
+        return is_measured and (self._is_mission or failsafe.reason not in UNPLACED)
 
     def _fenced(self, fence: Fence, flown: list[float]) -> list[float]:
         """Input limited by the fence, which does not stop a landing vehicle from descending."""
@@ -314,6 +331,8 @@ class Pilot:
         self._vehicle.decide(keeps_frame=keeps_frame)
         if not keeps_frame:
             self._navigation.begin_anew()
+            if self.compensator.rests:
+                self._drop()
         self._failsafe.decide()
         self.leap_m = None
 

@@ -73,6 +73,8 @@ class Vehicle(ABC):
     node: Node | None = None
     """Node of the ROS graph whose topics the port is connected to; None: the port is connected to
     the line at `vehicle.address`."""
+    drifts = False
+    """Whether the vehicle drifts while it is commanded to stand."""
     returns = False
     """Whether the vehicle can return home by itself, see `return_home`."""
     leap_m: tuple[float, ...] | None = None

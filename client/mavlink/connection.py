@@ -42,6 +42,8 @@ class Connection:
         self.peer: Address | None = line.peer
         self.target: tuple[int, int] | None = None
         """Numbers of the autopilot's system and component; None until its first heartbeat."""
+        self.unmet: tuple[Address, tuple[int, int]] | None = None
+        """Address and numbers of an autopilot that has sent no heartbeat yet."""
         self.codec = Codec(keys.system, keys.component, stream=line.kind in ("tcp", "serial"))
         self.counts: Counter[str] = Counter()
         """Number of messages `heard`, `foreign` and `for_others`, and of datagrams from
@@ -71,7 +73,9 @@ class Connection:
         for message in messages:
             sender = _sender(message)
             if self.target is None and self._is_autopilot(message):
-                self.target, self.peer, met = sender, peer, message
+                self.target, self.peer, met, self.unmet = sender, peer, message, None
+            elif self.target is None and self._is_wanted(sender):
+                self.unmet = peer, sender
             if sender != self.target:
                 self.counts["foreign"] += 1
                 if self.target is not None and sender != (self._keys.system, self._keys.component):
@@ -85,13 +89,16 @@ class Connection:
 
     def _is_autopilot(self, message: Message) -> bool:
         """Whether a message is a heartbeat of the autopilot that the scenario asks for."""
-        system, component = _sender(message)
         return (
             message.get_type() == "HEARTBEAT"
-            and component == AUTOPILOT_COMPONENT
-            and self._keys.autopilot in (0, system)
+            and self._is_wanted(_sender(message))
             and message.autopilot != dialect.MAV_AUTOPILOT_INVALID
         )
+
+    def _is_wanted(self, sender: tuple[int, int]) -> bool:
+        """Whether these are the numbers of an autopilot that may be flown."""
+        system, component = sender
+        return component == AUTOPILOT_COMPONENT and self._keys.autopilot in (0, system)
 
     def _is_for_us(self, message: Message) -> bool:
         system = getattr(message, "target_system", 0)

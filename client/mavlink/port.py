@@ -13,6 +13,7 @@ from skytether.client.mavlink.connection import Connection
 from skytether.client.mavlink.hindrances import Hindrances
 from skytether.client.mavlink.launch import Phase
 from skytether.client.mavlink.setpoints import Sends, Setpoints
+from skytether.client.mavlink.streams import HEARTBEAT, request
 from skytether.client.positions import Vector
 from skytether.mavlink.codec import Message
 from skytether.mavlink.dialect import dialect
@@ -105,6 +106,7 @@ class Port(Endpoint):
         if now_ns >= self._tick_ns:
             self._tick_ns = now_ns + TICK_NS
             self._send_heartbeats(now_ns)
+            self._request_heartbeat()
             for message in self.autopilot.ask(now_ns=now_ns):
                 self._say(message)
         setpoint_ns = self._setpoints.due_ns(self._sends(), now_ns=now_ns)
@@ -122,6 +124,15 @@ class Port(Endpoint):
         self._say(_heartbeat(dialect.MAV_TYPE_ONBOARD_CONTROLLER))
         if self._may_be_station():
             self._say(_heartbeat(dialect.MAV_TYPE_GCS))
+
+    def _request_heartbeat(self) -> None:
+        """Request the first heartbeat: it may come a second later by itself, and a client that is
+        started again in flight has to send set-points before.
+        """
+        if self._connection.unmet is not None:
+            peer, target = self._connection.unmet
+            wanted = request(target, HEARTBEAT)
+            self.send(self._connection.codec.encode(wanted), peer)
 
     def _is_given_up(self) -> bool:
         """Whether the vehicle ignores the command to land: without the client's heartbeats its own

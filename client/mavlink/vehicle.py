@@ -30,6 +30,7 @@ class MavlinkVehicle(Vehicle):
     """
 
     returns = True
+    drifts = True
     changeable = keys_of(InFlight.ARMED, InFlight.ORIGIN)
 
     def __init__(self, scenario: Scenario, number: int) -> None:
