@@ -199,7 +199,8 @@ class Autopilot:
             case "LOCAL_POSITION_NED":
                 self.positions.hear(message, now_ns=now_ns)
             case "GPS_RAW_INT" if condition.has_new_fix:
-                self.positions.hear_fix(condition.receiver.velocity, condition.receiver.stamp_ns)
+                receiver = condition.receiver
+                self.positions.hear_fix(receiver.velocity, receiver.stamp_ns, now_ns=now_ns)
             case "TIMESYNC":
                 if self.timesync.hear(message, now_ns=now_ns):
                     self.restart()

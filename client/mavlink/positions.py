@@ -10,6 +10,9 @@ from skytether.mavlink.frames import turned
 from skytether.shared.base.units import MILLISECOND_NS
 from skytether.shared.scenario.schema import Scenario
 
+FRESH_NS = 200 * MILLISECOND_NS
+"""Age up to which a position is compared with a fix of the receiver."""
+
 
 def given_origin(scenario: Scenario) -> Vector | None:
     """Origin given by a scenario, in our axes [m]; None if it is the place of take-off."""
@@ -38,17 +41,20 @@ class Positions(positions.Positions):
         velocity = turned((message.vx, message.vy, message.vz))
         self.take_in(boot_ns, position, velocity, now_ns=now_ns)
 
-    def hear_fix(self, velocity: Plane | None, stamp_ns: int) -> None:
+    def hear_fix(self, velocity: Plane | None, stamp_ns: int, *, now_ns: int) -> None:
         """Compare the position with a fix of the receiver.
 
         Args:
             velocity: the receiver's velocity, north and east [m/s]; None if it measures none.
             stamp_ns: time of the fix, by the autopilot's clock [ns].
         """
-        if velocity is None or self.position is None or not self.is_flown:
+        if velocity is None or self.position is None or self.came_ns is None or not self.is_flown:
             return
-        if self.origin != self._origin_before:
+        is_old = now_ns - self.came_ns > FRESH_NS
+        if is_old or self.origin != self._origin_before:
             self._slides.begin()
+        if is_old:  # where newer ones are dropped it stands, while the fixes move on
+            return
         (north, east, _), (x, y, _) = self.position, self.origin
         slide = self._slides.slid((north - x, east - y), velocity, stamp_ns)
         if slide is not None:
