@@ -29,7 +29,7 @@ TWO = -n 2 --dist loadfile --no-loadscope-reorder
 ALONE = $(BIN)/pytest -q -rsR --reruns 1 --rerun-show-tracebacks --durations=20
 VIRTUAL = not realtime and not docker and not browser and not autopilot
 
-.PHONY: help setup demo reproduce test realtime-test long-test nightly check format lock dist keys docs docker-test page-test autopilot-test bench figures fuzz clean
+.PHONY: help setup demo reproduce test realtime-test long-test nightly check format lock dist keys docs docker-test page-test tour-pictures autopilot-test bench figures fuzz clean
 
 help:  ## what can be made
 	@sed -n 's/^\([a-z-]*\):.*  ## \(.*\)/\1\t\2/p' $(MAKEFILE_LIST) | expand -t 16
@@ -105,6 +105,12 @@ docker-test: setup  ## the three containers, and what they survive; needs a Dock
 
 page-test: setup  ## the page in a real browser; needs Chromium, says so where there is none
 	$(ALONE) -m browser
+
+TOUR = flight-dark-wide network-light-wide cut-dark-wide duel-dark-wide
+tour-pictures: setup  ## pictures of README and the tour anew, from the page in a real browser
+	$(ALONE) -m browser -k light_and_dark
+	$(ALONE) -m browser -k "cutting_the_link or a_duel"
+	cp $(TOUR:%=page-test/%.png) docs/tour/
 
 autopilot-test: setup  ## actual autopilots in simulation: ARDUCOPTER=, PX4= name their programs
 	$(BIN)/pytest -q -rs -m autopilot

@@ -348,13 +348,25 @@ def test_documented_extras_exist() -> None:
             assert named in extras
 
 
+def anchors(document: Path) -> set[str]:
+    """Anchors of the headings, as GitHub and MkDocs name them, and those that are set by hand."""
+    text = document.read_text()
+    headings = re.findall(r"^#+ (.*)$", text, re.MULTILINE)
+    texts = (re.sub(r"\]\([^)]*\)|[^\w\s-]", "", each.lower()) for each in headings)
+    named = set(re.findall(r"<a id=\"([\w-]+)\"", text))
+    return named | {re.sub(r"\s", "-", each.strip()) for each in texts}
+
+
 def test_links_lead_somewhere() -> None:
-    dead = {
-        f"{document.name}: {target}"
-        for document in DOCUMENTS
-        for target in re.findall(r"\]\(([^)#:]+)\)", document.read_text())
-        if not (document.parent / target).exists()
-    }
+    dead = set()
+    for document in DOCUMENTS:
+        links = re.findall(r"\]\(([^):#\s]*)(?:#([^)\s]+))?\)", document.read_text())
+        for name, anchor in links:
+            target = document.parent / name if name else document
+            if not target.exists() or (
+                anchor and target.suffix == ".md" and anchor not in anchors(target)
+            ):
+                dead.add(f"{document.name}: {name}#{anchor}")
     assert dead == set()
 
 
