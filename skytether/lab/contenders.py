@@ -330,19 +330,19 @@ QUICK = ("paper-every-step", "paper-event", "feedback-gap", "trajectory-expected
 
 def quick(scale: ComparisonSize) -> ComparisonSize:
     """Reduced size for `--quick`, at most as large as requested."""
-    few = [case for case in scale.cases if case.name in ("target", "loss-0.5")]
+    few = [case for case in scale.cases if case is CASES[0]]
     return ComparisonSize(
-        runs=min(scale.runs, 3),
-        generations=min(scale.generations, 2),
+        runs=min(scale.runs, 10),
+        generations=min(scale.generations, 1),
         population=4,
         search_runs=2,
-        search_duration=12.0,
+        search_duration=20.0,
         cases=few or scale.cases[:1],
         contenders=[each for each in scale.contenders if each.keys or each.name in QUICK],
-        scouts=2,
-        rounds=1,
-        every=3,
-        duration=12.0,
+        scouts=4,
+        rounds=2,
+        every=1,
+        duration=40.0,
     )
 
 

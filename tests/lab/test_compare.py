@@ -28,6 +28,7 @@ from skytether.lab.calibration import Rmse, SearchLimits
 from skytether.lab.commands import pool
 from skytether.lab.comparison import (
     CLAIMS,
+    FLIGHTS_MIN,
     Claim,
     ComparedCase,
     ContenderRuns,
@@ -452,14 +453,28 @@ TUNE = ["compare", "--quick", "--tune", "--generations", "1"]
 FLOWN_S = 4.0
 
 
+def test_a_first_look_is_enough_for_a_verdict() -> None:
+    """As many flights as a verdict needs, each counted for as long as it settles, and longer."""
+    look = REAL["quick"](contenders.ComparisonSize(runs=100, generations=16))
+    assert look.runs >= FLIGHTS_MIN
+    for case in look.cases:
+        assert not case.weights, "with the weights of another case, half as many flights"
+        scenario = look.scenario(case)
+        assert scenario.duration > 2 * scenario.settled_s
+
+
 @pytest.fixture(scope="module")
 def fewer() -> Iterator[None]:
-    """`--quick` with two thresholds, the found one first, and few, short flights."""
+    """`--quick` with two thresholds, the found one first, few, short flights, and a case without
+    weights of its own.
+    """
     real = contenders.quick
+    brief = {"runs": 3, "duration": FLOWN_S, "search_duration": FLOWN_S, "scouts": 1, "rounds": 1}
 
     def quick(scale: contenders.ComparisonSize) -> contenders.ComparisonSize:
-        brief = {"duration": FLOWN_S, "search_duration": FLOWN_S, "scouts": 1}
-        return dataclasses.replace(real(scale), **brief)
+        cases = [case for case in scale.cases if case.name in ("target", "loss-0.5")]
+        size = dataclasses.replace(real(scale), **brief)
+        return dataclasses.replace(size, cases=cases) if cases else size
 
     with pytest.MonkeyPatch.context() as patch:
         for name in ("NEAR", "PERIODS"):
