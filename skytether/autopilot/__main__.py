@@ -56,7 +56,8 @@ class AutopilotOptions(ProcessOptions):
             "estimate@20-25: it has no position estimate; "
             "drift@20-25: its accelerometers fail, it drifts and its estimate does not; "
             "commander@20-25: a second station commands 3 m/s north, 50 times a second; "
-            "leap@20: the position that it reports leaps by 12 m.",
+            "leap@20: the position that it reports leaps by 12 m; "
+            "shift@20: its receiver's position shifts by 3 m; fix@20: its receiver has no fix.",
         ),
     ] = ()
     insecure: bool = False
