@@ -325,14 +325,15 @@ class Raid:
             case MoveKind.SERVER | MoveKind.STANDBY:
                 name, _ = SERVER if move.kind is MoveKind.SERVER else STANDBY
                 begin = [partial(lives.stop_server, name)]
-                end = [partial(lives.start_server, {}, name=name)]
+                end = [partial(lives.start_server, {}, name=name), self._note_zones]
             case MoveKind.FREEZES:
                 name = self._server(move.amounts)
                 begin, end = [partial(self._world.freeze, name)], [partial(self._world.thaw, name)]
             case MoveKind.STOPS:
                 name = self._server(move.amounts[1:])
                 stop = lives.end_server if round(move.amounts[0]) else lives.close_server
-                begin, end = [partial(stop, name)], [partial(lives.start_server, {}, name=name)]
+                begin = [partial(stop, name)]
+                end = [partial(lives.start_server, {}, name=name), self._note_zones]
             case MoveKind.RESTORES if move.vehicle == 0:
                 name, settings = self._server(move.amounts[1:]), dict[str, Any]()
                 self._before(move, lambda: settings.update(lives.settings(name)))
@@ -395,9 +396,11 @@ class Raid:
         self._note_zones()
 
     def _note_zones(self) -> None:
-        if running := self._lives.running:
+        """Note the zones in force: one that a server has refused need not hold once it leads."""
+        if up := self._lives.scenarios:
+            agree = len({each.mission.zones for each in up}) == 1
             since_s = CLOCK.local(self._world.now_ns) / SECOND_NS
-            self._zones.append((since_s, running.scenario.zones))
+            self._zones.append((since_s, (up[0] if agree else self._scenario).zones))
 
     # -- flight ------------------------------------------------------------------------------------
 

@@ -141,6 +141,11 @@ class Lives:
         """A server that is up, the first if both are, and its scenario; None if none is."""
         return self._running.get(SERVER[0]) or self._running.get(STANDBY[0])
 
+    @property
+    def scenarios(self) -> list[Scenario]:
+        """Scenario of each server that is up, with the keys set in flight."""
+        return [each.scenario for each in self._running.values()]
+
     def _server(self, scenario: Scenario, name: str) -> Server:
         number = len(self.servers) + 1
         entropy = stream(scenario.seed, "entropy", number).bytes

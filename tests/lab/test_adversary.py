@@ -167,6 +167,16 @@ def test_a_server_is_restarted_with_the_keys_that_it_had_some_time_before(
     assert not goals[1]
 
 
+def test_a_zone_that_one_of_two_servers_has_refused_does_not_count() -> None:
+    """The other keeps to it only while it leads."""
+    zones = move(MoveKind.ZONES, 0, "", LATE_S, 20.0, 3.5, 3.5, 0.4)
+    for dies, counts in (((), True), ((move(MoveKind.STANDBY, 0, "", LATE_S - 0.5, 0.4),), False)):
+        raid = Raid(FOUR, (HAS_STANDBY, zones, *dies))
+        raid._lives.run(LATE_S + 1.0)
+        assert "cylinder" in raid._lives._running[SERVER[0]].scenario.mission.zones
+        assert bool(raid._zones[-1][1]) == counts
+
+
 def test_a_standby_server_is_stopped_too() -> None:
     raid = Raid(FOUR, (HAS_STANDBY, move(MoveKind.STOPS, 0, "", EARLY_S, 60.0, 0.0, 1.0)))
     raid._lives.run(EARLY_S + 1.0)
