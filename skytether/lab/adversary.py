@@ -355,7 +355,7 @@ class Raid:
                 for number in hit:
                     lives.stop_client(number)
                 begin = []
-                end = [partial(lives.start_client, number, remembers=False) for number in hit]
+                end = [partial(lives.join_client, number) for number in hit]
             case MoveKind.CLIENT:
                 begin = [partial(lives.stop_client, number) for number in hit]
                 end = [partial(lives.start_client, number) for number in hit]

@@ -197,6 +197,11 @@ class Lives:
             body.reset(_sensor(self.scenario, number, len(self._lives[number])))
         self.world.restart(f"client {number}", self._client(number, *found))
 
+    def join_client(self, number: int) -> None:
+        """Start a vehicle's client, unless one has flown already."""
+        if not self._lives[number][-1].client.began_ns:
+            self.start_client(number, remembers=False)
+
     def saved(self, number: int) -> Sequence[Saved]:
         """The state that a vehicle's client has saved last, if any."""
         saved = self.world.memory(f"client {number}")

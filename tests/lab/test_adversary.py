@@ -35,7 +35,7 @@ from skytether.lab.adversary import (
 )
 from skytether.lab.commands import pool
 from skytether.lab.commands.adversary import Kept
-from skytether.lab.lives import Body
+from skytether.lab.lives import Body, world_s
 from skytether.server.common.clock import ClockMap
 from skytether.server.missions.mission_planner import MissionPlanner
 from skytether.server.missions.mission_state import MissionState
@@ -165,6 +165,14 @@ def test_a_server_is_restarted_with_the_keys_that_it_had_some_time_before(
         )
     assert "goal(1," in goals[0]
     assert not goals[1]
+
+
+def test_a_vehicle_joins_once() -> None:
+    joins = (move(MoveKind.JOINS, 2, "", 0.0, 2.0), move(MoveKind.JOINS, 2, "", 4.0, 3.0))
+    raid = Raid(FOUR, joins)
+    raid._lives.run(8.0)
+    (_, client) = (life.client for life in raid._lives._lives[2])
+    assert world_s(client.began_ns / SECOND_NS) == pytest.approx(2.1, abs=0.1)
 
 
 def test_a_zone_that_one_of_two_servers_has_refused_does_not_count() -> None:
