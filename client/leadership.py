@@ -4,9 +4,12 @@ The vehicle decides, by a number that only rises: with s servers, number n means
 leads, and what was planned under another number is not flown. The vehicle raises it when the leader
 is silent and another server is heard; when an operator says so; and on a mission when a server that
 it hears has been told a larger number by another vehicle, so that all come to follow one server.
+On a mission it follows no server that plans within other limits than the one that leads.
 """
 
 from collections.abc import Sequence
+
+from skytether.shared.law.terms import Limits
 
 NUMBER_MAX, JUMP_MAX = 2**32 - 1, 10_000
 """Largest number, and largest rise at once by what a server knows."""
@@ -29,11 +32,30 @@ class Leadership:
         self._servers, self.number = servers, number
         self._ask_ns = round(ASK_SHARE * timeout_ns)
         self._change_ns = round(CHANGE_SHARE * timeout_ns)
+        self.limits: list[Limits | None] = [None] * servers
+        """Limits of each server's motions, as it told last; None if it has not, or without a
+        mission."""
+        self._changes = [0] * servers
+        """Number of changes of these limits in the server's run, as it told last."""
 
     @property
     def leader(self) -> int:
         """Which server leads, from 0."""
         return self.number % self._servers
+
+    def begin(self, server: int) -> None:
+        """Begin a session with another run of a server, which counts its changes anew."""
+        self._changes[server] = 0
+
+    def hear_limits(self, server: int, limits: Limits | None, changes: int) -> None:
+        """Note the limits that a server told, unless it has told later ones."""
+        if changes >= self._changes[server]:
+            self._changes[server], self.limits[server] = changes, limits
+
+    def may_lead(self, server: int) -> bool:
+        """Whether a server plans within the limits of the present leader, as far as is known."""
+        theirs, ours = self.limits[server], self.limits[self.leader]
+        return theirs is None or ours is None or theirs == ours
 
     def doubts(self, heard_ns: Sequence[int], now_ns: int) -> bool:
         """Whether the leader is silent for so long that other servers are to be asked.
@@ -45,12 +67,12 @@ class Leadership:
 
     def successor(self, heard_ns: Sequence[int], now_ns: int) -> int | None:
         """Server that is to lead in place of a silent leader; None if the leader is not silent, or
-        no other server is heard.
+        no other server is heard that may lead.
         """
         last_ns = heard_ns[self.leader]
         if now_ns - last_ns < self._change_ns:
             return None
-        newest = max(range(self._servers), key=heard_ns.__getitem__)
+        newest = max(filter(self.may_lead, range(self._servers)), key=heard_ns.__getitem__)
         # Only one that was heard since the leader was doubted: both may be out of reach.
         return newest if heard_ns[newest] >= last_ns + self._ask_ns else None
 
@@ -61,17 +83,18 @@ class Leadership:
             self.number = raised
 
     def exceed(self, told: int, server: int) -> None:
-        """Let `server` lead if it has been told a larger number by this vehicle, by an earlier run
-        that has not saved it.
+        """Let `server` lead, if it may, once it has been told a larger number by an earlier run of
+        this vehicle that has not saved it.
         """
         if self.number < told <= NUMBER_MAX - self._servers:
+            leads = server if self.may_lead(server) else self.leader
             self.number = told + 1
-            self.hand_over(server)
+            self.hand_over(leads)
 
     def learn(self, known: int, server: int) -> bool:
-        """Take over a larger number that `server` knows, if that server leads with it."""
+        """Take over a larger number that `server` knows, if that server leads with it, and may."""
         is_larger = self.number < known <= min(NUMBER_MAX, self.number + JUMP_MAX)
-        if not is_larger or known % self._servers != server:
+        if not is_larger or known % self._servers != server or not self.may_lead(server):
             return False
         self.number = known
         return True

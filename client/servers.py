@@ -12,7 +12,9 @@ from skytether.client.memory import FlownMotion
 from skytether.client.session import ServerSession, Watch
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
 from skytether.shared.core.endpoint import Events
-from skytether.shared.core.events import LeaderChanged, address_text
+from skytether.shared.core.events import LeaderChanged, LimitsDiffer, address_text
+from skytether.shared.law.terms import Difference
+from skytether.shared.scenario.catalogue import differences
 from skytether.shared.telemetry.record import Reason
 from skytether.shared.wire.protocol import Lead
 
@@ -65,6 +67,8 @@ class Servers:
         self._timeout_ns, self._motion, self._may_tell = timeout_ns, motion, may_tell
         self._reported = number
         """Number of the leadership that was last reported."""
+        self._differing: dict[int, tuple[Difference, ...]] = {}
+        """Reported differences of the limits of each server that may not lead."""
         self._now_ns = NEVER_NS
         self._named_ns: int | None = None
         """Time from which the silence of the leader counts at most: a server that did not lead,
@@ -105,6 +109,7 @@ class Servers:
         if successor is not None:
             lead.hand_over(successor)
         self._report()
+        self._report_limits()
         # The next run must not follow an earlier leadership than the servers have been told.
         if self._may_tell(now_ns):
             self._tell(lead.doubts(heard_ns, now_ns), heard_ns[lead.leader], step, now_ns)
@@ -123,7 +128,8 @@ class Servers:
         """
         if self.sessions[server].leads:
             others = [i for i, each in enumerate(self.sessions) if i != server]
-            ready = [i for i in others if not self.sessions[i].is_lost(now_ns)]
+            may_lead = filter(self.leadership.may_lead, others)
+            ready = [i for i in may_lead if not self.sessions[i].is_lost(now_ns)]
             if cause not in DEPARTURES or not ready:
                 return False
             self.name(ready[0], now_ns=now_ns)
@@ -140,6 +146,8 @@ class Servers:
         if not session.leads and session.is_lost(self._now_ns):
             at = address_text(*session.address)
             return f"{LEADER_KEY}: got {named!r}, but the server at {at} is not heard"
+        if not self.leadership.may_lead(server):
+            return f"{LEADER_KEY}: got {named!r}, but {self._limits_differ(server)}"
         return ""
 
     # -- telling -----------------------------------------------------------------------------
@@ -163,7 +171,8 @@ class Servers:
 
     def _is_alone(self, now_ns: int) -> bool:
         """Whether no server is heard that could lead in place of the leader."""
-        return all(each.leads or each.is_lost(now_ns) for each in self.sessions)
+        may_lead = filter(self.leadership.may_lead, range(self._count))
+        return all(self.sessions[i].leads or self.sessions[i].is_lost(now_ns) for i in may_lead)
 
     def _lead(self, session: ServerSession, step: int) -> Lead:
         assert session.number is not None
@@ -173,6 +182,25 @@ class Servers:
         if motion is None:
             return message
         return message._replace(in_force=motion.step, spacing=motion.spacing, knots=motion.numbers)
+
+    def _limits_differ(self, server: int) -> LimitsDiffer:
+        lead, (host, port) = self.leadership, self.sessions[server].address
+        ours, theirs = lead.limits[lead.leader], lead.limits[server]
+        assert ours is not None
+        assert theirs is not None
+        differing = differences(ours, theirs)
+        return LimitsDiffer(vehicle=self._vehicle, host=host, port=port, differences=differing)
+
+    def _report_limits(self) -> None:
+        """Report servers that may not lead, once for each difference."""
+        for server in range(self._count):
+            if self.leadership.may_lead(server):
+                self._differing.pop(server, None)
+                continue
+            event = self._limits_differ(server)
+            if self._differing.get(server) != event.differences:
+                self._differing[server] = event.differences
+                self._events.append(event)
 
     def _report(self) -> None:
         """Report that another server leads; its packets count as the link's from now on."""

@@ -265,7 +265,8 @@ class ServerSession:
                     self._name(path, now_ns)
             case Lead() as lead:
                 self._check(lead)
-                self.told = lead.number
+                self.told = max(self.told or 0, lead.number)
+                self._leadership.hear_limits(self._index, lead.limits, lead.step)
                 self._leadership.exceed(lead.number, self._index)
                 self._leadership.learn(lead.known, self._index)
                 self._note_heard(now_ns)
@@ -306,6 +307,7 @@ class ServerSession:
             self.echo = NEVER
         if self.number != welcome.session:
             self.sent, self.sent_step, self.told = 0, -1, None
+            self._leadership.begin(self._index)
             self.hearing.begin()
             self._proofs.clear()
             several = len(self._addresses) > 1

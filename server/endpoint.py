@@ -40,6 +40,8 @@ VEHICLES_MAX = 64
 LATEST_NS = 2 * SECOND_NS
 """Time after the end of all motions within which a server that is asked to end does so [ns]; a
 vehicle's observation of it takes a round trip."""
+LIMITS_NS = 10 * SECOND_NS
+"""Time for which vehicles are told every second of changed limits [ns]: packets are lost."""
 TICK_EDGES_MS = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0)
 """Bin edges of the histogram of tick durations [ms]."""
 
@@ -112,6 +114,7 @@ class Server(Endpoint):
         self._grid = Grid(terms.dt_ns, self._events)
         self._reception = Reception(
             terms,
+            scenario.limits(),
             scenario.link,
             boot_id,
             gate or PlainGate(),
@@ -136,6 +139,8 @@ class Server(Endpoint):
         )
         self._leaves = False
         """Whether an operator has asked the server to end."""
+        self._limits_until_ns = 0
+        """Time until which vehicles are told every second of the limits of their motions."""
         self._dt_ns = terms.dt_ns
         self._ticked_ns = 0
         self._expire_ns = 0
@@ -166,11 +171,18 @@ class Server(Endpoint):
             self._grid.rest()
 
     def _spread_leadership(self, now_ns: int) -> None:
-        """Tell vehicles of a mission that follow a smaller number of the largest one."""
+        """Tell vehicles of a mission that follow a smaller number of the largest one, and for a
+        while all of changed limits.
+        """
+        is_changed = now_ns < self._limits_until_ns
         for session in self.sessions:
             number = session.leadership
-            if number is not None and (known := self.controller.known(number)) > number:
-                self._out += session.sealed(encode(session.lead(known)), now_ns)
+            if number is None:
+                continue
+            known = self.controller.known(number)
+            if known > number or is_changed:
+                lead = self._reception.lead(session, known)
+                self._out += session.sealed(encode(lead), now_ns)
 
     def leave(self, *, now_ns: int) -> int:
         """On a mission, wait until all vehicles rest, or follow another server."""
@@ -208,6 +220,9 @@ class Server(Endpoint):
             self._guided.goals = parse_goals(scenario.mission.goals, scenario.model.axes)
         if keys & ZONES:
             self.controller.scheme.change_zones(scenario.zones)
+            self._reception.limits = scenario.limits()
+            self._reception.limits_changes += 1
+            self._limits_until_ns = now_ns + LIMITS_NS
         if keys & POINT:
             moved = "reference.points_m" in keys
             position = scenario.make_reference()(np.zeros(()))[:, 0] if moved else None

@@ -32,7 +32,7 @@ from skytether.shared.core.events import (
 )
 from skytether.shared.core.stopwatch import Stopwatch
 from skytether.shared.core.time_of_day import DRIFT, TimeOfDay
-from skytether.shared.law.terms import Terms
+from skytether.shared.law.terms import Limits, Terms
 from skytether.shared.scenario.catalogue import differences
 from skytether.shared.scenario.schema import LinkConfig
 from skytether.shared.wire.drop import Drop, ProtocolError
@@ -77,6 +77,7 @@ class Reception:
     def __init__(
         self,
         terms: Terms,
+        limits: Limits | None,
         link: LinkConfig,
         boot_id: int,
         gate: Gate,
@@ -105,6 +106,10 @@ class Reception:
         """Number of accepted observations, in any order of arrival."""
         self.dropped: Counter[Drop] = Counter()
         self.refused: Counter[Refusal] = Counter()
+        self.limits = limits
+        """Limits of the motions of a mission; None without one."""
+        self.limits_changes = 0
+        """Number of their changes in flight."""
         self.time: TimeOfDay | None = None
         """Time of day; None if the host does not know it."""
         self._reported: deque[tuple[int, int, Refusal]] = deque(maxlen=REFUSALS_REPORTED)
@@ -252,7 +257,13 @@ class Reception:
             else:
                 session.first = message
         known = self._controller.known(session.leadership)
-        self._answer(session.lead(known), call, datagram)
+        self._answer(self.lead(session, known), call, datagram)
+
+    def lead(self, session: Session, known: int) -> Lead:
+        """LEAD to a vehicle: what it has told, the largest number that it should know, and the
+        limits of the server's motions.
+        """
+        return session.lead(known)._replace(step=self.limits_changes, limits=self.limits)
 
     def _make_paths(self, session: Session, prices: tuple[int, ...]) -> ServerPaths:
         paths = ServerPaths(prices, self._spread, self._sessions.entropy, self._timeout_ns)

@@ -37,6 +37,11 @@ class LedVehicles:
     def leads(self, row: int) -> bool:
         return self._numbers.get(row, 0) is not None
 
+    @property
+    def is_standby(self) -> bool:
+        """Whether all vehicles that were heard are led by another server."""
+        return bool(self._numbers) and set(self._numbers.values()) == {None}
+
     def awaits(self, row: int) -> bool:
         """Whether nothing was observed of a vehicle since this server began to lead it."""
         return row in self._awaited

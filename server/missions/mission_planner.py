@@ -191,7 +191,12 @@ class MissionPlanner(SplineScheme):
             vehicle.goal = None  # closed positions and progress belong to the old zones
 
     def objection(self, zones: Zones) -> str:
-        """Reason why these zones are refused; empty if they are accepted."""
+        """Reason why these zones are refused; empty if they are accepted.
+
+        A server that leads no vehicle leaves that to the one that does, and knows all motions.
+        """
+        if self._state.led.is_standby:
+            return ""
         if zones and (number := self._state.unknown()) is not None:
             return f"zones before it is known where vehicle {number} is"
         for row, vehicle in self._state.vehicles.items():

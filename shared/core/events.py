@@ -416,6 +416,19 @@ class Flying(VehicleEvent, frozen=True, kw_only=True):
         return f"vehicle {self.vehicle}: session open, flying"
 
 
+class LimitsDiffer(PeerEvent, frozen=True, kw_only=True):
+    """A server must not lead a vehicle: it plans a mission within other limits than the leader."""
+
+    differences: tuple[Difference, ...]
+
+    def __str__(self) -> str:
+        keys = "; ".join(
+            f"{difference.key} is {difference.there} there and {difference.here} at the leader"
+            for difference in self.differences
+        )
+        return f"vehicle {self.vehicle}: the server at {self.peer} will not lead it: {keys}"
+
+
 class LeaderChanged(PeerEvent, frozen=True, kw_only=True):
     """Another server leads a vehicle."""
 
@@ -675,6 +688,7 @@ Event = (
     | ServerHeard
     | Flying
     | LeaderChanged
+    | LimitsDiffer
     | ModeChanged
     | PlanningStopped
     | StateDoubted

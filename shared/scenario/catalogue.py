@@ -10,7 +10,7 @@ from types import MappingProxyType
 import msgspec
 
 from skytether.shared.base.units import SECOND_NS
-from skytether.shared.law.terms import Difference, Terms
+from skytether.shared.law.terms import Difference, Limits, Terms
 from skytether.shared.scenario.owners import InFlight, Key, Owner
 from skytether.shared.scenario.schema import Scenario, Section
 
@@ -39,15 +39,27 @@ TERMS: Mapping[str, str] = MappingProxyType(
 """Dotted key of each term, by the term's field in `Terms`."""
 
 
+LIMITS: Mapping[str, str] = MappingProxyType(
+    {
+        "speed_mps": "mission.speed_mps",
+        "acceleration_mps2": "mission.acceleration_mps2",
+        "asymmetry_s": "link.asymmetry_s",
+        "zones": "mission.zones",
+    }
+)
+"""Dotted key of each limit of a mission's motions, by the field in `Limits`."""
+
+
 def keys_of(*groups: InFlight) -> frozenset[str]:
     """Dotted names of the keys in these groups, which may change in flight."""
     return frozenset(name for name, key in KEYS.items() if key.in_flight in groups)
 
 
-def differences(here: Terms, there: Terms) -> tuple[Difference, ...]:
+def differences(here: Terms | Limits, there: Terms | Limits) -> tuple[Difference, ...]:
+    names = TERMS if isinstance(here, Terms) else LIMITS
     return tuple(
-        Difference(TERMS[field], _text(field, ours), _text(field, theirs))
-        for field, ours, theirs in zip(Terms._fields, here, there, strict=True)
+        Difference(names[field], _text(field, ours), _text(field, theirs))
+        for field, ours, theirs in zip(here._fields, here, there, strict=True)
         if ours != theirs
     )
 

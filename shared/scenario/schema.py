@@ -22,7 +22,7 @@ from skytether.shared.base.units import seconds_to_ns
 from skytether.shared.law.heartbeat import PATIENCE, SESSION_NS
 from skytether.shared.law.model import Array
 from skytether.shared.law.motion import Clearances, bend_m
-from skytether.shared.law.terms import Terms
+from skytether.shared.law.terms import Limits, Terms
 from skytether.shared.scenario import reference as shapes
 from skytether.shared.scenario import schemes, zone_texts
 from skytether.shared.scenario.air import path as air
@@ -628,6 +628,19 @@ class Scenario(Section, frozen=True):
             separation_m=self.mission.separation_m,
             height_m=self.mission.height_m,
             tube_m=self.mission.tube_m,
+        )
+
+    def limits(self) -> Limits | None:
+        """Limits of the motions of a mission; None without one."""
+        if not self.is_mission:
+            return None
+        mission, zones = self.mission, self.zones.zones
+        plain = [(zone.corners.tolist(), *zone[2:]) for zone in zones]
+        return Limits(
+            speed_mps=mission.speed_mps,
+            acceleration_mps2=mission.acceleration_mps2,
+            asymmetry_s=self.link.asymmetry_s,
+            zones=_digest(repr(plain).encode() if plain else b""),
         )
 
     def make_reference(self, vehicle: int = 1) -> shapes.Reference:

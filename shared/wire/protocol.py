@@ -18,7 +18,7 @@
 | 8    | TIME        | client  | session, step, epoch_us, error_us                          |
 | 9    | PATH        | both    | session, path, proof, prices                               |
 | 10   | LEAD        | both    | session, number, leads, known, step, in_force, spacing,    |
-|      |             |         | knots                                                      |
+|      |             |         | knots, limits                                              |
 
 With the scheme "trajectory", TRAJECTORY replaces HORIZON. `docs/protocol.md` describes the bytes.
 
@@ -44,7 +44,7 @@ from numpy.typing import NDArray
 from skytether.shared.base.units import MICROSECOND_NS
 from skytether.shared.law.heartbeat import NUMBERS
 from skytether.shared.law.model import Array
-from skytether.shared.law.terms import Terms
+from skytether.shared.law.terms import Limits, Terms
 from skytether.shared.wire.drop import Drop, ProtocolError
 from skytether.shared.wire.paths import PATHS_MAX
 
@@ -314,13 +314,16 @@ class Lead(NamedTuple):
     known: int = 0
     """Largest number that the server has been told; 0 from a vehicle."""
     step: int = 0
-    """Step k in which the vehicle sends, on its grid; 0 from a server, as are the fields below."""
+    """Step k in which the vehicle sends, on its grid; from a server, the number of changes of its
+    `limits`. The next three fields are empty from a server."""
     in_force: int | None = None
     """Step that the motion in force was made for; None without one."""
     spacing: int = 0
     """Steps from one knot of that motion to the next."""
     knots: NDArray[np.float32] | bytes = b""
     """Position [m] and velocity [m/s] of each knot; shape (axes, knots, 2)."""
+    limits: Limits | None = None
+    """Limits of the server's motions; None from a vehicle, or without a mission."""
 
 
 # With 10 % loss, all three are lost once in a thousand times.
@@ -391,6 +394,16 @@ def _terms(value: object, ours: Terms) -> Terms:
         if type(theirs) is not type(our) or not _is_plain(theirs):
             raise ProtocolError(Drop.FIELD)
     return Terms._make(value)
+
+
+def _limits(value: object, ours: Terms) -> Limits | None:  # noqa: ARG001
+    if value is None:
+        return None
+    if type(value) is not tuple or tuple(map(type, value)) != (float, float, float, str):
+        raise ProtocolError(Drop.FIELD)
+    if not all(map(_is_plain, value)):
+        raise ProtocolError(Drop.FIELD)
+    return Limits._make(value)
 
 
 def _is_plain(value: object) -> bool:
@@ -522,7 +535,10 @@ _TYPES: tuple[tuple[type[Message], tuple[_Check, ...]], ...] = (
     (PathProof, (_U16, _U32, range(PATHS_MAX), _U64, _prices)),
     (
         Lead,
-        (_U16, _U32, _U32, _FLAG, _U32, _U31, _OrNone(_U31), range(2**16), _knots_or_none),
+        (
+            *(_U16, _U32, _U32, _FLAG, _U32, _U31, _OrNone(_U31), range(2**16)),
+            *(_knots_or_none, _limits),
+        ),
     ),
 )
 """Message of each type number (from 1) and the check of each of its fields on the wire."""

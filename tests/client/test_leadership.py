@@ -15,6 +15,7 @@ from skytether.shared.base.errors import ConfigError
 from skytether.shared.base.units import SECOND_NS, seconds_to_ns
 from skytether.shared.core.endpoint import STANDBY_SOCKETS, Address, Datagram
 from skytether.shared.core.events import LeaderChanged
+from skytether.shared.law.terms import Limits
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.wire.drop import Drop
 from skytether.shared.wire.protocol import (
@@ -341,6 +342,17 @@ def test_a_server_that_was_told_more_by_an_earlier_run_leads(vehicle: Vehicle) -
     vehicle.step(0.1)
     vehicle.hear(0, Lead(4, 7, 6, 0, 6))
     assert vehicle.client.vehicle_figures()["leadership"]["number"] == 7
+
+
+def test_a_late_copy_of_limits_changes_nothing(vehicle: Vehicle) -> None:
+    own, other = Limits(0.0, 0.6, 0.0, "a"), Limits(0.0, 0.6, 0.0, "b")
+    vehicle.step(0.1)
+    for server, limits, changes, may_lead in (
+        *((0, own, 0, True), (1, own, 0, True), (0, other, 1, False), (1, other, 1, True)),
+        *((1, own, 0, True), (0, own, 0, True), (1, own, 2, False)),
+    ):
+        vehicle.hear(server, Lead(4, 7 + server, 0, 1 - server, 0, changes, limits=limits))
+        assert vehicle.client._servers.leadership.may_lead(1) == may_lead
 
 
 def test_a_number_far_above_the_own_is_not_believed(vehicle: Vehicle) -> None:

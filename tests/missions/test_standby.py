@@ -1,21 +1,24 @@
 """Missions with two servers: vehicles keep apart whoever hears whom."""
 
+from functools import partial
+
 import msgspec
 import numpy as np
 import pytest
 
 from helpers import packaged
+from skytether.client.endpoint import Client
 from skytether.lab.adversary import AdversaryNetwork, Climb, Move, MoveKind, Raid, climb, spare_m
 from skytether.lab.lives import Lives
 from skytether.server.missions.led_vehicles import LedVehicles
 from skytether.shared.base.units import SECOND_NS
-from skytether.shared.core.events import SessionRefused
+from skytether.shared.core.events import LimitsDiffer, SessionRefused
 from skytether.shared.law.motion import SPACING, Motion, resting
 from skytether.shared.scenario.mission import Mission
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.summary import nearest
 from skytether.shared.wire.protocol import NO_HORIZON, Lead
-from skytether.sim.flight import STANDBY
+from skytether.sim.flight import SERVER, STANDBY
 from two_vehicles import along, ready
 
 SPLIT_S = 30
@@ -204,3 +207,66 @@ def test_a_standby_that_would_keep_another_distance_is_refused_with_both() -> No
     assert differs.key == "mission.separation_m"
     assert {differs.here, differs.there} == {"0.1", "0.5"}
     assert lives.running is not None
+
+
+def with_standby(**others: object) -> Lives:
+    """Four vehicles on a network without losses, which give up a leader after 0.75 · 8 s.
+
+    Args:
+        others: other values of the standby, by key.
+    """
+    mission = {"reference": {"shape": "swap(4)"}, "link": {"timeout_s": 8.0}}
+    lives = Lives(
+        packaged("swap", duration=30.0, **mission), AdversaryNetwork((), 1), has_standby=True
+    )
+    lives.start_server(others, name=STANDBY[0])
+    return lives
+
+
+def leaderships(lives: Lives) -> list[int]:
+    return [client.vehicle_figures()["leadership"]["number"] for client in clients(lives)]
+
+
+@pytest.mark.parametrize(
+    "others",
+    [
+        {},
+        {"mission.zones": "box(6, 7, 6, 7)"},
+        {"mission.acceleration_mps2": 0.5},
+        {"link.asymmetry_s": 0.3},
+    ],
+)
+def test_a_standby_that_plans_within_other_limits_is_not_followed(
+    others: dict[str, object],
+) -> None:
+    lives = with_standby(**others)
+    lives.run(6.0)
+    lives.stop_server()
+    lives.run(15.0)
+    assert leaderships(lives) == [int(not others)] * 4
+    refused = [each for _, _, each in lives.events if isinstance(each, LimitsDiffer)]
+    assert sorted(each.vehicle for each in refused) == ([1, 2, 3, 4] if others else [])
+    for each in refused:
+        (differs,) = each.differences
+        assert [differs.key] == list(others)
+        assert differs.here != differs.there
+
+
+def test_zones_that_are_set_at_both_servers_are_followed_by_the_standby() -> None:
+    """It leads nobody and does not know every motion, so it leaves objections to the leader."""
+    lives = with_standby()
+    for name, at_s in ((SERVER[0], 4.0), (STANDBY[0], 6.0)):
+        lives.run(at_s)
+        change = partial(lives._running[name].change, {"mission.zones": "box(6, 7, 6, 7)"})
+        lives.world.act(name, change)
+        lives.run(at_s + 1.9)
+        differs = name == SERVER[0]
+        may_lead = [client._servers.leadership.may_lead(1) for client in clients(lives)]
+        assert may_lead == [not differs] * 4
+    lives.stop_server()
+    lives.run(17.0)
+    assert leaderships(lives) == [1] * 4
+
+
+def clients(lives: Lives) -> list[Client]:
+    return [each[-1].client for each in lives._lives.values()]
