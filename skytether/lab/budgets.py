@@ -85,9 +85,7 @@ class FlownContender:
         return FlownContender(self.contender, threshold, self.report, False, keys)
 
 
-def flying(
-    contender: Contender, case: Case, tuned: Scenario, scale: ComparisonSize
-) -> list[FlownContender]:
+def flying(contender: Contender, case: Case, tuned: Scenario) -> list[FlownContender]:
     """Contender with every reporting policy at all its thresholds, in rising order."""
     keys, key = differences(tuned, case.plant), contender.threshold
     keys = {path: value for path, value in keys.items() if path not in case.keys}
@@ -95,8 +93,7 @@ def flying(
     values: list[float | None] = [None]
     tuned_threshold = value(reading.to_table(tuned), f"control.{key}") if key else None
     if tuned_threshold is not None:
-        first = contender.factors.index(1) % scale.every
-        scaled = [tuned_threshold * factor for factor in contender.factors[first :: scale.every]]
+        scaled = [tuned_threshold * factor for factor in contender.factors]
         if isinstance(tuned_threshold, int):  # steps
             scaled = [max(1, round(value)) for value in scaled]
         values = sorted({*scaled})
@@ -157,7 +154,7 @@ class Plan:
         self.case = case
         self.points: list[FlownContender] = []
         for contender in scale.who(case):
-            self.points += flying(contender, case, tuned(contender, case, weights), scale)
+            self.points += flying(contender, case, tuned(contender, case, weights))
         self.runs = -(-scale.runs // 2) if case.weights else scale.runs
         """Number of flights of each chosen point; half in a case with its own weights."""
         self._scenario = scale.scenario(case)

@@ -295,8 +295,6 @@ class ComparisonSize:
     """Number of rounds in which more thresholds are tried near the budgets."""
     budgets: Sequence[float] = ()
     """Budgets for which points are chosen and flown; all unless given."""
-    every: int = 1
-    """Stride over a contender's factors; the factor 1 is always among them."""
     duration: float = math.inf
     """Largest length of a flight [s]."""
 
@@ -341,7 +339,6 @@ def quick(scale: ComparisonSize) -> ComparisonSize:
         contenders=[each for each in scale.contenders if each.keys or each.name in QUICK],
         scouts=4,
         rounds=2,
-        every=1,
         duration=40.0,
     )
 

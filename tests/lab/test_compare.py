@@ -139,7 +139,7 @@ def test_the_file_of_what_was_found_is_read_as_it(tmp_path: Path) -> None:
 
 
 def thresholds(contender: Contender, scenario: Scenario) -> dict[float | None, bool]:
-    points = budgets.flying(contender, BY_CASE["gusts"], scenario, SCALE)
+    points = budgets.flying(contender, BY_CASE["gusts"], scenario)
     found = {point.threshold: point.tuned for point in points}
     assert [(point.threshold, point.report) for point in points] == [
         (threshold, report) for threshold in found for report in REPORTS
@@ -165,7 +165,7 @@ def test_where_nobody_has_searched_the_weights_of_another_case_meet_what_is_met_
     tuned = contenders.search_start(contender, TARGET, SCALE)
     lossy = "paper(0.4, 0.02, 2.0) & loss(0.2)"
     tuned = replace(tuned, network=replace(tuned.network, uplink=lossy))
-    for flying in budgets.flying(contender, case, tuned, SCALE):
+    for flying in budgets.flying(contender, case, tuned):
         assert flying.keys.keys() & case.keys.keys() <= {
             key for changes in REPORTS.values() for key in changes
         }
@@ -174,11 +174,9 @@ def test_where_nobody_has_searched_the_weights_of_another_case_meet_what_is_met_
 SPENT = {"rmse_xy": 1.0, "packets_per_s": 50.0, "effort_mps": 0.1}
 
 
-def planned(name: str, every: int = 1, case: str = "gusts") -> Plan:
+def planned(name: str, case: str = "gusts") -> Plan:
     """Plan of one contender in a case, one scouting flight a point."""
-    scale = contenders.ComparisonSize(
-        runs=4, generations=1, scouts=1, contenders=[BY_NAME[name]], every=every
-    )
+    scale = contenders.ComparisonSize(runs=4, generations=1, scouts=1, contenders=[BY_NAME[name]])
     return Plan(BY_CASE[case], COMPARED, scale)
 
 
@@ -195,7 +193,7 @@ def scout(
 def test_within_a_budget_the_nearest_is_chosen() -> None:
     def chosen(*flown: dict[str, float | None]) -> list[int | None]:
         """Number of the chosen point within each budget, if the first points have these results."""
-        plan = planned("committed-gap", every=3)
+        plan = planned("committed-gap")
         all_flown = [*flown, *[{}] * (len(plan.points) - len(flown))]
         scout(plan, plan.points, lambda point: all_flown[plan.points.index(point)])
         found = plan.chosen()
