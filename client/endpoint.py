@@ -375,7 +375,7 @@ class Client(Endpoint):
         session, waits_for = self._session, self._flies.waits_for
         ground = self._ground[self._servers.leadership.leader]
         if session.number is not None:
-            ground.hear(session.number, session.echo.received_ns, now_ns=now_ns)
+            ground.hear(session.number, session.clock.echo.received_ns, now_ns=now_ns)
         elif self._flies.is_ready:
             waits_for = f"an answer of the server at {address_text(*session.address)}"
         ground.wait(waits_for, now_ns=now_ns)

@@ -373,7 +373,7 @@ class Pilot:
         failsafe, compensator = self._failsafe, self.compensator
         if session.number is None or not self._navigation.is_known:
             return None
-        echo = session.echo
+        echo = session.clock.echo
         backward_ns = echo.received_ns - self.starts_ns(0) - echo.server_ns
         return Observation(
             self._number,

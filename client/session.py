@@ -8,10 +8,11 @@ delays. `client.failsafe` decides how packets and silence change the vehicle's m
 """
 
 from collections.abc import Sequence
-from typing import Literal, NamedTuple, Protocol
+from typing import Literal, Protocol
 
 from skytether.client.leadership import Leadership
 from skytether.client.link import AGAIN_NS, ClientLink
+from skytether.client.server_clock import ServerClock
 from skytether.shared.base.units import SECOND_NS, seconds_to_ns
 from skytether.shared.core.endpoint import PATH_SOCKETS, Address, Datagram, Events
 from skytether.shared.core.events import (
@@ -24,7 +25,6 @@ from skytether.shared.core.events import (
     Unanswered,
     address_text,
 )
-from skytether.shared.core.steady import JUMP_NS
 from skytether.shared.law.heartbeat import NUMBERS, RARE_TIMES, SESSION_NS, STANDBY_TIMES, Hearing
 from skytether.shared.law.terms import Terms
 from skytether.shared.scenario.catalogue import differences
@@ -47,12 +47,8 @@ from skytether.shared.wire.protocol import (
     Welcome,
     decode,
     encode,
-    stamped_ns,
 )
 
-SLEPT_NS = JUMP_NS // 2
-"""Advance of the server's clock over the client's that shows that this machine was suspended; far
-more than changing delays cause."""
 UNANSWERED_NS = 5 * SECOND_NS
 """Time without a first answer after which the log reports it."""
 REFUSED = {
@@ -67,19 +63,10 @@ DEGRADED = "the server misses its deadlines"
 """Why there is no newer horizon although the server plans: it reports that it is degraded."""
 
 
-class Echo(NamedTuple):
-    """Newest packet of the server, as echoed in observations."""
-
-    server_ns: int
-    """Server time at which the packet was sent [ns]."""
-    received_ns: int
-    """Time of its arrival [ns; the client's clock]."""
-    heard: int
-    """Number of packets received up to and including that packet, modulo NUMBERS."""
-
-
-NEVER = Echo(0, 0, 0)
-"""Echo before the first packet of the server."""
+Stamped = Horizon | Trajectory | Heartbeat
+"""Messages that contain the server's time."""
+FromServer = Stamped | Close | PathProof | Lead
+"""Messages of a server in a session."""
 
 
 class Watch(Protocol):
@@ -136,10 +123,8 @@ class ServerSession:
         out: list[Datagram],
         events: Events,
     ) -> None:
-        self._terms = terms
+        self._terms, self._vehicle, self._boot_id = terms, vehicle, boot_id
         self._index, self._sockets, self._leadership = server, sockets, leadership
-        self._vehicle = vehicle
-        self._boot_id = boot_id
         self._addresses, self._prices, self._spread = paths, prices, spread
         self._names = names or [address_text(*each) for each in paths]
         self._server, self._timeout_ns = paths[0], timeout_ns
@@ -169,6 +154,8 @@ class ServerSession:
         """Number of the leadership that the server knows; None before it knows one."""
         self.lead_ns = 0
         """Time before which it is not told again."""
+        self._asked = 0, -SESSION_NS
+        """Vehicle's step, and time [ns], at which it was last told."""
         self._out = out
         self._events = events
         self.hello_ns = 0
@@ -181,7 +168,7 @@ class ServerSession:
         self._is_open = False
         """Whether the session may continue; otherwise only a WELCOME is accepted."""
         self._server_boot_id: int | None = None
-        self.echo = NEVER
+        self.clock = ServerClock(hearing.stale_ns)
         self.idle = str(Idle.PLANS)
         """Why no newer horizon comes, as the server last reported."""
         self._refusal: NoSession | None = None
@@ -229,49 +216,63 @@ class ServerSession:
             return None
         report, payload = split(payload)
         message = self._decode(payload, now_ns)
-        # A slow path may still bring reports of an earlier session.
-        of = message.vehicle, getattr(message, "session", None)
-        if report and self.paths and of == (self._vehicle, self.number):
-            self.paths.heard(report, datagram, path, now_ns)
-        if isinstance(message, Horizon | Trajectory):
-            self._heard(message, now_ns)
+        if isinstance(message, Welcome):
+            self._welcome(message, now_ns)
+            return None
+        if not isinstance(message, FromServer):
+            raise ProtocolError(Drop.NOT_FOR_A_CLIENT)
+        # Nothing of a message is believed before it is found to be of this session, and recent.
+        self._check(message)
+        server_ns = 0
+        if isinstance(message, Stamped):
+            server_ns = self.clock.sent_ns(message.server_us, now_ns)
+        if report and self.paths:
+            is_recent = not isinstance(message, PathProof)
+            self.paths.heard(report, datagram, path, now_ns, is_recent=is_recent)
+        if isinstance(message, Stamped):
+            return self._take_stamped(message, server_ns, now_ns)
+        match message:
+            case Close():
+                self._watch.meet(Reason.CLOSED, now_ns=now_ns)
+            case PathProof():
+                self._note_heard(now_ns)
+                if message.proof:
+                    self._proofs[path] = message.proof
+                    self._name(path, now_ns)
+            case Lead():
+                self._hear_leader(message, now_ns)
+        return None
+
+    def _take_stamped(
+        self, message: Stamped, server_ns: int, now_ns: int
+    ) -> Horizon | Trajectory | None:
+        useful_ns = self.useful_ns
+        self._heard(server_ns, now_ns)
+        self.silence_asked = message.silence
+        self.hearing.hear(message.number, server_ns)
+        if not isinstance(message, Heartbeat):
             if not self.leads or message.leadership != self._leadership.number:
                 raise ProtocolError(Drop.NOT_THE_LEADER)
             self.idle = str(Idle.PLANS)
             return message
-        self._take(message, path, now_ns)
+        if message.idle in DEAF:
+            self.useful_ns = useful_ns
+        is_degraded = message.idle == Idle.PLANS and message.degraded
+        self.idle = DEGRADED if is_degraded else str(Idle(message.idle))
         return None
 
-    def _take(self, message: Message, path: int, now_ns: int) -> None:
-        match message:
-            case Welcome() as welcome:
-                self._welcome(welcome, now_ns)
-            case Heartbeat() as heartbeat:
-                useful_ns = self.useful_ns
-                self._heard(heartbeat, now_ns)
-                planning = heartbeat.idle == Idle.PLANS
-                if heartbeat.idle in DEAF:
-                    self.useful_ns = useful_ns
-                missing = planning and heartbeat.degraded
-                self.idle = DEGRADED if missing else str(Idle(heartbeat.idle))
-            case Close() as close:
-                self._check(close)
-                self._watch.meet(Reason.CLOSED, now_ns=now_ns)
-            case PathProof() as asked:
-                self._check(asked)
-                self._note_heard(now_ns)
-                if asked.proof:
-                    self._proofs[path] = asked.proof
-                    self._name(path, now_ns)
-            case Lead() as lead:
-                self._check(lead)
-                self.told = max(self.told or 0, lead.number)
-                self._leadership.hear_limits(self._index, lead.limits, lead.step)
-                self._leadership.exceed(lead.number, self._index)
-                self._leadership.learn(lead.known, self._index)
-                self._note_heard(now_ns)
-            case _:
-                raise ProtocolError(Drop.NOT_FOR_A_CLIENT)
+    def _hear_leader(self, answer: Lead, now_ns: int) -> None:
+        """Note what the server knows of the leadership: its numbers only rise, so that a late one
+        tells nothing new, and is a sign of life only as the answer to a recent question.
+        """
+        self.told = max(self.told or 0, answer.number)
+        self._leadership.hear_limits(self._index, answer.limits, answer.changes)
+        self._leadership.exceed(answer.number, self._index)
+        self._leadership.learn(answer.known, self._index)
+        step, asked_ns = self._asked
+        age_ns = now_ns - asked_ns + (step - answer.step) * self._terms.dt_ns
+        if age_ns <= self.hearing.stale_ns:
+            self._note_heard(now_ns)
 
     def _decode(self, payload: bytes, now_ns: int) -> Message:
         try:
@@ -303,8 +304,7 @@ class ServerSession:
         self._refusal = None
         restarted = self._server_boot_id not in (None, welcome.server_boot_id)
         if restarted:
-            # A restarted server has another clock: its time stamps cannot be compared.
-            self.echo = NEVER
+            self.clock.begin()
         if self.number != welcome.session:
             self.sent, self.sent_step, self.told = 0, -1, None
             self._leadership.begin(self._index)
@@ -315,7 +315,7 @@ class ServerSession:
         self.number, self._server_boot_id = welcome.session, welcome.server_boot_id
         self._is_open = True
         self.link.adopt(now_ns=now_ns)
-        self._heard(welcome, now_ns)
+        self._heard(welcome.server_ns, now_ns)
         self._awaits_welcome = True  # another HELLO may be answered by a session that lives longer
         if restarted:
             self._watch.meet(Reason.RESTARTED, now_ns=now_ns)
@@ -331,34 +331,16 @@ class ServerSession:
             self._refusal = sent
             self._events.append(sent)
 
-    def _check(
-        self, message: Welcome | Horizon | Trajectory | Heartbeat | Close | PathProof | Lead
-    ) -> None:
+    def _check(self, message: FromServer) -> None:
         named = message.vehicle, message.session
         if not self._is_open or named != (self._vehicle, self.number):
             raise ProtocolError(Drop.UNKNOWN_SESSION)
 
-    def _heard(self, message: Welcome | Horizon | Trajectory | Heartbeat, now_ns: int) -> None:
-        """Note a packet of the session, and detect that this machine was suspended.
-
-        The client's clock may have stood still, or its jump was mistaken for a clock that was set
-        (`shared.core.steady`); the server's clock has gone on in both cases. After a suspension
-        longer than time stamps can express, the server has forgotten the session, and its WELCOME
-        contains the full time.
-        """
-        self._check(message)
-        expected_ns = self.echo.server_ns + now_ns - self.echo.received_ns
-        if isinstance(message, Welcome):
-            server_ns = message.server_ns
-        else:
-            server_ns = stamped_ns(message.server_us, expected_ns)
-        if server_ns - expected_ns > SLEPT_NS and self.echo != NEVER:
+    def _heard(self, server_ns: int, now_ns: int) -> None:
+        """Note a packet of the session that was sent at a time of the server [ns]."""
+        if self.clock.hear(server_ns, now_ns):
             self._watch.meet(Reason.STALLED, now_ns=now_ns)
         self._note_heard(now_ns)
-        self.echo = Echo(server_ns, now_ns, (self.echo.heard + 1) % NUMBERS)
-        if not isinstance(message, Welcome):
-            self.silence_asked = message.silence
-            self.hearing.hear(message.number, server_ns)
 
     def _note_heard(self, now_ns: int) -> None:
         self._awaits_welcome = False
@@ -399,7 +381,7 @@ class ServerSession:
 
     def tell_leader(self, flown: Lead, again_ns: int, *, now_ns: int) -> None:
         """Tell the server who leads, and in which motion the vehicle is; again after `again_ns`."""
-        self.lead_ns = now_ns + again_ns
+        self.lead_ns, self._asked = now_ns + again_ns, (flown.step, now_ns)
         self._post(flown, now_ns)
 
     def is_observation_due(self, step: int) -> bool:

@@ -18,7 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skytether.shared.base.kernel import F4, R2, kernel, part, record, records, shared
-from skytether.shared.base.units import MILLISECOND_NS
+from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
+from skytether.shared.core.time_of_day import DRIFT
 from skytether.shared.law import leap
 from skytether.shared.law.leap import NOISE_M, NOISE_MPS
 from skytether.shared.law.terms import Terms
@@ -27,7 +28,8 @@ from skytether.shared.wire.protocol import NO_HORIZON, Observation
 REPEATS = 3
 """Number of consistent rejected observations in a row that replace the accepted observation."""
 SLACK_NS = 50 * MILLISECOND_NS
-"""Time by which drifting clocks may shorten a measured round trip [ns]."""
+"""Time by which a measured round trip may be too short [ns], beside what clocks drift apart from
+one observation to the other."""
 
 
 class Statement:
@@ -119,7 +121,8 @@ def _against(
     elif before.step >= 0:
         # F of one observation plus G of another is also a round trip, which cannot be negative.
         trip = min(new.forward + before.backward, new.backward + before.forward)
-        if min(trip, new.forward + new.backward) < -SLACK_NS:
+        drift = int(abs(new.step - before.step) * dt * SECOND_NS) // DRIFT
+        if min(trip, new.forward + new.backward) < -SLACK_NS - drift:
             verdict = CLOCK
         elif new.step > before.step:  # an older one is checked for its clocks only
             back = new.in_force < before.in_force or new.since < before.since

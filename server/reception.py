@@ -179,28 +179,51 @@ class Reception:
         self._stopwatch.lap("decode")
         if call.vehicle not in (None, message.vehicle):
             raise ProtocolError(Drop.OF_ANOTHER_VEHICLE)
-        if report and not isinstance(message, Hello):
-            self._hear_report(report, message, call, datagram, now_ns)
-        elif self._sessions.with_paths and call.moves and isinstance(message, Observation):
-            session = self._sessions.find(message)
-            if session:  # its client was started again with a single path
-                self._sessions.set_paths(session, None)
         match message:
             case Observation():
-                self._observe(message, call, datagram, now_ns)
+                self._observe(message, report, call, datagram, now_ns)
             case Hello():
                 self._hello(message, call, datagram, now_ns)
-            case Close():
-                self._sessions.end(message.vehicle, message.session)
-                self._events.append(SessionEnded(vehicle=message.vehicle))
-            case Time():
-                self._hear_time(message, now_ns)
-            case PathProof():
-                self._prove(message, call, datagram, now_ns)
-            case Lead():
-                self._note_leader(message, call, datagram, now_ns)
+            case Close() | Time() | PathProof() | Lead():
+                self._hear_in_session(message, report, call, datagram, now_ns)
             case _:
                 raise ProtocolError(Drop.NOT_FOR_A_SERVER)
+
+    def _hear_in_session(
+        self,
+        message: Close | Time | PathProof | Lead,
+        report: Report | None,
+        call: GateCall,
+        datagram: Datagram,
+        now_ns: int,
+    ) -> None:
+        """Process a message; nothing of it is believed before it is found to be recent."""
+        session = self._sessions.find(message)
+        if isinstance(message, Lead):
+            session = self._sessions.welcomed(message)
+        if session is None:
+            raise ProtocolError(Drop.UNKNOWN_SESSION)
+        if isinstance(message, Time | Lead):
+            self._refuse_stale(session, message.step)
+        if report and session.paths:
+            is_recent = not isinstance(message, PathProof)
+            self._hear_report(session, report, datagram, now_ns, is_recent=is_recent)
+        match message:
+            case Close():
+                self._sessions.end(session)
+                self._events.append(SessionEnded(vehicle=session.vehicle))
+            case Time():
+                self._hear_time(session, message, now_ns)
+            case PathProof():
+                self._prove(session, message, call, datagram, now_ns)
+            case Lead():
+                self._note_leader(session, message, call, datagram, now_ns)
+
+    def _refuse_stale(self, session: Session, step: int) -> None:
+        """Refuse a message that a vehicle sent in a step long before its newest observation's."""
+        newest = self._controller.observed_step[session.row] if session.row >= 0 else step
+        if (newest - step) * self._terms.dt_ns > session.hearing.stale_ns:
+            raise ProtocolError(Drop.STALE)
 
     def _report_unauthenticated(self, address: Address, reason: Drop, now_ns: int) -> None:
         host, port = address
@@ -209,33 +232,27 @@ class Reception:
         self._report_ns = now_ns + REPORT_NS
 
     def _hear_report(
-        self, report: Report, message: Message, call: GateCall, datagram: Datagram, now_ns: int
-    ) -> None:
-        """Note a report; ask for a proof where the vehicle has not been heard before."""
-        if isinstance(message, Observation) and self._sessions.find(message) is None:
-            self._begin(message, call, now_ns)
-        session = self._sessions.live(message.vehicle)
-        if session is None or session.number != getattr(message, "session", None):
-            return
-        count = len(report.arrived)
-        if session.paths is None or len(session.paths.prices) != count:
-            prices = message.prices if isinstance(message, PathProof) else (1,) * count
-            session.paths = self._make_paths(session, prices)
-        place = Place(datagram.peer, datagram.socket)
-        path = session.paths.number(place)
-        session.paths.paths.heard(report, datagram.payload, path, now_ns)
-        if path is None and call.moves and isinstance(message, Observation):
-            question = session.paths.question(session.vehicle, session.number, place)
-            self._answer(question, call, datagram)
+        self,
+        session: Session,
+        report: Report,
+        datagram: Datagram,
+        now_ns: int,
+        *,
+        is_recent: bool = True,
+    ) -> int | None:
+        """Note the report of a message; returns its path, None if its address is not proven."""
+        assert session.paths
+        path = session.paths.number(Place(datagram.peer, datagram.socket))
+        session.paths.paths.heard(report, datagram.payload, path, now_ns, is_recent=is_recent)
+        return path
 
-    def _prove(self, message: PathProof, call: GateCall, datagram: Datagram, now_ns: int) -> None:
+    def _prove(
+        self, session: Session, message: PathProof, call: GateCall, datagram: Datagram, now_ns: int
+    ) -> None:
         """Note the address of a path once it is proven; until then ask for the proof there."""
-        session = self._sessions.find(message)
-        if session is None:
-            raise ProtocolError(Drop.UNKNOWN_SESSION)
-        session.heard_ns = now_ns
         if session.paths is None:
-            session.paths = self._make_paths(session, message.prices)
+            raise ProtocolError(Drop.FIELD)
+        session.heard_ns = now_ns
         session.paths.set_prices(message.prices)
         place = Place(datagram.peer, datagram.socket)
         question = session.paths.prove(message, place)
@@ -244,12 +261,12 @@ class Reception:
         elif place in session.paths.places and self._sessions.at_place.get(place) is not session:
             self._sessions.set_paths(session, session.paths)
 
-    def _note_leader(self, message: Lead, call: GateCall, datagram: Datagram, now_ns: int) -> None:
+    def _note_leader(
+        self, session: Session, message: Lead, call: GateCall, datagram: Datagram, now_ns: int
+    ) -> None:
         """Note who leads a vehicle; a number counts once, for the vehicle repeats it."""
-        session = self._sessions.welcomed(message)
-        if session is None:
-            raise ProtocolError(Drop.UNKNOWN_SESSION)
         session.heard_ns = now_ns
+        session.told_step = max(session.told_step, message.step)
         if session.leadership is None or message.number > session.leadership:
             session.leadership, session.leads = message.number, bool(message.leads)
             if session.row >= 0:
@@ -260,15 +277,8 @@ class Reception:
         self._answer(self.lead(session, known), call, datagram)
 
     def lead(self, session: Session, known: int) -> Lead:
-        """LEAD to a vehicle: what it has told, the largest number that it should know, and the
-        limits of the server's motions.
-        """
-        return session.lead(known)._replace(step=self.limits_changes, limits=self.limits)
-
-    def _make_paths(self, session: Session, prices: tuple[int, ...]) -> ServerPaths:
-        paths = ServerPaths(prices, self._spread, self._sessions.entropy, self._timeout_ns)
-        self._sessions.set_paths(session, paths)
-        return paths
+        """LEAD to a vehicle, see `Session.lead`."""
+        return session.lead(known, self.limits, self.limits_changes)
 
     def _answer(self, message: Message, call: GateCall, datagram: Datagram) -> None:
         sealed = call.line.seal(encode(message))
@@ -316,7 +326,12 @@ class Reception:
         return refusal
 
     def _observe(
-        self, observation: Observation, call: GateCall, datagram: Datagram, now_ns: int
+        self,
+        observation: Observation,
+        report: Report | None,
+        call: GateCall,
+        datagram: Datagram,
+        now_ns: int,
     ) -> None:
         session = self._sessions.find(observation) or self._begin(observation, call, now_ns)
         row, forward_ns = session.row, now_ns - observation.step * self._terms.dt_ns
@@ -328,10 +343,14 @@ class Reception:
                 self._events.append(StateDoubted(vehicle=session.vehicle))
             session.doubted = True
             raise ProtocolError(IMPLAUSIBLE[verdict])
-        session.doubted = False
         if verdict == ANEW:
             self._anew(row, None)
             session.hearing.begin()
+        # Only after it was judged: if the newest observation is the wrong one, this one is not old.
+        self._refuse_stale(session, observation.step)
+        session.doubted = False
+        if report:
+            self._hear_paths(session, report, call, datagram, now_ns)
         # Only after it was accepted: a rejected observation does not keep a session alive.
         session.heard_ns = now_ns
         session.asked_ns = observation.silence * self._terms.dt_ns // 2
@@ -353,16 +372,36 @@ class Reception:
         # elsewhere does not, once the original has arrived.
         if call.moves:
             session.move(datagram.peer, call.line, now_ns, datagram.socket)
+            if session.paths and not report:  # its client was started again with a single path
+                self._sessions.set_paths(session, None)
         if observation.unsaved > session.unsaved:
             self._events.append(CannotResume(vehicle=session.vehicle))
         session.unsaved = bool(observation.unsaved)
         self._grid.arm(now_ns)
 
-    def _hear_time(self, message: Time, now_ns: int) -> None:
+    def _hear_paths(
+        self,
+        session: Session,
+        report: Report,
+        call: GateCall,
+        datagram: Datagram,
+        now_ns: int,
+    ) -> None:
+        """Note the report of an observation; ask for a proof where it comes from a new address."""
+        count = len(report.arrived)
+        if session.paths is None or len(session.paths.prices) != count:
+            ones, entropy = (1,) * count, self._sessions.entropy
+            paths = ServerPaths(ones, self._spread, entropy, self._timeout_ns)
+            self._sessions.set_paths(session, paths)
+        path = self._hear_report(session, report, datagram, now_ns)
+        if path is None and call.moves:
+            assert session.paths
+            place = Place(datagram.peer, datagram.socket)
+            question = session.paths.question(session.vehicle, session.number, place)
+            self._answer(question, call, datagram)
+
+    def _hear_time(self, session: Session, message: Time, now_ns: int) -> None:
         """Narrow the bounds of a clock offset by the vehicle's time of day, if known here too."""
-        session = self._sessions.find(message)
-        if session is None:
-            raise ProtocolError(Drop.UNKNOWN_SESSION)
         error_ns = self.time and self.time.error_at(now_ns)
         if error_ns is None or self.time is None:
             return

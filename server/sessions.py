@@ -21,8 +21,12 @@ from skytether.shared.base.units import SECOND_NS
 from skytether.shared.core.endpoint import Address, Datagram
 from skytether.shared.law.heartbeat import NUMBERS, SESSION_NS, Hearing
 from skytether.shared.law.model import Indices
+from skytether.shared.law.terms import Limits
 from skytether.shared.wire.drop import Drop, ProtocolError
-from skytether.shared.wire.protocol import Hello, Lead, Observation, PathProof, Time
+from skytether.shared.wire.protocol import Close, Hello, Lead, Observation, PathProof, Time
+
+InSession = Observation | Close | Time | PathProof | Lead
+"""Messages of a vehicle in a session."""
 
 OTHER_NS = 2 * SECOND_NS
 """Time for which packets are also sent where a repeat of a recent one has come from [ns]."""
@@ -74,15 +78,22 @@ class Session:
     """Paths to the vehicle; None with a single one."""
     leadership: int | None = None
     """Number of the leadership, as last told by the vehicle; None if it has no other server."""
+    told_step: int = 0
+    """Step of the vehicle in the newest LEAD from it."""
     leads: bool = True
     """Whether this server leads the vehicle with that number."""
     first: Lead | None = None
     """What the vehicle has told before its first observation."""
 
-    def lead(self, known: int) -> Lead:
-        """What the vehicle has told of its leader, and the largest number that it should know."""
-        assert self.leadership is not None
-        return Lead(self.vehicle, self.number, self.leadership, int(self.leads), known)
+    def lead(self, known: int, limits: Limits | None, changes: int) -> Lead:
+        """What the vehicle has told of its leader, the largest number that it should know, and the
+        limits of the server's motions.
+        """
+        number, leads, step = self.leadership, int(self.leads), self.told_step
+        assert number is not None
+        return Lead(
+            self.vehicle, self.number, number, leads, known, step, limits=limits, changes=changes
+        )
 
     def number_next(self, now_ns: int) -> int:
         number = self.sent
@@ -262,7 +273,7 @@ class Sessions:
                 return session
         return None
 
-    def find(self, message: Observation | Time | PathProof) -> Session | None:
+    def find(self, message: InSession) -> Session | None:
         session = self._live.get(message.vehicle)
         return session if session and session.number == message.session else None
 
@@ -295,21 +306,14 @@ class Sessions:
         self._note_rows()
         return session
 
-    def end(self, vehicle: int, number: int) -> None:
-        """End the live session; raises ProtocolError if the vehicle has none with this number."""
-        session = self._live.get(vehicle)
-        if session is None or session.number != number:
-            raise ProtocolError(Drop.UNKNOWN_SESSION)
-        self._forget(session)
-
     def expire(self, now_ns: int) -> list[Session]:
         """End the sessions of silent vehicles, and return them."""
         gone = [each for each in self if now_ns - each.heard_ns > SESSION_NS]
         for session in gone:
-            self._forget(session)
+            self.end(session)
         return gone
 
-    def _forget(self, session: Session) -> None:
+    def end(self, session: Session) -> None:
         del self._live[session.vehicle], self._by_row[session.row]
         self._forget_paths(session)
         if self._keeps_rows:

@@ -91,6 +91,9 @@ class Hearing:
 
     def __init__(self, timeout_ns: int, step_ns: int, fixed_ns: int | None) -> None:
         self._fixed_ns, self._half_step_ns = fixed_ns, step_ns // 2
+        self.stale_ns = min(timeout_ns, (NUMBERS - 1) * step_ns)
+        """Time by which a packet was overtaken from which on it counts as lost [ns]: it came after
+        the time-out, or its number may have come round again."""
         rare_ns = min(RARE_TIMES * timeout_ns, SESSION_NS // 4)
         self.rare = min(rare_ns // self._half_step_ns, SILENCE_MAX)
         """Longest silence between a vehicle and a server that does not lead it [half steps]."""

@@ -483,17 +483,32 @@ class Paths:
             self._mark(sequence, path)
         return True
 
-    def heard(self, report: Report, datagram: bytes, path: int | None, now_ns: int) -> None:
+    def heard(
+        self,
+        report: Report,
+        datagram: bytes,
+        path: int | None,
+        now_ns: int,
+        *,
+        is_recent: bool = True,
+    ) -> None:
         """Note an authentic datagram and its report, and what it says of packets sent.
 
+        Args:
+            is_recent: whether its message has been found recent; only then the report may be of a
+                run of the other end that has begun its numbers anew.
+
         Raises:
-            ProtocolError: it reports other paths than this session has.
+            ProtocolError: it reports other paths than this session has, or is too late to tell
+                anything although its message was not found recent.
         """
         if len(report.arrived) != len(self.each):
             raise ProtocolError(Drop.FIELD)
-        ahead = self._progress(report.sequence)
-        if ahead <= -WINDOW:  # too late to tell anything
-            return
+        ahead = self._progress(report.sequence, is_recent=is_recent)
+        if ahead <= -WINDOW:
+            if is_recent:
+                return
+            raise ProtocolError(Drop.STALE)
         self._copies[datagram] = report.sequence
         if len(self._copies) > COPIES:
             del self._copies[next(iter(self._copies))]
@@ -519,12 +534,12 @@ class Paths:
         ):
             self._newest = None
 
-    def _progress(self, sequence: int) -> int:
+    def _progress(self, sequence: int, *, is_recent: bool) -> int:
         """Number of packets by which a packet is ahead of the newest that has come; WINDOW if it is
         the first, -WINDOW if it is of the other end's earlier run.
         """
         ahead = WINDOW if self._heard is None else _ahead(sequence, self._heard)
-        if self.peer_may_restart and ahead <= -WINDOW:
+        if self.peer_may_restart and is_recent and ahead <= -WINDOW:
             self.peer_may_restart, ahead, self._before = False, WINDOW, self._heard
         elif self._before is not None and abs(_ahead(sequence, self._before)) <= IN_FLIGHT_MAX:
             if ahead >= WINDOW:

@@ -314,8 +314,8 @@ class Lead(NamedTuple):
     known: int = 0
     """Largest number that the server has been told; 0 from a vehicle."""
     step: int = 0
-    """Step k in which the vehicle sends, on its grid; from a server, the number of changes of its
-    `limits`. The next three fields are empty from a server."""
+    """Step k in which the vehicle sends, on its grid; from a server, that of the newest LEAD from
+    the vehicle. The next three fields are empty from a server."""
     in_force: int | None = None
     """Step that the motion in force was made for; None without one."""
     spacing: int = 0
@@ -324,6 +324,8 @@ class Lead(NamedTuple):
     """Position [m] and velocity [m/s] of each knot; shape (axes, knots, 2)."""
     limits: Limits | None = None
     """Limits of the server's motions; None from a vehicle, or without a mission."""
+    changes: int = 0
+    """Number of changes of these limits in the server's run."""
 
 
 # With 10 % loss, all three are lost once in a thousand times.
@@ -537,7 +539,7 @@ _TYPES: tuple[tuple[type[Message], tuple[_Check, ...]], ...] = (
         Lead,
         (
             *(_U16, _U32, _U32, _FLAG, _U32, _U31, _OrNone(_U31), range(2**16)),
-            *(_knots_or_none, _limits),
+            *(_knots_or_none, _limits, _U31),
         ),
     ),
 )

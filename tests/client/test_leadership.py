@@ -351,7 +351,7 @@ def test_a_late_copy_of_limits_changes_nothing(vehicle: Vehicle) -> None:
         *((0, own, 0, True), (1, own, 0, True), (0, other, 1, False), (1, other, 1, True)),
         *((1, own, 0, True), (0, own, 0, True), (1, own, 2, False)),
     ):
-        vehicle.hear(server, Lead(4, 7 + server, 0, 1 - server, 0, changes, limits=limits))
+        vehicle.hear(server, Lead(4, 7 + server, 0, 1 - server, 0, limits=limits, changes=changes))
         assert vehicle.client._servers.leadership.may_lead(1) == may_lead
 
 

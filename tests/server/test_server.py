@@ -1,7 +1,6 @@
 """The server as an endpoint: sessions, ticks, and messages."""
 
 import io
-from contextlib import suppress
 from functools import partial
 from typing import Any
 
@@ -628,8 +627,8 @@ def test_whoever_was_welcomed_last_and_comes_in_time_gets_a_row(
                 in_time = granted[0] == boot_id and now_ns <= granted[1]
                 assert refused in ("", "taken") or not in_time
             case "close" if (vehicle, boot_id) in numbers:
-                with suppress(ProtocolError):
-                    sessions.end(vehicle, numbers[vehicle, boot_id])
+                if session := sessions.find(Close(vehicle, numbers[vehicle, boot_id])):
+                    sessions.end(session)
             case "wait":
                 now_ns += boot_id * (SILENCE_NS // 2 + 1) + vehicle * SECOND_NS
                 if vehicle == 5:

@@ -1,0 +1,77 @@
+"""The server's clock as a vehicle knows it, from the time stamps of the server's packets.
+
+The newest packet is echoed in observations, from which the server estimates the delays. A packet is
+stale if a much newer one came before it; nothing of it is believed. Only a WELCOME is never stale:
+it answers a HELLO, and lets a server go on whose clock was set back.
+"""
+
+from typing import NamedTuple
+
+from skytether.shared.core.steady import JUMP_NS
+from skytether.shared.law.heartbeat import NUMBERS
+from skytether.shared.wire.drop import Drop, ProtocolError
+from skytether.shared.wire.protocol import stamped_ns
+
+SLEPT_NS = JUMP_NS // 2
+"""Advance of the server's clock over the client's that shows that this machine was suspended; far
+more than changing delays cause."""
+
+
+class Echo(NamedTuple):
+    """Newest packet of the server, as echoed in observations."""
+
+    server_ns: int
+    """Server time at which the packet was sent [ns]."""
+    received_ns: int
+    """Time of its arrival [ns; the client's clock]."""
+    heard: int
+    """Number of packets received up to and including that packet, modulo NUMBERS."""
+
+
+NEVER = Echo(0, 0, 0)
+"""Echo before the first packet of the server."""
+
+
+class ServerClock:
+    """Clock of one server.
+
+    Args:
+        stale_ns: time [ns] after which a packet that a newer one overtook is stale.
+    """
+
+    def __init__(self, stale_ns: int) -> None:
+        self.echo = NEVER
+        self._stale_ns = stale_ns
+
+    def begin(self) -> None:
+        """Begin with another run of the server, whose time stamps cannot be compared with those of
+        the run before.
+        """
+        self.echo = NEVER
+
+    def sent_ns(self, server_us: int, now_ns: int) -> int:
+        """Server's time of a packet's stamp [ns].
+
+        Raises:
+            ProtocolError: the packet is stale.
+        """
+        server_ns = stamped_ns(server_us, self._expected_ns(now_ns))
+        if self.echo.server_ns - server_ns > self._stale_ns:
+            raise ProtocolError(Drop.STALE)
+        return server_ns
+
+    def hear(self, server_ns: int, now_ns: int) -> bool:
+        """Note a packet sent at a time of the server; returns whether this machine was suspended.
+
+        The client's clock may have stood still, or its jump was mistaken for a clock that was set
+        (`shared.core.steady`); the server's clock has gone on in both cases. After a suspension
+        longer than time stamps can express, the server has forgotten the session, and its WELCOME
+        contains the full time.
+        """
+        slept = self.echo != NEVER and server_ns - self._expected_ns(now_ns) > SLEPT_NS
+        self.echo = Echo(server_ns, now_ns, (self.echo.heard + 1) % NUMBERS)
+        return slept
+
+    def _expected_ns(self, now_ns: int) -> int:
+        """Server's time [ns] if the delay has not changed since the newest packet."""
+        return self.echo.server_ns + now_ns - self.echo.received_ns
