@@ -185,7 +185,7 @@ def changed_channel(rng: Random, found: list[Any]) -> None:
 
 
 def changed_words(rng: Random, found: list[Any]) -> None:
-    (begun,) = of_topic(found, BEGUN)
+    begun = of_topic(found, BEGUN)[0]
     at = rng.choice([begun, *frames_of(found, "Opened")])
     message = msgspec.msgpack.decode(found[at].data)
     text = message["scenario"]

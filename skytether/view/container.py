@@ -1,23 +1,38 @@
 """Safe reading of MCAP files: sizes that a file claims are checked before memory is allocated.
 
 A file of a few kilobytes may claim to hold gigabytes, and the library `mcap` allocates them. So the
-library gets a stream that ends where the file does, and chunks whose size is known before they are
+library gets records that end within the file, and chunks whose size is known before they are
 decompressed. The file is read once, from its beginning, so that one without an index, whose writer
-was killed, can be read as well.
+was killed, can be read as well. After a damaged record reading goes on at the next chunk.
 """
 
 import os
+import re
 import stat
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from io import BytesIO
 from pathlib import Path
 from typing import Any
+from zlib import crc32
 
 import zstandard
+from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
-from mcap.records import Channel, Chunk, DataEnd, McapRecord, Message
-from mcap.stream_reader import CRCValidationError, StreamReader, breakup_chunk
+from mcap.opcode import Opcode
+from mcap.records import (
+    Attachment,
+    Channel,
+    Chunk,
+    DataEnd,
+    Header,
+    McapRecord,
+    Message,
+    MessageIndex,
+    Metadata,
+)
+from mcap.stream_reader import CRCValidationError, breakup_chunk
 
 from skytether.shared.base import files
 from skytether.shared.base.errors import ConfigError, RecordingError
@@ -26,6 +41,26 @@ from skytether.shared.telemetry.record import RECORDING
 MAGIC = b"\x89MCAP0\r\n"
 ENCODING = "msgpack"
 """Encoding of the messages that are read back; others are written for other programs."""
+COPY, COPY_OF = "/copy", "copy_of"
+"""Of a channel with a copy of another's first message: the prefix of its topic, and its metadata
+with the other's number.
+"""
+HEAD = struct.Struct("<BQ")
+"""Head of a record: its kind and the size of the rest [B]."""
+KINDS: Mapping[int, Any] = {
+    Opcode.HEADER: Header,
+    Opcode.CHUNK: Chunk,
+    Opcode.MESSAGE_INDEX: MessageIndex,
+    Opcode.ATTACHMENT: Attachment,
+    Opcode.METADATA: Metadata,
+    Opcode.DATA_END: DataEnd,
+}
+"""Records of a recording outside of chunks, up to the end of its data."""
+CHUNK = re.compile(rb"\x06.{36}\x04\0\0\0zstd.{8}\x28\xb5\x2f\xfd", re.DOTALL)
+"""Beginning of a chunk, by which the next one is found after a damaged record."""
+CHUNK_HEAD_BYTES = 57
+DAMAGES_MAX = 100
+"""Largest number of damaged places after which reading goes on; it bounds the time it takes."""
 
 CHUNK_BYTES_MAX = 5 * 1024 * 1024
 """Largest size of a decompressed chunk [B]; Skytether writes 256 KiB and a message."""
@@ -106,73 +141,122 @@ class Container:
     def close(self) -> None:
         self._file.close()
 
-    def read(self, size: int) -> bytes:
-        """Next bytes, at most `size`; the only method of a file that the library calls."""
-        return self._file.read(min(size, self._size - self._file.tell()))
-
     def messages(self) -> Iterator[tuple[str, bytes]]:
         """Topics and contents of messages in the encoding that is read back, in file order.
 
-        A file that was not completed is read up to the first record that is not whole. Of a
-        completed one damaged chunks are left out, and everything after a damaged length.
+        Damaged records are left out, and so is what comes before the next chunk. A copy of a
+        message stands for it if that is lost.
 
         Raises:
             BROKEN: the file holds what no flight writes.
         """
-        self._file.seek(0)
-        whole_bytes = len(MAGIC)
         topics: dict[int, str] = {}
+        has_copies = False
         messages_left = SPARE_MESSAGES + self._size // INDEXED_BYTES
-        try:
-            for record in self._unpacked():
-                match record:
-                    case DataEnd():
-                        return
-                    case Channel(message_encoding=encoding):
-                        topics[record.id] = record.topic if encoding == ENCODING else ""
-                    case Message(channel_id=number) if number not in topics:
-                        if not self.damaged_bytes:
-                            raise ValueError(f"a message before its channel {number}")
-                        self.damaged_bytes += len(record.data)
-                    case Message(channel_id=number) if topic := topics[number]:
-                        messages_left -= 1
-                        if messages_left < 0:
-                            raise ValueError("it has more messages than fit into its size")
-                        yield topic, record.data
-                whole_bytes = self._file.tell()
-        except CRCValidationError:  # of all data: what is read of it has checksums of its own
-            self.damaged_bytes = max(self.damaged_bytes, 1)
-        except BROKEN as error:
-            lost_bytes = self._size - whole_bytes
-            if not self.is_whole:
-                self.lost_bytes = lost_bytes
-            elif isinstance(error, McapError):
-                self.damaged_bytes += lost_bytes
-            else:
-                raise
+        for record in self._unpacked():
+            match record:
+                case Channel(message_encoding=encoding):
+                    topics[record.id] = record.topic if encoding == ENCODING else ""
+                    if original := record.metadata.get(COPY_OF):
+                        has_copies = True
+                        is_needed = int(original) not in topics
+                        topics[record.id] = record.topic.removeprefix(COPY) if is_needed else ""
+                        topics.setdefault(int(original), topics[record.id])
+                case Message(channel_id=number) if number not in topics:
+                    if not self.damaged_bytes:
+                        raise ValueError(f"a message before its channel {number}")
+                    # With copies a channel that is still unknown has nothing to be read back.
+                    self.damaged_bytes += 0 if has_copies else len(record.data)
+                case Message(channel_id=number) if topic := topics[number]:
+                    messages_left -= 1
+                    if messages_left < 0:
+                        raise ValueError("it has more messages than fit into its size")
+                    yield topic, record.data
 
     def _unpacked(self) -> Iterator[McapRecord]:
+        """Channels and messages in all chunks."""
         left_bytes = SPARE_BYTES + RATIO_MAX * self._size
-        stream: Any = self
-        for record in StreamReader(stream, emit_chunks=True, validate_crcs=True).records:
-            if not isinstance(record, Chunk):
-                yield record
-                continue
+        for record in self._chunks():
             size = record.uncompressed_size
+            if fault := _fault(record):
+                if not record.uncompressed_crc:  # which all of ours have
+                    raise ValueError(fault)
+                self.damaged_bytes += len(record.data)
+                continue
             left_bytes -= size
-            if size > CHUNK_BYTES_MAX:
-                raise ValueError(f"a chunk of {size} B, expected at most {CHUNK_BYTES_MAX} B")
             if left_bytes < 0:
                 raise ValueError("its chunks are larger than any flight's, for a file of its size")
-            if record.compression not in {"", "zstd"}:
-                compression = record.compression[:20]
-                raise ValueError(f"a chunk is compressed with {compression!r}, expected zstd")
-            packed = zstandard.frame_content_size if record.compression else len
-            if packed(record.data) not in {-1, size}:
-                raise ValueError("a chunk's content has another size than it says")
             try:
                 records = breakup_chunk(record, validate_crc=True)
             except (CRCValidationError, zstandard.ZstdError):
                 self.damaged_bytes += len(record.data)
             else:
                 yield from records
+
+    def _chunks(self) -> Iterator[Chunk]:
+        """Chunks up to the end of the data; counts what is damaged or lost between them."""
+        at, checksum = len(MAGIC), crc32(MAGIC)
+        for _ in range(DAMAGES_MAX):
+            while (content := self._framed(at)) and (record := _parsed(content)):
+                if isinstance(record, DataEnd):
+                    if record.data_section_crc not in {0, checksum}:
+                        self.damaged_bytes = max(self.damaged_bytes, 1)
+                    return
+                at, checksum = at + len(content), crc32(content, checksum)
+                if isinstance(record, Chunk):
+                    yield record
+            following = self._next_chunk(at + 1)
+            if following is None:
+                break
+            self.damaged_bytes += following - at
+            at = following
+        if self.is_whole:
+            self.damaged_bytes += self._size - at
+        else:
+            self.lost_bytes = self._size - at
+
+    def _framed(self, at: int) -> bytes:
+        """Record at a place in the file; empty if the file is too short for it."""
+        self._file.seek(at)
+        head = self._file.read(HEAD.size)
+        if len(head) < HEAD.size:
+            return b""
+        size = HEAD.unpack(head)[1]
+        return head + self._file.read(size) if at + len(head) + size <= self._size else b""
+
+    def _next_chunk(self, at: int) -> int | None:
+        """Place of the first chunk from there on; None if there is none."""
+        self._file.seek(at)
+        rest = b""
+        while piece := self._file.read(CHUNK_BYTES_MAX):
+            rest += piece
+            if found := CHUNK.search(rest):
+                return at + found.start()
+            at += max(len(rest) - CHUNK_HEAD_BYTES, 0)
+            rest = rest[-CHUNK_HEAD_BYTES:]
+        return None
+
+
+def _parsed(content: bytes) -> McapRecord | None:
+    """Record of these bytes, if a recording has such outside of chunks, and it fills them."""
+    stream = ReadDataStream(BytesIO(content[HEAD.size :]))
+    try:
+        record: McapRecord = KINDS[content[0]].read(stream)
+    except BROKEN:
+        return None
+    return record if stream.count == len(content) - HEAD.size else None
+
+
+def _fault(chunk: Chunk) -> str:
+    """Reason why a chunk must not be decompressed; empty if there is none."""
+    size = chunk.uncompressed_size
+    if size > CHUNK_BYTES_MAX:
+        return f"a chunk of {size} B, expected at most {CHUNK_BYTES_MAX} B"
+    if chunk.compression not in {"", "zstd"}:
+        return f"a chunk is compressed with {chunk.compression[:20]!r}, expected zstd"
+    try:
+        packed = zstandard.frame_content_size if chunk.compression else len
+        is_of_this_size = packed(chunk.data) in {-1, size}
+    except zstandard.ZstdError:
+        is_of_this_size = False
+    return "" if is_of_this_size else "a chunk's content has another size than it says"

@@ -5,6 +5,7 @@ The frames of the flight's processes are written as they come from their feeds, 
 
     /recording           facts about the recording, a `Begun`; the first message
     /feed/PROCESS        frames of a process
+    /copy/…              copy of the first message of each of these
 
 Other programs get a channel of JSON for each topic:
 
@@ -18,7 +19,8 @@ Other programs get a channel of JSON for each topic:
 Foxglove and Lichtblick draw /events, and for each of the first VEHICLES_MAX vehicles
 /vehicle/N/pose, /vehicle/N/transform and, below /vehicle/N/scene, the vehicle, its plan, its
 desired position and its trajectory. The scenario and, at the end, the summary are attachments. A
-chunk is complete as soon as it is written.
+chunk is complete as soon as it is written. The first message of each topic that is read back has
+a chunk of its own, and its copy the next one: the rest can be read without one of them.
 """
 
 from collections.abc import Mapping
@@ -44,7 +46,7 @@ from skytether.shared.telemetry.feed import Figures, Frame, Opened, Rows, Said, 
 from skytether.shared.telemetry.record import Rows as Table
 from skytether.shared.telemetry.summary import Summary
 from skytether.view import foxglove, rows
-from skytether.view.container import ENCODING
+from skytether.view.container import COPY, COPY_OF, ENCODING
 
 BEGUN, FEED = "/recording", "/feed/"
 """Topic of the first message, and the prefix of the topics of frames."""
@@ -106,7 +108,7 @@ class Recording:
         self._now_ns = 0
         toml = to_toml(scenario)
         begun = Begun(about=about, scenario=toml.decode())
-        self._add(BEGUN, ENCODING, 0, msgspec.msgpack.encode(begun))
+        self._add_twice(BEGUN, msgspec.msgpack.encode(begun))
         facts = msgspec.to_builtins(about)
         self._writer.add_metadata(OURS, {name: _text(value) for name, value in facts.items()})
         self._attach(SCENARIO, "application/toml", toml)
@@ -123,7 +125,10 @@ class Recording:
             case Opened():
                 for part, columns in frame.parts.items():
                     self._tables[process, part] = rows.RowTable(columns_of(columns))
-                self._add_frame(process, frame)
+                if f"{FEED}{process}" in self._channels:
+                    self._add_frame(process, frame)
+                else:
+                    self._add_twice(f"{FEED}{process}", feed.pack(frame))
             case Said():
                 self._add_frame(process, frame)
                 self._say(process, frame.event)
@@ -155,6 +160,16 @@ class Recording:
     def _add_frame(self, process: str, frame: Frame) -> None:
         """Add a frame unchanged, to be read back by Skytether."""
         self._add(f"{FEED}{process}", ENCODING, 0, feed.pack(frame))
+
+    def _add_twice(self, topic: str, content: bytes) -> None:
+        """Add a topic's first message, without which the others cannot be read, and its copy."""
+        self.flush()
+        self._add(topic, ENCODING, 0, content)
+        self.flush()
+        original = {COPY_OF: str(self._channels[topic])}
+        copy = self._writer.register_channel(f"{COPY}{topic}", ENCODING, 0, original)
+        self._writer.add_message(copy, self._now_ns, content, self._now_ns)
+        self.flush()
 
     def _say(self, process: str, event: Event) -> None:
         self._put("/said", "skytether.Said", _SAID, {"process": process, "event": event})
