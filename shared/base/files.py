@@ -309,8 +309,21 @@ def appending(path: Path) -> BinaryIO:
     Raises:
         OSError: the file cannot be written, is not a plain file, or another command has locked it.
     """
+    return _held(path, os.O_RDWR | os.O_CREAT, "r+b")
+
+
+def held(path: Path) -> BinaryIO:
+    """Open a file for reading, locked as by `appending` until it is closed.
+
+    Raises:
+        OSError: the file cannot be read, is not a plain file, or another command has locked it.
+    """
+    return _held(path, os.O_RDONLY, "rb")
+
+
+def _held(path: Path, flags: int, mode: str) -> BinaryIO:
     check(path)
-    file = os.fdopen(os.open(path, os.O_RDWR | os.O_CREAT | FLAGS, MODE), "r+b")
+    file: BinaryIO = os.fdopen(os.open(path, flags | FLAGS, MODE), mode)  # type: ignore[assignment]
     if not stat.S_ISREG(os.fstat(file.fileno()).st_mode) or not _locked(path, file.fileno()):
         file.close()
         raise OSError(EBUSY, "another command is writing it", str(path))

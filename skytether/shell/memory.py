@@ -15,9 +15,10 @@ import os
 import threading
 import time
 from collections.abc import Mapping
-from errno import EBUSY
+from errno import EBUSY, EIO, EROFS
 from hashlib import blake2b
 from pathlib import Path
+from typing import BinaryIO
 
 import msgspec
 
@@ -30,6 +31,8 @@ DIGEST_BYTES = 32
 FILE_BYTES_MAX = 65_536
 BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
 """File with the host's boot id, on Linux; the monotonic clock restarts at each boot."""
+DISK_FAILED = {EROFS, EIO}
+"""Errors of a disk that has failed; one that was full has had room for the lock file."""
 AGAIN_S = 1.0
 """Time after which a failed write is tried again."""
 
@@ -73,15 +76,15 @@ class MemoryFile:
         secret: key of the vehicle, which authenticates the file; empty without keys.
 
     Raises:
-        OSError: the folder cannot be created, or another process uses this file.
+        OSError: the folder cannot be created, or another process uses this file. On a disk that
+            has failed neither is an error: the flight goes on, and `news` says what is not kept.
     """
 
     def __init__(self, path: Path, identity: Mapping[str, str], secret: bytes = b"") -> None:
         self._path, self._identity, self._secret = path, dict(identity), secret
         self._host = _host()
-        path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         try:
-            self._lock = files.appending(path.with_name(path.name + ".lock"))
+            self._lock = _locked(path)
         except OSError as error:
             if error.errno != EBUSY:
                 raise
@@ -182,8 +185,9 @@ class MemoryFile:
             self._changed.notify()
         if self._thread is not None:
             self._thread.join(AGAIN_S)
-        with contextlib.suppress(OSError):
-            self._lock.close()
+        if self._lock:
+            with contextlib.suppress(OSError):
+                self._lock.close()
 
     def _work(self) -> None:
         while True:
@@ -229,6 +233,23 @@ class MemoryFile:
         if self._wanted is None:
             self._told_nothing = False
             self._endpoint.kept()
+
+
+def _locked(path: Path) -> BinaryIO | None:
+    """Lock of a memory file; None on a disk that has failed and holds no readable lock file."""
+    lock = path.with_name(path.name + ".lock")
+    try:
+        path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        return files.appending(lock)
+    except OSError as error:
+        if error.errno not in DISK_FAILED:
+            raise
+    try:
+        return files.held(lock)
+    except OSError as error:
+        if error.errno == EBUSY:
+            raise
+    return None
 
 
 def _host() -> str:

@@ -124,6 +124,38 @@ def test_two_processes_do_not_share_a_memory(path: Path) -> None:
     MemoryFile(path, IDENTITY).close()
 
 
+@pytest.mark.parametrize("error", [errno.EROFS, errno.EIO])
+def test_on_a_disk_that_failed_a_client_starts_unless_another_holds_the_lock(
+    error: int, path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    put(path, a_file(path))
+
+    def failed(*_: Any, **__: Any) -> Any:
+        raise OSError(error, "it has failed")
+
+    with closing(MemoryFile(path, IDENTITY)), monkeypatch.context() as disk:
+        disk.setattr(files, "appending", failed)
+        with pytest.raises(OSError, match=r"another process keeps its memory there"):
+            MemoryFile(path, IDENTITY)
+    monkeypatch.setattr(files, "appending", failed)
+    monkeypatch.setattr(files, "replacing", failed)
+    for has_lock_file in (True, False):
+        with closing(MemoryFile(path, IDENTITY, SECRET)) as kept:
+            with pytest.raises(MemoryRefused, match="it cannot be replaced"):
+                kept.read()
+            endpoint = Keeps()
+            begun(kept, endpoint, monkeypatch)
+            endpoint.wanted.append(CONTENT)
+            kept.look()
+            work(kept)
+            assert kept.news()
+            assert not endpoint.written
+        if has_lock_file:
+            path.with_name(path.name + ".lock").unlink()
+    monkeypatch.setattr(Path, "mkdir", failed)
+    MemoryFile(path.parent / "new" / "client-1", IDENTITY).close()
+
+
 class Loop(HandLoop):
     def call_soon_threadsafe(self, then: Callable[..., None]) -> None:
         then()
