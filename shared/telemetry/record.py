@@ -174,6 +174,23 @@ def compared(rows: Rows) -> Array:
     return figures
 
 
+class SentBy(NamedTuple):
+    """Number of plans sent, by what sent them."""
+
+    above: int
+    """The figure that the trigger compares was above its threshold, also if a sign of life was due
+    as well."""
+    due: int
+    """The others: due as a sign of life, by a schedule, or as the first plan."""
+
+
+def sent_by(rows: Rows) -> SentBy:
+    """Count the plans sent in rows of the server's part, by what sent them."""
+    sent = rows[rows["event"]]
+    above = (sent["compared"] != Compared.NOTHING) & (compared(sent) > sent["threshold"])
+    return SentBy(int(above.sum()), int((~above).sum()))
+
+
 def plan_columns(axes: int, planned: int) -> np.dtype[np.void]:
     """Columns of the server's plans: one row for each horizon that it sends.
 

@@ -13,7 +13,7 @@ from skytether.shared.law.model import Array
 from skytether.shared.scenario.pace import is_known, is_too_fast
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.drops import drops
-from skytether.shared.telemetry.record import DOWNLINK, UPLINK, Reason, Rows, compared
+from skytether.shared.telemetry.record import DOWNLINK, UPLINK, Reason, Rows, sent_by
 from skytether.shared.wire.protocol import NO_HORIZON, Mode
 
 AT_BOUND = 1.0 - 1e-6
@@ -54,8 +54,9 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
     """Number of packets with a horizon that the server sent; the other uplink packets are
     heartbeats and the handshake's."""
     uplink_above: int | None = None
-    """Number of these that were sent because the figure that the trigger compares was above its
-    threshold; the others were due, as a sign of life or by a schedule."""
+    """Number of these that the trigger's figure sent, see `shared.telemetry.record.SentBy`."""
+    uplink_due: int | None = None
+    """Number of the other ones, which were due."""
     uplink_packets: int | None
     """Number of packets that entered the network from the server, including lost ones."""
     uplink_bytes: int | None
@@ -155,12 +156,10 @@ def summarise(
     plan_age_s = (planned["step"] - planned["in_force"]) * scenario.control.dt
     changes = np.diff(client["input"], axis=0)[counted[1:]]
     stale, missed = _last(client, "stale"), _last(client, "missed")
-    horizons, above, event_ratio, solve_ms = None, None, None, np.empty(0)
+    sent, event_ratio, solve_ms = None, None, np.empty(0)
     if server is not None:
         rows = server[np.isin(server["vehicle"], client["vehicle"])]
-        sent = rows[rows["event"]]
-        horizons = len(sent)
-        above = int(((sent["compared"] != 0) & (compared(sent) > sent["threshold"])).sum())
+        sent = sent_by(rows)
         event_ratio = float(rows["event"].mean()) if len(rows) else None
         solve_ms = rows["solve_ns"][rows["solve_ns"] >= 0] / 1e6
         stale, missed = stale + _last(rows, "stale"), missed + _last(rows, "missed")
@@ -184,8 +183,9 @@ def summarise(
         mode=str(Mode(client["mode"][-1])) if len(client) else None,
         reason=str(Reason(client["reason"][-1])) if len(client) else None,
         event_ratio=event_ratio,
-        uplink_horizons=horizons,
-        uplink_above=above,
+        uplink_horizons=sum(sent) if sent else None,
+        uplink_above=sent.above if sent else None,
+        uplink_due=sent.due if sent else None,
         uplink_packets=_count(netem, UPLINK),
         uplink_bytes=_bytes(netem, UPLINK),
         downlink_packets=_count(netem, DOWNLINK),

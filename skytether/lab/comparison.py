@@ -30,6 +30,8 @@ FIGURES = (
     "downlink_packets_per_s",
     "downlink_bytes_per_s",
     SHARE,
+    "uplink_above",
+    "uplink_due",
     EFFORT,
     "saturated",
     "aoi_s_mean",

@@ -227,6 +227,8 @@ FIGURES = (
     "error_max",
     "covered",
     "event_ratio",
+    "uplink_above",
+    "uplink_due",
     "uplink_packets",
     "uplink_bytes",
     "downlink_packets",

@@ -111,7 +111,7 @@ def summary_rows(summary: Summary) -> list[tuple[str, str]]:
         ("modes [s]", ", ".join(f"{mode} {seconds:g}" for mode, seconds in s.modes.items())),
         ("event ratio", _values(".3f", s.event_ratio)),
         ("uplink horizons, other packets", _values("d", *_uplink(s))),
-        ("  horizons by the trigger's figure, due", _values("d", *_by_cause(s))),
+        ("  horizons by the trigger's figure, due", _values("d", s.uplink_above, s.uplink_due)),
         ("uplink packets, bytes", _values("d", s.uplink_packets, s.uplink_bytes)),
         ("downlink packets, bytes", _values("d", s.downlink_packets, s.downlink_bytes)),
         ("paths: packets up, down", "; ".join(_values("d", *each) for each in s.paths or ())),
@@ -149,12 +149,6 @@ def _uplink(s: Summary) -> tuple[int, ...]:
     if s.uplink_horizons is None or s.uplink_packets is None:
         return ()
     return s.uplink_horizons, max(0, s.uplink_packets - s.uplink_horizons)
-
-
-def _by_cause(s: Summary) -> tuple[int, ...]:
-    if s.uplink_above is None or s.uplink_horizons is None:
-        return ()
-    return s.uplink_above, s.uplink_horizons - s.uplink_above
 
 
 def _values(spec: str, *values: float | None) -> str:

@@ -36,7 +36,7 @@ from skytether.shared.telemetry.feed import (
     columns_of,
     table,
 )
-from skytether.shared.telemetry.record import DOWNLINK, UPLINK, Reason, compared
+from skytether.shared.telemetry.record import DOWNLINK, UPLINK, Reason, SentBy, compared, sent_by
 from skytether.shared.telemetry.record import Rows as Table
 from skytether.shared.wire.paths import PATHS_MAX
 from skytether.shared.wire.protocol import Mode
@@ -126,8 +126,8 @@ class VehicleTrack:
         self.row: np.void | None = None
         """Newest row of the client's part; None without any."""
         self.planned = 0
-        self.sent = 0
-        """Number of steps seen at which the server sent a horizon."""
+        self.sent = SentBy(0, 0)
+        """Plans that the server sent at the steps seen."""
         self._plans: deque[np.void] = deque(maxlen=PLANS_MAX)
         """Newest plans sent to the vehicle, the newest last."""
         self._seen: np.void | None = None
@@ -155,7 +155,8 @@ class VehicleTrack:
             rows["solve_ns"] >= 0, rows["solve_ns"] / MILLISECOND_NS, np.nan
         )
         self.planned += len(rows)
-        self.sent += int(rows["event"].sum())
+        more = sent_by(rows)
+        self.sent = SentBy(self.sent.above + more.above, self.sent.due + more.due)
         if len(rows):
             self._seen = rows[-1].copy()
 

@@ -76,6 +76,9 @@ def status(state: State, vehicle: int, now_ns: int, title: str = "") -> str:
     rows.append(("distance to reference, last 10 s", number(track.error_m(10.0), ".3f", " m")))
     rows.append(("age of the observation in use", number(track.age_s, ".2f", " s")))
     rows.append(("age of observation at server", number(track.known_s, ".2f", " s")))
+    if track.planned:
+        causes = f"{track.sent.above} by the trigger's figure, {track.sent.due} due"
+        rows.append(("plans sent", causes))
     rows += _leader(state, vehicle) + _mission(state, vehicle) + _autopilot(state, vehicle)
     rows += _network(state, now_ns)
     curves_ms = track.curves(60).solve_ms

@@ -104,6 +104,8 @@ HORIZONS = "uplink horizons, other packets"
     ("trigger", "least", "most"),
     [
         ("periodic(10)", 0.0, 0.0),
+        ("heartbeat", 0.0, 0.0),
+        ("state_gap(0, 100) | heartbeat", 0.95, 1.0),
         ("state_gap(3.6, 1.5)", 0.9, 1.0),
         ("state_gap(3.6, 1.5) | silence(0.2)", 0.1, 0.8),
     ],
@@ -112,6 +114,7 @@ def test_horizons_are_counted_by_what_sent_them(trigger: str, least: float, most
     flown = packaged("paper", duration=20.0, control={"trigger": trigger})
     result = summary(flown, fly(flown))
     assert least <= result.uplink_above / result.uplink_horizons <= most
+    assert result.uplink_above + result.uplink_due == result.uplink_horizons > 5
 
 
 def test_the_summary_counts_what_the_network_saw() -> None:

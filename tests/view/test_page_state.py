@@ -3,6 +3,7 @@
 import re
 from dataclasses import dataclass
 from functools import cache
+from html import unescape
 from typing import Any
 
 import msgspec
@@ -24,6 +25,7 @@ from skytether.shared.telemetry.record import (
     Record,
     client_columns,
 )
+from skytether.shared.telemetry.summary import summarise
 from skytether.shared.wire.protocol import Mode
 from skytether.sim import flight
 from skytether.view import plots, scene, words
@@ -89,7 +91,13 @@ def test_the_curves_of_a_vehicle_are_its_record() -> None:
     np.testing.assert_array_equal(curves.threshold[here], planned["threshold"])
     aged = flown["age_ns"] >= 0
     np.testing.assert_array_equal(curves.age_s[here][aged], flown["age_ns"][aged] / SECOND_NS)
-    assert server["event"].sum() == track.sent
+    told = summarise(shown.scenario, "demo", client, server)
+    assert track.sent == (told.uplink_above, told.uplink_due)
+    assert sum(track.sent) == server["event"].sum()
+    text = unescape(re.sub("<[^>]*>", " ", words.status(shown.state, 1, shown.now_ns)))
+    found = re.search(r"plans sent\D*(\d+)\D*(\d+)", text)
+    assert found is not None
+    assert tuple(map(int, found.groups())) == track.sent
 
 
 def test_a_cut_link_is_a_gap_in_all_that_nobody_knows_meanwhile() -> None:

@@ -22,6 +22,8 @@ DRAWN = {"rmse_xy": "RMSE xy [m]", "event_ratio": "event ratio"}
 SHOWN = {
     "rmse_xy": ("RMSE xy [m]", ".4f"),
     "event_ratio": ("event ratio", ".4f"),
+    "uplink_above": ("sent by the trigger's figure", ".1f"),
+    "uplink_due": ("due", ".1f"),
     "packets_per_s": ("packets/s both ways", ".2f"),
 }
 
