@@ -26,7 +26,7 @@ from skytether.shared.scenario import plans, reading, tracks
 from skytether.shared.scenario.mission import Mission
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.drops import drops
-from skytether.shared.telemetry.record import Record
+from skytether.shared.telemetry.record import Record, sent_by
 from skytether.shared.telemetry.summary import plugin_errors, separations, summarise
 from skytether.shell import command, plugins, terminal
 from skytether.shell.argument import Argument
@@ -85,6 +85,10 @@ class FleetSummary(msgspec.Struct, frozen=True, kw_only=True):
     server_steps: int
     """Steps that the server planned."""
     event_ratio: float
+    uplink_above: int | None
+    """Plans to all vehicles that the trigger's figure sent, see `SentBy`; in virtual time only."""
+    uplink_due: int | None
+    """Plans to all vehicles that were due; in virtual time only."""
     rmse_xy: tuple[float, float, float] | None
     """Smallest, median and largest RMSE of the vehicles [m]."""
     separation_m: float | None
@@ -336,6 +340,7 @@ def _summarise(options: FleetOptions, flight: FleetFlight, least_m: float | None
     scenario, flown, machine = options.config, flight.record, flight.machine
     client, counted = flown.client, flown.figures
     server = flown.server if options.virtual else None
+    sent = None if server is None else sent_by(server)
     servers = [counted[name] for name in counted if name.startswith("server")]
     measured = [counters for counters in counted.values() if "cpu_s" in counters]
     steps = sum(server["counts"].get("steps", 0) for server in servers)
@@ -367,6 +372,8 @@ def _summarise(options: FleetOptions, flight: FleetFlight, least_m: float | None
         secure=options.secure,
         server_steps=steps,
         event_ratio=sum(server["counts"].get("events", 0) for server in servers) / max(steps, 1),
+        uplink_above=sent.above if sent else None,
+        uplink_due=sent.due if sent else None,
         rmse_xy=(min(finite_rmse), float(np.median(finite_rmse)), max(finite_rmse))
         if finite_rmse
         else None,
@@ -414,6 +421,10 @@ def _show(summary: FleetSummary, title: str) -> None:
         ("observations outside a tube", None if s.left_tube is None else str(s.left_tube)),
         ("link", "sealed" if s.secure else "plaintext"),
         ("event ratio", f"{s.event_ratio:.3f}"),
+        (
+            "  horizons by the trigger's figure, due",
+            None if s.uplink_above is None else f"{s.uplink_above}, {s.uplink_due}",
+        ),
         (
             "packets/s up, down, both",
             ", ".join(f"{rate:.0f}" for rate in (up, down, up + down)),

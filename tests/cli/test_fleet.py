@@ -155,6 +155,7 @@ def test_a_virtual_fleet_is_summed_up(tmp_path: Path) -> None:
     summary = fleet_command(tmp_path, *argv, "--network.downlink", "loss(0.1) & corrupt(0.1)")
     assert (summary["vehicles"], summary["workers"], summary["steps"]) == (3, 1, 1200)
     assert (summary["event_ratio"], summary["server_missed"]) == (1.0, 0)
+    assert (summary["uplink_above"], summary["uplink_due"]) == (0, summary["server_steps"])
     smallest, median, largest = summary["rmse_xy"]
     assert 0.05 < smallest <= median <= largest < 0.8
     assert set(summary["server_cpu_us"]) == set(STAGES) - {"receive", "send"}
