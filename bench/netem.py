@@ -161,10 +161,10 @@ def receive(pipe: Connection, options: NetemBenchmarkOptions) -> tuple[bytes, li
 
 
 def sleep(pipe: Connection, options: NetemBenchmarkOptions) -> list[int]:
-    """Sleep until every next millisecond; returns the lateness of each wake [ns]."""
+    """Sleep until every fourth deadline of the sender; returns the lateness of each wake [ns]."""
     pipe.send("ready")
     start_ns, late_ns = pipe.recv(), []
-    for due_ns in range(start_ns, start_ns + options.seconds * SECOND_NS, MILLISECOND_NS):
+    for due_ns in range(start_ns, start_ns + options.seconds * SECOND_NS, 4 * BATCH_NS):
         sleep_until(due_ns)
         late_ns.append(time.monotonic_ns() - due_ns)
     return late_ns
@@ -305,7 +305,7 @@ def medians(runs: Sequence[NetemRun]) -> dict[str, float]:
 
 def tables(result: Mapping[str, Any]) -> dict[str, TextTable]:
     headings = ["run", "packets\nsent", "\nreceived", "\nlost", "error [ms]\np50", "\np99", "\nmax"]
-    headings += ["netem\nCPU", "\nwaited", "machine [ms]\np50", "\np99"]
+    headings += ["netem\nCPU", "\nwaited", "machine [ms]\np50", "\np99", "\nmax"]
     rows = [
         [
             str(number),
@@ -319,6 +319,7 @@ def tables(result: Mapping[str, Any]) -> dict[str, TextTable]:
             f"{run.netem_waited:.0%}",
             f"{run.wake_ms_p50:.2f}",
             f"{run.wake_ms_p99:.2f}",
+            f"{run.wake_ms_max:.1f}",
         ]
         for number, run in enumerate(runs_of(result), start=1)
     ]
@@ -333,14 +334,17 @@ def tables(result: Mapping[str, Any]) -> dict[str, TextTable]:
                 f"{packet_s * 1e6:.1f}",
                 f"{load['error_ms_p50']:.2f}",
                 f"{load['error_ms_p99']:.2f}",
+                f"{load['error_ms_max']:.1f}",
+                f"{load['wake_ms_p50']:.2f}",
+                f"{load['wake_ms_p99']:.2f}",
+                f"{load['wake_ms_max']:.1f}",
                 f"{load['netem_cpu']:.0%}",
                 f"{load['netem_waited']:.0%}",
-                f"{load['wake_ms_p99']:.2f}",
                 f"{1 - load['received'] / load['sent']:.1%}",
             ]
         )
-    titles = ["packets/s", "flows", "CPU a packet [µs]", "error p50 [ms]", "p99"]
-    titles += ["netem CPU", "waited", "machine p99 [ms]", "lost"]
+    titles = ["packets/s", "flows", "CPU a packet [µs]", "error p50 [ms]", "p99", "max"]
+    titles += ["machine p50 [ms]", "p99", "max", "netem CPU", "waited", "lost"]
     return {"netem": TextTable(headings, rows), "netem-loads": TextTable(titles, loads)}
 
 

@@ -1,12 +1,14 @@
 """Register of figures: its texts are in their pages, and every measured table is registered."""
 
+import json
 import math
 import re
 from pathlib import Path
 
 import pytest
 
-from bench import figures
+from bench import figures, netem
+from bench.__main__ import RESULTS
 from bench.figures import (
     Figure,
     Number,
@@ -181,3 +183,13 @@ commands.demo = "fly demo --virtual --settle 0 --duration 2"
     main(argv)
     with pytest.raises(CommandError, match="no such figure"):
         main([*argv, "--only", "other"])
+
+
+def test_each_error_of_netem_has_the_lateness_of_a_sleeping_process_beside_it() -> None:
+    result = json.loads(RESULTS.read_text())["netem"]
+    for row, load in zip(netem.tables(result)["netem-loads"].rows, result["loads"], strict=True):
+        written = [float(cell) for cell in row if not cell.endswith("%")]
+        for name in ("error_ms", "wake_ms"):
+            for statistic_of in ("p50", "p99", "max"):
+                figure = load[f"{name}_{statistic_of}"]
+                assert any(number == pytest.approx(figure, abs=0.06) for number in written)
