@@ -1,0 +1,104 @@
+"""Stale messages: what comes after newer messages by more than the time-out counts as lost."""
+
+from collections.abc import Callable
+from functools import cache, partial
+from typing import Any, NamedTuple
+from unittest.mock import patch
+
+import numpy as np
+import pytest
+from hypothesis import Phase, given, settings
+from hypothesis import strategies as st
+
+from helpers import packaged
+from skytether.client.endpoint import Client
+from skytether.server.endpoint import Server
+from skytether.shared.base.chance import stream
+from skytether.shared.base.units import SECOND_NS
+from skytether.shared.core.endpoint import Datagram, Endpoint
+from skytether.shared.telemetry.record import Record, Rows
+from skytether.shared.wire.drop import Drop
+from skytether.sim.flight import fly
+from skytether.sim.world import World
+
+STILL = {"uplink": "constant(0.05)", "downlink": "constant(0.05)"}
+"""Delays without chance, so that an additional packet changes no other's delay."""
+LINKS = {
+    "one": ("demo", STILL, {}),
+    "two": ("demo", {"paths": [STILL, STILL]}, {}),
+    "standby": ("demo", STILL, {"standby": True}),
+    "mission": ("swap", STILL, {"vehicles": 2, "standby": True}),
+}
+LATE_S, AT_S, SECONDS = 5.0, 10.0, 16.0
+"""Least age of the messages that come so late, when they do, and length of a flight [s]."""
+
+
+class Came(NamedTuple):
+    receive: Callable[..., None]
+    datagram: Datagram
+    host: str
+    at_ns: int
+    """Time of the world."""
+
+
+@cache
+def flown(links: str, seed: int, lost: float, comes: str, *, secure: bool = False) -> Record:
+    """Flight in which a share of the packets is lost; later copies of old ones come, in any order,
+    or the lost ones.
+    """
+    name, network, how = LINKS[links]
+    scenario = packaged(name, {"network": network}, duration=SECONDS)
+    rng, came, held, worlds = stream(seed, "lost"), list[Came](), list[Came](), list[World]()
+
+    def hooked(kind: type[Endpoint]) -> Any:
+        original = kind.receive
+
+        def receive(self: Endpoint, datagram: Datagram, *, now_ns: int) -> None:
+            if worlds:
+                (host,) = (n for n, each in worlds[0]._hosts.items() if each.endpoint is self)
+                each = Came(partial(original, self), datagram, host, worlds[0].now_ns)
+                is_lost = rng.random() < lost
+                (held if is_lost else came).append(each)
+                if is_lost:
+                    return
+            original(self, datagram, now_ns=now_ns)
+
+        return patch.object(kind, "receive", receive)
+
+    def come(world: World) -> None:
+        late = {"nothing": [], "copies": came, "lost": held}[comes]
+        late = [each for each in late if world.now_ns - each.at_ns > LATE_S * SECOND_NS]
+        for i in stream(seed, "order").permutation(len(late)):
+            world.act(late[i].host, partial(late[i].receive, late[i].datagram))
+        worlds.clear()
+
+    with hooked(Server), hooked(Client):
+        return fly(scenario, actions=[(2.0, worlds.append), (AT_S, come)], secure=secure, **how)
+
+
+def timeless(rows: Rows) -> Rows:
+    """The same without the computing time."""
+    return rows[[name for name in rows.dtype.names if name != "solve_ns"]]
+
+
+# A flight takes a while: a failing one is not searched for a simpler one.
+@settings(max_examples=20, phases=[Phase.explicit, Phase.generate])
+@given(
+    st.sampled_from([*LINKS]), st.booleans(), st.integers(0, 100), st.sampled_from([0.0, 0.1, 0.3])
+)
+def test_messages_that_come_much_too_late_are_as_good_as_lost(
+    links: str, secure: bool, seed: int, lost: float
+) -> None:
+    expected = flown(links, seed, lost, "nothing", secure=secure)
+    for comes in ["lost"] + ["copies"] * (not secure):
+        found = flown(links, seed, lost, comes, secure=secure)
+        assert np.array_equal(found.client, expected.client)
+        assert np.array_equal(timeless(found.server), timeless(expected.server))
+        assert found.events == expected.events
+
+
+@pytest.mark.parametrize("links", [*LINKS])
+def test_stale_messages_are_counted(links: str) -> None:
+    figures = flown(links, 1, 0.1, "copies").figures
+    dropped = [figures["server"], *figures["client"]["by_vehicle"].values()]
+    assert all(each["dropped"][Drop.STALE] > 10 for each in dropped)
