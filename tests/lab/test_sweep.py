@@ -165,6 +165,10 @@ def test_a_run_that_never_flew_has_no_error_and_spoils_no_mean() -> None:
     assert (cell["runs"], cell["flown"]) == ("6", str(6 - len(failed)))
     errors = [float(row["rmse_xy"]) for row in rows if row["rmse_xy"]]
     assert float(cell["rmse_xy"]) == pytest.approx(np.mean(errors))
+    sent = [float(row["uplink_horizons"]) for row in rows if row["uplink_horizons"]]
+    by_cause = float(cell["uplink_above"]) + float(cell["uplink_due"])
+    assert by_cause == pytest.approx(np.mean(sent))
+    assert by_cause > 0
 
 
 def test_the_interval_is_students() -> None:
