@@ -1,8 +1,8 @@
 """The server's clock as a vehicle knows it, from the time stamps of the server's packets.
 
-The newest packet is echoed in observations, from which the server estimates the delays. A packet is
-stale if a much newer one came before it; nothing of it is believed. Only a WELCOME is never stale:
-it answers a HELLO, and lets a server go on whose clock was set back.
+The newest packet is echoed in observations, from which the server estimates the delays. If a packet
+comes after one that was sent much later, nothing of it is believed. Only a WELCOME is taken at any
+time: it answers a HELLO, and lets a server go on whose clock was set back.
 """
 
 from typing import NamedTuple
@@ -36,12 +36,12 @@ class ServerClock:
     """Clock of one server.
 
     Args:
-        stale_ns: time [ns] after which a packet that a newer one overtook is stale.
+        overtaken_ns: time by which a packet may have been sent before one that came first [ns].
     """
 
-    def __init__(self, stale_ns: int) -> None:
+    def __init__(self, overtaken_ns: int) -> None:
         self.echo = NEVER
-        self._stale_ns = stale_ns
+        self._overtaken_ns = overtaken_ns
 
     def begin(self) -> None:
         """Begin with another run of the server, whose time stamps cannot be compared with those of
@@ -53,11 +53,11 @@ class ServerClock:
         """Server's time of a packet's stamp [ns].
 
         Raises:
-            ProtocolError: the packet is stale.
+            ProtocolError: a much newer packet has overtaken it.
         """
         server_ns = stamped_ns(server_us, self._expected_ns(now_ns))
-        if self.echo.server_ns - server_ns > self._stale_ns:
-            raise ProtocolError(Drop.STALE)
+        if self.echo.server_ns - server_ns > self._overtaken_ns:
+            raise ProtocolError(Drop.OVERTAKEN)
         return server_ns
 
     def hear(self, server_ns: int, now_ns: int) -> bool:

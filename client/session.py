@@ -168,7 +168,7 @@ class ServerSession:
         self._is_open = False
         """Whether the session may continue; otherwise only a WELCOME is accepted."""
         self._server_boot_id: int | None = None
-        self.clock = ServerClock(hearing.stale_ns)
+        self.clock = ServerClock(hearing.overtaken_ns)
         self.idle = str(Idle.PLANS)
         """Why no newer horizon comes, as the server last reported."""
         self._refusal: NoSession | None = None
@@ -271,7 +271,7 @@ class ServerSession:
         self._leadership.learn(answer.known, self._index)
         step, asked_ns = self._asked
         age_ns = now_ns - asked_ns + (step - answer.step) * self._terms.dt_ns
-        if age_ns <= self.hearing.stale_ns:
+        if age_ns <= self.hearing.overtaken_ns:
             self._note_heard(now_ns)
 
     def _decode(self, payload: bytes, now_ns: int) -> Message:

@@ -204,7 +204,7 @@ class Reception:
         if session is None:
             raise ProtocolError(Drop.UNKNOWN_SESSION)
         if isinstance(message, Time | Lead):
-            self._refuse_stale(session, message.step)
+            self._refuse_overtaken(session, message.step)
         if report and session.paths:
             is_recent = not isinstance(message, PathProof)
             self._hear_report(session, report, datagram, now_ns, is_recent=is_recent)
@@ -219,11 +219,11 @@ class Reception:
             case Lead():
                 self._note_leader(session, message, call, datagram, now_ns)
 
-    def _refuse_stale(self, session: Session, step: int) -> None:
+    def _refuse_overtaken(self, session: Session, step: int) -> None:
         """Refuse a message that a vehicle sent in a step long before its newest observation's."""
         newest = self._controller.observed_step[session.row] if session.row >= 0 else step
-        if (newest - step) * self._terms.dt_ns > session.hearing.stale_ns:
-            raise ProtocolError(Drop.STALE)
+        if (newest - step) * self._terms.dt_ns > session.hearing.overtaken_ns:
+            raise ProtocolError(Drop.OVERTAKEN)
 
     def _report_unauthenticated(self, address: Address, reason: Drop, now_ns: int) -> None:
         host, port = address
@@ -347,7 +347,7 @@ class Reception:
             self._anew(row, None)
             session.hearing.begin()
         # Only after it was judged: if the newest observation is the wrong one, this one is not old.
-        self._refuse_stale(session, observation.step)
+        self._refuse_overtaken(session, observation.step)
         session.doubted = False
         if report:
             self._hear_paths(session, report, call, datagram, now_ns)

@@ -91,7 +91,7 @@ class Hearing:
 
     def __init__(self, timeout_ns: int, step_ns: int, fixed_ns: int | None) -> None:
         self._fixed_ns, self._half_step_ns = fixed_ns, step_ns // 2
-        self.stale_ns = min(timeout_ns, (NUMBERS - 1) * step_ns)
+        self.overtaken_ns = min(timeout_ns, (NUMBERS - 1) * step_ns)
         """Time by which a packet was overtaken from which on it counts as lost [ns]: it came after
         the time-out, or its number may have come round again."""
         rare_ns = min(RARE_TIMES * timeout_ns, SESSION_NS // 4)

@@ -47,8 +47,8 @@ class Drop(StrEnum):
     OUT_OF_PLACE = "out of place"
     TOO_MANY_HANDSHAKES = "too many handshakes"
 
-    STALE = "stale"
-    """Newer messages of the session overtook it, longer ago than the time-out."""
+    OVERTAKEN = "overtaken"
+    """A message of the session came first that was sent later by more than the time-out."""
     COPY = "copy"
     """The message has come over another path before."""
 

@@ -508,7 +508,7 @@ class Paths:
         if ahead <= -WINDOW:
             if is_recent:
                 return
-            raise ProtocolError(Drop.STALE)
+            raise ProtocolError(Drop.OVERTAKEN)
         self._copies[datagram] = report.sequence
         if len(self._copies) > COPIES:
             del self._copies[next(iter(self._copies))]

@@ -148,6 +148,7 @@ messages: st.SearchStrategy[Message] = st.one_of(
         Lead,
         *(u16, u32, u32, st.integers(0, 1), u32, u31, st.none() | u31, u16),
         knots=st.just(np.empty((2, 0, 2))),
+        changes=u31,
     ),
 )
 knots = arrays("<f4", st.tuples(st.just(2), st.integers(1, 16), st.just(2)), elements=finite)
@@ -164,7 +165,9 @@ trajectories = st.builds(
     u16,
     u32,
 )
-leads = st.builds(Lead, u16, u32, u32, st.just(1), u32, u31, st.none() | u31, u16, knots)
+leads = st.builds(
+    Lead, u16, u32, u32, st.just(1), u32, u31, st.none() | u31, u16, knots, changes=u31
+)
 along_splines = TERMS._replace(scheme="trajectory")
 
 

@@ -1,5 +1,8 @@
-"""Stale messages: what comes after newer messages by more than the time-out counts as lost."""
+"""Overtaken messages: what was sent before others by more than the time-out, and comes after them,
+counts as lost.
+"""
 
+from collections import Counter
 from collections.abc import Callable
 from functools import cache, partial
 from typing import Any, NamedTuple
@@ -16,6 +19,7 @@ from skytether.server.endpoint import Server
 from skytether.shared.base.chance import stream
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.core.endpoint import Datagram, Endpoint
+from skytether.shared.core.events import Unauthenticated
 from skytether.shared.telemetry.record import Record, Rows
 from skytether.shared.wire.drop import Drop
 from skytether.sim.flight import fly
@@ -29,7 +33,7 @@ LINKS = {
     "standby": ("demo", STILL, {"standby": True}),
     "mission": ("swap", STILL, {"vehicles": 2, "standby": True}),
 }
-LATE_S, AT_S, SECONDS = 5.0, 10.0, 16.0
+LATE_S, AT_S, SECONDS = 7.0, 14.0, 20.0
 """Least age of the messages that come so late, when they do, and length of a flight [s]."""
 
 
@@ -76,9 +80,9 @@ def flown(links: str, seed: int, lost: float, comes: str, *, secure: bool = Fals
         return fly(scenario, actions=[(2.0, worlds.append), (AT_S, come)], secure=secure, **how)
 
 
-def timeless(rows: Rows) -> Rows:
-    """The same without the computing time."""
-    return rows[[name for name in rows.dtype.names if name != "solve_ns"]]
+def timeless(rows: Rows) -> list[bytes]:
+    """Columns without the computing time."""
+    return [rows[name].tobytes() for name in rows.dtype.names if name != "solve_ns"]
 
 
 # A flight takes a while: a failing one is not searched for a simpler one.
@@ -93,12 +97,16 @@ def test_messages_that_come_much_too_late_are_as_good_as_lost(
     for comes in ["lost"] + ["copies"] * (not secure):
         found = flown(links, seed, lost, comes, secure=secure)
         assert np.array_equal(found.client, expected.client)
-        assert np.array_equal(timeless(found.server), timeless(expected.server))
-        assert found.events == expected.events
+        assert timeless(found.server) == timeless(expected.server)
+        # With keys, what a newer path's packet has overtaken looks replayed.
+        events = (each for each in found.events if not isinstance(each.event, Unauthenticated))
+        assert (*events,) == expected.events
 
 
 @pytest.mark.parametrize("links", [*LINKS])
-def test_stale_messages_are_counted(links: str) -> None:
+def test_they_are_counted(links: str) -> None:
     figures = flown(links, 1, 0.1, "copies").figures
-    dropped = [figures["server"], *figures["client"]["by_vehicle"].values()]
-    assert all(each["dropped"][Drop.STALE] > 10 for each in dropped)
+    dropped = Counter(figures["server"]["dropped"])
+    for each in figures["client"]["by_vehicle"].values():
+        dropped += each["dropped"]
+    assert dropped[Drop.OVERTAKEN] + dropped[Drop.COPY] > 5
