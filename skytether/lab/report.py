@@ -120,9 +120,8 @@ def paper_table(entries: Sequence[TableEntry], columns: Mapping[str, MethodFligh
 
 
 def traffic_table(columns: Mapping[str, MethodFlights]) -> Table:
-    rows = [
-        {"column": method} | by_name(TRAFFIC, cell.estimate) for method, cell in columns.items()
-    ]
+    names = (*TRAFFIC, *SENT_BY)
+    rows = [{"column": method} | by_name(names, cell.estimate) for method, cell in columns.items()]
     share = [
         (columns[EVENT].estimate(name)[0] or 0.0) / (columns[EVERY].estimate(name)[0] or 1.0)
         for name in TRAFFIC
@@ -130,17 +129,21 @@ def traffic_table(columns: Mapping[str, MethodFlights]) -> Table:
     says = (
         f"All that entered the network in a flight. The paper's “10 times” counts packets on the "
         f"uplink alone: there the trigger sends {share[0]:.1%} of what every step takes; of all "
-        f"packets, both ways, {share[4]:.1%}, and {share[5]:.1%} of all bytes."
+        f"packets, both ways, {share[4]:.1%}, and {share[5]:.1%} of all bytes. Of the plans, those "
+        "“above” were sent because the trigger's figure exceeded its threshold, the others because "
+        "a sign of life, a first plan or the schedule was due."
     )
 
     def cell(name: str, row: Row) -> str:
         return as_interval((row[name], row[f"{name}_ci95"]), ",.0f")
 
-    shown = {name.replace("_", " "): partial(cell, name) for name in TRAFFIC}
+    shown = {name.replace("_", " "): partial(cell, name) for name in names}
     title = "Packets and bytes (UDP payload)"
     return table_of("traffic", title, says, rows, {"column": ("column", ""), **shown})
 
 
+SENT_BY = ("uplink_above", "uplink_due")
+"""Plans sent, by cause, see `shared.telemetry.record.SentBy`."""
 REAL = {
     "column": ("column", ""),
     "UDP": ("rmse_xy_udp", ".4f"),
