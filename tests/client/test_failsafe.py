@@ -21,7 +21,7 @@ from skytether.client.clamp import clamped
 from skytether.client.compensator import Compensator
 from skytether.client.failsafe import HOLD, TABLE, Failsafe
 from skytether.client.link import AGAIN_NS, PlainLink
-from skytether.client.session import SLEPT_NS
+from skytether.client.server_clock import SLEPT_NS
 from skytether.client.simulated.vehicle import SimulatedVehicle
 from skytether.shared.base.chance import stream
 from skytether.shared.base.errors import ConfigError
