@@ -7,10 +7,11 @@ import pytest
 
 from by_hand import ByHand
 from helpers import packaged
+from skytether.client.endpoint import Client
 from skytether.client.link import HELLO_NS
-from skytether.client.simulated.vehicle import SimulatedVehicle
+from skytether.client.simulated.vehicle import SimulatedVehicle, simulated
 from skytether.shared.base.units import SECOND_NS
-from skytether.shared.core.endpoint import Datagram
+from skytether.shared.core.endpoint import PATH_SOCKETS, Address, Datagram
 from skytether.shared.core.events import (
     Finished,
     Flying,
@@ -24,6 +25,7 @@ from skytether.shared.law.terms import Difference
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Reason
 from skytether.shared.wire.drop import Drop
+from skytether.shared.wire.paths import Paths
 from skytether.shared.wire.protocol import (
     NO_HORIZON,
     Close,
@@ -32,6 +34,7 @@ from skytether.shared.wire.protocol import (
     Idle,
     Message,
     Observation,
+    PathProof,
     Refusal,
     Welcome,
     encode,
@@ -375,3 +378,24 @@ def test_only_the_servers_address_is_heard() -> None:
     server.client.receive(Datagram(encode(welcome), ("elsewhere", 1)), now_ns=0)
     assert server.client.dropped == {"not from the server's address": 1}
     assert not any(isinstance(event, Flying) for event in server.client.events())
+
+
+def test_a_path_message_that_was_overtaken_is_no_sign_of_life() -> None:
+    flown = packaged("demo-two-links")
+    places: list[Address] = [("one", 1), ("two", 1)]
+    client = Client(flown, simulated(flown, 1), paths=places, vehicle=4, boot_id=99)
+    client.wake(now_ns=SECOND_NS)
+    peer, session = Paths((1000, 1000), SECOND_NS), client._session
+
+    def hear(message: Message, report: bytes, now_ns: int) -> None:
+        datagram = Datagram(report + encode(message), places[0], PATH_SOCKETS[0])
+        client.receive(datagram, now_ns=now_ns)
+
+    hear(Welcome(4, 7, 99, 1, 1234, Refusal.ACCEPTED, flown.terms()), b"", SECOND_NS)
+    late, tried = peer.report(), PathProof(4, 7, 0, 0, (1000, 1000))
+    for i in range(1, 20):
+        hear(tried, peer.report(), (i + 1) * SECOND_NS)
+    assert session.heard_ns == 20 * SECOND_NS
+    hear(tried, late, 21 * SECOND_NS)
+    assert session.heard_ns == 20 * SECOND_NS
+    assert client.dropped == {Drop.OVERTAKEN: 1}

@@ -365,3 +365,21 @@ def test_a_fixed_heartbeat_that_is_too_rare_for_a_standby_is_refused() -> None:
     rare = packaged("demo", link={"heartbeat_s": 0.6})
     with pytest.raises(ConfigError, match=r"link\.heartbeat_s: got 0\.6, expected at most a third"):
         Vehicle(rare)
+
+
+def test_only_the_answer_to_a_recent_question_is_a_sign_of_life(vehicle: Vehicle) -> None:
+    vehicle.step(0.1)
+    for server in (0, 1):
+        vehicle.answer(server)
+    vehicle.step(3.0)
+    session, asked = vehicle.client._sessions[1], vehicle.told(1, Lead)[-1]
+    assert isinstance(asked, Lead)
+    for step, is_heard in ((0, False), (asked.step, True)):
+        before_ns = session.heard_ns
+        vehicle.hear(1, Lead(4, 8, asked.number, asked.leads, asked.number, step))
+        assert (session.heard_ns != before_ns) == is_heard
+    vehicle.client._session.lead_ns = session.lead_ns = 2**62  # no further question
+    vehicle.step(2.0)
+    before_ns = session.heard_ns
+    vehicle.hear(1, Lead(4, 8, asked.number, asked.leads, asked.number, asked.step))
+    assert session.heard_ns == before_ns

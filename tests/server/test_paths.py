@@ -202,3 +202,27 @@ def test_client_that_was_started_again_in_its_session_is_acknowledged_at_once() 
     report, _ = split(session.paths.paths.report())
     assert report
     assert (report.newest, report.arrived) == (1, (1, 0))
+
+
+def test_a_path_message_that_was_overtaken_keeps_no_session_and_sets_no_price() -> None:
+    vehicle = Vehicle()
+    vehicle.observe(FIRST)
+    vehicle.prove(0, FIRST)
+    assert vehicle.paths
+    late = vehicle.paths.report() + encode(PathProof(1, vehicle.session, 0, 0, (1000, 7000)))
+    for _ in range(60):
+        vehicle.observe(FIRST)
+    session = vehicle.server.sessions.live(1)
+    assert session
+    assert session.paths
+    heard_ns = session.heard_ns
+    vehicle.now_ns += 1
+    # Even where the vehicle may have begun its numbers anew.
+    session.paths.paths.peer_may_restart = True
+    assert vehicle.send(late, FIRST) == []
+    assert vehicle.server.dropped == {Drop.OVERTAKEN: 1}
+    assert session.heard_ns == heard_ns
+    assert session.paths.prices == PRICES
+    vehicle.observe(FIRST)
+    assert vehicle.server.dropped == {Drop.OVERTAKEN: 1}
+    assert session.paths.paths.peer_may_restart

@@ -379,3 +379,14 @@ def test_a_state_that_leaps_is_said_at_both_ends(monkeypatch: pytest.MonkeyPatch
     why = str(Reason.LEAPT)
     assert changes[-2:] == [("brake", why), ("hover", why)]
     assert np.abs(flight.client["input"][-1]).max() == 0.0
+
+
+def test_observations_of_long_ago_do_not_begin_a_vehicle_anew_though_a_clock_drifts() -> None:
+    plausibility, ago = Plausibility(TERMS, 1), 20_000
+    # Since then the vehicle's clock has fallen behind by 100 ppm of 1000 s.
+    drifted_us = stamp_us(BACKWARD_NS - 100 * MS)
+    delayed = {"backward_us": stamp_us(BACKWARD_NS - DELAY_NS)}
+    for step in range(ago, ago + 5):
+        judge(plausibility, seen(step, {"backward_us": drifted_us}), step=step)
+    verdicts = {judge(plausibility, seen(step, delayed), step=ago + 6) for step in range(100, 105)}
+    assert verdicts == {Belief.BELIEVED}

@@ -835,3 +835,27 @@ def test_figures_tell_what_was_counted() -> None:
     assert (figures["vehicles"], figures["missed"]) == (1, 0)
     assert figures["counts"] == {"events": 1, "steps": 1, "unsolved": 0}
     assert figures["by_vehicle"] == {"1": {"step": 0, "clock_bound_ms": 15.045}}  # age of the echo
+
+
+def test_nothing_that_was_overtaken_by_the_time_out_keeps_a_session() -> None:
+    vehicles = Vehicles(scenario())
+    welcome = vehicles.open()
+    late = int(SILENCE_NS / vehicles.dt_ns) + 1
+    for step in range(1, late + 2):
+        vehicles.observe(welcome, step)
+    session = vehicles.server.sessions.live(1)
+    assert session
+    heard_ns, vehicles.now_ns = session.heard_ns, vehicles.now_ns + SECOND_NS
+    overtaken = (
+        vehicles.told(welcome, 1)._replace(silence=1),
+        Lead(1, welcome.session, 3, 0, step=1),
+        Time(1, welcome.session, 1, 0, 1000),
+    )
+    for message in overtaken:
+        assert vehicles.say(message) == []
+    assert vehicles.server.dropped == {Drop.OVERTAKEN: len(overtaken)}
+    assert session.heard_ns == heard_ns
+    assert session.leadership is None
+    for message in overtaken:
+        vehicles.say(message._replace(step=late))
+    assert vehicles.server.dropped == {Drop.OVERTAKEN: len(overtaken)}
