@@ -382,11 +382,12 @@ def test_a_state_that_leaps_is_said_at_both_ends(monkeypatch: pytest.MonkeyPatch
 
 
 def test_observations_of_long_ago_do_not_begin_a_vehicle_anew_though_a_clock_drifts() -> None:
-    plausibility, ago = Plausibility(TERMS, 1), 20_000
-    # Since then the vehicle's clock has fallen behind by 100 ppm of 1000 s.
-    drifted_us = stamp_us(BACKWARD_NS - 100 * MS)
-    delayed = {"backward_us": stamp_us(BACKWARD_NS - DELAY_NS)}
-    for step in range(ago, ago + 5):
-        judge(plausibility, seen(step, {"backward_us": drifted_us}), step=step)
-    verdicts = {judge(plausibility, seen(step, delayed), step=ago + 6) for step in range(100, 105)}
+    plausibility, later = Plausibility(TERMS, 1), 20_000
+    # By then the vehicle's clock is ahead by 100 ppm of 1000 s, and its packets take no time.
+    drifted = {"backward_us": stamp_us(BACKWARD_NS + 100 * MS)}
+    ahead = (DELAY_NS + 100 * MS) // DT_NS + 1
+    for step in range(later, later + 5):
+        judge(plausibility, seen(step, drifted), step=step - ahead)
+    at_once = {"backward_us": stamp_us(BACKWARD_NS - DELAY_NS)}
+    verdicts = {judge(plausibility, seen(step, at_once), step=later) for step in range(100, 105)}
     assert verdicts == {Belief.BELIEVED}
