@@ -2,6 +2,7 @@
 
 import sys
 
+from skytether.shell import system
 from skytether.shell.start import run
 
 if __name__ == "__main__":  # called before the slow imports below
@@ -9,7 +10,6 @@ if __name__ == "__main__":  # called before the slow imports below
 
 import gc
 import os
-import resource
 import signal
 from collections.abc import Sequence
 from contextlib import suppress
@@ -29,7 +29,7 @@ from skytether.shell import command, process
 from skytether.shell.argument import Argument
 from skytether.shell.process import ProcessOptions
 from skytether.shell.program import Program, ProgramError, program
-from skytether.shell.udp import files_max, leads_back, sockets_max
+from skytether.shell.udp import leads_back, sockets_max
 
 COLLECT_AFTER = 100_000
 """Number of new objects after which garbage is collected. Queued packets are not garbage, and the
@@ -174,7 +174,7 @@ def _end_like(program: Program) -> None:
         raise command.CommandError(program.fault or "the program was killed with its namespaces")
     if os.WIFSIGNALED(program.status):
         number = os.WTERMSIG(program.status)
-        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))  # the program has dumped its own
+        system.dump_no_core()  # the program has dumped its own
         with suppress(OSError):  # SIGKILL always has its own action
             signal.signal(number, signal.SIG_DFL)
         os.kill(os.getpid(), number)
@@ -227,8 +227,8 @@ def _flows(requested: int | None, most: int) -> int:
     command.check_sockets("--flows", flows)
     if requested is None and flows < usual:
         print(
-            f"netem: room for {flows} clients instead of {usual}: {files_max()} files may be "
-            "open here (ulimit -n)",
+            f"netem: room for {flows} clients instead of {usual}: {system.files_max()} files may "
+            "be open here (ulimit -n)",
             file=sys.stderr,
         )
     return flows

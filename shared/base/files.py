@@ -13,7 +13,6 @@ file has it.
 Nothing else in this package opens a file for writing; tests/whole/test_writes.py checks it.
 """
 
-import fcntl
 import os
 import stat
 from collections.abc import Callable, Iterator
@@ -25,7 +24,19 @@ from itertools import count
 from pathlib import Path
 from typing import BinaryIO, TypeVar
 
-FLAGS = os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None  # type: ignore[assignment]
+
+
+def open_flags(*names: str) -> int:
+    """Flags for `os.open` by their names, without those that this system lacks."""
+    # Windows would translate line ends.
+    return sum({getattr(os, name, 0) for name in ("O_BINARY", *names)})
+
+
+FLAGS = open_flags("O_NOFOLLOW", "O_NONBLOCK", "O_CLOEXEC")
 """Flags for files to be written: they guard against a link or a pipe in the file's place."""
 MODE = 0o666
 """Permissions of a new file, before the user's umask."""
@@ -114,8 +125,10 @@ def claim_folder(path: Path) -> None:
         OSError: the folder cannot be created, or another command has locked it.
     """
     path.mkdir(parents=True, exist_ok=True)
+    if not hasattr(os, "O_DIRECTORY"):  # Windows opens no folders
+        return
     with ExitStack() as stack:
-        descriptor = os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+        descriptor = os.open(path, open_flags("O_RDONLY", "O_DIRECTORY", "O_CLOEXEC"))
         stack.callback(os.close, descriptor)
         # Two options may name the same folder.
         if not _is_claimed(_inode(os.fstat(descriptor))):
@@ -139,10 +152,21 @@ def _is_claimed(inode: Inode) -> bool:
     return any(inode in each.outputs for each in _commands)
 
 
+def lock(descriptor: int) -> None:
+    """Lock an open file until it is closed; no effect on a system without such locks.
+
+    Raises:
+        BlockingIOError: another process has locked it.
+        OSError: its file system has no locks.
+    """
+    if fcntl is not None:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+
+
 def _locked(path: Path, descriptor: int) -> bool:
     """Lock an open file; False if another command has locked it, or has just replaced it."""
     try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        lock(descriptor)
     except BlockingIOError:
         return False
     except OSError:  # a file system without locks
@@ -177,10 +201,10 @@ def read(path: Path, most: int, *, private: bool = False) -> bytes:
         ValueError: the name is invalid.
     """
     # Without O_NONBLOCK, opening a pipe waits for a writer.
-    flags = os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC
+    flags = open_flags("O_RDONLY", "O_NONBLOCK", "O_CLOEXEC")
     if private:
         check_private(path)
-        flags |= os.O_NOFOLLOW
+        flags |= open_flags("O_NOFOLLOW")
     with os.fdopen(os.open(path, flags), "rb") as file:
         mode = os.fstat(file.fileno()).st_mode
         if not stat.S_ISREG(mode):
@@ -278,7 +302,9 @@ def replacing(
         mode = stat.S_IMODE(status.st_mode)
     part: Path | None = None
     try:
-        flags = os.O_TMPFILE | os.O_RDWR | os.O_CLOEXEC
+        if not hasattr(os, "O_TMPFILE"):
+            raise OSError(EOPNOTSUPP, "this system has no files without a name")
+        flags = open_flags("O_TMPFILE", "O_RDWR", "O_CLOEXEC")
         descriptor = os.open(path.absolute().parent, flags, MODE if mode is None else mode)
     except OSError as error:
         if error.errno not in (EISDIR, EOPNOTSUPP):  # EOPNOTSUPP for example on NFS
@@ -288,12 +314,15 @@ def replacing(
         with os.fdopen(descriptor, "r+b") as file:
             yield file
             file.flush()
-            if mode is not None:
+            if mode is not None and hasattr(os, "fchmod"):
                 os.fchmod(descriptor, mode)
             if is_synced:
                 os.fsync(descriptor)
             if is_new:
-                _link(descriptor, path)
+                if part is None:
+                    _link(descriptor, path)
+                else:
+                    os.link(part, path)
                 return
             if part is None:
                 part, _ = _unused(path, partial(_link, descriptor))

@@ -45,7 +45,7 @@ from skytether.shared.telemetry.record import (
     read,
     server_columns,
 )
-from skytether.shell import plugins, temporary
+from skytether.shell import plugins, system, temporary
 from skytether.shell.command import INTERRUPTED, CommandError
 from skytether.shell.log import LogLine, line_of
 from skytether.shell.workers import die_with_parent
@@ -123,6 +123,9 @@ async def started(
     Raises:
         CommandError: the process ended, or did not listen in time.
     """
+    if not system.FORKS:
+        flies = "this system flies in virtual time, as by `fly --virtual`"
+        raise CommandError(f"flights over UDP need Linux or macOS; {flies}")
     process = await asyncio.create_subprocess_exec(
         sys.executable,
         "-P",  # -P: a folder in the user's working directory must not shadow our package.

@@ -30,6 +30,7 @@ from skytether.shared.core.line import Line, parse_line
 from skytether.shared.scenario.mission import format_goals, parse_goals
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.feed import FeedError, Frame, Opened, Rows, columns_of, table
+from skytether.shell import system
 from skytether.shell.argument import Argument
 from skytether.shell.command import CONFIGURATION, CommandError
 from skytether.shell.control import Caller, ControlError
@@ -77,7 +78,7 @@ def connect(argv: Sequence[str]) -> None:
     async def until_told() -> None:
         task = asyncio.ensure_future(Bridge(options, line, out).run())
         for number in (signal.SIGINT, signal.SIGTERM):
-            asyncio.get_running_loop().add_signal_handler(number, task.cancel)
+            system.handle(asyncio.get_running_loop(), number, task.cancel)
         with suppress(asyncio.CancelledError):
             await task
 

@@ -28,14 +28,13 @@ from skytether.shared.core.line import HOST_PORT, parse_address
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.dotted import set_keys
 from skytether.shared.scenario.schema import Scenario
-from skytether.shell import plugins
+from skytether.shell import plugins, system
 from skytether.shell.argument import HELP_KEYS, Argument
 from skytether.shell.options import key_values, read
 from skytether.shell.paths import PATH_FORM, NetworkPath, parse_path
 from skytether.shell.udp import (
     SPARE_FILES,
     allow_sockets,
-    files_max,
     is_loopback,
     look_up,
     sockets_max,
@@ -189,7 +188,7 @@ def check_sockets(flag: str, given: int) -> None:
     most = sockets_max()
     if given > most:
         needed = f"got {given}, which takes {given + SPARE_FILES} open files"
-        allowed = f"expected at most {max(most, 0)}, for {files_max()} may be open here (ulimit -n)"
+        allowed = f"expected at most {max(most, 0)}, for {_may_be_open()}"
         raise CommandError(f"{flag}: {needed}; {allowed}", CONFIGURATION)
     allow_sockets(given)
 
@@ -281,9 +280,15 @@ def _refuse(prog: str, message: str, code: int) -> int:
     return code
 
 
+def _may_be_open() -> str:
+    return f"{system.files_max()} may be open here (ulimit -n)"
+
+
 def _reason(error: OSError) -> str:
     where = f"{error.filename}: " if error.filename else ""
-    allowed = f"; {files_max()} may be open here (ulimit -n)" if error.errno == EMFILE else ""
+    allowed = (
+        f"; {system.files_max()} may be open here (ulimit -n)" if error.errno == EMFILE else ""
+    )
     return f"{where}{error.strerror or error}{allowed}"
 
 

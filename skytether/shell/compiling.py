@@ -5,13 +5,14 @@ reads the machine code that they store on disk. Each takes the next kernel from 
 compile times are not known beforehand.
 """
 
-import os
 import subprocess
 import sys
 from collections import deque
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING
+
+from skytether.shell import system
 
 # for type checking only: the client aboard is installed without numba
 if TYPE_CHECKING:
@@ -26,7 +27,7 @@ def compile_kernels(kernels: Sequence["Missing"], on_done: Callable[[], None]) -
         on_done: called after each kernel, from any thread.
     """
     queue = deque(each for each in kernels if each.is_stored)
-    cores = min(len(os.sched_getaffinity(0)), len(queue))
+    cores = min(system.cores(), len(queue))
     if cores > 1:
         with ThreadPoolExecutor(cores) as helpers:
             for _ in range(cores):

@@ -19,6 +19,7 @@ import msgspec
 
 from skytether.shared.core.change import REQUEST_BYTES_MAX, Answer, Running
 from skytether.shared.core.events import NotKept
+from skytether.shell import system
 from skytether.shell.journal import Journal
 from skytether.shell.local import Local
 
@@ -134,7 +135,10 @@ class Caller:
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+        try:
+            self._socket = system.local_socket(socket.SOCK_DGRAM)
+        except OSError as error:
+            raise self._failed(error) from None
         try:
             self._folder = _answers(self._socket, path)
         except OSError as error:

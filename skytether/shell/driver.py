@@ -14,6 +14,7 @@ import time
 import traceback
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import groupby
 from operator import itemgetter
 from socket import socket
@@ -33,6 +34,7 @@ from skytether.shared.core.events import (
 )
 from skytether.shared.core.line import LINE, Line, Listen
 from skytether.shared.core.stopwatch import Stopwatch
+from skytether.shell import system
 from skytether.shell.batch import BATCH_MAX, DatagramBatch, Segments
 from skytether.shell.connections import Connections
 from skytether.shell.control import Control
@@ -74,7 +76,7 @@ DATAGRAM_BYTES_MAX = 65535
 RESOLVE_EVERY_S = 2.0
 """Interval at which names are looked up again [s]: a restarted host may have a new address."""
 CHECK_PATHS_EVERY_S = 1.0
-ENDING = (signal.SIGHUP, signal.SIGINT, signal.SIGQUIT, signal.SIGTERM)
+ENDING = system.signals("SIGHUP", "SIGINT", "SIGQUIT", "SIGTERM")
 """Signals by which users and systems end a process."""
 AnyLine = Line | Node | Program | Listen
 Numbers = dict[Address, Address]
@@ -92,7 +94,7 @@ def new_event_loop() -> asyncio.AbstractEventLoop:
     try:
         import uvloop
     except ImportError:
-        return asyncio.new_event_loop()
+        return asyncio.SelectorEventLoop()  # the only one of Windows that watches sockets
     return uvloop.new_event_loop()
 
 
@@ -618,12 +620,12 @@ def run(
             loop.call_later(max(left_ns, 0) / SECOND_NS, task.cancel)
 
         for number in (signal.SIGINT, signal.SIGTERM):
-            loop.add_signal_handler(number, leave)
+            system.handle(loop, number, leave)
         if on_signal:
             for number in ENDING:
-                loop.add_signal_handler(number, on_signal, number)
+                system.handle(loop, number, partial(on_signal, number))
         # A closed loop restores the default action of SIGUSR1, which would end the process.
-        signal.signal(signal.SIGUSR1, lambda *_: loop.call_soon_threadsafe(on_usr1))
+        system.on_usr1(lambda *_: loop.call_soon_threadsafe(on_usr1))
         loop.set_exception_handler(lambda _, context: on_event(_fault(context)))
 
         def tick() -> None:
@@ -636,7 +638,7 @@ def run(
             with contextlib.suppress(asyncio.CancelledError):
                 await task
         finally:
-            signal.signal(signal.SIGUSR1, signal.SIG_IGN)
+            system.on_usr1(signal.SIG_IGN)
 
     with asyncio.Runner(loop_factory=new_event_loop) as runner:
         runner.run(main())

@@ -9,7 +9,6 @@ Of the package it imports only what it needs: it starts with each program.
 """
 
 import ctypes
-import fcntl
 import os
 import select
 import shutil
@@ -24,6 +23,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from skytether.shared.base.packets import ADDRESS, ADDRESS6, RESOLVER
+from skytether.shell import system
 
 READY, START, ENDED, ALL_ENDED = b"ready", b"start", b"ended", b"all ended"
 """Messages: ready, with the device; start the program; it has ended, with its wait status; so has
@@ -48,7 +48,7 @@ _MS_BIND, _MS_REC, _MS_PRIVATE = 0x1000, 0x4000, 0x40000
 _PR_SET_PDEATHSIG, _PR_CAP_AMBIENT = 1, 47
 _CAPABILITY_VERSION_3, _CAP_NET_ADMIN, _RAISE, _CLEAR_ALL = 0x20080522, 12, 2, 4
 
-_libc = ctypes.CDLL(None, use_errno=True)
+_libc = system.LIBC
 
 
 def main(argv: Sequence[str]) -> int:
@@ -124,7 +124,7 @@ def _enter() -> None:
 
 def _open_device() -> int:
     device = os.open("/dev/net/tun", os.O_RDWR | os.O_NONBLOCK)
-    fcntl.ioctl(device, _TUNSETIFF, struct.pack("16sH22x", b"netem", _IFF_TUN | _IFF_NO_PI))
+    system.fcntl.ioctl(device, _TUNSETIFF, struct.pack("16sH22x", b"netem", _IFF_TUN | _IFF_NO_PI))
     return device
 
 

@@ -7,6 +7,8 @@ from contextlib import suppress
 from errno import EADDRINUSE, ECONNREFUSED
 from pathlib import Path
 
+from skytether.shell import system
+
 
 class LocalError(OSError):
     """A Unix socket cannot be created; the message says where and why."""
@@ -26,7 +28,10 @@ class Local:
 
     def __init__(self, path: Path, kind: socket.SocketKind) -> None:
         self._path = path
-        self.socket = socket.socket(socket.AF_UNIX, kind)
+        try:
+            self.socket = system.local_socket(kind)
+        except OSError as error:
+            raise LocalError(f"{path}: {error.strerror}") from None
         try:
             self.socket.setblocking(False)
             path.parent.mkdir(0o700, parents=True, exist_ok=True)
@@ -64,9 +69,9 @@ def _clear(path: Path, kind: socket.SocketKind) -> None:
         status = path.lstat()
     except FileNotFoundError:
         return
-    if not stat.S_ISSOCK(status.st_mode) or status.st_uid != os.geteuid():
+    if not stat.S_ISSOCK(status.st_mode) or status.st_uid != system.user():
         raise OSError("expected a new path, or a socket that an ended process left behind")
-    with socket.socket(socket.AF_UNIX, kind) as caller:
+    with system.local_socket(kind) as caller:
         caller.setblocking(False)  # a listener whose queue is full counts as alive
         if caller.connect_ex(str(path)) == ECONNREFUSED:
             path.unlink()

@@ -8,7 +8,6 @@ for the program.
 """
 
 import asyncio
-import fcntl
 import json
 import os
 import shutil
@@ -17,7 +16,6 @@ import socket
 import struct
 import subprocess
 import sys
-import termios
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
@@ -35,7 +33,7 @@ from skytether.shared.base.packets import (
     unframed,
 )
 from skytether.shared.core.endpoint import Address, Datagram
-from skytether.shell import temporary
+from skytether.shell import system, temporary
 from skytether.shell.batch import BATCH_MAX
 from skytether.shell.inside import ADMIN, ALL_ENDED, ENDED, READY, START
 from skytether.shell.start import PARENT
@@ -215,7 +213,7 @@ def _flush(outside: socket.socket) -> None:
     """Wait until slirp4netns has read all packets that were sent."""
     until_s, left = time.monotonic() + FLUSH_S, struct.pack("i", 1)
     while any(left) and time.monotonic() < until_s:
-        left = fcntl.ioctl(outside, termios.TIOCOUTQ, left)
+        left = system.fcntl.ioctl(outside, system.termios.TIOCOUTQ, left)
         if any(left):
             time.sleep(0.001)
 

@@ -12,6 +12,8 @@ import sys
 from collections.abc import Iterator, Sequence
 from importlib import import_module
 
+from skytether.shell import system
+
 PARENT = os.getppid()
 """Process that started this one, asked for before the slow imports: it may end meanwhile."""
 
@@ -59,8 +61,8 @@ def begin() -> None:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
-    if signal.getsignal(signal.SIGUSR1) is signal.SIG_DFL:
-        signal.signal(signal.SIGUSR1, signal.SIG_IGN)
+    if any(signal.getsignal(each) is signal.SIG_DFL for each in system.signals("SIGUSR1")):
+        system.on_usr1(signal.SIG_IGN)
 
 
 @contextlib.contextmanager

@@ -8,12 +8,11 @@ import asyncio
 import contextlib
 import os
 import socket
-import termios
-import tty
 from collections.abc import Callable
 
 from skytether.shared.core.endpoint import Address
 from skytether.shared.core.line import Line
+from skytether.shell import system
 from skytether.shell.udp import AddressError
 
 AGAIN_S = 1.0
@@ -32,7 +31,9 @@ class ByteStream:
     """
 
     def __init__(self, line: Line, hear: Callable[[bytes], None]) -> None:
-        if line.kind == "serial" and not hasattr(termios, f"B{line.number}"):
+        if line.kind == "serial" and system.termios is None:
+            raise AddressError(f"{line.host}: this system has no termios, which serial ports need")
+        if line.kind == "serial" and not hasattr(system.termios, f"B{line.number}"):
             raise AddressError(f"{line.host}: no serial port runs at {line.number} bit/s")
         self._line, self._hear = line, hear
         self._end: int | None = None
@@ -48,7 +49,7 @@ class ByteStream:
 
     async def run(self) -> None:
         while True:
-            with contextlib.suppress(OSError, termios.error):
+            with contextlib.suppress(OSError, system.SERIAL_ERROR):
                 await self._carry(await self._open())
             await asyncio.sleep(AGAIN_S)
 
@@ -108,8 +109,9 @@ def prepare(port: int, baud: int) -> None:
     Raises:
         termios.error: the file is not a serial port.
     """
+    termios = system.termios
     rate = getattr(termios, f"B{baud}")
-    tty.setraw(port)
+    system.tty.setraw(port)
     settings = termios.tcgetattr(port)
     settings[2] |= termios.CLOCAL | termios.CREAD
     settings[4] = settings[5] = rate

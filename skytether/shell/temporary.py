@@ -6,12 +6,14 @@ process completes an interrupted removal.
 """
 
 import contextlib
-import fcntl
 import os
 import shutil
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
+
+from skytether.shared.base import files
+from skytether.shell import system
 
 PREFIX = "skytether-"
 MARK = ".of-a-process"
@@ -40,7 +42,7 @@ def _marked(made: Path) -> Iterator[None]:
     with new_mark.open("x") as mark:
         # a file system without locks: no process can remove the folder
         with contextlib.suppress(OSError):
-            fcntl.flock(mark, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            files.lock(mark.fileno())
             new_mark.rename(made / MARK)
         yield
 
@@ -59,11 +61,11 @@ def _clear_one(made: Path) -> None:
     Raises:
         OSError: the folder has no mark, or its owner is still running.
     """
-    if made.lstat().st_uid != os.getuid():
+    if made.lstat().st_uid != system.user():
         return
-    descriptor = os.open(made / MARK, os.O_RDWR | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
+    descriptor = os.open(made / MARK, os.O_RDWR | files.FLAGS)
     with os.fdopen(descriptor) as mark:
-        fcntl.flock(mark, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        files.lock(mark.fileno())
         _remove(made)
 
 

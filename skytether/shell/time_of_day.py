@@ -14,6 +14,7 @@ from typing import NamedTuple
 from skytether.shared.base.units import MICROSECOND_NS
 from skytether.shared.core.endpoint import Endpoint
 from skytether.shared.core.events import TimeUnknown
+from skytether.shell import system
 
 UNSYNCHRONISED, CLOCK_ERROR = 0x40, 5
 """Status bit, and return value of `adjtimex`, of a clock that is not synchronised."""
@@ -44,7 +45,7 @@ class HostTime(NamedTuple):
 
 @cache
 def _adjtimex() -> "ctypes._FuncPointer | None":
-    return getattr(ctypes.CDLL(None), "adjtimex", None)
+    return getattr(system.LIBC, "adjtimex", None)
 
 
 def stated(answer: int, status: int, maxerror_us: int, esterror_us: int) -> int | None:

@@ -12,6 +12,7 @@ from collections.abc import Callable
 from typing import Protocol
 
 from skytether.shared.base.units import SECOND_NS
+from skytether.shell import system
 
 _CLOCK_MONOTONIC = 1
 _TFD_TIMER_ABSTIME = 1
@@ -43,11 +44,10 @@ class KernelTimer:
     """
 
     def __init__(self, loop: asyncio.AbstractEventLoop, callback: Callable[[], None]) -> None:
-        libc = ctypes.CDLL(None, use_errno=True)
-        try:
-            create, self._settime = libc.timerfd_create, libc.timerfd_settime
-        except AttributeError as missing:
-            raise OSError("this libc has no timerfd") from missing
+        create = getattr(system.LIBC, "timerfd_create", None)
+        if create is None:
+            raise OSError("this system has no timerfd")
+        self._settime = system.LIBC.timerfd_settime
         self._fd: int = create(_CLOCK_MONOTONIC, os.O_NONBLOCK | os.O_CLOEXEC)
         if self._fd < 0:
             raise OSError(ctypes.get_errno(), "timerfd_create failed")

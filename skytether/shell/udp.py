@@ -7,7 +7,6 @@ among them (the interface of a link-local address) is written into the host, as 
 import contextlib
 import ipaddress
 import os
-import resource
 import socket
 import struct
 import sys
@@ -17,6 +16,7 @@ from typing import Any, cast
 
 from skytether.shared.core.endpoint import Address, Form
 from skytether.shared.core.events import address_text
+from skytether.shell import system
 from skytether.shell.batch import RawAddress, pack_address, unpack_address
 
 BUFFER_BYTES = 4 * 1024 * 1024
@@ -171,23 +171,15 @@ def to_kernel(address: Address) -> tuple[Any, ...]:
     return (host, address[1], 0, socket.if_nametoindex(scope)) if percent else address
 
 
-def files_max() -> int:
-    _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    return sys.maxsize if hard == resource.RLIM_INFINITY else hard
-
-
 def sockets_max() -> int:
-    return files_max() - SPARE_FILES
+    return system.files_max() - SPARE_FILES
 
 
 def allow_sockets(count: int) -> None:
     """Raise this process's limit of open files for this number of sockets, as far as the system
     allows.
     """
-    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    wanted = min(count + SPARE_FILES, files_max())
-    if soft != resource.RLIM_INFINITY and wanted > soft:
-        resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
+    system.allow_files(count + SPARE_FILES)
 
 
 def admit_only(sock: socket.socket, forms: Sequence[Form]) -> None:

@@ -6,7 +6,6 @@ live. When one ends, all are ended.
 """
 
 import contextlib
-import ctypes
 import multiprocessing
 import os
 import signal
@@ -16,11 +15,13 @@ from multiprocessing.connection import wait
 from socket import socket
 
 from skytether.shared.core.endpoint import Address
+from skytether.shell import system
 from skytether.shell.udp import from_kernel, open_socket
 
-FORK = multiprocessing.get_context("fork")
+FORK = multiprocessing.get_context("fork" if system.FORKS else None)
 """Start method of workers: fork shares imported and compiled code, in memory and start-up time."""
-PASSED_ON = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1)
+PASSED_ON = system.signals("SIGINT", "SIGTERM", "SIGUSR1")
+ENDING = (signal.SIGINT, signal.SIGTERM)
 """Signals passed on to every worker, SIGINT as SIGTERM, and each of these two only once."""
 
 
@@ -53,7 +54,7 @@ def run(count: int, bind: Address, work: Callable[[int, socket], None]) -> int:
 
     def pass_on(number: int, _: object) -> None:
         nonlocal ending
-        if number != signal.SIGUSR1:
+        if number in ENDING:
             if ending:  # a second SIGTERM would interrupt a worker's orderly end
                 return
             number, ending = signal.SIGTERM, True
@@ -84,11 +85,11 @@ def _work(
     for other, sock in enumerate(sockets, start=1):
         if other != number:
             sock.close()
-    for passed_on in (signal.SIGINT, signal.SIGTERM):
+    for passed_on in ENDING:
         signal.signal(passed_on, signal.SIG_DFL)
-    signal.signal(signal.SIGUSR1, signal.SIG_IGN)  # ignored until there are figures to print
+    system.on_usr1(signal.SIG_IGN)  # ignored until there are figures to print
     # SIGINT stays blocked: a terminal sends it to all, and the parent passes it on as SIGTERM.
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, (signal.SIGTERM, signal.SIGUSR1))
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, PASSED_ON[1:])
     with closing(sockets[number - 1]) as sock:
         try:
             work(number, sock)
@@ -100,4 +101,4 @@ def die_with_parent() -> None:
     """Ask the kernel to send this process SIGTERM once its parent is gone; runs in a child."""
     pr_set_pdeathsig = 1
     with contextlib.suppress(OSError, AttributeError):
-        ctypes.CDLL(None).prctl(pr_set_pdeathsig, signal.SIGTERM)
+        system.LIBC.prctl(pr_set_pdeathsig, signal.SIGTERM)

@@ -2,16 +2,17 @@
 
 import sys
 
+from skytether.shell import system
 from skytether.shell.start import run
 
 if __name__ == "__main__":  # called before the slow imports below
     sys.exit(run("skytether.view.__main__:show", "page"))
 
-import os
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
+from socket import SOCK_STREAM
 from typing import Annotated
 
 import tyro
@@ -53,7 +54,11 @@ def show(argv: Sequence[str]) -> None:
         raise CommandError("got no folder, expected at least one", CONFIGURATION)
     at = command.address("--page", options.page)
     alone = len(options.folders) == 1
-    os.nice(NICE)
+    try:
+        system.local_socket(SOCK_STREAM).close()
+    except OSError as error:
+        raise CommandError(str(error.strerror)) from None
+    system.be_nice(NICE)
     with ExitStack() as stack:
         flights = [
             stack.enter_context(followed(each, "" if alone else each.name))

@@ -16,7 +16,7 @@ import pytest
 
 from helpers import PATIENCE_S, SKYTETHER, ran, refused, until
 from skytether.__main__ import main
-from skytether.shell import command, udp
+from skytether.shell import system
 
 SIGUSR1_IGNORED = 1 << (signal.SIGUSR1 - 1)
 
@@ -141,8 +141,7 @@ TOO_MANY = "got 200, which takes 248 open files; expected at most 16, for 64 may
 def test_too_few_open_files_are_told_before_anything_flies(
     argv: list[str], monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(udp, "files_max", lambda: 64)
-    monkeypatch.setattr(command, "files_max", lambda: 64)
+    monkeypatch.setattr(system, "files_max", lambda: 64)
     assert f"{argv[1]}: {TOO_MANY}" in refused(argv, capfd)
 
 

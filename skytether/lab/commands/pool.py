@@ -36,7 +36,7 @@ from skytether.lab.search import Point, Search, SearchPoint, Values, best
 from skytether.lab.sweep import Results, Runs, Sweep
 from skytether.shared.base import kernel
 from skytether.shared.scenario.schema import Scenario
-from skytether.shell import command, plugins, terminal
+from skytether.shell import command, plugins, system, terminal
 from skytether.shell.argument import Argument
 from skytether.shell.command import CommandError
 from skytether.shell.plugins import Plugin
@@ -201,7 +201,7 @@ class Crew:
         under_way: dict[Future[R], int] = {}
         while True:
             try:
-                with _deaf():
+                with system.blocked(signal.SIGINT):
                     for number, item in islice(waiting, UNDER_WAY_MAX - len(under_way)):
                         under_way[self.executor.submit(equipped, item)] = number
                 if not under_way:
@@ -266,16 +266,6 @@ def writing(out: Path | None) -> Iterator[None]:
         raise CommandError(f"{error.filename or out}: {error.strerror or error}") from None
 
 
-@contextmanager
-def _deaf() -> Iterator[None]:
-    """Start workers with SIGINT blocked, so that Ctrl-C reaches only the command."""
-    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
-
-
 def _equipped(function: Callable[[T], R], plugged: tuple[Plugin, ...], item: T) -> R:
     """Result of a function for an item; called in a worker, which first loads the plug-ins.
 
@@ -298,7 +288,7 @@ def _executor(flags: Flags) -> AbstractContextManager[Executor]:
         return _cluster(flags.scheduler)
     if flags.workers == 0:
         return _thread()
-    return _processes(flags.workers or len(os.sched_getaffinity(0)))
+    return _processes(flags.workers or system.cores())
 
 
 @contextmanager

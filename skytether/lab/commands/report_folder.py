@@ -1,7 +1,6 @@
 """Folder of a report: its page, each table and figure, and the commands that made it."""
 
 import json
-import os
 import platform
 import shlex
 import time
@@ -17,6 +16,7 @@ from skytether.lab.commands import machine
 from skytether.lab.report import Drawn
 from skytether.shared.base import files
 from skytether.shared.scenario.schema import Scenario
+from skytether.shell import system
 
 PAGE = "report.html"
 CALLS = "calls.jsonl"
@@ -42,8 +42,7 @@ class CommandCall:
             "command": self.command,
             "date": self.began.isoformat(timespec="seconds"),
             "runs": runs,
-            "machine": f"{machine.processor()}, {len(os.sched_getaffinity(0))} cores, "
-            f"{platform.platform()}",
+            "machine": f"{machine.processor()}, {system.cores()} cores, {platform.platform()}",
             "python": platform.python_version(),
             "versions": {name: metadata.version(name) for name in PACKAGES},
             "commit": machine.commit(),

@@ -1,0 +1,117 @@
+"""What not every operating system has, asked for in this one place.
+
+Flights in virtual time, the environments of `skytether.gym`, netem's relay and its pytest fixture
+run wherever Python and numba do; what needs more asks here whether it can, and says so if not.
+"""
+
+import asyncio
+import ctypes
+import os
+import signal
+import socket
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from errno import EAFNOSUPPORT
+from importlib import import_module
+from typing import Any
+
+
+def _module(name: str) -> Any:
+    """Module of the standard library; None if this system has none."""
+    try:
+        return import_module(name)
+    except ImportError:
+        return None
+
+
+fcntl, resource, termios, tty = map(_module, ("fcntl", "resource", "termios", "tty"))
+LIBC: Any = None if sys.platform == "win32" else ctypes.CDLL(None, use_errno=True)
+"""C library; a function that this system's has not is missing in it. None on Windows."""
+SERIAL_ERROR: type[Exception] = OSError if termios is None else termios.error
+"""Error of a file that is not a serial port."""
+FORKS = hasattr(os, "fork")
+"""Whether a process can continue as two; if not, flights over UDP are not started."""
+
+
+def cores() -> int:
+    """Number of cores that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def signals(*names: str) -> tuple[signal.Signals, ...]:
+    """Signals by their names, without those that this system lacks."""
+    return tuple(signal.Signals[name] for name in names if hasattr(signal, name))
+
+
+def user() -> int:
+    """Number of the user as the owner of files; 0 on a system without."""
+    return os.geteuid() if hasattr(os, "geteuid") else 0
+
+
+def handle(loop: asyncio.AbstractEventLoop, number: int, action: Callable[[], object]) -> None:
+    """Call a function in an event loop at a signal."""
+    try:
+        loop.add_signal_handler(number, action)
+    except NotImplementedError:  # Windows
+        signal.signal(number, lambda *_: loop.call_soon_threadsafe(action))
+
+
+@contextmanager
+def blocked(*numbers: signal.Signals) -> Iterator[None]:
+    """Block signals during the block, also in the processes that it starts."""
+    if hasattr(signal, "pthread_sigmask"):
+        signal.pthread_sigmask(signal.SIG_BLOCK, numbers)
+    try:
+        yield
+    finally:
+        if hasattr(signal, "pthread_sigmask"):
+            signal.pthread_sigmask(signal.SIG_UNBLOCK, numbers)
+
+
+def local_socket(kind: socket.SocketKind) -> socket.socket:
+    """Unix socket.
+
+    Raises:
+        OSError: this system has none.
+    """
+    if not hasattr(socket, "AF_UNIX"):
+        raise OSError(EAFNOSUPPORT, f"needs Unix sockets, which this system ({sys.platform}) lacks")
+    return socket.socket(socket.AF_UNIX, kind)
+
+
+def on_usr1(handler: Callable[[int, Any], Any] | signal.Handlers) -> None:
+    """Handle SIGUSR1 in this way, on systems that have it."""
+    for number in signals("SIGUSR1"):
+        signal.signal(number, handler)
+
+
+def files_max() -> int:
+    """Largest number of open files that this process may allow itself."""
+    if resource is None:
+        return sys.maxsize
+    _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    return sys.maxsize if hard == resource.RLIM_INFINITY else hard
+
+
+def allow_files(count: int) -> None:
+    """Raise the limit of open files, as far as the system allows."""
+    if resource is None:
+        return
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    if soft != resource.RLIM_INFINITY and count > soft:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (min(count, files_max()), hard))
+
+
+def dump_no_core() -> None:
+    """Let this process end by a signal without a core dump."""
+    if resource is not None:
+        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+
+
+def be_nice(by: int) -> None:
+    """Let other processes go first, where the system knows this."""
+    if hasattr(os, "nice"):
+        os.nice(by)
