@@ -153,14 +153,15 @@ def _is_claimed(inode: Inode) -> bool:
 
 
 def lock(descriptor: int) -> None:
-    """Lock an open file until it is closed; no effect on a system without such locks.
+    """Lock an open file until it is closed.
 
     Raises:
         BlockingIOError: another process has locked it.
-        OSError: its file system has no locks.
+        OSError: the system, or its file system, has no locks.
     """
-    if fcntl is not None:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    if fcntl is None:
+        raise OSError(EOPNOTSUPP, "this system has no locks of files")
+    fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
 
 
 def _locked(path: Path, descriptor: int) -> bool:
