@@ -19,8 +19,9 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from errno import EACCES, EBUSY, EEXIST, EFBIG, EINVAL, EISDIR, ELOOP, EOPNOTSUPP
-from functools import partial
+from functools import partial, reduce
 from itertools import count
+from operator import or_
 from pathlib import Path
 from typing import BinaryIO, TypeVar
 
@@ -33,7 +34,7 @@ except ImportError:  # Windows
 def open_flags(*names: str) -> int:
     """Flags for `os.open` by their names, without those that this system lacks."""
     # Windows would translate line ends.
-    return sum({getattr(os, name, 0) for name in ("O_BINARY", *names)})
+    return reduce(or_, (getattr(os, name, 0) for name in ("O_BINARY", *names)))
 
 
 FLAGS = open_flags("O_NOFOLLOW", "O_NONBLOCK", "O_CLOEXEC")
