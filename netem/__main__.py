@@ -2,7 +2,6 @@
 
 import sys
 
-from skytether.shell import system
 from skytether.shell.start import run
 
 if __name__ == "__main__":  # called before the slow imports below
@@ -25,7 +24,7 @@ from skytether.shared.core.line import CONNECTIONS_MAX, Listen
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import PACKET_COLUMNS
-from skytether.shell import command, process
+from skytether.shell import command, process, system
 from skytether.shell.argument import Argument
 from skytether.shell.process import ProcessOptions
 from skytether.shell.program import Program, ProgramError, program

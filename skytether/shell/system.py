@@ -4,7 +4,6 @@ Flights in virtual time, the environments of `skytether.gym`, netem's relay and 
 run wherever Python and numba do; what needs more asks here whether it can, and says so if not.
 """
 
-import asyncio
 import ctypes
 import os
 import signal
@@ -14,7 +13,10 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from errno import EAFNOSUPPORT
 from importlib import import_module
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:  # `start` imports this before anything slow
+    import asyncio
 
 
 def _module(name: str) -> Any:
@@ -51,7 +53,7 @@ def user() -> int:
     return os.geteuid() if hasattr(os, "geteuid") else 0
 
 
-def handle(loop: asyncio.AbstractEventLoop, number: int, action: Callable[[], object]) -> None:
+def handle(loop: "asyncio.AbstractEventLoop", number: int, action: Callable[[], object]) -> None:
     """Call a function in an event loop at a signal."""
     try:
         loop.add_signal_handler(number, action)

@@ -20,8 +20,8 @@ from skytether.shell.udp import from_kernel, open_socket
 
 FORK = multiprocessing.get_context("fork" if system.FORKS else None)
 """Start method of workers: fork shares imported and compiled code, in memory and start-up time."""
-PASSED_ON = system.signals("SIGINT", "SIGTERM", "SIGUSR1")
 ENDING = (signal.SIGINT, signal.SIGTERM)
+PASSED_ON = (*ENDING, *system.signals("SIGUSR1"))
 """Signals passed on to every worker, SIGINT as SIGTERM, and each of these two only once."""
 
 

@@ -2,7 +2,6 @@
 
 import sys
 
-from skytether.shell import system
 from skytether.shell.start import run
 
 if __name__ == "__main__":  # called before the slow imports below
@@ -17,7 +16,7 @@ from typing import Annotated
 
 import tyro
 
-from skytether.shell import command
+from skytether.shell import command, system
 from skytether.shell.argument import Argument
 from skytether.shell.command import CONFIGURATION, CommandError
 from skytether.shell.log import LogFormat
