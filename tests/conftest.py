@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, Future
 from contextlib import ExitStack, nullcontext
 from functools import cache, partial
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -144,6 +145,9 @@ def start(request: pytest.FixtureRequest) -> Iterator[Callable[..., Any]]:
 @pytest.fixture
 def plugin_tables() -> Iterator[None]:
     """Restore the tables that plug-ins extend."""
+    # Each fills a table when it is first imported, which must not be within a test.
+    for name in ("client.vehicles", "server.schemes.table", "server.mpc.plugin_planners"):
+        import_module(f"skytether.{name}")
     before = [dict(table) for table in TABLES]
     yield
     plugins._loaded.clear()
