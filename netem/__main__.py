@@ -30,6 +30,8 @@ from skytether.shell.process import ProcessOptions
 from skytether.shell.program import Program, ProgramError, program
 from skytether.shell.udp import leads_back, sockets_max
 
+NETWORK = "transparent"
+"""Scenario of a relay that belongs to no flight."""
 COLLECT_AFTER = 100_000
 """Number of new objects after which garbage is collected. Queued packets are not garbage, and the
 default of 700 would scan all of them many times a second."""
@@ -41,8 +43,10 @@ MTU_MIN, MTU_MAX = 1280, 65_520
 class NetemOptions(ProcessOptions):
     """Options of `skytether netem`."""
 
-    scenario: command.ScenarioName = "transparent"
-    """A scenario's name (see `skytether scenarios`) or a .toml file, for its network and seed."""
+    scenario: command.ScenarioName = NETWORK
+    """A scenario's name (see `skytether scenarios`) or a .toml file, for its network and seed.
+    netem is part of that scenario's flight then: fates follow the time, and not the number of a
+    packet in its flow."""
     bind: str = "127.0.0.1:47000"
     """HOST:PORT to listen on for clients; port 0 takes a free one. An IPv6 host is written in
     brackets, as in [::1]:47000; its socket receives IPv6 only, even for [::]. A name means its IPv4
@@ -68,7 +72,7 @@ class NetemOptions(ProcessOptions):
 class RunOptions(ProcessOptions):
     """Options of `skytether netem run`."""
 
-    scenario: command.ScenarioName = "transparent"
+    scenario: command.ScenarioName = NETWORK
     """A scenario's name (see `skytether scenarios`) or a .toml file, for its network and seed."""
     uplink: str | None = None
     """Impairments of packets to the program, joined by &, as in "constant(50ms) & loss(10%)", see
@@ -92,7 +96,8 @@ def emulate(argv: Sequence[str]) -> None:
         skytether netem --bind 127.0.0.1:5000 --server 192.0.2.1:5000 --to-client "constant(50ms)"
             --to-server "gamma(20ms, 80ms, 30ms) & loss(5%) & rate(1mbit, queue=30000)"
 
-    Without these, packets pass at once. SIGUSR1 prints the counters so far; they are also printed
+    Without these, packets pass at once. With one seed, the packet with the same number in its flow
+    has the same fate in each run. SIGUSR1 prints the counters so far; they are also printed
     at the end. With --control, `skytether set` changes the impairments meanwhile.
 
     `skytether netem run … -- CMD ARG…` does the same to all packets of one program.
@@ -118,7 +123,14 @@ def emulate(argv: Sequence[str]) -> None:
             relay = Relay(running.scenario, server=server, recorder=recorder, path=path)
             running.drive(relay, bind=None, line=listen, waiting_for=waiting_for)
             return
-        proxy = Proxy(running.scenario, server=server, flows=flows, recorder=recorder, path=path)
+        proxy = Proxy(
+            running.scenario,
+            server=server,
+            flows=flows,
+            by_number=options.scenario == NETWORK,
+            recorder=recorder,
+            path=path,
+        )
         running.drive(proxy, bind=bind, peers=[server], waiting_for=waiting_for)
 
 

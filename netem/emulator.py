@@ -28,6 +28,8 @@ class Emulator(Endpoint):
 
     Args:
         mtu: largest payload that passes [B].
+        by_number: whether fates follow the number of a packet in its flow, and not its time: of
+            every program but a flight, whose controllers send at times of their own.
         path: number of the session's path, from 0, in the record.
         header_bytes: see `Link`.
     """
@@ -39,12 +41,13 @@ class Emulator(Endpoint):
         scenario: Scenario,
         *,
         mtu: int,
+        by_number: bool,
         recorder: Recorder | None,
         path: int = 0,
         header_bytes: int = HEADER_BYTES,
     ) -> None:
         super().__init__()
-        self._scenario = scenario
+        self._scenario, self._by_number = scenario, by_number
 
         def make(direction: int, name: Direction) -> Link:
             of = self.path(name)
@@ -70,7 +73,8 @@ class Emulator(Endpoint):
 
     def fates(self, name: Direction, flow: int) -> Fates:
         """What the packets of one flow meet in a direction."""
-        return Fates(self.link(name).path, self._scenario.seed, name, flow)
+        at = self._scenario.seed, name, flow
+        return Fates(self.link(name).path, *at, by_number=self._by_number)
 
     def _open_lanes(self, began_ns: int) -> tuple[Lane, Lane]:
         """Uplink and downlink of a new flow, whose fates count from `began_ns`."""

@@ -1,11 +1,12 @@
 """Fates of packets: delay, loss, and other impairments of each packet.
 
 Each direction has a list of impairments (`shared.scenario.air`), which modify the fate of a packet
-one after another. A fate depends on the seed, the direction, the flow and the time slot in which
-the packet enters, but not on earlier packets: so two controllers meet the same network, however
-often each of them sends. Packets that enter in the same slot have different fates, by their rank in
-the slot: otherwise three CLOSEs sent at once would all be lost together. Control traffic is so
-sparse that nearly every packet is the first of its slot.
+one after another. In a flight a fate depends on the seed, the direction, the flow and the time slot
+in which the packet enters, but not on earlier packets: so two controllers meet the same network,
+however often each of them sends. For any other program it depends on the packet's number in its
+flow, see `shared.scenario.air.draws`. Packets of a flight that enter in the same slot have
+different fates, by their rank in the slot: otherwise three CLOSEs sent at once would all be lost
+together. Control traffic is so sparse that nearly every packet is the first of its slot.
 
 An impairment of a plug-in that raises an exception, or sets an impossible value, has no effect, so
 that its errors end no flight.
@@ -32,15 +33,23 @@ class Fates:
 
     Args:
         by_number: whether what is drawn for a packet depends on its number in the flow, and not on
-            its slot; what lasts for a time is then common to all flows.
+            its slot.
+        is_common: whether what lasts for a time, such as an outage, is common to all flows.
     """
 
     by_number = False
 
     def __init__(
-        self, direction: Path, seed: int, name: str, flow: int, *, by_number: bool = False
+        self,
+        direction: Path,
+        seed: int,
+        name: str,
+        flow: int,
+        *,
+        by_number: bool = False,
+        is_common: bool = False,
     ) -> None:
-        at, lasting = (seed, name, flow), (seed, name, 0 if by_number else flow)
+        at, lasting = (seed, name, flow), (seed, name, 0 if is_common else flow)
         packets = Stream(*at, "packets")
         self.by_number = by_number
         self._impairments: list[tuple[Impairment, Draws]] = []

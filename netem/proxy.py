@@ -38,7 +38,7 @@ class Proxy(Emulator):
     """Delays, reorders and loses datagrams between one server and at most `flows` clients.
 
     Args:
-        recorder, path: see `Emulator`.
+        by_number, recorder, path: see `Emulator`.
     """
 
     patience_ns = MILLISECOND_NS // 4
@@ -49,11 +49,12 @@ class Proxy(Emulator):
         *,
         server: Address,
         flows: int = FLOWS_MAX,
+        by_number: bool = False,
         recorder: Recorder | None = None,
         path: int = 0,
     ) -> None:
         self._mtu = mtu = scenario.network.mtu
-        super().__init__(scenario, mtu=mtu, recorder=recorder, path=path)
+        super().__init__(scenario, mtu=mtu, by_number=by_number, recorder=recorder, path=path)
         self._flows_max = flows
         self._server = server
         self._places = Places(flows)

@@ -27,6 +27,8 @@ from skytether.shared.scenario.air.path import Path
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Recorder
 
+TRY = 1 << 32
+"""Distance, in numbers of pieces, of what is drawn for one try of a piece and for its next."""
 RETRY_NS = 200 * MILLISECOND_NS
 """Time after which a piece that would have been lost is tried again [ns]: Linux's smallest
 retransmission time-out."""
@@ -46,13 +48,16 @@ class HalfConnection:
         self.lane, self.link = lane, link
         self.held: deque[Datagram] = deque()
         """Pieces that have not entered the link."""
+        self.tries = 0
+        """Number of times that the first held piece would have been lost."""
         self.retry_ns: int | None = None
         """Time at which the first held piece is tried again; None while it waits for room."""
 
     def loses(self, now_ns: int) -> bool:
-        """Whether a packet would be lost now."""
+        """Whether the first held piece would be lost now, as a packet."""
         slot = (now_ns - self.lane.began_ns) // SLOT_NS
-        return Fates.at(self.lane.fates, slot).lost  # those of its own lose nothing
+        number = self.lane.taken + TRY * self.tries
+        return Fates.at(self.lane.fates, slot, number).lost  # those of its own lose nothing
 
 
 class Relay(Emulator):
@@ -71,7 +76,7 @@ class Relay(Emulator):
         recorder: Recorder | None = None,
         path: int = 0,
     ) -> None:
-        super().__init__(scenario, mtu=PIECE_BYTES, recorder=recorder, path=path)
+        super().__init__(scenario, mtu=PIECE_BYTES, by_number=True, recorder=recorder, path=path)
         self._server = server
         self._streams: dict[Address, HalfConnection] = {}
         """Streams by their source."""
@@ -107,9 +112,11 @@ class Relay(Emulator):
                 stream.retry_ns = None
             elif stream.loses(now_ns):
                 stream.retry_ns = now_ns + RETRY_NS
+                stream.tries += 1
                 self._retries += 1
             else:
                 stream.link.accept(stream.held.popleft(), stream.lane, now_ns=now_ns)
+                stream.tries = 0
                 continue
             self._holding[source] = stream
             return
@@ -155,7 +162,8 @@ class Relay(Emulator):
         return super().path(name).for_streams()
 
     def fates(self, name: Direction, flow: int) -> Fates:
-        return LosslessFates(self.link(name).path, self._scenario.seed, name, flow)
+        at = self._scenario.seed, name, flow
+        return LosslessFates(self.link(name).path, *at, by_number=True)
 
     def change(self, scenario: Scenario, keys: frozenset[str], *, now_ns: int) -> None:
         """See `Endpoint`; what is held up is tried again at once."""

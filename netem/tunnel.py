@@ -1,8 +1,7 @@
 """Tunnel: the network of one program, whose packets of IP pass it both ways.
 
-As for a vehicle, uplink is to the program and downlink is from it. Fates follow the number of a
-packet in its flow, see `shared.scenario.air.draws`, so a program that sends alike meets the same
-network in each run.
+As for a vehicle, uplink is to the program and downlink is from it. A program that sends alike meets
+the same network in each run, see `shared.scenario.air.draws`.
 """
 
 from collections import OrderedDict
@@ -32,7 +31,7 @@ class Tunnel(Emulator):
     """
 
     def __init__(self, scenario: Scenario, *, mtu: int, recorder: Recorder | None = None) -> None:
-        super().__init__(scenario, mtu=mtu, recorder=recorder, header_bytes=0)
+        super().__init__(scenario, mtu=mtu, by_number=True, recorder=recorder, header_bytes=0)
         self._mtu = mtu
         self._flows: OrderedDict[bytes, tuple[Lane, Lane]] = OrderedDict()
         """Uplink and downlink of each flow by its key, that which was silent longest first.
@@ -80,7 +79,8 @@ class Tunnel(Emulator):
         return self._flows.values()
 
     def fates(self, name: Direction, flow: int) -> Fates:
-        return Fates(self.link(name).path, self._scenario.seed, name, flow, by_number=True)
+        at = self._scenario.seed, name, flow
+        return Fates(self.link(name).path, *at, by_number=True, is_common=True)
 
     def figures(self) -> dict[str, Any]:
         counts = {"flows": len(self._flows), "refused": self.refused, "header_bytes": 0}

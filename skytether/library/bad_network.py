@@ -35,7 +35,8 @@ class bad_network:  # noqa: N801 - read as a function, like `contextlib.closing`
         to: address of the server.
         to_server: impairments of packets to the server, in place of `network`.
         to_client: the same of packets to the client.
-        seed: seed of all fates: packets sent at the same times meet the same ones.
+        seed: seed of all fates: the packet with the same number in its flow meets the same one in
+            each run, and outages begin with the flow's first packet.
         bind: address to listen on; port 0 takes a free one.
         tcp: whether it relays TCP connections in place of UDP: latency, a rate and cuts, and no
             packet loss.
@@ -63,7 +64,9 @@ class bad_network:  # noqa: N801 - read as a function, like `contextlib.closing`
         table = reading.to_table(reading.load_base("transparent")) | {"seed": seed}
         table["network"] |= _directions(network, to_server, to_client)
         scenario = reading.check(table, "bad_network", any_network=True)
-        self._endpoint = Relay(scenario, server=to) if tcp else Proxy(scenario, server=to)
+        self._endpoint = (
+            Relay(scenario, server=to) if tcp else Proxy(scenario, server=to, by_number=True)
+        )
         self._running = Running(self._endpoint, scenario)
         if tcp:
             self._shell = Shell(self._endpoint, None, line=Listen(bind, to))

@@ -1,13 +1,14 @@
-"""Random numbers of packets, as functions of the seed and the packet's time.
+"""Random numbers of packets, as functions of the seed and the packet's time or number.
 
-The fate of a packet depends on the seed, its direction, its flow and the slot of SLOT_NS in which
-it enters, counted from the start of the flow. It does not depend on earlier packets. So two
-controllers are compared on the same network, however often each of them sends. Packets of one flow
-in one slot are numbered by rank.
+In a flight the fate of a packet depends on the seed, its direction, its flow and the slot of
+SLOT_NS in which it enters, counted from the start of the flow. It does not depend on earlier
+packets. So two controllers are compared on the same network, however often each of them sends.
+Packets of one flow in one slot are numbered by rank.
 
-The network of a program (`netem.tunnel`) is different: two runs of it send the same packets, but
-never in the same milliseconds. There a packet's rank is its number in its flow, and what is drawn
-for it alone depends on that number; what lasts depends on the time, and is common to all flows.
+Any other program is different: two runs of it send the same packets, but never in the same
+milliseconds. There a packet's rank is its number in its flow, and what is drawn for it alone
+depends on that number; what lasts depends on the time since the flow's first packet, or, for all
+flows of one program (`netem.tunnel`), since the first of all.
 """
 
 from dataclasses import dataclass
