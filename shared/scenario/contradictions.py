@@ -118,8 +118,11 @@ def contradictions(
 
 def _no_origin(scenario: Scenario) -> Iterator[Contradiction]:
     origin = scenario.reference.origin
-    if origin and (len(origin) != 2 or abs(origin[0]) > NORTH_MAX):
-        expected = f"latitude and longitude, up to {NORTH_MAX:g} degrees north or south"
+    if origin and not (
+        len(origin) in (2, 3) and abs(origin[0]) <= NORTH_MAX and abs(origin[1]) <= 180.0
+    ):
+        north = f"up to {NORTH_MAX:g} degrees north or south"
+        expected = f"latitude and longitude, {north}, and the altitude if it is known"
         yield "reference.origin", list(origin), expected
 
 

@@ -15,7 +15,8 @@ latter is less because degrees are projected onto a plane."""
 NORTH_MAX = 85.0
 """Largest latitude [degrees]."""
 Origin = tuple[float, ...]
-"""Latitude and longitude of a scenario's origin [degrees]; empty: not known."""
+"""Latitude and longitude of a scenario's origin [degrees], and its altitude above the sea [m] if
+that is known; empty: not known."""
 
 
 def check_origin(latitude: Any, longitude: Any, form: str) -> Origin:
@@ -70,7 +71,7 @@ def local(degrees: Array, origin: Origin) -> Array:
             "reference.origin, the latitude and longitude of the scenario's origin: the file's "
             "coordinates are degrees"
         )
-    north, east = origin
+    north, east = origin[:2]
     longitude, latitude = degrees.T
     if not ((np.abs(longitude) <= 180.0).all() and (np.abs(latitude) <= NORTH_MAX).all()):
         raise ValueError("coordinates of longitude and latitude")

@@ -1,11 +1,12 @@
 """Plans of QGroundControl (`.plan`): the geofence as zones, and the mission as a timed route.
 
 Coordinates are degrees; the scenario's origin is `reference.origin`, or else the planned home.
+Altitudes above home are taken as above the origin.
 """
 
 import json
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -33,6 +34,16 @@ LONG_S = 1e6
 """Longest duration of an item [s]."""
 FRAMES = {0: "above the sea", 3: "above home"}
 """MAV_FRAME of altitudes that can be flown."""
+MODE_FRAMES = {1: 3, 2: 0, 3: 0, 4: 10}
+"""MAV_FRAME that QGroundControl gives an item, by its AltitudeMode: above home, above the sea,
+above the terrain (sent as above the sea), and above the terrain as the autopilot knows it."""
+MULTICOPTERS, ROVERS = (None, 0, 2, 3, 4, 13, 14, 15, 29, 35), (10, 11)
+"""MAV_TYPE of vehicles that can stop at each place: in the air (or not given), and on the ground or
+on water."""
+SCAN, SCANS = "TransectStyleComplexItem", ("survey", "CorridorScan")
+"""Member with the simple items of a complex item, and the types of complex items that have it."""
+VERSIONS = {"plan": (1,), "mission": (2,), "geofence": (2,), SCAN: (1, 2)}
+"""Versions of a plan's parts that are read; a part without a version is taken as one of these."""
 WRONG = (KeyError, TypeError, AttributeError, IndexError)
 """Exceptions that Python raises where a file does not have the structure of a plan."""
 
@@ -42,7 +53,7 @@ class Home(NamedTuple):
 
     origin: Origin
     altitude_m: float | None
-    """Altitude of the planned home above the sea [m]; None: not known."""
+    """Altitude of the origin above the sea, or else of the planned home [m]; None: not known."""
 
     def local(self, latitude: Any, longitude: Any) -> Array:
         """Metres north and east [m]; shape (2,)."""
@@ -103,6 +114,8 @@ def has_fence(content: bytes) -> bool:
 def _fence(plan: dict[str, Any]) -> dict[str, list[Any]]:
     """Parts of a plan's geofence, by kind; raises ValueError if it is invalid."""
     fence = plan.get("geoFence") or {}
+    if isinstance(fence, dict) and "polygon" not in fence:
+        _check_version("geofence", fence)
     kinds: dict[str, Any] = dict.fromkeys(("polygons", "circles"))
     if isinstance(fence, dict) and "polygon" not in fence:
         kinds = {kind: fence.get(kind) or [] for kind in kinds}
@@ -123,19 +136,35 @@ def route(content: bytes, axes: int, origin: Origin) -> tuple[Array, Array]:
         ValueError: the file is not a plan, or an item cannot be flown; the message names it.
     """
     plan, home = _expected(content, origin)
-    mission = plan.get("mission")
-    if not (
-        isinstance(mission, dict) and isinstance(items := mission.get("items"), list) and items
-    ):
+    mission = plan["mission"]
+    if not (isinstance(items := mission.get("items"), list) and items):
         raise ValueError("expected a plan with mission items")
-    speed_mps = number(mission.get("hoverSpeed", 0.0), "hoverSpeed")
-    start = np.zeros(3)
-    start[:2] = home.local(*mission["plannedHomePosition"][:2])
+    key = _speed_key(mission.get("vehicleType"))
+    speed_mps = number(mission.get(key, 0.0), key)
+    start = np.append(home.local(*mission["plannedHomePosition"][:2]), 0.0)
+    times_s, places_m = along(_items(items), start, home, speed_mps, key)
+    return times_s, places_m[:, :axes]
+
+
+def along(
+    items: Iterable[Any], start: Array, home: Home, speed_mps: float, key: str
+) -> tuple[Array, Array]:
+    """Times [s; shape (n,)] and places [m; shape (n, 3)] along the items of a mission.
+
+    Args:
+        items: simple items, as in a plan.
+        start: place above which the first take-off is [m]; shape (3,).
+        speed_mps: speed before an item that changes it; `key` is its name for messages.
+
+    Raises:
+        ValueError: an item cannot be flown; the message names it.
+    """
     times, places = [0.0], [start]
-    for count, item in enumerate(_items(items), start=1):
+    for count, item in enumerate(items, start=1):
         try:
             if count > ITEMS_MAX:
                 raise ValueError(f"expected at most {ITEMS_MAX} items")
+            _check_kind(item)
             command, params = int(item["command"]), [*item["params"], *[None] * 7][:7]
             if command in STILL:
                 continue
@@ -154,31 +183,54 @@ def route(content: bytes, axes: int, origin: Origin) -> tuple[Array, Array]:
         for at in (above, place) if command == TAKEOFF else (place,):
             away_m = float(np.linalg.norm(at - places[-1]))
             if away_m and not 0.0 < speed_mps <= 1e3:
-                raise ValueError(
-                    f"mission item {count}: expected hoverSpeed above 0, got {speed_mps:g}"
-                )
+                raise ValueError(f"mission item {count}: expected {key} above 0, got {speed_mps:g}")
             if away_m:
                 times.append(times[-1] + away_m / speed_mps)
                 places.append(at)
         if hold_s > 0.0:
             times.append(times[-1] + hold_s)
             places.append(place)
-    return np.array(times), np.array(places)[:, :axes]
+    return np.array(times), np.array(places)
 
 
-def _items(items: Any, depth: int = 0) -> Iterator[Any]:
-    """Simple items of a mission; those of a survey or corridor scan are within its complex item."""
-    for i, item in enumerate(items):
-        if not isinstance(item, dict) or item.get("type") == "SimpleItem":
-            yield item
-            continue
-        inner = item.get("TransectStyleComplexItem")
-        inner = inner.get("Items") if isinstance(inner, dict) else None
-        if depth or not (isinstance(inner, list) and inner):
-            kind = str(item.get("complexItemType"))[:40]
-            expected = "expected a simple item, a survey or a corridor scan"
-            raise ValueError(f"mission item {i + 1}: {expected}, got {kind}")
-        yield from _items(inner, depth + 1)
+def _speed_key(kind: Any) -> str:
+    """Key of a plan's speed, by the MAV_TYPE of its vehicle; None: not given."""
+    if kind in MULTICOPTERS:
+        return "hoverSpeed"
+    if kind in ROVERS:
+        return "cruiseSpeed"
+    known = "that of a vehicle that can stop at each place, as a multicopter or a rover"
+    raise ValueError(f"vehicleType: expected {known}, got MAV_TYPE {str(kind)[:40]}")
+
+
+def _items(items: list[Any]) -> Iterator[Any]:
+    """Items of a mission, with the simple items of a survey or corridor scan in its place."""
+    for item in items:
+        scan = item.get(SCAN) if isinstance(item, dict) else None
+        inner = scan.get("Items") if isinstance(scan, dict) else None
+        is_known = isinstance(scan, dict) and scan.get("version", 1) in VERSIONS[SCAN]
+        yield from inner if is_known and isinstance(inner, list) and inner else [item]
+
+
+def _check_kind(item: dict[str, Any]) -> None:
+    """Refuse an item that is not simple by a ValueError."""
+    if item.get("type") == "SimpleItem":
+        return
+    kind, scan = str(item.get("complexItemType"))[:40], item.get(SCAN)
+    if isinstance(scan, dict):
+        _check_version(SCAN, scan)
+    if kind in SCANS and (not isinstance(scan, dict) or scan.get("Items") in (None, [])):
+        written = "as QGroundControl writes them once it knows the terrain"
+        raise ValueError(f"expected a {kind} with the places it leads to (Items), {written}")
+    raise ValueError(f"expected a simple item, a survey or a corridor scan, got {kind}")
+
+
+def _check_version(part: str, table: dict[str, Any]) -> None:
+    """Refuse a part of a plan of an unknown version by a ValueError."""
+    known = VERSIONS[part]
+    if (version := table.get("version", known[0])) not in known:
+        expected = " or ".join(map(str, known))
+        raise ValueError(f"a {part} of version {expected}, got {str(version)[:40]}")
 
 
 def _hold_s(command: int, params: list[Any]) -> float:
@@ -218,6 +270,8 @@ def _place(
         if frame not in FRAMES:
             known = " or ".join(FRAMES.values())
             raise ValueError(f"expected an altitude {known}, got one of frame {frame}")
+        if (belongs := MODE_FRAMES.get(mode := item.get("AltitudeMode"), frame)) != frame:
+            raise ValueError(f"expected frame {belongs} with AltitudeMode {mode}, got {frame}")
         if frame == 0 and home.altitude_m is None:
             raise ValueError("an altitude above home, for the home's above the sea is not known")
         place[2] = number(params[6], "altitude") - ((home.altitude_m or 0.0) if frame == 0 else 0.0)
@@ -240,12 +294,15 @@ def _plan(content: bytes, origin: Origin) -> tuple[dict[str, Any], Home]:
         raise ValueError(f"a QGroundControl plan ({error})") from None
     if not isinstance(plan, dict) or plan.get("fileType") != "Plan":
         raise ValueError('a QGroundControl plan, with "fileType": "Plan"')
+    _check_version("plan", plan)
+    if isinstance(mission := plan.get("mission"), dict):
+        _check_version("mission", mission)
     try:
         latitude, longitude, altitude_m = plan["mission"]["plannedHomePosition"]
     except (*WRONG, ValueError):
         raise ValueError("a plan with plannedHomePosition: latitude, longitude, altitude") from None
     form = '"plannedHomePosition": [latitude, longitude, altitude]'
-    return plan, Home(
-        origin or check_origin(latitude, longitude, form),
-        None if altitude_m is None else number(altitude_m, "altitude of home"),
-    )
+    home = check_origin(latitude, longitude, form)
+    if altitude_m is not None:
+        home = *home, number(altitude_m, "altitude of home")
+    return plan, Home(origin or home, (*origin[2:], *home[2:], None)[0])

@@ -67,7 +67,6 @@ TrueDeadTime = Annotated[float, Meta(ge=0, le=10)]
 Strength = Annotated[float, Meta(ge=0, le=1e3)]
 Speed = Annotated[float, Meta(ge=-1e3, le=1e3)]
 Position = Annotated[float, Meta(ge=-shapes.FAR_M, le=shapes.FAR_M)]
-Degrees = Annotated[float, Meta(ge=-180, le=180)]
 Amount = Annotated[float, Meta(ge=0, le=1e9)]
 Duration = Annotated[float, Meta(ge=0, le=3600)]
 Interval = Annotated[float, Meta(ge=1e-3, le=3600)]
@@ -191,9 +190,9 @@ class ReferenceConfig(Section, frozen=True):
     file: Annotated[str, Key(Owner.BOTH, term="table")] = ""
     """File with the points and their times, see docs/vehicles.md: CSV with the columns t, x, y (and
     z), for a mission also vehicle; relative to the scenario's folder."""
-    origin: OfEach[tuple[Degrees, ...]] = ()
-    """Latitude and longitude of the scenario's origin [degrees], for files with coordinates of the
-    globe; default: that of the file, if it has one."""
+    origin: OfEach[tuple[Position, ...]] = ()
+    """Latitude and longitude of the scenario's origin [degrees], and its altitude above the sea [m]
+    for files with such altitudes; default: those of the file, if it has them."""
 
 
 class VehicleConfig(Section, frozen=True):

@@ -3,7 +3,7 @@
 | file | content |
 |---|---|
 | CSV with t, x, y (and z) | seconds, and metres north, east and up |
-| CSV with t, lat, lon (and alt) | seconds, degrees, and metres above the origin |
+| CSV with t, lat, lon (and alt) | seconds, degrees, and metres above the sea or the origin |
 | CSV of Skybrush | `Time [msec]`, `x [m]`, `y [m]`, `z [m]` |
 | CSV of MAVSDK's drone show | t, px, py, pz: metres north, east and down |
 | CSV of Crazyswarm | duration, x^0 … x^7, y^0 …: polynomials, one piece a row |
@@ -39,6 +39,8 @@ POINTS_MAX = 1_000_000
 """Largest number of points made from polynomials."""
 SAMPLE_S = 0.05
 """Longest time between two points made from a polynomial."""
+GROUND_M = 1.0
+"""Largest distance from 0 of the lowest altitude in a table of altitudes above the origin [m]."""
 DEGREE = 7
 """Degree of the polynomials of Crazyswarm."""
 ZIP_BYTES_MAX = 64_000_000
@@ -66,8 +68,18 @@ def _from_ned(coordinates: Array, _: Origin | None) -> Array:
 
 
 def _from_globe(coordinates: Array, origin: Origin | None) -> Array:
-    origin = tuple(coordinates[0, :2].tolist()) if origin is None else origin
-    return np.concatenate([local(coordinates[:, 1::-1], origin), coordinates[:, 2:]], axis=1)
+    """Metres from the origin. Altitudes are above the sea if the origin's altitude is known, and
+    otherwise above the origin, and then the lowest is 0.
+    """
+    heights_m, zero_m = coordinates[:, 2:], 0.0
+    if origin is None:
+        origin = tuple(coordinates[0, :2].tolist())
+    elif len(origin) > 2:
+        zero_m = origin[2]
+    elif heights_m.size and abs(lowest_m := float(heights_m.min())) > GROUND_M:
+        above_sea = "those above the sea need reference.origin = [latitude, longitude, altitude]"
+        raise ValueError(f"alt: expected metres from 0 on, got {lowest_m:g} and more; {above_sea}")
+    return np.concatenate([local(coordinates[:, 1::-1], origin), heights_m - zero_m], axis=1)
 
 
 FORMS = (

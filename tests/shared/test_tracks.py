@@ -132,6 +132,16 @@ def test_a_table_of_the_globe_is_metres_from_the_origin() -> None:
     assert points_m[1] == pytest.approx([0.001 * DEGREE_M, east_m, 30.0], abs=0.01)
 
 
+def test_altitudes_above_the_sea_are_metres_above_the_origins_altitude() -> None:
+    text = b"t,lat,lon,alt\n0,47,8,488\n9,47,8,490\n"
+    _, points_m = only(tracks.tracks(text, 3, (*ORIGIN, 480.0)))
+    assert points_m[:, 2].tolist() == [8.0, 10.0]
+    flat = tracks.tracks(text, 2, ORIGIN)
+    assert flat[1][1].tolist() == [[0.0, 0.0], [0.0, 0.0]]
+    with pytest.raises(ValueError, match="alt: expected metres from 0 on, got 488 and more"):
+        tracks.tracks(text, 3, ORIGIN)
+
+
 def polynomials(*pieces: tuple[float, list[float], list[float]]) -> bytes:
     names = [f"{axis}^{power}" for axis in "xyz" for power in range(8)]
     rows = [
@@ -216,10 +226,16 @@ def plan(*items: Any, **mission: Any) -> bytes:
     return json.dumps({"fileType": "Plan", "mission": own}).encode()
 
 
-@pytest.mark.parametrize("origin", [[47.0], [120.0, 8.0]])
+@pytest.mark.parametrize("origin", [[47.0], [120.0, 8.0], [47.0, 200.0], [47.0, 8.0, 4.0, 1.0]])
 def test_an_origin_that_is_no_place_is_refused_by_its_key(origin: list[float]) -> None:
     with pytest.raises(ConfigError, match=r"reference\.origin: got .* expected latitude and long"):
         reading.check({"reference": {"origin": origin}}, "it")
+
+
+def scan(items: Any, **within: Any) -> dict[str, Any]:
+    """Survey of a plan, with its simple items."""
+    own = {"Items": items, **within}
+    return {"type": "ComplexItem", "complexItemType": "survey", "TransectStyleComplexItem": own}
 
 
 NORTH = 47.0 + 100.0 / DEGREE_M
@@ -227,11 +243,7 @@ NORTH = 47.0 + 100.0 / DEGREE_M
 
 
 def test_a_plan_is_flown_from_place_to_place_at_its_speed() -> None:
-    survey = {
-        "type": "ComplexItem",
-        "complexItemType": "survey",
-        "TransectStyleComplexItem": {"Items": [item(16, 0, 0, 0, 0, 47.0, 8.0, 20), item(206, 9)]},
-    }
+    survey = scan([item(16, 0, 0, 0, 0, 47.0, 8.0, 20), item(206, 9)], version=2)
     flown = plan(
         item(22, 0, 0, 0, None, 0, 0, 20),
         item(16, 3, 0, 0, None, NORTH, 8.0, 420, frame=0),
@@ -270,6 +282,18 @@ def test_the_origin_of_the_scenario_counts_more_than_the_plans() -> None:
         (plan(item(1e999)), "mission item 1: expected a command and its params"),
         (plan(item(178, 2, 5)), "mission item 1: expected a speed over ground or in the air"),
         (plan({"TransectStyleComplexItem": {"Items": 5}}), "expected a simple item"),
+        (plan(item(20), version=1), "a mission of version 2, got 1"),
+        (plan(item(20)).replace(b"{", b'{"version":2,', 1), "a plan of version 1, got 2"),
+        (plan(item(20), vehicleType=1), "vehicleType: expected that of a vehicle that can stop"),
+        (plan(item(20), vehicleType=[2]), "got MAV_TYPE [2]"),
+        (plan(item(20), scan([])), "mission item 2: expected a survey with the places"),
+        (plan(scan([item(206)] * 2), scan(None)), "mission item 3: expected a survey with the pla"),
+        (plan(scan([item(20)], version=9)), "mission item 1: a TransectStyleComplexItem of versio"),
+        (
+            plan(item(16) | {"AltitudeMode": 2}),
+            "mission item 1: expected frame 0 with AltitudeMode",
+        ),
+        (plan(item(16) | {"AltitudeMode": [2]}), "mission item 1: expected a command"),
     ],
 )
 def test_a_plan_that_cannot_be_flown_is_refused(content: bytes, said: str) -> None:
@@ -361,6 +385,18 @@ def test_the_homes_altitude_matters_only_for_altitudes_above_the_sea() -> None:
     above_sea = plan(item(22, 0, 0, 0, 0, 0, 0, 420, frame=0), plannedHomePosition=home)
     with pytest.raises(ValueError, match="mission item 1: an altitude above home"):
         tracks.tracks(above_sea, 3)
+
+
+def test_a_rovers_plan_is_driven_at_its_cruise_speed() -> None:
+    north = item(16, 0, 0, 0, 0, NORTH, 8.0, 0)
+    times_s, _ = only(tracks.tracks(plan(north, vehicleType=10, version=2, cruiseSpeed=2), 3))
+    assert times_s == pytest.approx([0.0, 50.0])
+
+
+def test_the_origins_altitude_counts_more_than_the_homes() -> None:
+    above_sea = item(16, 0, 0, 0, 0, 47.0, 8.0, 420, frame=0)
+    _, points_m = only(tracks.tracks(plan(above_sea), 3, (*ORIGIN, 410.0)))
+    assert points_m[-1] == pytest.approx([0.0, 0.0, 10.0])
 
 
 def test_a_zip_of_flat_tables_has_two_axes() -> None:

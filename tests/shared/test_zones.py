@@ -457,6 +457,7 @@ def test_a_geofence_of_a_plan_is_stayed_within_and_kept_out_of(tmp_path: Path) -
 @pytest.mark.parametrize(
     ("fence", "said"),
     [
+        ({"version": 3}, "a geofence of version 2, got 3"),
         ({}, "a plan with a geofence"),
         ({"version": 1, "polygon": [[47, 8], [47, 8.1], [47.1, 8]]}, "a geofence of version 2"),
         ({"polygons": 5}, "a geofence of version 2"),
