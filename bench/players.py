@@ -3,7 +3,8 @@
 Every player gets chunks of one policy, or single actions, over one network with the same seeds. A
 policy here is scripted; it predicts its chunk by a model that knows nothing of the disturbances.
 Delays are the same in both directions, at least half of the mean, with a standard deviation of a
-fifth of it. Needs the extra `bench`, for gym-pusht.
+fifth of it. Two bounds tell whether a task can judge players at all: no network, and nothing sent.
+Needs the extra `bench`, for gym-pusht.
 """
 
 import hashlib
@@ -14,7 +15,7 @@ from dataclasses import dataclass
 from itertools import product
 from math import cos, sin
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Any, NamedTuple
 
 import gymnasium
 import msgspec
@@ -24,7 +25,18 @@ from numpy.typing import NDArray
 
 from bench import push_t
 from bench.harness import TextTable
-from skytether.gym import Clocked, Held, Networked, Newest, Player, Queue
+from skytether.gym import (
+    NOTHING_SENT,
+    ORACLE,
+    Clocked,
+    Freshest,
+    Held,
+    Networked,
+    Newest,
+    Player,
+    Queue,
+)
+from skytether.gym.networked import Options
 from skytether.gym.players import Row
 from skytether.lab.commands.pool import Flags, study
 from skytether.lab.intervals import interval
@@ -32,17 +44,23 @@ from skytether.shared.base import files
 from skytether.shell import command
 
 Rows = NDArray[np.float64]
-PlayerName = Literal["newest", "replace", "average", "clocked", "sparing"]
-PLAYERS: Mapping[PlayerName, tuple[str, Callable[[], Player]]] = {
+PLAYERS: Mapping[str, tuple[str, Callable[[], Player]]] = {
     "newest": ("newest action held", Newest),
     "replace": ("queue, replaced", Queue),
     "average": ("queue, averaged", lambda: Queue("average")),
+    "freshest": ("queue, freshest (DRTC)", Freshest),
     "clocked": ("by the clock", Clocked),
     "sparing": ("by the clock, when needed", Clocked),
 }
-"""Title of each player, and what the robot runs. For the queues a chunk is sent when half of one is
-left or less (LeRobot's threshold), for the last when it differs from what the robot plays anyway,
-for the others always."""
+"""Title of each player, and what the robot runs. For the first two queues a chunk is sent when half
+of one is left or less (LeRobot's threshold), for DRTC's when a quarter was played and the last one
+should have come (its cooldown), for the last player when it differs from what the robot plays
+anyway, for the others always."""
+BOUNDS: Mapping[str, tuple[str, Options]] = {
+    "nothing": ("nothing sent", NOTHING_SENT),
+    "oracle": ("no network", ORACLE),
+}
+"""Title and options of each bound. Both are flown with the newest action held."""
 DELAYS_S, LOSSES = (0.0, 0.05, 0.1, 0.2), (0.0, 0.1, 0.3)
 SEEDS = 50
 """Number of seeds of the tables in docs/gym.md, from 1 on."""
@@ -202,7 +220,7 @@ class Watched(Player):
 
 class Cell(NamedTuple):
     task: str
-    player: PlayerName
+    player: str
     delay_s: float
     loss: float
     seed: int
@@ -228,74 +246,101 @@ def differs(task: Any, rows: Rows, coming: Rows) -> bool:
 
 
 def fly_cell(cell: Cell) -> FlownCell:
-    task = TASKS[cell.task]
+    task, name = TASKS[cell.task], cell.player
     mean = cell.delay_s
     delay = f"gamma({mean / 2:g}, {mean:g}, {mean / 5:g})" if mean else "none"
     way = f"{delay} & loss({cell.loss:g})"
     played, jumps = Played(task.make()), list[float]()
-    env = Networked(
-        played,
-        uplink=way,
-        downlink=way,
-        thinking=task.thinking_s,
-        player=lambda: Watched(PLAYERS[cell.player][1](), jumps),
-        step_s=task.step_s,
-    )
+    make_player = Newest if name in BOUNDS else PLAYERS[name][1]
+    options: Options = {
+        "uplink": way,
+        "downlink": way,
+        "thinking": task.thinking_s,
+        "player": lambda: Watched(make_player(), jumps),
+        "step_s": task.step_s,
+    }
+    env = Networked(played, **(options | BOUNDS[name][1] if name in BOUNDS else options))
     observation, info = env.reset(seed=cell.seed)
-    is_ours = cell.player in ("clocked", "sparing")
     terminated = truncated = False
+    ready = 0
     while not (terminated or truncated):
-        rows = task.plan(observation, info["committed"] if is_ours else info["committed"][:0])
-        answer = rows[0] if cell.player == "newest" else rows
-        is_queue = cell.player in ("replace", "average")
-        if is_queue and 2 * info["held"] > task.rows:
+        network = info["network"]
+        committed, coming = (
+            network[key][: network[f"{key}_rows"]] for key in ("committed", "coming")
+        )
+        continues = name in ("freshest", "clocked", "sparing")
+        rows = task.plan(observation, committed if continues else committed[:0])
+        answer = rows if name in PLAYERS and name != "newest" else rows[0]
+        if name in ("replace", "average") and 2 * network["held"] > task.rows:
             answer = None
-        if cell.player == "sparing" and not differs(task, rows, info["coming"]):
+        if name == "freshest":
+            step = len(played.rewards)
+            if step < ready or network["held"] > 3 * task.rows / 4:
+                answer = None
+            else:
+                ready = step + network["delay_steps"] + 1
+        if name == "sparing" and not differs(task, rows, coming):
             answer = None
         observation, _, terminated, truncated, info = env.step(answer)
     env.close()
-    steps = len(played.rewards)
+    steps, network = len(played.rewards), info["network"]
     return FlownCell(
         cell,
         task.score(played.rewards, terminated),
-        info["uplink_packets"] / (steps * task.step_s),
-        info["exhausted_steps"] / steps,
+        network["uplink_packets"] / (steps * task.step_s),
+        network["exhausted_steps"] / steps,
         float(np.mean(jumps or [0.0])),
     )
 
 
 def cells(tasks: Iterable[str], seeds: int = SEEDS) -> list[Cell]:
     """Cells of each task, with this number of seeds."""
-    kinds = get_args(PlayerName), DELAYS_S, LOSSES, range(1, seeds + 1)
-    return [Cell(*each) for each in product(tasks, *kinds)]
+    numbers = range(1, seeds + 1)
+    bounds = product(tasks, BOUNDS, (0.0,), (0.0,), numbers)
+    kinds = product(tasks, PLAYERS, DELAYS_S, LOSSES, numbers)
+    return [Cell(*each) for each in (*bounds, *kinds)]
 
 
 def tables(flights: Sequence[FlownCell]) -> dict[str, TextTable]:
-    """For each task a table of the mean score and packets a second, and one of stalls and jumps."""
+    """The bounds; and for each task a table of the mean score and packets a second, and one of
+    stalls and jumps.
+    """
     found: dict[tuple[Any, ...], list[FlownCell]] = {}
     for each in flights:
         found.setdefault(each.cell[:-1], []).append(each)
     shown = {}
-    for task in dict.fromkeys(key[0] for key in found):
-        networks = list(dict.fromkeys(key[2:] for key in found))
-        headings = ["delay, loss each way", *(PLAYERS[name][0] for name in get_args(PlayerName))]
+    tasks = list(dict.fromkeys(key[0] for key in found))
+    if any(key[1] in BOUNDS for key in found):
+        headings = ["task", *(title for title, _ in BOUNDS.values())]
+        bounds = [
+            [TASKS[task].title, *(_mean(found[task, name, 0.0, 0.0]) for name in BOUNDS)]
+            for task in tasks
+        ]
+        shown["players bounds"] = TextTable(headings, bounds)
+    for task in tasks:
+        networks = list(dict.fromkeys(key[2:] for key in found if key[1] in PLAYERS))
+        headings = ["delay, loss each way", *(title for title, _ in PLAYERS.values())]
         for kind, text in (("scores", _score), ("stalls", _stalls)):
             rows = []
             for delay_s, loss in networks:
                 row = [f"{1e3 * delay_s:g} ms, {loss:.0%}"]
-                row += [text(found[task, name, delay_s, loss]) for name in get_args(PlayerName)]
+                row += [text(found[task, name, delay_s, loss]) for name in PLAYERS]
                 rows.append(row)
             shown[f"players {task} {kind}"] = TextTable(headings, rows)
     return shown
 
 
-def _score(flown: Sequence[FlownCell]) -> str:
-    """Mean score with half of its 95 % interval, and packets a second."""
+def _mean(flown: Sequence[FlownCell]) -> str:
+    """Mean score with half of its 95 % interval."""
     middle, half = interval([each.score for each in flown])
     assert middle is not None
     digits = 2 if abs(middle) < 10 else 0
-    packets = np.mean([each.packets_per_s for each in flown])
-    return f"{middle:.{digits}f} ± {half or 0.0:.{digits}f}, {packets:.1f}/s"
+    return f"{middle:.{digits}f} ± {half or 0.0:.{digits}f}"
+
+
+def _score(flown: Sequence[FlownCell]) -> str:
+    """Mean score, and packets a second."""
+    return f"{_mean(flown)}, {np.mean([each.packets_per_s for each in flown]):.1f}/s"
 
 
 def _stalls(flown: Sequence[FlownCell]) -> str:
@@ -303,11 +348,23 @@ def _stalls(flown: Sequence[FlownCell]) -> str:
     return f"{stalled:.1%}, {jump:.2g}"
 
 
-STYLES = "C7s:", "C1^--", "C3v--", "C0o-", "C2D-"
+STYLES = "C7s:", "C1^--", "C3v--", "C4<--", "C0o-", "C2D-"
+BOUND_STYLES = ":", "--"
+
+
+def _mean_score(
+    flights: Sequence[FlownCell],
+    task: str,
+    name: str,
+    delay_s: float,
+    loss: float,
+) -> float:
+    at = task, name, delay_s, loss
+    return float(np.mean([each.score for each in flights if each.cell[:4] == at]))
 
 
 def draw(flights: Sequence[FlownCell], path: Path) -> None:
-    """Score over the delay, a panel for each task and loss, a line for each player."""
+    """Score over the delay, a panel for each task and loss, a line for each player and bound."""
     import matplotlib.pyplot as plt
 
     tasks = list(dict.fromkeys(each.cell.task for each in flights))
@@ -320,19 +377,24 @@ def draw(flights: Sequence[FlownCell], path: Path) -> None:
         layout="constrained",
     )
     for (task, loss), panel in zip(product(tasks, LOSSES), panels.flat, strict=True):
-        for name, style in zip(get_args(PlayerName), STYLES, strict=True):
-            means = [
-                np.mean([f.score for f in flights if f.cell[:4] == (task, name, delay_s, loss)])
-                for delay_s in DELAYS_S
-            ]
-            panel.plot(np.array(DELAYS_S) * 1e3, means, style, markersize=4, label=PLAYERS[name][0])
+        for (name, (title, _)), style in zip(PLAYERS.items(), STYLES, strict=True):
+            means = [_mean_score(flights, task, name, delay_s, loss) for delay_s in DELAYS_S]
+            panel.plot(np.array(DELAYS_S) * 1e3, means, style, markersize=4, label=title)
+        for (name, (title, _)), style in zip(BOUNDS.items(), BOUND_STYLES, strict=True):
+            panel.axhline(
+                _mean_score(flights, task, name, 0.0, 0.0),
+                color="black",
+                linestyle=style,
+                linewidth=1,
+                label=title,
+            )
         panel.set_title(f"{TASKS[task].title}, {loss:.0%} lost", fontsize=10)
         panel.grid(alpha=0.3)
     for panel in panels[-1]:
         panel.set_xlabel("delay each way [ms]")
     for panel in panels[:, 0]:
         panel.set_ylabel("score")
-    figure.legend(*panels[0, 0].get_legend_handles_labels(), loc="outside upper center", ncols=5)
+    figure.legend(*panels[0, 0].get_legend_handles_labels(), loc="outside upper center", ncols=4)
     with files.replacing(path) as file:
         figure.savefig(file, format=path.suffix[1:], dpi=110)
     plt.close(figure)

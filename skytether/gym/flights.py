@@ -15,6 +15,7 @@ from typing import Any
 import gymnasium
 import msgspec
 import numpy as np
+from gymnasium.error import ResetNeeded
 from gymnasium.spaces import Box, Discrete
 from numpy.typing import NDArray
 from pettingzoo import ParallelEnv
@@ -167,7 +168,8 @@ class Target(gymnasium.Env[NDArray[np.float32], Any]):
 
     def step(self, action: Any) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
         flight = self._flight
-        assert flight is not None, "reset comes first"
+        if flight is None:
+            raise ResetNeeded("step: called before reset, which gives the first observation")
         value = float(np.asarray(action).reshape(-1)[0])
         flight.thresholds[0] = (-1.0 if value else np.inf) if self._is_sending else value
         before = int(flight.trigger.sent_packets[0])
@@ -230,7 +232,8 @@ class Crowd(ParallelEnv):  # type: ignore[misc]  # it ships no types
 
     def step(self, actions: dict[str, Any]) -> tuple[Any, Any, Any, Any, Any]:
         flight = self._flight
-        assert flight is not None, "reset comes first"
+        if flight is None:
+            raise ResetNeeded("step: called before reset, which gives the first observation")
         for number, agent in enumerate(self.possible_agents):
             flight.thresholds[number] = -1.0 if actions.get(agent) else np.inf
         before = flight.trigger.sent_packets.copy()

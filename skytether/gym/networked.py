@@ -10,20 +10,26 @@ With `thinking = "measured"` the time between two calls is charged. That is the 
 read here.
 """
 
+import math
 from collections.abc import Callable, Sequence
+from copy import deepcopy
+from numbers import Integral, Real
 from time import perf_counter_ns
 from typing import Any, Literal, TypedDict, Unpack
 
 import gymnasium
 import numpy as np
-from gymnasium.spaces import Box
+from gymnasium.error import ResetNeeded
+from gymnasium.spaces import Tuple
 from gymnasium.utils import RecordConstructorArgs
 from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
-from numpy.typing import NDArray
+from gymnasium.vector.utils import concatenate, create_empty_array, iterate
 
 from skytether.gym.players import Chunk, Clocked, Player, Row
-from skytether.gym.remote import ROWS_MAX, Network, Remote
+from skytether.gym.remote import PART_BYTES, ROWS_MAX, Network, Remote
+from skytether.gym.spaces import Space, idle, no_rows, observed, size_of, to_action, to_rows
 from skytether.netem.fate import Fates
+from skytether.netem.link import QUEUE_BYTES_MAX
 from skytether.shared.base.chance import stream
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.base.units import seconds_to_ns
@@ -32,11 +38,18 @@ from skytether.shared.scenario.air.draws import SLOT_NS
 from skytether.shared.scenario.air.path import Path, path
 from skytether.shared.scenario.grammar import GrammarError
 
-Answer = NDArray[Any] | Chunk | None
-"""An action, rows of actions from the step of the observation shown on, a `Chunk`, or nothing."""
-Exhausted = Literal["hold", "zero"] | Callable[[NDArray[Any], Row | None], Any]
-"""Rule when rows have run out: the last row again, zeros, or a function of the robot's present
-observation and the last row (None before the first), which returns an action."""
+MTU = 1472
+"""Largest UDP payload of a datagram that fits into 1500 B with headers [B]."""
+KEY = "network"
+"""Key of `info` under which everything of the network stands."""
+Answer = Any
+"""An action, actions for successive steps from that of the observation shown on (as the action, but
+with one axis more in front of each array), a `Chunk` of them, or None: nothing."""
+Exhausted = Literal["hold", "zero"] | Callable[[Any, Any], Any]
+"""Rule when rows have run out: the last action again, the action `idle`, or a function of the
+robot's present observation and its last action (None before the first), which returns an action."""
+Compress = Callable[[Any], bytes | int]
+"""What an observation is sent as, or the size of that [B]."""
 
 
 class Options(TypedDict, total=False):
@@ -50,18 +63,36 @@ class Options(TypedDict, total=False):
     """Time that an answer takes [s], a distribution of it such as "gamma(20ms, 80ms, 30ms)", or
     "measured": the time that passes until `step` is called."""
     price: float
-    """Cost of a packet with an answer, subtracted from the reward."""
+    """Cost of each datagram with an answer, subtracted from the reward."""
     seed: int
     """Seed of the network. `reset(seed=…)` starts its random numbers anew, others with another
     seed; each further `reset` draws those of the next episode."""
     exhausted: Exhausted
-    """What the robot plays when rows have run out: "hold", "zero", or a function."""
+    """What the robot plays when rows have run out: "hold" (the last action), "zero" (`idle`), or a
+    function."""
+    idle: Any
+    """Action before the first has arrived, and that of "zero"; by default zeros, or what in the
+    action space is closest to them."""
     player: Callable[[], Player]
     """Makes the robot's rule for the row to play, for each episode."""
     step_s: float | None
     """Length of a step [s]; None: by the environment's `render_fps`."""
     clock_ns: Callable[[], int]
     """Clock for "measured" [ns]."""
+    mtu: int
+    """Largest UDP payload of a datagram [B], to which 28 B of headers are added. An observation or
+    an answer that is longer takes several, and has arrived when all have."""
+    compress: Compress | None
+    """Function that gives an observation's compressed bytes, or their number. The agent sees the
+    observation itself."""
+    shown_rows: int
+    """Number of rows in `coming` and `committed`."""
+
+
+ORACLE: Options = {"uplink": "none", "downlink": "none", "thinking": 0.0, "price": 0.0}
+"""Bound of what any player can reach: no network at all."""
+NOTHING_SENT: Options = {"uplink": "loss(1)", "price": 0.0}
+"""Bound of what a robot reaches without a network: no answer arrives."""
 
 
 class _Far:
@@ -69,8 +100,8 @@ class _Far:
 
     def __init__(
         self,
-        action: Any,
-        observation: Any,
+        action: Space,
+        observation: Space,
         metadata: dict[str, Any],
         count: int,
         *,
@@ -80,73 +111,91 @@ class _Far:
         price: float = 0.0,
         seed: int = 1,
         exhausted: Exhausted = "hold",
+        idle: Any = None,
         player: Callable[[], Player] = Clocked,
         step_s: float | None = None,
         clock_ns: Callable[[], int] = perf_counter_ns,
+        mtu: int = MTU,
+        compress: Compress | None = None,
+        shown_rows: int = 64,
     ) -> None:
-        for name, space in (("action", action), ("observation", observation)):
-            if not isinstance(space, Box):
-                raise ConfigError(f"env: got the {name} space {space}, expected a Box")
         if exhausted not in ("hold", "zero") and not callable(exhausted):
             raise ConfigError(
                 f"exhausted: got {exhausted!r}, expected 'hold', 'zero' or a function"
             )
+        for name, each in (("player", player), ("clock_ns", clock_ns), ("compress", compress)):
+            if not callable(each) and (name, each) != ("compress", None):
+                raise ConfigError(f"{name}: got {each!r}, expected a function")
         step_s = 1.0 / metadata.get("render_fps", np.nan) if step_s is None else step_s
-        if not step_s >= 1e-3:
-            raise ConfigError(f"step_s: got {step_s!r}, expected at least 0.001 s")
+        self.price = _number("price", price, 0.0, math.inf)
+        self.step_ns = seconds_to_ns(_number("step_s", step_s, 1e-3, 86_400.0))
+        self.seed = _whole("seed", seed, 0, 2**63 - 1)
+        self._mtu = _whole("mtu", mtu, 2 * PART_BYTES, 65_507)
+        self._shown = _whole("shown_rows", shown_rows, 1, 4096)
         self.ways = _path("uplink", uplink), _path("downlink", downlink)
         self.thinking = None if thinking == "measured" else _thinking(thinking)
-        self.price, self.seed, self.count = price, seed, count
-        self.step_ns = seconds_to_ns(step_s)
-        self.space, self._exhausted, self._player = action, exhausted, player
-        self._observation = np.zeros(observation.shape, observation.dtype)
-        self._zero = np.clip(np.zeros(action.shape, action.dtype), action.low, action.high)
+        self.count, self.space, self._observation = count, action, observation
+        self._none = no_rows(action)
+        self._idle = self._idle_row(idle)
+        self._exhausted, self._player, self._compress = exhausted, player, compress
         self._clock_ns, self._returned_ns = clock_ns, 0
         self._episode = 0
         self._network_seed = seed
-        self._present: list[NDArray[Any]] = []
-        self.remote: Remote
+        self._present: list[Any] = []
+        self.remote: Remote | None = None
         self._thoughts: Fates
 
-    def restart(self, seed: int | None, observations: Sequence[NDArray[Any]]) -> None:
+    def _idle_row(self, given: Any) -> Row:
+        try:
+            (row,) = to_rows(self.space, idle(self.space) if given is None else given, "idle")
+        except ValueError as error:
+            raise ConfigError(str(error)) from None
+        return row
+
+    def restart(self, seed: int | None, observations: Sequence[Any]) -> None:
         """Begin an episode of all robots; with a seed, that of a first episode."""
         self._episode += 1
         if seed is not None:
             self._network_seed = int(stream(self.seed, "network", seed).integers(2**32))
             self._episode = 0
         mixed = int(stream(self._network_seed, "episode", self._episode).integers(2**32))
-        network = Network(*self.ways, mixed)
-        zero, like = self._zero, self._observation
+        network = Network(*self.ways, mixed, self._mtu)
         self.remote = Remote(
-            network, self._player, self.step_ns, zero, like, self._fill, self.count
+            network, self._player, self.step_ns, self._none, self._shown, self._fill, self.count
         )
         if self.thinking is not None:
             self._thoughts = Fates(self.thinking, mixed, "thinking", 0)
         self.begin(range(self.count), observations)
 
-    def begin(self, robots: Sequence[int], observations: Sequence[NDArray[Any]]) -> None:
-        self._present = list(self._present) or list(observations)
-        for index, observation in zip(robots, observations, strict=True):
+    def begun(self) -> Remote:
+        """Robots and network; raises ResetNeeded before the first episode."""
+        if self.remote is None:
+            raise ResetNeeded("step: called before reset, which gives the first observation")
+        return self.remote
+
+    def begin(self, robots: Sequence[int], observations: Sequence[Any]) -> None:
+        seen = [observed(self._observation, each) for each in observations]
+        self._present = list(self._present) or seen
+        for index, observation in zip(robots, seen, strict=True):
             self._present[index] = observation
-        self.remote.begin([np.array(each) for each in observations], robots)
+        self.begun().begin(seen, robots)
 
     def chunk(self, answer: Answer, thought_ns: int) -> Chunk:
         """Answer as rows of the action's dtype, with the time that it took.
 
         Raises:
-            ValueError: the rows are not finite, too many, or of another shape.
+            ValueError: the rows are no actions of the space, or too many.
         """
-        first, rows, shape = None, answer, self.space.shape
+        first, given = None, answer
         if isinstance(answer, Chunk):
-            first, rows = answer.first, answer.rows
+            first, given = answer.first, answer.rows
             thought_ns = thought_ns if answer.thought_ns is None else answer.thought_ns
-        rows = np.zeros((0, *shape)) if rows is None else np.asarray(rows)
-        rows = np.ascontiguousarray(rows[None] if rows.shape == shape else rows, self.space.dtype)
-        if rows.shape[1:] != shape or len(rows) > ROWS_MAX:
-            expected = f"{shape}, or (n, *{shape}) with n of at most {ROWS_MAX}"
-            raise ValueError(f"action: got the shape {rows.shape}, expected {expected}")
-        if not np.isfinite(rows).all():
-            raise ValueError("action: got infinity or NaN, expected finite numbers")
+        if given is None:
+            return Chunk(self._none, first, thought_ns)
+        rows = to_rows(self.space, given, "action")
+        if len(rows) > ROWS_MAX:
+            raise ValueError(f"action: got {len(rows)} rows, expected at most {ROWS_MAX}")
+        rows.setflags(write=False)  # the robot plays these very rows
         return Chunk(rows, first, thought_ns)
 
     def thought_ns(self, *, is_nothing: bool) -> int:
@@ -155,30 +204,50 @@ class _Far:
             return self._clock_ns() - self._returned_ns
         if is_nothing:
             return 0
-        return self._thoughts.at(self.remote.now_ns // SLOT_NS).delay_ns
+        return self._thoughts.at(self.begun().now_ns // SLOT_NS).delay_ns
 
-    def played(self) -> list[Row]:
+    def played(self) -> list[Any]:
         """Action of each robot at the present step."""
-        rows = self.remote.rows()
-        return [self._rule(i) if row is None else row for i, row in enumerate(rows)]
+        rows = self.begun().rows()
+        return [
+            to_action(self.space, self._rule(i) if row is None else self._row(row, "player's row"))
+            for i, row in enumerate(rows)
+        ]
+
+    def _row(self, given: Any, name: str) -> Row:
+        """Row that a function of the user returned; raises ValueError if it is none."""
+        if (np.shape(given), getattr(given, "dtype", None)) == (self._idle.shape, self._idle.dtype):
+            return given
+        (row, *others) = to_rows(self.space, given, name)
+        if others:
+            raise ValueError(f"{name}: got {1 + len(others)} actions, expected one")
+        return row
 
     def _fill(self, last: Row | None) -> Row | None:
         if callable(self._exhausted):
             return None
-        return self._zero if last is None or self._exhausted == "zero" else last
+        return self._idle if last is None or self._exhausted == "zero" else last
 
     def _rule(self, index: int) -> Row:
-        last = self.remote.last(index)
+        last = self.begun().last(index)
         if callable(self._exhausted):
-            row = np.asarray(self._exhausted(self._present[index], last), self.space.dtype)
-            return row.reshape(self.space.shape)
+            action = None if last is None else to_action(self.space, last)
+            return self._row(self._exhausted(self._present[index], action), "exhausted")
         fill = self._fill(last)
         assert fill is not None
         return fill
 
-    def advance(self, observations: Sequence[NDArray[Any]]) -> None:
-        self._present = list(observations)
-        self.remote.advance([np.asarray(each, self._observation.dtype) for each in observations])
+    def advance(self, observations: Sequence[Any]) -> None:
+        self._present = [observed(self._observation, each) for each in observations]
+        self.begun().advance(self._present, [self._size(each) for each in self._present])
+
+    def _size(self, observation: Any) -> int:
+        """Size of an observation as it is sent [B]."""
+        if self._compress is None:
+            return size_of(observation)
+        sent = self._compress(observation)
+        size = len(sent) if isinstance(sent, bytes | bytearray | memoryview) else sent
+        return _whole("compress", size, 0, QUEUE_BYTES_MAX)
 
     def returns(self) -> None:
         """Note that the agent is asked now."""
@@ -192,13 +261,15 @@ class Networked(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         env = Networked(gymnasium.make("Pendulum-v1"), uplink="constant(50ms) & loss(10%)")
 
     `reset` gives the first observation at once. Then the agent sees the newest observation that
-    has arrived. It answers with an action, with an array of actions for successive steps from that
-    observation on, with a `Chunk`, or with None: nothing is sent. `info` says what arrived, what
-    the robot holds, and what was sent, see docs/gym.md. The reward is the sum over the steps that
-    have passed, minus `price` for a packet. The end of an episode is known at once.
+    has arrived. It answers with an action, with actions for successive steps from that observation
+    on, with a `Chunk`, or with None: nothing is sent. `info["network"]` says what arrived, what the
+    robot holds, and what was sent, see docs/gym.md; the rest of `info` is the environment's own.
+    The reward is the sum over the steps that have passed, minus `price` for each datagram. The end
+    of an episode is known at once.
 
     Args:
-        env: environment with a Box of observations and one of actions.
+        env: environment whose actions are of Box, Discrete, MultiBinary, MultiDiscrete or Text,
+            alone or within Dict or Tuple; its observations may be of any space.
         options: see `Options`.
 
     Raises:
@@ -215,36 +286,40 @@ class Networked(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     ) -> tuple[Any, dict[str, Any]]:
         observation, info = self.env.reset(seed=seed, options=options)
         self._far.restart(seed, [observation])
-        info = info | self._far.remote.info(0)
+        info = _joined(info, self._far.begun().info(0))
         self._far.returns()
         return observation, info
 
     def step(self, action: Answer) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        far, remote = self._far, self._far.remote
+        far, remote = self._far, self._far.begun()
         answer = far.chunk(action, far.thought_ns(is_nothing=action is None))
         assert answer.thought_ns is not None
-        free_ns, before, reward = remote.now_ns + answer.thought_ns, remote.step, 0.0
+        free_ns, reward = remote.now_ns + answer.thought_ns, 0.0
         if len(answer.rows):
-            remote.answer(0, answer, free_ns)
-            reward -= far.price
+            reward -= far.price * remote.answer(0, answer, free_ns)
+        rewards, infos = list[float](), list[dict[str, Any]]()
         while True:
-            (row,) = far.played()
-            observation, gained, terminated, truncated, info = self.env.step(row)
+            (played,) = far.played()
+            observation, gained, terminated, truncated, info = self.env.step(played)
             reward += float(gained)
+            rewards.append(float(gained))
+            infos.append(dict(info))
             far.advance([observation])
             if terminated or truncated or remote.now_ns >= free_ns:
                 break
-        info = info | remote.info(0) | {"answer": answer, "steps": remote.step - before}
+        passed = {"answer": answer, "steps": len(infos), "rewards": rewards, "infos": infos}
+        info = _joined(info, remote.info(0) | passed)
         far.returns()
-        return remote.report(0).observation.copy(), reward, terminated, truncated, info
+        return deepcopy(remote.report(0).observation), reward, terminated, truncated, info
 
 
 class NetworkedVector(VectorWrapper[Any, Any, Any, Any, Any]):
     """`Networked` for a vector environment, whose robots share both directions of the network.
 
     One agent answers all robots at once, so its thinking time is that of all answers together.
-    `step` takes one answer for each robot, or an array of actions; it returns early at the step at
-    which an episode ends, and the next call starts that robot's next one, as the environment does.
+    `step` takes a list of one answer for each robot, or actions of the environment's own
+    `action_space`; it returns early at the step at which an episode ends, and the next call starts
+    that robot's next one, as the environment does.
 
     Args:
         env: vector environment that starts an episode in the step after an end (gymnasium's
@@ -266,49 +341,90 @@ class NetworkedVector(VectorWrapper[Any, Any, Any, Any, Any]):
     ) -> tuple[Any, dict[str, Any]]:
         observations, info = self.env.reset(seed=seed, options=options)
         self._ended[:] = False
-        self._far.restart(seed, list(observations))
-        info = self._with_infos(info)
+        self._far.restart(seed, self._each(observations))
+        info = _joined(info, self._infos())
         self._far.returns()
         return observations, info
 
-    def step(self, actions: Sequence[Answer]) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
-        far, remote, count = self._far, self._far.remote, self.num_envs
-        if len(actions) != count:
-            raise ValueError(
-                f"actions: got {len(actions)}, expected one for each of {count} robots"
-            )
-        thought_ns = far.thought_ns(is_nothing=all(each is None for each in actions))
-        answers = [far.chunk(each, thought_ns) for each in actions]
-        thought_ns = max(each.thought_ns or 0 for each in answers)
-        free_ns, before = remote.now_ns + thought_ns, remote.step
+    def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+        far, remote, count = self._far, self._far.begun(), self.num_envs
+        answers = self._answers(actions)
+        thought_ns = far.thought_ns(is_nothing=all(each is None for each in answers))
+        chunks = [far.chunk(each, thought_ns) for each in answers]
+        free_ns = remote.now_ns + max(each.thought_ns or 0 for each in chunks)
         reward = np.zeros(count)
-        for index, answer in enumerate(answers):
-            if len(answer.rows) and not self._ended[index]:
-                remote.answer(index, answer, free_ns)
-                reward[index] -= far.price
+        for index, chunk in enumerate(chunks):
+            if len(chunk.rows) and not self._ended[index]:
+                reward[index] -= far.price * remote.answer(index, chunk, free_ns)
+        rewards, infos = [], []
         while True:
-            observations, gained, terminated, truncated, info = self.env.step(
-                np.array(far.played())
-            )
+            played = _batch(self.single_action_space, far.played())
+            observations, gained, terminated, truncated, info = self.env.step(played)
             reward += gained
-            far.advance(list(observations))
+            rewards.append(np.array(gained))
+            infos.append(dict(info))
+            each = self._each(observations)
+            far.advance(each)
             began = np.flatnonzero(self._ended)
-            far.begin(began.tolist(), [observations[index] for index in began])
+            far.begin(began.tolist(), [each[index] for index in began])
             self._ended = terminated | truncated
             if self._ended.any() or remote.now_ns >= free_ns:
                 break
-        info = self._with_infos(info) | {"answer": answers, "steps": remote.step - before}
+        passed = {"answer": chunks, "steps": len(infos), "infos": infos}
+        info = _joined(info, self._infos() | passed | {"rewards": np.stack(rewards, axis=1)})
         far.returns()
-        seen = np.stack([remote.report(index).observation for index in range(count)])
-        return seen, reward, terminated, truncated, info
+        seen = [remote.report(index).observation for index in range(count)]
+        return (_batch(self.single_observation_space, seen), reward, terminated, truncated, info)
 
-    def _with_infos(self, info: dict[str, Any]) -> dict[str, Any]:
-        """Infos of all robots: a list for each name, of the network as a whole one number."""
-        each = [self._far.remote.info(index) for index in range(self.num_envs)]
-        return info | {name: [one[name] for one in each] for name in each[0]}
+    def _answers(self, actions: Any) -> list[Answer]:
+        """One answer for each robot."""
+        space = self.single_action_space
+        if isinstance(actions, dict) or (isinstance(space, Tuple) and isinstance(actions, tuple)):
+            answers = list(iterate(self.action_space, actions))
+        else:
+            answers = list(actions)
+        if len(answers) != self.num_envs:
+            expected = f"one for each of {self.num_envs} robots"
+            raise ValueError(f"actions: got {len(answers)}, expected {expected}")
+        return answers
+
+    def _each(self, observations: Any) -> list[Any]:
+        return list(iterate(self.observation_space, observations))
+
+    def _infos(self) -> dict[str, Any]:
+        """Entries of all robots as arrays with a row for each."""
+        each = [self._far.begun().info(index) for index in range(self.num_envs)]
+        return {name: np.array([one[name] for one in each]) for name in each[0]}
+
+
+def _batch(space: Space, each: Sequence[Any]) -> Any:
+    """Actions or observations of a vector environment."""
+    empty: Any = create_empty_array(space, len(each))
+    return concatenate(space, each, empty)
+
+
+def _joined(info: dict[str, Any], own: dict[str, Any]) -> dict[str, Any]:
+    if KEY in info:
+        raise ConfigError(f"env: got {KEY!r} in its own info, expected an env without a network")
+    return info | {KEY: own}
+
+
+def _number(key: str, value: Any, low: float, high: float) -> float:
+    if not isinstance(value, Real) or not low <= float(value) <= high or value == math.inf:
+        expected = f"a finite number from {low:g}" + (f" to {high:g}" if high < math.inf else "")
+        raise ConfigError(f"{key}: got {value!r}, expected {expected}")
+    return float(value)
+
+
+def _whole(key: str, value: Any, low: int, high: int) -> int:
+    if not isinstance(value, Integral) or not low <= int(value) <= high:
+        raise ConfigError(f"{key}: got {value!r}, expected a whole number from {low} to {high}")
+    return int(value)
 
 
 def _path(key: str, text: str) -> Path:
+    if not isinstance(text, str):
+        raise ConfigError(f"{key}: got {text!r}, expected impairments such as 'loss(10%)'")
     try:
         return path(text, reading.files_of("network.uplink", text, key))
     except GrammarError as error:

@@ -1,8 +1,8 @@
 """Players: the robot's end of a link, which decides what is played at each step of the environment.
 
 An agent sends chunks: rows of actions for coming steps. Packets are late, lost and overtaken, so
-the robot needs a rule for the row of the present step. `Clocked` is Skytether's. `Newest` and
-`Queue` are what is common elsewhere, from public descriptions, to compare with.
+the robot needs a rule for the row of the present step. `Clocked` is Skytether's. `Newest`, `Queue`
+and `Freshest` are what is common elsewhere, from public descriptions, to compare with.
 
 A player stores tuples only: a copy of one is a snapshot of what the robot holds.
 """
@@ -12,11 +12,15 @@ from typing import Any, Literal, NamedTuple
 
 from numpy.typing import NDArray
 
+from skytether.shared.base.errors import ConfigError
+
 Row = NDArray[Any]
-"""Action of one step, of the shape of the action space."""
+"""Action of one step; of a Dict or a Tuple a record, see `gym.spaces`."""
 
 HELD_MAX = 16
 """Largest number of chunks that a player holds; the oldest are dropped."""
+ROWS_HELD_MAX = 4096
+"""Largest number of rows that `Freshest` holds; the last are dropped."""
 NEWER_WEIGHT = 0.7
 """Weight of the newer row in an average, as LeRobot's default."""
 
@@ -25,7 +29,7 @@ class Chunk(NamedTuple):
     """Answer of an agent."""
 
     rows: NDArray[Any]
-    """Actions of successive steps; shape (n, *action). With n = 0 nothing is sent."""
+    """Actions of successive steps; shape (n, *row). With n = 0 nothing is sent."""
     first: int | None = None
     """Step of the first row, as the player counts steps; None: that of the observation shown."""
     thought_ns: int | None = None
@@ -114,6 +118,9 @@ class Queue(Player):
 
     Args:
         merge: what happens where both have a row.
+
+    Raises:
+        ConfigError: rows that are no real numbers, as of a Discrete, are to be averaged.
     """
 
     def __init__(self, merge: Literal["replace", "average"] = "replace") -> None:
@@ -127,6 +134,9 @@ class Queue(Player):
     def accept(self, chunk: Held, step: int) -> None:  # noqa: ARG002
         rows = chunk.rows[max(0, self.played - chunk.first) :]
         first = max(chunk.first, self.played)
+        if self.merge == "average" and rows.dtype.kind != "f":
+            expected = "real numbers: those of a Box, or merge='replace'"
+            raise ConfigError(f"player: got rows of {rows.dtype} to average, expected {expected}")
         if self.merge == "average" and self.held:
             queued = self.held[0]
             rows = rows.copy()
@@ -145,4 +155,38 @@ class Queue(Player):
         self.held = (Held(generation, first + 1, rows[1:]),)
         self.played += 1
         self.last = rows[0]
+        return self.last
+
+
+class Freshest(Player):
+    """Schedule of rows, of each step the freshest, as DRTC (distributed real-time chunking) has it.
+
+    Steps are counted by rows played, as in `Queue`. A chunk that is not newer than the newest so
+    far is ignored. Of a newer one, rows that were played are skipped; the others replace those of
+    the same steps, and rows of other steps stay.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.newest = 0
+        self.played = 0
+
+    def number(self, step: int) -> int:  # noqa: ARG002
+        return self.played
+
+    def accept(self, chunk: Held, step: int) -> None:  # noqa: ARG002
+        generation, first, rows = chunk
+        if generation <= self.newest:
+            return
+        self.newest = generation
+        by_number = {each.first: each for each in self.held}
+        for at in range(max(first, self.played), first + len(rows)):
+            by_number[at] = Held(generation, at, rows[at - first : at - first + 1])
+        self.held = tuple(by_number[at] for at in sorted(by_number)[:ROWS_HELD_MAX])
+
+    def row(self, step: int) -> Row | None:  # noqa: ARG002
+        if not self.held:
+            return None
+        (_, number, rows), *_ = self.held
+        self.held, self.played, self.last = self.held[1:], number + 1, rows[0]
         return self.last

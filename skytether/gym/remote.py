@@ -1,16 +1,18 @@
 """Robots and the agents far from them, over one network in virtual time.
 
 At each step a robot reports what it observes (downlink), and the agent may answer with a chunk of
-actions (uplink). Both are packets of bytes with a checksum, whose fates are netem's. All robots
-share the two directions, so also their finite rates.
+actions (uplink). Each of these messages is a datagram, or several if it is longer than one may be;
+it has arrived when all of them have. Their fates are netem's. All robots share the two directions,
+so also their finite rates.
+
+Only the size of a datagram matters to a network, so its bytes are zeros, and the message rides
+along. A datagram with a flipped bit is dropped, as by a checksum.
 """
 
-import zlib
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from copy import copy
 from dataclasses import dataclass
-from struct import Struct
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -29,17 +31,17 @@ from skytether.shared.telemetry.record import DOWNLINK, UPLINK
 
 ROWS_MAX = 1024
 """Largest number of rows of a chunk."""
-SHOWN_ROWS_MAX = 64
-"""Largest number of rows in `info["coming"]`, unless more are committed."""
 UNDER_WAY_MAX = 4096
 """Number of newest reports and answers that the agent remembers, each way."""
 DELAY_STEPS_MAX = 4096
-_ANSWER = Struct("<IIqH")
-"""Session, generation, step of the first row, number of rows."""
-_REPORT = Struct("<IqqIq")
-"""Session, step, the player's number of the step, newest generation held or 0, and the step at
-which it came."""
-_SUM = Struct("<I")
+ANSWER_BYTES = 22
+"""Size of an answer without its rows [B]: session, generation, step of the first row (8 B), number
+of rows (2 B), checksum; 4 B each unless stated."""
+REPORT_BYTES = 36
+"""Size of a report without its observation [B]: session, step (8 B), the player's number of the
+step (8 B), newest generation held, the step at which it came (8 B), checksum."""
+PART_BYTES = 12
+"""Size of what each datagram of several has of its own [B]: message, number and count, as RTP."""
 
 
 class Network(NamedTuple):
@@ -48,6 +50,8 @@ class Network(NamedTuple):
     downlink: Path
     """From robot to agent."""
     seed: int
+    mtu: int
+    """Largest UDP payload of a datagram [B]."""
 
 
 class Report(NamedTuple):
@@ -60,7 +64,22 @@ class Report(NamedTuple):
     """Newest generation that the robot held; 0 for none."""
     since: int
     """Step at which that generation came."""
-    observation: NDArray[Any]
+    observation: Any
+
+
+@dataclass(slots=True)
+class Message:
+    session: int
+    content: Held | Report
+    missing: set[int]
+    """Numbers of the datagrams that have not arrived."""
+
+
+class Part(bytes):
+    """Datagram of a message. A copy with a flipped bit is bytes, and no `Part`."""
+
+    message: Message
+    number: int
 
 
 @dataclass(slots=True)
@@ -94,7 +113,8 @@ class Remote:
     Args:
         make_player: called for each robot and episode.
         step_ns: length of a step of the environment [ns].
-        action, observation: arrays of the shapes and dtypes of both.
+        none: no rows of actions; shape (0, *row).
+        shown: number of rows in `coming` and `committed`.
         fill: row that a robot plays without one of its own, from the last row (None before the
             first); None if the agent cannot know.
     """
@@ -104,20 +124,19 @@ class Remote:
         network: Network,
         make_player: Callable[[], Player],
         step_ns: int,
-        action: NDArray[Any],
-        observation: NDArray[Any],
+        none: NDArray[Any],
+        shown: int,
         fill: Callable[[Row | None], Row | None],
         count: int = 1,
     ) -> None:
         self._network, self._make_player, self._step_ns = network, make_player, step_ns
-        self._action, self._observation, self._fill = action, observation, fill
-        self._none = np.zeros((0, *action.shape), action.dtype)
+        self._none, self._shown, self._fill = none, shown, fill
         self.uplink = Link(UPLINK, QUEUE_BYTES_MAX, None, network.uplink)
         self.downlink = Link(DOWNLINK, QUEUE_BYTES_MAX, None, network.downlink)
         self._bound = delay_bound(count, step_ns / SECOND_NS, DELAY_STEPS_MAX, None)
-        self._leaving: list[tuple[int, int, bytes]] = []
-        """Answers that agents still think about: time of sending [ns], robot, packet. A call of
-        `step` adds at most one for each robot, and mostly lasts until they have left."""
+        self._leaving: list[tuple[int, int, Message, int]] = []
+        """Answers that agents still think about: time of sending [ns], robot, message, its size. A
+        call of `step` adds at most one for each robot, and mostly lasts until they have left."""
         self._robots: list[Robot] = []
         self.step = 0
         self._flows = 0
@@ -126,7 +145,7 @@ class Remote:
     def now_ns(self) -> int:
         return self.step * self._step_ns
 
-    def begin(self, observations: Sequence[NDArray[Any]], robots: Sequence[int]) -> None:
+    def begin(self, observations: Sequence[Any], robots: Sequence[int]) -> None:
         """Begin an episode of some robots; each agent is given the first observation at once."""
         for index, observation in zip(robots, observations, strict=True):
             flow = self._flows
@@ -146,15 +165,22 @@ class Remote:
         network = self._network
         return Lane(flow, Fates(getattr(network, way), network.seed, way, flow), self.now_ns)
 
-    def answer(self, index: int, chunk: Chunk, at_ns: int) -> None:
-        """Send rows, of the action's dtype, to a robot at a time from now on [ns]."""
+    def answer(self, index: int, chunk: Chunk, at_ns: int) -> int:
+        """Send rows to a robot at a time from now on [ns]; the number of datagrams."""
         robot, rows = self._robots[index], chunk.rows
         robot.generation += 1
         first = robot.report.number if chunk.first is None else chunk.first
         sent = Held(robot.generation, first, rows)
         _remember(robot.sent, robot.generation, (robot.report.step, sent))
-        head = _ANSWER.pack(robot.session, robot.generation, first, len(rows))
-        self._leaving.append((at_ns, index, _sealed(head + rows.tobytes())))
+        size = ANSWER_BYTES + rows.nbytes
+        count = self._datagrams(size)
+        self._leaving.append((at_ns, index, Message(robot.session, sent, set(range(count))), size))
+        return count
+
+    def _datagrams(self, size: int) -> int:
+        """Number of datagrams of a message."""
+        mtu = self._network.mtu
+        return 1 if size <= mtu else -(-size // (mtu - PART_BYTES))
 
     def rows(self) -> list[Row | None]:
         """Row of each robot for the present step; None where rows have run out."""
@@ -168,53 +194,66 @@ class Remote:
         """Row that a robot holds when rows have run out."""
         return self._robots[index].player.last
 
-    def advance(self, observations: Sequence[NDArray[Any]]) -> None:
-        """Go to the next step, at which the robots observe this."""
+    def advance(self, observations: Sequence[Any], sizes: Sequence[int]) -> None:
+        """Go to the next step, at which the robots observe this, of these sizes [B]."""
         self.step += 1
         self._hear_agents()
-        for index, (robot, observation) in enumerate(zip(self._robots, observations, strict=True)):
+        for index, (robot, observation, size) in enumerate(
+            zip(self._robots, observations, sizes, strict=True)
+        ):
             _remember(robot.snapshots, self.step, copy(robot.player))
             number = robot.player.number(self.step)
-            at = robot.session, self.step, number, robot.acknowledged, robot.since
-            packet = _sealed(_REPORT.pack(*at) + observation.tobytes())
-            self._send(self.downlink, robot.downlink, index, packet, self.now_ns)
+            report = Report(self.step, number, robot.acknowledged, robot.since, observation)
+            whole = REPORT_BYTES + size
+            message = Message(robot.session, report, set(range(self._datagrams(whole))))
+            self._send(self.downlink, robot.downlink, index, message, whole, self.now_ns)
         self._hear_robots()
 
-    def _send(self, link: Link, lane: Lane, index: int, packet: bytes, at_ns: int) -> None:
-        link.accept(make_datagram((packet, ("", index), 0)), lane, now_ns=at_ns)
+    def _send(
+        self, link: Link, lane: Lane, index: int, message: Message, size: int, at_ns: int
+    ) -> None:
+        parts = sorted(message.missing)
+        left = size + (PART_BYTES * len(parts) if len(parts) > 1 else 0)
+        for number in parts:
+            part = Part(min(left, self._network.mtu))
+            part.message, part.number = message, number
+            left -= len(part)
+            link.accept(make_datagram((part, ("", index), 0)), lane, now_ns=at_ns)
         if lane.fates.fault:
             raise ConfigError(lane.fates.fault.splitlines()[-1])
 
+    def _arrived(self, link: Link) -> list[tuple[int, Any]]:
+        """Robot and content of each message whose last datagram arrives."""
+        found = []
+        for part, (_, index), _ in link.release(now_ns=self.now_ns):
+            if not isinstance(part, Part):
+                continue  # a bit was flipped
+            message = part.message
+            message.missing.discard(part.number)
+            if not message.missing and message.session == self._robots[index].session:
+                found.append((index, message.content))
+        return found
+
     def _hear_agents(self) -> None:
         now_ns = self.now_ns
-        for at_ns, index, packet in [each for each in self._leaving if each[0] <= now_ns]:
-            self._send(self.uplink, self._robots[index].uplink, index, packet, at_ns)
+        for at_ns, index, message, size in [each for each in self._leaving if each[0] <= now_ns]:
+            self._send(self.uplink, self._robots[index].uplink, index, message, size, at_ns)
         self._leaving = [each for each in self._leaving if each[0] > now_ns]
-        for packet, (_, index), _ in self.uplink.release(now_ns=now_ns):
-            robot, body = self._robots[index], _opened(packet)
-            if body is None or _ANSWER.unpack_from(body)[0] != robot.session:
-                continue  # corrupted, or of an earlier episode
-            _, generation, first, count = _ANSWER.unpack_from(body)
-            rows = np.frombuffer(body, self._action.dtype, offset=_ANSWER.size)
-            rows = rows.reshape(count, *self._action.shape)
-            robot.player.accept(Held(generation, first, rows), self.step)
-            if generation > robot.acknowledged:
-                robot.acknowledged, robot.since = generation, self.step
+        for index, chunk in self._arrived(self.uplink):
+            robot = self._robots[index]
+            robot.player.accept(chunk, self.step)
+            if chunk.generation > robot.acknowledged:
+                robot.acknowledged, robot.since = chunk.generation, self.step
 
     def _hear_robots(self) -> None:
-        for packet, (_, index), _ in self.downlink.release(now_ns=self.now_ns):
-            robot, body = self._robots[index], _opened(packet)
-            if body is None or _REPORT.unpack_from(body)[0] != robot.session:
-                continue
-            _, step, number, newest, since = _REPORT.unpack_from(body)
-            if step <= robot.report.step:
+        for index, report in self._arrived(self.downlink):
+            robot = self._robots[index]
+            if report.step <= robot.report.step:
                 continue  # overtaken
-            observation = np.frombuffer(body, self._observation.dtype, offset=_REPORT.size)
-            observation = observation.reshape(self._observation.shape).copy()
-            robot.report = report = Report(step, number, newest, since, observation)
+            robot.report = report
             made = robot.sent.get(report.acknowledged)
             _forget_before(robot.sent, report.acknowledged + 1)
-            _forget_before(robot.snapshots, step)
+            _forget_before(robot.snapshots, report.step)
             if made is not None:
                 learn(self._bound, index, report.since - made[0])
 
@@ -227,7 +266,7 @@ class Remote:
         age_steps = self.step - report.step
         # Until an answer was acknowledged, the way there is taken to be as long as the way back.
         delay_steps = int(self._bound.steps[index]) or 2 * age_steps
-        held, coming, committed = self._coming(robot, delay_steps)
+        held, every, settled, until = self._coming(robot, delay_steps)
         up, down = self.uplink.counts, self.downlink.counts
         return {
             "step": report.step,
@@ -236,8 +275,10 @@ class Remote:
             "acknowledged": report.acknowledged,
             "delay_steps": delay_steps,
             "held": held,
-            "coming": coming,
-            "committed": committed,
+            "coming": self._padded(every[:until]),
+            "coming_rows": until,
+            "committed": self._padded(every[:settled]),
+            "committed_rows": settled,
             "exhausted_steps": robot.exhausted,
             "uplink_packets": up.packets,
             "uplink_bytes": up.bytes + HEADER_BYTES * up.packets,
@@ -246,23 +287,30 @@ class Remote:
             "lost": sum(each.lost + each.dropped + each.overflowed for each in (up, down)),
         }
 
-    def _coming(self, robot: Robot, delay_steps: int) -> tuple[int, NDArray[Any], NDArray[Any]]:
-        """Number of rows that a robot held at the observation's step; rows that it plays from then
-        on, until they run out; and those of the first `delay_steps`; shapes (n, *action).
+    def _padded(self, rows: NDArray[Any]) -> NDArray[Any]:
+        """Rows in the shape that they have at each step; vector environments stack them."""
+        padded = np.zeros((self._shown, *rows.shape[1:]), rows.dtype)
+        padded[: len(rows)] = rows
+        return padded
 
-        As the agent can tell: it knows what it sent, the report says what has arrived, and each
-        answer under way is expected `delay_steps` after its observation.
+    def _coming(self, robot: Robot, delay_steps: int) -> tuple[int, NDArray[Any], int, int]:
+        """Rows that a robot plays from the observation's step on, at most `shown`, as the agent can
+        tell: it knows what it sent, the report says what has arrived, and each answer under way is
+        expected `delay_steps` after its observation.
+
+        Returns: number of rows that the robot held at that step, the rows, how many of them are
+        within `delay_steps`, and how many come before rows run out.
         """
         step, rows = robot.report.step, list[Row]()
         if step not in robot.snapshots:
-            return 0, self._none, self._none
+            return 0, self._none, 0, 0
         player, held = copy(robot.snapshots[step]), 0
         alone = copy(player)
-        while held < SHOWN_ROWS_MAX and alone.row(step + held) is not None:
+        while held < self._shown and alone.row(step + held) is not None:
             held += 1
         under_way = [each for each in robot.sent.values() if each[0] + delay_steps > step]
         ran_out: int | None = None
-        for at in range(step, step + max(SHOWN_ROWS_MAX, delay_steps)):
+        for at in range(step, step + self._shown):
             for made, chunk in under_way:
                 if made + delay_steps == at:
                     player.accept(chunk, at)
@@ -273,18 +321,9 @@ class Remote:
                 if row is None or len(rows) >= delay_steps:
                     break
             rows.append(row)
-        every = np.array(rows, dtype=self._action.dtype).reshape(-1, *self._action.shape)
-        return held, every[:ran_out], every[:delay_steps]
-
-
-def _sealed(body: bytes) -> bytes:
-    return body + _SUM.pack(zlib.crc32(body))
-
-
-def _opened(packet: bytes) -> bytes | None:
-    """Packet without its checksum; None if a bit was flipped."""
-    body = packet[: -_SUM.size]
-    return body if _sealed(body) == packet else None
+        every = np.array(rows, dtype=self._none.dtype).reshape(-1, *self._none.shape[1:])
+        settled = min(delay_steps, len(every))
+        return held, every, settled, len(every) if ran_out is None else ran_out
 
 
 def _remember(by_number: OrderedDict[int, Any], number: int, value: object) -> None:

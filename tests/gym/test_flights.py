@@ -5,9 +5,10 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
+from gymnasium.error import ResetNeeded
 from gymnasium.utils.env_checker import check_env
 
-from skytether.gym.flights import Crowd
+from skytether.gym.flights import Crowd, Target
 
 SHORT = {"duration": 3.0, "settle": 0.0}
 
@@ -42,6 +43,13 @@ def test_a_packet_costs_its_price() -> None:
     (one, packets), (other, again) = flown(free, 2, lambda _: 1), flown(paid, 2, lambda _: 1)
     assert packets == again
     assert (one - other) * 60 == pytest.approx(0.5 * packets)
+
+
+def test_a_step_before_the_first_reset_is_refused() -> None:
+    with pytest.raises(ResetNeeded):
+        Target(keys=SHORT).step(1)
+    with pytest.raises(ResetNeeded):
+        Crowd(2, keys=SHORT).step({})
 
 
 @pytest.mark.filterwarnings("ignore::UserWarning")

@@ -5,7 +5,8 @@ from copy import copy
 import numpy as np
 import pytest
 
-from skytether.gym.players import HELD_MAX, Clocked, Held, Newest, Player, Queue
+from skytether.gym.players import HELD_MAX, Clocked, Freshest, Held, Newest, Player, Queue
+from skytether.shared.base.errors import ConfigError
 
 
 def held(generation: int, first: int, *rows: float) -> Held:
@@ -91,3 +92,25 @@ def test_a_queue_averages_where_both_have_a_row() -> None:
     player.accept(held(2, 1, 11.0, 12.0, 13.0), 0)
     assert played(player, range(1)) == [pytest.approx(0.3 * 1.0 + 0.7 * 11.0)]
     assert played(player, range(1, 3)) == [pytest.approx(0.3 * 2.0 + 0.7 * 12.0), 13.0]
+
+
+def test_a_queue_refuses_to_average_what_is_no_real_number() -> None:
+    with pytest.raises(ConfigError, match="player: got rows of int64"):
+        Queue("average").accept(Held(1, 0, np.array([1, 2])), 0)
+
+
+def test_of_each_step_the_freshest_row_is_played_and_the_rest_of_an_older_chunk_stays() -> None:
+    player = Freshest()
+    player.accept(held(1, 0, 10.0, 11.0, 12.0, 13.0, 14.0), 0)
+    assert played(player, range(2)) == [10.0, 11.0]
+    player.accept(held(2, 1, 21.0, 22.0, 23.0), 2)
+    assert player.number(2) == 2
+    assert played(player, range(2, 6)) == [22.0, 23.0, 14.0, None]
+    assert player.number(6) == 5
+
+
+def test_a_chunk_that_was_overtaken_is_ignored_whole() -> None:
+    player = Freshest()
+    player.accept(held(2, 0, 20.0), 0)
+    player.accept(held(1, 0, 10.0, 11.0), 0)
+    assert played(player, range(2)) == [20.0, None]

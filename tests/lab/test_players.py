@@ -6,17 +6,25 @@ import numpy as np
 import pytest
 
 from bench import push_t
-from bench.players import TASKS, Cell, FlownCell, PlayerName, differs, fly_cell, tables
+from bench.players import (
+    BOUNDS,
+    PLAYERS,
+    TASKS,
+    Cell,
+    FlownCell,
+    differs,
+    fly_cell,
+    tables,
+)
 
 
 @pytest.fixture(scope="module")
-def flown() -> dict[PlayerName, FlownCell]:
-    players: tuple[PlayerName, ...] = ("newest", "replace", "average", "clocked", "sparing")
-    return {player: fly_cell(Cell("pendulum", player, 0.1, 0.1, 1)) for player in players}
+def flown() -> dict[str, FlownCell]:
+    return {player: fly_cell(Cell("pendulum", player, 0.1, 0.1, 1)) for player in PLAYERS}
 
 
 def test_a_chunk_by_the_clock_continues_the_last_and_one_of_a_queue_jumps(
-    flown: dict[PlayerName, FlownCell],
+    flown: dict[str, FlownCell],
 ) -> None:
     scores = {player: each.score for player, each in flown.items()}
     assert scores["newest"] < scores["replace"] < scores["clocked"]
@@ -24,13 +32,13 @@ def test_a_chunk_by_the_clock_continues_the_last_and_one_of_a_queue_jumps(
 
 
 def test_when_needed_takes_fewer_packets_for_nearly_the_same(
-    flown: dict[PlayerName, FlownCell],
+    flown: dict[str, FlownCell],
 ) -> None:
     assert flown["sparing"].packets_per_s < 0.5 * flown["clocked"].packets_per_s
     assert flown["sparing"].score == pytest.approx(flown["clocked"].score, rel=0.1)
 
 
-def test_a_flight_is_the_same_each_time(flown: dict[PlayerName, FlownCell]) -> None:
+def test_a_flight_is_the_same_each_time(flown: dict[str, FlownCell]) -> None:
     assert fly_cell(flown["sparing"].cell) == flown["sparing"]
 
 
@@ -42,10 +50,19 @@ def test_a_chunk_differs_by_a_row_beyond_the_tolerance_or_when_rows_run_out() ->
     assert differs(task, coming, coming[:8])
 
 
-def test_the_tables_have_a_row_for_each_network(flown: dict[PlayerName, FlownCell]) -> None:
+def test_the_tables_have_a_row_for_each_network(flown: dict[str, FlownCell]) -> None:
     shown = tables(list(flown.values()))
     assert [len(table.rows) for table in shown.values()] == [1, 1]
     assert shown["players pendulum scores"].rows[0][0] == "100 ms, 10%"
+
+
+def test_every_player_lies_between_the_bounds(flown: dict[str, FlownCell]) -> None:
+    bounds = {name: fly_cell(Cell("pendulum", name, 0.0, 0.0, 1)) for name in BOUNDS}
+    least, most = bounds["nothing"].score, bounds["oracle"].score
+    for name in ("freshest", "clocked", "sparing"):
+        assert least < flown[name].score < most
+    shown = tables([*flown.values(), *bounds.values()])
+    assert shown["players bounds"].rows[0][0] == "Pendulum-v1"
 
 
 def test_a_push_through_the_centre_of_gravity_moves_the_block_and_one_beside_it_turns_it() -> None:

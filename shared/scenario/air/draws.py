@@ -62,9 +62,13 @@ class Stream:
 
     def __init__(self, *names: str | int) -> None:
         # A hash and not a generator: any place can be drawn without drawing those before it.
+        self._names = names
         self._seeded = blake2b(repr(names).encode(), digest_size=_DRAWN.size)
         self._at, self._number, self._pair = -1, -1, (0.0, 0.0)
         """Arguments and result of the last call of `pair`."""
+
+    def __reduce__(self) -> tuple[type["Stream"], tuple[str | int, ...]]:
+        return Stream, self._names  # a hash cannot be pickled
 
     def pair(self, place: int, number: int) -> tuple[float, float]:
         """Two random numbers from 0 to below 1.
