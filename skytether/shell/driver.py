@@ -356,10 +356,11 @@ class Shell:
         is_left, nothing_came = False, list[int]()
         came: list[tuple[int, Datagram]] = []
         for number, batch in list(self._crowded.items()):
-            count = BURST_MAX
+            count, last_ns = BURST_MAX, self._heard_ns
             for read in range(BATCHES_MAX):
-                datagrams = self._read_batch(number, batch)
+                datagrams = self._read_batch(number, batch, last_ns)
                 count = len(datagrams)
+                last_ns = datagrams[-1][0] if datagrams else last_ns
                 if not (count or read):
                     nothing_came.append(number)
                 came += datagrams
@@ -387,17 +388,24 @@ class Shell:
                 self._batches[sock.family] = None
         return self._batches[sock.family]
 
-    def _read_batch(self, number: int, batch: DatagramBatch) -> list[tuple[int, Datagram]]:
-        """Datagrams that one call reads from a socket, each with its arrival time [ns]."""
+    def _read_batch(
+        self, number: int, batch: DatagramBatch, last_ns: int
+    ) -> list[tuple[int, Datagram]]:
+        """Datagrams that one call reads from a socket, each with its arrival time [ns], which does
+        not decrease.
+
+        Args:
+            last_ns: arrival time of the datagram before them [ns].
+        """
         self._stopwatch.start()
         payloads, raws, came_ns = batch.receive(self._sockets[number])
         if not payloads:
             return []
         self._count(number, len(payloads))
-        # Timestamps are of CLOCK_REALTIME, which may have been set; endpoint times must not
-        # decrease.
-        now_ns, last_ns = time.monotonic_ns(), self._heard_ns
-        stamps_ns = [min(max(stamp_ns, last_ns), now_ns) for stamp_ns in came_ns]
+        # Timestamps are of CLOCK_REALTIME, which may have been set, and a socket's first datagrams
+        # have that of their reading; but a socket's datagrams are read as they came.
+        now_ns = time.monotonic_ns()
+        stamps_ns = [last_ns := min(max(stamp_ns, last_ns), now_ns) for stamp_ns in came_ns]
         try:
             peers = self._names_at(number).heard_all(raws)
         except OSError:  # a network interface is gone

@@ -494,6 +494,22 @@ def test_crowded_sockets_are_heard_in_the_order_of_their_stamps(
     assert (last == list(range(40, 80))) == stamped
 
 
+def test_the_datagrams_of_a_socket_stay_in_order_whatever_their_stamps(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Until the kernel begins to stamp, a datagram has the time of its reading."""
+    real = DatagramBatch.receive
+
+    def receive(batch: DatagramBatch, sock: socket.socket) -> Any:
+        payloads, raws, came_ns = real(batch, sock)
+        return payloads, raws, [ns - 1000 * (i % 3) for i, ns in enumerate(came_ns)]
+
+    monkeypatch.setattr(DatagramBatch, "receive", receive)
+    endpoint = send_to_both([[0] * 90] * 3)
+    heard = [int(each.payload) for each in endpoint.heard[1:]]
+    assert heard == sorted(heard)
+
+
 def test_a_quiet_socket_beside_a_crowded_one_shows_no_earlier_time() -> None:
     """A datagram that arrived at the crowded socket before, but is read later, counts as new."""
     endpoint = send_to_both([[0] * 20, [0, 0, 0, 0, 1, 0, 0, 0, 0], [0] * 5 + [1, 1] + [0] * 5])
