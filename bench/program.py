@@ -1,6 +1,6 @@
 """Programs of others under `netem run`: what ping and iperf3 find, beside what was asked for.
 
-They talk to this machine's loopback, through netem and slirp4netns; the uplink is to the program.
+They talk to this machine's loopback, through netem and slirp4netns.
 Needs ping, iperf3, and what `netem run` needs. TCP without impairments is also measured through
 slirp4netns alone, whose own device in a namespace takes the place of netem.
 """
@@ -87,7 +87,7 @@ def round_trip_ms(count: int, *options: str) -> float:
 
 
 def echoes_lost(count: int) -> int:
-    ways = f"--uplink=loss({LOST_UP})", f"--downlink=loss({LOST_DOWN})"
+    ways = f"--to-program=loss({LOST_UP})", f"--from-program=loss({LOST_DOWN})"
     said, _ = run(["ping", "-q", "-c", str(count), "-i", "0.005", GATEWAY], *ways)
     (received,) = re.findall(r"(\d+) received", said)
     return count - int(received)
@@ -121,13 +121,13 @@ def received_bps(said: str) -> float:
 
 def paced(way: str, protocol: str, seconds: int) -> dict[str, float]:
     """Rate of payload through a finite rate in one direction, asked for and received [bit/s]."""
-    more = ["--omit", "2"] if way == "downlink" else ["--omit", "2", "--reverse"]
+    more = ["--omit", "2"] if way == "from" else ["--omit", "2", "--reverse"]
     payload = {"udp": DATAGRAM, "tcp": SEGMENT}[protocol]
     if protocol == "udp":
         more += ["--udp", "--bitrate", f"{1.1 * RATE_BPS:.0f}", "--length", str(DATAGRAM)]
     with iperf_server() as port:
         said, _ = run(
-            client(port, seconds, *more), f"--{way}=rate({RATE_BPS / 8:.0f}, queue=30000)"
+            client(port, seconds, *more), f"--{way}-program=rate({RATE_BPS / 8:.0f}, queue=30000)"
         )
     asked = RATE_BPS * payload / (payload + HEADERS[protocol])
     return {"asked": asked, "came": received_bps(said)}
@@ -141,10 +141,10 @@ def over_loss(share: float, seconds: int) -> dict[str, float]:
     with iperf_server() as port:
         said, counts = run(
             client(port, seconds, "--congestion", "reno"),
-            f"--uplink={delay}",
-            f"--downlink={delay} & loss({share})",
+            f"--to-program={delay}",
+            f"--from-program={delay} & loss({share})",
         )
-    down = counts["downlink"]
+    down = counts["from_program"]
     rtt_s = json.loads(said)["end"]["streams"][0]["sender"]["mean_rtt"] / 1e6
     had = down["lost"] / down["packets"]
     formula = 8 * SEGMENT / rtt_s * math.sqrt(1.5 / had) if had else math.inf
@@ -181,11 +181,11 @@ def without_netem(command: Sequence[str]) -> str:
 
 def measure(counts: ProgramCounts) -> dict[str, Any]:
     bare_ms = round_trip_ms(counts.timed)
-    ways = f"--uplink=constant({ONE_WAY_S / 2})", f"--downlink=constant({ONE_WAY_S / 2})"
+    ways = f"--to-program=constant({ONE_WAY_S / 2})", f"--from-program=constant({ONE_WAY_S / 2})"
     rates = {
         f"{protocol} {way}": paced(way, protocol, counts.seconds)
         for way, protocol in progress(
-            [("downlink", "udp"), ("uplink", "udp"), ("downlink", "tcp"), ("uplink", "tcp")],
+            [("from", "udp"), ("to", "udp"), ("from", "tcp"), ("to", "tcp")],
             "finite rates",
         )
     }
@@ -222,10 +222,9 @@ def tables(result: Mapping[str, Any]) -> dict[str, TextTable]:
             f"{result['lost']}",
         ],
     ]
-    titles = {"downlink": "from", "uplink": "to"}
     rows += [
         [
-            f"{protocol.upper()} {titles[way]} the program, over {RATE_BPS / 1e6:g} Mbit/s",
+            f"{protocol.upper()} {way} the program, over {RATE_BPS / 1e6:g} Mbit/s",
             f"{found['asked'] / 1e3:.0f} kbit/s",
             f"{found['came'] / 1e3:.0f} kbit/s",
         ]

@@ -18,9 +18,11 @@ from typing import Annotated
 from skytether.netem.proxy import FLOWS_MAX, Proxy
 from skytether.netem.relay import Relay
 from skytether.netem.tunnel import Tunnel
+from skytether.shared.base.errors import ConfigError
 from skytether.shared.core.endpoint import Address
 from skytether.shared.core.events import address_text
 from skytether.shared.core.line import CONNECTIONS_MAX, Listen
+from skytether.shared.core.ways import FLIGHT, KEYS, RELAY, RUN, Ways, named
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import PACKET_COLUMNS
@@ -74,10 +76,10 @@ class RunOptions(ProcessOptions):
 
     scenario: command.ScenarioName = NETWORK
     """A scenario's name (see `skytether scenarios`) or a .toml file, for its network and seed."""
-    uplink: str | None = None
+    to_program: str | None = None
     """Impairments of packets to the program, joined by &, as in "constant(50ms) & loss(10%)", see
     `skytether impairments`; the key network.uplink of a scenario."""
-    downlink: str | None = None
+    from_program: str | None = None
     """Impairments of packets from the program; the key network.downlink."""
     expose: Annotated[tuple[str, ...], Argument(metavar="PORT", append=True)] = ()
     """Port of this machine, TCP and UDP, that leads to the same port of the program; PORT listens
@@ -127,7 +129,7 @@ def emulate(argv: Sequence[str]) -> None:
             running.scenario,
             server=server,
             flows=flows,
-            by_number=options.scenario == NETWORK,
+            ways=RELAY if options.scenario == NETWORK else FLIGHT,
             recorder=recorder,
             path=path,
         )
@@ -137,8 +139,8 @@ def emulate(argv: Sequence[str]) -> None:
 def emulate_for(argv: Sequence[str]) -> None:
     """Run a program whose only network is netem; exit code and standard streams are its own.
 
-        skytether netem run --uplink "constant(50ms)" --downlink "constant(50ms) & loss(5%)"
-            --seed 7 -- curl http://10.0.2.2:8000/
+        skytether netem run --to-program "constant(50ms)"
+            --from-program "constant(50ms) & loss(5%)" --seed 7 -- curl http://10.0.2.2:8000/
 
     All its packets of IPv4 and IPv6 are impaired, as are those of its children: TCP, UDP, QUIC,
     ICMP, DNS. It reaches other machines as ever, and this one at 10.0.2.2 and fd00::2. With one
@@ -156,7 +158,7 @@ def emulate_for(argv: Sequence[str]) -> None:
     if not argv[end + 1 :]:
         message = "got no program, expected -- CMD ARG… at the end"
         raise command.CommandError(message, command.CONFIGURATION)
-    options = replace(options, config=_impaired(options, options.uplink, options.downlink))
+    options = replace(options, config=_impaired(options, RUN))
     exposed = [
         command.address("--expose", text if ":" in text else f"127.0.0.1:{text}")
         for text in options.expose
@@ -201,20 +203,27 @@ def _with_directions(options: NetemOptions) -> NetemOptions:
     """
     command.check_count("--path", options.path, len(options.config.paths) + 1)
     alone = replace(options, config=options.config.on_path(options.path - 1))
-    return replace(options, config=_impaired(alone, options.to_client, options.to_server))
+    return replace(options, config=_impaired(alone, RELAY))
 
 
-def _impaired(options: command.Options, uplink: str | None, downlink: str | None) -> Scenario:
-    """Scenario of the options with these texts of its two directions, where they are given.
+def _impaired(options: NetemOptions | RunOptions, names: Ways) -> Scenario:
+    """Scenario of the options with the texts of its two directions, where they are given.
+
+    Args:
+        names: options of both directions.
 
     Raises:
         ConfigError: the network is invalid.
     """
-    table = reading.to_table(options.config)
-    directions = {"uplink": uplink, "downlink": downlink}
-    table["network"] |= {key: text for key, text in directions.items() if text is not None}
-    source = f"{options.scenario} and the command line"
-    return reading.check(table, source, any_network=True)
+    table, flags = reading.to_table(options.config), dict[str, str]()
+    for key, way, name in zip(KEYS, FLIGHT, names, strict=True):
+        text = getattr(options, name)
+        if text is not None:
+            table["network"][way], flags[key] = text, f"--{name.replace('_', '-')}"
+    try:
+        return reading.check(table, any_network=True)
+    except ConfigError as error:
+        raise ConfigError(named(str(error), flags)) from None
 
 
 def _check_server(server: Address, bind: Address) -> None:

@@ -2,7 +2,7 @@
 `relay` for byte streams and `tunnel` for packets of IP.
 
 As in the paper, uplink is to the vehicle, or to whoever takes its place: a proxy's client, a
-tunnel's program.
+tunnel's program. Users of other programs read names of their own (`shared.core.ways`).
 """
 
 from abc import abstractmethod
@@ -14,6 +14,7 @@ from skytether.netem.link import Lane, Link
 from skytether.shared.base.units import HEADER_BYTES
 from skytether.shared.core.endpoint import Datagram, Endpoint
 from skytether.shared.core.events import Fault
+from skytether.shared.core.ways import FLIGHT, Ways
 from skytether.shared.scenario.air.path import Path
 from skytether.shared.scenario.catalogue import keys_of
 from skytether.shared.scenario.owners import InFlight
@@ -28,8 +29,8 @@ class Emulator(Endpoint):
 
     Args:
         mtu: largest payload that passes [B].
-        by_number: whether fates follow the number of a packet in its flow, and not its time: of
-            every program but a flight, whose controllers send at times of their own.
+        ways: names of both directions. Packets of a flight have fates by their time, since two
+            controllers send at times of their own; those of other programs by their number.
         path: number of the session's path, from 0, in the record.
         header_bytes: see `Link`.
     """
@@ -41,13 +42,13 @@ class Emulator(Endpoint):
         scenario: Scenario,
         *,
         mtu: int,
-        by_number: bool,
+        ways: Ways,
         recorder: Recorder | None,
         path: int = 0,
         header_bytes: int = HEADER_BYTES,
     ) -> None:
         super().__init__()
-        self._scenario, self._by_number = scenario, by_number
+        self._scenario, self.ways = scenario, ways
 
         def make(direction: int, name: Direction) -> Link:
             of = self.path(name)
@@ -74,7 +75,7 @@ class Emulator(Endpoint):
     def fates(self, name: Direction, flow: int) -> Fates:
         """What the packets of one flow meet in a direction."""
         at = self._scenario.seed, name, flow
-        return Fates(self.link(name).path, *at, by_number=self._by_number)
+        return Fates(self.link(name).path, *at, by_number=self.ways != FLIGHT)
 
     def _open_lanes(self, began_ns: int) -> tuple[Lane, Lane]:
         """Uplink and downlink of a new flow, whose fates count from `began_ns`."""
@@ -121,4 +122,5 @@ class Emulator(Endpoint):
             self._events.append(Fault(traceback=fault))
 
     def figures(self) -> dict[str, Any]:
-        return {"uplink": self.uplink.figures(), "downlink": self.downlink.figures()}
+        up, down = self.ways
+        return {up: self.uplink.figures(), down: self.downlink.figures()}

@@ -25,6 +25,7 @@ from skytether.shared.core.endpoint import (
     make_datagram,
 )
 from skytether.shared.core.events import FlowOpened, Returned, TooLong, Unreachable
+from skytether.shared.core.ways import FLIGHT, Ways
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Recorder
 
@@ -38,7 +39,7 @@ class Proxy(Emulator):
     """Delays, reorders and loses datagrams between one server and at most `flows` clients.
 
     Args:
-        by_number, recorder, path: see `Emulator`.
+        ways, recorder, path: see `Emulator`.
     """
 
     patience_ns = MILLISECOND_NS // 4
@@ -49,12 +50,12 @@ class Proxy(Emulator):
         *,
         server: Address,
         flows: int = FLOWS_MAX,
-        by_number: bool = False,
+        ways: Ways = FLIGHT,
         recorder: Recorder | None = None,
         path: int = 0,
     ) -> None:
         self._mtu = mtu = scenario.network.mtu
-        super().__init__(scenario, mtu=mtu, by_number=by_number, recorder=recorder, path=path)
+        super().__init__(scenario, mtu=mtu, ways=ways, recorder=recorder, path=path)
         self._flows_max = flows
         self._server = server
         self._places = Places(flows)

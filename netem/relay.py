@@ -22,6 +22,7 @@ from skytether.shared.base.units import MILLISECOND_NS
 from skytether.shared.core.endpoint import Address, Datagram, make_datagram
 from skytether.shared.core.events import FlowOpened, Unreachable
 from skytether.shared.core.line import CLIENT, PIECE_BYTES, SERVER
+from skytether.shared.core.ways import RELAY
 from skytether.shared.scenario.air.draws import SLOT_NS, Fate
 from skytether.shared.scenario.air.path import Path
 from skytether.shared.scenario.schema import Scenario
@@ -76,7 +77,7 @@ class Relay(Emulator):
         recorder: Recorder | None = None,
         path: int = 0,
     ) -> None:
-        super().__init__(scenario, mtu=PIECE_BYTES, by_number=True, recorder=recorder, path=path)
+        super().__init__(scenario, mtu=PIECE_BYTES, ways=RELAY, recorder=recorder, path=path)
         self._server = server
         self._streams: dict[Address, HalfConnection] = {}
         """Streams by their source."""

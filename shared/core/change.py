@@ -16,6 +16,7 @@ import msgspec
 
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.base.hint import hint
+from skytether.shared.core import ways
 from skytether.shared.core.endpoint import Endpoint
 from skytether.shared.core.events import Changed, ChangeRefused, Event
 from skytether.shared.scenario import reading
@@ -37,6 +38,8 @@ class Answer(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     changed: tuple[Changed, ...] = ()
     values: dict[str, Any] = {}
     """Keys that may change and their present values, if the request was empty."""
+    names: dict[str, str] = {}
+    """What the operator calls some of these keys, see `core.ways`."""
 
 
 class Running:
@@ -54,6 +57,7 @@ class Running:
         settings: Mapping[str, Any] = MappingProxyType({}),
     ) -> None:
         self.endpoint = endpoint
+        self._names = ways.NAMES.get(endpoint.ways, {})
         self._scenario = scenario
         self.settings = settings
         """All values that were set in flight, by key; replaced by a new object at each change."""
@@ -70,7 +74,8 @@ class Running:
         """Change the values of keys, and report the change by events of the endpoint.
 
         Args:
-            values: plain values by key, as in a scenario's file.
+            values: plain values by key, as in a scenario's file; the endpoint's own names of its
+                directions (`core.ways`) are keys, too.
             now_ns: time on the endpoint's clock [ns].
 
         Returns:
@@ -86,8 +91,9 @@ class Running:
             if objection := self.endpoint.objection(scenario, frozenset(values)):
                 raise ConfigError(objection)
         except ConfigError as error:
-            self.refuse(str(error))
-            raise
+            reason = ways.named(str(error), self._names)
+            self.refuse(reason)
+            raise ConfigError(reason) from None
         # Only after checking the whole scenario: a change is made completely, or not at all.
         self.endpoint.change(scenario, frozenset(values), now_ns=now_ns)
         self._scenario, after = scenario, reading.to_table(scenario)
@@ -95,7 +101,7 @@ class Running:
         if lasting:
             self.settings = {**self.settings, **lasting}
         changed = tuple(
-            Changed(key=key, before=before_text, after=after_text)
+            Changed(key=key, before=before_text, after=after_text, name=self._names.get(key, ""))
             for key in values
             if (before_text := _text(value(before, key)))
             != (after_text := _text(value(after, key)))
@@ -126,7 +132,7 @@ class Running:
         if not values:
             table = reading.to_table(self._scenario)
             values = {key: value(table, key) for key in sorted(self.changeable)}
-            return msgspec.json.encode(Answer(values=values))
+            return msgspec.json.encode(Answer(values=values, names=self._names))
         try:
             return msgspec.json.encode(Answer(changed=self.change(values, now_ns=now_ns)))
         except ConfigError as error:
@@ -144,8 +150,11 @@ class Running:
             ConfigError: a key may not change, or a text has no such argument.
         """
         may, table = sorted(self.changeable), reading.to_table(self._scenario)
+        keys = {name: key for key, name in self._names.items()}
         merged: dict[str, Any] = {}
-        for key, given in values.items():
+        for name, given in values.items():
+            head, dot, argument = name.partition(".")
+            key = f"{keys[head]}{dot}{argument}" if head in keys else name
             text = text_key(key)
             if text in may:
                 set_keys({key: given}, table)
@@ -158,7 +167,8 @@ class Running:
                 # A request may come from any process that can open the socket: no control
                 # characters in the log.
                 shown_key = shown_key if shown_key.isprintable() else repr(shown_key)
-                raise ConfigError(f"{shown_key}: no such key; {hint(key, may)}") from None
+                known = [self._names.get(each, each) for each in may]
+                raise ConfigError(f"{shown_key}: no such key; {hint(key, known)}") from None
             what = f"expected one of {', '.join(may)}"
             raise ConfigError(f"{key}: cannot be changed in flight; {what}")
         return merged

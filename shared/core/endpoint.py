@@ -13,6 +13,7 @@ from functools import partial
 from typing import Any, NamedTuple, Self
 
 from skytether.shared.core.events import Event, Omitted
+from skytether.shared.core.ways import FLIGHT, Ways
 from skytether.shared.scenario.schema import Scenario
 
 Address = tuple[str, int]
@@ -103,6 +104,8 @@ class Endpoint(ABC):
 
     changeable: frozenset[str] = frozenset()
     """Keys of the scenario that may change in flight, see `shared.core.change`."""
+    ways: Ways = FLIGHT
+    """Names of both directions of its network."""
     keeps = False
     """Whether the endpoint has state for the next run of the process, see `keep`."""
     waits_for_disk = False

@@ -252,13 +252,15 @@ class Degraded(msgspec.Struct, frozen=True, tag=True, kw_only=True):
         return "degraded: ticks are missed" if self.degraded else "ticks are in time again"
 
 
-class Changed(msgspec.Struct, frozen=True, tag=True, kw_only=True):
+class Changed(msgspec.Struct, frozen=True, tag=True, kw_only=True, omit_defaults=True):
     key: str
     before: str
     after: str
+    name: str = ""
+    """What the operator calls the key, if not by itself, see `core.ways`."""
 
     def __str__(self) -> str:
-        return f"{self.key} is {self.after} from now on, it was {self.before}"
+        return f"{self.name or self.key} is {self.after} from now on, it was {self.before}"
 
 
 class ChangeRefused(msgspec.Struct, frozen=True, tag=True, kw_only=True):

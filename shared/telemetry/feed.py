@@ -13,6 +13,7 @@ import msgspec
 import numpy as np
 
 from skytether.shared.core.events import Event
+from skytether.shared.core.ways import FLIGHT, Ways
 from skytether.shared.telemetry import record
 from skytether.shared.telemetry.record import Rows as Table
 
@@ -26,7 +27,7 @@ class FeedError(ValueError):
     """The data are not a feed."""
 
 
-class Opened(msgspec.Struct, frozen=True, tag=True, kw_only=True):
+class Opened(msgspec.Struct, frozen=True, tag=True, kw_only=True, omit_defaults=True):
     """A process and its scenario: the first frame of its feed."""
 
     process: str
@@ -37,6 +38,8 @@ class Opened(msgspec.Struct, frozen=True, tag=True, kw_only=True):
     parts: dict[str, str]
     """Parts of the record in this feed: columns by name of the part, as numpy's description in
     JSON."""
+    ways: Ways = FLIGHT
+    """Names of both directions of the process's network."""
     wall_ns: int
     """Time of day corresponding to `time_ns` [ns since 1970]."""
     time_ns: int

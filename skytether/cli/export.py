@@ -73,7 +73,7 @@ def _traffic(options: ExportOptions, recorded: Recorded) -> None:
         raise CommandError(message, CONFIGURATION)
     command.claim_output("--pcap", options.pcap)
     if options.traces:
-        traces = traffic.traces(packets)
+        traces = traffic.traces(packets, recorded.ways)
         command.claim_folder("--traces", options.traces, *(f"{name}.csv" for name in traces))
         for name, trace in traces.items():
             _write(options.traces / f"{name}.csv", trace.encode())

@@ -42,7 +42,7 @@ def set_keys(argv: Sequence[str]) -> None:
     if answer.refused:
         raise CommandError(f"{options.path}: {answer.refused}", CONFIGURATION)
     for key, value in answer.values.items():
-        print(f"{key} = {msgspec.json.encode(value).decode()}")
+        print(f"{answer.names.get(key, key)} = {msgspec.json.encode(value).decode()}")
     for event in answer.changed:
         print(event)
 

@@ -10,9 +10,11 @@ from typing import Any, Self, TypeVar
 
 from skytether.netem.proxy import Proxy
 from skytether.netem.relay import Relay
+from skytether.shared.base.errors import ConfigError
 from skytether.shared.core.change import Running
 from skytether.shared.core.endpoint import Address
 from skytether.shared.core.line import Listen
+from skytether.shared.core.ways import FLIGHT, NAMES, RELAY, named
 from skytether.shared.scenario import reading
 from skytether.shell import plugins
 from skytether.shell.driver import Shell, new_event_loop
@@ -62,10 +64,14 @@ class bad_network:  # noqa: N801 - read as a function, like `contextlib.closing`
     ) -> None:
         plugins.load()
         table = reading.to_table(reading.load_base("transparent")) | {"seed": seed}
-        table["network"] |= _directions(network, to_server, to_client)
-        scenario = reading.check(table, "bad_network", any_network=True)
+        texts = _directions(network, to_server, to_client)
+        table["network"] |= dict(zip(FLIGHT, texts.values(), strict=True))
+        try:
+            scenario = reading.check(table, any_network=True)
+        except ConfigError as error:
+            raise ConfigError(f"bad_network: {named(str(error), NAMES[RELAY])}") from None
         self._endpoint = (
-            Relay(scenario, server=to) if tcp else Proxy(scenario, server=to, by_number=True)
+            Relay(scenario, server=to) if tcp else Proxy(scenario, server=to, ways=RELAY)
         )
         self._running = Running(self._endpoint, scenario)
         if tcp:
@@ -88,10 +94,7 @@ class bad_network:  # noqa: N801 - read as a function, like `contextlib.closing`
         Raises:
             ConfigError: a network is invalid; nothing was changed.
         """
-        values = {
-            f"network.{key}": text
-            for key, text in _directions(network, to_server, to_client).items()
-        }
+        values = _directions(network, to_server, to_client)
 
         def change() -> None:
             self._running.change(values, now_ns=time.monotonic_ns())
@@ -103,8 +106,7 @@ class bad_network:  # noqa: N801 - read as a function, like `contextlib.closing`
     @property
     def counts(self) -> dict[str, Any]:
         """Counters as `skytether netem --json` writes them, with "to_server" and "to_client"."""
-        figures = self._within(self._endpoint.figures)
-        return {_NAMES.get(key, key): value for key, value in figures.items()}
+        return self._within(self._endpoint.figures)
 
     def __enter__(self) -> Self:
         began: Future[None] = Future()
@@ -158,12 +160,9 @@ class bad_network:  # noqa: N801 - read as a function, like `contextlib.closing`
         return done.result()
 
 
-_NAMES = {"uplink": "to_client", "downlink": "to_server"}
-
-
 def _directions(both: str | None, to_server: str | None, to_client: str | None) -> dict[str, str]:
     texts = {
-        "uplink": both if to_client is None else to_client,
-        "downlink": both if to_server is None else to_server,
+        "to_client": both if to_client is None else to_client,
+        "to_server": both if to_server is None else to_server,
     }
     return {key: text for key, text in texts.items() if text is not None}

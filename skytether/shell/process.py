@@ -324,6 +324,7 @@ def opened(process: str, name: str, running: Running, feed: Feed) -> Callable[[]
         name=name,
         scenario=reading.to_toml(running.scenario).decode(),
         parts=feed.parts,
+        ways=running.endpoint.ways,
         wall_ns=wall_ns,
         time_ns=time_ns,
     )

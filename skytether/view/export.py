@@ -33,7 +33,7 @@ def tables(recorded: Recorded) -> dict[str, Columns]:
     parts = recorded.parts
     result = {
         part: {"time_s": recorded.times_ns[part] / SECOND_NS}
-        | dict(_in_ms(name, column) for name, column in readable(rows).items())
+        | dict(_in_ms(name, column) for name, column in readable(rows, recorded.ways).items())
         for part, rows in parts.items()
     }
     if "client" in parts:

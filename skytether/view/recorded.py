@@ -18,6 +18,7 @@ from skytether.shared.base import toml
 from skytether.shared.base.errors import RecordingError
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.core.events import Counted, Event
+from skytether.shared.core.ways import FLIGHT, Ways
 from skytether.shared.law.model import Indices
 from skytether.shared.scenario.reading import check
 from skytether.shared.scenario.schema import Scenario
@@ -65,6 +66,12 @@ class Recorded:
             for _, process, frame in self.frames
             if isinstance(frame, Figures)
         }
+
+    @property
+    def ways(self) -> Ways:
+        """Names of both directions of the recorded network."""
+        opened = (frame for *_, frame in self.frames if isinstance(frame, Opened))
+        return next((each.ways for each in opened if each.ways != FLIGHT), FLIGHT)
 
     @property
     def begin_ns(self) -> int:

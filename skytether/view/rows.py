@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skytether.shared.base.units import SECOND_NS
+from skytether.shared.core.ways import FLIGHT, Ways
 from skytether.shared.law.model import Array
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.scenario.triggers import Compared
@@ -35,7 +36,7 @@ WORDS: Mapping[str, Mapping[int, str]] = {
     "mode": {mode: str(mode) for mode in Mode},
     "reason": {reason: str(reason) for reason in Reason},
     "compared": {figure: str(figure) for figure in Compared},
-    "direction": {UPLINK: "uplink", DOWNLINK: "downlink"},
+    "direction": {UPLINK: FLIGHT[0], DOWNLINK: FLIGHT[1]},
 }
 FLOWN_S_MAX = 2 * 86_400.0
 """Latest time of a step [s]: a scenario lasts for a day at most."""
@@ -178,15 +179,20 @@ def check_values(part: str, rows: Rows, scenario: Scenario) -> None:
             )
 
 
-def readable(rows: Rows) -> Columns:
-    """Plain columns of rows, with words for codes, and one column per input of a plan."""
+def readable(rows: Rows, ways: Ways = FLIGHT) -> Columns:
+    """Plain columns of rows, with words for codes, and one column per input of a plan.
+
+    Args:
+        ways: words for the two directions.
+    """
+    said = {**WORDS, "direction": {UPLINK: ways[0], DOWNLINK: ways[1]}}
     flat = np.ascontiguousarray(rows).view(plain(rows.dtype))
     result: Columns = {}
     for name in flat.dtype.names or ():
         if flat.dtype[name].shape:
             result |= {f"{name}_{k}": each for k, each in enumerate(flat[name].T)}
-        elif name in WORDS:
-            words = WORDS[name]
+        elif name in said:
+            words = said[name]
             result[name] = np.array(
                 [words.get(number, str(number)) for number in flat[name].tolist()], dtype=np.str_
             )

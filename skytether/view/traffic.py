@@ -12,9 +12,9 @@ import numpy as np
 
 from skytether.figures.tables import to_csv
 from skytether.shared.base.units import HEADER_BYTES, SECOND_NS
+from skytether.shared.core.ways import FLIGHT, Ways
 from skytether.shared.telemetry.record import DOWNLINK, UPLINK, Rows
 
-WAYS = {"uplink": UPLINK, "downlink": DOWNLINK}
 RAW_IP = 101
 """LINKTYPE_RAW: each packet begins with its IP header."""
 SERVER = bytes((10, 255, 255, 254))
@@ -22,10 +22,10 @@ CLIENT_PORT, SERVER_PORT = 47000, 47001
 _UDP = 17
 
 
-def traces(packets: Rows) -> Mapping[str, str]:
+def traces(packets: Rows, ways: Ways = FLIGHT) -> Mapping[str, str]:
     """Delay traces that the impairment `trace` replays, as CSV, by direction, flow and path."""
     csv = {}
-    for way, direction in WAYS.items():
+    for way, direction in zip(ways, (UPLINK, DOWNLINK), strict=True):
         for path, flow in np.unique(packets[["path", "flow"]]).tolist():
             of_flow = (packets["path"] == path) & (packets["flow"] == flow)
             rows = packets[of_flow & (packets["direction"] == direction)]

@@ -2,6 +2,7 @@
 namespace, with real programs on loopback.
 """
 
+import json
 import re
 import shlex
 import shutil
@@ -22,21 +23,28 @@ import msgspec
 import numpy as np
 import pytest
 
+import skytether
+import skytether.cli.set
 from helpers import PATIENCE_S, packaged, until
 from skytether.__main__ import main
 from skytether.netem.__main__ import NetemOptions, _with_directions
 from skytether.netem.proxy import Proxy
 from skytether.shared.base.units import HEADER_BYTES, MILLISECOND_NS, SECOND_NS
-from skytether.shared.core.change import Running
+from skytether.shared.core.change import Answer, Running
 from skytether.shared.core.endpoint import Address, Datagram
+from skytether.shared.core.ways import FLIGHT, NAMES, RELAY, RUN, Ways
 from skytether.shared.scenario.air.recorded import recorded_in
 from skytether.shared.scenario.reading import load
 from skytether.shared.scenario.registry import File
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import DOWNLINK, PACKET_COLUMNS, UPLINK
 from skytether.shell.command import parse
+from skytether.shell.control import answer_of
+from skytether.shell.metrics import families
+from skytether.shell.process import Process
 from skytether.shell.udp import leads_back
 from skytether.view import traffic
+from skytether.view.rows import readable
 
 ROOT = Path(__file__).parents[2]
 TEXT = (ROOT / "docs" / "network.md").read_text()
@@ -90,7 +98,7 @@ def running(line: str, folder: Path, until: str = "") -> Iterator["subprocess.Po
 
 
 def counted(said: str, name: str) -> tuple[int, int]:
-    """Counters of netem for uplink and downlink, printed at its end."""
+    """Counters of netem to the client and to the server, printed at its end."""
     found = re.search(rf"  {name} +(\d+) +(\d+)$", said, re.MULTILINE)
     assert found, said
     return int(found[1]), int(found[2])
@@ -197,8 +205,8 @@ def test_changes_and_recordings(
         for line in changes:
             assert main(shlex.split(line)[1:]) == 0
     said = capsys.readouterr().out
-    assert 'network.downlink is "loss(0.6)" from now on, it was "loss(0.1)"' in said
-    assert 'network.uplink is "constant(0.1) & rate(12500, queue=20000)" from now on' in said
+    assert 'to_server is "loss(0.6)" from now on, it was "loss(0.1)"' in said
+    assert 'to_client is "constant(0.1) & rate(12500, queue=20000)" from now on' in said
     netem, export = block("passed.mcap")
     with running(netem, tmp_path, "listening") as relay:
         port = int(re.findall(r"127\.0\.0\.1:(\d+)", netem)[0])
@@ -209,7 +217,7 @@ def test_changes_and_recordings(
         time.sleep(0.5)
         ended(relay)
     assert main(shlex.split(export)[1:]) == 0
-    found = recorded_in(File("it", (tmp_path / "traces" / "downlink-0.csv").read_bytes()))
+    found = recorded_in(File("it", (tmp_path / "traces" / "to_server-0.csv").read_bytes()))
     assert 0 < found.lost.sum() < len(found.time_s) <= 60
     assert found.delay_s.min() >= 0.01
     passed = captured((tmp_path / "passed.pcap").read_bytes())
@@ -219,7 +227,7 @@ def test_changes_and_recordings(
 @pytest.mark.parametrize(
     ("flags", "said"),
     [
-        (["--to-client", "los(1)"], "network.uplink: got 'los(1)'"),
+        (["--to-client", "los(1)"], "--to-client: got 'los(1)'"),
         (["--to-server", "loss(2)"], "expected loss(share) with 0 <= share <= 1"),
         (
             ["--to-server", "trace(none.csv)"],
@@ -409,3 +417,79 @@ def test_netem_is_not_its_own_server(
 )
 def test_other_servers_do_not_lead_back(server: Address, bind: Address) -> None:
     assert not leads_back(server, bind)
+
+
+WAYS = [("transparent", RELAY), ("demo", FLIGHT)]
+
+
+@pytest.mark.parametrize(("scenario", "ways"), WAYS)
+def test_a_relay_names_its_directions_by_their_ends_and_a_flight_as_modems_do(
+    scenario: str, ways: Ways, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    driven: list[Any] = []
+    monkeypatch.setattr(Process, "drive", lambda _, endpoint, **__: driven.append(endpoint))
+    assert main(["netem", scenario, "--bind", "127.0.0.1:0"]) == 0
+    (proxy,) = driven
+    assert {*ways} <= proxy.figures().keys()
+
+
+def test_changes_of_a_relay_are_asked_for_and_told_by_its_own_names() -> None:
+    scenario = directed(to_server="loss(0.1)")
+    relay = Proxy(scenario, server=("server", 1), ways=RELAY)
+    running_ = Running(relay, scenario)
+    assert json.loads(running_.answer(b"{}", now_ns=0))["names"] == NAMES[RELAY]
+    (changed,) = running_.change({"to_server.loss": 0.3}, now_ns=0)
+    assert (changed.key, changed.name) == ("network.downlink", "to_server")
+    assert str(changed).startswith("to_server is")
+    for wrong in ({"to_client": "los(1)"}, {"to_client.los": 1.0}, {"to_cliet": "none"}):
+        with pytest.raises(skytether.ConfigError, match="to_client") as refused:
+            running_.change(wrong, now_ns=0)
+        assert "link" not in str(refused.value)
+    assert relay.downlink.path.loss == 0.3
+
+
+def test_set_lists_the_names_of_a_relay(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    scenario = directed()
+    running_ = Running(Proxy(scenario, server=("server", 1), ways=RELAY), scenario)
+
+    class Caller:
+        def __init__(self, _: Path) -> None:
+            """Reach the process at once."""
+
+        def ask(self, values: dict[str, Any]) -> Answer:
+            return answer_of(running_.answer(msgspec.json.encode(values), now_ns=0))
+
+        def close(self) -> None:
+            """Leave nothing behind."""
+
+    monkeypatch.setattr(skytether.cli.set, "Caller", Caller)
+    assert main(["set", "netem.sock", "to_server=loss(0.2)"]) == 0
+    assert main(["set", "netem.sock"]) == 0
+    _, *listed = capsys.readouterr().out.splitlines()
+    assert listed == ['to_server = "loss(0.2)"', 'to_client = "none"']
+
+
+def test_metrics_and_tables_have_the_names_of_a_relay() -> None:
+    relay = Proxy(directed(), server=("server", 1), ways=RELAY)
+    exposed, unknown = families("netem", relay.figures())
+    labels = {each.labels.get("direction") for family in exposed for each in family.samples}
+    assert labels >= {*RELAY}
+    assert not labels & {*FLIGHT}
+    assert not unknown
+    rows = np.zeros(2, PACKET_COLUMNS)
+    rows["direction"] = [UPLINK, DOWNLINK]
+    assert readable(rows, RELAY)["direction"].tolist() == [*RELAY]
+    assert {name.partition("-")[0] for name in traffic.traces(rows, RELAY)} == {*RELAY}
+
+
+@pytest.mark.parametrize(("command", "ways"), [([], RELAY), (["run"], RUN)])
+def test_options_are_named_by_the_ends(
+    command: list[str], ways: Ways, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit):
+        main(["netem", *command, "--help"])
+    said = capsys.readouterr().out
+    assert all(f"--{way.replace('_', '-')}" in said for way in ways)
+    assert not any(f"--{way} " in said for way in FLIGHT)

@@ -7,6 +7,7 @@ from skytether.netem.relay import RETRY_NS, Relay
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.core.endpoint import Datagram
 from skytether.shared.core.line import CLIENT, PIECE_BYTES, SERVER
+from skytether.shared.core.ways import RELAY
 from skytether.shared.scenario.schema import NetworkConfig, Scenario
 
 SERVED = ("192.0.2.9", 80)
@@ -75,7 +76,7 @@ def test_every_stream_arrives_whole_and_in_order(
     assert {peer: data for peer, data in came.items() if data} == sent
     figures = relay.figures()
     assert figures["flows"] == 0
-    for link in ("uplink", "downlink"):
+    for link in RELAY:
         for lost in ("lost", "dropped", "overflowed", "oversized", "duplicated", "corrupted"):
             assert figures[link][lost] == 0
 

@@ -190,7 +190,7 @@ class TestProgram:
     def test_the_kernel_sends_nothing_by_itself(self, tmp_path: Path) -> None:
         ran("--json", str(tmp_path / "counted"), of=["sleep", "2"])
         counted = json.loads((tmp_path / "counted").read_bytes())
-        assert counted["uplink"]["packets"] == counted["downlink"]["packets"] == 0
+        assert counted["to_program"]["packets"] == counted["from_program"]["packets"] == 0
 
 
 @pytest.mark.realtime
@@ -242,7 +242,7 @@ class TestNetwork:
             threading.Thread(target=server.serve_forever, daemon=True).start()
             url = f"http://{GATEWAY}:{server.server_port}/"
             air = "constant(0.02) & loss(0.02)"
-            options = ("--uplink", air, "--downlink", air, "--path-mtu", "1300")
+            options = ("--to-program", air, "--from-program", air, "--path-mtu", "1300")
             run = ran(*options, of=python(code, url, tmp_path / "came"))
             server.shutdown()
         assert run.returncode == 0, run.stderr
@@ -260,7 +260,7 @@ class TestNetwork:
         with echo() as port:
             for run, seed in enumerate((7, 7, 8)):
                 record = tmp_path / str(run)
-                options = ("--downlink", air, "--seed", str(seed), "--record", str(record))
+                options = ("--from-program", air, "--seed", str(seed), "--record", str(record))
                 ran(*options, of=python(code, GATEWAY, port))
                 rows = read(record)
                 # Answers to a closed port get an ICMP error of the kernel, which is another flow.
@@ -290,13 +290,13 @@ class TestNetwork:
         control = tmp_path / "control"
         with echo() as port:
             line = argv(
-                *("--downlink", "loss(1)", "--control", str(control)),
+                *("--from-program", "loss(1)", "--control", str(control)),
                 of=python(code, GATEWAY, port),
             )
             with subprocess.Popen(line, stdout=subprocess.PIPE, text=True) as run:
                 assert run.stdout is not None
                 assert run.stdout.readline() == "up\n"
-                change = [*SKYTETHER, "set", str(control), "network.downlink=none"]
+                change = [*SKYTETHER, "set", str(control), "from_program=none"]
                 subprocess.run(change, check=True, timeout=PATIENCE_S, capture_output=True)
                 assert run.wait(PATIENCE_S) == 0
 
@@ -342,7 +342,9 @@ class TestNetwork:
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as server:
             server.bind(("127.0.0.1", 0))
             server.settimeout(PATIENCE_S)
-            ran("--downlink", "constant(0.5)", of=python(code, GATEWAY, server.getsockname()[1]))
+            ran(
+                "--from-program", "constant(0.5)", of=python(code, GATEWAY, server.getsockname()[1])
+            )
             assert server.recv(100) == b"bye"
 
     def test_programs_find_each_other_by_multicast(self) -> None:
@@ -377,9 +379,9 @@ class TestPrograms:
     @pytest.mark.parametrize(
         ("way", "options"),
         [
-            ("downlink", ("--udp", "--bitrate", "4M", "--length", "1400")),
-            ("uplink", ("--udp", "--bitrate", "4M", "--length", "1400", "--reverse")),
-            ("downlink", ()),
+            ("from-program", ("--udp", "--bitrate", "4M", "--length", "1400")),
+            ("to-program", ("--udp", "--bitrate", "4M", "--length", "1400", "--reverse")),
+            ("from-program", ()),
         ],
     )
     def test_iperf3_gets_the_rate_of_the_network(
@@ -400,7 +402,7 @@ class TestPrograms:
             server.terminate()
         assert json.loads(run.stdout)["end"]
         rows = read(record)
-        rows = rows[rows["direction"] == (DOWNLINK if way == "downlink" else UPLINK)]
+        rows = rows[rows["direction"] == (DOWNLINK if way == "from-program" else UPLINK)]
         rows = rows[rows["bytes"] > 1000]
         assert len(rows) > 1
         left_ns = np.sort(rows["arrived_ns"] + rows["delay_ns"])

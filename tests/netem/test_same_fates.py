@@ -22,6 +22,7 @@ from skytether.shared.base.packets import PROGRAM
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
 from skytether.shared.core.endpoint import Datagram
 from skytether.shared.core.line import CLIENT
+from skytether.shared.core.ways import RELAY
 from skytether.shared.scenario.schema import NetworkConfig, Scenario
 from skytether.shared.telemetry.record import DOWNLINK, PACKET_COLUMNS, Recorder, parse
 from skytether.shell.process import Process
@@ -56,7 +57,7 @@ def made(kind: Callable[..., Emulator], text: str, recorder: Recorder | None = N
 
 
 KINDS = {
-    "proxy": (partial(Proxy, server=FAR, by_number=True), heard_by_a_proxy),
+    "proxy": (partial(Proxy, server=FAR, ways=RELAY), heard_by_a_proxy),
     "tunnel": (partial(Tunnel, mtu=1500), heard_by_a_tunnel),
     "relay": (partial(Relay, server=FAR), heard_by_a_relay),
 }
