@@ -4,7 +4,6 @@ Coordinates are degrees; the scenario's origin is `reference.origin`, or else th
 Altitudes above home are taken as above the origin.
 """
 
-import json
 import math
 from collections.abc import Iterable, Iterator
 from typing import Any, NamedTuple
@@ -12,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from skytether.shared.law.model import Array
+from skytether.shared.scenario import bounded
 from skytether.shared.scenario.geographic import (
     METRES_MAX,
     Origin,
@@ -89,7 +89,9 @@ def fences(file: File) -> list[Zone]:
 
 
 def _polygon(part: Any, home: Home) -> Array:
-    points = part["polygon"][: CORNERS_MAX + 1]
+    points = part["polygon"]
+    if len(points) > CORNERS_MAX + 1:
+        raise ValueError(f"at most {CORNERS_MAX} corners")
     return ring(np.array([home.local(*point) for point in points]))
 
 
@@ -289,8 +291,8 @@ def _expected(content: bytes, origin: Origin) -> tuple[dict[str, Any], Home]:
 def _plan(content: bytes, origin: Origin) -> tuple[dict[str, Any], Home]:
     """A plan, and the origin of its coordinates; raises ValueError if the content is not a plan."""
     try:
-        plan = json.loads(content)
-    except (ValueError, RecursionError) as error:
+        plan = bounded.json_of(content)
+    except ValueError as error:
         raise ValueError(f"a QGroundControl plan ({error})") from None
     if not isinstance(plan, dict) or plan.get("fileType") != "Plan":
         raise ValueError('a QGroundControl plan, with "fileType": "Plan"')

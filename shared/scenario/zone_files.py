@@ -1,6 +1,5 @@
 """Zones in GeoJSON and KML files."""
 
-import json
 import math
 from collections.abc import Callable, Iterator
 from itertools import islice
@@ -10,6 +9,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from skytether.shared.law.model import Array
+from skytether.shared.scenario import bounded
 from skytether.shared.scenario.geographic import (
     METRES_MAX,
     Origin,
@@ -36,8 +36,8 @@ _NOWHERE: Array = np.zeros((0, 2))
 def geojson(file: File) -> list[Zone]:
     """Zones in a GeoJSON file, see docs/together.md."""
     try:
-        collection = json.loads(file.content)
-    except (ValueError, RecursionError) as error:
+        collection = bounded.json_of(file.content)
+    except ValueError as error:
         raise ValueError(f"a GeoJSON file ({error})") from None
     zones: list[Zone] = []
     corners = 0
@@ -58,27 +58,38 @@ def kml(file: File, *, is_fence: bool) -> list[Zone]:
         ValueError: it is not a KML file.
         GrammarError: a placemark is invalid; the message names it and the expected form.
     """
-    text = file.content.replace(b"\0", b"")  # also in UTF-16
-    if b"<!DOCTYPE" in text or b"<!ENTITY" in text:
-        raise ValueError("a KML file without a document type or entities")
-    try:
-        root = ElementTree.fromstring(file.content)
-    except (ElementTree.ParseError, ValueError, LookupError) as error:
-        raise ValueError(f"a KML file ({error}); a KMZ has to be unpacked") from None
-    if next(_tagged(root, "NetworkLink"), None) is not None:
-        raise ValueError("a KML file without links to others")
-    zones, name = list[Zone](), file.name.rpartition("/")[2]
+    root = kml_root(file.content)
+    zones, name, corners = list[Zone](), file.name.rpartition("/")[2], 0
     for i, placemark in enumerate(_below(root, "Placemark")):
         title = f"{name}: {_text(placemark, 'name') or f'placemark {i + 1}'}"
         try:
-            zones += _placemark(title, placemark, file.origin, is_fence=is_fence)
+            for zone in _placemark(title, placemark, file.origin, is_fence=is_fence):
+                zones.append(zone)
+                corners += len(zone.corners)
+                if corners > CORNERS_MAX:
+                    raise ValueError(f"a KML file of at most {CORNERS_MAX} corners up to here")
         except ValueError as error:
             raise GrammarError(title, str(error)) from None
-        if sum(len(zone.corners) for zone in zones) > CORNERS_MAX:
-            raise ValueError(f"a KML file of at most {CORNERS_MAX} corners")
     if not zones:
         raise ValueError("a KML file with a Polygon in a Placemark")
     return zones
+
+
+def kml_root(content: bytes) -> ElementTree.Element:
+    """Root of a KML file, or of that in a KMZ; raises ValueError if it is none."""
+    if bounded.is_zip(content):
+        content, *_ = bounded.members(content, _is_kml, "a KML file").values()
+    try:
+        root = bounded.xml_of(content)
+    except ValueError as error:
+        raise ValueError(f"a KML file {error}") from None
+    if next(_tagged(root, "NetworkLink"), None) is not None:
+        raise ValueError("a KML file without links to others")
+    return root
+
+
+def _is_kml(name: str) -> bool:
+    return name.lower().endswith(".kml")
 
 
 def _placemark(
@@ -107,7 +118,9 @@ def _bare(placemark: ElementTree.Element, kind: str) -> Iterator[ElementTree.Ele
 
 def _coordinates(text: str) -> Array:
     """Longitudes and latitudes in a KML text such as `8.54,47.39,0 8.55,47.39,0`."""
-    points = [point.split(",") for point in text.split()]
+    points = [point.split(",") for point in text.split(maxsplit=CORNERS_MAX + 1)]
+    if len(points) > CORNERS_MAX + 1:
+        raise ValueError(f"a Polygon of at most {CORNERS_MAX} corners")
     for point in points:
         if len(point) not in (2, 3) or float((point[2:] or ["0"])[0]):
             raise ValueError(f"longitude,latitude without heights, got {','.join(point)[:80]}")
@@ -233,6 +246,8 @@ def _feature(file: str, i: int, feature: Any, placed: Frame) -> Iterator[Zone]:
         if len(rings) > 1 and not is_fence:
             zone = zone._replace(name=f"{zone.name}, with its holes")
         for hole, points in enumerate(rings if is_fence else rings[:1]):
+            if len(points) > CORNERS_MAX + 1:
+                raise ValueError(f"a Polygon of at most {CORNERS_MAX} corners")
             corners = ring(placed(points))
             name = f"{zone.name}, hole {hole}" if hole else zone.name
             yield zone._replace(name=name, corners=corners, is_fence=is_fence and not hole)

@@ -1,0 +1,62 @@
+"""Files of other programs with the tracks of vehicles: a module a format.
+
+Each is a `Format`, and is imported when a file of its format is read: a flight without such a file
+loads none of them.
+"""
+
+from collections.abc import Callable
+from importlib import import_module
+from typing import Any, Protocol
+
+from skytether.shared.law.model import Array
+from skytether.shared.scenario import bounded
+from skytether.shared.scenario.geographic import Origin
+
+Tracks = dict[int, tuple[Array, Array]]
+"""Rising times from 0 [s; shape (n,)] and points [m; shape (n, axes)], by number of the vehicle."""
+BOM = b"\xef\xbb\xbf"
+HEAD_BYTES = 4096
+"""Size of a file's beginning that shows its format [B]."""
+
+
+class Format(Protocol):
+    """Module of a format."""
+
+    def tracks(
+        self, content: bytes, axes: int, origin: Origin | None, speed_mps: float, /
+    ) -> Tracks:
+        """Tracks in a file.
+
+        Args:
+            axes: number of axes of the points.
+            origin: origin of the scenario; (): that of the file, if it has one; None: any.
+            speed_mps: speed between places, for a file without times [m/s].
+
+        Raises:
+            ValueError: the file is invalid; the message names the fault and its place.
+        """
+
+    def axes_of(self, content: bytes, /) -> int:
+        """3 if the points of a file have heights, otherwise 2; raises ValueError as `tracks`."""
+
+
+def _begins(*heads: bytes) -> Callable[[bytes], bool]:
+    return lambda content: content[:HEAD_BYTES].removeprefix(BOM).lstrip().startswith(heads)
+
+
+FORMATS: tuple[tuple[str, tuple[str, ...], Callable[[bytes], bool]], ...] = (
+    ("tables", (".zip",), bounded.is_zip),
+    ("plan", (".plan",), _begins(b"{")),
+    ("tables", (".csv",), lambda _: True),
+)
+"""Module of each format, ends of its files' names, and whether a content has it; the first that
+has decides."""
+SUFFIXES = tuple(suffix for _, suffixes, _ in FORMATS for suffix in suffixes)
+"""Ends of the names of files with tracks."""
+
+
+def of(content: bytes) -> Format:
+    """Module of a content's format."""
+    module = next(module for module, _, fits in FORMATS if fits(content))
+    found: Any = import_module(f"{__name__}.{module}")
+    return found
