@@ -16,7 +16,7 @@ from helpers import PATIENCE_S
 from skytether.view.words import FLOWN_S
 
 if TYPE_CHECKING:
-    from playwright.sync_api import Browser, Page
+    from playwright.sync_api import Browser, Locator, Page
 
 CHROMIUM = os.environ.get("CHROMIUM") or shutil.which("chromium") or ""
 FLAGS = (
@@ -108,10 +108,14 @@ def plotted_s(page: "Page") -> float:
     return float(page.evaluate(newest))
 
 
+def number(page: "Page", label: str) -> "Locator":
+    """Field of a number beside a slider, or of a text."""
+    return page.locator(f"xpath=//*[text()='{label}']/ancestor::*[.//input][1]//input").last
+
+
 def put(page: "Page", label: str, value: float | str) -> None:
     """Type a number beside a slider, or a text into a field."""
-    nearest = f"xpath=//*[text()='{label}']/ancestor::*[.//input][1]//input"
-    field = page.locator(nearest).last
+    field = number(page, label)
     field.fill(value if isinstance(value, str) else f"{value:g}")
     # Not on the field: the page removes it as soon as its token is right.
     page.keyboard.press("Enter")

@@ -28,7 +28,9 @@ LOST = ("loss(1)", "loss(1.0)")
 class Knob:
     """Slider for a number that can be changed in flight."""
 
-    label: str
+    name: str
+    unit: str
+    """Unit of the number; empty if it has none."""
     hint: str
     process: str
     """Process that owns the keys: server, netem or client."""
@@ -39,7 +41,36 @@ class Knob:
     read: Read
     """Function that reads the number from the process's values; None if there is no such number."""
     write: Write
-    """Function that returns the changed keys and values, given the present values."""
+    """Function that returns the changed keys and values, given the present values. A key is as
+    narrow as can be, such as `network.uplink.loss`: the process keeps the rest of its text.
+    """
+
+    @property
+    def label(self) -> str:
+        return f"{self.name} [{self.unit}]" if self.unit else self.name
+
+    def with_unit(self, numbers: str) -> str:
+        return f"{self.name}: {numbers} {self.unit}".rstrip()
+
+
+def applied(values: Values, changed: Values) -> dict[str, Any]:
+    """Values after a change of some keys, or of arguments in their texts."""
+    after = dict(values)
+    for key, value in changed.items():
+        text = dotted.text_key(key)
+        after[text] = value if key == text else _with(text, after[text], key, value)
+    return after
+
+
+def argument(values: Values, key: str) -> Any:
+    """Value of a key, or of an argument in its text.
+
+    Raises:
+        KeyError, GrammarError: there is no such value.
+    """
+    text = dotted.text_key(key)
+    at = key.removeprefix(f"{text}.")
+    return values[key] if key == text else dotted.TEXTS[text].argument(values[text], at)
 
 
 def texts(values: Values) -> dict[str, str]:
@@ -58,18 +89,18 @@ def is_cut(values: Values) -> bool:
 def healed(values: Values) -> dict[str, Any]:
     changed = {way: text.removesuffix(ALL_LOST) for way, text in texts(values).items()}
     return {
-        way: _with(way, text, "loss", 0.0) if text.endswith(LOST) else text
+        way: _with(way, text, f"{way}.loss", 0.0) if text.endswith(LOST) else text
         for way, text in changed.items()
     }
 
 
-def _with(key: str, text: str, at: str, number: float) -> str:
-    return dotted.TEXTS[key].with_argument(text, at, number)
+def _with(text_key: str, text: str, key: str, value: Any) -> str:
+    return dotted.TEXTS[text_key].with_argument(text, key.removeprefix(f"{text_key}."), value)
 
 
-def _number(values: Values, key: str, at: str) -> float | None:
+def _number(values: Values, key: str) -> float | None:
     try:
-        return float(dotted.TEXTS[key].argument(values[key], at))
+        return float(argument(values, key))
     except (KeyError, GrammarError):
         return None
 
@@ -86,17 +117,17 @@ def _ways(names: tuple[str, ...], scale: float) -> tuple[Read, Write]:
         scale: factor from the argument to the slider's number.
     """
 
-    def known(values: Values) -> dict[str, tuple[str, float]]:
-        numbers = ((way, name, _number(values, way, name)) for way in WAYS for name in names)
-        return {way: (name, number) for way, name, number in numbers if number is not None}
+    def known(values: Values) -> dict[str, float]:
+        keys = [f"{way}.{name}" for way in WAYS for name in names]
+        numbers = ((key, _number(values, key)) for key in keys)
+        return {key: number for key, number in numbers if number is not None}
 
     def read(values: Values) -> float | None:
         found = known(values)
-        return scale * max(number for _, number in found.values()) if found else None
+        return scale * max(found.values()) if found else None
 
     def write(values: Values, number: float) -> dict[str, Any]:
-        found = known(values).items()
-        return {way: _with(way, values[way], name, number / scale) for way, (name, _) in found}
+        return dict.fromkeys(known(values), number / scale)
 
     return read, write
 
@@ -110,39 +141,47 @@ def _component(key: str, axis: int, axes: int) -> tuple[Read, Write]:
         return {key: numbers}
 
     def read(values: Values) -> float | None:
-        return None if key not in values else float(values[key][axis]) if values[key] else 0.0
+        numbers = values.get(key)
+        if numbers is None or 0 < len(numbers) <= axis:
+            return None
+        return float(numbers[axis]) if numbers else 0.0
 
     return read, write
 
 
-def _compared(label: str, hint: str, at: str, high: float, step: float) -> Knob:
-    key = "control.trigger"
+def _argument(
+    name: str, unit: str, hint: str, at: str, low: float, high: float, step: float
+) -> Knob:
+    """Slider for an argument of the trigger; a whole number if the step is."""
+    key = f"control.trigger.{at}"
 
-    def write(values: Values, number: float) -> dict[str, Any]:
-        return {key: _with(key, values[key], at, number)}
+    def write(_: Values, number: float) -> dict[str, Any]:
+        return {key: round(number) if step >= 1.0 else number}
 
-    return Knob(label, hint, "server", 0.0, high, step, lambda each: _number(each, key, at), write)
+    return Knob(
+        name, unit, hint, "server", low, high, step, lambda values: _number(values, key), write
+    )
 
 
 def knobs(axes: int) -> tuple[Knob, ...]:
-    wind, steady = "vehicle.wind", "vehicle.steady_wind_mps"
     lossy = "Share of packets that are lost, both ways"
     least = "Smallest delay of a packet, each way"
-    white = "Strength of white acceleration"
-    along = "Velocity of the steady wind"
+    white, along = "Strength of white acceleration", "Velocity of the steady wind"
+    delays = "paper", "constant"
     return (
-        Knob("Loss [%]", lossy, "netem", 0.0, 100.0, 1.0, *_ways(("loss",), 100.0)),
-        Knob("Delay [ms]", least, "netem", 0.0, 1500.0, 10.0, *_ways(("paper", "constant"), 1e3)),
-        Knob("Wind [m/s per √s]", white, "client", 0.0, 1.0, 0.01, *_own(wind)),
+        Knob("Loss", "%", lossy, "netem", 0.0, 100.0, 1.0, *_ways(("loss",), 100.0)),
+        Knob("Delay", "ms", least, "netem", 0.0, 1500.0, 10.0, *_ways(delays, 1e3)),
+        Knob("Wind", "m/s per √s", white, "client", 0.0, 1.0, 0.01, *_own("vehicle.wind")),
         *(
             Knob(
-                f"Steady wind {name} [m/s]",
+                f"Steady wind {name}",
+                "m/s",
                 along,
                 "client",
                 -1.0,
                 1.0,
                 0.02,
-                *_component(steady, axis, axes),
+                *_component("vehicle.steady_wind_mps", axis, axes),
             )
             for axis, name in enumerate("xyz"[:axes])
         ),
@@ -150,36 +189,39 @@ def knobs(axes: int) -> tuple[Knob, ...]:
 
 
 THRESHOLDS = (
-    _compared("Threshold: cost gap", "Extra cost above which a plan is sent", "cost_gap", 20, 0.05),
-    _compared(
+    _argument(
+        "Threshold: cost gap", "", "Extra cost above which a plan is sent", "cost_gap", 0, 20, 0.05
+    ),
+    _argument(
         "Threshold: expected gap",
+        "",
         "Expected extra cost above which a plan is sent",
         "expected_gap",
+        0,
         20,
         0.05,
     ),
-    _compared("Threshold: ε", "Tolerance of eq. (16)", "state_gap.epsilon", 20, 0.1),
-    _compared("Threshold: decay λ [1/s]", "Decay rate of (16)", "state_gap.decay_rate", 10, 0.1),
-    _compared(
-        "Threshold: deviation [m]",
+    _argument("Threshold: ε", "", "Tolerance of eq. (16)", "state_gap.epsilon", 0, 20, 0.1),
+    _argument(
+        "Threshold: decay λ", "1/s", "Decay rate of (16)", "state_gap.decay_rate", 0, 10, 0.1
+    ),
+    _argument(
+        "Threshold: deviation",
+        "m",
         "Distance from the plan above which one is sent",
         "deviation",
+        0,
         1,
         0.01,
     ),
-    Knob(
-        "Rate: steps from packet to packet",
+    _argument(
+        "Rate: steps a packet",
+        "",
         "Number of steps from one packet to the next",
-        "server",
+        "periodic",
+        1,
+        100,
         1.0,
-        100.0,
-        1.0,
-        lambda values: _number(values, "control.trigger", "periodic"),
-        lambda values, number: {
-            "control.trigger": _with(
-                "control.trigger", values["control.trigger"], "periodic", round(number)
-            )
-        },
     ),
 )
 """Sliders for the thresholds of triggers, each shown if the present trigger compares it."""

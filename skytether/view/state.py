@@ -1,6 +1,6 @@
 """State of one flight on a page: its last minute, from its processes' frames.
 
-    (process, Frame) → `State.take` → `State.vehicles`, `State.network`, `State.said`
+    (process, Frame) → `State.take` → `State.vehicles`, `State.network`, `State.said`, `State.marks`
 
 Memory is bounded: a ring buffer for each vehicle, one for the network, and the newest events. Times
 are those of the frames; the drawing code passes the present time.
@@ -40,6 +40,8 @@ from skytether.shared.telemetry.record import DOWNLINK, UPLINK, Reason, SentBy, 
 from skytether.shared.telemetry.record import Rows as Table
 from skytether.shared.wire.paths import PATHS_MAX
 from skytether.shared.wire.protocol import Mode
+from skytether.view.changes import Mark, mark, together
+from skytether.view.controls import WAYS
 from skytether.view.network import DIRECTIONS, SPAN_S, Network
 from skytether.view.rows import check_columns, check_values, planned
 
@@ -52,6 +54,10 @@ ZONED, GUIDED = "mission.zones", "mission.goals"
 PLANS_MAX = 8
 """Number of plans of a vehicle that are kept, retransmissions included."""
 SAID_MAX = 50
+FOLDED = 3
+"""Number of newest events among which one with the same words is counted, not repeated."""
+AT_ONCE_S = 2.0
+"""Time within which changes of one key, as a slider is dragged, are one change [s]."""
 LED = "reference.points_m"
 """Key that changes many times a second while a target is dragged; its changes are not logged."""
 LOSS_S = 10.0
@@ -93,6 +99,16 @@ class Curves:
     """Age of the observation from which the input in force was computed [s]; shape (n,)."""
     solve_ms: Array
     """Computing time of both MPC problems [ms]; shape (n,)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Heard:
+    """Event of a flight, or several with the same words."""
+
+    time_s: float
+    """Time of flight of the newest [s]."""
+    text: str
+    count: int = 1
 
 
 class VehicleTrack:
@@ -356,8 +372,12 @@ class State:
         self._zones: str | None = None
         """Zones as changed in flight; None before a change."""
         self.network = Network(0)
-        self.said: deque[tuple[float, str]] = deque(maxlen=SAID_MAX)
-        """Newest events, oldest first: time of flight [s] and sentence."""
+        self.said: deque[Heard] = deque(maxlen=SAID_MAX)
+        """Newest events, oldest first."""
+        self.marks: deque[tuple[float, Mark]] = deque(maxlen=SAID_MAX)
+        """Newest changes, oldest first, with their times of flight [s]."""
+        self.changed: dict[tuple[str, str], Changed] = {}
+        """Newest change, by process and key: several keys if they were changed at once."""
         self.newest_ns = 0
         self.begin_ns: int | None = None
         """Start of the flight's step 0 [ns]; None before any step."""
@@ -381,7 +401,7 @@ class State:
         if isinstance(frame, Rows):
             self._rows(known, frame)
         elif isinstance(frame, Said):
-            self._said(frame.event, frame.time_ns)
+            self._said(process, frame.event, frame.time_ns)
         elif isinstance(frame, Figures):
             known.figures = frame.figures
             if _is_netem(process):
@@ -460,13 +480,43 @@ class State:
             track = self.vehicles[number] = VehicleTrack(number, self.scenario)
         return track
 
-    def _said(self, event: Event, time_ns: int) -> None:
-        if isinstance(event, Changed) and event.key == ZONED:
-            self._zones = msgspec.json.decode(event.after)
-        moves = isinstance(event, Changed) and event.key == LED
-        if moves or isinstance(event, Counted | Listening | Plaintext):
+    def _said(self, process: str, event: Event, time_ns: int) -> None:
+        time_s = self.time_s(time_ns)
+        if isinstance(event, Counted | Listening | Plaintext):
             return
-        self.said.append((self.time_s(time_ns), str(event).splitlines()[0]))
+        if isinstance(event, Changed):
+            if event.key != LED:
+                self._change(process, event, time_s)
+            return
+        text, count = str(event).splitlines()[0], 1
+        for heard in list(self.said)[-FOLDED:]:
+            if heard.text == text:
+                self.said.remove(heard)
+                count += heard.count
+        self.said.append(Heard(time_s, text, count))
+
+    def _change(self, process: str, event: Changed, time_s: float) -> None:
+        """Hear of a change; it may continue the newest one, or be its other direction or path."""
+        if event.key == ZONED:
+            self._zones = msgspec.json.decode(event.after)
+        marked, before = mark(event), self.changed.get((process, event.key))
+        netems = sum(map(_is_netem, self._processes))
+        if (
+            self.changed
+            and self.said[-1].text == together(self.changed, netems)
+            and time_s - self.said[-1].time_s < AT_ONCE_S
+            and all(key == event.key or {key, event.key} <= {*WAYS} for _, key in self.changed)
+            and marked is self.marks[-1][1]
+            and (before is None or before.before != event.after)  # else it is undone
+        ):
+            self.said.pop()
+            if before:
+                event = Changed(key=event.key, before=before.before, after=event.after)
+            self.changed = {**self.changed, (process, event.key): event}
+        else:
+            self.changed = {(process, event.key): event}
+            self.marks.append((time_s, marked))
+        self.said.append(Heard(time_s, together(self.changed, netems)))
 
     # -- display ----------------------------------------------------------------------------
 

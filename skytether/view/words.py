@@ -12,7 +12,7 @@ from skytether.shared.base.units import MILLISECOND_NS
 from skytether.shared.telemetry.record import DOWNLINK, UPLINK
 from skytether.shared.telemetry.summary import PLUGINS
 from skytether.view.scene import FENCE_RGB, FLIGHT_RGB, GOAL_RGB
-from skytether.view.state import LOSS_S, State, Word, group, told
+from skytether.view.state import LOSS_S, Heard, State, Word, group, told
 
 CSS = {
     "grey": "var(--mantine-color-gray-6)",
@@ -137,10 +137,15 @@ def _newest(state: State) -> str:
     """Newest events, in a box of fixed height, so that the page does not move."""
     style = "white-space:nowrap;overflow:hidden;text-overflow:ellipsis"
     lines = "".join(
-        f'<div style="{style}" title="{escape(text)}">{time_s:.1f} s {escape(text)}</div>'
-        for time_s, text in list(state.said)[: -NEWEST - 1 : -1]
+        f'<div style="{style}" title="{escape(each.text)}">{each.time_s:.1f} s '
+        f"{escape(_counted(each))}</div>"
+        for each in list(state.said)[: -NEWEST - 1 : -1]
     )
     return f'<div style="height:{1.45 * NEWEST}em">{lines}</div>'
+
+
+def _counted(heard: Heard) -> str:
+    return f"{heard.text} ×{heard.count}" if heard.count > 1 else heard.text
 
 
 def _link(state: State, vehicle: int, now_ns: int) -> Word:
@@ -246,9 +251,9 @@ def _network(state: State, now_ns: int) -> list[tuple[str, str]]:
 
 def said(states: Sequence[tuple[str, State]]) -> str:
     events = [
-        (time_s, f"{title} {text}".strip())
+        (each.time_s, f"{title} {_counted(each)}".strip())
         for title, state in states
-        for time_s, text in state.said
+        for each in state.said
     ]
     events.sort(key=lambda each: each[0], reverse=True)
     lines = "".join(
@@ -262,8 +267,12 @@ def note(text: str) -> str:
     return f'<div style="{_BODY};{_DIM}">{escape(text)}</div>'
 
 
+def refused(why: str) -> str:
+    return f'<div style="{_BODY};color:{CSS["red"]};margin:-0.4em 0 0.4em">{escape(why)}</div>'
+
+
 def answers(given: Sequence[tuple[str, bool]]) -> str:
-    """Answers to the newest request, in a box of fixed height.
+    """Answers to the newest request; one of a line does not move the page.
 
     Args:
         given: answer of each flight, and whether it is a refusal.
@@ -272,7 +281,8 @@ def answers(given: Sequence[tuple[str, bool]]) -> str:
         f'<div style="color:{CSS["red" if refused else "green"]}">{escape(text)}</div>'
         for text, refused in dict.fromkeys(given)
     )
-    return f'<div style="{_BODY};height:2.9em;overflow-y:auto">{lines}</div>'
+    box = "min-height:1.45em;max-height:4.35em;overflow-y:auto"
+    return f'<div style="{_BODY};{box}">{lines}</div>'
 
 
 def legend(titles: Sequence[str], *, has_zones: bool) -> str:

@@ -25,6 +25,7 @@ from chromium import (
     chromium,
     cut,
     flown_s,
+    number,
     opened,
     picture,
     pictures,
@@ -109,11 +110,48 @@ def test_the_loss_slider_changes_the_measured_loss(
         slider = page.get_by_text("Loss [%]")
         place = slider.bounding_box()
         put(page, "Loss [%]", 60)
-        until(lambda: page.get_by_text("network.uplink is").count(), "it is answered")
+        until(lambda: page.get_by_text("→ 60 %").count() > 2, "it is answered")
         assert slider.bounding_box() == place, "the answer has moved the controls"
         until(lambda: min(measured(), default=0) > 40, "the measured loss follows")
         put(page, "Loss [%]", 10)
         until(lambda: max(measured(), default=100) < 35, "the measured loss follows back")
+
+
+@pytest.mark.long
+def test_a_typed_number_counts_once_it_is_whole(browser: "sync_api.Browser", flight: str) -> None:
+    """On Enter, or when the field is left; Escape restores it, and a number beyond the range is
+    refused at the field.
+    """
+    with opened(browser, flight) as page:
+        until(lambda: "TRACK" in status(page), "it flies a plan")
+        field, beside = number(page, "Loss [%]"), number(page, "Delay [ms]")
+
+        def typed(text: str, key: str) -> str:
+            field.click()
+            field.press("Control+a")
+            page.keyboard.type(text, delay=100.0)
+            shown = field.input_value()
+            page.keyboard.press(key)
+            page.wait_for_timeout(2500)  # longer than an answer takes
+            return shown
+
+        changes = page.get_by_text(re.compile("^Loss .* →"))
+        put(page, "Loss [%]", 12)
+        until(changes.count, "it is answered")
+        for text, key, expected in (("45", "Escape", "12"), ("250", "Enter", "12")):
+            assert typed(text, key) == text
+            assert field.input_value() == expected
+        refused = page.get_by_text("0 to 100 %")
+        assert refused.bounding_box()["y"] < beside.bounding_box()["y"]  # type: ignore[index]
+        assert changes.first.inner_text().endswith("→ 12 %")
+        typed("20", "Enter")
+        until(lambda: changes.first.inner_text().endswith("12 → 20 %"), "no prefix was flown")
+        assert not refused.count()
+        typed("10", "Tab")
+        until(lambda: changes.first.inner_text().endswith("20 → 10 %"), "a field that is left acts")
+        page.get_by_role("button", name="Undo").click()
+        until(lambda: changes.first.inner_text().endswith("10 → 20 %"), "it is taken back")
+        put(page, "Loss [%]", 10)
 
 
 def test_cutting_the_link_leads_to_braking_and_hovering_and_healing_it_back(

@@ -6,6 +6,7 @@ real page with its threads.
 
 import asyncio
 import base64
+import gzip
 import os
 import socket
 import struct
@@ -19,7 +20,9 @@ import pytest
 import viser
 import zstandard
 from websockets.asyncio.client import ClientConnection, connect
+from websockets.datastructures import Headers
 from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.http11 import Response
 from websockets.sync import client as in_threads
 from websockets.typing import Subprotocol
 
@@ -225,6 +228,32 @@ async def test_no_answer_may_be_shown_in_a_frame(request_: bytes, status: bytes 
     assert status is None or head[0].split()[1] == status
     assert b"Content-Security-Policy: frame-ancestors 'none'" in head
     assert b"X-Frame-Options: DENY" in head
+
+
+@pytest.mark.parametrize("zipped", [True, False])
+@virtually
+async def test_the_page_gets_our_style_and_script(zipped: bool) -> None:
+    """Before its end, compressed or not; other files stay as they are."""
+    form = {"Content-Type": "text/html; charset=utf-8", "Content-Length": "3"}
+    body = b"<html><body>viser</body></html>"
+    if zipped:
+        form, body = form | {"Content-Encoding": "gzip"}, gzip.compress(body)
+    page, other = Response(200, "OK", Headers(form), body), Response(200, "OK", Headers(), body)
+    guarded = Guarded()
+    guarded._answer = lambda _, request: other if request.path == "/x" else page  # type: ignore[method-assign]
+    async with guarded.served() as served:
+        for path, dressed in (("/", True), ("/x", False)):
+            reader, writer = await asyncio.open_connection("127.0.0.1", served.port)
+            writer.write(f"GET {path} HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n".encode())
+            head = await reader.readuntil(b"\r\n\r\n")
+            got = await reader.read()
+            writer.close()
+            text = gzip.decompress(got) if zipped else got
+            assert (guard.DRESS.read_bytes() in text) is dressed
+            assert text.startswith(b"<html><body>viser")
+            assert text.endswith(b"</body></html>")
+            if dressed:
+                assert f"Content-Length: {len(got)}\r\n".encode() in head
 
 
 @virtually

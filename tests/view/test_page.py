@@ -20,8 +20,10 @@ from helpers import until
 from skytether.cli import page_process
 from skytether.cli.duel import DuelOptions, titles, together
 from skytether.shared.core.change import Answer, Running
+from skytether.shared.core.events import Changed
 from skytether.shared.scenario import reading, registry, schema
 from skytether.shared.scenario.schema import Scenario
+from skytether.shared.telemetry.feed import Opened, Said
 from skytether.shell.command import CommandError
 from skytether.sim import flight as virtual
 from skytether.view import plots
@@ -33,6 +35,7 @@ from skytether.view.browser.replay import Player
 from skytether.view.controls import (
     THRESHOLDS,
     TRIGGERS,
+    applied,
     cut,
     healed,
     is_cut,
@@ -165,7 +168,97 @@ def test_a_direction_without_loss_or_delay_has_no_slider_for_it() -> None:
     loss, delay, *_ = knobs(2)
     values = {"network.uplink": "rate(5000)", "network.downlink": "constant(0.1) & rate(5000)"}
     assert (loss.read(values), delay.read(values)) == (None, 100.0)
-    assert delay.write(values, 200.0) == {"network.downlink": "constant(0.2) & rate(5000)"}
+    after = applied(values, delay.write(values, 200.0))
+    assert after == values | {"network.downlink": "constant(0.2) & rate(5000)"}
+
+
+def test_a_slider_sends_its_own_number_and_not_what_the_page_knew_beside_it() -> None:
+    """A page that has stayed open since an earlier flight changes nothing else in a later one."""
+    scenario = reading.load("demo")
+    for knob in (*knobs(2)[:2], THRESHOLDS[1]):
+        runs, values = running(knob.process, scenario)
+        now = {"network.uplink": PAPER.replace("0.02", "0.03"), "network.downlink": PAPER}
+        now |= {"control.trigger": "expected_gap(3) | silence(2)"}
+        own = {key: now[key] for key in values.keys() & now.keys()}
+        runs.answer(msgspec.json.encode(own), now_ns=0)
+        asked = msgspec.json.encode(knob.write(values, 7.0))
+        assert not msgspec.json.decode(runs.answer(asked, now_ns=0), type=Answer).refused
+        after = msgspec.json.decode(runs.answer(b"{}", now_ns=0), type=Answer).values
+        assert knob.read(after) == pytest.approx(7.0)
+        for key, text in own.items():
+            assert after[key] == applied(own, knob.write(own, 7.0))[key] != text
+
+
+def test_what_was_known_of_a_process_is_forgotten_when_another_one_begins() -> None:
+    flight, asked = PageFlight(), list[tuple[str, dict[str, Any]]]()
+    flight.operator = mock.Mock(ask=lambda *request: asked.append(request))
+    scenario = msgspec.structs.replace(reading.load("demo"), duration=1.0, settle=0.0)
+    frames = list(of_flight(scenario, "demo", virtual.fly(scenario)))
+    netem = next(frame for _, process, frame in frames if process == "netem")
+    assert isinstance(netem, Opened)
+    flight.take("netem", netem)
+    flight.values["netem"] = NETWORK
+    flight.take("netem", netem)
+    assert flight.netems == ["netem"], "its feed was only read anew"
+    flight.cut()
+    flight.take("netem", msgspec.structs.replace(netem, time_ns=netem.time_ns + 1))
+    assert not flight.netems
+    flight.values["netem"] = {way: f"{text} & loss(1)" for way, text in NETWORK.items()}
+    flight.values["netem"]["network.uplink"] = "loss(0.4) & loss(1)"
+    asked.clear()
+    flight.heal()
+    assert asked == [("netem", NETWORK | {"network.uplink": "loss(0.4)"})]
+
+
+def test_the_newest_change_is_taken_back() -> None:
+    flight, asked = flown(), list[tuple[str, dict[str, Any]]]()
+    flight.operator = mock.Mock(ask=lambda *request: asked.append(request))
+    flight.values = {"netem": NETWORK, "client": {"armed": True}}
+    assert not flight.undoable
+    after_ns = flight.state.newest_ns
+    before, after = (msgspec.json.encode(text).decode() for text in (f"{PAPER} & loss(1)", PAPER))
+    for key in NETWORK:
+        change = Changed(key=key, before=before, after=after)
+        flight.take("netem", Said(time_ns=after_ns + 1, event=change))
+    asked.clear()
+    assert flight.undo_cuts
+    gui = Gui()
+    panel.Controls(mock.Mock(gui=gui), [flight], lambda: 1)
+    gui.elements["Undo"].use(True)
+    assert not asked, "it would cut the link, so it is asked once more"
+    gui.elements["Yes, cut it"].use()
+    assert asked == [("netem", dict.fromkeys(NETWORK, f"{PAPER} & loss(1)"))]
+    disarmed = Changed(key="armed", before="true", after="false")
+    flight.take("client", Said(time_ns=after_ns + 2, event=disarmed))
+    assert not flight.undoable
+
+
+def test_a_refused_number_is_told_at_its_field_and_not_sent() -> None:
+    flight, asked = flown(), list[tuple[str, dict[str, Any]]]()
+    flight.operator = mock.Mock(ask=lambda *request: asked.append(request))
+    flight.values = {"netem": NETWORK, "server": {"control.trigger": "cost_gap"}}
+    gui = Gui()
+    controls = panel.Controls(mock.Mock(gui=gui), [flight], lambda: 1)
+    controls.show()
+    slider = gui.elements["Loss [%]"]
+    for refused in (150.0, -1.0, np.nan):
+        slider.use(refused)
+        assert (asked, slider.value) == ([], 10.0)
+        controls.show()
+        note, delay = (each.note._html for each in controls._sliders[:2])
+        assert note.visible
+        assert not delay.visible
+        assert "Loss: 0 to 100 %" in note.content
+    slider.use(30.0)
+    assert asked == [("netem", {"network.uplink.loss": 0.3, "network.downlink.loss": 0.3})]
+    flight._answered("netem", asked[0][1], Answer(refused="the horizon is too short"))
+    controls.show()
+    assert "horizon" in note.content
+    assert "horizon" not in controls._answer.content
+    flight._answered("netem", {"network.uplink": ""}, Answer(refused="no such impairment"))
+    controls.show()
+    assert not note.visible
+    assert "no such impairment" in controls._answer.content
 
 
 def test_healing_brings_back_what_was_before_the_link_was_cut(tmp_path: Path) -> None:
@@ -206,11 +299,22 @@ def test_a_path_is_cut_and_healed_alone(tmp_path: Path) -> None:
     flight.close()
 
 
+def flown() -> PageFlight:
+    """A flight of one second on a page."""
+    scenario = msgspec.structs.replace(reading.load("demo"), duration=1.0, settle=0.0)
+    flight = PageFlight()
+    for _, process, frame in of_flight(scenario, "demo", virtual.fly(scenario)):
+        flight.take(process, frame)
+    return flight
+
+
 class Handle:
     """Element of a browser, which the test uses in place of a person."""
 
     def __init__(self, value: Any = None) -> None:
         self.value, self.uses = value, list[Any]()
+        self.visible, self.content, self.label = True, "", ""
+        self.min, self.max = -np.inf, np.inf
 
     def on_click(self, act: Any) -> Any:
         self.uses.append(act)
@@ -242,9 +346,11 @@ class Gui:
         self.elements: dict[str, Handle] = {}
 
     def __getattr__(self, _: str) -> Any:
-        def add(label: str, *_: Any, **__: Any) -> Handle:
-            self.elements[label] = Handle()
-            return self.elements[label]
+        def add(label: str, *given: Any, **__: Any) -> Handle:
+            handle = self.elements[label] = Handle()
+            if len(given) == 4:  # of a slider
+                handle.min, handle.max, _, handle.value = given
+            return handle
 
         return add
 
@@ -261,10 +367,7 @@ def test_what_may_end_a_flight_is_asked_once_more(
     label: str, value: object, yes: str, expected: str
 ) -> None:
     """One click changes nothing; a second one, elsewhere, does, unless it says to leave it."""
-    scenario = msgspec.structs.replace(reading.load("demo"), duration=1.0, settle=0.0)
-    flight, asked = PageFlight(), list[tuple[str, dict[str, Any]]]()
-    for _, process, frame in of_flight(scenario, "demo", virtual.fly(scenario)):
-        flight.take(process, frame)
+    flight, asked = flown(), list[tuple[str, dict[str, Any]]]()
     flight.operator = mock.Mock(ask=lambda *request: asked.append(request))
     flight.values = {"netem": NETWORK, "client": {"armed": True}}
     gui = Gui()

@@ -4,6 +4,7 @@ import re
 from dataclasses import dataclass
 from functools import cache
 from html import unescape
+from itertools import pairwise
 from typing import Any
 
 import msgspec
@@ -12,7 +13,7 @@ import pytest
 
 from skytether.figures.colours import MODE_COLOURS
 from skytether.shared.base.units import SECOND_NS
-from skytether.shared.core.events import ModeChanged
+from skytether.shared.core.events import Changed, Event, ModeChanged
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.reading import to_toml
 from skytether.shared.scenario.schema import Scenario
@@ -28,7 +29,8 @@ from skytether.shared.telemetry.record import (
 from skytether.shared.telemetry.summary import summarise
 from skytether.shared.wire.protocol import Mode
 from skytether.sim import flight
-from skytether.view import plots, scene, words
+from skytether.view import changes, plots, scene, words
+from skytether.view.changes import Mark
 from skytether.view.frames import of_flight
 from skytether.view.network import BINS, DELAY_BINS, SPAN_S
 from skytether.view.rows import planned
@@ -225,7 +227,7 @@ def test_a_cut_link_is_said_in_words_and_colour() -> None:
     does = state.vehicles[number].does
     assert (does.word, does.colour) == ("HOVER", "blue")
     assert does.text == f"hovers: {Reason.LOST}"
-    said = [text for _, text in state.said]
+    said = [each.text for each in state.said]
     assert f"vehicle 1 brakes: {Reason.LOST}" in said
     assert said.index(f"vehicle 1 brakes: {Reason.LOST}") < said.index(
         f"vehicle 1 hovers: {Reason.LOST}"
@@ -237,6 +239,93 @@ def test_a_cut_link_is_said_in_words_and_colour() -> None:
     good = demo()
     assert good.state.link(1, good.now_ns).word == "GOOD"
     assert good.state.vehicles[1].mode is Mode.TRACK
+
+
+PAPER = "paper(0.4, 0.02, 2.0) & loss(0.1)"
+
+
+def turned(key: str, before: object, after: object) -> Changed:
+    return Changed(
+        key=key,
+        before=msgspec.json.encode(before).decode(),
+        after=msgspec.json.encode(after).decode(),
+    )
+
+
+@pytest.mark.parametrize(
+    ("key", "before", "after", "said"),
+    [
+        ("network.uplink", PAPER, PAPER.replace("0.1", "0.3"), "Loss 10 → 30 %"),
+        ("network.uplink", PAPER, "paper(0.5, 0.02, 2) & loss(0.1)", "Delay 400 → 500 ms"),
+        (
+            "network.uplink",
+            PAPER,
+            f"{PAPER} & rate(5000)",
+            "network.uplink nothing → rate(5000)",
+        ),
+        ("network.uplink", PAPER, f"{PAPER} & loss(1)", str(Mark.CUT.value)),
+        ("network.uplink", f"{PAPER} & loss(1)", PAPER, str(Mark.HEALED.value)),
+        ("vehicle.steady_wind_mps", [], [0.2, 0.0], "Steady wind x 0 → 0.2 m/s"),
+        ("control.trigger", "cost_gap | silence(1)", "always", "cost_gap | silence(1) → always"),
+        ("control.trigger", "periodic", "periodic(3)", "10 → 3"),
+        ("armed", True, False, "armed true → false"),
+        ("of another version", "a(", 3, "a( → 3"),
+        ("network.uplink", "unknown(3) & loss(0.1)", "unknown(3) & loss(0.2)", "loss(0.2)"),
+    ],
+)
+def test_a_change_is_told_by_what_differs(key: str, before: Any, after: Any, said: str) -> None:
+    told = changes.in_words(turned(key, before, after))
+    assert said.lower() in told.lower()
+    assert len(told) < 60
+
+
+def changing(*told: tuple[float, str, Event]) -> State:
+    """State of a flight that hears of events at times of flight [s] from processes."""
+    state = state_of(brief().frames)
+    state.said.clear()
+    begin_ns = state.newest_ns
+    for time_s, process, event in told:
+        state.take(process, Said(time_ns=begin_ns + round(time_s * SECOND_NS), event=event))
+    return state
+
+
+def test_a_dragged_slider_is_one_change_of_both_directions() -> None:
+    steps = list(pairwise((PAPER, PAPER.replace("0.1", "0.2"), PAPER.replace("0.1", "0.3"))))
+    both = [
+        (0.1 * k + 1.0, "netem", turned(way, *step))
+        for k, step in enumerate(steps)
+        for way in changes.DIRECTIONS
+    ]
+    state = changing(*both)
+    assert [each.text for each in state.said] == ["Loss 10 → 30 %"]
+    assert [marked for _, marked in state.marks] == [Mark.CHANGED]
+    later = (9.0, "netem", turned("network.uplink", PAPER, PAPER.replace("0.1", "0.4")))
+    assert [each.text for each in changing(*both, later).said][1:] == ["Loss 10 → 40 % (up)"]
+    back = [(1.5, "netem", turned(way, steps[-1][1], PAPER)) for way in changes.DIRECTIONS]
+    undone = [each.text for each in changing(*both, *back).said]
+    assert undone == ["Loss 10 → 30 %", "Loss 30 → 10 %"]
+
+
+def test_the_path_that_is_cut_alone_is_named() -> None:
+    state = changing()
+    second = opened("netem", {"netem": PACKET_COLUMNS})
+    state.take("netem 2", msgspec.structs.replace(second, time_ns=1))
+    for way in changes.DIRECTIONS:
+        event = turned(way, PAPER, f"{PAPER} & loss(1)")
+        state.take("netem 2", Said(time_ns=state.newest_ns + 1, event=event))
+    assert [each.text for each in state.said] == ["Link cut (path 2)"]
+    assert state.marks[-1][1] is Mark.CUT
+
+
+def test_events_that_repeat_are_counted_and_leave_room_for_others() -> None:
+    brakes = ModeChanged(vehicle=1, before="track", after="brake", reason="it woke too late")
+    flies = ModeChanged(vehicle=1, before="brake", after="track", reason="a horizon has come")
+    lands = ModeChanged(vehicle=1, before="track", after="land", reason="its battery is low")
+    events = [lands, *[brakes, flies] * 5]
+    state = changing(*((float(k), "client", event) for k, event in enumerate(events)))
+    assert [each.count for each in state.said] == [1, 5, 5]
+    assert state.said[-1].time_s - state.said[0].time_s == pytest.approx(10.0)
+    assert "×5" in words.said([("", state)])
 
 
 def test_an_autopilot_s_mode_battery_and_home_are_shown_where_they_are_told() -> None:

@@ -6,12 +6,18 @@ from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
 
-from skytether.shared.core.change import Answer
+import msgspec
+
+from skytether.shared.core.change import ONCE, Answer
 from skytether.shared.core.events import Changed
 from skytether.shared.telemetry.feed import Frame, Opened, Said
 from skytether.view import controls
 from skytether.view.browser.play import NETEMS, PROCESSES, Operator
+from skytether.view.changes import Mark, mark, together
 from skytether.view.state import LED, State
+
+FINAL = {*ONCE, "armed"}
+"""Keys whose changes are not taken back: decisions for once, and what may end a flight."""
 
 
 class PageFlight:
@@ -30,6 +36,10 @@ class PageFlight:
         """Keys that may change and their known values, by process."""
         self.answer = ""
         self.refused = False
+        self.asked: frozenset[str] = frozenset()
+        """Keys of the request that was answered last."""
+        self._opened_ns: dict[str, int] = {}
+        """Start of each process on its clock [ns]: another start is another process."""
         self._before: dict[str, dict[str, Any]] = {}
         """Values to restore when a link is healed, by its netem."""
         self.operator = Operator(folder, self._answered) if folder else None
@@ -41,6 +51,11 @@ class PageFlight:
         changed = (
             isinstance(frame, Said) and isinstance(frame.event, Changed) and frame.event.key != LED
         )
+        if isinstance(frame, Opened) and self._opened_ns.get(process) != frame.time_ns:
+            self._opened_ns[process] = frame.time_ns
+            # Of the process before: they would change the new one's keys to what was once asked.
+            self.values.pop(process, None)
+            self._before.pop(process, None)
         if process in PROCESSES and (changed or isinstance(frame, Opened)):
             self.ask(process, {})
 
@@ -58,11 +73,37 @@ class PageFlight:
         if answer and answer.values:
             self.values[process] = answer.values
         elif answer and (answer.refused or LED not in asked):
-            self.refused = bool(answer.refused)
-            self.answer = answer.refused or "; ".join(map(str, answer.changed))
+            changed = {(process, each.key): each for each in answer.changed}
+            self._say(asked, answer.refused or together(changed, 1), refused=bool(answer.refused))
         elif asked and not answer:
-            self.refused = True
-            self.answer = f"{process} does not answer: the flight is over, or accepts no changes"
+            silent = f"{process} does not answer: the flight is over, or accepts no changes"
+            self._say(asked, silent, refused=True)
+
+    def _say(self, asked: Collection[str], answer: str, *, refused: bool) -> None:
+        self.asked, self.answer, self.refused = frozenset(asked), answer, refused
+
+    @property
+    def undoable(self) -> dict[tuple[str, str], Changed]:
+        """Newest change, by process and key, if it can be taken back from here."""
+        changed = {
+            place: event
+            for place, event in self.state.changed.items()
+            if place[0] in self.values and event.key not in FINAL
+        }
+        return changed if len(changed) == len(self.state.changed) else {}
+
+    @property
+    def undo_cuts(self) -> bool:
+        """Whether taking back the newest change cuts the link."""
+        return any(mark(event) is Mark.HEALED for event in self.undoable.values())
+
+    def undo(self) -> None:
+        """Take back the newest change."""
+        before: dict[str, dict[str, Any]] = {}
+        for (process, key), event in self.undoable.items():
+            before.setdefault(process, {})[key] = msgspec.json.decode(event.before)
+        for process, values in before.items():
+            self.ask(process, values)
 
     @property
     def netems(self) -> list[str]:

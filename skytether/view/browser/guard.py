@@ -3,7 +3,7 @@
 viser itself accepts any connection and any message: uploads of any size, requests to put the page
 on the internet, values of any attribute. `Guard.served` makes it listen with these rules:
 
-- no answer may be shown in a website's frame;
+- no answer may be shown in a website's frame; the page itself gets our style and script (`DRESS`);
 - a websocket is opened only for browsers that may look (`access.refusal`), up to BROWSERS_MAX;
 - only messages that our page sends (`MESSAGES`) are accepted, of at most 64 KiB in 64 pieces;
 - at most `RATE_HZ` messages a second are read; more of them wait in the browser's kernel;
@@ -14,13 +14,15 @@ A misbehaving browser loses its own connection, and affects no other.
 """
 
 import asyncio
+import gzip
 import logging
 import threading
 from collections import Counter
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
 from contextlib import contextmanager
-from functools import partial
+from functools import lru_cache, partial
 from http import HTTPStatus
+from pathlib import Path
 from socket import SO_SNDBUF, SOL_SOCKET
 from typing import Any
 
@@ -61,6 +63,8 @@ MESSAGES = frozenset(
 VALUE = "value"
 """The only attribute of an element that a browser may set."""
 PROTOCOL = f"viser-v{viser.__version__}"
+DRESS = Path(__file__).with_name("dress.html")
+"""Style and script that viser's page gets from us."""
 
 _QUIET = logging.getLogger(__name__)
 _QUIET.disabled = True  # invalid bytes from the network must not print a traceback
@@ -158,6 +162,8 @@ class Guard:
             why is TurnedAway.HOST and request.path == "/"
         ):  # otherwise viser would wait for this client's websocket for ever
             return connection.respond(HTTPStatus.FORBIDDEN, f"{why}\n")
+        if response and response.headers.get("Content-Type", "").startswith("text/html"):
+            _dress(response)
         return response
 
     async def _handle(
@@ -250,6 +256,21 @@ class _Connection(sockets.ServerConnection):
         self._guard.count(why)
         self._is_cut = True
         self.transport.abort()
+
+
+def _dress(response: Response) -> None:
+    """Add DRESS to a page, before its end."""
+    zipped = response.headers.get("Content-Encoding") == "gzip"
+    response.body = _dressed(bytes(response.body), zipped=zipped)
+    del response.headers["Content-Length"]
+    response.headers["Content-Length"] = str(len(response.body))
+
+
+@lru_cache(maxsize=2)
+def _dressed(page: bytes, *, zipped: bool) -> bytes:
+    head, end, tail = (gzip.decompress(page) if zipped else page).rpartition(b"</body>")
+    whole = b"".join((head, DRESS.read_bytes(), end, tail))
+    return gzip.compress(whole) if zipped else whole
 
 
 def _unframed(_: sockets.ServerConnection, __: Request, response: Response) -> None:

@@ -4,7 +4,7 @@ Each browser has a panel of its own; one that may only look gets no controls.
 """
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import nullcontext
 from functools import partial
 from typing import Any
@@ -17,11 +17,13 @@ from skytether.shared.scenario.mission import format_goals, parse_goals
 from skytether.view import words
 from skytether.view.browser.flight import PageFlight
 from skytether.view.browser.play import NETEMS
+from skytether.view.changes import together
 from skytether.view.controls import (
     THRESHOLDS,
     WAYS,
     Knob,
     Values,
+    applied,
     is_cut,
     knobs,
     texts,
@@ -233,31 +235,70 @@ def assign(handle: Any, value: Any) -> None:
     handle.value = value
 
 
+class _Note:
+    """Refusal in words, under the field that it is about."""
+
+    def __init__(self, gui: viser.GuiApi) -> None:
+        self._html = gui.add_html("", visible=False)
+        self._keys: frozenset[str] = frozenset()
+        self._own = ""
+
+    def asks(self, keys: Iterable[str]) -> None:
+        """Show a refusal of these keys from now on."""
+        self._keys, self._own = frozenset(keys), ""
+
+    def refuse(self, why: str) -> None:
+        """Show a refusal by the page itself, until the field asks again."""
+        self._keys, self._own = frozenset(), why
+
+    def show(self, flights: Sequence[PageFlight]) -> bool:
+        """Redraw; returns whether the newest answer is shown here."""
+        refused = [each.answer for each in flights if each.refused and each.asked == self._keys]
+        why = "; ".join(dict.fromkeys(refused)) or self._own
+        self._html.content = words.refused(why)
+        self._html.visible = bool(why)
+        return bool(refused)
+
+
 class _Slider:
     """Slider for a number that the browser can change.
 
     Callbacks are coroutines, here and below: viser runs coroutines in order, and plain functions in
     any order.
+
+    Args:
+        ask: asks the flights for a number, and returns the keys asked for.
     """
 
-    def __init__(self, gui: viser.GuiApi, knob: Knob, ask: Callable[[Knob, float], None]) -> None:
+    def __init__(
+        self, gui: viser.GuiApi, knob: Knob, ask: Callable[[Knob, float], Collection[str]]
+    ) -> None:
         self.knob = knob
         self._slider = gui.add_slider(
             knob.label, knob.low, knob.high, knob.step, knob.low, hint=knob.hint, visible=False
         )
+        self.note = _Note(gui)
+        self._known = knob.low
         self._moved_s = -np.inf
 
         @self._slider.on_update
         async def _(event: Any) -> None:
-            if event.client is not None:  # ignore changes made by the program itself
+            if event.client is None:  # a change made by the program itself
+                return
+            number, low, high = float(self._slider.value), self._slider.min, self._slider.max
+            if low <= number <= high:
                 self._moved_s = time.monotonic()
-                ask(knob, float(self._slider.value))
+                self.note.asks(ask(knob, number))
+            else:
+                self.note.refuse(knob.with_unit(f"{low:g} to {high:g}"))
+                assign(self._slider, self._known)
 
     def show(self, values: Values) -> None:
         number = self.knob.read(values)
         self._slider.visible = number is not None
         if number is None or time.monotonic() - self._moved_s < HELD_S:
             return
+        self._known = number
         self._slider.max = max(self._slider.max, number)
         self._slider.min = min(self._slider.min, number)
         if abs(self._slider.value - number) > self.knob.step / 2:
@@ -334,6 +375,7 @@ class _Network:
                 way: gui.add_text(label, "", hint=IMPAIRMENTS)
                 for way, label in zip(WAYS, to, strict=True)
             }
+            self.note = _Note(gui)
             apply = gui.add_button("Change the network")
             self._alone = gui.add_button_group("This path", ("cut", "heal"), visible=False)
 
@@ -343,7 +385,11 @@ class _Network:
 
         @apply.on_click
         async def _(_: Any) -> None:
-            ask({way: text.value for way, text in self._texts.items()})
+            given = {way: text.value for way, text in self._texts.items()}
+            changed = {way: text for way, text in given.items() if text != self._known.get(way)}
+            self.note.asks(changed)
+            if changed:
+                ask(changed)
 
     def show(self, values: Values, *, is_alone: bool) -> None:
         known = texts(values)
@@ -378,7 +424,13 @@ class Controls:
         self._cut = gui.add_button("Cut the link", color="red", icon=viser.Icon.PLUG_CONNECTED_X)
         self._heal = gui.add_button("Heal it", color="green", icon=viser.Icon.PLUG_CONNECTED)
         self._answer = gui.add_html("")
-        self._sliders = [_Slider(gui, knob, self._ask) for knob in knobs(scenario.model.axes)]
+        self._sliders: list[_Slider] = []
+        offered = knobs(scenario.model.axes)
+        self._add_sliders(knob for knob in offered if knob.process == "netem")
+        if flies:
+            self._add_trigger()
+        self._undo = gui.add_button("Undo", disabled=True, icon=viser.Icon.ARROW_BACK_UP)
+        self._add_sliders(knob for knob in offered if knob.process != "netem")
         self._networks = {
             netem: _Network(
                 gui,
@@ -390,7 +442,6 @@ class Controls:
             )
             for number, netem in enumerate(NETEMS, start=1)
         }
-        self._thresholds: list[_Slider] = []
         self._lead: _Lead | None = None
         self._mission: _Mission | None = None
         if flies:
@@ -404,15 +455,35 @@ class Controls:
         def _(_: Any) -> None:
             self._heal_all()
 
-    def _let_fly(self) -> None:
-        gui, scenario = self._client.gui, self._flights[0].state.scenario
+        @self._undo.on_click
+        async def _(_: Any) -> None:
+            if any(flight.undo_cuts for flight in self._flights):
+                self._question.ask("Cut the link?", "Yes, cut it", self._undo_all)
+            else:
+                self._undo_all()
+
+    def _add_sliders(self, offered: Iterable[Knob]) -> None:
+        self._sliders += [_Slider(self._client.gui, knob, self._ask) for knob in offered]
+
+    def _add_trigger(self) -> None:
+        gui, control = self._client.gui, self._flights[0].state.scenario.control
         self._trigger = gui.add_dropdown(
             "Trigger",
-            triggers(scenario.control.scheme, scenario.control.trigger),
-            initial_value=scenario.control.trigger,
+            triggers(control.scheme, control.trigger),
+            initial_value=control.trigger,
             hint="Rule for sending a plan",
         )
-        self._thresholds = [_Slider(gui, knob, self._ask) for knob in THRESHOLDS]
+        self._trigger_note = _Note(gui)
+        self._add_sliders(THRESHOLDS)
+
+        @self._trigger.on_update
+        async def _(event: Any) -> None:
+            if event.client is not None:
+                self._trigger_note.asks(("control.trigger",))
+                self._all("server", {"control.trigger": self._trigger.value})
+
+    def _let_fly(self) -> None:
+        gui, scenario = self._client.gui, self._flights[0].state.scenario
         self._armed = gui.add_checkbox("Armed", True, hint="Disarmed: the vehicle ignores plans")
         self._after_leap = gui.add_button_group(
             "After a leap", ("old", "new", "stay"), visible=False, hint=AFTER_LEAP
@@ -423,11 +494,6 @@ class Controls:
         if scenario.is_mission:
             ask = partial(self._all, "server")
             self._mission = _Mission(self._client, self._flights, ask, self._vehicle)
-
-        @self._trigger.on_update
-        async def _(event: Any) -> None:
-            if event.client is not None:
-                self._all("server", {"control.trigger": self._trigger.value})
 
         @self._after_leap.on_click
         async def _(_: Any) -> None:
@@ -460,36 +526,56 @@ class Controls:
         for flight in self._flights:
             flight.heal(netems)
 
+    def _undo_all(self) -> None:
+        for flight in self._flights:
+            flight.undo()
+
     def _all(self, process: str, values: dict[str, Any]) -> None:
         for flight in self._flights:
             flight.ask(process, values)
 
-    def _ask(self, knob: Knob, number: float) -> None:
+    def _ask(self, knob: Knob, number: float) -> Collection[str]:
+        """Ask for a number; returns the keys asked for."""
+        keys: set[str] = set()
         for flight in self._flights:
             for process in flight.netems if knob.process == "netem" else (knob.process,):
                 values = flight.values.get(process, {})
                 if knob.read(values) is None:
                     continue
                 changed = knob.write(values, number)
-                if process in NETEMS and is_cut({**values, **changed}):
+                if process in NETEMS and is_cut(applied(values, changed)):
                     self._question.ask("Cut the link?", "Yes, cut it", self._cut_all)
-                    return
+                    return ()
+                keys |= changed.keys()
                 flight.ask(process, changed)
+        return keys
 
     def show(self) -> None:
         flight = self._flights[0]
-        if self._flights[0].state.flies:
-            self._show_flight(flight)
         for netem, network in self._networks.items():
             network.show(flight.values.get(netem, {}), is_alone=len(flight.netems) < 2)
         for slider in self._sliders:
             values = flight.values.get(slider.knob.process, {})
             slider.show(values)
-        self._cut.disabled = flight.cuts == flight.netems
-        self._heal.disabled = not flight.cuts
-        self._answer.content = words.answers(
-            [(each.answer, each.refused) for each in self._flights]
-        )
+        if flight.state.flies:
+            self._show_flight(flight)
+        is_cut_off = bool(flight.netems) and flight.cuts == flight.netems
+        self._cut.visible, self._heal.visible = not is_cut_off, bool(flight.cuts)
+        self._cut.disabled = not flight.netems
+        undoable = flight.undoable
+        self._undo.disabled = not undoable
+        self._undo.label = f"Undo: {together(undoable, 1)}" if undoable else "Undo"
+        at_fields = [each.show(self._flights) for each in self._notes()]
+        said = [] if any(at_fields) else [(each.answer, each.refused) for each in self._flights]
+        self._answer.content = words.answers(said)
+
+    def _notes(self) -> Iterator[_Note]:
+        yield from (slider.note for slider in self._sliders)
+        yield from (network.note for network in self._networks.values())
+        if self._flights[0].state.flies:
+            yield self._trigger_note
+        if self._mission:
+            yield self._mission.note
 
     def _show_flight(self, flight: PageFlight) -> None:
         server = flight.values.get("server", {})
@@ -498,8 +584,6 @@ class Controls:
             scheme = flight.state.scenario.control.scheme
             self._trigger.options = triggers(scheme, trigger)
             assign(self._trigger, trigger)
-        for slider in self._thresholds:
-            slider.show(server)
         armed = flight.values.get("client", {}).get("armed", self._armed.value)
         if armed != self._armed.value:
             assign(self._armed, armed)
@@ -528,6 +612,7 @@ class _Mission:
         gui = client.gui
         with gui.add_folder("Mission"):
             self._text = gui.add_text("Zones", self._known, hint=ZONES)
+            self.note = _Note(gui)
             apply = gui.add_button("Change the zones")
             self._clicks = gui.add_dropdown("A click", CLICKS, hint=CLICKED)
             gui.add_html(words.note("Drag the handle: it is the chosen vehicle's goal."))
@@ -536,6 +621,7 @@ class _Mission:
 
         @apply.on_click
         async def _(_: Any) -> None:
+            self.note.asks((ZONED,))
             ask({ZONED: self._text.value})
 
         @self._clicks.on_update
