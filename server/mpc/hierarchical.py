@@ -25,7 +25,7 @@ from skytether.server.mpc.appraisal import (
     conclude,
     planned_state,
 )
-from skytether.server.mpc.exact import ExactSolver, RiccatiWorkspace, active_sets
+from skytether.server.mpc.exact import ExactSolver
 from skytether.server.mpc.problem import (
     FIRST,
     LATER,
@@ -46,6 +46,7 @@ from skytether.server.mpc.problem import (
     simd_memory,
     slope,
 )
+from skytether.server.mpc.riccati import RiccatiWorkspace, active_sets
 from skytether.server.mpc.solver import Solver
 from skytether.shared.base.kernel import B1, F1, F3, I1, kernel, part
 from skytether.shared.core.stopwatch import Stopwatch

@@ -43,7 +43,7 @@ from skytether.server.common.clock import Seen
 from skytether.server.common.desired import Window
 from skytether.server.common.scheme import Figures, Fleet, Foresight, Splines
 from skytether.server.common.splines import SplineScheme
-from skytether.server.mpc import exact
+from skytether.server.mpc import riccati
 from skytether.server.mpc.nominal import Nominal, make_nominal, plan_nominal
 from skytether.server.mpc.plugin_planners import PluginPlanners
 from skytether.server.schemes import knots
@@ -249,7 +249,7 @@ class Guidance(SplineScheme):
 
 
 make = Guidance
-KERNELS = (knots, splines, exact)
+KERNELS = (knots, splines, riccati)
 """Other modules and packages whose kernels this scheme calls, see `server.schemes.table`."""
 
 

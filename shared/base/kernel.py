@@ -14,6 +14,7 @@ whether the kernel's own file has changed; here every function and constant that
 checked, in any module, so that no outdated machine code is used.
 """
 
+import ctypes
 import hashlib
 import inspect
 import linecache
@@ -21,11 +22,12 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
 from importlib import import_module
+from pathlib import Path
 from typing import Annotated, Any, NamedTuple, TypeVar, get_type_hints
 
 import numba
 import numpy as np
-from numba.core import caching, compiler
+from numba.core import caching, codegen, compiler
 from numba.core.compiler_lock import global_compiler_lock
 from numba.core.runtime import rtsys
 from numba.extending import register_jitable
@@ -74,11 +76,13 @@ def kernel(function: F) -> F:
     It cannot create arrays, since it is compiled without reference counts: they are an atomic
     instruction per array and slice, and took half of the time of a plan.
     """
-    return _at_first_call(numba.njit(error_model="numpy", _nrt=False)(function))
+    return _at_first_call(
+        numba.njit(error_model="numpy", _nrt=False, pipeline_class=Called)(function)
+    )
 
 
 def making_kernel(function: F) -> F:
-    return _at_first_call(numba.njit(error_model="numpy")(function))
+    return _at_first_call(numba.njit(error_model="numpy", pipeline_class=Called)(function))
 
 
 def _at_first_call(dispatcher: Any) -> Any:
@@ -129,6 +133,8 @@ class Missing(NamedTuple):
     compile: Callable[[], None]
     """Function that compiles the kernel, or loads machine code compiled by another process
     since."""
+    is_compiled: Callable[[], bool]
+    """Whether another process has compiled it since."""
 
 
 def missing(without: Collection[str] = ()) -> list[Missing]:
@@ -142,7 +148,10 @@ def missing(without: Collection[str] = ()) -> list[Missing]:
     ]
     return [
         Missing(
-            _name(each), not isinstance(each._cache, caching.NullCache), partial(_compile, each)
+            _name(each),
+            not isinstance(each._cache, caching.NullCache),
+            partial(_compile, each),
+            partial(_is_stored, each),
         )
         for each in sorted(uncompiled, key=_extent, reverse=True)
     ]
@@ -230,11 +239,13 @@ def _type(hint: Any) -> Any:
 
 def part(function: F) -> F:
     """Function called by kernels, for example once per vehicle or axis; it creates no arrays."""
-    return _for_any_constant(numba.njit(error_model="numpy", _nrt=False)(function))
+    return _for_any_constant(
+        numba.njit(error_model="numpy", _nrt=False, pipeline_class=Linked)(function)
+    )
 
 
 def making_part(function: F) -> F:
-    return _for_any_constant(numba.njit(error_model="numpy")(function))
+    return _for_any_constant(numba.njit(error_model="numpy", pipeline_class=Linked)(function))
 
 
 def _for_any_constant(dispatcher: Any) -> Any:
@@ -253,7 +264,58 @@ def _for_any_constant(dispatcher: Any) -> Any:
     return dispatcher
 
 
-class Disjoint(compiler.Compiler):  # type: ignore[misc]
+class PartLibrary(codegen.JITCodeLibrary):  # type: ignore[misc]
+    """Code of a part: optimised and turned into machine code only within kernels that it is linked
+    into.
+
+    Numba does both for each function by itself, and again for all that call it: two thirds of the
+    time for compiling `server.schemes.trajectory`.
+    """
+
+    def _optimize_final_module(self) -> None:
+        pass
+
+    def _finalize_final_module(self) -> None:
+        self._finalized = True
+
+    def get_pointer_to_function(self, name: str) -> int:  # noqa: ARG002
+        """Address of what a call from Python reaches, which raises a TypeError: a part has no
+        code of its own.
+        """
+        self._ensure_finalized()
+        return NOT_CALLABLE
+
+    @property
+    def codegen(self) -> "PartLibrary":
+        return self
+
+    def set_env(self, name: str, environment: object) -> None:
+        """Nothing: the environment is the kernel's, which has Python's objects for a function."""
+
+
+NOT_CALLABLE: int = ctypes.cast(ctypes.pythonapi.PyObject_Call, ctypes.c_void_p).value or 0
+"""Called with a function's environment in place of a callable object."""
+
+
+class Called(compiler.Compiler):  # type: ignore[misc]
+    """Numba's compiler for functions called from Python, and not from C."""
+
+    def define_pipelines(self) -> Any:
+        self.state.flags.no_cfunc_wrapper = True
+        return super().define_pipelines()
+
+
+class Linked(Called):
+    """Numba's compiler for functions that only compiled functions call."""
+
+    def define_pipelines(self) -> Any:
+        self.state.flags.no_cpython_wrapper = True
+        name, code = self.state.func_id.func_qualname, self.state.targetctx.codegen()
+        self.state.library = PartLibrary(code, name)
+        return super().define_pipelines()
+
+
+class Disjoint(Linked):
     """Numba's compiler for functions whose arrays share no memory.
 
     Numba does not give LLVM this guarantee for its own functions, and LLVM does not vectorise if
@@ -284,7 +346,7 @@ def shared(function: F) -> F:
     """Unchanged function that kernels may call, too, with everything that it calls."""
     for each in _dependencies(function):
         if inspect.isfunction(each) and each not in _SHARED:
-            register_jitable(error_model="numpy")(each)
+            register_jitable(error_model="numpy", pipeline_class=Linked)(each)
             _SHARED.add(each)
     return function
 
@@ -357,6 +419,15 @@ class CacheFolders(caching.CompileResultCacheImpl):  # type: ignore[misc]
     """
 
     _locator_classes = (NamedFolder, SourceFolder, UserFolder)
+
+
+def folder() -> Path | None:
+    """Folder with the machine code of one of the parts of every flight; None: not stored."""
+    with suppress(RuntimeError):  # no folder is writable
+        place = CacheFolders(stamp)
+        place.locator.ensure_cache_path()
+        return Path(place.locator.get_cache_path())
+    return None
 
 
 class KernelCache(caching.FunctionCache):  # type: ignore[misc]

@@ -1,22 +1,66 @@
-"""Compilation of kernels, in as many processes as there are cores.
+"""Compilation of kernels, by as many processes as there are cores.
 
-Numba compiles one function at a time in a process. So several processes compile, and this process
-reads the machine code that they store on disk. Each takes the next kernel from a queue, because
-compile times are not known beforehand.
+Numba compiles one function at a time in a process. So other processes compile beside this one,
+which then reads the machine code that they stored on disk. Each takes the next kernel from a
+queue, because compile times are not known beforehand. A second command waits for the first, which
+compiles what it needs, too.
 """
 
 import subprocess
 import sys
+import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager, suppress
+from pathlib import Path
 from typing import TYPE_CHECKING
 
+from skytether.shared.base import files
 from skytether.shell import system
 
 # for type checking only: the client aboard is installed without numba
 if TYPE_CHECKING:
     from skytether.shared.base.kernel import Missing
+
+LOCK = "compiling.lock"
+POLL_S = 0.1
+"""Time between two tries for the lock."""
+
+
+@contextmanager
+def alone(folder: Path | None, on_wait: Callable[[], None]) -> Iterator[None]:
+    """Let no other command that stores machine code in a folder compile during the block.
+
+    Args:
+        folder: None where machine code is not stored.
+        on_wait: called once if another command compiles.
+    """
+    try:
+        lock = folder and (folder / LOCK).open("ab")
+    except OSError:  # read-only
+        lock = None
+    if not lock:
+        yield
+        return
+    with lock:
+        waits = False
+        while not _locked(lock.fileno()):
+            if not waits:
+                waits = True
+                on_wait()
+            time.sleep(POLL_S)
+        yield
+
+
+def _locked(descriptor: int) -> bool:
+    try:
+        files.lock(descriptor)
+    except BlockingIOError:
+        return False
+    except OSError:  # no locks on this system: each command compiles
+        pass
+    return True
 
 
 def compile_kernels(kernels: Sequence["Missing"], on_done: Callable[[], None]) -> None:
@@ -27,15 +71,18 @@ def compile_kernels(kernels: Sequence["Missing"], on_done: Callable[[], None]) -
         on_done: called after each kernel, from any thread.
     """
     queue = deque(each for each in kernels if each.is_stored)
-    cores = min(system.cores(), len(queue))
-    if cores > 1:
-        with ThreadPoolExecutor(cores) as helpers:
-            for _ in range(cores):
-                helpers.submit(_have_compiled, queue, on_done)
+    helpers = min(system.cores(), len(queue)) - 1
+    with ThreadPoolExecutor(max(helpers, 1)) as pool:
+        for _ in range(helpers):
+            pool.submit(_have_compiled, queue, on_done)
+        while queue:
+            with suppress(IndexError):  # a helper took the last one
+                queue.popleft().compile()
+                on_done()
     for each in kernels:
         # Loads code that other processes have compiled, and compiles kernels for which they failed.
         each.compile()
-        if cores < 2 or not each.is_stored:
+        if not each.is_stored:
             on_done()
 
 

@@ -58,13 +58,19 @@ def prepare(kernels: Sequence["Missing"]) -> None:
     """Compile the kernels that are not compiled on this machine yet, with a note on stderr."""
     if not kernels:
         return
-    from skytether.shell.compiling import compile_kernels
+    from skytether.shared.base import kernel
+    from skytether.shell.compiling import alone, compile_kernels
 
-    message = "compiling control loops, once on this machine: takes up to a minute"
-    print(message, file=sys.stderr, flush=True)
-    with progress("compiling", len(kernels), "kernels") as bar:
-        done = count(1)
-        compile_kernels(kernels, lambda: bar(next(done)))
+    waiting = "waiting for another command, which compiles the control loops"
+    with alone(kernel.folder(), lambda: print(waiting, file=sys.stderr, flush=True)):
+        left = [each for each in kernels if not each.is_compiled()]
+        if not left:
+            return
+        message = "compiling control loops, once on this machine: takes up to a minute"
+        print(message, file=sys.stderr, flush=True)
+        with progress("compiling", len(left), "kernels") as bar:
+            done = count(1)
+            compile_kernels(left, lambda: bar(next(done)))
 
 
 def counted(number: int, noun: str) -> str:

@@ -11,7 +11,7 @@ from scipy.optimize import lsq_linear
 
 from bench.problems import gradients
 from skytether.server.mpc import exact
-from skytether.server.mpc.exact import ExactSolver, active_sets, workspace
+from skytether.server.mpc.exact import ExactSolver
 from skytether.server.mpc.hierarchical import make_solver
 from skytether.server.mpc.osqp_solver import OsqpSolver
 from skytether.server.mpc.problem import (
@@ -22,6 +22,7 @@ from skytether.server.mpc.problem import (
     set_previous,
     simd_batch,
 )
+from skytether.server.mpc.riccati import active_sets, workspace
 from skytether.shared.law.model import Array
 from skytether.shared.scenario import reading
 
