@@ -3,9 +3,11 @@
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 from unittest.mock import patch
 
+import numba
 import numpy as np
 
 from skytether.server.mpc import hierarchical as planner
@@ -36,6 +38,16 @@ def derive(name: str, **sections: Any) -> Scenario:
     return reading.check(table, "a benchmark")
 
 
+@cache
+def from_python(part: Any) -> Any:
+    """Part of kernels as a function that Python can call; it is compiled at the first call."""
+    return numba.njit(error_model="numpy")(part.py_func)
+
+
+_set_target, _set_previous = from_python(set_target), from_python(set_previous)
+_lead, _gradient = from_python(lead), from_python(gradient)
+
+
 def gradients(
     problem: Problem, x: Array, target: Array, previous: Array, disturbance: Array
 ) -> Array:
@@ -52,10 +64,10 @@ def gradients(
     simd = simd_batch(simd_memory(previous.shape[2], 1))
     for at in np.ndindex(*previous.shape[:2]):
         (simd.p[0], simd.v[0]), simd.w[0], axis = x[at], disturbance[at], at[1]
-        set_target(target[at], simd, 0)
-        set_previous(previous[at], 0, which == FIRST, simd, 0)
-        lead(mpc, axis, simd)
-        gradient(mpc, axis, which, simd, simd.target_v)
+        _set_target(target[at], simd, 0)
+        _set_previous(previous[at], 0, which == FIRST, simd, 0)
+        _lead(mpc, axis, simd)
+        _gradient(mpc, axis, which, simd, simd.target_v)
         result[at] = simd.gradient[:, 0]
     return result
 

@@ -238,7 +238,7 @@ def _type(hint: Any) -> Any:
 
 
 def part(function: F) -> F:
-    """Function called by kernels, for example once per vehicle or axis; it creates no arrays."""
+    """Function that only kernels call, for example once per vehicle; it creates no arrays."""
     return _for_any_constant(
         numba.njit(error_model="numpy", _nrt=False, pipeline_class=Linked)(function)
     )

@@ -84,8 +84,25 @@ def show(table: "Table") -> None:
     Console(width=max(Console().width, Console(width=1000).measure(table).maximum)).print(table)
 
 
-def finish(summary: Summary, title: str, json: Path | None = None) -> None:
+COMPARED = (
+    ("RMSE xy [m]", "rmse_xy", ".4f"),
+    ("largest error [m]", "error_max", ".4f"),
+    ("steps with a planned input", "covered", ".3f"),
+    ("packets/s, both ways", "packets_per_s", ".2f"),
+    ("bytes/s with headers, both ways", "bytes_per_s", ".0f"),
+    ("age p99 [ms]", "age_ms_p99", ".0f"),
+)
+"""Name, field and format of what is shown where flights are compared."""
+
+
+def finish(
+    summary: Summary, title: str, json: Path | None = None, beside: Sequence[Summary] = ()
+) -> None:
     """Print a summary as a table, and write it to a file.
+
+    Args:
+        beside: summaries to compare with: the table has a column for each flight, named by its
+            scenario, and fewer rows.
 
     Raises:
         CommandError: the file cannot be written.
@@ -93,12 +110,26 @@ def finish(summary: Summary, title: str, json: Path | None = None) -> None:
     # The file is written first, because printing fails if the reader of stdout is gone.
     if json is not None:
         write(json, msgspec.json.encode(summary))
+    if not beside:
+        _print(title, (), summary_rows(summary))
+        return
+    flights = (summary, *beside)
+    rows = [
+        (name, *(_values(spec, getattr(each, field)) for each in flights))
+        for name, field, spec in COMPARED
+    ]
+    _print(title, ("", *(each.scenario for each in flights)), rows)
+
+
+def _print(title: str, header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
     from rich.console import Console
     from rich.table import Table
     from rich.text import Text
 
-    table = Table(title=title, title_justify="left", show_header=False)
-    for row in summary_rows(summary):
+    table = Table(title=Text(title), title_justify="left", show_header=bool(header))
+    for each in header:
+        table.add_column(Text(each))
+    for row in rows:
         table.add_row(*map(Text, row))  # `Text`, because rich would take "[m]" for markup
     Console().print(table)
 

@@ -29,7 +29,7 @@ LISTS = (
     *("scenarios", "schemes", "planners", "triggers", "reports", "references", "vehicles"),
     "impairments",
 )
-BARE = ("client", "netem", "keygen", "set", "probe", *LISTS)
+BARE = ("client", "netem", "keygen", "set", "probe", "completion", *LISTS)
 NEEDS: dict[str, tuple[str, ...]] = {
     **dict.fromkeys(BARE, ()),
     "server": ("server",),

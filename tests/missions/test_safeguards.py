@@ -5,6 +5,7 @@ from itertools import islice
 import numpy as np
 import pytest
 
+from bench.problems import from_python
 from skytether.server.common.clock import EXACT, ClockMap, Contradiction, StepError
 from skytether.server.missions.half_planes import half_planes
 from skytether.server.missions.mission_state import LONGEST
@@ -19,7 +20,6 @@ from skytether.server.missions.vehicle_motions import SentMotion, VehicleMotions
 from skytether.server.missions.waypoints import Waypoints
 from skytether.server.missions.zone_clearance import comes_near
 from skytether.shared.base.chance import stream
-from skytether.shared.base.kernel import plain
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
 from skytether.shared.core.events import InZone
 from skytether.shared.law.motion import SAMPLES, SPACING, Motion, bend_m, resting
@@ -67,7 +67,7 @@ def test_clocks_that_drift_over_the_time_looked_ahead_count() -> None:
 
 def test_another_is_ahead_by_its_own_earliness_and_by_how_late_the_first_is() -> None:
     one, other = StepError(early=1.0, late=2.0), StepError(early=10.0, late=20.0)
-    assert plain(shifts)(one, other, 0.5) == (-21.5, 12.5)
+    assert from_python(shifts)(one, other, 0.5) == (-21.5, 12.5)
 
 
 def test_one_that_may_be_down_is_kept_away_from_by_one_that_is_late() -> None:
@@ -133,7 +133,7 @@ def test_a_swept_piece_is_as_near_as_its_nearest_side_or_point_less_its_twist(
 ) -> None:
     """A square of 2 m."""
     square = np.array([middle, (2.0, 0.0), (0.0, 2.0), (twist, 0.0)])
-    assert plain(_distance_from_parallelogram)(square) == pytest.approx(distance_m)
+    assert from_python(_distance_from_parallelogram)(square) == pytest.approx(distance_m)
 
 
 def test_straight_pieces_are_off_a_motion_by_no_more_than_its_bend() -> None:

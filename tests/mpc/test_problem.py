@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import lsq_linear
 
-from bench.problems import gradients
+from bench.problems import from_python, gradients
 from skytether.server.mpc.osqp_solver import OsqpSolver
 from skytether.server.mpc.problem import (
     FIRST,
@@ -123,7 +123,7 @@ def test_cost_of_a_change_is_that_of_the_hessian(seed: int, H: int) -> None:
     problem, change = make(control(H, change_weight=0.7)), situation(seed, H)[2]
     cost = 3.0
     for axis in range(2):
-        cost = add_cost(problem.mpc, axis, (0.0, 0.0), change[axis], cost)
+        cost = from_python(add_cost)(problem.mpc, axis, (0.0, 0.0), change[axis], cost)
     expected = np.einsum("ak,akl,al->", change, problem.hessian, change)
     np.testing.assert_allclose(cost - 3.0, expected, rtol=1e-9, atol=1e-9)
 
@@ -153,12 +153,12 @@ def test_prediction_is_the_model_flown_step_by_step(seed: int, H: int, axes: int
     simd.w[0] = 0.3
     for axis in range(axes):
         (simd.p[0], simd.v[0]), (simd.leader_p[0], simd.leader_v[0]) = follower, x[axis]
-        set_inputs(u[axis], simd, 0)
+        from_python(set_inputs)(u[axis], simd, 0)
         follow(problem.mpc, axis, simd)
         speeds, drift = simd.leader_speed[:, 0].copy(), simd.drift_p[:, 0].copy()
         np.testing.assert_allclose(speeds, flown[axis, :, 1], rtol=0, atol=1e-11)
         simd.p[0], simd.v[0] = follower
-        set_target(flown[axis], simd, 0)
+        from_python(set_target)(flown[axis], simd, 0)
         lead(problem.mpc, axis, simd)
         np.testing.assert_allclose(drift, simd.drift_p[:, 0], rtol=0, atol=1e-8)
 
@@ -206,7 +206,7 @@ def test_only_with_input_reference_a_steady_flight_is_optimal() -> None:
 
 def carried(inputs: Array, gap: int, *, fresh: bool = False) -> Array:
     simd = simd_batch(simd_memory(len(inputs), 1))
-    set_previous(inputs, gap, fresh, simd, 0)
+    from_python(set_previous)(inputs, gap, fresh, simd, 0)
     return simd.previous[:, 0]
 
 

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 import skytether
+from bench.problems import from_python
 from skytether.client.compensator import Compensator
 from skytether.client.navigation import Navigation
 from skytether.lab.sweep import summaries
@@ -26,7 +27,6 @@ from skytether.server.schemes.knots import fewest_knots
 from skytether.server.schemes.sent import FIRST_LOSS
 from skytether.server.schemes.trajectory import Guidance
 from skytether.shared.base.errors import ConfigError
-from skytether.shared.base.kernel import plain
 from skytether.shared.core.stopwatch import Stopwatch
 from skytether.shared.law.model import Array, Indices, advance
 from skytether.shared.law.spline import AxisSpline, along, follow, guided_to, regulated, spline_at
@@ -371,7 +371,7 @@ def test_the_longer_an_observation_knows_nothing_of_it_the_less_likely_it_comes(
     bound = server.scheme._memory.sent.bound
     for since, later in ((0, 4), (1, 4), (2, 2), (4, 1), (8, 0)):
         share = (1.0 - loss) * ((later + 1) / 5 if since else 1.0)
-        found = plain(trajectory._arrives)(bound, 0, loss, since)
+        found = from_python(trajectory._arrives)(bound, 0, loss, since)
         assert found == pytest.approx(share / (share + loss))
 
 
@@ -423,7 +423,7 @@ def fitted(path: Any, error_m: float) -> tuple[int, int, float]:
     times = np.arange(61) * 0.1
     states = np.stack([path(times), np.gradient(path(times), 0.1)], axis=-1)
     knots = np.zeros((2, 2 * KNOTS_MAX), dtype=np.float32)
-    count, spacing = plain(fewest_knots)(np.stack([states, states]), 0.1, error_m, knots)
+    count, spacing = from_python(fewest_knots)(np.stack([states, states]), 0.1, error_m, knots)
     some = knots[0, : 2 * count]
     found = np.array([spline_at(some, spacing, 0.1, stage)[0] for stage in range(61)])
     return count, spacing, float(np.abs(found - states[:, 0]).max())
@@ -459,7 +459,7 @@ def test_what_a_vehicle_is_told_can_be_flown(seed: int) -> None:
     desired[:, :, 0] = places
     states = np.zeros((2, 21, 2))
     states[:, 0] = start
-    assert plain(plan_nominal)(nominal, 0, 7, desired, states)
+    assert from_python(plan_nominal)(nominal, 0, 7, desired, states)
     assert states[:, 0].tolist() == [list(start)] * 2
     for axis, model in enumerate(terms.model.axes()):
         for (p, v), (q, w) in itertools.pairwise(states[axis].tolist()):

@@ -8,12 +8,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from bench.problems import from_python
 from helpers import packaged
 from skytether.server.common.desired import EMPTY, PAGE, PAGES, Desired, _extrapolated
 from skytether.server.common.moving_setpoint import MEMORY_S, REST_S, LivePoint
 from skytether.server.controller import BLOCK
 from skytether.shared.base.chance import stream
-from skytether.shared.base.kernel import plain
 from skytether.shared.base.units import SECOND_NS, seconds_to_ns
 from skytether.shared.law.model import Array, Indices
 from skytether.shared.scenario import reference as shapes
@@ -276,7 +276,7 @@ def test_a_prediction_that_turns_round_at_the_bounds_is_better() -> None:
         error = p + ahead_s * v - then[..., 0]
         errors["goes on"].append(error)
         errors["accelerates"].append(error + 0.5 * ahead_s**2 * (v - old))
-        lead = np.vectorize(lambda p, v: plain(_extrapolated)(p, v, ahead_s, 10.0)[0])
+        lead = np.vectorize(lambda p, v: from_python(_extrapolated)(p, v, ahead_s, 10.0)[0])
         errors["turns"].append(lead(p, v) - then[..., 0])
     rms = {name: float(np.sqrt(np.mean(np.square(each)))) for name, each in errors.items()}
     assert rms["goes on"] == pytest.approx(0.55, abs=0.02)
@@ -299,8 +299,8 @@ def test_a_prediction_goes_to_and_fro_between_walls(
     p: float, v: float, after_s: float, expected: tuple[float, float]
 ) -> None:
     """Reflected at walls at 2 m, any number of times; straight without walls."""
-    assert plain(_extrapolated)(p, v, after_s, 2.0) == expected
-    assert plain(_extrapolated)(p, v, after_s, np.inf) == (p + v * after_s, v)
+    assert from_python(_extrapolated)(p, v, after_s, 2.0) == expected
+    assert from_python(_extrapolated)(p, v, after_s, np.inf) == (p + v * after_s, v)
 
 
 # -- references of several vehicles ------------------------------------------------------------

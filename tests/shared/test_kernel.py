@@ -15,8 +15,9 @@ import pytest
 from numba import config as numba_config
 
 from skytether.server.controller import other_schemes
-from skytether.shared.base import kernel
+from skytether.shared.base import files, kernel
 from skytether.shared.scenario import reading
+from skytether.shell.compiling import LOCK
 
 HELPER = """
 from typing import NamedTuple
@@ -77,7 +78,7 @@ prepare(kernel.missing())
 
 
 SIDE_BY_SIDE = """
-import os, sys
+import os, sys, time
 import caller, second
 from skytether.shared.base import kernel
 from skytether.shell.compiling import compile_kernels
@@ -87,7 +88,15 @@ if sys.argv[1:] == ["alone"]:
     sys.executable = "/bin/false"
 done = []
 kernels = kernel.missing()
-compile_kernels(kernels, lambda: done.append(1))
+
+def after_the_helper(each):
+    def compile():
+        while sys.argv[1:] == ["helped"] and not done:
+            time.sleep(0.01)
+        each.compile()
+    return each._replace(compile=compile)
+
+compile_kernels([after_the_helper(each) for each in kernels], lambda: done.append(1))
 for each in (caller.double, second.double):
     print(sum(each.dispatcher.stats.cache_hits.values()), len(each.dispatcher.overloads))
 print([each.name for each in kernels], len(done), kernel.missing())
@@ -253,8 +262,8 @@ def test_what_is_compiled_is_said_once(tmp_path: Path) -> None:
 
 @pytest.mark.long
 @pytest.mark.parametrize("helpers", ["helped", "alone"])
-def test_kernels_are_compiled_by_other_processes(tmp_path: Path, helpers: str) -> None:
-    """Their machine code is read from the disk; without helpers this process compiles."""
+def test_kernels_are_compiled_by_another_process_beside(tmp_path: Path, helpers: str) -> None:
+    """Its machine code is read from the disk; where it fails, this process compiles all."""
     (tmp_path / "helper.py").write_text(HELPER)
     for name in ("caller", "second"):
         (tmp_path / f"{name}.py").write_text(MODULE)
@@ -266,12 +275,50 @@ def test_kernels_are_compiled_by_other_processes(tmp_path: Path, helpers: str) -
         text=True,
         check=True,
     )
-    read, told = ("1 1", 2) if helpers == "helped" else ("0 1", 0)
-    assert done.stdout.splitlines() == [
-        read,
-        read,
-        f"['caller:double', 'second:double'] {told} []",
-    ]
+    read, told = ("1 1", 2) if helpers == "helped" else ("0 1", 1)
+    *hits, compiled = done.stdout.splitlines()
+    assert sorted(hits) == ["0 1", read]
+    assert compiled == f"['caller:double', 'second:double'] {told} []"
+
+
+@pytest.mark.long
+def test_a_command_waits_for_another_that_compiles(tmp_path: Path) -> None:
+    """And then finds machine code where the other has stored it."""
+    put(tmp_path, caller=MODULE)
+    kept = {"NUMBA_CACHE_DIR": str(tmp_path / "kept"), "PYTHONPATH": str(tmp_path)}
+    command = [sys.executable, "-P", "-c", PREPARED]
+    subprocess.run(command, cwd=tmp_path, env=kept, check=True)
+    (lock,) = (tmp_path / "kept").rglob(LOCK)
+    stored = [each for each in (tmp_path / "kept").rglob("*") if each.suffix in (".nbi", ".nbc")]
+    away = [each.rename(tmp_path / each.name) for each in stored]
+    with lock.open() as held:
+        files.lock(held.fileno())
+        with subprocess.Popen(
+            command, cwd=tmp_path, env=kept, stderr=subprocess.PIPE, text=True
+        ) as second:
+            assert second.stderr
+            assert "waiting for another command" in second.stderr.readline()
+            for compiled, place in zip(away, stored, strict=True):
+                compiled.rename(place)
+            held.close()
+            assert second.stderr.read() == ""
+    assert second.returncode == 0
+
+
+def test_a_part_is_for_kernels_alone() -> None:
+    """It has no machine code of its own; see `kernel.PartLibrary`."""
+
+    @kernel.part
+    def doubled(x: float) -> float:
+        return 2.0 * x
+
+    @kernel.kernel
+    def called(x: float) -> float:
+        return doubled(x)
+
+    assert called(3.0) == 6.0
+    with pytest.raises(TypeError, match="not callable"):
+        doubled(3.0)
 
 
 @pytest.mark.long
@@ -289,7 +336,7 @@ import sys
 import msgspec
 from numba.core import event
 from skytether.server.controller import other_schemes
-from skytether.shared.base import kernel
+from skytether.shared.base import files, kernel
 from skytether.shared.scenario import reading
 from skytether.sim import flight
 

@@ -6,8 +6,6 @@ of its tasks, a search a study of its points, generation by generation. The work
 this machine, or of a Dask cluster.
 """
 
-import multiprocessing
-import os
 import signal
 import time
 from collections.abc import Callable, Collection, Hashable, Iterator, Mapping, Sequence
@@ -17,7 +15,6 @@ from concurrent.futures import (
     CancelledError,
     Executor,
     Future,
-    ProcessPoolExecutor,
     ThreadPoolExecutor,
     wait,
 )
@@ -40,8 +37,8 @@ from skytether.shell import command, plugins, system, terminal
 from skytether.shell.argument import Argument
 from skytether.shell.command import CommandError
 from skytether.shell.plugins import Plugin
+from skytether.shell.pool import processes
 from skytether.shell.terminal import Bar
-from skytether.shell.workers import die_with_parent
 
 UNDER_WAY_MAX = 256
 """Largest number of tasks submitted at once; more than the cores of any machine."""
@@ -288,7 +285,7 @@ def _executor(flags: Flags) -> AbstractContextManager[Executor]:
         return _cluster(flags.scheduler)
     if flags.workers == 0:
         return _thread()
-    return _processes(flags.workers or system.cores())
+    return processes(flags.workers or system.cores())
 
 
 @contextmanager
@@ -299,27 +296,6 @@ def _thread() -> Iterator[Executor]:
         yield pool
     finally:
         pool.shutdown(cancel_futures=True)
-
-
-@contextmanager
-def _processes(count: int) -> Iterator[Executor]:
-    for library in ("OMP", "OPENBLAS", "MKL", "NUMBA"):
-        os.environ[f"{library}_NUM_THREADS"] = "1"
-    pool = ProcessPoolExecutor(count, multiprocessing.get_context("spawn"), _start, (os.getpid(),))
-    before = set(multiprocessing.active_children())
-    try:
-        yield pool
-    finally:
-        pool.shutdown(wait=False, cancel_futures=True)
-        for child in set(multiprocessing.active_children()) - before:
-            child.terminate()
-
-
-def _start(parent: int) -> None:
-    """Initialise a worker, which ends with the process that started it."""
-    die_with_parent()
-    if os.getppid() != parent:  # the command had already ended
-        os._exit(1)
 
 
 @contextmanager

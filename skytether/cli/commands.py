@@ -1,0 +1,155 @@
+"""The commands of `skytether`, in groups."""
+
+ABOUT = """usage: skytether COMMAND ...
+
+Flies a UAV over a bad network: a server plans, a client flies, and netem,
+between them, delays, reorders and loses their packets."""
+COMMANDS_IN_GROUPS = {
+    "Flying": {
+        "fly [SCENARIO]": (
+            "one flight, with everything it needs: start here",
+            "skytether.cli.fly:fly",
+        ),
+        "fleet [SCENARIO]": (
+            "many vehicles on one server, and missions",
+            "skytether.cli.fleet:fleet",
+        ),
+        "duel SCENARIO...": (
+            "scenarios on the same network, side by side on one page",
+            "skytether.cli.duel:duel",
+        ),
+        "straight [SCENARIO]": (
+            "by set-points sent straight to an autopilot, to compare",
+            "skytether.cli.straight:straight",
+        ),
+        "set PATH KEY=VALUE": (
+            "change keys in flight, at a process with --control",
+            "skytether.cli.set:set_keys",
+        ),
+        "ros2 FOLDER": (
+            "plans and goals of a flight for RViz and other tools",
+            "skytether.cli.ros2:connect",
+        ),
+    },
+    "Any program's network": {
+        "netem [SCENARIO]": (
+            "a bad network between two; `netem run` PROGRAM: in it",
+            "skytether.netem.__main__:emulate",
+        ),
+        "probe HOST:PORT": (
+            "delay and loss of a real path, each way",
+            "skytether.cli.probe:probe",
+        ),
+    },
+    "After a flight": {
+        "replay FILE": (
+            "a recording on the page that showed the flight",
+            "skytether.cli.replay:replay",
+        ),
+        "report FILE": (
+            "a recording as an HTML page with figures",
+            "skytether.cli.report:report",
+        ),
+        "export FILE": (
+            "a recording as tables, CSV or Parquet",
+            "skytether.cli.export:export",
+        ),
+        "join FILE...": (
+            "recordings of server, netem and client, as one",
+            "skytether.cli.join:join",
+        ),
+    },
+    "Studies": {
+        "sweep [SCENARIO]": (
+            "a grid of scenarios, on all cores or a cluster",
+            "skytether.lab.commands.sweep:sweep",
+        ),
+        "compare": (
+            "schemes and triggers, each at its best weights",
+            "skytether.lab.commands.compare:compare",
+        ),
+        "reproduce": (
+            "the paper's table and figures, and more, as a report",
+            "skytether.lab.commands.reproduce:reproduce",
+        ),
+        "calibrate [SCENARIO]": (
+            "a search for the paper's numbers, or for the best ones",
+            "skytether.lab.commands.calibrate:calibrate",
+        ),
+        "envelope [SCENARIO]": (
+            "the networks and settings that a scenario tolerates",
+            "skytether.lab.commands.envelope:envelope",
+        ),
+        "margins [SCENARIO]": (
+            "whether its loop is stable, and with which vehicles",
+            "skytether.lab.commands.margins:margins",
+        ),
+        "crowd [SCENARIO]": (
+            "how many vehicles can share one radio channel",
+            "skytether.lab.commands.crowd:crowd",
+        ),
+        "torture": (
+            "flights under faults and attacks: is all of it safe?",
+            "skytether.lab.commands.torture:torture",
+        ),
+        "adversary [MISSION]": (
+            "a search for faults that bring vehicles too close",
+            "skytether.lab.commands.adversary:adversary",
+        ),
+        "identify KIND": (
+            "a vehicle's gain, time constant and dead time",
+            "skytether.lab.commands.identify:identify",
+        ),
+    },
+    "One process at a time": {
+        "server [SCENARIO]": ("plans for vehicles", "skytether.server.__main__:serve"),
+        "client [SCENARIO]": ("a vehicle", "skytether.client.__main__:fly"),
+        "page FOLDER...": (
+            "the page of flights of other commands",
+            "skytether.view.__main__:show",
+        ),
+        "keygen FILE": (
+            "keys for vehicles, so that nobody else can fly them",
+            "skytether.cli.keygen:keygen",
+        ),
+        "autopilot [SCENARIO]": (
+            "a simulated autopilot that speaks MAVLink",
+            "skytether.autopilot.__main__:pilot",
+        ),
+        "station [SCENARIO]": (
+            "a ground station that sends set-points to one",
+            "skytether.station.__main__:fly",
+        ),
+    },
+    "Lists, a sentence each": {
+        "scenarios": ("scenarios that come with Skytether", "skytether.__main__:list_scenarios"),
+        "triggers": ("policies for control.trigger", "skytether.cli.names:triggers"),
+        "reports": ("policies for vehicle.report", "skytether.cli.names:reports"),
+        "schemes": ("schemes for control.scheme", "skytether.cli.names:schemes"),
+        "planners": ("planners for control.planner", "skytether.cli.names:planners"),
+        "references": ("shapes for reference.shape", "skytether.cli.names:references"),
+        "impairments": ("what a network does to packets", "skytether.cli.names:impairments"),
+        "vehicles": ("vehicle models for vehicle.kind", "skytether.cli.names:vehicles"),
+        "completion SHELL": (
+            "names and options at the Tab key: bash, zsh or fish",
+            "skytether.cli.completion:complete",
+        ),
+    },
+}
+"""What each command does, and its function, imported when called, so that netem does not import
+the kernels of a server; by its usage, in groups.
+"""
+COMMANDS = {
+    usage.partition(" ")[0]: place
+    for group in COMMANDS_IN_GROUPS.values()
+    for usage, (_, place) in group.items()
+}
+
+
+def usage() -> str:
+    lines = [ABOUT]
+    for title, group in COMMANDS_IN_GROUPS.items():
+        lines += ["", f"{title}:", *(f"  {use:21} {does}" for use, (does, _) in group.items())]
+    return "\n".join(
+        [*lines, "", "Each has a --help of its own. `skytether fly demo` flies a demonstration."]
+    )
