@@ -1,9 +1,11 @@
 """`skytether fly`: one flight, over real UDP or in virtual time, and its summary."""
 
 import os
+import signal
 import time
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from concurrent.futures import BrokenExecutor, Future
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -33,9 +35,10 @@ from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Record
 from skytether.shared.telemetry.summary import Summary, summarise
 from skytether.shared.wire.protocol import Idle, Mode
-from skytether.shell import command, temporary, terminal
+from skytether.shell import command, plugins, pool, system, temporary, terminal
 from skytether.shell.argument import Argument
 from skytether.shell.command import CommandError, ScenarioOptions
+from skytether.shell.plugins import Plugin
 from skytether.sim import flight
 from skytether.view.browser.access import HOST_PORT
 
@@ -48,6 +51,8 @@ PRINTED = (
 """Events that are printed during the flight."""
 POLL_S = 0.2
 """Interval at which Ctrl-C is checked while the page stays open."""
+Flown = tuple[Scenario, "Future[Record]"]
+"""Scenario that another process flies, and its flight."""
 ON_THE_GROUND = {str(mode) for mode in (Mode.INIT, Mode.SYNC, Mode.READY)}
 """Modes before the first plan is flown, which are not printed."""
 
@@ -72,10 +77,10 @@ class FlyOptions(ScenarioOptions):
     through which keys change in flight, see `skytether set`; created if necessary. Not in virtual
     time.
     """
-    page: str = os.environ.get(page_process.VARIABLE, HOST_PORT)
-    """HOST:PORT of the page that shows the flight and changes it; if the port is taken, the next
-    free one. Visitors from other machines need the printed token to change anything. Not in virtual
-    time.
+    page: str | None = None
+    """HOST:PORT of the page that shows the flight and changes it, by default SKYTETHER_PAGE or
+    127.0.0.1:8080; if the port is taken, the next free one. Visitors from other machines need the
+    printed token to change anything. Not in virtual time: see `skytether replay`.
     """
     no_page: bool = False
     """Fly without a page."""
@@ -109,6 +114,10 @@ def fly(argv: Sequence[str]) -> None:
         from skytether.cli import recorder
 
         recorder.check(options.record)
+    if options.virtual and (options.linger or options.page not in (None, "none")):
+        flag = "--linger" if options.linger else "--page"
+        expected = "expected a flight in real time; `skytether replay` shows a --record"
+        raise CommandError(f"{flag}: got --virtual as well, {expected}", command.CONFIGURATION)
     if options.control:
         _make_folder(options.control, virtual=options.virtual)
     beside = _beside(options)
@@ -120,23 +129,46 @@ def fly(argv: Sequence[str]) -> None:
     vehicles.make(
         scenario, 0
     )  # compiles the vehicle's kernels, and fails here if it cannot be made
-    page = None if options.virtual or options.no_page else options.page
+    page = options.page or os.environ.get(page_process.VARIABLE, HOST_PORT)
+    page = None if options.virtual or options.no_page else page
     with page_process.paged(page, options.control) as sockets:
         together = [scenario, *beside.values()]
         terminal.prepare(kernel.missing(set.intersection(*map(other_schemes, together))))
-        with (
-            command.interruptible() as interrupted,
-            terminal.progress(f"flying {title}", scenario.duration) as on_second,
-        ):
-            if options.virtual:
-                flown, unrecorded = _virtually(options, on_second, interrupted)
-            else:
-                flown, unrecorded = _really(options, sockets, on_second, interrupted)
-        _show(options, title, flown, unrecorded, beside)
+        with _flying(beside.values()) as others:
+            with (
+                command.interruptible() as interrupted,
+                terminal.progress(f"flying {title}", scenario.duration) as on_second,
+            ):
+                if options.virtual:
+                    flown, unrecorded = _virtually(options, on_second, interrupted)
+                else:
+                    flown, unrecorded = _really(options, sockets, on_second, interrupted)
+            _show(options, title, flown, unrecorded, dict(zip(beside, others, strict=True)))
         if options.linger and sockets:
             with command.interruptible() as interrupted:
                 while not interrupted():
                     time.sleep(POLL_S)
+
+
+@contextmanager
+def _flying(scenarios: Collection[Scenario]) -> Iterator[list[Flown]]:
+    """Fly scenarios in virtual time by a process that runs during the block."""
+    if not scenarios:
+        yield []
+        return
+    with pool.processes(1, polite=True) as worker:
+        plugged = plugins.loaded()
+        with system.blocked(signal.SIGINT):  # this process ends the worker
+            flying = [(each, worker.submit(_fly_beside, plugged, each)) for each in scenarios]
+        try:
+            yield flying
+        except BrokenExecutor:
+            raise CommandError("--beside: the process that flew it has died") from None
+
+
+def _fly_beside(plugged: tuple[Plugin, ...], scenario: Scenario) -> Record:
+    plugins.use(plugged)
+    return flight.fly(scenario)
 
 
 def _show(
@@ -144,7 +176,7 @@ def _show(
     title: str,
     flown: Record,
     unrecorded: str | None,
-    beside: Mapping[str, Scenario],
+    beside: Mapping[str, Flown],
 ) -> None:
     """Print the flight's summary, and write its picture."""
     scenario = options.config
@@ -156,13 +188,14 @@ def _show(
         missing = _missing(scenario, flown)
         code = command.RUN if missing else command.INTERRUPTED
         raise CommandError(missing or "interrupted before the first step", code)
-    flights = {title: (scenario, flown)}
-    for name, other in beside.items():
-        other_title = f"{name}, in virtual time, seed {other.seed}"
-        flights[other_title] = other, flight.fly(other)
-        terminal.finish(_summarise(other, name, flights[other_title][1]), other_title)
     summary = _summarise(scenario, options.scenario, flown, secure=options.secure)
-    terminal.finish(summary, title, options.json)
+    flights, summaries = {title: (scenario, flown)}, []
+    for name, (other, flying) in beside.items():
+        flights[f"{name}, in virtual time, seed {other.seed}"] = other, flying.result()
+        summaries.append(_summarise(other, name, flying.result()))
+    if beside and not options.virtual:
+        title += "; others in virtual time"
+    terminal.finish(summary, title, options.json, summaries)
     if options.figure:
         figures.flights(options.figure, flights)
     if missing := _missing(scenario, flown) or unrecorded:

@@ -51,6 +51,8 @@ QUICK = [
         ("fly papr", "fly: papr: no such scenario; did you mean paper?"),
         ("flyy", "skytether: no command 'flyy'; did you mean fly?"),
         ("fly demo --virtual --control sockets", "fly: --control: got --virtual"),
+        ("fly demo --virtual --page 127.0.0.1:0", "fly: --page: got --virtual"),
+        ("fly demo --virtual --linger", "fly: --linger: got --virtual"),
         ("set nobody armed", "set: got 'armed', expected KEY=VALUE"),
         (
             "fly demo --control.dt 0",
@@ -287,8 +289,14 @@ def test_a_flight_is_compared_with_several_others(capfd: pytest.CaptureFixture[s
     argv = ["fly", "demo", "--virtual", "--duration", "4", "--settle", "0"]
     assert main([*argv, "--beside", "demo-paper", "--beside", "demo-no-compensation"]) == 0
     told = capfd.readouterr().out
+    (names,) = (line for line in told.splitlines() if "demo-paper" in line)
+    assert re.findall(r"[\w-]+", names) == ["demo", "demo-paper", "demo-no-compensation"]
+    alone = []
     for name in ("demo", "demo-paper", "demo-no-compensation"):
-        assert f"{name}, in virtual time, seed 1" in told
+        assert main(["fly", name, *argv[2:]]) == 0
+        alone += re.findall(r"largest error \[m\] +│ (\S+)", capfd.readouterr().out)
+    (errors,) = (line for line in told.splitlines() if "largest error" in line)
+    assert re.findall(r"[\d.]+", errors) == alone
 
 
 @pytest.mark.realtime
