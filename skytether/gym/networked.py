@@ -126,7 +126,14 @@ class _Far:
         for name, each in (("player", player), ("clock_ns", clock_ns), ("compress", compress)):
             if not callable(each) and (name, each) != ("compress", None):
                 raise ConfigError(f"{name}: got {each!r}, expected a function")
-        step_s = 1.0 / metadata.get("render_fps", np.nan) if step_s is None else step_s
+        if not isinstance(player(), Player):
+            raise ConfigError(f"player: got {player!r}, expected a function that makes a Player")
+        if step_s is None:
+            if not metadata.get("render_fps"):
+                raise ConfigError(
+                    "step_s: got None and an env without render_fps, expected seconds"
+                )
+            step_s = 1.0 / metadata["render_fps"]
         self.price = _number("price", price, 0.0, math.inf)
         self.step_ns = seconds_to_ns(_number("step_s", step_s, 1e-3, 86_400.0))
         self.seed = _whole("seed", seed, 0, 2**63 - 1)
@@ -184,12 +191,15 @@ class _Far:
         """Answer as rows of the action's dtype, with the time that it took.
 
         Raises:
-            ValueError: the rows are no actions of the space, or too many.
+            ValueError: the rows are no actions of the space, or too many, or a number is none.
         """
         first, given = None, answer
         if isinstance(answer, Chunk):
-            first, given = answer.first, answer.rows
-            thought_ns = thought_ns if answer.thought_ns is None else answer.thought_ns
+            given = answer.rows
+            if answer.first is not None:
+                first = _whole("first", answer.first, -(2**62), 2**62, ValueError)
+            if answer.thought_ns is not None:
+                thought_ns = _whole("thought_ns", answer.thought_ns, 0, 2**62, ValueError)
         if given is None:
             return Chunk(self._none, first, thought_ns)
         rows = to_rows(self.space, given, "action")
@@ -416,9 +426,9 @@ def _number(key: str, value: Any, low: float, high: float) -> float:
     return float(value)
 
 
-def _whole(key: str, value: Any, low: int, high: int) -> int:
+def _whole(key: str, value: Any, low: int, high: int, kind: type[Exception] = ConfigError) -> int:
     if not isinstance(value, Integral) or not low <= int(value) <= high:
-        raise ConfigError(f"{key}: got {value!r}, expected a whole number from {low} to {high}")
+        raise kind(f"{key}: got {value!r}, expected a whole number from {low} to {high}")
     return int(value)
 
 
@@ -433,7 +443,7 @@ def _path(key: str, text: str) -> Path:
 
 def _thinking(given: float | str) -> Path:
     """Delays of answers; raises ConfigError if it loses answers or is no delay."""
-    text = given if isinstance(given, str) else f"constant({given!r})"
+    text = given if isinstance(given, str) else f"constant({float(given)!r})"
     delays = _path("thinking", text)
     if delays.queue or any(each.kind != "delay" for _, each in delays.impairments) or delays.loss:
         expected = "seconds, delays such as 'gamma(20ms, 80ms, 30ms)', or 'measured'"

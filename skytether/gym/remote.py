@@ -321,7 +321,7 @@ class Remote:
                 if row is None or len(rows) >= delay_steps:
                     break
             rows.append(row)
-        every = np.array(rows, dtype=self._none.dtype).reshape(-1, *self._none.shape[1:])
+        every = np.array(rows, self._none.dtype).reshape(len(rows), *self._none.shape[1:])
         settled = min(delay_steps, len(every))
         return held, every, settled, len(every) if ran_out is None else ran_out
 

@@ -37,6 +37,8 @@ def no_rows(space: Space, name: str = "action space") -> NDArray[Any]:
     """
     match space:
         case Dict() | Tuple():
+            if not _parts(space) or not all(key and isinstance(key, str) for key in _parts(space)):
+                raise ConfigError(f"env: got the {name} {space}, expected parts with names")
             every = {key: no_rows(part, f"{name}, {key}") for key, part in _parts(space).items()}
             fields = [(key, rows.dtype, rows.shape[1:]) for key, rows in every.items()]
             return np.zeros(0, fields)

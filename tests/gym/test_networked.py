@@ -282,6 +282,7 @@ def test_robots_on_one_link_share_its_rate() -> None:
         ({"mtu": 0}, "mtu: got 0"),
         ({"shown_rows": 0}, "shown_rows: got 0"),
         ({"player": 3}, "player: got 3"),
+        ({"player": dict}, "player: got <class 'dict'>"),
         ({"compress": 0.1}, "compress: got 0.1"),
         ({"idle": np.zeros(2)}, "idle: got the shape"),
         ({"idle": math.nan}, "idle: got"),
@@ -298,6 +299,22 @@ def test_an_action_space_without_rows_is_named() -> None:
 
     with pytest.raises(ConfigError, match="action space Sequence"):
         Networked(Of())
+
+
+def test_an_environment_without_a_length_of_step_needs_one() -> None:
+    class Timeless(Counting):
+        metadata = {}  # noqa: RUF012 - gymnasium's own form
+
+    with pytest.raises(ConfigError, match="step_s: got None"):
+        Networked(Timeless())
+
+
+@pytest.mark.parametrize("given", [{"first": 1.5}, {"thought_ns": math.nan}, {"thought_ns": -1}])
+def test_a_chunk_with_an_impossible_number_is_refused(given: dict[str, Any]) -> None:
+    env = Networked(Counting())
+    env.reset(seed=1)
+    with pytest.raises(ValueError, match=next(iter(given))):
+        env.step(Chunk(rows(1.0), **given))
 
 
 @pytest.mark.parametrize("answer", [np.zeros(2), np.zeros((3, 2)), np.array([math.nan])])

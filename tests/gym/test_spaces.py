@@ -7,6 +7,7 @@ import pytest
 from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, MultiDiscrete, Text, Tuple
 
 from skytether.gym.spaces import idle, no_rows, observed, size_of, to_action, to_rows
+from skytether.shared.base.errors import ConfigError
 
 ARM = Dict(
     {
@@ -71,6 +72,12 @@ def test_what_is_no_action_is_refused_with_what_was_expected(
 ) -> None:
     with pytest.raises(ValueError, match=message):
         to_rows(space, given, "a")
+
+
+@pytest.mark.parametrize("space", [Dict(), Dict({1: Discrete(2)}), Dict({"": Discrete(2)})])  # type: ignore[dict-item]
+def test_a_part_without_a_name_is_refused(space: Dict) -> None:
+    with pytest.raises(ConfigError, match="expected parts with names"):
+        no_rows(space)
 
 
 def test_an_observation_is_a_copy_in_the_dtype_of_its_space() -> None:
