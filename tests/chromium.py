@@ -89,8 +89,9 @@ def until(true: Callable[[], object], what: str) -> None:
 
 
 def status(page: "Page", place: int = 0) -> str:
-    words = page.locator(".skytether-status")
-    return words.nth(place).inner_text() if words.count() > place else ""
+    """Status of a flight, and its other figures."""
+    parts = [page.locator(f".skytether-{part}") for part in ("status", "figures")]
+    return "\n".join(each.nth(place).inner_text() for each in parts if each.count() > place)
 
 
 def flown_s(page: "Page", place: int = 0) -> float:

@@ -36,9 +36,11 @@ TRAIL_POINTS = 240
 TRAIL_POINTS_ALL = 2000
 ROUND_S = 600.0
 """Longest part of the desired trajectory that is drawn."""
+SHADE = 0.45
+"""Share of a flight's colour that its vehicles have: the scene's lights make them pale."""
 SIZE = 0.05
 """Size of a vehicle, relative to the extent of the flight."""
-WIDE, NARROW = 1.5, 0.65
+WIDE, NARROW = 1.5, 0.6
 """Aspect ratios (width over height) of a wide window, and of the widest narrow one."""
 FOV_RAD = 0.7
 
@@ -197,12 +199,13 @@ def quadrotor(size: float) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
 class _Marker:
     def __init__(self, scene: viser.SceneApi, name: str, size: float, rgb: Rgb) -> None:
         vertices, faces = quadrotor(size)
+        red, green, blue = (round(SHADE * part) for part in rgb)
         self._frame = scene.add_frame(name, show_axes=False)
         scene.add_mesh_simple(
             f"{name}/body",
             vertices,
             faces,
-            color=rgb,
+            color=(red, green, blue),
             side="double",
             cast_shadow=False,
             receive_shadow=False,
@@ -244,20 +247,29 @@ class _Flight:
                 f"{self._name}/{what}", nothing, rgb, thickness=width, thickness_units="screen"
             )
 
-        begin, arm = in_space(home(scenario)), 0.5 * self._size
-        cross = np.array([[[-arm, 0, 0], [arm, 0, 0]], [[0, -arm, 0], [0, arm, 0]]], np.float32)
-        line("home", GOAL_RGB, 2.0).points = begin + cross
+        arm = 0.5 * self._size
+        self._cross = np.array(
+            [[[-arm, 0, 0], [arm, 0, 0]], [[0, -arm, 0], [0, arm, 0]]], np.float32
+        )
+        self._is_mission = scenario.is_mission
+        if not self._is_mission:
+            line("home", GOAL_RGB, 2.0).points = in_space(home(scenario)) + self._cross
         if scenario.fence.is_there:
             line("fence", FENCE_RGB, 1.5).points = fence(scenario, reach_m)
         self._zones, self._zoned = line("zones", FENCE_RGB, 2.5), ""
         self._reach_m = reach_m
         self._trail, self._plan = line("trail", faint, 2.0), line("plan", self._rgb, 4.0)
-        self._shows_goals = scenario.reference.shape in ("target", "live") or scenario.is_mission
-        if not self._shows_goals:
+        self._shows_goals = scenario.reference.shape in ("target", "live")
+        if not self._shows_goals and not self._is_mission:
             line("desired", GOAL_RGB, 1.0).points = segments(_desired(scenario))
         self._goal_trail = line("goal-trail", GOAL_RGB, 1.0)
         self._goal = scene.add_icosphere(
-            f"{self._name}/goal", 0.3 * self._size, GOAL_RGB, subdivisions=2, cast_shadow=False
+            f"{self._name}/goal",
+            0.3 * self._size,
+            GOAL_RGB,
+            subdivisions=2,
+            cast_shadow=False,
+            visible=False,
         )
 
     def move(self, state: State) -> None:
@@ -285,6 +297,10 @@ class _Flight:
         )
         ahead = [segments(path, dashed=True) for each in tracks for path in each.motions()]
         self._set(self._plan, ahead)
+        if self._is_mission:
+            goals = [goal for track in tracks if (goal := track.goal(GOAL_S)) is not None]
+            self._set(self._goal_trail, [in_space(goal[None]) + self._cross for goal in goals])
+            return
         goal = tracks[0].goal(GOAL_S) if tracks else None
         if self._goal.visible != (goal is not None):
             self._goal.visible = goal is not None

@@ -9,8 +9,9 @@ import numpy as np
 
 from skytether.figures.colours import css
 from skytether.shared.base.units import MILLISECOND_NS
-from skytether.shared.telemetry.record import DOWNLINK, UPLINK
+from skytether.shared.telemetry.record import UPLINK
 from skytether.shared.telemetry.summary import PLUGINS
+from skytether.view.network import DIRECTIONS
 from skytether.view.scene import FENCE_RGB, FLIGHT_RGB, GOAL_RGB
 from skytether.view.state import LOSS_S, Heard, State, Word, group, told
 
@@ -47,6 +48,7 @@ FLOWN_S = "data-flown-s"
 
 _BODY = "font-size:0.85em;line-height:1.45;padding:0 0.6em;color:var(--mantine-color-text)"
 _DIM = "color:var(--mantine-color-dimmed)"
+_LINE = "white-space:nowrap;overflow:hidden;text-overflow:ellipsis"
 _GAP = ' style="padding-left:1.2em"'
 
 
@@ -64,23 +66,44 @@ def number(value: float, form: str, unit: str = "") -> str:
 
 
 def status(state: State, vehicle: int, now_ns: int, title: str = "") -> str:
+    """What an operator decides by: state, link, error, losses and the newest events."""
     if not state.name:
         return f'<div style="{_BODY}">{escape(title)} No flight yet.</div>'
     if not state.flies:
         return _carried(state, now_ns, title)
     track = state.vehicles.get(vehicle)
-    head = f"<b>{escape(title or state.title)}</b>"
+    head = f'<div style="{_LINE}"><b>{escape(title or state.title)}</b></div>'
     if track is None:
-        return f'<div style="{_BODY}">{head}: no data of vehicle {vehicle} yet.</div>'
-    rows = [("time of flight", f"{track.time_s:.0f} s of {state.duration_s:g} s")]
-    rows.append(("distance to reference, last 10 s", number(track.error_m(10.0), ".3f", " m")))
-    rows.append(("age of the observation in use", number(track.age_s, ".2f", " s")))
-    rows.append(("age of observation at server", number(track.known_s, ".2f", " s")))
+        return f'<div style="{_BODY}">{head}No data of vehicle {vehicle} yet.</div>'
+    rows = [
+        ("time of flight", f"{track.time_s:.0f} s of {state.duration_s:g} s"),
+        ("error, last 10 s", number(track.error_m(10.0), ".3f", " m")),
+        *_apart(state, vehicle),
+        (f"lost, last {LOSS_S:.0f} s", _lost(state, now_ns)),
+    ]
+    return (
+        f'<div style="{_BODY}" class="skytether-status" {FLOWN_S}="{track.time_s:.0f}">{head}'
+        f"<div>{badge(track.does)}</div>"
+        f'<div style="margin:0.3em 0">{badge(_link(state, vehicle, now_ns))}</div>'
+        f"{_gone(state)}{_table(rows)}"
+        f'<div style="{_DIM};margin-top:0.3em">{_newest(state)}</div></div>'
+    )
+
+
+def figures(state: State, vehicle: int, now_ns: int, title: str = "") -> str:
+    """All other figures of a vehicle; empty without a vehicle."""
+    track = state.vehicles.get(vehicle) if state.flies else None
+    if track is None:
+        return ""
+    rows = [
+        ("age of the observation in use", number(track.age_s, ".2f", " s")),
+        ("age of observation at server", number(track.known_s, ".2f", " s")),
+    ]
     if track.planned:
         causes = f"{track.sent.above} by the trigger's figure, {track.sent.due} due"
         rows.append(("plans sent", causes))
     rows += _leader(state, vehicle) + _mission(state, vehicle) + _autopilot(state, vehicle)
-    rows += _network(state, now_ns)
+    rows += [*_rates(state, now_ns), _delays(state, now_ns)]
     curves_ms = track.curves(60).solve_ms
     solved = curves_ms[~np.isnan(curves_ms)]
     deadline_ms = state.scenario.dt_ns / MILLISECOND_NS
@@ -91,19 +114,18 @@ def status(state: State, vehicle: int, now_ns: int, title: str = "") -> str:
     failed = {kind: told(server, "counts", f"{kind}_errors") for kind in PLUGINS}
     if errors := ", ".join(f"{kind} {count:.0f}" for kind, count in failed.items() if count > 0):
         rows.append(("errors of plug-ins", errors))
+    head = f"<b>{escape(title)}</b>" if title else ""
     return (
-        f'<div style="{_BODY}" class="skytether-status" {FLOWN_S}="{track.time_s:.0f}">{head}'
-        f"<div>{badge(track.does)}</div>"
-        f'<div style="margin:0.3em 0">{badge(_link(state, vehicle, now_ns))}</div>'
-        f"{_gone(state)}{_table(rows)}{_table(_paths(state, vehicle))}"
-        f'<div style="{_DIM};margin-top:0.3em">{_newest(state)}</div></div>'
+        f'<div style="{_BODY}" class="skytether-figures">{head}{_table(rows)}'
+        f"{_table(_paths(state, vehicle))}</div>"
     )
 
 
 def _carried(state: State, now_ns: int, title: str) -> str:
     """Counters of netem where it carries other programs' packets."""
     counted = state.figures("netem")
-    rows = [("flows", number(told(counted, "flows"), ".0f")), *_network(state, now_ns)]
+    rows = [("flows", number(told(counted, "flows"), ".0f")), *_rates(state, now_ns)]
+    rows += [(f"lost, last {LOSS_S:.0f} s", _lost(state, now_ns)), _delays(state, now_ns)]
     for way, name in (("uplink", "up"), ("downlink", "down")):
         counts = (f"{number(told(counted, way, each), '.0f')} {each}" for each in FATES)
         rows.append((f"{name}, so far", ", ".join(counts)))
@@ -119,8 +141,9 @@ def _carried(state: State, now_ns: int, title: str) -> str:
 
 def _table(rows: Sequence[Sequence[str]]) -> str:
     """Table with a name at the left of each row; empty without rows."""
+    style = f"{_DIM};padding-right:0.8em;vertical-align:top;white-space:nowrap"
     lines = "".join(
-        f'<tr><td style="{_DIM};padding-right:0.8em;vertical-align:top">{escape(name)}</td>'
+        f'<tr><td style="{style}">{escape(name)}</td>'
         + "".join(f"<td{_GAP if i else ''}>{escape(value)}</td>" for i, value in enumerate(values))
         + "</tr>"
         for name, *values in rows
@@ -135,9 +158,8 @@ def _gone(state: State) -> str:
 
 def _newest(state: State) -> str:
     """Newest events, in a box of fixed height, so that the page does not move."""
-    style = "white-space:nowrap;overflow:hidden;text-overflow:ellipsis"
     lines = "".join(
-        f'<div style="{style}" title="{escape(each.text)}">{each.time_s:.1f} s '
+        f'<div style="{_LINE}" title="{escape(each.text)}">{each.time_s:.1f} s '
         f"{escape(_counted(each))}</div>"
         for each in list(state.said)[: -NEWEST - 1 : -1]
     )
@@ -162,17 +184,19 @@ def _leader(state: State, vehicle: int) -> list[tuple[str, str]]:
     return [("led by", f"{leadership.get('server', '–')}, leadership {number_}")]
 
 
-def _mission(state: State, vehicle: int) -> list[tuple[str, str]]:
+def _apart(state: State, vehicle: int) -> list[tuple[str, str]]:
     if not state.scenario.is_mission:
         return []
     required = f"at least {state.scenario.mission.separation_m:g} m"
     nearest = number(float(state.nearest_m(vehicle)[-1]), ".2f", " m")
+    return [("nearest other vehicle", f"{nearest}, {required}")]
+
+
+def _mission(state: State, vehicle: int) -> list[tuple[str, str]]:
+    if not state.scenario.is_mission:
+        return []
     bound_ms, clock_m = state.clock(vehicle)
     return [
-        (
-            "nearest other vehicle",
-            f"{nearest}, {required}",
-        ),
         ("waits for", state.waits(vehicle) or "–"),
         (
             "clock and position, known to ±",
@@ -222,31 +246,32 @@ def _path(path: int, ends: tuple[dict[str, Any], dict[str, Any]]) -> tuple[str, 
     )
 
 
-def _network(state: State, now_ns: int) -> list[tuple[str, str]]:
+def _rates(state: State, now_ns: int) -> list[tuple[str, str]]:
     rows = []
-    for direction, name in ((UPLINK, "up"), (DOWNLINK, "down")):
+    for direction, name in DIRECTIONS.items():
         traffic = state.network.traffic(direction, LOSS_S, now_ns)
-        rows.append(
-            (
-                name,
-                f"{traffic.packets_per_s:.1f} packets/s, {traffic.bytes_per_s / 1e3:.2f} kB/s",
-            )
-        )
-        if direction == UPLINK and state.flies:
-            size = state.network.horizon_bytes(now_ns)
-            if not np.isnan(size):
-                rate = state.every_step
-                every = f"{rate:.0f} packets/s, {rate * size / 1e3:.2f} kB/s"
-                rows.append(("up, at every step", every))
-    lost, delays = [], []
-    for direction, name in ((UPLINK, "up"), (DOWNLINK, "down")):
+        rates = f"{traffic.packets_per_s:.1f} packets/s, {traffic.bytes_per_s / 1e3:.2f} kB/s"
+        rows.append((name, rates))
+        size = state.network.horizon_bytes(now_ns)
+        if direction == UPLINK and state.flies and not np.isnan(size):
+            rate = state.every_step
+            every = f"{rate:.0f} packets/s, {rate * size / 1e3:.2f} kB/s"
+            rows.append(("up, at every step", every))
+    return rows
+
+
+def _lost(state: State, now_ns: int) -> str:
+    traffic = {name: state.network.traffic(way, LOSS_S, now_ns) for way, name in DIRECTIONS.items()}
+    return ", ".join(f"{number(100 * t.loss, '.0f')} % {name}" for name, t in traffic.items())
+
+
+def _delays(state: State, now_ns: int) -> tuple[str, str]:
+    delays = []
+    for direction, name in DIRECTIONS.items():
         traffic = state.network.traffic(direction, LOSS_S, now_ns)
-        lost.append(f"{number(100 * traffic.loss, '.0f')} % {name}")
         p50, p99 = number(traffic.delay_ms_p50, ".0f"), number(traffic.delay_ms_p99, ".0f")
         delays.append(f"{p50}, {p99} {name}")
-    rows.append((f"lost, last {LOSS_S:.0f} s", ", ".join(lost)))
-    rows.append(("delay p50, p99 [ms]", "; ".join(delays)))
-    return rows
+    return "delay p50, p99 [ms]", "; ".join(delays)
 
 
 def said(states: Sequence[tuple[str, State]]) -> str:
@@ -285,8 +310,10 @@ def answers(given: Sequence[tuple[str, bool]]) -> str:
     return f'<div style="{_BODY};{box}">{lines}</div>'
 
 
-def legend(titles: Sequence[str], *, has_zones: bool) -> str:
-    marks = [("─", "reference", GOAL_RGB), ("+", "start", GOAL_RGB)]
+def legend(titles: Sequence[str], *, has_zones: bool, mission: bool) -> str:
+    marks = [("+", "goal", GOAL_RGB)] if mission else [("─", "reference", GOAL_RGB)]
+    if not mission:
+        marks.append(("+", "start", GOAL_RGB))
     for title, rgb in zip(titles, cycle(FLIGHT_RGB), strict=False):
         marks += [("─", f"{title} flown".strip(), rgb), ("━", f"{title} plan".strip(), rgb)]
     if has_zones:

@@ -368,6 +368,37 @@ def test_it_is_light_and_dark_wide_and_narrow(browser: "sync_api.Browser", fligh
 
 
 @pytest.mark.long
+@pytest.mark.parametrize(
+    ("width", "height", "labels"),
+    [
+        (1280, 800, ("Loss [%]", "Delay [ms]", "Trigger", "Threshold: expected gap")),
+        (390, 844, ("Loss [%]", "Delay [ms]")),
+    ],
+)
+def test_what_an_operator_needs_is_seen_without_scrolling(
+    browser: "sync_api.Browser", flight: str, width: int, height: int, labels: tuple[str, ...]
+) -> None:
+    page = browser.new_page(viewport={"width": width, "height": height})
+    page.set_default_timeout(100_000)
+    page.goto(flight)
+    until(lambda: "TRACK" in status(page), "it flies a plan")
+    page.wait_for_timeout(1000)
+    words, button = page.locator(".skytether-status"), page.get_by_role("button", name="Cut the")
+    shown = [words, button, *(page.locator("label").get_by_text(each) for each in labels)]
+    boxes = [each.bounding_box() for each in shown]
+    assert None not in boxes
+    tops = [box["y"] for box in boxes if box]
+    assert tops == sorted(tops)
+    assert tops[-1] + 20.0 < height
+    assert all(box["height"] < 25.0 for box in boxes[2:] if box), "a label has a line"
+    if width < 500:
+        assert boxes[0]
+        assert boxes[0]["width"] > 0.9 * width
+    picture(page, PICTURES / f"opened-{width}.png")
+    page.close()
+
+
+@pytest.mark.long
 def test_a_phone_finds_plots_beside_the_words(browser: "sync_api.Browser", flight: str) -> None:
     with opened(browser, flight, "narrow") as page:
         until(lambda: "TRACK" in status(page), "it flies a plan")

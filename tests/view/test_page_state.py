@@ -75,6 +75,12 @@ def state_of(frames: tuple[tuple[int, str, Frame], ...]) -> State:
     return state
 
 
+def shown_of(state: State, vehicle: int, now_ns: int, title: str = "") -> str:
+    """All words about a vehicle."""
+    given = state, vehicle, now_ns, title
+    return words.status(*given) + words.figures(*given)
+
+
 def test_the_curves_of_a_vehicle_are_its_record() -> None:
     shown = demo()
     track, client, server = shown.state.vehicles[1], shown.flown.client, shown.flown.server
@@ -96,7 +102,7 @@ def test_the_curves_of_a_vehicle_are_its_record() -> None:
     told = summarise(shown.scenario, "demo", client, server)
     assert track.sent == (told.uplink_above, told.uplink_due)
     assert sum(track.sent) == server["event"].sum()
-    text = unescape(re.sub("<[^>]*>", " ", words.status(shown.state, 1, shown.now_ns)))
+    text = unescape(re.sub("<[^>]*>", " ", shown_of(shown.state, 1, shown.now_ns)))
     found = re.search(r"plans sent\D*(\d+)\D*(\d+)", text)
     assert found is not None
     assert tuple(map(int, found.groups())) == track.sent
@@ -233,7 +239,7 @@ def test_a_cut_link_is_said_in_words_and_colour() -> None:
         f"vehicle 1 hovers: {Reason.LOST}"
     )
     assert len(state.vehicles[number].ahead()) == 0, "a plan is drawn that nobody flies"
-    page = words.status(state, number, shown.now_ns)
+    page = shown_of(state, number, shown.now_ns)
     assert "HOVER" in page
     assert "link cut" in page
     good = demo()
@@ -331,7 +337,7 @@ def test_events_that_repeat_are_counted_and_leave_room_for_others() -> None:
 def test_an_autopilot_s_mode_battery_and_home_are_shown_where_they_are_told() -> None:
     shown = brief()
     state, number = state_of(shown.frames), 1
-    assert "autopilot" not in words.status(state, number, shown.now_ns)
+    assert "autopilot" not in shown_of(state, number, shown.now_ns)
     home = {"latitude_deg": 47.5, "longitude_deg": 8.25}
     told = {"mode": "GUIDED", "armed": 1, "battery": 0.83, "voltage_v": 15.14, "home": home}
     for autopilot, said in (
@@ -340,20 +346,20 @@ def test_an_autopilot_s_mode_battery_and_home_are_shown_where_they_are_told() ->
     ):
         figures = {"by_vehicle": {"1": {"autopilot": autopilot}}}
         state.take("client", Figures(time_ns=shown.now_ns, figures=figures))
-        page = words.status(state, number, shown.now_ns)
+        page = shown_of(state, number, shown.now_ns)
         assert all(each in page for each in said)
 
 
 def test_the_server_that_leads_is_shown_if_there_is_a_standby() -> None:
     now_ns, state = brief().now_ns, state_of(brief().frames)
-    assert "led by" not in words.status(state, 1, now_ns)
+    assert "led by" not in shown_of(state, 1, now_ns)
     for told, said in (
         ({"number": 3, "server": "b:47001"}, "b:47001, leadership 3"),
         ({"number": "x", "server": "<b>"}, "&lt;b&gt;, leadership –"),
     ):
         figures = {"by_vehicle": {"1": {"leadership": told}}}
         state.take("client", Figures(time_ns=now_ns, figures=figures))
-        assert said in words.status(state, 1, now_ns)
+        assert said in shown_of(state, 1, now_ns)
 
 
 def test_a_mission_s_zones_waits_and_distances_are_shown() -> None:
@@ -374,17 +380,17 @@ def test_a_mission_s_zones_waits_and_distances_are_shown() -> None:
     assert state.nearest_m(first, 400)[-1] == pytest.approx(away)
     assert np.nanmin(state.nearest_m(first, 400)) > scenario.mission.separation_m
     assert np.isnan(state.nearest_m(9)).all()
-    page = words.status(state, first, state.newest_ns)
+    page = shown_of(state, first, state.newest_ns)
     assert f"{away:.2f} m, at least 0.5 m" in page
     state.take("server", Figures(time_ns=0, figures={"by_vehicle": {"1": {"waits": "vehicle 3"}}}))
-    assert "vehicle 3" in words.status(state, 1, state.newest_ns)
-    assert "errors of plug-ins" not in words.status(state, 1, state.newest_ns)
+    assert "vehicle 3" in shown_of(state, 1, state.newest_ns)
+    assert "errors of plug-ins" not in shown_of(state, 1, state.newest_ns)
     failed = {"counts": {"trigger_errors": 3}}
     state.take("server", Figures(time_ns=0, figures=failed))
-    assert "trigger 3" in words.status(state, 1, state.newest_ns)
+    assert "trigger 3" in shown_of(state, 1, state.newest_ns)
     known = {"clock_bound_ms": 412.3, "clock_m": 0.487}
     state.take("server", Figures(time_ns=0, figures={"by_vehicle": {"1": known}}))
-    assert "412 ms, 0.49 m" in words.status(state, 1, state.newest_ns)
+    assert "412 ms, 0.49 m" in shown_of(state, 1, state.newest_ns)
 
 
 def test_a_mission_s_motions_that_may_be_flown_are_shown() -> None:
@@ -531,7 +537,7 @@ def test_what_is_said_cannot_become_part_of_the_page() -> None:
     state.take("client", Said(time_ns=state.newest_ns + 1, event=evil))
     assert "<script>" not in words.said([("<b>", state)])
     assert "&lt;script&gt;" in words.said([("", state)])
-    assert "<script>" not in words.status(state, 1, shown.now_ns, "<script>")
+    assert "<script>" not in shown_of(state, 1, shown.now_ns, "<script>")
 
 
 def test_it_says_how_old_what_the_server_knows_is() -> None:
@@ -541,7 +547,7 @@ def test_it_says_how_old_what_the_server_knows_is() -> None:
     behind = int(newest["step"] - newest["observed_step"])
     assert track.known_s == pytest.approx(behind * shown.scenario.control.dt)
     assert 0.3 < track.known_s < 2.0
-    said = words.status(shown.state, 1, shown.now_ns)
+    said = shown_of(shown.state, 1, shown.now_ns)
     assert f"age of observation at server</td><td>{track.known_s:.2f} s" in said
     assert not np.isnan(track.trail(5.0)).any()
 
@@ -564,7 +570,7 @@ def test_netem_alone_is_a_network_and_no_flight() -> None:
     assert state.network.waiting(UPLINK, now_ns)[-1] == 7
     assert state.network.waiting(DOWNLINK, now_ns)[-1] == 0
     assert 12.0 < state.time_s(now_ns) < 15.0
-    shown = words.status(state, 1, now_ns)
+    shown = shown_of(state, 1, now_ns)
     assert "no vehicle" not in shown
     assert "every step" not in shown
     assert "2 lost" in shown
@@ -609,16 +615,16 @@ def with_paths(paths: dict[str, Any]) -> State:
 
 
 def test_each_path_of_several_has_a_column() -> None:
-    shown = words.status(with_paths(PATHS), 1, brief().now_ns)
+    shown = shown_of(with_paths(PATHS), 1, brief().now_ns)
     assert cells(shown)[-len(PATHS_SHOWN) :] == PATHS_SHOWN
-    alone = words.status(brief().state, 1, brief().now_ns)
-    assert alone.count("<table") == 1
+    alone = shown_of(brief().state, 1, brief().now_ns)
+    assert alone.count("<table") == 2
     assert "path 1" not in alone
 
 
 @pytest.mark.parametrize("told", [None, "two", ["one", "two"], {"1": {}}, [{}] * 9])
 def test_what_one_end_does_not_tell_of_a_path_is_a_dash(told: Any) -> None:
-    shown = cells(words.status(with_paths(PATHS | {"server": told}), 1, brief().now_ns))
+    shown = cells(shown_of(with_paths(PATHS | {"server": told}), 1, brief().now_ns))
     row = {name: values for name, *values in shown}
     assert row["packets up, down"][:2] == ["–, 38", "–, 12"]
     assert row["came first up, down"][:2] == ["31, –", "4, –"]

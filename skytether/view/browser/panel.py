@@ -102,7 +102,7 @@ class Panel:
         tabs = gui.add_tab_group() if client.camera.image_width <= NARROW else None
         if tabs is None:
             gui.main_panel.dock_right()
-        gui.main_panel.set_width(340)
+        gui.main_panel.set_width(360)
         self._scene = scene
         self._aimed = scene.camera(WIDE)[0]
         """Position at which the panel has put the camera."""
@@ -114,10 +114,6 @@ class Panel:
     def _add_words(self, more: More | None, *, may_play: bool) -> None:
         gui, flights = self._client.gui, self._flights
         self._status = [gui.add_html("") for _ in flights]
-        flying = [each for each in flights if each.state.flies]
-        if flying:
-            zoned = any(each.state.has_zones for each in flying)
-            gui.add_html(words.legend([each.title for each in flying], has_zones=zoned))
         self._more = more(gui) if more else None
         numbers = sorted({number for each in flights for number in each.state.vehicles} or {1})
         self._vehicle = gui.add_dropdown(
@@ -128,6 +124,13 @@ class Panel:
             self._let_look()
         elif any(each.operator for each in flights):
             self._let_play()
+        flying = [each for each in flights if each.state.flies]
+        with gui.add_folder("Figures", visible=bool(flying)):
+            self._figures = [gui.add_html("") for _ in flights]
+            zoned = any(each.state.has_zones for each in flying)
+            mission = any(each.state.scenario.is_mission for each in flying)
+            titles = [each.title for each in flying]
+            gui.add_html(words.legend(titles, has_zones=zoned, mission=mission))
         light = gui.add_checkbox(LIGHT, initial_value=False)
         gui.add_html(AS_PREFERRED)
 
@@ -211,8 +214,10 @@ class Panel:
             self._vehicle.options = tuple(map(str, numbers))
             self._vehicle.visible = len(numbers) > 1
         vehicle = int(self._vehicle.value)
-        for status, flight in zip(self._status, self._flights, strict=True):
+        shown = zip(self._status, self._figures, self._flights, strict=True)
+        for status, figures, flight in shown:
             status.content = words.status(flight.state, vehicle, now_ns, flight.title)
+            figures.content = words.figures(flight.state, vehicle, now_ns, flight.title)
         self._said.content = words.said([(each.title, each.state) for each in self._flights])
         tracks = [each.state.vehicles.get(vehicle, self._nobody) for each in self._flights]
         known = [track for track in tracks if track]
@@ -692,6 +697,7 @@ class _Handle:
             active_axes=(True, True, axes > 2),
             disable_rotations=True,
             depth_test=False,
+            visible=False,  # until a position is known
         )
 
         @self._handle.on_update
@@ -715,6 +721,7 @@ class _Handle:
     def show(self, goal: NDArray[Any] | None) -> None:
         if goal is None or self._held or time.monotonic() < self._free_s:
             return
+        self._handle.visible = True
         place = in_space(goal[None])[0]
         if np.abs(place - self.place).max() > MOVED_M:
             self.put(place)
