@@ -15,6 +15,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Annotated
 
+from skytether.netem import relay
 from skytether.netem.proxy import FLOWS_MAX, Proxy
 from skytether.netem.relay import Relay
 from skytether.netem.tunnel import Tunnel
@@ -122,8 +123,8 @@ def emulate(argv: Sequence[str]) -> None:
         waiting_for = f"clients of {options.server}"
         if options.tcp:
             listen = Listen(bind, server, flows)
-            relay = Relay(running.scenario, server=server, recorder=recorder, path=path)
-            running.drive(relay, bind=None, line=listen, waiting_for=waiting_for)
+            streams = Relay(running.scenario, server=server, recorder=recorder, path=path)
+            running.drive(streams, bind=None, line=listen, waiting_for=waiting_for)
             return
         proxy = Proxy(
             running.scenario,
@@ -203,14 +204,15 @@ def _with_directions(options: NetemOptions) -> NetemOptions:
     """
     command.check_count("--path", options.path, len(options.config.paths) + 1)
     alone = replace(options, config=options.config.on_path(options.path - 1))
-    return replace(options, config=_impaired(alone, RELAY))
+    return replace(options, config=_impaired(alone, RELAY, tcp=options.tcp))
 
 
-def _impaired(options: NetemOptions | RunOptions, names: Ways) -> Scenario:
+def _impaired(options: NetemOptions | RunOptions, names: Ways, *, tcp: bool = False) -> Scenario:
     """Scenario of the options with the texts of its two directions, where they are given.
 
     Args:
         names: options of both directions.
+        tcp: whether connections are relayed.
 
     Raises:
         ConfigError: the network is invalid.
@@ -221,9 +223,12 @@ def _impaired(options: NetemOptions | RunOptions, names: Ways) -> Scenario:
         if text is not None:
             table["network"][way], flags[key] = text, f"--{name.replace('_', '-')}"
     try:
-        return reading.check(table, any_network=True)
+        scenario = reading.check(table, any_network=True)
+        if tcp and (why := relay.objection(scenario)):
+            raise ConfigError(why)
     except ConfigError as error:
         raise ConfigError(named(str(error), flags)) from None
+    return scenario
 
 
 def _check_server(server: Address, bind: Address) -> None:

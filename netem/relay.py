@@ -22,7 +22,7 @@ from skytether.shared.base.units import MILLISECOND_NS
 from skytether.shared.core.endpoint import Address, Datagram, make_datagram
 from skytether.shared.core.events import FlowOpened, Unreachable
 from skytether.shared.core.line import CLIENT, PIECE_BYTES, SERVER
-from skytether.shared.core.ways import RELAY
+from skytether.shared.core.ways import KEYS, RELAY
 from skytether.shared.scenario.air.draws import SLOT_NS, Fate
 from skytether.shared.scenario.air.path import Path
 from skytether.shared.scenario.schema import Scenario
@@ -166,6 +166,9 @@ class Relay(Emulator):
         at = self._scenario.seed, name, flow
         return LosslessFates(self.link(name).path, *at, by_number=True)
 
+    def objection(self, scenario: Scenario, keys: frozenset[str]) -> str:  # noqa: ARG002
+        return objection(scenario)
+
     def change(self, scenario: Scenario, keys: frozenset[str], *, now_ns: int) -> None:
         """See `Endpoint`; what is held up is tried again at once."""
         super().change(scenario, keys, now_ns=now_ns)
@@ -175,6 +178,16 @@ class Relay(Emulator):
     def figures(self) -> dict[str, Any]:
         flows = {"flows": len(self._streams) // 2, "retries": self._retries}
         return flows | super().figures()
+
+
+def objection(scenario: Scenario) -> str:
+    """Why the network of a scenario suits no byte streams, in words; empty if it does."""
+    for key, path in zip(KEYS, (scenario.uplink, scenario.downlink), strict=True):
+        if names := path.only_packets():
+            expected = "nothing that acts on packets alone, for TCP is relayed as a stream of bytes"
+            what = f"{key}: got {' and '.join(names)}, expected {expected}"
+            return f"{what}; under `skytether netem run` its packets pass"
+    return ""
 
 
 def _other(side: str) -> str:

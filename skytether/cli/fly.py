@@ -129,8 +129,8 @@ def fly(argv: Sequence[str]) -> None:
     vehicles.make(
         scenario, 0
     )  # compiles the vehicle's kernels, and fails here if it cannot be made
-    page = options.page or os.environ.get(page_process.VARIABLE, HOST_PORT)
-    page = None if options.virtual or options.no_page else page
+    at = options.page or os.environ.get(page_process.VARIABLE, HOST_PORT)
+    page = None if options.virtual or options.no_page else at
     with page_process.paged(page, options.control) as sockets:
         together = [scenario, *beside.values()]
         terminal.prepare(kernel.missing(set.intersection(*map(other_schemes, together))))

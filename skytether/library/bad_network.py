@@ -8,6 +8,7 @@ from collections.abc import Callable
 from concurrent.futures import Future
 from typing import Any, Self, TypeVar
 
+from skytether.netem import relay
 from skytether.netem.proxy import Proxy
 from skytether.netem.relay import Relay
 from skytether.shared.base.errors import ConfigError
@@ -68,6 +69,8 @@ class bad_network:  # noqa: N801 - read as a function, like `contextlib.closing`
         table["network"] |= dict(zip(FLIGHT, texts.values(), strict=True))
         try:
             scenario = reading.check(table, any_network=True)
+            if tcp and (why := relay.objection(scenario)):
+                raise ConfigError(why)
         except ConfigError as error:
             raise ConfigError(f"bad_network: {named(str(error), NAMES[RELAY])}") from None
         self._endpoint = (

@@ -29,6 +29,7 @@ from helpers import PATIENCE_S, packaged, until
 from skytether.__main__ import main
 from skytether.netem.__main__ import NetemOptions, _with_directions
 from skytether.netem.proxy import Proxy
+from skytether.netem.relay import Relay
 from skytether.shared.base.units import HEADER_BYTES, MILLISECOND_NS, SECOND_NS
 from skytether.shared.core.change import Answer, Running
 from skytether.shared.core.endpoint import Address, Datagram
@@ -246,6 +247,23 @@ def test_a_wrong_direction_is_told_in_a_line(
 
 def directed(**given: Any) -> Scenario:
     return _with_directions(parse(NetemOptions(**given), [], "netem", None, is_final=False)).config
+
+
+@pytest.mark.parametrize("text", ["corrupt(50%) & duplicate(50%)", "rate(1mbit, drop=codel)"])
+def test_what_acts_on_packets_alone_is_refused_for_streams(
+    text: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["netem", "--tcp", "--bind", "127.0.0.1:0", "--to-client", text]) == 2
+    said = capsys.readouterr().err
+    assert said.startswith("netem: --to-client: got ")
+    assert "skytether netem run" in said
+    to = ("127.0.0.1", 5000)
+    with pytest.raises(skytether.ConfigError, match="to_server"):
+        skytether.bad_network(to_server=text, to=to, tcp=True)
+    scenario = directed(tcp=True, to_client="ordered & loss(0.1) & rate(1mbit)")
+    with pytest.raises(skytether.ConfigError, match="to_client"):
+        Running(Relay(scenario, server=to), scenario).change({"to_client": text}, now_ns=0)
+    assert directed(to_client=text).network.uplink == text
 
 
 def test_without_a_scenario_netem_changes_nothing() -> None:

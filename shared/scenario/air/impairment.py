@@ -42,6 +42,8 @@ class Impairment:
     """Mean delay that the impairment adds [s]."""
     loss: float = 0.0
     """Mean share of packets that the impairment loses."""
+    only_packets: bool = False
+    """Whether byte streams, such as connections of TCP, cannot have the impairment."""
 
     def __call__(self, fate: Fate, draws: Draws) -> None:
         """Change the fate of a packet that enters.

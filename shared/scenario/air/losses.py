@@ -87,6 +87,8 @@ class Outages(Impairment):
 class Duplicate(Impairment):
     """Sends a share of the packets twice."""
 
+    only_packets = True
+
     def __init__(self, share: Share) -> None:
         self._share = share
 
@@ -98,6 +100,8 @@ class Duplicate(Impairment):
 @impairment(name="corrupt")
 class Corrupt(Impairment):
     """Flips one bit of a share of the packets."""
+
+    only_packets = True
 
     def __init__(self, share: Share) -> None:
         self._share = share

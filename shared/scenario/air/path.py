@@ -46,6 +46,11 @@ class Path:
             self.loss += each.loss * (1.0 - self.loss)
         """Mean share of packets that are lost, without the losses of the queue."""
 
+    def only_packets(self) -> list[str]:
+        """Names of what byte streams cannot have."""
+        names = [name for name, each in self.impairments if each.only_packets]
+        return [*names, "drop=codel"] if self.queue and self.queue.drop == "codel" else names
+
     def for_streams(self) -> "Path":
         """The same for pieces of byte streams: they stay in order, and its queue drops none."""
         path = copy(self)
