@@ -7,7 +7,8 @@ process that owns the key; keys with which both ends predict must be equal. Time
 the clock of the first client, by the difference of the times of day.
 """
 
-from collections.abc import Iterator, Sequence
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
 from heapq import merge
 from typing import BinaryIO
 
@@ -40,11 +41,32 @@ def join(recordings: Sequence[Recorded], file: BinaryIO) -> None:
     first = next((each for each in recordings if "client" in each.parts), recordings[0])
     about, scenario = first.about, _scenario(first, recordings)
     joined = Recording(file, scenario, about)
-    streams = [_moved(each, about.offset_ns) for each in recordings]
+    names = _names(recordings)
+    streams = [
+        _moved(each, about.offset_ns, named) for each, named in zip(recordings, names, strict=True)
+    ]
     for process, frame in merge(*streams, key=lambda each: each[1].time_ns):
         joined.add(process, frame)
-    figures = {name: counted for each in recordings for name, counted in each.figures.items()}
+    figures = {
+        named[process]: counted
+        for each, named in zip(recordings, names, strict=True)
+        for process, counted in each.figures.items()
+    }
     joined.finish(summary_of(scenario, about, _parts(recordings), figures))
+
+
+def _names(recordings: Sequence[Recorded]) -> list[dict[str, str]]:
+    """New names of each recording's processes: the second that calls itself `server` is `server 2`,
+    as it is where one command starts both.
+    """
+    found, counts = [], Counter[str]()
+    for recorded in recordings:
+        processes = dict.fromkeys(process for _, process, _ in recorded.frames)
+        counts.update(processes.keys())
+        found.append(
+            {each: f"{each} {counts[each]}" if counts[each] > 1 else each for each in processes}
+        )
+    return found
 
 
 def _scenario(first: Recorded, recordings: Sequence[Recorded]) -> Scenario:
@@ -63,8 +85,12 @@ def _scenario(first: Recorded, recordings: Sequence[Recorded]) -> Scenario:
     return check(table, "the scenarios together")
 
 
-def _moved(recorded: Recorded, offset_ns: int) -> Iterator[tuple[str, Frame]]:
-    """Frames of a recording, with times on the clock whose offset is given."""
+def _moved(
+    recorded: Recorded, offset_ns: int, named: Mapping[str, str]
+) -> Iterator[tuple[str, Frame]]:
+    """Frames of a recording by their process's new name, with times on the clock whose offset is
+    given.
+    """
     late_ns = recorded.about.offset_ns - offset_ns
     for _, process, frame in recorded.frames:
         moved = msgspec.structs.replace(frame, time_ns=frame.time_ns + late_ns)
@@ -72,7 +98,7 @@ def _moved(recorded: Recorded, offset_ns: int) -> Iterator[tuple[str, Frame]]:
             rows = np.frombuffer(moved.rows, recorded.parts["netem"].dtype).copy()
             rows["arrived_ns"] += late_ns
             moved = msgspec.structs.replace(moved, rows=rows.tobytes())
-        yield process, moved
+        yield named[process], moved
 
 
 def _parts(recordings: Sequence[Recorded]) -> dict[str, Table]:

@@ -9,15 +9,17 @@ from numpy.typing import NDArray
 
 from skytether.figures.colours import MODE_COLOURS, PALETTE, css
 from skytether.figures.flights import draw_packets, draw_reference
-from skytether.figures.page import Picture, Table, as_png, lettered, rendered
+from skytether.figures.page import Picture, Table, as_png, as_text, lettered, rendered
 from skytether.shared.base.errors import RecordingError
 from skytether.shared.base.units import SECOND_NS
+from skytether.shared.core.events import DOES
 from skytether.shared.law.model import Array
 from skytether.shared.scenario.reading import to_toml
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Rows, compared
-from skytether.shared.telemetry.summary import desired, position_error
+from skytether.shared.telemetry.summary import Summary, desired, position_error
 from skytether.shared.wire.protocol import NO_HORIZON, Mode
+from skytether.view.outcome import Outcome, listed, spans
 from skytether.view.recorded import Recorded
 
 if TYPE_CHECKING:
@@ -25,6 +27,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 EVENTS_MAX = 400
+TOLD_MAX = 20
 WIDTH = 9.0
 LETTERS = 9
 
@@ -49,11 +52,7 @@ class ReportedFlight:
         return time_s
 
     def spans(self) -> Iterator[tuple[Mode, slice]]:
-        """Modes in succession, each with the slice of its rows and the first row after it."""
-        modes = self.client["mode"]
-        begins = np.flatnonzero(np.diff(modes, prepend=-1))
-        for begin, end in zip(begins, [*begins[1:], len(modes)], strict=True):
-            yield Mode(modes[begin]), slice(begin, end + 1)
+        return spans(self.client)
 
 
 def page(recorded: Recorded, figures: Sequence[tuple[str, str]]) -> str:
@@ -83,17 +82,19 @@ def page(recorded: Recorded, figures: Sequence[tuple[str, str]]) -> str:
         parts.get("netem", empty),
         recorded.begin_ns + epoch_ns,
     )
+    outcome = Outcome(recorded, epoch_ns)
     began = f"{about.began[:10]} {about.began[11:16]} UTC"
     where = f"over UDP, {began}" if about.began else "in virtual time"
-    fleet = len(np.unique(client["vehicle"]))
-    others = f" The figures show vehicle {number} of {fleet}." if fleet > 1 else ""
+    fleet = len(outcome.numbers)
     summary = recorded.summary
-    sent = "–" if summary.event_ratio is None else f"{summary.event_ratio:.1%}"
-    rmse = summary.rmse_xy
-    off = "" if rmse is None else f"The vehicle was {rmse:.3f} m off (RMSE xy); "
-    rows = [list(row) for row in figures]
+    whose = f", of vehicle {number} of {fleet}" if fleet > 1 else ""
     table = Table(
-        "summary", "Summary", "Figures of the whole flight.", "", ("figure", "value"), rows
+        "summary",
+        "Summary",
+        f"Figures of the whole flight{whose}.",
+        "",
+        ("figure", "value"),
+        [list(row) for row in figures],
     )
     facts = {
         "scenario": about.scenario,
@@ -104,16 +105,104 @@ def page(recorded: Recorded, figures: Sequence[tuple[str, str]]) -> str:
     }
     drawn = {
         "title": f"Flight of {about.scenario}, seed {scenario.seed}",
-        "about": f"{summary.duration_s:g} s {where}.{others}",
-        "verdict": f"{off}a horizon was sent at {sent} of the steps.",
-        "tables": [table],
-        "pictures": [path(flown), timeline(flown)],
+        "about": f"{counted(fleet)}, {summary.duration_s:g} s {where}.",
+        "verdict": outcome.verdict if scenario.is_mission else _verdict(summary),
+        "tables": _first(outcome),
+        "pictures": [course(outcome)] if fleet > 1 else [timeline(flown)],
+        "whose": whose,
+        "folded_tables": [table],
+        "folded_pictures": [path(flown), *([timeline(flown)] if fleet > 1 else [])],
         "events": events[:EVENTS_MAX],
         "untold": max(0, len(events) - EVENTS_MAX),
         "made": facts,
         "toml": to_toml(scenario).decode(),
     }
     return rendered("view/report.html.jinja", drawn=drawn)
+
+
+def _verdict(summary: Summary) -> str:
+    sent = "–" if summary.event_ratio is None else f"{summary.event_ratio:.1%}"
+    rmse = summary.rmse_xy
+    off = "" if rmse is None else f"The vehicle was {rmse:.3f} m off (RMSE xy); "
+    return f"{off}a horizon was sent at {sent} of the steps."
+
+
+def counted(vehicles: int) -> str:
+    return f"{vehicles} vehicle{'s' * (vehicles != 1)}"
+
+
+def _first(outcome: Outcome) -> list[Table]:
+    """Tables that come first: the vehicles, and what failed and took over."""
+    found = []
+    if len(outcome.ended) > 1:
+        is_mission = outcome.scenario.is_mission
+        heading = ["vehicle", "at the end", "off [m]", *["largest error [m]"] * (not is_mission)]
+        heading += ["braked [s]", *["nearest other [m]"] * is_mission]
+        rows = []
+        for each in outcome.ended:
+            row = [
+                str(each.vehicle),
+                DOES.get(str(each.mode), str(each.mode)),
+                as_text(each.off_m, ".3f"),
+            ]
+            row += [] if is_mission else [as_text(each.error_max_m, ".3f")]
+            row += [f"{each.braked_s:.1f}" if each.braked_s else "–"]
+            if is_mission:
+                near = f"{as_text(each.nearest_m, '.3f')} ({each.to})" if each.to else "–"
+                row += [near]
+            rows.append(row)
+        says = "Off: from where it should have been at its last step."
+        if len(outcome.numbers) > len(rows):
+            says += f" The first {len(rows)} of {len(outcome.numbers)}."
+        found.append(Table("vehicles", "Vehicles", says, "", heading, rows))
+    told = [
+        [text, listed(who) if who else "–", process, f"{at_s:.1f}"]
+        for at_s, who, process, text in outcome.told
+    ]
+    says = "" if told else "Nothing failed."
+    if len(told) > TOLD_MAX:
+        says = f"The first {TOLD_MAX} of {len(told)}; all events are below."
+    heading = ["event", "vehicles", "told by", "time [s]"] if told else []
+    happened = Table("told", "What failed, and what took over", says, "", heading, told[:TOLD_MAX])
+    return [happened, *found] if told else [*found, happened]
+
+
+def course(outcome: Outcome) -> Picture:
+    """Lanes over time: each vehicle's mode, new leaders, and dead paths; and the separation."""
+    numbers, paths, is_apart = list(outcome.rows), outcome.dead_paths(), bool(outcome.least)
+    lanes = len(numbers) + len(paths)
+    heights = [0.3 + 0.18 * lanes, *[1.8] * is_apart]
+    with lettered(WIDTH, 0.8 + sum(heights), LETTERS) as figure:
+        above, *rest = figure.subplots(
+            len(heights), 1, sharex=True, height_ratios=heights, squeeze=False
+        )[:, 0]
+        modes = set()
+        for lane, number in enumerate(numbers):
+            for mode, begin_s, end_s in outcome.modes(number):
+                modes.add(mode)
+                at = (lane - 0.4, 0.8)
+                above.broken_barh([(begin_s, end_s - begin_s)], at, color=_colour(mode))
+        for lane, dead in enumerate(paths.values(), start=len(numbers)):
+            spans_s = [(begin_s, end_s - begin_s) for _, begin_s, end_s in dead]
+            above.broken_barh(spans_s, (lane - 0.4, 0.8), color="k", alpha=0.5)
+        led = [each for each in outcome.new_leaders() if each[0] in numbers]
+        above.plot([at_s for _, at_s in led], [numbers.index(each) for each, _ in led], "kv")
+        names = [f"vehicle {number}" for number in numbers] + [f"path {path}" for path in paths]
+        above.set_yticks(range(lanes), names)
+        above.invert_yaxis()
+        above.grid(visible=False, axis="y")
+        for below in rest:
+            below.plot(*outcome.apart(), "k-", linewidth=1.0)
+            below.axhline(outcome.scenario.mission.separation_m, color="r", linestyle="--")
+            below.set_ylim(bottom=0.0)
+            below.set_ylabel("nearest two [m]")
+        [above, *rest][-1].set_xlabel("time [s]")
+        _name_modes(figure, modes)
+        says = "Modes of the vehicles."
+        says += " Triangles: another server leads." * bool(led)
+        says += " Black: nothing came over the path." * bool(paths)
+        says += " Below: distance between the nearest two, and what is required." * is_apart
+        return Picture("course", "What happened", says, as_png(figure, 140))
 
 
 def _colour(mode: Mode) -> str:
@@ -133,7 +222,7 @@ def path(flown: ReportedFlight) -> Picture:
         plane.set_xlabel("x [m]")
         plane.set_ylabel("y [m]")
         plane.legend(loc="upper right")
-        _name_modes(figure, flown)
+        _name_modes(figure, {mode for mode, _ in flown.spans()})
         says = "Dashed red: desired positions. Coloured: the vehicle's positions, by mode."
         return Picture("path", "Path from above", says, as_png(figure, 140))
 
@@ -154,7 +243,7 @@ def timeline(flown: ReportedFlight) -> Picture:
         axes[-1].set_xlabel("time [s]")
         axes[-1].set_xlim(0.0, flown.time_s[-1] + flown.scenario.control.dt)
         figure.align_ylabels(axes)
-        _name_modes(figure, flown)
+        _name_modes(figure, {mode for mode, _ in flown.spans()})
         says = (
             "From top to bottom: position, with the desired one dashed; distance between them; the "
             "figure that the trigger compares with its threshold, linear up to it and logarithmic "
@@ -233,11 +322,11 @@ def _packets(below: "Axes", flown: ReportedFlight) -> None:
     draw_packets(below, flown.scenario, flown.netem["direction"][flying], arrived_s[flying])
 
 
-def _name_modes(figure: "Figure", flown: ReportedFlight) -> None:
+def _name_modes(figure: "Figure", modes: set[Mode]) -> None:
     from matplotlib.patches import Patch
 
     names: dict[str, list[str]] = {}
-    for mode in sorted({mode for mode, _ in flown.spans()}):
+    for mode in sorted(modes):
         names.setdefault(_colour(mode), []).append(str(mode))
     patches = [Patch(color=color, label=", ".join(each)) for color, each in names.items()]
     figure.legend(handles=patches, loc="outside upper center", ncols=len(patches), frameon=False)

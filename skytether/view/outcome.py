@@ -1,0 +1,262 @@
+"""Outcome of a recorded flight: which vehicles arrived, how near they came, and what failed."""
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import combinations
+
+import numpy as np
+
+from skytether.shared.base.units import SECOND_NS
+from skytether.shared.core.events import (
+    BegunAnew,
+    Changed,
+    ChangeRefused,
+    ClockContradicted,
+    Degraded,
+    Event,
+    Fault,
+    FenceHolds,
+    HostFound,
+    HostMissing,
+    LeaderChanged,
+    LeftMotion,
+    LeftTube,
+    ModeChanged,
+    NotFlown,
+    NotRecalled,
+    PathDied,
+    PathHealed,
+    PathMissing,
+    Recalled,
+    RecordIncomplete,
+    ServerHeard,
+    ServerSilent,
+    StateLeapt,
+    SteppedLate,
+    TimeUnknown,
+)
+from skytether.shared.law.model import Array
+from skytether.shared.telemetry.record import Rows
+from skytether.shared.telemetry.summary import Track, nearest, position_error, track
+from skytether.shared.wire.protocol import Mode
+from skytether.view.recorded import Recorded
+
+TOLD = (
+    *(HostMissing, HostFound, PathMissing, PathDied, PathHealed, LeaderChanged, ModeChanged),
+    *(ServerSilent, ServerHeard, LeftTube, LeftMotion, SteppedLate, StateLeapt, FenceHolds),
+    *(ClockContradicted, TimeUnknown, BegunAnew, Recalled, NotRecalled, NotFlown),
+    *(Fault, Degraded, RecordIncomplete, Changed, ChangeRefused),
+)
+"""Events that tell what failed, and what took over."""
+GROUND = {str(mode) for mode in (Mode.INIT, Mode.SYNC, Mode.READY)}
+WITHIN_S = 2.0
+"""Time within which the same event of several vehicles is told once."""
+VEHICLES_MAX = 64
+"""Largest number of vehicles that have a row, and distances to each other."""
+
+
+@dataclass(frozen=True, slots=True)
+class Ended:
+    """A vehicle at the end of its flight, and the worst of it; None if unknown."""
+
+    vehicle: int
+    mode: Mode
+    off_m: float | None
+    """Distance from where it should be [m]."""
+    error_max_m: float | None
+    braked_s: float
+    nearest_m: float | None
+    """Smallest distance to another vehicle on the mission [m]."""
+    to: int | None
+    """Number of that vehicle."""
+
+
+class Outcome:
+    """Args:
+    recorded: recording in which a vehicle has flown a step.
+    epoch_ns: time of step 0 of the first vehicle, from the first frame on [ns].
+    """
+
+    def __init__(self, recorded: Recorded, epoch_ns: int) -> None:
+        self._recorded, self._epoch_ns = recorded, epoch_ns
+        self.scenario = recorded.scenario
+        client = recorded.parts["client"]
+        self.numbers: list[int] = np.unique(client["vehicle"]).tolist()
+        self.rows: dict[int, Rows] = {}
+        self.began_s: dict[int, float] = {}
+        """Time of step 0 of each vehicle, on the first one's clock [s]."""
+        for number in self.numbers[:VEHICLES_MAX]:
+            at = np.flatnonzero(client["vehicle"] == number)
+            self.rows[number] = client[at]
+            first_s = (int(recorded.times_ns["client"][at[0]]) - epoch_ns) / SECOND_NS
+            self.began_s[number] = first_s - float(client["step"][at[0]]) * self._dt_s
+
+    @property
+    def _dt_s(self) -> float:
+        return self.scenario.control.dt
+
+    def time_s(self, time_ns: int) -> float:
+        return (time_ns - self._epoch_ns) / SECOND_NS
+
+    def modes(self, number: int) -> Iterator[tuple[Mode, float, float]]:
+        """Modes of a vehicle in succession, and when each begins and ends [s]."""
+        rows, began_s = self.rows[number], self.began_s[number]
+        for mode, span in spans(rows):
+            first, last = rows["step"][span][[0, -1]]
+            yield mode, began_s + float(first) * self._dt_s, began_s + float(last) * self._dt_s
+
+    def apart(self) -> tuple[Array, Array]:
+        """Times [s], and the distance between the nearest two vehicles on the mission [m]."""
+        return nearest(list(self._tracks.values()), self._dt_s)
+
+    @cached_property
+    def _tracks(self) -> dict[int, Track]:
+        if not self.scenario.is_mission:
+            return {}
+        scale = self.scenario.mission.height_scale
+        return {
+            number: track(rows, self.began_s[number], self._dt_s, scale)
+            for number, rows in self.rows.items()
+            if (rows["mode"] == Mode.TRACK).any()
+        }
+
+    @cached_property
+    def least(self) -> dict[tuple[int, int], tuple[float, float]]:
+        """Smallest distance of each two vehicles on a mission, and its time [m, s]."""
+        found = {}
+        for pair in combinations(self._tracks, 2):
+            times_s, apart_m = nearest([self._tracks[each] for each in pair], self._dt_s)
+            if np.isfinite(apart_m).any():
+                at = int(np.nanargmin(apart_m))
+                found[pair] = float(apart_m[at]), float(times_s[at])
+        return found
+
+    @cached_property
+    def ended(self) -> list[Ended]:
+        server = self._recorded.parts.get("server")
+        found = []
+        for number, rows in self.rows.items():
+            off_m = np.linalg.norm(position_error(self.scenario, rows, server), axis=1)
+            known = np.isfinite(off_m).any()
+            near = [
+                (apart_m, sum(pair) - number)
+                for pair, (apart_m, _) in self.least.items()
+                if number in pair
+            ]
+            nearest_m, to = min(near, default=(None, None))
+            found.append(
+                Ended(
+                    number,
+                    Mode(rows["mode"][-1]),
+                    float(off_m[-1]) if np.isfinite(off_m[-1]) else None,
+                    float(np.nanmax(off_m)) if known and not self.scenario.is_mission else None,
+                    float((rows["mode"] == Mode.BRAKE).sum() * self._dt_s),
+                    nearest_m,
+                    to,
+                )
+            )
+        return found
+
+    def arrived(self, each: Ended) -> bool:
+        """Whether a vehicle of a mission ended at its last goal."""
+        return each.off_m is not None and each.off_m <= self.scenario.mission.tube_m
+
+    @property
+    def verdict(self) -> str:
+        """Sentences about a mission: who arrived, and the least separation."""
+        late = [each.vehicle for each in self.ended if not self.arrived(each)]
+        count = len(self.ended)
+        said = f"{count - len(late)} of {count} vehicles arrived"
+        if late:
+            said += f", not {listed(late)}"
+        if not self.least:
+            return f"{said}."
+        (one, other), (apart_m, at_s) = min(self.least.items(), key=lambda each: each[1])
+        required_m = self.scenario.mission.separation_m
+        short = "less than" if apart_m < required_m else "of"
+        return (
+            f"{said}. The least separation was {apart_m:.3f} m, {short} {required_m:g} m required "
+            f"(vehicles {one} and {other}, at {at_s:.1f} s)."
+        )
+
+    @cached_property
+    def told(self) -> list[tuple[float, tuple[int, ...], str, str]]:
+        """What failed and took over: time [s], vehicles, process and sentence, in order of time.
+
+        The same event of several vehicles is told once.
+        """
+        found: list[tuple[float, list[int], str, str]] = []
+        newest: dict[tuple[str, str], int] = {}
+        died_s: dict[tuple[int, int], float] = {}
+        for time_ns, process, event in self._recorded.events():
+            if not isinstance(event, TOLD) or _is_ordinary(event):
+                continue
+            at_s, vehicle = self.time_s(time_ns), getattr(event, "vehicle", None)
+            text = re.sub(r"^vehicle \d+:? ", "", str(event))
+            if isinstance(event, PathDied):
+                died_s[event.vehicle, event.path] = at_s
+            elif isinstance(event, PathHealed):
+                since_s = died_s.pop((event.vehicle, event.path), at_s)
+                text += f", after {at_s - since_s:.0f} s" if at_s > since_s else ""
+            known = newest.get((process, text))
+            if known is not None and vehicle and at_s - found[known][0] < WITHIN_S:
+                if vehicle not in found[known][1]:
+                    found[known][1].append(vehicle)
+                continue
+            newest[process, text] = len(found)
+            found.append((at_s, [vehicle] if vehicle else [], process, text))
+        return [(at_s, tuple(sorted(who)), *rest) for at_s, who, *rest in found]  # type: ignore[misc]
+
+    def dead_paths(self) -> dict[int, list[tuple[int, float, float]]]:
+        """Times without packets on each path: vehicle, begin and end [s]; by the path's number."""
+        open_s: dict[tuple[int, int], float] = {}
+        found: dict[int, list[tuple[int, float, float]]] = {}
+        end_s = max(
+            began + float(self.rows[number]["step"][-1]) * self._dt_s
+            for number, began in self.began_s.items()
+        )
+        for time_ns, _, event in self._recorded.events():
+            if isinstance(event, PathDied):
+                open_s.setdefault((event.vehicle, event.path), self.time_s(time_ns))
+            elif isinstance(event, PathHealed) and (event.vehicle, event.path) in open_s:
+                begin_s = open_s.pop((event.vehicle, event.path))
+                found.setdefault(event.path, []).append(
+                    (event.vehicle, begin_s, self.time_s(time_ns))
+                )
+        for (vehicle, path), begin_s in open_s.items():
+            found.setdefault(path, []).append((vehicle, begin_s, end_s))
+        return dict(sorted(found.items()))
+
+    def new_leaders(self) -> list[tuple[int, float]]:
+        """Vehicles and times [s] at which another server came to lead them."""
+        return [
+            (event.vehicle, self.time_s(time_ns))
+            for time_ns, _, event in self._recorded.events()
+            if isinstance(event, LeaderChanged)
+        ]
+
+
+def spans(rows: Rows) -> Iterator[tuple[Mode, slice]]:
+    """Modes in succession, each with the slice of its rows and the first row after it."""
+    begins = np.flatnonzero(np.diff(rows["mode"], prepend=-1))
+    for begin, end in zip(begins, [*begins[1:], len(rows)], strict=True):
+        yield Mode(rows["mode"][begin]), slice(begin, end + 1)
+
+
+def _is_ordinary(event: Event) -> bool:
+    """Whether a vehicle only begins its flight."""
+    return isinstance(event, ModeChanged) and event.before in GROUND
+
+
+def listed(numbers: list[int] | tuple[int, ...]) -> str:
+    """Numbers in words, ranges of three or more as such: 1, 3 to 6, 9."""
+    runs: list[list[int]] = []
+    for number in sorted(numbers):
+        if runs and number == runs[-1][-1] + 1:
+            runs[-1].append(number)
+        else:
+            runs.append([number])
+    words = [f"{run[0]} to {run[-1]}" if len(run) > 2 else ", ".join(map(str, run)) for run in runs]
+    return ", ".join(words)
