@@ -76,8 +76,6 @@ DATAGRAM_BYTES_MAX = 65535
 RESOLVE_EVERY_S = 2.0
 """Interval at which names are looked up again [s]: a restarted host may have a new address."""
 CHECK_PATHS_EVERY_S = 1.0
-ENDING = system.signals("SIGHUP", "SIGINT", "SIGQUIT", "SIGTERM")
-"""Signals by which users and systems end a process."""
 AnyLine = Line | Node | Program | Listen
 Numbers = dict[Address, Address]
 """Numeric addresses by the peers' names."""
@@ -608,7 +606,7 @@ def run(
         on_event: called with each event of an endpoint, and with each exception of its code.
         on_usr1: called at SIGUSR1.
         on_second: called about once a second.
-        on_signal: called at signals that would end this process, instead of ending it.
+        on_signal: called at signals for another process, instead of what they do to this one.
     """
     # Imported objects live as long as the process; without `freeze`, collecting them takes 13 ms.
     gc.collect()
@@ -630,7 +628,7 @@ def run(
         for number in (signal.SIGINT, signal.SIGTERM):
             system.handle(loop, number, leave)
         if on_signal:
-            for number in ENDING:
+            for number in system.passable():
                 system.handle(loop, number, partial(on_signal, number))
         # A closed loop restores the default action of SIGUSR1, which would end the process.
         system.on_usr1(lambda *_: loop.call_soon_threadsafe(on_usr1))

@@ -20,6 +20,7 @@ import sys
 import tempfile
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from errno import EACCES, ENOSPC, EPERM
 from pathlib import Path
 
 from skytether.shared.base.packets import ADDRESS, ADDRESS6, RESOLVER
@@ -39,6 +40,8 @@ QUEUE = 10_000
 """Number of packets that the device queues for netem: a burst must not be lost here."""
 RESOLVERS = ("/run/nscd", "/run/systemd/resolve")
 """Folders of sockets at which this machine resolves names for its programs."""
+FORBIDDEN = (EACCES, EPERM, ENOSPC)
+"""Errors of namespaces that the system, or a container, does not allow; ENOSPC: none is left."""
 ADMIN = ":/usr/local/sbin:/usr/sbin:/sbin"
 """Folders that are missing in the PATH of ordinary users."""
 
@@ -61,7 +64,9 @@ def main(argv: Sequence[str]) -> int:
         _enter()
         first = os.fork()
     except OSError as error:
-        return _fail(control, f"this process may make no namespaces ({error.strerror}); {_how()}")
+        return _fail(
+            control, f"this process may make no namespaces ({error.strerror}){_how(error)}"
+        )
     if first:
         control.close()
         os.waitpid(first, 0)
@@ -72,7 +77,8 @@ def main(argv: Sequence[str]) -> int:
         _configure(mtu)
         _mount()
     except OSError as error:
-        return _fail(control, f"{error.filename or 'a namespace'}: {error.strerror}; {_how()}")
+        what = error.filename or "the program's namespaces"
+        return _fail(control, f"{what}: {error.strerror}{_how(error)}")
     except subprocess.CalledProcessError as error:
         return _fail(control, f"ip: {error.stderr.decode(errors='replace').strip()}")
     socket.send_fds(control, [READY], [device])
@@ -95,14 +101,16 @@ def _fail(control: socket.socket, message: str) -> int:
     return 1
 
 
-def _how() -> str:
-    """How to get what is missing."""
+def _how(error: OSError) -> str:
+    """How to get what is missing; empty if it is not known."""
     if not Path("/dev/net/tun").exists():
-        return "there is no /dev/net/tun (modprobe tun; in a container --device /dev/net/tun)"
+        return "; there is no /dev/net/tun (modprobe tun; in a container --device /dev/net/tun)"
+    if error.errno not in FORBIDDEN:
+        return ""
     if os.geteuid() == 0:
-        return "root needs CAP_SYS_ADMIN and CAP_NET_ADMIN (in a container --privileged)"
+        return "; root needs CAP_SYS_ADMIN and CAP_NET_ADMIN (in a container --privileged)"
     return (
-        "allow user namespaces (sysctl kernel.apparmor_restrict_unprivileged_userns=0 on Ubuntu, "
+        "; allow user namespaces (sysctl kernel.apparmor_restrict_unprivileged_userns=0 on Ubuntu, "
         "kernel.unprivileged_userns_clone=1 on Debian), or run as root"
     )
 
@@ -178,8 +186,8 @@ def _mount() -> None:
     with suppress(OSError):  # a container may hide a part of /proc: then it stays as it is
         _call(_libc.mount, b"proc", b"/proc", b"proc", 0, None)
     path = Path("/etc/resolv.conf")
-    text = path.read_text() if path.exists() else ""
-    kept = [line for line in text.splitlines() if not line.startswith("nameserver")]
+    before = path.read_text() if path.exists() else ""
+    kept = [line for line in before.splitlines() if not line.startswith("nameserver")]
     text = "\n".join((f"nameserver {RESOLVER}", *kept, ""))
     for folder in filter(os.path.isdir, RESOLVERS):
         _call(_libc.mount, b"tmpfs", folder.encode(), b"tmpfs", 0, None)
@@ -187,6 +195,8 @@ def _mount() -> None:
     if not real.exists():  # a machine without this file resolves no names
         if str(real.parent) in RESOLVERS:  # hidden by now, and nobody else's
             real.write_text(text)
+        return
+    if text == before:  # in another `run`, whose file has lost its name and takes no mount
         return
     with tempfile.NamedTemporaryFile("w") as file:  # its name goes, the mount stays
         file.write(text)
@@ -239,10 +249,10 @@ def _wait(control: socket.socket, program: int) -> None:
             message = control.recv(1)
             if not message or not is_running:
                 return
-            _pass_on(signal.Signals(message[0]), program)
+            _pass_on(message[0], program)
 
 
-def _pass_on(number: signal.Signals, program: int) -> None:
+def _pass_on(number: int, program: int) -> None:
     """Send the program a signal that netem received, unless the program received it, too.
 
     A terminal, or `kill` of a process group, sends it to both, and to this process, where it is

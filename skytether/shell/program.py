@@ -78,6 +78,8 @@ class Program:
     """Status of `os.waitpid`; None until the program has ended."""
     fault: str = ""
     """Why the program has lost its network, or empty."""
+    outlives_parent: bool = False
+    """Whether it goes on when the process that started netem has ended, as under `nohup`."""
 
     def start(self) -> None:
         self.control.send(START)
@@ -86,6 +88,8 @@ class Program:
         """Pass a signal on to the program; if it has ended, end what it left."""
         with suppress(OSError):
             self.control.send(bytes([number]))
+        if number == signal.SIGTSTP:  # the shell waits until netem has stopped, too
+            os.kill(os.getpid(), signal.SIGSTOP)
 
 
 @contextmanager
@@ -122,7 +126,8 @@ def program(
             raise ProgramError(said.decode(errors="replace") or "its namespaces could not be made")
         stack.callback(os.close, devices[0])
         control.setblocking(False)
-        yield Program(devices[0], outside, guard, control)
+        outlives = signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+        yield Program(devices[0], outside, guard, control, outlives_parent=outlives)
 
 
 @contextmanager
@@ -321,7 +326,7 @@ class ProgramLine:
 
     def _watch_parent(self) -> int | None:
         """File that is readable once netem's parent has ended; None under `nohup`."""
-        if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN:
+        if self._program.outlives_parent:
             return None
         try:
             parent = os.pidfd_open(PARENT)

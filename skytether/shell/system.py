@@ -48,6 +48,17 @@ def signals(*names: str) -> tuple[signal.Signals, ...]:
     return tuple(signal.Signals[name] for name in names if hasattr(signal, name))
 
 
+def passable() -> tuple[int, ...]:
+    """Signals that a process can pass on to another.
+
+    Not those that cannot be handled, that tell a process of itself (its faults, children, files and
+    terminal), and SIGUSR1, which asks for counters.
+    """
+    own = ("SIGKILL", "SIGSTOP", "SIGUSR1", "SIGCHLD", "SIGPIPE", "SIGXFSZ", "SIGTTIN", "SIGTTOU")
+    faults = ("SIGABRT", "SIGBUS", "SIGFPE", "SIGILL", "SIGSEGV", "SIGSYS", "SIGTRAP")
+    return tuple(sorted(signal.valid_signals() - {*signals(*own, *faults)}))
+
+
 def user() -> int:
     """Number of the user as the owner of files; 0 on a system without."""
     return os.geteuid() if hasattr(os, "geteuid") else 0

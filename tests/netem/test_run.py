@@ -29,10 +29,14 @@ from skytether.netem.__main__ import emulate_for
 from skytether.shared.base.packets import GATEWAY, GATEWAY6
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.telemetry.record import DOWNLINK, UPLINK, read
+from skytether.shell import system
 from skytether.shell.command import CommandError
 from skytether.shell.inside import ADMIN
+from skytether.shell.program import GRACE_S
 
 PATIENCE_S = 180.0
+PASSED_ON = set(system.passable()) - {signal.SIGTSTP}
+"""All but that which stops netem, too."""
 
 
 @cache
@@ -169,23 +173,79 @@ class TestProgram:
     def test_a_signal_reaches_the_program_once(self) -> None:
         code = """if 1:
             import signal, sys
-            for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-                signal.signal(number, lambda number, _: print(number))
+            for number in map(int, sys.argv[1:]):
+                signal.signal(number, lambda number, _: print(int(number)))
             print("up")
             while True:
                 signal.pause()"""
+        numbers = [*map(int, PASSED_ON)]
         with subprocess.Popen(
-            argv(of=python(code)), stdout=subprocess.PIPE, text=True, start_new_session=True
+            argv(of=python(code, *numbers)),
+            stdout=subprocess.PIPE,
+            text=True,
+            start_new_session=True,
         ) as run:
             assert run.stdout is not None
             assert run.stdout.readline() == "up\n"
-            for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            for number in numbers:
                 run.send_signal(number)  # as by kill
                 assert run.stdout.readline() == f"{number}\n"
                 os.killpg(run.pid, number)  # as by a terminal
                 assert run.stdout.readline() == f"{number}\n"
             run.kill()
             assert run.stdout.read() == ""
+
+    def test_netem_stops_and_goes_on_with_the_program(self) -> None:
+        code = """if 1:
+            import signal
+            for number in (signal.SIGTSTP, signal.SIGCONT):
+                signal.signal(number, lambda number, _: print(int(number)))
+            print("up")
+            while True:
+                signal.pause()"""
+        with subprocess.Popen(argv(of=python(code)), stdout=subprocess.PIPE, text=True) as run:
+            assert run.stdout is not None
+            assert run.stdout.readline() == "up\n"
+            run.send_signal(signal.SIGTSTP)
+            assert run.stdout.readline() == f"{int(signal.SIGTSTP)}\n"
+            _, status = os.waitpid(run.pid, os.WUNTRACED)
+            assert os.WIFSTOPPED(status)
+            run.send_signal(signal.SIGCONT)
+            assert run.stdout.readline() == f"{int(signal.SIGCONT)}\n"
+            run.kill()
+
+    def test_a_run_within_a_run_has_a_network(self) -> None:
+        code = """if 1:
+            import socket, sys
+            client = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+            client.settimeout(120)
+            client.connect((sys.argv[1], int(sys.argv[2])))
+            client.send(b"from inside")
+            print(client.recv(100))"""
+        serving = """if 1:
+            import socket, subprocess, sys
+            server = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+            server.bind(("127.0.0.1", 5000))
+            inner = subprocess.Popen(sys.argv[1:])
+            server.sendto(*server.recvfrom(100))
+            sys.exit(inner.wait())"""
+        inner = argv(of=python(code, GATEWAY, 5000))
+        run = ran(of=python(serving, *inner))
+        assert (run.stdout, run.returncode) == ("b'from inside'\n", 0), run.stderr
+
+    def test_under_nohup_it_outlives_its_parent(self, tmp_path: Path) -> None:
+        program = f"echo up; while [ ! -e {tmp_path}/go ]; do sleep 0.05; done; echo on"
+        line = shlex.join(argv(of=["sh", "-c", program]))
+        script = f"nohup {line} > {tmp_path}/said 2>&1 & echo $!; read -r _"
+        said = tmp_path / "said"
+        with subprocess.Popen(
+            ["sh", "-c", script], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        ) as parent:
+            until(lambda: said.exists() and "up\n" in said.read_text())
+        time.sleep(1.5 * GRACE_S)
+        (tmp_path / "go").touch()
+        until(lambda: said.read_text() == "up\non\n")
+        assert parent.returncode is not None
 
     def test_the_kernel_sends_nothing_by_itself(self, tmp_path: Path) -> None:
         ran("--json", str(tmp_path / "counted"), of=["sleep", "2"])
