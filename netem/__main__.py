@@ -13,6 +13,7 @@ import signal
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from socket import AF_INET
 from typing import Annotated
 
 from skytether.netem import relay
@@ -22,7 +23,7 @@ from skytether.netem.tunnel import Tunnel
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.core.endpoint import Address
 from skytether.shared.core.events import address_text
-from skytether.shared.core.line import CONNECTIONS_MAX, Listen
+from skytether.shared.core.line import CONNECTIONS_MAX, Listen, parse_address
 from skytether.shared.core.ways import FLIGHT, KEYS, RELAY, RUN, Ways, named
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.schema import Scenario
@@ -31,7 +32,7 @@ from skytether.shell import command, process, system
 from skytether.shell.argument import Argument
 from skytether.shell.process import ProcessOptions
 from skytether.shell.program import Program, ProgramError, program
-from skytether.shell.udp import leads_back, sockets_max
+from skytether.shell.udp import leads_back, look_up, sockets_max
 
 NETWORK = "transparent"
 """Scenario of a relay that belongs to no flight."""
@@ -84,7 +85,7 @@ class RunOptions(ProcessOptions):
     """Impairments of packets from the program; the key network.downlink."""
     expose: Annotated[tuple[str, ...], Argument(metavar="PORT", append=True)] = ()
     """Port of this machine, TCP and UDP, that leads to the same port of the program; PORT listens
-    on 127.0.0.1, HOST:PORT elsewhere. May be repeated."""
+    on 127.0.0.1, HOST:PORT at another IPv4 address. May be repeated."""
     mtu: Annotated[int, Argument(metavar="BYTES")] = 1500
     """Largest packet of the program's network device, 1280 to 65520 bytes."""
     path_mtu: Annotated[int | None, Argument(metavar="BYTES")] = None
@@ -160,10 +161,7 @@ def emulate_for(argv: Sequence[str]) -> None:
         message = "got no program, expected -- CMD ARG… at the end"
         raise command.CommandError(message, command.CONFIGURATION)
     options = replace(options, config=_impaired(options, RUN))
-    exposed = [
-        command.address("--expose", text if ":" in text else f"127.0.0.1:{text}")
-        for text in options.expose
-    ]
+    exposed = [_exposed(text) for text in options.expose]
     mtu = options.mtu
     path_mtu = mtu if options.path_mtu is None else options.path_mtu
     for flag, size in (("--mtu", mtu), ("--path-mtu", path_mtu)):
@@ -180,6 +178,25 @@ def emulate_for(argv: Sequence[str]) -> None:
         except ProgramError as error:
             raise command.CommandError(str(error)) from None
     _end_like(run_)
+
+
+def _exposed(text: str) -> Address:
+    """IPv4 address and port at which to listen for a server of the program."""
+    host, colon, _ = text.rpartition(":")
+    why = ""
+    if host.isdecimal():
+        why = "; the port is the same on both sides"
+    elif "[" in host:
+        why = "; slirp4netns passes IPv4 alone"
+    address = None if why else parse_address(text if colon else f"127.0.0.1:{text}")
+    if address is None or not address[1]:
+        expected = f"expected PORT, or HOST:PORT to listen at another address than 127.0.0.1{why}"
+        raise command.CommandError(f"--expose: got {text!r}, {expected}", command.CONFIGURATION)
+    try:
+        return look_up(address, AF_INET)
+    except OSError as error:
+        message = f"--expose: {address[0]}: {error.strerror}"
+        raise command.CommandError(message, command.CONFIGURATION) from None
 
 
 def _end_like(program: Program) -> None:

@@ -628,8 +628,8 @@ def run(
         for number in (signal.SIGINT, signal.SIGTERM):
             system.handle(loop, number, leave)
         if on_signal:
-            for number in system.passable():
-                system.handle(loop, number, partial(on_signal, number))
+            for passed in system.passable():
+                system.handle(loop, passed, partial(on_signal, passed))
         # A closed loop restores the default action of SIGUSR1, which would end the process.
         system.on_usr1(lambda *_: loop.call_soon_threadsafe(on_usr1))
         loop.set_exception_handler(lambda _, context: on_event(_fault(context)))

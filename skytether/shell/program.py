@@ -209,9 +209,20 @@ def _failed(said: IO[bytes]) -> ProgramError:
 def _expose(order: Callable[..., bool], address: Address) -> None:
     host, port = address
     at = {"host_addr": host, "host_port": port, "guest_addr": str(ADDRESS), "guest_port": port}
-    for protocol in ("tcp", "udp"):
+    for protocol, kind in (("tcp", socket.SOCK_STREAM), ("udp", socket.SOCK_DGRAM)):
         if not order("add_hostfwd", proto=protocol, **at):
-            raise ProgramError(f"--expose: {SLIRP} cannot listen on {host}:{port} ({protocol})")
+            what = f"--expose: cannot listen on {host}:{port} ({protocol})"
+            raise ProgramError(f"{what}: {_why_not(kind, address)}")
+
+
+def _why_not(kind: socket.SocketKind, address: Address) -> str:
+    """Why an address cannot be listened on, which slirp4netns does not tell."""
+    try:
+        with socket.socket(socket.AF_INET, kind) as sock:
+            sock.bind(address)
+    except OSError as error:
+        return error.strerror or str(error)
+    return f"{SLIRP} refuses it"
 
 
 def _flush(outside: socket.socket) -> None:

@@ -14,6 +14,7 @@ import threading
 import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
+from errno import EADDRINUSE
 from functools import cache
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -117,6 +118,9 @@ def test_without_slirp4netns_one_line_says_how_to_get_it(monkeypatch: pytest.Mon
         emulate_for(["--", "true"])
 
 
+EXPOSED = ("x", "0", "18080:80", "8080:8080", "::8080", "[::1]:8080", "127.0.0.1:8080:80")
+
+
 @pytest.mark.parametrize(
     ("line", "wrong"),
     [
@@ -125,7 +129,7 @@ def test_without_slirp4netns_one_line_says_how_to_get_it(monkeypatch: pytest.Mon
         (["--mtu", "1279", "--", "true"], "--mtu"),
         (["--mtu", "65521", "--", "true"], "--mtu"),
         (["--path-mtu", "0", "--", "true"], "--path-mtu"),
-        (["--expose", "x", "--", "true"], "--expose"),
+        *((["--expose", text, "--", "true"], f"--expose: got '{text}'") for text in EXPOSED),
     ],
 )
 def test_an_impossible_request_is_refused(line: list[str], wrong: str) -> None:
@@ -376,6 +380,14 @@ class TestNetwork:
                 client.sendall(b"hello")
                 assert client.recv(100) == b"HELLO"
             assert run.wait(PATIENCE_S) == 0
+
+    def test_a_port_that_cannot_be_exposed_is_told_with_the_reason(self) -> None:
+        with socket.create_server(("127.0.0.1", 0)) as taken:
+            port = taken.getsockname()[1]
+            run = ran("--expose", f"localhost:{port}", of=["true"])
+        assert run.stdout == ""
+        assert run.returncode == 1
+        assert f"127.0.0.1:{port} (tcp): {os.strerror(EADDRINUSE)}" in run.stderr
 
     def test_a_packet_too_long_for_the_path_is_an_error_of_the_program(self) -> None:
         code = """if 1:
