@@ -1,28 +1,78 @@
 """Tables that commands print."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 
+from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
 from skytether.shell import terminal
 
+AROUND = 3
+"""Width of the frame and space around a cell."""
+
+Cells = Sequence[Sequence[str]]
+
 
 def show(title: str, headings: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
     """Print a table: the first column flush left, the others right, and nothing cut off.
 
-    Without headings the table is a list of names and values.
+    On a terminal that is too narrow several tables stand below each other. Without headings the
+    table is a list of names and values.
     """
-    table = Table(
-        title=Text(title, style="table.title"),
-        title_justify="left",
-        min_width=len(title),
-        show_header=bool(headings),
-    )
-    for number, heading in enumerate(headings or ("", "")):
-        is_right = headings and number
-        table.add_column(Text(heading), justify="right" if is_right else "left", no_wrap=True)
-    for row in rows:
-        cells = (f"{cell:.3f}" if isinstance(cell, float) else str(cell) for cell in row)
-        table.add_row(*map(Text, cells))
-    terminal.show(table)
+    cells = [
+        [f"{cell:.3f}" if isinstance(cell, float) else str(cell) for cell in row] for row in rows
+    ]
+    console = Console()
+    parts = fitted(title, headings, cells, console.width) if console.is_terminal else ()
+    for named, heads, some in parts or [(title, headings, cells)]:
+        table = Table(
+            title=Text(named, style="table.title"),
+            title_justify="left",
+            min_width=len(named),
+            show_header=bool(heads),
+        )
+        for number, heading in enumerate(heads or ("", "")):
+            is_right = heads and number
+            table.add_column(Text(heading), justify="right" if is_right else "left", no_wrap=True)
+        for row in some:
+            table.add_row(*map(Text, row))
+        terminal.show(table)
+
+
+def fitted(
+    title: str, headings: Sequence[str], rows: Cells, width: int
+) -> list[tuple[str, Sequence[str], Cells]]:
+    """Tables no wider than `width` with all of a table's cells, where its cells allow it.
+
+    A first column that repeats itself becomes a part of the titles; what is still too wide is cut
+    between columns, and each piece has the first one.
+    """
+    widths = [AROUND + max(map(len, column)) for column in zip(headings, *rows, strict=True)]
+    if not headings or len(headings) < 3 or 1 + sum(widths) <= width:
+        return [(title, headings, rows)]
+    groups: dict[str, list[Sequence[str]]] = {}
+    for first, *rest in rows:
+        groups.setdefault(first, []).append(rest)
+    if len(groups) < len(rows):
+        return [
+            each
+            for first, some in groups.items()
+            for each in fitted(f"{title}: {first}", headings[1:], some, width)
+        ]
+    return [
+        (title, [headings[at] for at in piece], [[row[at] for at in piece] for row in rows])
+        for piece in _pieces(widths, width)
+    ]
+
+
+def _pieces(widths: Sequence[int], width: int) -> Iterator[list[int]]:
+    """Columns of each piece of a table, the first column in each."""
+    piece, used = [0], 1 + widths[0]
+    for at, wide in enumerate(widths[1:], start=1):
+        if used + wide > width and len(piece) > 1:
+            yield piece
+            piece, used = [0], 1 + widths[0]
+        piece.append(at)
+        used += wide
+    yield piece
