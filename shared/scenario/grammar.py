@@ -154,7 +154,13 @@ def _call(name: str, arguments: str | None, text: str, begin: int, end: int) -> 
     return Call(name, values, tuple(key for key, _ in pairs), text[begin:end].rstrip(), begin)
 
 
+DIGITS_MAX = 300
+"""Largest number of digits of a whole number; a longer one becomes a float, mostly infinite."""
+
+
 def _value(word: str) -> Value:
     if NUMBER.fullmatch(word):
-        return float(word) if re.search(r"[.e]", word, re.IGNORECASE) else int(word)
+        # Python makes no whole number of more than 4300 digits; nothing here takes so large a one.
+        is_whole = len(word) <= DIGITS_MAX and not re.search(r"[.e]", word, re.IGNORECASE)
+        return int(word) if is_whole else float(word)
     return word[1:-1] if word[:1] == word[-1:] == '"' else word
