@@ -15,7 +15,6 @@ import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from errno import EADDRINUSE
-from functools import cache
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
@@ -25,6 +24,7 @@ import numpy as np
 import pytest
 
 from helpers import SKYTETHER, echo, until
+from namespaces import needs_namespaces
 from robot import free_port
 from skytether.netem.__main__ import emulate_for
 from skytether.shared.base.packets import GATEWAY, GATEWAY6
@@ -32,7 +32,6 @@ from skytether.shared.base.units import SECOND_NS
 from skytether.shared.telemetry.record import DOWNLINK, UPLINK, read
 from skytether.shell import system
 from skytether.shell.command import CommandError
-from skytether.shell.inside import ADMIN
 from skytether.shell.program import GRACE_S
 
 PATIENCE_S = 180.0
@@ -40,26 +39,11 @@ PASSED_ON = set(system.passable()) - {signal.SIGTSTP}
 """All but that which stops netem, too."""
 
 
-@cache
-def missing() -> str:
-    """What this machine lacks, or empty."""
-    slirp = shutil.which("slirp4netns", path=os.environ["PATH"] + ADMIN)
-    if slirp is None or not shutil.which("unshare"):
-        return "no slirp4netns"
-    said = subprocess.run([slirp, "--help"], capture_output=True, check=False).stdout
-    if b"--target-type" not in said:
-        return "slirp4netns before 1.2"
-    spaces = ["unshare", "-nmp"] if os.geteuid() == 0 else ["unshare", "-Unmp"]
-    made = subprocess.run([*spaces, "--fork", "true"], capture_output=True, check=False)
-    return "" if made.returncode == 0 and Path("/dev/net/tun").exists() else "no namespaces or TUN"
-
-
 def needs(name: str) -> pytest.MarkDecorator:
     return pytest.mark.skipif(shutil.which(name) is None, reason=f"no {name} here")
 
 
 needs_ping = needs("ping")
-needs_namespaces = pytest.mark.skipif("missing()", reason="no slirp4netns, namespaces or TUN here")
 
 
 def argv(*options: str, of: list[str]) -> list[str]:
