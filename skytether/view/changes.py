@@ -43,16 +43,20 @@ def together(changed: Mapping[tuple[str, str], Changed], netems: int) -> str:
         changed: changes by process and key.
         netems: number of netems of the flight, one for each path.
     """
-    at: dict[str, list[tuple[str, str]]] = {}
+    at: dict[str, list[tuple[str, Changed]]] = {}
     for place, event in changed.items():
-        at.setdefault(in_words(event), []).append(place)
+        at.setdefault(in_words(event), []).append((place[0], event))
     return "; ".join(text + _where(places, netems) for text, places in at.items())
 
 
-def _where(places: Sequence[tuple[str, str]], netems: int) -> str:
+def _where(changes: Sequence[tuple[str, Changed]], netems: int) -> str:
     """Direction and path of changes of the network; empty for all of them."""
-    ways = {DIRECTIONS[key] for _, key in places if key in DIRECTIONS}
-    paths = {process.partition(" ")[2] or "1" for process, _ in places} if ways else set()
+    ways = {
+        event.name.replace("_", " ") or DIRECTIONS[event.key]
+        for _, event in changes
+        if event.key in DIRECTIONS
+    }
+    paths = {process.partition(" ")[2] or "1" for process, _ in changes} if ways else set()
     where = [*ways] if len(ways) == 1 else []
     if 0 < len(paths) < netems:
         where.append(f"path {', '.join(sorted(paths))}")
@@ -68,7 +72,7 @@ def in_words(event: Changed) -> str:
         return turned
     if isinstance(before, str) and isinstance(after, str):
         before, after = _differing(before, after)
-    return f"{event.key} {_shown(before)} → {_shown(after)}"
+    return f"{event.name or event.key} {_shown(before)} → {_shown(after)}"
 
 
 def _turned(key: str, before: Any, after: Any) -> str:

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -208,8 +208,9 @@ def of_network(*, solves: bool) -> tuple[Plot, ...]:
     return (*packets, solving) if solves else packets
 
 
-def of_link() -> tuple[Plot, ...]:
-    return (
+def of_link(names: Sequence[str] = ("up", "down")) -> tuple[Plot, ...]:
+    """Plots of netem alone, whose directions have these names."""
+    plots = (
         _ways("Packets in a second", Network.rates),
         _ways("Payload in a second [kB]", Network.loads, 1e-3),
         _ways("Lost [%]", Network.losses, 100.0),
@@ -217,6 +218,12 @@ def of_link() -> tuple[Plot, ...]:
         _ways("Packets under way", Network.waiting),
         BY_DELAY,
     )
+
+    def named(plot: Plot) -> Plot:
+        lines = zip(plot.lines, names, strict=True)
+        return replace(plot, lines=tuple(replace(line, label=name) for line, name in lines))
+
+    return tuple(map(named, plots))
 
 
 def _ways(title: str, values: Callable[[Network, int, int], Array], scale: float = 1.0) -> Plot:

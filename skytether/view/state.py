@@ -21,6 +21,7 @@ from skytether.shared.base import toml
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS, seconds_to_ns
 from skytether.shared.core.events import DOES, Changed, Counted, Event, Listening, Plaintext
+from skytether.shared.core.ways import FLIGHT, Ways
 from skytether.shared.law.model import Array
 from skytether.shared.scenario import reading, zone_texts
 from skytether.shared.scenario.grammar import GrammarError
@@ -406,7 +407,7 @@ class State:
             known.figures = frame.figures
             if _is_netem(process):
                 queues = [
-                    [told(each.figures, way, "queue") for way in ("uplink", "downlink")]
+                    [told(each.figures, way, "queue") for way in each.opened.ways]
                     for name, each in self._processes.items()
                     if _is_netem(name)
                 ]
@@ -524,6 +525,19 @@ class State:
     def flies(self) -> bool:
         """Whether a vehicle or a server is known; netem alone may carry any protocol."""
         return not all(map(_is_netem, self._processes))
+
+    @property
+    def ways(self) -> Ways:
+        """Names of both directions of the network in netem's figures."""
+        known = (each.opened.ways for each in self._processes.values())
+        return next((ways for ways in known if ways != FLIGHT), FLIGHT)
+
+    @property
+    def directions(self) -> dict[int, str]:
+        """Words for both directions."""
+        if self.ways == FLIGHT:
+            return DIRECTIONS
+        return {way: name.replace("_", " ") for way, name in enumerate(self.ways)}
 
     def time_s(self, time_ns: int) -> float:
         """Time of flight [s] at a time [ns], 0 before it; of netem alone, its running time."""

@@ -11,7 +11,6 @@ from skytether.figures.colours import css
 from skytether.shared.base.units import MILLISECOND_NS
 from skytether.shared.telemetry.record import UPLINK
 from skytether.shared.telemetry.summary import PLUGINS
-from skytether.view.network import DIRECTIONS
 from skytether.view.scene import FENCE_RGB, FLIGHT_RGB, GOAL_RGB
 from skytether.view.state import LOSS_S, Heard, State, Word, group, told
 
@@ -126,7 +125,7 @@ def _carried(state: State, now_ns: int, title: str) -> str:
     counted = state.figures("netem")
     rows = [("flows", number(told(counted, "flows"), ".0f")), *_rates(state, now_ns)]
     rows += [(f"lost, last {LOSS_S:.0f} s", _lost(state, now_ns)), _delays(state, now_ns)]
-    for way, name in (("uplink", "up"), ("downlink", "down")):
+    for way, name in zip(state.ways, state.directions.values(), strict=True):
         counts = (f"{number(told(counted, way, each), '.0f')} {each}" for each in FATES)
         rows.append((f"{name}, so far", ", ".join(counts)))
         queue, p99_ms = told(counted, way, "queue"), told(counted, way, "queueing_ms_p99")
@@ -248,7 +247,7 @@ def _path(path: int, ends: tuple[dict[str, Any], dict[str, Any]]) -> tuple[str, 
 
 def _rates(state: State, now_ns: int) -> list[tuple[str, str]]:
     rows = []
-    for direction, name in DIRECTIONS.items():
+    for direction, name in state.directions.items():
         traffic = state.network.traffic(direction, LOSS_S, now_ns)
         rates = f"{traffic.packets_per_s:.1f} packets/s, {traffic.bytes_per_s / 1e3:.2f} kB/s"
         rows.append((name, rates))
@@ -261,13 +260,15 @@ def _rates(state: State, now_ns: int) -> list[tuple[str, str]]:
 
 
 def _lost(state: State, now_ns: int) -> str:
-    traffic = {name: state.network.traffic(way, LOSS_S, now_ns) for way, name in DIRECTIONS.items()}
+    traffic = {
+        name: state.network.traffic(way, LOSS_S, now_ns) for way, name in state.directions.items()
+    }
     return ", ".join(f"{number(100 * t.loss, '.0f')} % {name}" for name, t in traffic.items())
 
 
 def _delays(state: State, now_ns: int) -> tuple[str, str]:
     delays = []
-    for direction, name in DIRECTIONS.items():
+    for direction, name in state.directions.items():
         traffic = state.network.traffic(direction, LOSS_S, now_ns)
         p50, p99 = number(traffic.delay_ms_p50, ".0f"), number(traffic.delay_ms_p99, ".0f")
         delays.append(f"{p50}, {p99} {name}")

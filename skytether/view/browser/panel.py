@@ -162,7 +162,7 @@ class Panel:
                     Plots(gui, titles, of_flight(axes, mission=scenarios[0].is_mission))
                 )
         with panel.add_tab("Network"):
-            of_air = of_network(solves=solves) if flies else of_link()
+            of_air = of_network(solves=solves) if flies else of_link([*flights[0].state.directions.values()])
             self._plots.append(Plots(gui, titles, of_air))
         with panel.add_tab("Events"):
             self._said = gui.add_html("")
@@ -359,6 +359,7 @@ class _Network:
     Args:
         number: number of the path, from 1.
         ask, cut, heal: change, cut and heal this path.
+        labels: names of both directions.
     """
 
     def __init__(
@@ -368,17 +369,17 @@ class _Network:
         ask: Callable[[dict[str, Any]], None],
         cut: Callable[[], None],
         heal: Callable[[], None],
+        labels: Sequence[str],
         *,
         flies: bool,
     ) -> None:
         self._number = number
-        to = ("To the vehicle" if flies else "To clients", "To the server")
         self._known: dict[str, str] = {}
         self._folder = gui.add_folder("Network", expand_by_default=not flies, visible=False)
         with self._folder:
             self._texts = {
                 way: gui.add_text(label, "", hint=IMPAIRMENTS)
-                for way, label in zip(WAYS, to, strict=True)
+                for way, label in zip(WAYS, labels, strict=True)
             }
             self.note = _Note(gui)
             apply = gui.add_button("Change the network")
@@ -436,6 +437,8 @@ class Controls:
             self._add_trigger()
         self._undo = gui.add_button("Undo", disabled=True, icon=viser.Icon.ARROW_BACK_UP)
         self._add_sliders(knob for knob in offered if knob.process != "netem")
+        ways = self._flights[0].state.directions.values()
+        labels = ("To the vehicle", "To the server") if flies else [*map(str.capitalize, ways)]
         self._networks = {
             netem: _Network(
                 gui,
@@ -443,6 +446,7 @@ class Controls:
                 partial(self._all, netem),
                 partial(self._cut_alone, netem),
                 partial(self._heal_all, (netem,)),
+                labels,
                 flies=flies,
             )
             for number, netem in enumerate(NETEMS, start=1)
