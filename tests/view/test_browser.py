@@ -239,15 +239,15 @@ def test_a_network_is_written_and_measured_on_a_page_of_its_own(
                 served("page", str(folder), "--page", "127.0.0.1:0") as address,
                 opened(browser, address) as page,
             ):
-                until(lambda: "0 % down" in measured(), "nothing is lost")
+                until(lambda: "0 % to server" in measured(), "nothing is lost")
                 assert "TRACK" not in status(page)
                 assert page.get_by_text("Trigger").count() == 0
-                put(page, "To the server", "loss(2)")
+                put(page, "To server", "loss(2)")
                 page.get_by_role("button", name="Change the network").click()
                 until(lambda: page.get_by_text("expected loss(share)").count(), "it is refused")
-                put(page, "To the server", "loss(1)")
+                put(page, "To server", "loss(1)")
                 page.get_by_role("button", name="Change the network").click()
-                until(lambda: "100 % down" in measured(), "everything is lost")
+                until(lambda: "100 % to server" in measured(), "everything is lost")
                 picture(page, PICTURES / "netem-dark-wide.png")
         finally:
             process.send_signal(signal.SIGINT)
