@@ -21,7 +21,9 @@ from skytether.shared.core import change
 from skytether.shared.core.change import REQUEST_BYTES_MAX, Answer, Running
 from skytether.shared.core.events import Counted
 from skytether.shared.scenario import (
+    bounded,
     contradictions,
+    formats,
     grammar,
     mission,
     plans,
@@ -125,7 +127,11 @@ class NamedFiles(Text):
     values that can be flown.
     """
 
-    code = (tracks, mission, plans, zone_files, zone_texts, recorded, pings, traces, captures, keys)
+    code = (
+        *(importlib.import_module(f"{formats.__name__}.{name}") for name, *_ in formats.FORMATS),
+        *(bounded, tracks, mission, plans, zone_files, zone_texts),
+        *(recorded, pings, traces, captures, keys),
+    )
     largest = 20_000
 
     def __init__(self, folder: Path) -> None:
@@ -160,6 +166,15 @@ class NamedFiles(Text):
                 "</Placemark></kml>"
             ),
             route,
+            "QGC WPL 110\n0 1 0 16 0 0 0 0 47 8 400 1\n1 0 3 16 1 0 0 0 47.001 8 9 1\n",
+            (
+                "<gpx><trk><trkseg><trkpt lat='47' lon='8'><ele>9</ele><time>2026-01-01T00:00:00Z"
+                "</time></trkpt></trkseg></trk></gpx>"
+            ),
+            (
+                "<kml><LineString><altitudeMode>absolute</altitudeMode><coordinates>8,47,9 "
+                "8,47.001,9</coordinates></LineString></kml>"
+            ),
             "time_s,delay_s,lost\n0,0.1,0\n1,,1\n2,0.2,0\n",
             "timestamp,rtt\n1700000000000,20\n1700000000200,-1\n",
             "\n".join(map(row.format, (1, 2, 4))),
@@ -179,7 +194,7 @@ class NamedFiles(Text):
             "0\n3\n3\n17\n",
             keys.write(1, 1, bytes(32)) + keys.write(2, 1, bytes(32)),
         )
-        kinds = b"\0\1\1\0\0\2\2\2" + 7 * b"\3" + b"\4\6"
+        kinds = b"\0\1\1\0\0\2\2\2\0\1\1" + 7 * b"\3" + b"\4\6"
         known = [bytes([k]) + text.encode() for k, text in zip(kinds, texts, strict=True)]
         known.append(b"\5" + capture(0) + capture(9))
         super().__init__(known, [b"nan", b"1e308", b"-0", b"inf", b"9" * 5000, b"[" * 500])

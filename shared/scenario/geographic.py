@@ -87,3 +87,30 @@ def within(places: Array, most_m: float) -> Array:
     if not (np.abs(places) <= most_m).all():
         raise ValueError(f"coordinates of at most {most_m:g} m from the origin")
     return places
+
+
+def above_sea(places: Array, axes: int, origin: Origin | None, home: Origin = ()) -> Array:
+    """Metres from the origin, from places with altitudes above the sea; shape (n, axes).
+
+    Args:
+        places: longitude and latitude [degrees], and altitude [m]; shape (n, 3).
+        axes: number of axes asked for; with 2 the altitudes are ignored.
+        origin: the scenario's origin; (): not given; None: any.
+        home: origin of the file, and its altitude, for what the scenario does not give.
+
+    Raises:
+        ValueError: a coordinate is out of range, or origin or altitude are not known.
+    """
+    if origin is None:
+        longitude, latitude, altitude_m = places[0].tolist()
+        origin = latitude, longitude, altitude_m
+    flat = local(places[:, :2], origin or home)
+    if axes < 3:
+        return flat
+    altitude = (*origin[2:], *home[2:])
+    if not altitude:
+        raise ValueError(
+            "reference.origin = [latitude, longitude, altitude], with the altitude of the "
+            "scenario's origin: those of the file are above the sea"
+        )
+    return np.concatenate([flat, places[:, 2:] - altitude[0]], axis=1)

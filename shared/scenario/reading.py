@@ -41,7 +41,9 @@ FILES: Mapping[str, tuple[PluginTable, int]] = MappingProxyType(
     }
 )
 """Keys whose text may name files: table of the text's entries, and largest size of a file [B]."""
-TABLE_BYTES_MAX = 16_000_000
+TABLE_BYTES_MAX, LOG_BYTES_MAX = 16_000_000, 64_000_000
+"""Largest size of `reference.file` [B]; the second for an autopilot's log."""
+LOGS = (".ulg", ".bin")
 WAYS = ("uplink", "downlink")
 COMPARED = "compare"
 """Name of the file with the scenarios of `skytether compare`."""
@@ -250,7 +252,8 @@ def files_of(key: str, text: str, source: str = "", known: Files = ()) -> Files:
         ConfigError: a file cannot be read.
         GrammarError: the text is invalid.
     """
-    table, most = FILES.get(key, (None, TABLE_BYTES_MAX))
+    is_log = text.lower().endswith(LOGS)
+    table, most = FILES.get(key, (None, LOG_BYTES_MAX if is_log else TABLE_BYTES_MAX))
     read = {file.name: file for file in known}
     return tuple(
         read.get(name) or File(name, _content(f"{_where(source)}{key}", name, most))

@@ -184,12 +184,14 @@ class ReferenceConfig(Section, frozen=True):
     velocity_mps: Annotated[tuple[Speed, ...], Key(Owner.SERVER, InFlight.POINT)] = ()
     """Velocity of a live point [m/s]; default: estimated from its moves."""
     speed_mps: Term[Factor] = 1.0
-    """Speed between waypoints; largest speed of a target along an axis [m/s]."""
+    """Speed between waypoints, and between the places of a file without times; largest speed of a
+    target along an axis [m/s]."""
     loop: Term[bool] = False
     """Whether the waypoints are repeated."""
     file: Annotated[str, Key(Owner.BOTH, term="table")] = ""
     """File with the points and their times, see docs/vehicles.md: CSV with the columns t, x, y (and
-    z), for a mission also vehicle; relative to the scenario's folder."""
+    z), for a mission also vehicle, or one of the formats in docs/together.md; relative to the
+    scenario's folder."""
     origin: OfEach[tuple[Position, ...]] = ()
     """Latitude and longitude of the scenario's origin [degrees], and its altitude above the sea [m]
     for files with such altitudes; default: those of the file, if it has them."""

@@ -64,7 +64,8 @@ def hover(scenario: Scenario) -> Reference:
 @reference
 def csv(scenario: Scenario) -> Reference:
     """Timed path of one vehicle from `file`, straight from point to point."""
-    return tracks.path(scenario.table, scenario.model.axes, scenario.reference.origin)
+    keys = scenario.reference
+    return tracks.path(scenario.table, scenario.model.axes, keys.origin, keys.speed_mps)
 
 
 @reference
@@ -115,6 +116,6 @@ def show(scenario: Scenario) -> Reference:
 
 
 def _mission(scenario: Scenario, *, is_show: bool) -> Reference:
-    axes = scenario.model.axes
-    found = tracks.tracks(scenario.table, axes, scenario.reference.origin)
+    axes, keys = scenario.model.axes, scenario.reference
+    found = tracks.tracks(scenario.table, axes, keys.origin, keys.speed_mps)
     return missions.Mission(found, axes, 1, is_show=is_show)

@@ -22,7 +22,7 @@ from skytether.shared.base import kernel
 from skytether.shared.core.events import NotFlown
 from skytether.shared.core.stopwatch import Stopwatch
 from skytether.shared.law.model import Array
-from skytether.shared.scenario import plans, reading, tracks
+from skytether.shared.scenario import formats, plans, reading, tracks
 from skytether.shared.scenario.mission import Mission
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.drops import drops
@@ -34,7 +34,6 @@ from skytether.shell.command import CommandError, ScenarioName, ScenarioOptions
 from skytether.sim import flight as sim
 
 VEHICLES = 20
-TRACKS = (".csv", ".zip", ".plan")
 """Ends of the names of files with timed points."""
 AFTER_S = 30.0
 """Time flown after the last goal of a mission's table [s]."""
@@ -208,17 +207,20 @@ def _with_mission(argv: Sequence[str]) -> list[str]:
     if other:
         message = f"{flag}: got {other[0]} as well, expected one of the two"
         raise CommandError(message, command.CONFIGURATION)
-    is_file = Path(file).suffix in TRACKS or (Path(file).is_dir() and file not in reading.names())
+    is_folder = Path(file).is_dir() and file not in reading.names()
+    is_file = Path(file).suffix.lower() in formats.SUFFIXES or is_folder
     if not (shows or is_file):
         if file not in reading.names() and not file.endswith(".toml"):
             expected = "swap, sphere, rings, corridor, warehouse, a folder, or a file that ends in"
-            message = f"{flag}: got {file!r}, expected {expected} .csv, .zip, .plan or .toml"
+            ends = f"{', '.join(formats.SUFFIXES)} or .toml"
+            message = f"{flag}: got {file!r}, expected {expected} {ends}"
             raise CommandError(message, command.CONFIGURATION)
         return [file, *rest]
     try:
         (read,) = reading.files_of(flag, file)
         axes = tracks.axes_of(read.content)
-        lasts_s = tracks.lasts_s(read.content, axes)
+        speeds, _ = plugins.flag_values(rest, "--reference.speed-mps")
+        lasts_s = tracks.lasts_s(read.content, axes, float((speeds or ["1"])[-1]))
         is_fenced = file.endswith(".plan") and plans.has_fence(read.content)
     except ValueError as error:
         raise CommandError(f"{flag}: {file}: {error}", command.CONFIGURATION) from None

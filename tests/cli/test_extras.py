@@ -19,7 +19,7 @@ from skytether.shared.base.extras import MODULES
 
 ALL = (
     *("server", "mavlink", "ros2", "page", "plot", "record", "pandas", "parquet", "cluster"),
-    *("gym", "lab"),
+    *("gym", "lab", "ulog"),
 )
 LAB = (
     *("crowd", "sweep", "envelope", "margins", "identify", "torture", "adversary", "reproduce"),

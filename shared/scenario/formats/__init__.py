@@ -40,13 +40,31 @@ class Format(Protocol):
         """3 if the points of a file have heights, otherwise 2; raises ValueError as `tracks`."""
 
 
+def _has(name: str) -> Callable[[bytes], bool]:
+    """Whether a zip has a file whose name ends so."""
+    return lambda content: any(each.endswith(name) for each in bounded.names(content))
+
+
 def _begins(*heads: bytes) -> Callable[[bytes], bool]:
     return lambda content: content[:HEAD_BYTES].removeprefix(BOM).lstrip().startswith(heads)
 
 
+def _root(tag: bytes) -> Callable[[bytes], bool]:
+    """Whether an XML text begins with an element, in UTF-8 or UTF-16."""
+    return lambda content: tag in content[:HEAD_BYTES].replace(b"\0", b"")
+
+
 FORMATS: tuple[tuple[str, tuple[str, ...], Callable[[bytes], bool]], ...] = (
+    ("skyc", (".skyc",), _has("show.json")),
+    ("kml", (".kmz",), _has(".kml")),
     ("tables", (".zip",), bounded.is_zip),
     ("plan", (".plan",), _begins(b"{")),
+    ("waypoints", (".waypoints",), _begins(b"QGC WPL")),
+    ("ulog", (".ulg",), _begins(b"ULog")),
+    ("dataflash", (".bin",), _begins(b"\xa3\x95")),
+    ("kml", (".kml",), _root(b"<kml")),
+    ("gpx", (".gpx",), _root(b"<gpx")),
+    ("gpx", (), _begins(b"<")),
     ("tables", (".csv",), lambda _: True),
 )
 """Module of each format, ends of its files' names, and whether a content has it; the first that

@@ -1,0 +1,86 @@
+"""ULog of PX4 (`.ulg`): the track of one vehicle.
+
+Places are those of `vehicle_global_position`, with altitudes above the sea; home is the first
+`home_position`, or else the first place. A log without them has `vehicle_local_position`, in metres
+from where the estimator began.
+"""
+
+import contextlib
+import io
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skytether.shared.base import extras
+from skytether.shared.law.model import Array
+from skytether.shared.scenario.formats import Tracks
+from skytether.shared.scenario.formats.timing import Line, together
+from skytether.shared.scenario.geographic import Origin, above_sea
+
+GLOBAL, LOCAL, HOME = "vehicle_global_position", "vehicle_local_position", "home_position"
+READS_MAX = 4_000_000
+"""Largest number of reads from a log: two a message, and more where its bytes are no messages."""
+
+
+class _Content(io.BytesIO):
+    """Content of a log, which can be read so many times and no more."""
+
+    def __init__(self, content: bytes) -> None:
+        super().__init__(content)
+        self._left = READS_MAX
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        self._left -= 1
+        if self._left < 0:
+            raise EOFError
+        return super().read(size)
+
+
+def tracks(content: bytes, axes: int, origin: Origin | None, speed_mps: float) -> Tracks:
+    found = _messages(content)
+    if GLOBAL in found:
+        placed, times_ns = _global(found, axes, origin)
+    elif LOCAL in found:
+        own = found[LOCAL]
+        ned = np.stack([own["x"], own["y"], own["z"]], axis=1).astype(np.float64)
+        placed, times_ns = (ned * [1.0, 1.0, -1.0])[:, :axes], _times_ns(own)
+    else:
+        raise ValueError(f"expected a ULog with {GLOBAL} or {LOCAL}")
+    return together([Line("the log", placed, times_ns)], speed_mps)
+
+
+def axes_of(_: bytes) -> int:
+    return 3
+
+
+def _global(
+    found: dict[str, Any], axes: int, origin: Origin | None
+) -> tuple[Array, NDArray[np.int64]]:
+    at = found[GLOBAL]
+    places = np.stack([at["lon"], at["lat"], at["alt"]], axis=1).astype(np.float64)
+    known = found.get(HOME, at)
+    home = tuple(float(known[each][0]) for each in ("lat", "lon", "alt"))
+    return above_sea(places, axes, origin, home), _times_ns(at)
+
+
+def _times_ns(message: Any) -> NDArray[np.int64]:
+    return 1000 * message["timestamp"].astype(np.int64)
+
+
+def _messages(content: bytes) -> dict[str, Any]:
+    """Fields of the wanted messages that the log has, by the message's name: an array each."""
+    with extras.named():
+        from pyulog import ULog
+    try:
+        with contextlib.redirect_stdout(io.StringIO()):  # it prints what it skips
+            log = ULog(_Content(content), [GLOBAL, LOCAL, HOME])
+    except EOFError:
+        raise ValueError(f"expected a ULog of at most {READS_MAX // 2} messages") from None
+    except Exception as error:  # it raises many kinds
+        raise ValueError(f"expected a ULog ({type(error).__name__}: {error})") from None
+    return {
+        each.name: each.data
+        for each in log.data_list
+        if each.multi_id == 0 and len(each.data["timestamp"])
+    }
