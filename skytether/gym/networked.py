@@ -27,7 +27,7 @@ from gymnasium.vector.utils import concatenate, create_empty_array, iterate
 
 from skytether.gym.players import Chunk, Clocked, Player, Row
 from skytether.gym.remote import PART_BYTES, ROWS_MAX, Network, Remote
-from skytether.gym.spaces import Space, idle, no_rows, observed, size_of, to_action, to_rows
+from skytether.gym.spaces import Space, idle_of, no_rows, observed, size_of, to_action, to_rows
 from skytether.netem.fate import Fates
 from skytether.netem.link import QUEUE_BYTES_MAX
 from skytether.shared.base.chance import stream
@@ -143,7 +143,10 @@ class _Far:
         self.thinking = None if thinking == "measured" else _thinking(thinking)
         self.count, self.space, self._observation = count, action, observation
         self._none = no_rows(action)
-        self._idle = self._idle_row(idle)
+        try:
+            self._idle = self._one(idle_of(action) if idle is None else idle, "idle")
+        except ValueError as error:
+            raise ConfigError(str(error)) from None
         self._exhausted, self._player, self._compress = exhausted, player, compress
         self._clock_ns, self._returned_ns = clock_ns, 0
         self._episode = 0
@@ -151,13 +154,6 @@ class _Far:
         self._present: list[Any] = []
         self.remote: Remote | None = None
         self._thoughts: Fates
-
-    def _idle_row(self, given: Any) -> Row:
-        try:
-            (row,) = to_rows(self.space, idle(self.space) if given is None else given, "idle")
-        except ValueError as error:
-            raise ConfigError(str(error)) from None
-        return row
 
     def restart(self, seed: int | None, observations: Sequence[Any]) -> None:
         """Begin an episode of all robots; with a seed, that of a first episode."""
@@ -220,14 +216,19 @@ class _Far:
         """Action of each robot at the present step."""
         rows = self.begun().rows()
         return [
-            to_action(self.space, self._rule(i) if row is None else self._row(row, "player's row"))
+            to_action(self.space, self._rule(i) if row is None else self._row(row))
             for i, row in enumerate(rows)
         ]
 
-    def _row(self, given: Any, name: str) -> Row:
-        """Row that a function of the user returned; raises ValueError if it is none."""
-        if (np.shape(given), getattr(given, "dtype", None)) == (self._idle.shape, self._idle.dtype):
-            return given
+    def _row(self, played: Row) -> Row:
+        """Row of a player; raises ValueError if it is none."""
+        kind = np.shape(played), getattr(played, "dtype", None)
+        if kind == (self._idle.shape, self._idle.dtype):
+            return played
+        return self._one(played, "row of the player")
+
+    def _one(self, given: Any, name: str) -> Row:
+        """Row of one action; raises ValueError if it is none."""
         (row, *others) = to_rows(self.space, given, name)
         if others:
             raise ValueError(f"{name}: got {1 + len(others)} actions, expected one")
@@ -242,7 +243,7 @@ class _Far:
         last = self.begun().last(index)
         if callable(self._exhausted):
             action = None if last is None else to_action(self.space, last)
-            return self._row(self._exhausted(self._present[index], action), "exhausted")
+            return self._one(self._exhausted(deepcopy(self._present[index]), action), "exhausted")
         fill = self._fill(last)
         assert fill is not None
         return fill
@@ -391,8 +392,10 @@ class NetworkedVector(VectorWrapper[Any, Any, Any, Any, Any]):
         space = self.single_action_space
         if isinstance(actions, dict) or (isinstance(space, Tuple) and isinstance(actions, tuple)):
             answers = list(iterate(self.action_space, actions))
-        else:
+        elif isinstance(actions, Sequence | np.ndarray):
             answers = list(actions)
+        else:
+            raise ValueError(f"actions: got {type(actions).__name__}, expected a list of answers")
         if len(answers) != self.num_envs:
             expected = f"one for each of {self.num_envs} robots"
             raise ValueError(f"actions: got {len(answers)}, expected {expected}")

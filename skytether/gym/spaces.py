@@ -149,10 +149,10 @@ def to_action(space: Space, row: Any) -> Any:
     return str(row) if isinstance(space, Text) else row
 
 
-def idle(space: Space) -> Any:
+def idle_of(space: Space) -> Any:
     """Action of zeros, or of what in the space is closest to them."""
     if isinstance(space, Dict | Tuple):
-        made = {key: idle(part) for key, part in _parts(space).items()}
+        made = {key: idle_of(part) for key, part in _parts(space).items()}
         return made if isinstance(space, Dict) else tuple(made.values())
     if isinstance(space, Text):
         return min(space.character_set, default="") * space.min_length

@@ -251,6 +251,14 @@ def test_a_vector_environment_has_a_network_for_all_and_a_fate_for_each() -> Non
     assert vector.envs[0].played == [0.0]
 
 
+@pytest.mark.parametrize("actions", [None, 1.0, [None], np.zeros((3, 1))])
+def test_a_vector_takes_one_answer_for_each_robot(actions: Any) -> None:
+    env = NetworkedVector(SyncVectorEnv([Counting, Counting]))
+    env.reset(seed=1)
+    with pytest.raises(ValueError, match="actions: got"):
+        env.step(actions)
+
+
 def test_robots_on_one_link_share_its_rate() -> None:
     """Answers to two robots queue for a rate that carries those to one."""
 
@@ -428,10 +436,11 @@ def test_an_observation_or_a_function_that_returns_another_shape_is_refused_at_o
     env.reset(seed=1)
     with pytest.raises(ValueError, match="observation: got the shape"):
         env.step(np.zeros(1))
-    env = Networked(Counting(), exhausted=lambda *_: np.zeros(3))
-    env.reset(seed=1)
-    with pytest.raises(ValueError, match="exhausted: got the shape"):
-        env.step(None)
+    for wrong, message in ((np.zeros(3), "the shape"), (np.array([math.nan]), "nan")):
+        env = Networked(Counting(), exhausted=lambda *_, wrong=wrong: wrong)
+        env.reset(seed=1)
+        with pytest.raises(ValueError, match=f"exhausted: got {message}"):
+            env.step(None)
     env = Networked(Counting(), compress=lambda _: 0.5)  # type: ignore[arg-type,return-value]
     env.reset(seed=1)
     with pytest.raises(ConfigError, match=r"compress: got 0\.5"):

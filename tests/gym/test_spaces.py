@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, MultiDiscrete, Text, Tuple
 
-from skytether.gym.spaces import idle, no_rows, observed, size_of, to_action, to_rows
+from skytether.gym.spaces import idle_of, no_rows, observed, size_of, to_action, to_rows
 from skytether.shared.base.errors import ConfigError
 
 ARM = Dict(
@@ -32,7 +32,7 @@ def test_an_action_is_a_row_and_a_row_an_action(space: Any) -> None:
         assert again in space
         np.testing.assert_equal(again, action)
     assert len(no_rows(space)) == 0
-    assert idle(space) in space
+    assert idle_of(space) in space
 
 
 def test_rows_of_a_dict_are_given_as_arrays_with_one_axis_more_or_as_rows() -> None:
