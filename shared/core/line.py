@@ -15,7 +15,7 @@ from typing import Literal, NamedTuple
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.core.endpoint import Address
 
-HOST_PORT = "HOST:PORT, or [HOST]:PORT where HOST is an IPv6 address"
+HOST_PORT = "HOST:PORT with a PORT of at most 65535, or [HOST]:PORT where HOST is an IPv6 address"
 LINE: Address = ("line", 0)
 """Peer at the other end of a TCP or serial line."""
 CLIENT, SERVER = "client", "server"

@@ -6,11 +6,14 @@ of a process; so simple flags, which commands pass to processes, are parsed here
 """
 
 import dataclasses
+import io
 import json
+import re
 from collections import deque
 from collections.abc import Mapping, Sequence
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack, redirect_stderr, suppress
 from functools import cache
+from itertools import takewhile
 from pathlib import Path
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
@@ -28,8 +31,8 @@ def read(default: T, argv: Sequence[str], prog: str, help_: str | None) -> T:
     """Options of a command line, laid over defaults; `help_` describes the command.
 
     Raises:
-        ConfigError: a plug-in cannot be imported.
-        SystemExit: the help or an error in a flag has been printed.
+        ConfigError: a flag is wrong, or a plug-in cannot be imported.
+        SystemExit: the help has been printed.
     """
     plugins.load(plugins.named(argv))
     options = plain(default, argv)
@@ -47,9 +50,50 @@ def read(default: T, argv: Sequence[str], prog: str, help_: str | None) -> T:
     import tyro
 
     kind: Any = type(default)
+    said = io.StringIO()
     with ExitStack() as undo:
         _tell_tyro(kind, undo)
-        return tyro.cli(kind, args=argv, default=default, prog=prog)
+        try:
+            with redirect_stderr(said):
+                return tyro.cli(kind, args=argv, default=default, prog=prog)
+        except SystemExit:
+            raise ConfigError(refusal(said.getvalue(), kind, prog)) from None
+
+
+def refusal(frame: str, options: type, prog: str) -> str:
+    """Sentence about a wrong command line, from what tyro prints in a frame about it."""
+    lines = (line.strip("│ ") for line in frame.splitlines() if line.startswith("│"))
+    said = " ".join(takewhile(lambda line: not line.startswith("─"), lines))
+    if unknown := re.match(r"Unrecognized options: (.*?)(?:, |$)", said):
+        return _unknown(unknown[1], options, f"see {prog} --help")
+    for pattern, sentence in REFUSALS:
+        if found := re.match(pattern, said):
+            return found.expand(sentence)
+    return said
+
+
+def _unknown(word: str, options: type, see: str) -> str:
+    import difflib  # slow to import, and needed only after a typing error
+
+    if not word.startswith("-"):
+        return f"got {word!r} as well, expected no further argument; {see}"
+    flags, _ = _flags(options)
+    names = [f"--{name.replace('_', '-')}" for name in flags]
+    close = difflib.get_close_matches(word, names, 1, 0.8)
+    return f"{word}: no such option; {f'did you mean {close[0]}?' if close else see}"
+
+
+REFUSALS = (
+    (r"Missing from [^:]+: (-\S+ )?(\S+) +(.*?)\.? +\(required\)", r"expected \1\2: \3"),
+    (r"Missing value for argument '([^']+)'", r"\1: got nothing, expected a value"),
+    (
+        r"invalid choice ('.*') for argument '(\S+)'\. Expected one of \((.*?),?\)",
+        r"\2: got \1, expected one of \3",
+    ),
+    (r"Error parsing (\S+): .* from \[(.*?)\].*'int'", r"\1: got \2, expected a whole number"),
+    (r"Error parsing (\S+): .* from \[(.*?)\].*'float'", r"\1: got \2, expected a number"),
+)
+"""What tyro says, and the sentence in its place."""
 
 
 def key_values(argv: Sequence[str], options: type) -> tuple[list[str], dict[str, Any]]:

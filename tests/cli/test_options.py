@@ -79,7 +79,7 @@ def test_the_help_is_as_wide_as_the_terminal(
 
 def test_a_flag_has_one_group_over_all_commands(capfd: pytest.CaptureFixture[str]) -> None:
     used = set[str]()
-    for name in COMMANDS.keys() - {"scenarios"}:
+    for name in COMMANDS.keys() - {"scenarios", "completion"}:
         text = shown([name, "--help"], capfd)
         assert "MISSING" not in text, name
         used |= set(re.findall(r"^  --([a-z-]+)", text, re.MULTILINE))
@@ -147,3 +147,26 @@ def test_a_wrong_key_or_value_is_one_clear_line(flags: list[str], said: str) -> 
     with pytest.raises(ConfigError) as error:
         command.parse(client.ClientOptions(), ["demo", *flags], "x", None)
     assert said in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("line", "refused"),
+    [
+        ("fly --virtul", "fly: --virtul: no such option; did you mean --virtual?"),
+        ("fly --nothing-like-it", "fly: --nothing-like-it: no such option"),
+        ("fly demo paper", "fly: got 'paper' as well"),
+        ("fly demo --json", "fly: --json: got nothing, expected a value"),
+        ("fleet --vehicles x", "fleet: --vehicles: got 'x', expected a whole number"),
+        ("server --log xml", "server: --log: got 'xml', expected one of 'text', 'json'"),
+        ("replay", "replay: expected FILE: The recording"),
+        ("sweep demo", "sweep: expected --out PATH: Folder"),
+        ("server --bind 127.0.0.1:99999", "server: --bind: got '127.0.0.1:99999', expected"),
+    ],
+)
+def test_a_wrong_line_is_refused_in_one_line(
+    line: str, refused: str, capfd: pytest.CaptureFixture[str]
+) -> None:
+    assert main(line.split()) == 2
+    said = capfd.readouterr().err
+    assert said.startswith(refused)
+    assert said.count("\n") == 1
