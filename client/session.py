@@ -448,14 +448,21 @@ class ServerSession:
         self._give_up(waited_ns / SECOND_NS)
         return False
 
+    @property
+    def _others(self) -> tuple[str, ...]:
+        """Addresses of the server's paths but for the first."""
+        return tuple(address_text(*each) for each in self._addresses[1:])
+
     def _say_unanswered(self, left_ns: int, waited_ns: int) -> None:
         """Report once, after a while, that the server has not answered."""
         if self._is_unanswered or self._refusal is not None or waited_ns < UNANSWERED_NS:
             return
         self._is_unanswered = True
-        host, port = self._server
-        sent = Unanswered(vehicle=self._vehicle, host=host, port=port, left_s=left_ns / SECOND_NS)
-        self._events.append(sent)
+        (host, port), others = self._server, self._others
+        left_s = left_ns / SECOND_NS
+        self._events.append(
+            Unanswered(vehicle=self._vehicle, host=host, port=port, others=others, left_s=left_s)
+        )
 
     def _give_up(self, waited_s: float) -> None:
         """Fail for lack of a first session; a refusal has been reported already."""
@@ -468,6 +475,7 @@ class ServerSession:
                 vehicle=self._vehicle,
                 host=host,
                 port=port,
+                others=self._others,
                 waited_s=waited_s,
                 secure=self.link.secure,
             )

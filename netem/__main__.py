@@ -97,14 +97,15 @@ def emulate(argv: Sequence[str]) -> None:
 
     It carries any UDP. Clients send to --bind instead of the server:
 
-        skytether netem --bind 127.0.0.1:5000 --server 192.0.2.1:5000 --to-client "constant(50ms)"
-            --to-server "gamma(20ms, 80ms, 30ms) & loss(5%) & rate(1mbit, queue=30000)"
+        skytether netem --bind 127.0.0.1:5000 --server 192.0.2.1:5000
+            --to-client "constant(50ms)"
+            --to-server "gamma(20ms, 80ms, 30ms) & loss(5%) & rate(1mbit)"
 
     Without these, packets pass at once. With one seed, the packet with the same number in its flow
     has the same fate in each run. SIGUSR1 prints the counters so far; they are also printed
     at the end. With --control, `skytether set` changes the impairments meanwhile.
 
-    `skytether netem run … -- CMD ARG…` does the same to all packets of one program.
+    `skytether netem run … -- CMD ARG…`: the same, for all packets of one program.
     """
     if argv[:1] == ["run"]:
         emulate_for(argv[1:])
@@ -142,7 +143,8 @@ def emulate_for(argv: Sequence[str]) -> None:
     """Run a program whose only network is netem; exit code and standard streams are its own.
 
         skytether netem run --to-program "constant(50ms)"
-            --from-program "constant(50ms) & loss(5%)" --seed 7 -- curl http://10.0.2.2:8000/
+            --from-program "constant(50ms) & loss(5%)" --seed 7
+            -- curl http://10.0.2.2:8000/
 
     All its packets of IPv4 and IPv6 are impaired, as are those of its children: TCP, UDP, QUIC,
     ICMP, DNS. It reaches other machines as ever, and this one at 10.0.2.2 and fd00::2. With one

@@ -371,23 +371,33 @@ class NoSession(PeerEvent, frozen=True, kw_only=True):
         return f"vehicle {self.vehicle} is refused by {self.peer}: {why}"
 
 
-class NoAnswer(PeerEvent, frozen=True, kw_only=True):
+class UnansweredEvent(PeerEvent, frozen=True, kw_only=True):
+    others: tuple[str, ...] = ()
+    """Addresses of the server's other paths, from which no answer has come either."""
+
+    @property
+    def everywhere(self) -> str:
+        return ", ".join((self.peer, *self.others))
+
+
+class NoAnswer(UnansweredEvent, frozen=True, kw_only=True):
     waited_s: float
     secure: bool = False
     """Whether the vehicle has a key, so that only answers with that key count."""
 
     def __str__(self) -> str:
         key, and_key = (" with this key", ", with this key") if self.secure else ("", "")
-        no_answer = f"no answer{key} from {self.peer} in {self.waited_s:.0f} s"
+        no_answer = f"no answer{key} from {self.everywhere} in {self.waited_s:.0f} s"
         return f"vehicle {self.vehicle}: {no_answer}: is a server running there{and_key}?"
 
 
-class Unanswered(PeerEvent, frozen=True, kw_only=True):
+class Unanswered(UnansweredEvent, frozen=True, kw_only=True):
     left_s: float
 
     def __str__(self) -> str:
         left = f"{self.left_s:.0f} s"
-        return f"vehicle {self.vehicle}: no answer from {self.peer} yet, asking for another {left}"
+        unheard = f"vehicle {self.vehicle}: no answer from {self.everywhere} yet"
+        return f"{unheard}, asking for another {left}"
 
 
 class Welcomed(PeerEvent, frozen=True, kw_only=True):

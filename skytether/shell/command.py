@@ -51,8 +51,8 @@ Plugins = Annotated[
     Argument(
         metavar="FILE",
         append=True,
-        help="Python file with triggers or references of your own; may be repeated. See "
-        "`skytether triggers` and `skytether references`.",
+        help="Python file with impairments, triggers, references and others of your own; may be "
+        "repeated. See `skytether impairments`, `triggers`, `references`.",
     ),
 ]
 

@@ -77,6 +77,13 @@ def test_the_help_is_as_wide_as_the_terminal(
         assert len(line) <= width or line.startswith("  ")
 
 
+def test_every_help_fits_80_columns(capfd: pytest.CaptureFixture[str]) -> None:
+    for argv in [[name, "--help"] for name in COMMANDS.keys() - {"scenarios", "completion"}] + [
+        ["netem", "run", "--help"]
+    ]:
+        assert max(map(len, shown(argv, capfd).splitlines())) <= 80, argv
+
+
 def test_a_flag_has_one_group_over_all_commands(capfd: pytest.CaptureFixture[str]) -> None:
     used = set[str]()
     for name in COMMANDS.keys() - {"scenarios", "completion"}:

@@ -80,6 +80,17 @@ def test_an_unreachable_server_ends_the_client_with_a_reason() -> None:
     assert server.client.next_wake_ns() is None
 
 
+def test_a_server_that_is_not_heard_on_any_path_is_named_by_all_its_addresses() -> None:
+    flown, places = scenario(link={"connect_s": 15.0}), (("wifi", 1), ("lte", 2))
+    client = Client(flown, simulated(flown, 1), paths=places, vehicle=4, boot_id=99)
+    while (now_ns := client.next_wake_ns()) is not None:
+        client.wake(now_ns=now_ns)
+    waits, failure = client.events()
+    assert isinstance(waits, Unanswered)
+    assert isinstance(failure, NoAnswer)
+    assert waits.everywhere == failure.everywhere == "wifi:1, lte:2"
+
+
 def test_another_scenario_at_the_server_ends_the_client_with_the_difference() -> None:
     server = ByHand(scenario())
     server.wake()

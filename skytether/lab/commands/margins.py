@@ -56,7 +56,7 @@ def margins(argv: Sequence[str]) -> None:
 
     Flown in virtual time, hovering, over the scenario's network. After a weak push:
 
-      growth   of the mean square of the deviation per step; below 1 the loop is stable
+      growth   of the mean square of the deviation per step; below 1 it is stable
 
     In the scenario's white wind and noise alone, where the loop is stable:
 
