@@ -142,6 +142,6 @@ def pictures(browser: "Browser", address: str, folder: Path) -> None:
             until(lambda page=page: "TRACK" in status(page), "it flies a plan")
             until(lambda page=page: flown_s(page) > SHOWN_S, "it has flown for a while")
             picture(page, folder / f"flight-{prefers}-{size}.png")
-            page.get_by_role("tab", name="Network").click()
+            page.get_by_role("tab", name="More").click()
             page.wait_for_timeout(2000)
             picture(page, folder / f"network-{prefers}-{size}.png")

@@ -152,6 +152,16 @@ class Network:
         count = self._by_second(through, now_ns)
         return np.where(count > 0, total_ns / np.maximum(count, 1), np.nan) / SECOND_NS
 
+    def bins(self, direction: int, now_ns: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Packets, and lost ones, in each bin until now, oldest first; shape (BINS,)."""
+        numbers = now_ns // BIN_NS - np.arange(BINS)[::-1]
+        is_kept = self._bin[numbers % BINS] == numbers
+        packets, lost = (
+            np.where(is_kept, counts[numbers % BINS, direction], 0)
+            for counts in (self._packets, self._lost)
+        )
+        return packets, lost
+
     def _by_second(self, counts: NDArray[np.int64] | Array, now_ns: int) -> Array:
         """Sums of counts by second, oldest first."""
         recent = self._since(SPAN_S, now_ns)

@@ -1,7 +1,7 @@
 """Plots of a page: the last minute of one vehicle of each flight, and of their networks."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -9,10 +9,11 @@ import numpy as np
 import viser
 from viser import uplot
 
-from skytether.figures.colours import css
+from skytether.figures.colours import AMBER, BLUE, GREEN, MODE_COLOURS, PALETTE, RED, VIOLET, css
 from skytether.shared.base.units import MILLISECOND_NS
 from skytether.shared.law.model import Array
 from skytether.shared.telemetry.record import DOWNLINK, UPLINK
+from skytether.view.changes import Mark
 from skytether.view.network import DELAY_BIN_NS, DELAY_BINS, SPAN_S, Network
 from skytether.view.scene import FLIGHT_RGB
 from skytether.view.state import Curves, State
@@ -22,11 +23,23 @@ SEEN = 4.0
 """Upper limit of the trigger's plot, in thresholds."""
 SPARE = 6
 """Number of zeros left at the end of a cropped plot."""
-HEIGHT = 150
+HEIGHT, BANDS_HEIGHT, AXIS = 115, 75, 35
+"""Heights of a plot and one of bands without a horizontal axis, and that of the axis [pixels]."""
+BAND_MODE, BAND_LINK, BAND_ENDS = 2.0, 1.0, (0.0, 3.0)
+"""Heights of the bands of `STATE`, and of its range."""
 GREY = "#868e96"
 UP, DOWN = "#12b886", "#e64980"
 """Colours of the two directions, in plots of one flight or of data that all flights share."""
-TIME = "time of flight [s]"
+TIME, DELAY = "time of flight [s]", "delay [ms]"
+MARKS: dict[Mark, str] = {
+    Mark.CUT: css(PALETTE[RED]),
+    Mark.HEALED: css(PALETTE[GREEN]),
+    Mark.CHANGED: css(PALETTE[AMBER]),
+}
+"""Colours of the vertical lines at changes."""
+BANDS = {GREEN: "TRACK", AMBER: "COAST", RED: "BRAKE", BLUE: "HOVER", VIOLET: "LAND"}
+"""Modes, one for each colour of a mode that matters."""
+LINKS = {GREEN: "link good", AMBER: "degraded", RED: "cut"}
 UNSEEN: uplot.Series = {"label": "\u00a0", "stroke": "transparent", "points": {"show": False}}
 """Invisible series that widens a plot's range: changing the range itself would redraw all."""
 
@@ -69,6 +82,12 @@ class Plot:
     """Whether trailing zeros are cropped."""
     equal: bool = False
     """Whether the vertical range is as wide as in all other plots with `equal`."""
+    bands: bool = False
+    """Whether the values are only names of bands, so that the vertical axis has no numbers."""
+
+    @property
+    def timed(self) -> bool:
+        return self.across != DELAY
 
 
 def _axis(axis: int) -> tuple[PlotLine, ...]:
@@ -142,7 +161,7 @@ BY_DELAY = Plot(
         PlotLine("down", _share(DOWNLINK), DOWN, dash=(2, 3)),
     ),
     grid=_bins_ms,
-    across="delay [ms]",
+    across=DELAY,
     crop=True,
 )
 
@@ -162,10 +181,47 @@ APART = Plot(
 )
 
 
-def of_flight(axes: int, *, mission: bool = False) -> tuple[Plot, ...]:
+ERROR = Plot("Error [m]", (PlotLine("error", lambda look: look.curves.error_m),))
+
+
+SOLVING = Plot(
+    "Computing time, and its deadline [ms]",
+    (
+        PlotLine("deadline", _deadline_ms, GREY, dash=(4, 4), once=True),
+        PlotLine("solving", lambda look: look.curves.solve_ms),
+    ),
+    log=True,
+)
+
+
+def _mode(colour: str) -> Values:
+    modes = [mode for mode, its in MODE_COLOURS.items() if its == colour]
+    return lambda look: np.where(np.isin(look.curves.mode, modes), BAND_MODE, np.nan)
+
+
+def _link(colour: str) -> Values:
+    return lambda look: np.where(
+        look.state.links(look.curves, look.now_ns) == colour, BAND_LINK, np.nan
+    )
+
+
+STATE = Plot(
+    "State, and link below",
+    tuple(
+        PlotLine(name, values(colour), css(PALETTE[colour]), width=10.0, once=True)
+        for names, values in ((BANDS, _mode), (LINKS, _link))
+        for colour, name in names.items()
+    ),
+    bands=True,
+)
+
+
+def of_flight(*, mission: bool = False) -> tuple[Plot, ...]:
+    """Plots that an operator decides by; the state is that of the first flight."""
     return (
+        ERROR,
         *((APART,) if mission else ()),
-        *(Plot(f"{name} [m]", _axis(axis), equal=True) for axis, name in enumerate("xyz"[:axes])),
+        STATE,
         Plot(
             "Packets in a second",
             (
@@ -175,6 +231,12 @@ def of_flight(axes: int, *, mission: bool = False) -> tuple[Plot, ...]:
             ),
             grid=_seconds,
         ),
+    )
+
+
+def more(axes: int, *, solves: bool) -> tuple[Plot, ...]:
+    return (
+        *(Plot(f"{name} [m]", _axis(axis), equal=True) for axis, name in enumerate("xyz"[:axes])),
         Plot(
             "Trigger: figure and threshold",
             (
@@ -182,11 +244,6 @@ def of_flight(axes: int, *, mission: bool = False) -> tuple[Plot, ...]:
                 PlotLine("compared", _compared),
             ),
         ),
-    )
-
-
-def of_network(*, solves: bool) -> tuple[Plot, ...]:
-    packets = (
         Plot(
             "Age of the observation in use, and delays [s]",
             (
@@ -195,17 +252,9 @@ def of_network(*, solves: bool) -> tuple[Plot, ...]:
                 PlotLine("delay down", _delays(DOWNLINK), DOWN, dash=(2, 3), once=True, width=1.0),
             ),
         ),
+        *((SOLVING,) if solves else ()),
         BY_DELAY,
     )
-    solving = Plot(
-        "Computing time, and its deadline [ms]",
-        (
-            PlotLine("deadline", _deadline_ms, GREY, dash=(4, 4), once=True),
-            PlotLine("solving", lambda look: look.curves.solve_ms),
-        ),
-        log=True,
-    )
-    return (*packets, solving) if solves else packets
 
 
 def of_link(names: Sequence[str] = ("up", "down")) -> tuple[Plot, ...]:
@@ -245,10 +294,16 @@ class Plots:
 
     def __init__(self, gui: viser.GuiApi, titles: Sequence[str], plots: Sequence[Plot]) -> None:
         self._plots = plots
-        self._handles = [self._make(gui, plot, titles) for plot in self._plots]
+        last = max((at for at, plot in enumerate(plots) if plot.timed), default=-1)
+        self._handles = [
+            self._make(gui, plot, titles, first=not at, axis=at == last or not plot.timed)
+            for at, plot in enumerate(plots)
+        ]
 
     @staticmethod
-    def _make(gui: viser.GuiApi, plot: Plot, titles: Sequence[str]) -> viser.GuiUplotHandle:
+    def _make(
+        gui: viser.GuiApi, plot: Plot, titles: Sequence[str], *, first: bool, axis: bool
+    ) -> viser.GuiUplotHandle:
         series: list[uplot.Series] = [{"label": "t"}]
         for place, title in enumerate(titles):
             for line in plot.lines:
@@ -265,7 +320,19 @@ class Plots:
                     "points": {"show": False},
                 }
                 series.append(shown)
-        if plot.equal:
+        own = len(series)
+        if plot.timed:
+            series += [
+                {
+                    "label": mark.value,
+                    "stroke": rgb,
+                    "width": 1.5,
+                    "points": {"show": False},
+                    "class": "skytether-first" if first else "skytether-mark",
+                }
+                for mark, rgb in MARKS.items()
+            ]
+        if plot.equal or plot.bands:
             series.append(UNSEEN)
         scales: dict[str, uplot.Scale] = {"x": {"time": False}}
         if plot.log:
@@ -278,17 +345,19 @@ class Plots:
             "size": 26,
             **upright,
         }
+        hidden: uplot.Axis = {**upright, "values": (), "size": 0}
+        numbers: uplot.Axis = {**upright, "values": ()} if plot.bands else upright
         nothing = (np.array([0.0, 1.0]),) * len(series)
         return gui.add_uplot(
             nothing,
             tuple(series),
             title=plot.title,
             scales=scales,
-            axes=(across, upright),
-            legend={"show": len(series) > 2, "live": False},
+            axes=(across if axis else hidden, numbers),
+            legend={"show": first or own > 2, "live": False},
             cursor={"drag": {"x": False, "y": False, "setScale": False}},
-            height=HEIGHT,
-            padding=(2, 8, 0, 0),
+            height=(BANDS_HEIGHT if plot.bands else HEIGHT) + (AXIS if axis else 0),
+            padding=(2, 8, 0 if axis else 8, 0),
         )
 
     def draw(self, looks: Sequence[Look]) -> None:
@@ -298,13 +367,52 @@ class Plots:
             data = [plot.grid(looks[0])]
             for place, look in enumerate(looks):
                 data.extend(line.values(look) for line in plot.lines if not (line.once and place))
-            drawn.append(begun(cropped(data) if plot.crop else data))
+            drawn.append(cropped(data) if plot.crop else data)
+        timed = [data for plot, data in zip(self._plots, drawn, strict=True) if plot.timed]
+        for data, same in zip(timed, on_one_axis(timed), strict=True):
+            data[:] = same + marked(same, looks[0].state.marks)
         equal = [data for plot, data in zip(self._plots, drawn, strict=True) if plot.equal]
-        for data, ends in zip(equal, spans([data[1:] for data in equal]), strict=True):
+        own = [data[1 : len(data) - len(MARKS)] for data in equal]
+        for data, ends in zip(equal, spans(own), strict=True):
             data.append(np.resize(ends, len(data[0])))
+        for plot, data in zip(self._plots, drawn, strict=True):
+            if plot.bands:
+                data.append(np.resize(BAND_ENDS, len(data[0])))
         for handle, data in zip(self._handles, drawn, strict=True):
             shown: Any = drawable(data)
             handle.data = shown
+
+
+def on_one_axis(plots: Sequence[Sequence[Array]]) -> list[list[Array]]:
+    """Data of plots over time on one grid, the finest, from the first time at which any is known.
+
+    Args:
+        plots: times of each plot, and its values at them.
+    """
+    if not plots:
+        return []
+    grid_s = max((data[0] for data in plots), key=len)
+    together = []
+    for time_s, *lines in plots:
+        nearest = np.searchsorted((time_s[:-1] + time_s[1:]) / 2, grid_s)
+        together.append([grid_s, *(line[nearest] for line in lines)])
+    known = [~np.isnan(line) for _, *lines in together for line in lines]
+    begin = [int(np.argmax(each)) for each in known if each.any() and not each.all()]
+    first = min(min(begin, default=0), len(grid_s) - 2)
+    return [[line[first:] for line in data] for data in together]
+
+
+def marked(data: Sequence[Array], marks: Iterable[tuple[float, Mark]]) -> list[Array]:
+    """A line for each of MARKS: from the least value of a plot to the largest at each change."""
+    time_s, *lines = data
+    known = np.concatenate([line[~np.isnan(line)] for line in lines])
+    low, high = (known.min(), known.max()) if len(known) else (0.0, 1.0)
+    found = {mark: np.full(len(time_s), np.nan) for mark in MARKS}
+    for at_s, mark in marks:
+        at = int(np.searchsorted(time_s, at_s))
+        if time_s[0] <= at_s and 0 < at < len(time_s):
+            found[mark][at - 1 : at + 1] = low, high
+    return list(found.values())
 
 
 def spans(plots: Sequence[Sequence[Array]]) -> list[tuple[float, float]]:
@@ -320,14 +428,6 @@ def spans(plots: Sequence[Sequence[Array]]) -> list[tuple[float, float]]:
 def cropped(data: Sequence[Array]) -> list[Array]:
     used = [int(np.flatnonzero(values).max(initial=0)) for values in data[1:]]
     return [values[: max(used) + SPARE] for values in data]
-
-
-def begun(data: Sequence[Array]) -> list[Array]:
-    """Data from the first known value on."""
-    missing = [np.isnan(values) for values in data[1:]]
-    begin = [int(np.argmin(unknown)) for unknown in missing if unknown.any() and not unknown.all()]
-    first = min(min(begin, default=0), len(data[0]) - 2)
-    return [values[first:] for values in data]
 
 
 def drawable(data: Sequence[Array]) -> list[Any]:

@@ -43,7 +43,7 @@ from skytether.shared.wire.paths import PATHS_MAX
 from skytether.shared.wire.protocol import Mode
 from skytether.view.changes import Mark, mark, together
 from skytether.view.controls import WAYS
-from skytether.view.network import DIRECTIONS, SPAN_S, Network
+from skytether.view.network import BIN_NS, BINS, DIRECTIONS, SPAN_S, Network
 from skytether.view.rows import check_columns, check_values, planned
 
 SLOTS_MAX = 1200
@@ -68,7 +68,7 @@ LOSS_HIGH = 0.3
 TRAJECTORY_BYTES = 32
 """Size between that of a heartbeat and that of the shortest trajectory [B], without encryption."""
 
-VALUES = ("position", "reference", "figure", "threshold", "age_s", "solve_ms")
+VALUES = ("position", "reference", "figure", "threshold", "age_s", "solve_ms", "mode")
 """Columns of a vehicle's ring that are NaN where unknown."""
 ROUNDING = 1e-6
 """Rounding tolerance of times, relative to the length of a slot."""
@@ -100,6 +100,14 @@ class Curves:
     """Age of the observation from which the input in force was computed [s]; shape (n,)."""
     solve_ms: Array
     """Computing time of both MPC problems [ms]; shape (n,)."""
+    mode: Array
+    """Mode of the vehicle; shape (n,)."""
+
+    @property
+    def error_m(self) -> Array:
+        """Distance to the desired position [m]; shape (n,)."""
+        error: Array = np.linalg.norm(self.position - self.reference, axis=1)
+        return error
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,6 +142,7 @@ class VehicleTrack:
                 ("threshold", "f8"),
                 ("age_s", "f8"),
                 ("solve_ms", "f8"),
+                ("mode", "f8"),
             ],
         )
         self._empty = np.zeros(1, self._ring.dtype)
@@ -157,6 +166,7 @@ class VehicleTrack:
         is_kept = at >= 0
         ring, at = self._ring, at[is_kept]
         ring["position"][at] = rows["state"][is_kept, :, 0]
+        ring["mode"][at] = rows["mode"][is_kept]
         age_ns = rows["age_ns"][is_kept]
         ring["age_s"][at] = np.where(age_ns >= 0, age_ns / SECOND_NS, np.nan)
         self.row = rows[-1].copy()
@@ -624,16 +634,37 @@ class State:
         """Packets per second if all vehicles got one at every step."""
         return max(1, len(self.vehicles)) / self.scenario.control.dt
 
+    @property
+    def _silence_ns(self) -> dict[int, int]:
+        """Silence after which a direction counts as cut [ns]."""
+        link = self.scenario.link
+        return {UPLINK: seconds_to_ns(link.timeout_s), DOWNLINK: link.patience_ns}
+
+    def links(self, curves: Curves, now_ns: int) -> NDArray[np.str_]:
+        """Colour of a vehicle's link at each time of its curves, see `link`; empty if unknown."""
+        shape = curves.time_s.shape
+        cut, degraded = np.zeros(shape, bool), curves.age_s > self.scenario.link.age_max_s / 2
+        known = ~np.isnan(curves.mode) & (curves.mode != Mode.INIT)
+        ago_ns = (self.time_s(now_ns) - curves.time_s) * SECOND_NS
+        at = BINS - 1 - np.clip(np.nan_to_num(ago_ns) // BIN_NS, 0, BINS - 1).astype(int)
+        numbers = np.arange(BINS)
+        for direction, longest_ns in self._silence_ns.items():
+            packets, lost = self.network.bins(direction, now_ns)
+            heard = np.maximum.accumulate(np.where(packets > lost, numbers, -1))
+            cut |= ((heard >= 0) & ((numbers - heard) * BIN_NS > longest_ns))[at]
+            recent = np.ones(round(LOSS_S * SECOND_NS / BIN_NS))
+            sums = [np.convolve(counts, recent)[:BINS] for counts in (packets, lost)]
+            degraded |= (sums[1] > LOSS_HIGH * sums[0])[at]
+        return np.select([~known, cut, degraded], ["", RED, AMBER], GREEN)
+
     def link(self, number: int, now_ns: int) -> Word:
         """State of a vehicle's link, in words."""
         track = self.vehicles.get(number)
         if track is None or track.row is None or track.mode is Mode.INIT:
             return Word("NONE", "there is no session yet", GREY)
-        link = self.scenario.link
-        longest_ns = {UPLINK: seconds_to_ns(link.timeout_s), DOWNLINK: link.patience_ns}
         for direction, name in DIRECTIONS.items():
             heard_ns = self.network.heard_ns.get(direction)
-            if heard_ns is not None and now_ns - heard_ns > longest_ns[direction]:
+            if heard_ns is not None and now_ns - heard_ns > self._silence_ns[direction]:
                 ago_s = (now_ns - heard_ns) / SECOND_NS
                 return Word("CUT", f"no packet has got through {name} for {ago_s:.0f} s", RED)
         if track.row["reason"] == Reason.LOST:
@@ -642,6 +673,6 @@ class State:
             traffic = self.network.traffic(direction, LOSS_S, now_ns)
             if traffic.loss > LOSS_HIGH:
                 return Word("DEGRADED", f"{traffic.loss:.0%} of the packets {name} are lost", AMBER)
-        if track.age_s > link.age_max_s / 2:
+        if track.age_s > self.scenario.link.age_max_s / 2:
             return Word("DEGRADED", f"the observation in use is {track.age_s:.1f} s old", AMBER)
         return Word("GOOD", "packets come through both ways", GREEN)

@@ -439,7 +439,7 @@ def test_a_gap_of_a_plot_is_drawn_as_a_gap() -> None:
     nan = np.nan
     x, late, never = np.arange(4.0), np.array([nan, nan, 5.0, 6.0]), np.full(4, nan)
     cut = np.array([nan, 1.0, nan, 3.0])
-    drawn = plots.drawable(plots.begun([x, late, cut, never]))
+    drawn = plots.drawable(plots.on_one_axis([[x, late, cut, never]])[0])
     assert [list(each) for each in drawn] == [
         [1.0, 2.0, 3.0],
         [None, 5.0, 6.0],
@@ -466,7 +466,9 @@ def test_a_plot_with_gaps_reaches_a_browser() -> None:
         shown = plots.Plots(server.gui, [""], [plot])
         nothing = np.empty(0)
         time_s, age_s = np.arange(3.0), np.array([1.0, np.nan, 3.0])
-        curves = Curves(time_s, nothing, nothing, nothing, nothing, age_s=age_s, solve_ms=nothing)
+        curves = Curves(
+            time_s, nothing, nothing, nothing, nothing, age_s=age_s, solve_ms=nothing, mode=nothing
+        )
         shown.draw([plots.Look(State(), curves, 0)])
         sent = list(server._websock_server.get_message_buffer().message_from_id.values())[-1]
         data = sent.as_serializable_dict([])["updates"]["data"]

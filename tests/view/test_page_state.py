@@ -135,11 +135,52 @@ def test_a_cut_link_is_a_gap_in_all_that_nobody_knows_meanwhile() -> None:
         assert not np.isnan(delays_s[-200:-170]).any()
 
 
+@pytest.mark.parametrize("cut_s", [0.0, 5.0])
+def test_state_link_and_error_of_the_last_minute_are_those_of_each_moment(cut_s: float) -> None:
+    """The newest colours are those of the words; before a cut they are those before it."""
+    shown = demo(cut_s=cut_s)
+    track, now_ns = shown.state.vehicles[1], shown.now_ns
+    curves = track.curves(plots.POINTS)
+    links = shown.state.links(curves, now_ns)
+    assert links[-1] == shown.state.link(1, now_ns).colour
+    assert curves.mode[-1] == track.mode
+    known = links[~np.isnan(curves.mode) & (curves.mode > Mode.INIT)]
+    assert "" not in known
+    if cut_s:
+        before = (curves.time_s > 4.0) & (curves.time_s < cut_s)
+        assert set(links[before]) <= {"green", "amber"}
+        assert set(links[curves.time_s > 9.0]) == {"red"}
+        assert (curves.mode[before] == Mode.TRACK).all()
+    error_m = curves.error_m[~np.isnan(curves.error_m)]
+    assert np.sqrt((error_m**2).mean()) == pytest.approx(track.error_m(60.0), rel=0.1)
+
+
+def test_plots_share_a_time_axis_and_mark_what_was_changed() -> None:
+    shown = demo(cut_s=5.0)
+    look = plots.Look(shown.state, shown.state.vehicles[1].curves(400), shown.now_ns, 1)
+    timed = [
+        [plot.grid(look), *(line.values(look) for line in plot.lines)]
+        for plot in (*plots.of_flight(), *plots.more(2, solves=False))
+        if plot.timed
+    ]
+    assert len({len(data[0]) for data in timed}) > 1
+    together = plots.on_one_axis(timed)
+    for data in together:
+        np.testing.assert_array_equal(data[0], together[0][0])
+        lines = dict(zip(plots.MARKS, plots.marked(data, shown.state.marks), strict=True))
+        at = np.flatnonzero(~np.isnan(lines[Mark.CUT]))
+        assert data[0][at] == pytest.approx(shown.state.marks[-1][0], abs=0.2)
+        assert np.isnan(lines[Mark.HEALED]).all()
+        assert lines[Mark.CUT][at].tolist() == [np.nanmin(data[1:]), np.nanmax(data[1:])]
+    old = [(-3.0, Mark.CUT), (1e6, Mark.HEALED)]
+    assert np.isnan(plots.marked(together[0], old)).all()
+
+
 def test_packets_are_plotted_as_a_rate_both_ways() -> None:
     """At every step a line at the top, and none before the flight."""
     shown = demo()
     look = plots.Look(shown.state, shown.state.vehicles[1].curves(400), shown.now_ns)
-    (packets,) = (each for each in plots.of_flight(2) if each.title == "Packets in a second")
+    (packets,) = (each for each in plots.of_flight() if each.title == "Packets in a second")
     every_step, up, down = (line.values(look) for line in packets.lines)
     seconds = packets.grid(look)
     assert set(every_step) == {20.0}

@@ -29,7 +29,7 @@ from skytether.view.controls import (
     texts,
     triggers,
 )
-from skytether.view.plots import POINTS, Look, Plots, of_flight, of_link, of_network
+from skytether.view.plots import POINTS, Look, Plots, more, of_flight, of_link
 from skytether.view.scene import GROUND_RGB, WIDE, Scene, in_space
 from skytether.view.state import GUIDED, LED, ZONED, VehicleTrack
 
@@ -156,14 +156,13 @@ class Panel:
         solves = any(not each.control.properties.splines for each in scenarios)
         flies = any(each.state.flies for each in flights)
         self._nobody = None if flies else VehicleTrack(0, scenarios[0])
+        shown = {"Network": of_link([*flights[0].state.directions.values()])}
         if flies:
-            with panel.add_tab("Flight"):
-                self._plots.append(
-                    Plots(gui, titles, of_flight(axes, mission=scenarios[0].is_mission))
-                )
-        with panel.add_tab("Network"):
-            of_air = of_network(solves=solves) if flies else of_link([*flights[0].state.directions.values()])
-            self._plots.append(Plots(gui, titles, of_air))
+            mission = scenarios[0].is_mission
+            shown = {"Flight": of_flight(mission=mission), "More": more(axes, solves=solves)}
+        for name, plots in shown.items():
+            with panel.add_tab(name):
+                self._plots.append(Plots(gui, titles, plots))
         with panel.add_tab("Events"):
             self._said = gui.add_html("")
         if isinstance(panel, viser.PanelHandle):
