@@ -3,7 +3,7 @@
 Every player gets chunks of one policy, or single actions, over one network with the same seeds. A
 policy here is scripted; it predicts its chunk by a model that knows nothing of the disturbances.
 Delays are the same in both directions, at least half of the mean, with a standard deviation of a
-fifth of it. Two bounds tell whether a task can judge players at all: no network, and nothing sent.
+fifth of it. Bounds tell whether a task can judge players at all: nothing sent, and no network.
 Needs the extra `bench`, for gym-pusht.
 """
 
@@ -44,7 +44,7 @@ from skytether.shared.base import files
 from skytether.shell import command
 
 Rows = NDArray[np.float64]
-PLAYERS: Mapping[str, tuple[str, Callable[[], Player]]] = {
+PLAYERS: dict[str, tuple[str, Callable[[], Player]]] = {
     "newest": ("newest action held", Newest),
     "replace": ("queue, replaced", Queue),
     "average": ("queue, averaged", lambda: Queue("average")),
@@ -53,14 +53,15 @@ PLAYERS: Mapping[str, tuple[str, Callable[[], Player]]] = {
     "sparing": ("by the clock, when needed", Clocked),
 }
 """Title of each player, and what the robot runs. For the first two queues a chunk is sent when half
-of one is left or less (LeRobot's threshold), for DRTC's when a quarter was played and the last one
-should have come (its cooldown), for the last player when it differs from what the robot plays
-anyway, for the others always."""
-BOUNDS: Mapping[str, tuple[str, Options]] = {
-    "nothing": ("nothing sent", NOTHING_SENT),
-    "oracle": ("no network", ORACLE),
+of one is left or less (LeRobot's threshold), for DRTC's when a quarter was played and the one
+before should have come (its cooldown), for the last player when it differs from what the robot
+plays anyway, for the others always."""
+BOUNDS: dict[str, tuple[str, Callable[[], Player], Options]] = {
+    "nothing": ("nothing sent", Newest, NOTHING_SENT),
+    "oracle": ("no network, an action a step", Newest, ORACLE),
+    "chunks": ("no network, half a chunk at once", Queue, ORACLE),
 }
-"""Title and options of each bound. Both are flown with the newest action held."""
+"""Title, player and options of each bound."""
 DELAYS_S, LOSSES = (0.0, 0.05, 0.1, 0.2), (0.0, 0.1, 0.3)
 SEEDS = 50
 """Number of seeds of the tables in docs/gym.md, from 1 on."""
@@ -248,10 +249,10 @@ def differs(task: Any, rows: Rows, coming: Rows) -> bool:
 def fly_cell(cell: Cell) -> FlownCell:
     task, name = TASKS[cell.task], cell.player
     mean = cell.delay_s
-    delay = f"gamma({mean / 2:g}, {mean:g}, {mean / 5:g})" if mean else "none"
-    way = f"{delay} & loss({cell.loss:g})"
+    delays = f"gamma({mean / 2:g}, {mean:g}, {mean / 5:g})" if mean else "none"
+    way = f"{delays} & loss({cell.loss:g})"
     played, jumps = Played(task.make()), list[float]()
-    make_player = Newest if name in BOUNDS else PLAYERS[name][1]
+    make_player = (PLAYERS | BOUNDS)[name][1]
     options: Options = {
         "uplink": way,
         "downlink": way,
@@ -259,7 +260,9 @@ def fly_cell(cell: Cell) -> FlownCell:
         "player": lambda: Watched(make_player(), jumps),
         "step_s": task.step_s,
     }
-    env = Networked(played, **(options | BOUNDS[name][1] if name in BOUNDS else options))
+    if name in BOUNDS:
+        options |= BOUNDS[name][2]
+    env = Networked(played, **options)
     observation, info = env.reset(seed=cell.seed)
     terminated = truncated = False
     ready = 0
@@ -268,17 +271,18 @@ def fly_cell(cell: Cell) -> FlownCell:
         committed, coming = (
             network[key][: network[f"{key}_rows"]] for key in ("committed", "coming")
         )
-        continues = name in ("freshest", "clocked", "sparing")
-        rows = task.plan(observation, committed if continues else committed[:0])
-        answer = rows if name in PLAYERS and name != "newest" else rows[0]
-        if name in ("replace", "average") and 2 * network["held"] > task.rows:
+        delay = min(network["delay_steps"], task.rows // 2)  # DRTC's bound
+        settled = {"freshest": delay, "clocked": None, "sparing": None}.get(name, 0)
+        rows = task.plan(observation, committed[:settled])
+        answer = rows[0] if make_player is Newest else rows
+        if name in ("replace", "average", "chunks") and 2 * network["held"] > task.rows:
             answer = None
         if name == "freshest":
             step = len(played.rewards)
             if step < ready or network["held"] > 3 * task.rows / 4:
                 answer = None
             else:
-                ready = step + network["delay_steps"] + 1
+                ready = step + delay + 1
         if name == "sparing" and not differs(task, rows, coming):
             answer = None
         observation, _, terminated, truncated, info = env.step(answer)
@@ -311,7 +315,7 @@ def tables(flights: Sequence[FlownCell]) -> dict[str, TextTable]:
     shown = {}
     tasks = list(dict.fromkeys(key[0] for key in found))
     if any(key[1] in BOUNDS for key in found):
-        headings = ["task", *(title for title, _ in BOUNDS.values())]
+        headings = ["task", *(title for title, *_ in BOUNDS.values())]
         bounds = [
             [TASKS[task].title, *(_mean(found[task, name, 0.0, 0.0]) for name in BOUNDS)]
             for task in tasks
@@ -349,7 +353,7 @@ def _stalls(flown: Sequence[FlownCell]) -> str:
 
 
 STYLES = "C7s:", "C1^--", "C3v--", "C4<--", "C0o-", "C2D-"
-BOUND_STYLES = ":", "--"
+BOUND_STYLES = ":", "--", "-."
 
 
 def _mean_score(
@@ -380,7 +384,7 @@ def draw(flights: Sequence[FlownCell], path: Path) -> None:
         for (name, (title, _)), style in zip(PLAYERS.items(), STYLES, strict=True):
             means = [_mean_score(flights, task, name, delay_s, loss) for delay_s in DELAYS_S]
             panel.plot(np.array(DELAYS_S) * 1e3, means, style, markersize=4, label=title)
-        for (name, (title, _)), style in zip(BOUNDS.items(), BOUND_STYLES, strict=True):
+        for (name, (title, *_)), style in zip(BOUNDS.items(), BOUND_STYLES, strict=True):
             panel.axhline(
                 _mean_score(flights, task, name, 0.0, 0.0),
                 color="black",

@@ -90,9 +90,9 @@ class Options(TypedDict, total=False):
 
 
 ORACLE: Options = {"uplink": "none", "downlink": "none", "thinking": 0.0, "price": 0.0}
-"""Bound of what any player can reach: no network at all."""
+"""Upper bound for a policy: no network at all."""
 NOTHING_SENT: Options = {"uplink": "loss(1)", "price": 0.0}
-"""Bound of what a robot reaches without a network: no answer arrives."""
+"""Lower bound: no answer arrives."""
 
 
 class _Far:
