@@ -27,7 +27,7 @@ from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import RECORDING, plan_columns, server_columns
 from skytether.shared.wire import keys
 from skytether.shared.wire.keys import Keyring
-from skytether.shell import command, process, terminal, workers
+from skytether.shell import command, process, system, terminal, workers
 from skytether.shell.argument import Argument
 from skytether.shell.command import CommandError
 from skytether.shell.planning import SHARE, Planners
@@ -71,7 +71,7 @@ def serve(argv: Sequence[str]) -> None:
     """
     options = command.parse(ServerOptions(), argv, "skytether server", serve.__doc__)
     command.check_count("--vehicles", options.vehicles, 65_536)
-    command.check_count("--workers", options.workers, 64)
+    command.check_count("--workers", options.workers, 64 if system.FORKS else 1)
     command.check_sockets("--workers", options.workers)
     bind = [command.address("--bind", text) for text in options.bind or ("127.0.0.1:47001",)]
     command.check_count("--bind", len(bind), len(PATH_SOCKETS))

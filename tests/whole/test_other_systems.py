@@ -28,7 +28,11 @@ def test_commands_run(system: str, command: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "command", ["fly demo --duration 2", "netem run -- true", "page .", "set nothing a=b"]
+    "command",
+    [
+        *("fly demo --duration 2", "netem run -- true", "page .", "set nothing a=b"),
+        "server demo --workers 2",
+    ],
 )
 def test_what_a_system_cannot_do_is_said_in_one_line(command: str) -> None:
     done = ran(*RUNS, "windows", *command.split())
