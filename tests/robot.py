@@ -95,6 +95,12 @@ def goal(frame: str, place: tuple[float, float, float]) -> bytes:
     return encode(POSE_STAMPED, SimpleNamespace(header=header, pose=pose))
 
 
+def base(kind: str) -> Node:
+    """The robot's node, which takes commands of a type."""
+    commands = messages.topic("/cmd_vel", kind)
+    return Node("127.0.0.1", 0, 0, "base", messages.topic("/odom", ODOMETRY), commands)
+
+
 class Robot:
     """Body of the robot, and what came on `cmd_vel`; `kind` is the type of its commands."""
 
@@ -104,6 +110,8 @@ class Robot:
         self.heard: list[tuple[int, Any]] = []
         """Commands, and when they came [ns; the robot's clock]."""
         self.kind = kind
+        self.token = base(kind).tokens("ab")[2]
+        """Token of the subscriber of its commands."""
         self._now_ns: int | None = None
 
     def hear(self, payload: bytes, now_ns: int) -> None:
@@ -172,6 +180,24 @@ class Commanded(Endpoint):
         raise AssertionError(now_ns)
 
 
+class Announcing(Endpoint):
+    """Host that is named like a token of the robot's node, which tells of it again and again."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._next_ns = 0
+
+    def receive(self, datagram: Datagram, *, now_ns: int) -> None:
+        raise AssertionError(datagram, now_ns)
+
+    def next_wake_ns(self) -> int:
+        return self._next_ns
+
+    def wake(self, *, now_ns: int) -> None:
+        self._next_ns = now_ns + SECOND
+        self.send(b"1", ("client", 1))
+
+
 class Cut(Proxy):
     """Netem that can be cut off."""
 
@@ -199,9 +225,11 @@ def scenario(**table: Any) -> Scenario:
 class Ground:
     """Flight of a robot in virtual time: server, netem, client and robot."""
 
-    def __init__(self, *, heading: float = 0.0, drift_ppm: float = 0.0, **table: Any) -> None:
+    def __init__(
+        self, *, heading: float = 0.0, drift_ppm: float = 0.0, kind: str = "", **table: Any
+    ) -> None:
         self.scenario = scenario(**table)
-        kind = TWIST_STAMPED if self.scenario.ros2.stamped else TWIST
+        kind = kind or (TWIST_STAMPED if self.scenario.ros2.stamped else TWIST)
         self.robot = Robot(heading, kind)
         self.odometer = Odometer(self.robot)
         self.events: list[tuple[int, Event]] = []
@@ -218,6 +246,7 @@ class Ground:
         clock = Clock(EPOCH_NS, round(1000 * drift_ppm))
         self.world.add("/odom", self.odometer, clock=clock)
         self.world.add("/cmd_vel", Commanded(self.robot), clock=clock)
+        self.world.add(self.robot.token, Announcing())
         self.netem = Cut(self.scenario, server=("server", 0), flows=1)
         self.world.add("netem", self.netem)
         self.world.add("client", self.client, clock=Clock(CLIENT_NS))
@@ -298,9 +327,9 @@ def opened(mode: str, port: int) -> Any:
 class Live:
     """Router, and a robot that lives in a thread until the block ends."""
 
-    def __init__(self, port: int) -> None:
+    def __init__(self, port: int, kind: str = TWIST_STAMPED) -> None:
         self._router, self._session = opened("router", port), opened("peer", port)
-        self.robot = Robot()
+        self.robot = Robot(kind=kind)
         self._is_over = threading.Event()
         self._thread = threading.Thread(target=self._live)
 
@@ -312,13 +341,16 @@ class Live:
         def hear(sample: Any) -> None:
             self.robot.hear(bytes(sample.payload), time.time_ns())
 
-        commands = self._session.declare_subscriber(CMD_VEL.key(0), hear)
+        node, zid = base(self.robot.kind), str(self._session.zid())
+        alive = [self._session.liveliness().declare_token(each) for each in node.tokens(zid)]
+        commands = self._session.declare_subscriber(node.subscribes.key(0), hear)
         out = self._session.declare_publisher(ODOM.key(0))
         while not self._is_over.wait(0.02):
             now_ns = time.time_ns()
             self.robot.step(now_ns)
             out.put(self.robot.odometry(now_ns))
         commands.undeclare()
+        del alive
 
     def __exit__(self, *_: object) -> None:
         self._is_over.set()

@@ -4,17 +4,21 @@
          is gone
     out  commands, at each of the pilot's steps; after a landing zeros for ZEROS_NS, then silence
 
+Commands are of the type that a subscriber takes: TwistStamped or Twist. Without a subscriber of
+either, no flight begins, for the robot would not move.
+
 No command is repeated: if the pilot stops, the robot's own time-out acts.
 """
 
 from collections import deque
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 from skytether.client.positions import Vector
 from skytether.client.ros2 import drive
 from skytether.client.ros2.odometry import OdometryFilter
 from skytether.ros2 import messages
-from skytether.ros2.graph import TOKENS, Node, node_of
+from skytether.ros2.graph import PUBLISHER, SUBSCRIBER, TOKENS, Entity, Node, Topic, entity_of
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS, seconds_to_ns
 from skytether.shared.core.aboard import OdometryDropped, SecondPublisher
 from skytether.shared.core.endpoint import Datagram, Endpoint, by_name
@@ -35,8 +39,8 @@ QUIET_NS = 3 * SECOND_NS
 """Silence after which a second commander counts as gone."""
 REPORT_NS = 10 * SECOND_NS
 """Time after which a second commander is reported again."""
-NODES_MAX = 32
-"""Number of other publishers whose names are kept."""
+ENTITIES_MAX = 96
+"""Number of others' publishers and subscribers that are kept."""
 
 
 class Port(Endpoint):
@@ -47,18 +51,23 @@ class Port(Endpoint):
         keys = self._keys = scenario.ros2
         self._vehicle, self._step_ns = vehicle, scenario.dt_ns
         self._silence_ns = seconds_to_ns(keys.silence_s)
-        kind = messages.TWIST_STAMPED if keys.stamped else messages.TWIST
+        stamped, plain = (
+            messages.topic(keys.command, kind) for kind in (messages.TWIST_STAMPED, messages.TWIST)
+        )
         self.node = Node(
             line.host,
             line.number,
             keys.domain,
             f"skytether_{vehicle}",
-            messages.topic(keys.command, kind),
+            stamped if keys.stamped else plain,
             messages.topic(keys.odometry, messages.ODOMETRY),
+            (plain,) if keys.stamped == "auto" else (),
         )
         self.odometry = OdometryFilter(scenario, vehicle)
-        self._others: dict[str, str] = {}
-        """Nodes that may publish commands too, by their tokens."""
+        self._entities: dict[str, Entity] = {}
+        """Others' publishers and subscribers of our topics, by their tokens."""
+        self._form: int | None = None
+        """Index of the type of the commands in the node's `forms`, once one was sent."""
         self._rivals_ns: deque[int] = deque(maxlen=RIVALS_LEAST)
         self._rival_ns: int | None = None
         """Time of the newest command of a second commander; None without one."""
@@ -81,17 +90,45 @@ class Port(Endpoint):
 
     @property
     def is_ready(self) -> bool:
+        return self._has_odometry and self._known_form is not None
+
+    @property
+    def _has_odometry(self) -> bool:
         return self.odometry.newest is not None and self._is_fresh(self.now_ns)
+
+    @property
+    def _known_form(self) -> int | None:
+        """Index of the type of the commands; None while there is no subscriber of any."""
+        if self._form is not None:
+            return self._form
+        takers = self._those(SUBSCRIBER, self._keys.command)
+        taken = (
+            index
+            for index, topic in enumerate(self.node.forms)
+            if any(each.takes(topic) for each in takers)
+        )
+        return next(taken, None)
+
+    def _those(self, kind: str, topic: str) -> list[Entity]:
+        known = self._entities.values()
+        return [each for each in known if (each.kind, each.topic) == (kind, topic)]
 
     @property
     def waits_for(self) -> str:
         if self.is_ready:
             return ""
-        wanted = f"nav_msgs/Odometry on {self._keys.odometry}"
+        keys, node = self._keys, self.node
+        wanted = f"nav_msgs/Odometry on {keys.odometry}"
+        at = f", domain {keys.domain}, at {node.host}:{node.port}"
         if self._is_past(self.odometry.positions.heard_ns, self.now_ns):
-            at = f"{self.node.host}:{self.node.port}"
-            return f"{wanted}, domain {self._keys.domain}, at {at}"
-        return f"usable {wanted}: {self.odometry.fault}"
+            sources = self._those(PUBLISHER, keys.odometry)
+            others = [each for each in sources if not each.takes(node.subscribes)]
+            return f"{wanted}{at}" + _instead(others, [node.subscribes])
+        if not self._has_odometry:
+            return f"usable {wanted}: {self.odometry.fault}"
+        kinds = " or ".join(topic.kind.replace("/msg/", "/") for topic in node.forms)
+        others = self._those(SUBSCRIBER, keys.command)
+        return f"a subscriber of {kinds} on {keys.command}{at}" + _instead(others, node.forms)
 
     def fly(self, velocity: Vector) -> None:
         if self._silent_ns is None:
@@ -145,14 +182,15 @@ class Port(Endpoint):
             return
         if self._reported_ns is None or now_ns - self._reported_ns >= REPORT_NS:
             self._reported_ns = now_ns
-            nodes, topic = tuple(sorted(set(self._others.values()))), self._keys.command
+            topic = self._keys.command
+            nodes = tuple(sorted({each.node for each in self._those(PUBLISHER, topic)}))
             self._events.append(SecondPublisher(vehicle=self._vehicle, topic=topic, nodes=nodes))
 
     def _hear_token(self, token: str, *, is_gone: bool) -> None:
         if is_gone:
-            self._others.pop(token, None)
-        elif (node := node_of(token)) and len(self._others) < NODES_MAX:
-            self._others[token] = node
+            self._entities.pop(token, None)
+        elif (entity := entity_of(token)) and len(self._entities) < ENTITIES_MAX:
+            self._entities[token] = entity
 
     # -- sent --------------------------------------------------------------------------------
 
@@ -169,16 +207,17 @@ class Port(Endpoint):
         return min(self._tick_ns, self._zero_ns)
 
     def _command(self, velocity: Vector) -> None:
-        newest, keys = self.odometry.newest, self._keys
-        if newest is None:
+        newest, keys, form = self.odometry.newest, self._keys, self._known_form
+        if newest is None or form is None:
             return
+        self._form = form
         command = drive.command(velocity, newest, keys.drive, keys.ahead_m)
         payload = messages.twist(command.linear, command.turn)
-        if keys.stamped:
+        if self.node.forms[form].kind == messages.TWIST_STAMPED:
             stamp_ns = self.odometry.clock.boot_ns(self.now_ns)
             payload = messages.twist_stamped(stamp_ns, *command)
         self._commands += 1
-        self.send(payload, (keys.command, 0))
+        self.send(payload, (keys.command, form))
 
     def close(self, *, now_ns: int) -> None:
         """Stop the robot, whatever it does when commands end."""
@@ -197,3 +236,11 @@ class Port(Endpoint):
             | {"for_others": self._rival_commands},
             "drift_ppm": 1e6 * self.odometry.clock.drift,
         }
+
+
+def _instead(others: Sequence[Entity], expected: Iterable[Topic]) -> str:
+    """What there is instead of the expected types, in words; empty if there is nothing."""
+    if not others:
+        return ""
+    hashes = " or ".join(topic.type_hash for topic in expected)
+    return f"; got {str(others[0])[:200]}, expected {hashes}, as ROS 2 has them from Jazzy on"

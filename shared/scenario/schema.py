@@ -374,8 +374,9 @@ class Ros2Config(Section, frozen=True):
     """Topic of nav_msgs/Odometry."""
     command: OfVehicle[TopicName] = "/cmd_vel"
     """Topic on which velocities are commanded."""
-    stamped: OfVehicle[bool] = True
-    """Whether commands are geometry_msgs/TwistStamped; otherwise Twist."""
+    stamped: OfVehicle[bool | Literal["auto"]] = "auto"
+    """Whether commands are geometry_msgs/TwistStamped; otherwise Twist. auto: what the subscriber of
+    `command` takes."""
     drive: OfVehicle[Literal["holonomic", "differential", "fixed"]] = "holonomic"
     """Way in which the robot is commanded: any velocity in its own frame; forwards and a turn; or
     any velocity in the fixed frame of its odometry."""

@@ -13,6 +13,7 @@ has one. Numbers are little-endian.
 import struct
 from dataclasses import dataclass
 from hashlib import blake2b
+from typing import NamedTuple
 
 TOKENS = "@ros2_lv"
 IDENTITY_BYTES = 16
@@ -55,14 +56,21 @@ class Node:
     name: str
     publishes: Topic
     subscribes: Topic
+    alternatives: tuple[Topic, ...] = ()
+    """The published topic with other types; with any, the first message decides on one."""
+
+    @property
+    def forms(self) -> tuple[Topic, ...]:
+        """The published topic with each of its types; a message's address has the index."""
+        return self.publishes, *self.alternatives
 
     def tokens(self, session: str) -> list[str]:
         """Tokens of the node, its publisher and its subscriber; `session` is Zenoh's identity."""
         subscriber = self._token(session, 2, SUBSCRIBER, self.subscribes)
         return [self._token(session, 0, NODE), self.publisher(session), subscriber]
 
-    def publisher(self, session: str) -> str:
-        return self._token(session, 1, PUBLISHER, self.publishes)
+    def publisher(self, session: str, form: int = 0) -> str:
+        return self._token(session, 1, PUBLISHER, self.forms[form])
 
     def _token(self, session: str, number: int, kind: str, topic: Topic | None = None) -> str:
         parts = [TOKENS, str(self.domain), session, "0", str(number), kind, "%", "%", self.name]
@@ -71,23 +79,47 @@ class Node:
         return "/".join(parts)
 
     @property
-    def other_publishers(self) -> str:
-        """Pattern of the tokens of all publishers of the topic that we publish."""
-        topic = mangled(self.publishes.name)
-        return f"{TOKENS}/{self.domain}/*/*/*/{PUBLISHER}/*/*/*/{topic}/**"
+    def others(self) -> list[str]:
+        """Patterns of the tokens of whoever publishes or takes the topic that we publish, or
+        publishes the one that we take.
+        """
+        out, into = mangled(self.publishes.name), mangled(self.subscribes.name)
+        pairs = ((PUBLISHER, out), (SUBSCRIBER, out), (PUBLISHER, into))
+        return [f"{TOKENS}/{self.domain}/*/*/*/{kind}/*/*/*/{name}/**" for kind, name in pairs]
+
+
+class Entity(NamedTuple):
+    """Publisher or subscriber of a node."""
+
+    kind: str
+    """PUBLISHER or SUBSCRIBER."""
+    node: str
+    """Name of the node, with its namespace."""
+    topic: str
+    dds_kind: str
+    type_hash: str
+
+    def takes(self, topic: Topic) -> bool:
+        """Whether its messages are those of a topic: same type, same hash."""
+        return (self.dds_kind, self.type_hash) == (topic.dds_kind, topic.type_hash)
+
+    def __str__(self) -> str:
+        kind = self.dds_kind.replace("::msg::dds_::", "/").removesuffix("_")
+        return f"{self.node} with {kind}, {self.type_hash}"
 
 
 def mangled(name: str) -> str:
     return name.replace("/", "%")
 
 
-def node_of(token: str) -> str | None:
-    """Name of the node of a publisher's token, with its namespace; None for any other text."""
+def entity_of(token: str) -> Entity | None:
+    """Publisher or subscriber of a token; None for any other text."""
     parts = token.split("/")
-    if len(parts) != PARTS or parts[0] != TOKENS or parts[5] != PUBLISHER:
+    if len(parts) != PARTS or parts[0] != TOKENS or parts[5] not in (PUBLISHER, SUBSCRIBER):
         return None
-    namespace, name = (part.replace("%", "/") for part in parts[NAME_AT - 1 : NAME_AT + 1])
-    return f"{namespace.rstrip('/')}/{name}"
+    named = (part.replace("%", "/") for part in parts[NAME_AT - 1 : NAME_AT + 2])
+    namespace, name, topic = named
+    return Entity(parts[5], f"{namespace.rstrip('/')}/{name}", topic, *parts[NAME_AT + 2 : -1])
 
 
 def identity(token: str) -> bytes:

@@ -13,7 +13,7 @@ from collections import deque
 from collections.abc import Callable
 from typing import Any
 
-from skytether.ros2.graph import Node, attachment, identity, session_settings
+from skytether.ros2.graph import IDENTITY_BYTES, Node, attachment, identity, session_settings
 from skytether.shared.core.endpoint import Address, Datagram
 from skytether.shell.udp import AddressError
 
@@ -27,11 +27,13 @@ class GraphSession:
     """Zenoh session of one node.
 
     Args:
-        hear: called with each message, and each token of another publisher.
+        hear: called with each message, and each token of another publisher or subscriber.
 
     Raises:
         AddressError: Zenoh refuses the address.
     """
+
+    _is_open, _form = False, 0
 
     def __init__(self, node: Node, hear: Callable[[Datagram], None]) -> None:
         import zenoh  # takes 0.1 s, and is an extra
@@ -44,8 +46,7 @@ class GraphSession:
             self._session = zenoh.open(config)
         except zenoh.ZError as error:
             raise AddressError(f"Zenoh at {node.host}:{node.port}: {error}") from None
-        self._identity = identity(node.publisher(str(self._session.zid())))
-        self._sent = 0
+        self._identity, self._sent = bytes(IDENTITY_BYTES), 0
         self._publisher: Any = None
         self._queue: deque[tuple[str, bytes]] = deque(maxlen=QUEUE_MAX)
         self._is_called = False
@@ -61,14 +62,15 @@ class GraphSession:
             self._session.close()
 
     def _declare(self) -> list[Any]:
-        """Publisher, subscribers and tokens, which end when they are no longer referred to."""
+        """Subscribers and tokens, which end when they are no longer referred to."""
         zenoh, node, session = self._zenoh, self._node, self._session
-        out, into = node.publishes, node.subscribes
-        # A command that waits for a connection would be stale: it is dropped.
-        self._publisher = session.declare_publisher(
-            out.key(node.domain), congestion_control=zenoh.CongestionControl.DROP, express=True
-        )
-        liveliness, own = session.liveliness(), node.tokens(str(session.zid()))
+        out, into, zid = node.publishes, node.subscribes, str(session.zid())
+        liveliness, (alive, publisher, subscriber) = session.liveliness(), node.tokens(zid)
+        own = {alive, publisher, subscriber}
+        own |= {node.publisher(zid, form) for form in range(len(node.forms))}
+        self._is_open = True
+        if not node.alternatives:
+            self._publish(0)
 
         def put(topic: str) -> Callable[[Any], None]:
             return lambda sample: self._put(topic, bytes(sample.payload))
@@ -84,9 +86,22 @@ class GraphSession:
             session.declare_subscriber(
                 f"{node.domain}/{out.name.strip('/')}/*/*", put(out.name), allowed_origin=remote
             ),
-            liveliness.declare_subscriber(node.other_publishers, token, history=True),
-            *map(liveliness.declare_token, own),
+            *(liveliness.declare_subscriber(each, token, history=True) for each in node.others),
+            *map(liveliness.declare_token, (alive, subscriber)),
         ]
+
+    def _publish(self, form: int) -> None:
+        """Be a publisher of the topic with one of its types, in place of another."""
+        node, session = self._node, self._session
+        # A command that waits for a connection would be stale: it is dropped.
+        self._publisher = session.declare_publisher(
+            node.forms[form].key(node.domain),
+            congestion_control=self._zenoh.CongestionControl.DROP,
+            express=True,
+        )
+        token = node.publisher(str(session.zid()), form)
+        self._identity, self._form = identity(token), form
+        self._token = session.liveliness().declare_token(token)
 
     def _put(self, topic: str, payload: bytes) -> None:
         """Queue a message; called by Zenoh's threads."""
@@ -105,8 +120,17 @@ class GraphSession:
             self._hear(Datagram(payload, (topic, 0), 1))
 
     def send(self, payload: bytes, peer: Address) -> bool:
-        """Publish a message; False if Zenoh refuses it, or the peer is no topic of ours."""
-        if self._publisher is None or peer[0] != self._node.publishes.name:
+        """Publish a message; False if Zenoh refuses it, or the peer is no topic of ours.
+
+        Args:
+            peer: name of the topic, and index of its type in the node's `forms`.
+        """
+        name, form = peer
+        if name != self._node.publishes.name:
+            return False
+        if self._is_open and (self._publisher is None or form != self._form):
+            self._publish(form)
+        if self._publisher is None:
             return False
         self._sent += 1
         told = attachment(self._sent, time.time_ns(), self._identity)

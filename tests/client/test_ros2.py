@@ -14,6 +14,7 @@ from robot import EPOCH_NS, MS, SECOND, Ground
 from skytether.client import vehicles
 from skytether.client.ros2 import drive
 from skytether.client.ros2.odometry import OdometryFilter
+from skytether.client.ros2.port import Port
 from skytether.lab.identify.fit import fit
 from skytether.lab.identify.flight import Identifying
 from skytether.lab.identify.responses import responses
@@ -22,7 +23,7 @@ from skytether.ros2 import messages
 from skytether.shared.base import extras
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.base.extras import ExtraMissing
-from skytether.shared.core.aboard import OdometryDropped, SecondPublisher
+from skytether.shared.core.aboard import AutopilotWaits, OdometryDropped, SecondPublisher
 from skytether.shared.core.endpoint import Datagram
 from skytether.shared.wire.protocol import Mode
 from skytether.sim.world import Clock, World
@@ -134,6 +135,81 @@ def test_a_robot_follows_its_reference(table: dict[str, Any]) -> None:
     error = np.linalg.norm(rows["state"][:, :2, 0] - wanted, axis=1)[200:]
     assert ground.mode in (Mode.TRACK, Mode.COAST)
     assert error.max() < 0.25, ground.said()
+
+
+@pytest.mark.parametrize("kind", [robot.TWIST, robot.TWIST_STAMPED])
+def test_commands_are_of_the_type_that_the_robot_takes(kind: str) -> None:
+    ground = Ground(kind=kind)
+    ground.run(8.0)
+    assert ground.mode in (Mode.TRACK, Mode.COAST)
+    assert math.hypot(*ground.robot.place[:2]) > 0.5
+
+
+def waiting(ground: Ground) -> str:
+    """What the client waits for in the end; it has not moved the robot."""
+    ground.run(12.0)
+    assert not ground.robot.heard
+    waits_for: str = ground.of(AutopilotWaits)[-1].waits_for
+    return waits_for
+
+
+def told(ground: Ground, token: str, payload: bytes = b"1") -> None:
+    """Let the client hear that a token of the graph is there, or by b"" that it is gone."""
+    datagram = Datagram(payload, (token, 0), 1)
+    ground.world.act("client", lambda now_ns: ground.client.receive(datagram, now_ns=now_ns))
+
+
+def test_without_a_subscriber_of_its_commands_no_flight_begins() -> None:
+    ground = Ground()
+    ground.world.stop(ground.robot.token)
+    assert "geometry_msgs/TwistStamped or geometry_msgs/Twist on /cmd_vel" in waiting(ground)
+    told(ground, ground.robot.token)
+    ground.run(3.0)
+    assert ground.mode in (Mode.TRACK, Mode.COAST)
+
+
+@pytest.mark.parametrize(
+    ("stamped", "change"),
+    [
+        ("auto", ("RIHS01_", "TypeHashNotSupported")),
+        ("auto", ("dds_::TwistStamped_", "dds_::Twist_")),
+        (True, ("", "")),
+        (False, ("", "")),
+    ],
+)
+def test_a_subscriber_of_another_type_or_hash_is_named(
+    stamped: str | bool, change: tuple[str, str]
+) -> None:
+    """ROS 2 before Jazzy has no hashes of types."""
+    kind = robot.TWIST if stamped is True else robot.TWIST_STAMPED
+    ground = Ground(kind=kind, ros2={"stamped": stamped})
+    token = ground.robot.token
+    if any(change):
+        ground.world.stop(token)
+        told(ground, token.replace(*change))
+    assert "; got /base with geometry_msgs/Twist" in waiting(ground)
+
+
+def test_odometry_of_another_hash_is_named() -> None:
+    ground = Ground()
+    ground.odometer.is_mute = True
+    publisher = robot.base(robot.TWIST).publisher("ab")
+    told(ground, publisher.replace("RIHS01_", "TypeHashNotSupported"))
+    assert "/odom" in (waits_for := waiting(ground))
+    assert "; got /base with nav_msgs/Odometry, TypeHashNotSupported" in waits_for
+
+
+def test_a_subscriber_that_leaves_before_the_flight_is_not_counted() -> None:
+    ground = Ground()
+    ground.run(0.5)
+    port = ground.client._port
+    assert isinstance(port, Port)
+    assert port.is_ready
+    ground.world.stop(ground.robot.token)
+    told(ground, ground.robot.token, b"")
+    ground.run(0.1)
+    assert not port.is_ready
+    assert not ground.robot.heard
 
 
 def test_commands_are_stamped_by_the_robots_clock() -> None:
@@ -269,6 +345,7 @@ def test_identify_finds_the_model_of_a_robot(drive_by: str, within: float) -> No
     clock = Clock(EPOCH_NS)
     world.add("/odom", robot.Odometer(body), clock=clock)
     world.add("/cmd_vel", robot.Commanded(body), clock=clock)
+    world.add(body.token, robot.Announcing())
     world.add("client", flight, clock=Clock(robot.CLIENT_NS))
     world.run(lambda: flight.finished, limit_ns=300 * SECOND)
     for axis in range(2):

@@ -4,7 +4,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from skytether.ros2 import graph
-from skytether.ros2.graph import Node, Topic
+from skytether.ros2.graph import Entity, Node, Topic
 
 HASH = "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18"
 SESSION = "8b20917502ee955ac4476e0266340d5c"
@@ -26,18 +26,25 @@ def test_tokens_are_like_those_of_rmw_zenoh() -> None:
     assert subscriber == f"@ros2_lv/0/{SESSION}/0/2/MS/%/%/talker/%a%b/{kind}"
 
 
-def test_the_node_of_a_token_is_known() -> None:
-    _, publisher, subscriber = TALKER.tokens(SESSION)
-    assert graph.node_of(publisher) == "/talker"
-    assert graph.node_of(publisher.replace("/%/%/", "/%/%robot/")) == "/robot/talker"
-    assert graph.node_of(subscriber) is None
+def test_the_entity_of_a_token_is_known() -> None:
+    node, publisher, subscriber = TALKER.tokens(SESSION)
+    kind = "std_msgs::msg::dds_::String_"
+    talks = Entity(graph.PUBLISHER, "/talker", "/chatter", kind, HASH)
+    assert graph.entity_of(publisher) == talks
+    apart = graph.entity_of(publisher.replace("/%/%/", "/%/%robot/"))
+    assert apart == talks._replace(node="/robot/talker")
+    listens = talks._replace(kind=graph.SUBSCRIBER, topic="/a/b")
+    assert graph.entity_of(subscriber) == listens
+    assert graph.entity_of(node) is None
+    assert talks.takes(CHATTER)
+    assert not talks._replace(type_hash="TypeHashNotSupported").takes(CHATTER)
 
 
 @given(st.text("@ros2_lv/%NMPtalker0:,\0\u20ac\ud800"))
 @example("@ros2_lv")
 @example("/" * 20)
 def test_any_text_is_a_token_or_none(text: str) -> None:
-    assert graph.node_of(text) is None
+    assert graph.entity_of(text) is None
 
 
 def test_an_attachment_has_33_bytes_in_the_order_of_rmw_zenoh() -> None:

@@ -143,6 +143,29 @@ def test_commands_and_odometry_pass_and_the_graph_shows_the_node(net: Net) -> No
 
 
 @pytest.mark.realtime
+def test_the_first_message_decides_on_one_of_two_types(net: Net) -> None:
+    plain = messages.topic(CMD_VEL.name, messages.TWIST)
+    node = Node("127.0.0.1", net.port, 0, "skytether_1", CMD_VEL, ODOM, (plain,))
+    taken: list[Any] = []
+    net._declared.append(net.robot.declare_subscriber(plain.key(0), taken.append))
+
+    async def story() -> None:
+        session = GraphSession(node, lambda _: None)
+        running = asyncio.get_running_loop().create_task(session.run())
+        await until(lambda: len(net.tokens) == 2)
+        await until(lambda: session.send(b"moves", (plain.name, 1)) and taken)
+        await until(lambda: len(net.tokens) == 3)
+        running.cancel()
+
+    asyncio.run(story())
+    (token,) = (each for each in net.tokens if "/MP/" in each)
+    assert plain.dds_kind in token
+    publisher = graph.ATTACHMENT.unpack(bytes(taken[0].attachment))[3]
+    assert publisher == graph.identity(token)
+    assert not net.commands
+
+
+@pytest.mark.realtime
 def test_the_loss_of_the_router_stops_nothing(net: Net) -> None:
     async def story() -> None:
         await until(lambda: net.commands)
