@@ -9,6 +9,7 @@ the server knew at its last one. The reward is minus the squared distance from t
 the truth, minus `price` for each packet to the vehicle.
 """
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -20,8 +21,10 @@ from gymnasium.spaces import Box, Discrete
 from numpy.typing import NDArray
 from pettingzoo import ParallelEnv
 
+from skytether.gym.networked import number
 from skytether.server.endpoint import Server
 from skytether.shared.base.chance import stream
+from skytether.shared.base.errors import ConfigError
 from skytether.shared.base.units import SECOND_NS, seconds_to_ns
 from skytether.shared.law.model import Indices
 from skytether.shared.scenario import reading
@@ -95,6 +98,12 @@ class Flight:
         server.controller.use_trigger(self.trigger)
         self._step_ns = 0
 
+    def __reduce__(self) -> str:
+        raise TypeError(
+            "a flight cannot be copied or pickled; make the environment again, reset it with the "
+            "same seed, and take the same steps"
+        )
+
     def _measured(self, vehicle: int) -> Reference:
         return self._scenario.measured_reference(vehicle)
 
@@ -149,10 +158,12 @@ class Target(gymnasium.Env[NDArray[np.float32], Any]):
         scenario: str = "target",
         keys: Mapping[str, Any] | None = None,
     ) -> None:
+        if action not in ("send", "threshold"):
+            raise ConfigError(f"action: got {action!r}, expected 'send' or 'threshold'")
         self.observation_space = _SPACE
         is_sending = action == "send"
         self.action_space = Discrete(2) if is_sending else Box(0.0, 1e3, (1,), np.float32)
-        self._is_sending, self._price, self._name, self._keys = is_sending, price, scenario, keys
+        self._is_sending, self._price = is_sending, number("price", price, 0.0, math.inf)
         self._flight: Flight | None = None
         self._config = _scenario(scenario, keys or {}, 1)
 
@@ -204,8 +215,8 @@ class Crowd(ParallelEnv):  # type: ignore[misc]  # it ships no types
     ) -> None:
         self.possible_agents = [f"vehicle_{number}" for number in range(1, vehicles + 1)]
         self.agents: list[str] = []
-        self._price, self._keys = price, keys or {}
-        self._config = _scenario(scenario, self._keys, 1)
+        self._price = number("price", price, 0.0, math.inf)
+        self._config = _scenario(scenario, keys or {}, 1)
         self._spaces = {agent: Discrete(2) for agent in self.possible_agents}
         self._seen = {agent: Box(-1e9, 1e9, _SPACE.shape, np.float32) for agent in self._spaces}
         self._rng = np.random.default_rng(0)
@@ -234,8 +245,8 @@ class Crowd(ParallelEnv):  # type: ignore[misc]  # it ships no types
         flight = self._flight
         if flight is None:
             raise ResetNeeded("step: called before reset, which gives the first observation")
-        for number, agent in enumerate(self.possible_agents):
-            flight.thresholds[number] = -1.0 if actions.get(agent) else np.inf
+        for index, agent in enumerate(self.possible_agents):
+            flight.thresholds[index] = -1.0 if actions.get(agent) else np.inf
         before = flight.trigger.sent_packets.copy()
         flies = flight.go()
         sent = flight.trigger.sent_packets - before

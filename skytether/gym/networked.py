@@ -134,8 +134,8 @@ class _Far:
                     "step_s: got None and an env without render_fps, expected seconds"
                 )
             step_s = 1.0 / metadata["render_fps"]
-        self.price = _number("price", price, 0.0, math.inf)
-        self.step_ns = seconds_to_ns(_number("step_s", step_s, 1e-3, 86_400.0))
+        self.price = number("price", price, 0.0, math.inf)
+        self.step_ns = seconds_to_ns(number("step_s", step_s, 1e-3, 86_400.0))
         self.seed = _whole("seed", seed, 0, 2**63 - 1)
         self._mtu = _whole("mtu", mtu, 2 * PART_BYTES, 65_507)
         self._shown = _whole("shown_rows", shown_rows, 1, 4096)
@@ -422,7 +422,8 @@ def _joined(info: dict[str, Any], own: dict[str, Any]) -> dict[str, Any]:
     return info | {KEY: own}
 
 
-def _number(key: str, value: Any, low: float, high: float) -> float:
+def number(key: str, value: Any, low: float, high: float) -> float:
+    """Number that a user gave; raises ConfigError if it is none between these."""
     if not isinstance(value, Real) or not low <= float(value) <= high or value == math.inf:
         expected = f"a finite number from {low:g}" + (f" to {high:g}" if high < math.inf else "")
         raise ConfigError(f"{key}: got {value!r}, expected {expected}")

@@ -1,5 +1,8 @@
 """`gym.flights`: Skytether's flights as environments."""
 
+import copy
+import math
+import pickle
 from typing import Any
 
 import gymnasium
@@ -9,6 +12,7 @@ from gymnasium.error import ResetNeeded
 from gymnasium.utils.env_checker import check_env
 
 from skytether.gym.flights import Crowd, Target
+from skytether.shared.base.errors import ConfigError
 
 SHORT = {"duration": 3.0, "settle": 0.0}
 
@@ -45,11 +49,28 @@ def test_a_packet_costs_its_price() -> None:
     assert (one - other) * 60 == pytest.approx(0.5 * packets)
 
 
+@pytest.mark.parametrize("made", [Target, Crowd])
+def test_an_impossible_price_or_kind_of_action_is_refused(made: Any) -> None:
+    with pytest.raises(ConfigError, match="price: got nan"):
+        made(price=math.nan)
+    with pytest.raises(ConfigError, match="action: got 'sned'"):
+        Target(action="sned")
+
+
 def test_a_step_before_the_first_reset_is_refused() -> None:
     with pytest.raises(ResetNeeded):
         Target(keys=SHORT).step(1)
     with pytest.raises(ResetNeeded):
         Crowd(2, keys=SHORT).step({})
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, pickle.dumps])
+def test_an_environment_can_be_copied_before_a_flight_and_not_in_it(copied: Any) -> None:
+    env = Target(keys=SHORT)
+    copied(env)
+    env.reset(seed=1)
+    with pytest.raises(TypeError, match="a flight cannot be copied"):
+        copied(env)
 
 
 @pytest.mark.filterwarnings("ignore::UserWarning")
