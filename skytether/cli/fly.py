@@ -133,7 +133,8 @@ def fly(argv: Sequence[str]) -> None:
     page = None if options.virtual or options.no_page else at
     with page_process.paged(page, options.control) as sockets:
         together = [scenario, *beside.values()]
-        terminal.prepare(kernel.missing(set.intersection(*map(other_schemes, together))))
+        missing = kernel.missing(set.intersection(*map(other_schemes, together)))
+        terminal.prepare(missing, sockets)
         with _flying(beside.values()) as others:
             with (
                 command.interruptible() as interrupted,

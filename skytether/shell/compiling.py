@@ -63,6 +63,30 @@ def _locked(descriptor: int) -> bool:
     return True
 
 
+TOLD = "compiling"
+"""Name of the file in a flight's folder that says how far compiling is, for the page."""
+TOLD_BYTES = 200
+
+
+def tell(folder: Path | None, text: str) -> None:
+    """Leave a text for `told` in a flight's folder, if it has one; without a text, none."""
+    if folder is None:
+        return
+    with suppress(OSError):
+        if text:
+            with files.replacing(folder / TOLD, is_synced=False) as file:
+                file.write(text.encode())
+        else:
+            (folder / TOLD).unlink(missing_ok=True)
+
+
+def told(folder: Path | None) -> str:
+    """What a command has told of its compiling; empty if nothing, or once it is over."""
+    with suppress(OSError, ValueError):
+        return files.read(folder / TOLD, TOLD_BYTES).decode() if folder else ""
+    return ""
+
+
 def compile_kernels(kernels: Sequence["Missing"], on_done: Callable[[], None]) -> None:
     """Compile kernels, in parallel where there are several cores.
 

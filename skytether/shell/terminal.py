@@ -54,23 +54,41 @@ def progress(title: str, total: float, unit: str = "s") -> Iterator[Bar]:
         yield show
 
 
-def prepare(kernels: Sequence["Missing"]) -> None:
-    """Compile the kernels that are not compiled on this machine yet, with a note on stderr."""
+def prepare(kernels: Sequence["Missing"], folder: Path | None = None) -> None:
+    """Compile the kernels that are not compiled on this machine yet, with a note on stderr.
+
+    Args:
+        folder: folder of the flight's sockets, in which its page finds how far this is.
+    """
     if not kernels:
         return
     from skytether.shared.base import kernel
-    from skytether.shell.compiling import alone, compile_kernels
+    from skytether.shell.compiling import alone, compile_kernels, tell
 
     waiting = "waiting for another command, which compiles the control loops"
-    with alone(kernel.folder(), lambda: print(waiting, file=sys.stderr, flush=True)):
+
+    def wait() -> None:
+        print(waiting, file=sys.stderr, flush=True)
+        tell(folder, waiting)
+
+    with alone(kernel.folder(), wait):
         left = [each for each in kernels if not each.is_compiled()]
         if not left:
+            tell(folder, "")
             return
         message = "compiling control loops, once on this machine: takes up to a minute"
         print(message, file=sys.stderr, flush=True)
         with progress("compiling", len(left), "kernels") as bar:
             done = count(1)
-            compile_kernels(left, lambda: bar(next(done)))
+
+            def on_done() -> None:
+                number = next(done)
+                bar(number)
+                tell(folder, f"compiling control loops: {number} of {len(left)}")
+
+            tell(folder, f"compiling control loops: 0 of {len(left)}")
+            compile_kernels(left, on_done)
+        tell(folder, "")
 
 
 def counted(number: int, noun: str) -> str:

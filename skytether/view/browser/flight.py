@@ -11,6 +11,7 @@ import msgspec
 from skytether.shared.core.change import ONCE, Answer
 from skytether.shared.core.events import Changed
 from skytether.shared.telemetry.feed import Frame, Opened, Said
+from skytether.shell.compiling import told
 from skytether.view import controls
 from skytether.view.browser.play import NETEMS, PROCESSES, Operator
 from skytether.view.changes import Mark, mark, together
@@ -29,7 +30,7 @@ class PageFlight:
     """
 
     def __init__(self, title: str = "", folder: Path | None = None) -> None:
-        self.title = title
+        self.title, self._folder = title, folder
         self.state = State()
         self.lock = threading.Lock()
         self.values: dict[str, dict[str, Any]] = {}
@@ -62,6 +63,11 @@ class PageFlight:
     def lose(self, process: str) -> None:
         with self.lock:
             self.state.lose(process)
+
+    @property
+    def waits(self) -> str:
+        """What a flight that has not begun waits for."""
+        return told(self._folder) or f"{self.title} No process of the flight is heard yet."
 
     # -- changes -----------------------------------------------------------------------------
 

@@ -78,6 +78,8 @@ class Page:
         self._server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
         self._server.gui.set_panel_label("Skytether")
         self._panels: dict[int, Panel] = {}
+        self._waiting: viser.GuiMarkdownHandle | None = None
+        """What the flights wait for, shown until they begin."""
         self._scene: Scene | None = None
         self._shown: tuple[object, ...] = ()
         """State from which the scene was last built."""
@@ -116,6 +118,8 @@ class Page:
     def _show(self, clients: Mapping[int, viser.ClientHandle], *, draws: bool) -> None:
         states = [flight.state for flight in self._flights]
         if not all(state.name for state in states):
+            if draws:
+                self._wait()
             return
         shown = tuple((state.flights, state.flies) for state in states)
         if self._scene is None or self._shown != shown:
@@ -138,6 +142,15 @@ class Page:
                     with self._alone(number), clients[number].atomic():
                         panel.show(now_ns)
 
+    def _wait(self) -> None:
+        """Show what the flights that have not begun wait for."""
+        waits = [flight.waits for flight in self._flights if not flight.state.name]
+        text = "\n\n".join(waits)
+        if self._waiting is None:
+            self._waiting = self._server.gui.add_markdown(text)
+        elif self._waiting.content != text:
+            self._waiting.content = text
+
     def _reads(self, number: int) -> bool:
         """Whether a browser has read everything sent; if not, nothing is drawn for it."""
         connection = self._connections.get(number)
@@ -158,6 +171,9 @@ class Page:
                 self._server.get_event_loop().call_soon_threadsafe(connection.transport.abort)
 
     def _begin(self, shown: tuple[object, ...]) -> None:
+        if self._waiting:
+            self._waiting.remove()
+            self._waiting = None
         self._server.scene.reset()
         for client in self._server.get_clients().values():
             client.gui.reset()
