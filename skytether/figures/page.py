@@ -2,7 +2,7 @@
 
 import base64
 import io
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib import resources
@@ -26,6 +26,18 @@ class Table:
     """Numbers as CSV, with all digits."""
     heading: Sequence[str]
     rows: Sequence[Sequence[str]]
+    bold: Collection[tuple[int, int]] = ()
+    """Rows and columns of cells in bold type."""
+    own: Collection[int] = ()
+    """Rows of what the reader has brought."""
+
+    @property
+    def groups(self) -> dict[str, list[int]]:
+        """Rows by the first column, if that repeats itself; else all of them under no name."""
+        groups: dict[str, list[int]] = {}
+        for at, (first, *_) in enumerate(self.rows):
+            groups.setdefault(first, []).append(at)
+        return groups if len(groups) < len(self.rows) else {"": [*range(len(self.rows))]}
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,7 +85,12 @@ Cell = tuple[str, str] | Callable[[Row], str]
 
 
 def table_of(
-    name: str, title: str, says: str, rows: Sequence[Row], shown: Mapping[str, Cell]
+    name: str,
+    title: str,
+    says: str,
+    rows: Sequence[Row],
+    shown: Mapping[str, Cell],
+    own: Collection[int] = (),
 ) -> Table:
     """Table of some numbers.
 
@@ -81,13 +98,14 @@ def table_of(
         name, title, says: see `Table`.
         rows: all numbers; they go into the CSV.
         shown: content of each column's cells, by heading.
+        own: see `Table`.
     """
 
     def text(row: Row, cell: Cell) -> str:
         return cell(row) if callable(cell) else as_text(row[cell[0]], cell[1])
 
     lines = [[text(row, cell) for cell in shown.values()] for row in rows]
-    return Table(name, title, says, rows_csv(rows), list(shown), lines)
+    return Table(name, title, says, rows_csv(rows), list(shown), lines, own=own)
 
 
 def rendered(template: str, **values: Any) -> str:

@@ -199,7 +199,7 @@ def judge(claim: Claim, compared: ComparedCase) -> Judged | None:
 
 def draw(results: Sequence[ComparedCase]) -> Drawn:
     own = [each for each in results if not each.case.weights]
-    judged = [found for claim in CLAIMS for each in results if (found := judge(claim, each))]
+    judged = [found for each in results for claim in CLAIMS if (found := judge(claim, each))]
     asked = [each.holds for each in judged if each.holds is not None]
     flights = min((len(each.ours.runs) for each in judged), default=0)
     if flights < FLIGHTS_MIN:
@@ -218,7 +218,7 @@ def draw(results: Sequence[ComparedCase]) -> Drawn:
         ratios_table(judged),
         weights_table(own),
     ]
-    return Drawn(TITLE, ABOUT, tables, list(map(curves, results)), verdict)
+    return Drawn(TITLE, ABOUT, tables, list(map(curves, results)), verdict, figures_first=True)
 
 
 FLIGHTS_MIN = 10
@@ -235,13 +235,24 @@ ABOUT = (
 )
 
 
+UNTOLD = "too few flights to tell"
+SIMILAR = 2 / 3
+"""Share of the contenders within a budget that may be as good as the best; of more, none is marked.
+"""
+
+
 def budgets_table(results: Sequence[ComparedCase]) -> Table:
-    rows, lines = [], []
+    rows: list[dict[str, Any]] = []
+    lines: list[tuple[str, ...]] = []
+    bold, own = [], []
     for each in results:
         best = {budget: leading(each, budget) for budget in BUDGETS}
+        untold = {budget for budget in BUDGETS if not _told(each, budget)}
         for contender in each.contenders:
+            if contender.keys:
+                own.append(len(lines))
             cells = []
-            for budget in BUDGETS:
+            for column, budget in enumerate(BUDGETS, start=2):
                 runs = each.bought.get((contender.name, budget))
                 if runs is None:
                     cells.append("–")
@@ -253,13 +264,20 @@ def budgets_table(results: Sequence[ComparedCase]) -> Table:
                 )
                 text = f"{mean} ± {half} ({median}) @ {as_text(runs.mean(PACKETS), '.1f')}"
                 text += "!" if runs.mean(PACKETS) > budget else ""
-                cells.append(f"{text} *" if runs in best[budget] else text)
+                is_marked = runs in best[budget] and budget not in untold
+                cells.append(f"{text} *" if is_marked else text)
+                if is_marked and runs is best[budget][0]:
+                    bold.append((len(lines), column))
             lines.append((each.case.title, contender.title, *cells))
+        if untold:
+            told = (UNTOLD if budget in untold else "" for budget in BUDGETS)
+            lines.append((each.case.title, "which is best", *told))
     says = (
         "Mean RMSE xy [m] with its 95 % interval, and median, @ packets a second. Within a budget "
         "each contender flies at the threshold and with the reporting policy that had the smallest "
-        "error on other seeds. * marks the smallest mean, and means that do not differ from it "
-        "significantly: the interval of their ratio on the same seeds contains 1. ! marks what has "
+        "error on other seeds. The smallest mean is bold; * marks it, and means that do not differ "
+        "from it significantly: the interval of their ratio on the same seeds contains 1. Where "
+        f"that is so for nearly all, there are {UNTOLD}, and none is marked. ! marks what has "
         "sent more than the budget, which was kept on the other seeds. – means that no "
         "flown setting was within the budget and the case's limit on effort. The CSV has bytes and "
         "all other figures."
@@ -269,9 +287,14 @@ def budgets_table(results: Sequence[ComparedCase]) -> Table:
     if failed:
         says += f" {failed} runs without a session are left out of the means."
     heading = ("case", "contender", *(f"≤ {budget:g}/s" for budget in BUDGETS))
-    return Table(
-        "budgets", "Error within each budget of packets", says, rows_csv(rows), heading, lines
-    )
+    title = "Error within each budget of packets"
+    return Table("budgets", title, says, rows_csv(rows), heading, lines, bold, own)
+
+
+def _told(compared: ComparedCase, budget: float) -> bool:
+    """Whether the flights tell which contenders are best within a budget."""
+    flown = sum(not math.isnan(each.mean(RMSE)) for each in _ranked(compared, budget))
+    return flown < 2 or len(leading(compared, budget)) <= SIMILAR * flown
 
 
 def _ranked(compared: ComparedCase, budget: float) -> list[ContenderRuns]:
@@ -327,7 +350,8 @@ def leaders_table(results: Sequence[ComparedCase]) -> Table:
         "ratio": ("ratio", ".3f"),
         "95 %": _ratio_span,
     }
-    return table_of("leaders", "At equal packets", says, rows, shown)
+    own = [at for at, row in enumerate(rows) if row["contender"] != OURS]
+    return table_of("leaders", "At equal packets", says, rows, shown, own)
 
 
 def _ratio_row(found: tuple[float, float, float] | None) -> dict[str, float | None]:
@@ -410,7 +434,8 @@ def weights_table(results: Sequence[ComparedCase]) -> Table:
     lines = [(case.title, one.title, *row) for case, one, row in rows]
     heading = ("case", "contender", *(key.removeprefix("control.") for key in keys))
     says = "An empty cell has the value of the case's own scenario."
-    return Table("weights", "Weights and thresholds", says, text, heading, lines)
+    own = [at for at, (_, one, _) in enumerate(rows) if one.keys]
+    return Table("weights", "Weights and thresholds", says, text, heading, lines, own=own)
 
 
 def _weights(value: Any) -> str:
@@ -500,16 +525,17 @@ def _draw_curve(
     median = np.array([each.median() for each in flown], np.float64)
     low = np.maximum(rmse - half, 0.5 * rmse)  # a logarithmic axis cannot show 0
     colour, marker = style
+    size, width, above = (7, 2.0, 3.0) if contender.keys else (4, 0.8, 2.0)
     if flown and not flown[0].mean(PACKETS):
         for plane in panes:
             plane.axhline(rmse[0], color=colour, linestyle="--", label=contender.title)
         return
-    dots: Any = {"color": colour, "linestyle": "none"}
+    dots: Any = {"color": colour, "linestyle": "none", "zorder": above}
     for plane, spent in zip(panes, SPENT, strict=True):
         cost = np.array([each.mean(spent) for each in flown], np.float64)
-        plane.plot(cost, rmse, **dots, marker=marker, markersize=4, label=contender.title)
+        plane.plot(cost, rmse, **dots, marker=marker, markersize=size, label=contender.title)
         plane.plot(cost, median, **dots, marker="_", markersize=7)
         if spent == EFFORT:
             continue  # effort may rise or fall with the threshold
-        plane.plot(cost, rmse, color=colour, linewidth=0.8)
+        plane.plot(cost, rmse, color=colour, linewidth=width, zorder=above)
         plane.fill_between(cost, low, rmse + half, color=colour, alpha=0.2, linewidth=0)

@@ -72,6 +72,8 @@ class Drawn:
     tables: Sequence[Table]
     pictures: Sequence[Plate]
     verdict: str
+    figures_first: bool = False
+    """Whether the figures stand before the tables."""
 
 
 def draw(measured: Reproduction) -> Drawn:

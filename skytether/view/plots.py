@@ -181,7 +181,7 @@ APART = Plot(
 )
 
 
-ERROR = Plot("Error [m]", (PlotLine("error", lambda look: look.curves.error_m),))
+ERROR = Plot("Error [m]", (PlotLine("", lambda look: look.curves.error_m),))
 
 
 SOLVING = Plot(

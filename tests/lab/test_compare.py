@@ -12,6 +12,7 @@ import time
 import tomllib
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -22,13 +23,16 @@ from msgspec.structs import replace
 import skytether
 from helpers import refused_before_writing
 from skytether.__main__ import main
+from skytether.figures.page import Picture
 from skytether.lab import budgets, contenders
 from skytether.lab.budgets import BUDGETS, REPORTS, SOUGHT, FlownContender, Plan
 from skytether.lab.calibration import Rmse, SearchLimits
 from skytether.lab.commands import pool
+from skytether.lab.commands.report_folder import CommandCall
 from skytether.lab.comparison import (
     CLAIMS,
     FLIGHTS_MIN,
+    UNTOLD,
     Claim,
     ComparedCase,
     ContenderRuns,
@@ -47,6 +51,7 @@ from skytether.lab.contenders import (
     Contender,
     TunedWeights,
 )
+from skytether.lab.report import Drawn, html
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.dotted import text_key
@@ -434,6 +439,37 @@ def test_a_contender_that_cannot_be_told_from_the_best_is_marked_as_well() -> No
     assert [*marked.values()] == [False, True, True]
     found = [row["best"] for row in csv.DictReader(table.csv.splitlines())]
     assert found == ["false", "true", "true"]
+
+
+def test_where_nearly_all_are_as_good_as_the_best_none_is_marked() -> None:
+    """The figures stand before the tables, the case over its rows, and the best in bold type."""
+    alike = [flew(each.name, [0.2, 0.3 + 0.01 * at, 0.2]) for at, each in enumerate(CONTENDERS[:4])]
+    better = flew(CONTENDERS[4].name, [0.05, 0.06, 0.05])
+    compared = within(TARGET, *((5.0, each) for each in alike), (10.0, better), (10.0, alike[0]))
+    table = budgets_table([compared])
+    assert not [row for row in table.rows if row[4].endswith("*")]
+    assert [row[1:3] + row[4:6] for row in table.rows if UNTOLD in row] == [
+        ("which is best", "", UNTOLD, "")
+    ]
+    ((line, column),) = table.bold
+    assert table.rows[line][1] == CONTENDERS[4].title
+    assert table.heading[column] == "≤ 10/s"
+    picture: Any = Picture("trade", "trade", "", b"")
+    drawn = Drawn("", "", [table], [picture], "", figures_first=True)
+    page = html(drawn, reading.load("demo"), [CommandCall.now("compare", []).facts(0)])
+    assert page.index('id="trade"') < page.index('id="budgets"')
+    assert page.count(TARGET.title) == 1
+    assert page.count('class="best"') == 1
+
+
+def test_a_contender_of_ones_own_is_highlighted() -> None:
+    own = Contender("mine", "mine", "", {}, keys={"control.horizon": 20})
+    mine = ContenderRuns(
+        FlownContender(own, 3.0, "", True, {}), flew("paper-event", [0.1, 0.1]).runs
+    )
+    compared = within(TARGET, (5.0, mine), (5.0, flew("feedback-gap", [0.2, 0.2])))
+    for table in (budgets_table([compared]), leaders_table([compared])):
+        assert ["mine" in table.rows[at] for at in table.own] == [True]
 
 
 def test_what_is_claimed_is_what_was_asked_for() -> None:
