@@ -53,6 +53,8 @@ TOLD = (
 GROUND = {str(mode) for mode in (Mode.INIT, Mode.SYNC, Mode.READY)}
 WITHIN_S = 2.0
 """Time within which the same event of several vehicles is told once."""
+BRIEF_S = 1.0
+"""Length of a path's outage below which it is not told."""
 VEHICLES_MAX = 64
 """Largest number of vehicles that have a row, and distances to each other."""
 
@@ -182,52 +184,59 @@ class Outcome:
         )
 
     @cached_property
-    def told(self) -> list[tuple[float, tuple[int, ...], str, str]]:
-        """What failed and took over: time [s], vehicles, process and sentence, in order of time.
+    def told(self) -> list[tuple[float, tuple[int, ...], str]]:
+        """What failed and took over: time [s], vehicles and sentence, in order of time.
 
-        The same event of several vehicles is told once.
+        The same event of several vehicles is told once, and outages of a path below BRIEF_S not at
+        all.
         """
-        found: list[tuple[float, list[int], str, str]] = []
-        newest: dict[tuple[str, str], int] = {}
-        died_s: dict[tuple[int, int], float] = {}
-        for time_ns, process, event in self._recorded.events():
-            if not isinstance(event, TOLD) or _is_ordinary(event):
-                continue
+        found: list[tuple[float, list[int], str]] = []
+        newest: dict[str, list[int]] = {}
+        begin_s: dict[str, float] = {}
+        for time_ns, _, event in self._recorded.events():
             at_s, vehicle = self.time_s(time_ns), getattr(event, "vehicle", None)
-            text = re.sub(r"^vehicle \d+:? ", "", str(event))
-            if isinstance(event, PathDied):
-                died_s[event.vehicle, event.path] = at_s
-            elif isinstance(event, PathHealed):
-                since_s = died_s.pop((event.vehicle, event.path), at_s)
-                text += f", after {at_s - since_s:.0f} s" if at_s > since_s else ""
-            known = newest.get((process, text))
-            if known is not None and vehicle and at_s - found[known][0] < WITHIN_S:
-                if vehicle not in found[known][1]:
-                    found[known][1].append(vehicle)
+            if not isinstance(event, TOLD) or _is_ordinary(event) or self._is_brief(event, at_s):
                 continue
-            newest[process, text] = len(found)
-            found.append((at_s, [vehicle] if vehicle else [], process, text))
-        return [(at_s, tuple(sorted(who)), *rest) for at_s, who, *rest in found]  # type: ignore[misc]
+            text = re.sub(r"^vehicle \d+:? ", "", str(event))
+            if vehicle and text in newest and at_s - begin_s[text] < WITHIN_S:
+                newest[text].append(vehicle)
+                continue
+            newest[text], begin_s[text] = [vehicle] if vehicle else [], at_s
+            found.append((at_s, newest[text], text))
+        return [(at_s, tuple(sorted(set(who))), text) for at_s, who, text in found]
 
+    def _is_brief(self, event: Event, at_s: float) -> bool:
+        """Whether an event begins or ends a path's outage that is too brief to be told."""
+        if not isinstance(event, PathDied | PathHealed):
+            return False
+        outages = self.dead_paths.get(event.path, [])
+        return not any(
+            event.vehicle == vehicle and at_s in (begin_s, end_s)
+            for vehicle, begin_s, end_s in outages
+        )
+
+    @cached_property
     def dead_paths(self) -> dict[int, list[tuple[int, float, float]]]:
         """Times without packets on each path: vehicle, begin and end [s]; by the path's number."""
-        open_s: dict[tuple[int, int], float] = {}
-        found: dict[int, list[tuple[int, float, float]]] = {}
+        begun_s: dict[tuple[int, int], float] = {}
+        outages: list[tuple[int, int, float, float]] = []
+        for time_ns, _, event in self._recorded.events():
+            at_s = self.time_s(time_ns)
+            if isinstance(event, PathDied):
+                begun_s.setdefault((event.path, event.vehicle), at_s)
+            elif isinstance(event, PathHealed) and (event.path, event.vehicle) in begun_s:
+                which = event.path, event.vehicle
+                outages.append((*which, begun_s.pop(which), at_s))
         end_s = max(
             began + float(self.rows[number]["step"][-1]) * self._dt_s
             for number, began in self.began_s.items()
         )
-        for time_ns, _, event in self._recorded.events():
-            if isinstance(event, PathDied):
-                open_s.setdefault((event.vehicle, event.path), self.time_s(time_ns))
-            elif isinstance(event, PathHealed) and (event.vehicle, event.path) in open_s:
-                begin_s = open_s.pop((event.vehicle, event.path))
-                found.setdefault(event.path, []).append(
-                    (event.vehicle, begin_s, self.time_s(time_ns))
-                )
-        for (vehicle, path), begin_s in open_s.items():
-            found.setdefault(path, []).append((vehicle, begin_s, end_s))
-        return dict(sorted(found.items()))
+        outages += [(*which, begin_s, end_s) for which, begin_s in begun_s.items()]
+        found: dict[int, list[tuple[int, float, float]]] = {}
+        for path, vehicle, begin_s, over_s in sorted(outages):
+            if over_s - begin_s >= BRIEF_S:
+                found.setdefault(path, []).append((vehicle, begin_s, over_s))
+        return found
 
     def new_leaders(self) -> list[tuple[int, float]]:
         """Vehicles and times [s] at which another server came to lead them."""

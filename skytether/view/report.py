@@ -155,21 +155,18 @@ def _first(outcome: Outcome) -> list[Table]:
         if len(outcome.numbers) > len(rows):
             says += f" The first {len(rows)} of {len(outcome.numbers)}."
         found.append(Table("vehicles", "Vehicles", says, "", heading, rows))
-    told = [
-        [text, listed(who) if who else "–", process, f"{at_s:.1f}"]
-        for at_s, who, process, text in outcome.told
-    ]
+    told = [[f"{at_s:.1f}", listed(who) if who else "–", text] for at_s, who, text in outcome.told]
     says = "" if told else "Nothing failed."
     if len(told) > TOLD_MAX:
         says = f"The first {TOLD_MAX} of {len(told)}; all events are below."
-    heading = ["event", "vehicles", "told by", "time [s]"] if told else []
+    heading = ["time [s]", "vehicles", "event"] if told else []
     happened = Table("told", "What failed, and what took over", says, "", heading, told[:TOLD_MAX])
     return [happened, *found] if told else [*found, happened]
 
 
 def course(outcome: Outcome) -> Picture:
     """Lanes over time: each vehicle's mode, new leaders, and dead paths; and the separation."""
-    numbers, paths, is_apart = list(outcome.rows), outcome.dead_paths(), bool(outcome.least)
+    numbers, paths, is_apart = list(outcome.rows), outcome.dead_paths, bool(outcome.least)
     lanes = len(numbers) + len(paths)
     heights = [0.3 + 0.18 * lanes, *[1.8] * is_apart]
     with lettered(WIDTH, 0.8 + sum(heights), LETTERS) as figure:
