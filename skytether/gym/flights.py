@@ -225,7 +225,7 @@ class Crowd(ParallelEnv):  # type: ignore[misc]  # it ships no types
     def observation_space(self, agent: str) -> Box:
         return self._seen[agent]
 
-    def action_space(self, agent: str) -> Discrete[Any]:
+    def action_space(self, agent: str) -> "Discrete[Any]":  # generic since gymnasium 1.3
         return self._spaces[agent]
 
     def reset(

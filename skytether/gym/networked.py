@@ -15,7 +15,7 @@ from collections.abc import Callable, Sequence
 from copy import deepcopy
 from numbers import Integral, Real
 from time import perf_counter_ns
-from typing import Any, Literal, TypedDict, Unpack
+from typing import TYPE_CHECKING, Any, Literal, TypedDict, Unpack
 
 import gymnasium
 import numpy as np
@@ -37,6 +37,11 @@ from skytether.shared.scenario import reading
 from skytether.shared.scenario.air.draws import SLOT_NS
 from skytether.shared.scenario.air.path import Path, path
 from skytether.shared.scenario.grammar import GrammarError
+
+if TYPE_CHECKING:
+    _VectorWrapper = VectorWrapper[Any, Any, Any, Any, Any]
+else:
+    _VectorWrapper = VectorWrapper  # generic since gymnasium 1.4 alone
 
 MTU = 1472
 """Largest UDP payload of a datagram that fits into 1500 B with headers [B]."""
@@ -324,7 +329,7 @@ class Networked(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         return deepcopy(remote.report(0).observation), reward, terminated, truncated, info
 
 
-class NetworkedVector(VectorWrapper[Any, Any, Any, Any, Any]):
+class NetworkedVector(_VectorWrapper):
     """`Networked` for a vector environment, whose robots share both directions of the network.
 
     One agent answers all robots at once, so its thinking time is that of all answers together.
