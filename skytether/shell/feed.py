@@ -51,7 +51,9 @@ PATIENCE_S = 0.5
 
 READ_BYTES = 256 * 1024
 AGAIN_S = 1.0
-"""Time between two attempts to connect to a process."""
+"""Time between two attempts to connect to a process, or two searches for further ones."""
+FOLLOWED_MAX = 128
+"""Largest number of feeds that a subscriber follows."""
 
 
 class _Part:
@@ -261,6 +263,7 @@ class Subscriber:
         take: called in the thread with the process name and each frame; a feed begins with
             `Opened`.
         lost: called in the thread with the process name when a feed has ended.
+        further: returns the sockets of further feeds that exist; called again and again.
     """
 
     def __init__(
@@ -268,8 +271,9 @@ class Subscriber:
         paths: Mapping[str, Path],
         take: Callable[[str, Frame], None],
         lost: Callable[[str], None] = lambda _: None,
+        further: Callable[[], Mapping[str, Path]] | None = None,
     ) -> None:
-        self._take, self._lost = take, lost
+        self._take, self._lost, self._further = take, lost, further
         self._closed = False
         self._loop = asyncio.new_event_loop()
         self._reading = self._loop.create_task(self._read_all(paths))
@@ -290,8 +294,16 @@ class Subscriber:
 
     async def _read_all(self, paths: Mapping[str, Path]) -> None:
         async with asyncio.TaskGroup() as readers:
-            for name, path in paths.items():
-                readers.create_task(self._follow(name, path))
+            known: set[str] = set()
+            found = paths
+            while True:
+                for name in list(found.keys() - known)[: FOLLOWED_MAX - len(known)]:
+                    known.add(name)
+                    readers.create_task(self._follow(name, found[name]))
+                if self._further is None:
+                    break
+                await asyncio.sleep(AGAIN_S)
+                found = self._further()
 
     async def _follow(self, name: str, path: Path) -> None:
         """Read the feed of a process, and of each process that listens at the same path later."""

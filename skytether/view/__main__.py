@@ -45,8 +45,9 @@ def show(argv: Sequence[str]) -> None:
     """Show flights in a browser while they fly, until SIGINT or SIGTERM.
 
     A flight's folder is the one given to `fly --control`, or one in which server, netem and client
-    have their sockets: `--feed FOLDER/server.feed --control FOLDER/server` and so on. Flights may
-    begin, or begin again, later.
+    have their sockets: `--feed FOLDER/server.feed --control FOLDER/server` and so on; several
+    clients each under a name of its own, such as `client-2`. Flights may begin, or begin again,
+    later.
     """
     options = read(PageOptions(tyro.MISSING), argv, "skytether page", show.__doc__)
     if not options.folders:

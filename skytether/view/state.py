@@ -6,6 +6,7 @@ Memory is bounded: a ring buffer for each vehicle, one for the network, and the 
 are those of the frames; the drawing code passes the present time.
 """
 
+import re
 from collections import deque
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -68,6 +69,8 @@ LOSS_HIGH = 0.3
 TRAJECTORY_BYTES = 32
 """Size between that of a heartbeat and that of the shortest trajectory [B], without encryption."""
 
+NO_SESSION = "there is no session yet"
+ONLY_SERVER = "only the server tells of this vehicle"
 VALUES = ("position", "reference", "figure", "threshold", "age_s", "solve_ms", "mode")
 """Columns of a vehicle's ring that are NaN where unknown."""
 ROUNDING = 1e-6
@@ -125,6 +128,8 @@ class VehicleTrack:
 
     def __init__(self, number: int, scenario: Scenario) -> None:
         self.number = number
+        self.client = self.server = ""
+        """Processes of the newest rows of either end; empty before any."""
         self._scenario = scenario
         steps = max(1, round(SPAN_S / scenario.control.dt))
         self._stride = -(-steps // SLOTS_MAX)
@@ -349,14 +354,15 @@ def told(figures: dict[str, Any], *names: str) -> float:
     return float(value) if isinstance(value, int | float) else np.nan
 
 
-def _is_netem(process: str) -> bool:
-    """Whether a process is the netem of a path: `netem`, or `netem 2` and so on."""
-    return process.partition(" ")[0] == "netem"
+ENDS = "server", "client"
+"""Roles of processes that each flight has; a netem it may be without."""
 
 
 @dataclass(slots=True)
 class _Process:
     opened: Opened
+    role: str
+    """What it is: server, netem or client; several processes may be the same."""
     columns: dict[str, np.dtype[np.void]]
     newest_ns: int = 0
     seen_ns: int = -1
@@ -410,16 +416,16 @@ class State:
         known.newest_ns = max(known.newest_ns, frame.time_ns)
         self.newest_ns = max(self.newest_ns, frame.time_ns)
         if isinstance(frame, Rows):
-            self._rows(known, frame)
+            self._rows(process, known, frame)
         elif isinstance(frame, Said):
             self._said(process, frame.event, frame.time_ns)
         elif isinstance(frame, Figures):
             known.figures = frame.figures
-            if _is_netem(process):
+            if known.role == "netem":
                 queues = [
                     [told(each.figures, way, "queue") for way in each.opened.ways]
-                    for name, each in self._processes.items()
-                    if _is_netem(name)
+                    for each in self._processes.values()
+                    if each.role == "netem"
                 ]
                 self.network.wait(np.nan_to_num(queues).sum(axis=0), time_ns=frame.time_ns)
 
@@ -439,9 +445,10 @@ class State:
             raise FeedError(f"got no scenario: {error}") from None
         with suppress(ConfigError):  # a file named in the scenario is on another machine
             scenario = reading.check(reading.to_table(scenario))
-        if known and process == "client":
+        role = re.split("[ .]", opened.process)[0]
+        if known and role == "client" and not self._others_fly(process):
             self._begin()  # a new flight
-        if process == "client" or not self.name:
+        if role == "client" or not self.name:
             self.duration_s = scenario.duration
         if not self.name:
             self.flights += 1
@@ -456,9 +463,16 @@ class State:
                 found = columns_of(described)
                 check_columns(part, found, self.scenario)
                 columns[part] = found
-        self._processes[process] = _Process(opened, columns)
+        self._processes[process] = _Process(opened, role, columns)
 
-    def _rows(self, process: _Process, frame: Rows) -> None:
+    def _others_fly(self, client: str) -> bool:
+        """Whether another client than this process is heard: then the flight goes on."""
+        return any(
+            each.role == "client" and name != client and name not in self._lost
+            for name, each in self._processes.items()
+        )
+
+    def _rows(self, name: str, process: _Process, frame: Rows) -> None:
         columns = process.columns.get(frame.part)
         if columns is None:
             return
@@ -479,8 +493,10 @@ class State:
             own = rows[rows["vehicle"] == number]
             match frame.part:
                 case "client":
+                    track.client = name
                     track.fly(own)
                 case "server":
+                    track.server = name
                     track.plan(own)
                 case "plan":
                     track.lead(own)
@@ -511,7 +527,7 @@ class State:
         if event.key == ZONED:
             self._zones = msgspec.json.decode(event.after)
         marked, before = mark(event), self.changed.get((process, event.key))
-        netems = sum(map(_is_netem, self._processes))
+        netems = sum(each.role == "netem" for each in self._processes.values())
         if (
             self.changed
             and self.said[-1].text == together(self.changed, netems)
@@ -534,7 +550,7 @@ class State:
     @property
     def flies(self) -> bool:
         """Whether a vehicle or a server is known; netem alone may carry any protocol."""
-        return not all(map(_is_netem, self._processes))
+        return any(each.role != "netem" for each in self._processes.values())
 
     @property
     def ways(self) -> Ways:
@@ -582,7 +598,7 @@ class State:
 
     def waits(self, number: int) -> str:
         """Reason why a vehicle of a mission waits; empty if it does not."""
-        reason = group(self.figures("server"), "by_vehicle", str(number)).get("waits", "")
+        reason = self.of_vehicle("server", number).get("waits", "")
         return reason if isinstance(reason, str) else ""
 
     def clock(self, number: int) -> tuple[float, float]:
@@ -590,7 +606,7 @@ class State:
 
         NaN if the server reports neither.
         """
-        figures = group(self.figures("server"), "by_vehicle", str(number))
+        figures = self.of_vehicle("server", number)
         return told(figures, "clock_bound_ms"), told(figures, "clock_m")
 
     def paths(self, number: int) -> list[tuple[dict[str, Any], dict[str, Any]]]:
@@ -598,10 +614,7 @@ class State:
         a single path.
         """
         nothing: dict[str, Any] = {}
-        up, down = (
-            group(self.figures(process), "by_vehicle", str(number)).get("paths")
-            for process in ("server", "client")
-        )
+        up, down = (self.of_vehicle(role, number).get("paths") for role in ("server", "client"))
         known = zip_longest(_groups(up), _groups(down), fillvalue=nothing)
         return list(known)[:PATHS_MAX]
 
@@ -625,9 +638,40 @@ class State:
     def lost(self) -> tuple[str, ...]:
         return tuple(sorted(self._lost))
 
-    def figures(self, process: str) -> dict[str, Any]:
+    @property
+    def missing(self) -> tuple[str, ...]:
+        """What a flight has and nobody tells of: roles, and vehicles that only a server knows."""
+        if not self.flies:
+            return ()
+        roles = {each.role for each in self._processes.values()}
+        absent = [f"a {role}" for role in ENDS if role not in roles]
+        if "client" in roles:
+            silent = [number for number, each in self.vehicles.items() if not each.client]
+            absent += [f"vehicle {number}'s client" for number in sorted(silent)]
+        return tuple(absent)
+
+    def role(self, process: str) -> str:
+        """What a process is: server, netem or client; empty before its feed has begun."""
         known = self._processes.get(process)
-        return known.figures if known else {}
+        return known.role if known else ""
+
+    def figures(self, role: str) -> dict[str, Any]:
+        """Figures of the first process of a role that tells any; empty without one."""
+        known = (each.figures for each in self._processes.values() if each.role == role)
+        return next(filter(None, known), {})
+
+    def of_vehicle(self, role: str, number: int) -> dict[str, Any]:
+        """Figures of a vehicle by its client, or by the server that plans for it; or else by any
+        process of the role that tells them.
+        """
+        track = self.vehicles.get(number)
+        own = {"client": track.client, "server": track.server}.get(role) if track else None
+        told_ = {
+            name: group(each.figures, "by_vehicle", str(number))
+            for name, each in self._processes.items()
+            if each.role == role
+        }
+        return told_.get(own or "") or next(filter(None, told_.values()), {})
 
     @property
     def every_step(self) -> float:
@@ -661,7 +705,8 @@ class State:
         """State of a vehicle's link, in words."""
         track = self.vehicles.get(number)
         if track is None or track.row is None or track.mode is Mode.INIT:
-            return Word("NONE", "there is no session yet", GREY)
+            known = track is not None and track.server and not track.client
+            return Word("UNKNOWN", ONLY_SERVER, GREY) if known else Word("NONE", NO_SESSION, GREY)
         for direction, name in DIRECTIONS.items():
             heard_ns = self.network.heard_ns.get(direction)
             if heard_ns is not None and now_ns - heard_ns > self._silence_ns[direction]:

@@ -151,8 +151,8 @@ def _table(rows: Sequence[Sequence[str]]) -> str:
 
 
 def _gone(state: State) -> str:
-    names = ", ".join(state.lost)
-    return f'<div style="color:{CSS["red"]}">no feed of {names}</div>' if names else ""
+    names = ", ".join((*state.lost, *state.missing))
+    return f'<div style="color:{CSS["red"]}">no feed of {escape(names)}</div>' if names else ""
 
 
 def _newest(state: State) -> str:
@@ -176,7 +176,7 @@ def _link(state: State, vehicle: int, now_ns: int) -> Word:
 
 def _leader(state: State, vehicle: int) -> list[tuple[str, str]]:
     """Row with the server that leads, if there is a standby server."""
-    leadership = group(state.figures("client"), "by_vehicle", str(vehicle), "leadership")
+    leadership = group(state.of_vehicle("client", vehicle), "leadership")
     if not leadership:
         return []
     number_ = number(told(leadership, "number"), ".0f")
@@ -205,7 +205,7 @@ def _mission(state: State, vehicle: int) -> list[tuple[str, str]]:
 
 
 def _autopilot(state: State, vehicle: int) -> list[tuple[str, str]]:
-    says = group(state.figures("client"), "by_vehicle", str(vehicle), "autopilot")
+    says = group(state.of_vehicle("client", vehicle), "autopilot")
     if "mode" not in says:  # a robot has none of these
         return []
     armed = "armed" if says.get("armed") else "disarmed"

@@ -9,7 +9,7 @@ import sys
 import tempfile
 from collections import Counter, defaultdict
 from collections.abc import AsyncIterator, Callable, Iterator
-from contextlib import asynccontextmanager, closing, suppress
+from contextlib import AsyncExitStack, asynccontextmanager, closing, suppress
 from pathlib import Path
 from typing import Any
 
@@ -57,6 +57,7 @@ from skytether.shell.feed import (
 )
 from skytether.shell.local import LocalError
 from skytether.sim import flight
+from skytether.view.browser import serve
 from virtual_loop import virtually
 
 DEMO = reading.load("demo")
@@ -486,10 +487,13 @@ class Seen:
         self.lost[name] += 1
 
     @asynccontextmanager
-    async def reading(self, **paths: Path) -> AsyncIterator[None]:
+    async def reading(
+        self, further: Callable[[], dict[str, Path]] | None = None, **paths: Path
+    ) -> AsyncIterator[None]:
         """Read feeds as `Subscriber` does, without its thread."""
         subscriber = Subscriber.__new__(Subscriber)
         subscriber._take, subscriber._lost, subscriber._closed = self.take, self.lose, False
+        subscriber._further = further
         task = asyncio.create_task(subscriber._read_all(paths))
         yield
         task.cancel()
@@ -578,6 +582,29 @@ async def test_a_subscriber_begins_anew_where_a_process_does(tmp_path: Path) -> 
                 await once(lambda life=life: seen.lost["netem"] == life)  # type: ignore[misc]
             path.unlink(missing_ok=True)
     assert seen.frames["netem"] == [OPENED, OPENED]
+
+
+@virtually
+async def test_a_subscriber_finds_feeds_that_begin_later(tmp_path: Path) -> None:
+    """Of clients that are processes of their own, each once, beside those that it was given."""
+    seen, writers = Seen(), list[asyncio.StreamWriter]()
+
+    async def tell(_: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        writers.append(writer)
+        writer.write(LIVES[0])
+        await writer.drain()
+
+    async with AsyncExitStack() as listening:
+        async with seen.reading(lambda: serve.feeds(tmp_path), netem=tmp_path / "netem.feed"):
+            for name in ("netem.feed", "client-3.feed", "server.feed.2", "client 2.feed", "other"):
+                server = await asyncio.start_unix_server(tell, tmp_path / name)
+                await listening.enter_async_context(server)
+                await asyncio.sleep(3.0)
+        for writer in writers:
+            writer.close()
+    names = "netem", "client-3", "server.2", "client 2"
+    assert seen.frames == {name: [OPENED] for name in names}
+    assert len(writers) == len(names)
 
 
 @pytest.mark.realtime

@@ -45,7 +45,7 @@ from skytether.view.controls import (
 from skytether.view.frames import of_flight
 from skytether.view.report import with_gaps
 from skytether.view.scene import extent, fence, grid, home, quadrotor, segments
-from skytether.view.state import Curves, State
+from skytether.view.state import Curves, State, VehicleTrack
 
 HERE = {"Host": "127.0.0.1:8080", "Origin": "http://127.0.0.1:8080"}
 
@@ -231,6 +231,35 @@ def test_the_newest_change_is_taken_back() -> None:
     disarmed = Changed(key="armed", before="true", after="false")
     flight.take("client", Said(time_ns=after_ns + 2, event=disarmed))
     assert not flight.undoable
+
+
+def test_a_change_goes_to_all_clients_or_to_that_of_the_chosen_vehicle() -> None:
+    flight, asked = flown(), list[tuple[str, dict[str, Any]]]()
+    client = next(process for process in flight.state._processes if process == "client")
+    for name in ("client-2", "server 2"):
+        opened = flight.state._processes[name.rstrip(" -2")].opened
+        flight.take(name, msgspec.structs.replace(opened, time_ns=7))
+    flight.state.vehicles[2] = VehicleTrack(2, flight.state.scenario)
+    flight.state.vehicles[2].client = "client-2"
+    flight.operator = mock.Mock(ask=lambda *request: asked.append(request))
+    values = {"armed": True, "vehicle.wind": 0.1}
+    flight.values = {"netem": NETWORK, client: values, "client-2": values}
+    trigger = {"control.trigger": "always"}
+    flight.values |= {"server": trigger, "server 2": trigger}
+    gui = Gui()
+    panel.Controls(mock.Mock(gui=gui), [flight], lambda: 2)
+    for label, value, answering in (
+        ("Wind [m/s per √s]", 0.3, ["client", "client-2"]),
+        ("Trigger", "periodic", ["server", "server 2"]),
+        ("Armed", True, ["client-2"]),
+    ):
+        asked.clear()
+        gui.elements[label].use(value)
+        assert [process for process, _ in asked] == answering
+    flight.lose("server")
+    asked.clear()
+    gui.elements["Trigger"].use("always")
+    assert [process for process, _ in asked] == ["server 2"]
 
 
 def test_a_refused_number_is_told_at_its_field_and_not_sent() -> None:

@@ -457,6 +457,77 @@ def test_a_mission_s_motions_that_may_be_flown_are_shown() -> None:
         assert len(track.motions()) == shown
 
 
+def apart(*names: str, vehicles: int = 3) -> State:
+    """State of a flight whose vehicles have clients of their own, with feeds of these names."""
+    shown = demo(vehicles=vehicles, duration_s=3.0)
+    clients = dict(enumerate((name for name in names if name.startswith("client")), start=1))
+    state = State()
+    for _, process, frame in shown.frames:
+        if process != "client" and process in names:
+            state.take(process, frame)
+        for number, name in clients.items() if process == "client" else ():
+            if isinstance(frame, Opened):
+                state.take(name, msgspec.structs.replace(frame, time_ns=number))
+            elif isinstance(frame, Rows):
+                rows = np.frombuffer(frame.rows, client_columns(2))
+                own = rows[rows["vehicle"] == number].tobytes()
+                state.take(name, msgspec.structs.replace(frame, rows=own))
+    return state
+
+
+def test_vehicles_with_clients_of_their_own_are_all_shown() -> None:
+    state = apart("server", "netem", "client-1", "client-2", "client-3")
+    assert not state.missing
+    assert {number: each.client for number, each in state.vehicles.items()} == {
+        number: f"client-{number}" for number in (1, 2, 3)
+    }
+    now_ns = demo(vehicles=3, duration_s=3.0).now_ns
+    assert {state.link(number, now_ns).word for number in (1, 2, 3)} == {"GOOD"}
+    for name, armed in (("client-1", 1), ("client-3", 0)):
+        number = name.rpartition("-")[2]
+        told = {"by_vehicle": {number: {"autopilot": {"mode": name, "armed": armed}}}}
+        state.take(name, Figures(time_ns=now_ns, figures=told))
+    assert "client-3, disarmed" in words.figures(state, 3, now_ns)
+    assert "client-1, armed" in words.figures(state, 1, now_ns)
+    assert "autopilot" not in words.figures(state, 2, now_ns)
+
+
+def test_one_of_several_clients_that_begins_anew_is_no_new_flight() -> None:
+    state = apart("server", "netem", "client-1", "client-2", "client-3")
+    again = msgspec.structs.replace(opened("client", {"client": client_columns(2)}), time_ns=10**12)
+    state.lose("client-2")
+    state.take("client-2", again)
+    assert (state.flights, sorted(state.vehicles)) == (1, [1, 2, 3])
+    state.lose("client-1")
+    state.lose("client-3")
+    state.take("client-2", msgspec.structs.replace(again, time_ns=10**12 + 1))
+    assert (state.flights, sorted(state.vehicles)) == (2, [])
+
+
+def test_what_nobody_tells_of_is_named() -> None:
+    now_ns = demo(vehicles=3, duration_s=3.0).now_ns
+    state = apart("server", "netem", "client-1", "client-2")
+    assert state.missing == ("vehicle 3's client",)
+    assert "vehicle 3&#x27;s client" in words.status(state, 1, now_ns)
+    assert state.link(3, now_ns).word == "UNKNOWN"
+    assert apart("server", "netem").missing == ("a client",)
+    assert apart("client-1", "netem").missing == ("a server",)
+    assert not apart("netem").missing
+    assert "no feed" not in words.status(demo().state, 1, demo().now_ns)
+
+
+def test_figures_are_those_of_the_server_that_plans() -> None:
+    state = state_of(brief().frames)
+    plans = [frame for _, process, frame in brief().frames if process == "server"]
+    for name, waits in (("server", "the old one"), ("server 2", "the new one")):
+        if name == "server 2":
+            for frame in plans:
+                state.take(name, frame)
+        told = {"by_vehicle": {"1": {"waits": waits}}}
+        state.take(name, Figures(time_ns=state.newest_ns + 1, figures=told))
+    assert state.waits(1) == "the new one"
+
+
 def test_what_comes_again_counts_once() -> None:
     """A feed repeats its newest frames to a new reader."""
     shown = demo()

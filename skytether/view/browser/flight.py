@@ -57,12 +57,14 @@ class PageFlight:
             # Of the process before: they would change the new one's keys to what was once asked.
             self.values.pop(process, None)
             self._before.pop(process, None)
-        if process in PROCESSES and (changed or isinstance(frame, Opened)):
+        is_asked = process in PROCESSES or self.state.role(process) == "client"
+        if is_asked and (changed or isinstance(frame, Opened)):
             self.ask(process, {})
 
     def lose(self, process: str) -> None:
         with self.lock:
             self.state.lose(process)
+        self.values.pop(process, None)
 
     @property
     def waits(self) -> str:
@@ -110,6 +112,22 @@ class PageFlight:
             before.setdefault(process, {})[key] = msgspec.json.decode(event.before)
         for process, values in before.items():
             self.ask(process, values)
+
+    def processes(self, role: str) -> list[str]:
+        """Processes of a role that have answered; its own name if none has."""
+        return [each for each in self.values if self._role(each) == role] or [role]
+
+    def of_role(self, role: str) -> dict[str, Any]:
+        """Values of the first process of a role; empty if none has answered."""
+        return self.values.get(self.processes(role)[0], {})
+
+    def client(self, vehicle: int) -> str:
+        """Client that flies a vehicle."""
+        track = self.state.vehicles.get(vehicle)
+        return (track.client if track else "") or self.processes("client")[0]
+
+    def _role(self, process: str) -> str:
+        return self.state.role(process) or process.partition(" ")[0]
 
     @property
     def netems(self) -> list[str]:

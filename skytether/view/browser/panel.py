@@ -442,7 +442,7 @@ class Controls:
             netem: _Network(
                 gui,
                 number,
-                partial(self._all, netem),
+                partial(self._path, netem),
                 partial(self._cut_alone, netem),
                 partial(self._heal_all, (netem,)),
                 labels,
@@ -505,13 +505,13 @@ class Controls:
 
         @self._after_leap.on_click
         async def _(_: Any) -> None:
-            self._all("client", {"vehicle.after_leap": self._after_leap.value})
+            self._chosen({"vehicle.after_leap": self._after_leap.value})
 
         @self._armed.on_update
         async def _(event: Any) -> None:
             if event.client is None:
                 return
-            arm = partial(self._all, "client", {"armed": self._armed.value})
+            arm = partial(self._chosen, {"armed": self._armed.value})
             if self._armed.value:
                 arm()
             else:
@@ -538,15 +538,25 @@ class Controls:
         for flight in self._flights:
             flight.undo()
 
-    def _all(self, process: str, values: dict[str, Any]) -> None:
+    def _all(self, role: str, values: dict[str, Any]) -> None:
         for flight in self._flights:
-            flight.ask(process, values)
+            for process in flight.processes(role):
+                flight.ask(process, values)
+
+    def _path(self, netem: str, values: dict[str, Any]) -> None:
+        for flight in self._flights:
+            flight.ask(netem, values)
+
+    def _chosen(self, values: dict[str, Any]) -> None:
+        """Ask the client of the chosen vehicle."""
+        for flight in self._flights:
+            flight.ask(flight.client(self._vehicle()), values)
 
     def _ask(self, knob: Knob, number: float) -> Collection[str]:
         """Ask for a number; returns the keys asked for."""
         keys: set[str] = set()
         for flight in self._flights:
-            for process in flight.netems if knob.process == "netem" else (knob.process,):
+            for process in flight.processes(knob.process):
                 values = flight.values.get(process, {})
                 if knob.read(values) is None:
                     continue
@@ -563,8 +573,7 @@ class Controls:
         for netem, network in self._networks.items():
             network.show(flight.values.get(netem, {}), is_alone=len(flight.netems) < 2)
         for slider in self._sliders:
-            values = flight.values.get(slider.knob.process, {})
-            slider.show(values)
+            slider.show(flight.of_role(slider.knob.process))
         if flight.state.flies:
             self._show_flight(flight)
         is_cut_off = bool(flight.netems) and flight.cuts == flight.netems
@@ -586,17 +595,17 @@ class Controls:
             yield self._mission.note
 
     def _show_flight(self, flight: PageFlight) -> None:
-        server = flight.values.get("server", {})
+        server = flight.of_role("server")
         trigger = server.get("control.trigger", self._trigger.value)
         if trigger != self._trigger.value:
             scheme = flight.state.scenario.control.scheme
             self._trigger.options = triggers(scheme, trigger)
             assign(self._trigger, trigger)
-        armed = flight.values.get("client", {}).get("armed", self._armed.value)
+        values = flight.values.get(flight.client(self._vehicle()), {})
+        armed = values.get("armed", self._armed.value)
         if armed != self._armed.value:
             assign(self._armed, armed)
         flies_real = flight.state.scenario.vehicle.kind in ("mavlink", "ros2")
-        values = flight.values.get("client", {})
         self._after_leap.visible = flies_real and "vehicle.after_leap" in values
         if self._lead:
             self._lead.show()
@@ -657,7 +666,7 @@ class _Mission:
 
     def _guide(self, place: NDArray[Any]) -> None:
         """Set the chosen vehicle's goal [m; shape (axes,) at least]."""
-        values = self._flight.values.get("server", {})
+        values = self._flight.of_role("server")
         goals = parse_goals(values.get(GUIDED, ""), self._axes)
         goals[self._vehicle()] = np.round(place[: self._axes], 2)
         self._ask({GUIDED: format_goals(goals)})
@@ -751,7 +760,9 @@ class _Lead:
 
     def _move(self, place: NDArray[Any]) -> None:
         for flight in self._flights:
-            flight.ask("server", {LED: [np.round(place[: self._axes], 3).tolist()]})
+            flight.ask(
+                flight.processes("server")[0], {LED: [np.round(place[: self._axes], 3).tolist()]}
+            )
 
     def show(self) -> None:
         for track in list(self._flights[0].state.vehicles.values())[:1]:

@@ -33,9 +33,15 @@ def followed(folder: Path, title: str = "") -> Iterator[PageFlight]:
     """Follow a flight whose processes have their feeds and control sockets in a folder."""
     flight = PageFlight(title, folder)
     paths = {name: folder / f"{name}.feed" for name in PROCESSES}
-    paths |= {each.name.replace(".feed", ""): each for each in folder.glob("*.feed.*")}
-    with closing(flight), closing(Subscriber(paths, flight.take, flight.lose)):
+    follows = Subscriber(paths, flight.take, flight.lose, lambda: feeds(folder))
+    with closing(flight), closing(follows):
         yield flight
+
+
+def feeds(folder: Path) -> dict[str, Path]:
+    """Feeds in a folder by their processes' names: of several clients, workers and servers."""
+    found = sorted({*folder.glob("*.feed"), *folder.glob("*.feed.*")})
+    return {each.name.replace(".feed", "", 1): each for each in found}
 
 
 @contextmanager
