@@ -23,9 +23,13 @@ def settings(unit: Path) -> dict[str, str]:
     return dict(re.findall(r"^(\w+)=(.*)$", text, re.MULTILINE))
 
 
-def started(unit: Path, name: str) -> list[str]:
+ONE, TWO = re.findall(r"^# LINKS=(.*)$", CLIENT.read_text(), re.MULTILINE)
+
+
+def started(unit: Path, name: str, links: str = ONE) -> list[str]:
     """Arguments of the command that a unit starts, with an existing scenario."""
-    words = shlex.split(settings(unit)["ExecStart"].replace("%i", "1"))
+    text = settings(unit)["ExecStart"].replace("%i", "1").replace("$LINKS", links)
+    words = shlex.split(text)
     assert words[:3] == [BINARY, name, "/etc/skytether/field.toml"]
     return ["demo", *words[3:]]
 
@@ -42,6 +46,12 @@ def test_the_client_starts_unarmed_and_as_a_flight_that_goes_on() -> None:
     assert unit["RuntimeDirectory"] == "skytether-%i"
     assert unit["RuntimeDirectoryPreserve"] == "restart"
     assert unit["StateDirectory"] == "skytether"
+
+
+def test_the_client_takes_several_links_and_a_standby_server() -> None:
+    options = command.parse(ClientOptions(), started(CLIENT, "client", TWO), "client", "")
+    assert options.path == ("wwan0=lab.example.org:47001", "wwan1=lab.example.org:47001")
+    assert options.standby == ("other.example.org:47001",)
 
 
 def test_the_server_keeps_what_was_set_where_it_outlives_the_computer() -> None:

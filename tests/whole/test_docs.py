@@ -53,7 +53,7 @@ ELSEWHERE = {
 
 
 LISTS = ("scenarios", "impairments")
-TABLES = {"field.toml", "mine.toml", "robot.toml"}
+TABLES = {"field.toml", "mine.toml", "mission.toml", "robot.toml"}
 """Scenarios that documents show in parts, and name in commands."""
 
 
@@ -210,6 +210,38 @@ def test_the_documented_robot_is_driven(tmp_path: Path) -> None:
     speeds = [math.hypot(*robot.twist(message)[:2]) for _, message in robot.heard]
     assert 0.0 < max(speeds) < 1.0
     assert speeds[-3:] == [0.0] * 3
+
+
+@at_night_over_udp
+def test_the_documented_mission_outlives_a_path_and_a_server(tmp_path: Path) -> None:
+    """The netem of a path ends, then the leading server is killed; the report says who arrived."""
+    document = ROOT / "docs" / "mission.md"
+    (table,) = re.findall(r"```toml\n(.*?)```", document.read_text(), re.DOTALL)
+    (tmp_path / "mission.toml").write_text(table)
+    (tmp_path / "air").mkdir()
+    (keygen, *lines, page), (joined, reported) = blocks(document)
+    assert ran(*skytether(keygen), cwd=tmp_path).returncode == 0
+    quiet: dict[str, Any] = {"cwd": tmp_path, "stdout": subprocess.DEVNULL}
+    with ExitStack() as stack:
+        started = {
+            line: stack.enter_context(subprocess.Popen(skytether(line), **quiet)) for line in lines
+        }
+        leader, standby, _, lte, *_ = started.values()
+        vehicles = [each for line, each in started.items() if "client" in line]
+        shown = stack.enter_context(subprocess.Popen(skytether(page), **quiet))
+        try:
+            for process in (lte, leader):
+                time.sleep(15.0)
+                process.kill() if process is leader else process.terminate()
+            assert [each.wait(120.0) for each in vehicles] == [0] * len(vehicles)
+        finally:
+            for process in (shown, *started.values()):
+                process.terminate()
+    assert shown.returncode == standby.returncode == 0
+    for line in (joined, reported):
+        run = ran(*skytether(line), cwd=tmp_path)
+        assert run.returncode == 0, run.stderr
+    assert "4 of 4 vehicles arrived" in (tmp_path / "flight.html").read_text()
 
 
 def fly_together(lines: list[str], folder: Path) -> str:
