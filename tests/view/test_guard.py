@@ -326,6 +326,8 @@ async def test_browsers_beyond_the_most_are_turned_away() -> None:
         patch.setattr(guard, "BROWSERS_MAX", 1)
         async with Guarded().served() as page, page.joined() as first:
             assert await first.recv()
+            await send(first, **CAMERA)
+            await once(lambda: page.heard)
             async with page.joined() as second:
                 with pytest.raises(ConnectionClosed) as closed:
                     await second.recv()
@@ -339,6 +341,36 @@ async def test_browsers_beyond_the_most_are_turned_away() -> None:
             writer.close()
             assert page.counts == {TurnedAway.FULL: 2}
             await (await first.ping())
+
+
+@virtually
+async def test_idle_connections_make_room_and_browsers_in_use_stay() -> None:
+    """Two hundred connections that send nothing, or open a websocket and say nothing over it."""
+    async with Guarded().served() as page, page.joined() as user:
+        await send(user, **CAMERA)
+        await once(lambda: page.heard)
+        writers = []
+        for number in range(200):
+            _, writer = await asyncio.open_connection("127.0.0.1", page.port)
+            writers.append(writer)
+            if number % 4 == 0:
+                writers[-1].write(b"GET / HTTP/1.1\r\n")
+        reader, writer = await asyncio.open_connection("127.0.0.1", page.port)
+        writer.write(b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")
+        assert (await reader.readuntil(b"\r\n")).split()[1] == b"200"
+        mute = [await page.opened() for _ in range(guard.BROWSERS_MAX + 4)]
+        async with page.joined() as newcomer:
+            assert await newcomer.recv()
+            await send(newcomer, **CAMERA)
+            await once(lambda: len(page.heard) == 2)
+        await (await user.ping())
+        await once(lambda: page.guard.connections <= guard.CONNECTIONS_MAX)
+        assert page.guard.browsers <= guard.BROWSERS_MAX
+        assert page.counts.keys() == {TurnedAway.IDLE}
+        for each in (writer, *writers, *mute):
+            each.close()
+    await once(lambda: not page.guard.connections)
+    assert not page.guard.idle
 
 
 @virtually

@@ -24,6 +24,7 @@ class TurnedAway(Enum):
     HOST = "a browser used a name as address; expected a number, localhost, or the token"
     VERSION = "a browser has a page of another version open"
     FULL = "there are too many browsers"
+    IDLE = "a connection that has sent nothing made room for another"
     MESSAGE = "a browser has sent a message that the page does not accept"
     ROOM = "a browser has sent more than the page can queue"
     PANEL = "a browser has sent an invalid value"

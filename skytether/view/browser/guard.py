@@ -5,6 +5,7 @@ on the internet, values of any attribute. `Guard.served` makes it listen with th
 
 - no answer may be shown in a website's frame; the page itself gets our style and script (`DRESS`);
 - a websocket is opened only for browsers that may look (`access.refusal`), up to BROWSERS_MAX;
+- connections that have sent no message yet make room for newcomers, the longest silent first;
 - only messages that our page sends (`MESSAGES`) are accepted, of at most 64 KiB in 64 pieces;
 - at most `RATE_HZ` messages a second are read; more of them wait in the browser's kernel;
 - a browser that does not read gets nothing more; it is disconnected after 40 s, because it does not
@@ -98,6 +99,8 @@ class Guard:
         self.counts: Counter[TurnedAway] = Counter()
         self.connections = 0
         self.browsers = 0
+        self.idle: dict[_Connection, None] = {}
+        """Connections without an accepted message, the longest silent first."""
         self._news: set[TurnedAway] = set()
         self._lock = threading.Lock()
 
@@ -174,7 +177,7 @@ class Guard:
         if connection.subprotocol != PROTOCOL:
             self.count(TurnedAway.VERSION)
             await connection.close(CloseCode.PROTOCOL_ERROR, f"Version mismatch: {PROTOCOL}")
-        elif self.browsers >= BROWSERS_MAX:
+        elif self.browsers >= BROWSERS_MAX and not self._make_room(connection, opened=True):
             self.count(TurnedAway.FULL)
             await connection.close(CloseCode.TRY_AGAIN_LATER, str(TurnedAway.FULL))
         else:
@@ -185,6 +188,25 @@ class Guard:
                 self.count(TurnedAway.MESSAGE)
             finally:
                 self.browsers -= 1
+
+    def arrive(self, newcomer: "_Connection") -> None:
+        """Count a connection; if there are too many, end the longest silent one, or this one."""
+        self.connections += 1
+        self.idle[newcomer] = None
+        if self.connections > CONNECTIONS_MAX and not self._make_room(newcomer):
+            newcomer.cut(TurnedAway.FULL)
+
+    def _make_room(self, newcomer: sockets.ServerConnection, *, opened: bool = False) -> bool:
+        """End the longest silent connection but the newcomer; returns whether there is one.
+
+        Args:
+            opened: whether it must be a websocket.
+        """
+        for each in self.idle:
+            if each is not newcomer and (each.subprotocol or not opened):
+                each.cut(TurnedAway.IDLE)
+                return True
+        return False
 
     def _fault(self, _: asyncio.AbstractEventLoop, __: dict[str, Any]) -> None:
         """Count a message that made one of viser's handlers fail."""
@@ -204,23 +226,25 @@ class _Connection(sockets.ServerConnection):
         super().connection_made(transport)
         # Otherwise the kernel would buffer 4 MB for a browser that does not read.
         transport.get_extra_info("socket").setsockopt(SOL_SOCKET, SO_SNDBUF, UNREAD_BYTES)
-        self._guard.connections += 1
-        if self._guard.connections > CONNECTIONS_MAX:
-            self._cut(TurnedAway.FULL)
+        self._guard.arrive(self)
 
     def connection_lost(self, exc: Exception | None) -> None:
         self._guard.connections -= 1
+        self._guard.idle.pop(self, None)
         super().connection_lost(exc)
 
     def data_received(self, data: bytes) -> None:
         super().data_received(data)
+        if self in self._guard.idle:
+            del self._guard.idle[self]
+            self._guard.idle[self] = None  # at the end
         if len(self.recv_messages.frames) > FRAMES_MAX:
-            self._cut(TurnedAway.ROOM)
+            self.cut(TurnedAway.ROOM)
 
     def process_event(self, event: Any) -> None:
         """End a connection that sends pings without reading the answers, which would queue up."""
         if isinstance(event, Frame) and event.opcode is Opcode.PING and self.paused:
-            self._cut(TurnedAway.ROOM)
+            self.cut(TurnedAway.ROOM)
         super().process_event(event)
 
     async def recv(self, decode: bool | None = None) -> Any:  # noqa: ARG002 - viser's are bytes
@@ -234,9 +258,10 @@ class _Connection(sockets.ServerConnection):
             async for piece in self._pieces():
                 pieces.append(piece)
                 if len(pieces) == PIECES_MAX:
-                    self._cut(TurnedAway.ROOM)
+                    self.cut(TurnedAway.ROOM)
             await self._wait_for_its_turn()
             if is_taken(message := b"".join(pieces)):
+                self._guard.idle.pop(self, None)
                 return message
             self._guard.count(TurnedAway.MESSAGE)
         # Reading the rest of a flood would take minutes, and keep another browser out.
@@ -252,8 +277,9 @@ class _Connection(sockets.ServerConnection):
         if self._due_s > now_s:
             await asyncio.sleep(self._due_s - now_s)
 
-    def _cut(self, why: TurnedAway) -> None:
+    def cut(self, why: TurnedAway) -> None:
         self._guard.count(why)
+        self._guard.idle.pop(self, None)
         self._is_cut = True
         self.transport.abort()
 
