@@ -457,6 +457,13 @@ def test_a_ulog_of_too_many_messages_is_refused(monkeypatch: pytest.MonkeyPatch)
     assert "at most 50 messages" in refusal(px4(*own))
 
 
+def test_a_damaged_ulog_is_refused_in_bounded_time() -> None:
+    """pyulog goes back by the length of a message that the file does not have."""
+    whole = px4()
+    definitions = whole[: whole.index(b"\0\0\0vehicle_global") - 3]
+    assert "ULog" in refusal(definitions + pack("<HB", 120, 0) + b"short")
+
+
 def test_the_extra_of_a_ulog_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pyulog", None)
     with pytest.raises(ExtraMissing, match=r"'skytether\[ulog\]'"):

@@ -19,8 +19,9 @@ from skytether.shared.scenario.formats.timing import Line, together
 from skytether.shared.scenario.geographic import Origin, above_sea
 
 GLOBAL, LOCAL, HOME = "vehicle_global_position", "vehicle_local_position", "home_position"
-READS_MAX = 4_000_000
-"""Largest number of reads from a log: two a message, and more where its bytes are no messages."""
+READS_MAX, READS_LEAST, MESSAGE_BYTES = 4_000_000, 1000, 8
+"""Largest number of reads from a log, and bounds for a short one: two reads a message of at least so
+many bytes. In some damaged logs pyulog seeks back for ever."""
 
 
 class _Content(io.BytesIO):
@@ -28,7 +29,7 @@ class _Content(io.BytesIO):
 
     def __init__(self, content: bytes) -> None:
         super().__init__(content)
-        self._left = READS_MAX
+        self._left = min(READS_MAX, READS_LEAST + 2 * len(content) // MESSAGE_BYTES)
 
     def read(self, size: int | None = -1, /) -> bytes:
         self._left -= 1
@@ -76,7 +77,8 @@ def _messages(content: bytes) -> dict[str, Any]:
         with contextlib.redirect_stdout(io.StringIO()):  # it prints what it skips
             log = ULog(_Content(content), [GLOBAL, LOCAL, HOME])
     except EOFError:
-        raise ValueError(f"expected a ULog of at most {READS_MAX // 2} messages") from None
+        most = f"of at most {READS_MAX // 2} messages"
+        raise ValueError(f"expected a ULog {most}, or one without damage") from None
     except Exception as error:  # it raises many kinds
         raise ValueError(f"expected a ULog ({type(error).__name__}: {error})") from None
     return {
