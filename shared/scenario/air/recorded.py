@@ -23,12 +23,13 @@ import numpy as np
 from skytether.shared.law.model import Array, Flags
 from skytether.shared.scenario.air import pings
 from skytether.shared.scenario.air.pings import BACK_MAX_S, ROWS_MAX
-from skytether.shared.scenario.bounded import COLUMNS_MAX
 from skytether.shared.scenario.registry import File
 
 DELAY_MAX_S = 3600.0
 TEXT_BYTES_MAX = 256 * 1024 * 1024
 """Largest size of a file after decompression [B]."""
+CELLS_MAX = 2_000_000
+"""Largest number of columns, which bounds the memory for a line."""
 TIE_S = 1e-6
 """Difference of times up to which two packets count as sent at the same time [s]."""
 
@@ -137,8 +138,8 @@ def table(text: str, columns: Sequence[int], delimiter: str = ",") -> Array:
     body = text.split("\n", 1)[1] if "\n" in text else ""
     if not body.strip():
         raise ValueError("got no rows, expected at least one below its first line")
-    if any(line.count(delimiter) >= COLUMNS_MAX for line in StringIO(body)):
-        raise ValueError(f"expected at most {COLUMNS_MAX} columns")
+    if any(line.count(delimiter) >= CELLS_MAX for line in StringIO(body)):
+        raise ValueError(f"expected at most {CELLS_MAX} columns")
     try:
         return np.loadtxt(
             StringIO(body),

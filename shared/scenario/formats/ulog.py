@@ -20,8 +20,8 @@ from skytether.shared.scenario.geographic import Origin, above_sea
 
 GLOBAL, LOCAL, HOME = "vehicle_global_position", "vehicle_local_position", "home_position"
 READS_MAX, READS_LEAST, MESSAGE_BYTES = 4_000_000, 1000, 8
-"""Largest number of reads from a log, and bounds for a short one: two reads a message of at least so
-many bytes. In some damaged logs pyulog seeks back for ever."""
+"""Largest number of reads from a log, and bounds for a short one: two reads a message of at least
+so many bytes. In some damaged logs pyulog seeks back for ever."""
 
 
 class _Content(io.BytesIO):
