@@ -375,8 +375,8 @@ class Ros2Config(Section, frozen=True):
     command: OfVehicle[TopicName] = "/cmd_vel"
     """Topic on which velocities are commanded."""
     stamped: OfVehicle[bool | Literal["auto"]] = "auto"
-    """Whether commands are geometry_msgs/TwistStamped; otherwise Twist. auto: what the subscriber of
-    `command` takes."""
+    """Whether commands are geometry_msgs/TwistStamped; otherwise Twist. auto: what the subscriber
+    of `command` takes."""
     drive: OfVehicle[Literal["holonomic", "differential", "fixed"]] = "holonomic"
     """Way in which the robot is commanded: any velocity in its own frame; forwards and a turn; or
     any velocity in the fixed frame of its odometry."""
