@@ -56,8 +56,8 @@ ZONED, GUIDED = "mission.zones", "mission.goals"
 PLANS_MAX = 8
 """Number of plans of a vehicle that are kept, retransmissions included."""
 SAID_MAX = 50
-FOLDED = 3
-"""Number of newest events among which one with the same words is counted, not repeated."""
+FOLDED_S = 10.0
+"""Age of an event up to which one with the same words is counted, not repeated [s]."""
 AT_ONCE_S = 2.0
 """Time within which changes of one key, as a slider is dragged, are one change [s]."""
 LED = "reference.points_m"
@@ -516,8 +516,8 @@ class State:
                 self._change(process, event, time_s)
             return
         text, count = str(event).splitlines()[0], 1
-        for heard in list(self.said)[-FOLDED:]:
-            if heard.text == text:
+        for heard in list(self.said):
+            if heard.text == text and time_s - heard.time_s < FOLDED_S:
                 self.said.remove(heard)
                 count += heard.count
         self.said.append(Heard(time_s, text, count))

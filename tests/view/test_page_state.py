@@ -373,6 +373,8 @@ def test_events_that_repeat_are_counted_and_leave_room_for_others() -> None:
     assert [each.count for each in state.said] == [1, 5, 5]
     assert state.said[-1].time_s - state.said[0].time_s == pytest.approx(10.0)
     assert "×5" in words.said([("", state)])
+    apart_ = changing((0.0, "client", brakes), (100.0, "client", brakes))
+    assert [each.count for each in apart_.said] == [1, 1]
 
 
 def test_an_autopilot_s_mode_battery_and_home_are_shown_where_they_are_told() -> None:
