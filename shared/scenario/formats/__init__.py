@@ -42,7 +42,7 @@ class Format(Protocol):
 
 def _has(name: str) -> Callable[[bytes], bool]:
     """Whether a zip has a file whose name ends so."""
-    return lambda content: any(each.endswith(name) for each in bounded.names(content))
+    return lambda content: any(each.lower().endswith(name) for each in bounded.names(content))
 
 
 def _begins(*heads: bytes) -> Callable[[bytes], bool]:
