@@ -115,7 +115,7 @@ class PageFlight:
 
     def processes(self, role: str) -> list[str]:
         """Processes of a role that have answered; its own name if none has."""
-        return [each for each in self.values if self._role(each) == role] or [role]
+        return [each for each in list(self.values) if self._role(each) == role] or [role]
 
     def of_role(self, role: str) -> dict[str, Any]:
         """Values of the first process of a role; empty if none has answered."""
