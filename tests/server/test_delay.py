@@ -1,24 +1,23 @@
 """Delay bound: above the recent delays, and constant while the network is."""
 
+import sys
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from bench.problems import from_python
 from skytether.netem.fate import Fates
 from skytether.server.schemes import delay_bound as delay
-from skytether.server.schemes.delay_bound import (
-    DelayBound,
-    add_sample,
-    delay_bound,
-    forget,
-    raise_to,
-    set_first,
-)
+from skytether.server.schemes.delay_bound import DelayBound, delay_bound, forget
 from skytether.shared.base.units import seconds_to_ns
 from skytether.shared.scenario.air.path import path
 
 quick = settings(max_examples=40)
+
+set_first, raise_to = from_python(delay.set_first), from_python(delay.raise_to)
+add_sample = from_python(delay.add_sample)
 
 MOST = 39
 
@@ -31,7 +30,7 @@ def known(delays: list[int], first: int = 1, most: int = MOST) -> list[int]:
     bound, steps = estimated(most=most), []
     set_first(bound, 0, first)
     for sample in delays:
-        delay.add_sample(bound, 0, sample)
+        add_sample(bound, 0, sample)
         steps += bound.steps.tolist()
     return steps
 
@@ -116,7 +115,7 @@ def test_either_reason_to_stay_is_needed(
 ) -> None:
     """Otherwise d falls soon after a late horizon, and the next one is late too."""
     guarded = known(delays)
-    monkeypatch.setattr(delay, "add_sample", add_sample.py_func)
+    monkeypatch.setattr(sys.modules[__name__], "add_sample", delay.add_sample.py_func)
     assert known(delays) == guarded
     monkeypatch.setattr(delay, name, value)
     bare = known(delays)
@@ -204,7 +203,7 @@ def flown(
         if made > in_force:
             in_force = made
             late.append(step - made > bounds[made])
-            delay.add_sample(bound, 0, step - made)
+            add_sample(bound, 0, step - made)
         bounds += bound.steps.tolist()
     return bounds, float(np.mean(late))
 
@@ -232,7 +231,7 @@ def test_on_the_papers_network_it_is_at_rest(dt_s: float, period: int) -> None:
 def test_without_its_memory_it_chatters(monkeypatch: pytest.MonkeyPatch) -> None:
     """Five times the changes, and five times the late horizons."""
     steps, late = flown(0.02, 1, seed=0)
-    monkeypatch.setattr(delay, "add_sample", add_sample.py_func)
+    monkeypatch.setattr(sys.modules[__name__], "add_sample", delay.add_sample.py_func)
     monkeypatch.setattr(delay, "RECENT", 1)
     monkeypatch.setattr(delay, "LATE", 1.0)
     bare_steps, bare_late = flown(0.02, 1, seed=0)

@@ -63,8 +63,8 @@ def fly_over(flown: Scenario, delays: Sequence[tuple[Delay, Delay]]) -> list[Rec
     class Clocked(Fates):
         """Fates as functions of the time, by the seed of the flight."""
 
-        def __init__(self, direction: Path, seed: int, name: str, flow: int) -> None:
-            super().__init__(direction, seed, name, flow)
+        def __init__(self, direction: Path, seed: int, name: str, flow: int, **how: bool) -> None:
+            super().__init__(direction, seed, name, flow, **how)
             self._delay = delays[seed][name != "uplink"]
 
         def at(self, slot: int, rank: int = 0) -> Fate:  # noqa: ARG002
