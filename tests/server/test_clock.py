@@ -7,10 +7,13 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
+from bench.problems import from_python
 from skytether.server.common import clock as clocks
-from skytether.server.common.clock import ECHOES, ClockMap, half_trip_ns, shortest_ns
+from skytether.server.common.clock import ECHOES, ClockMap, shortest_ns
 from skytether.shared.base.units import MILLISECOND_NS as MS
 from skytether.shared.base.units import SECOND_NS as S
+
+half_trip_ns = from_python(clocks.half_trip_ns)
 
 quick = settings(max_examples=25)
 

@@ -9,6 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.linalg import expm
 
+from bench.problems import from_python
 from skytether.server.common.compiled import advance as shared
 from skytether.shared.base.kernel import part
 from skytether.shared.law.model import advance, discretise, white_acceleration
@@ -65,7 +66,7 @@ def test_a_roll_is_its_steps() -> None:
     np.testing.assert_array_equal(states[-1], x)
 
 
-@pytest.mark.parametrize("step", [advance, part(shared)])
+@pytest.mark.parametrize("step", [advance, from_python(part(shared))])
 def test_one_axis_in_numbers_steps_as_all_in_arrays(step: Callable[..., Any]) -> None:
     """To the last bit, compiled or not, because client and server must agree."""
     model, rng = discretise([0.8, 0.3, 1.1], 0.05), np.random.default_rng(1)
