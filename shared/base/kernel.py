@@ -268,8 +268,8 @@ class PartLibrary(codegen.JITCodeLibrary):  # type: ignore[misc]
     """Code of a part: optimised and turned into machine code only within kernels that it is linked
     into.
 
-    Numba does both for each function by itself, and again for all that call it: two thirds of the
-    time for compiling `server.schemes.trajectory`.
+    Numba does both for each function by itself, and again for all that call it: with that, and the
+    wrappers that a part does not need, all kernels of `demo` took 21 s of CPU instead of 12.
     """
 
     def _optimize_final_module(self) -> None:
