@@ -384,11 +384,16 @@ def test_what_an_operator_needs_is_seen_without_scrolling(
     page.set_default_timeout(100_000)
     page.goto(flight)
     until(lambda: "TRACK" in status(page), "it flies a plan")
-    page.wait_for_timeout(1000)
     words, button = page.locator(".skytether-status"), page.get_by_role("button", name="Cut the")
     shown = [words, button, *(page.locator("label").get_by_text(each) for each in labels)]
-    boxes = [each.bounding_box() for each in shown]
-    assert None not in boxes
+    boxes: list[sync_api.FloatRect | None] = []
+
+    def laid_out() -> bool:
+        """Whether all is there at once: words are replaced as the flight goes on."""
+        boxes[:] = [each.bounding_box() for each in shown]
+        return None not in boxes
+
+    until(laid_out, "all is shown")
     tops = [box["y"] for box in boxes if box]
     assert tops == sorted(tops)
     assert tops[-1] + 20.0 < height
@@ -419,6 +424,7 @@ def test_a_wide_table_of_a_report_fits_the_window(browser: "sync_api.Browser") -
     tables = [Table(name, name, "", "", heading[:count], [["0"] * count]) for name, count in WIDTHS]
     drawn: dict[str, object] = dict.fromkeys(("title", "about", "verdict", "toml"), "")
     drawn |= {"tables": tables, "pictures": [], "events": [], "untold": 0, "made": {}}
+    drawn |= {"whose": "", "folded_tables": [], "folded_pictures": []}
     page = browser.new_page(viewport={"width": 1400, "height": 900})
     page.set_content(rendered("view/report.html.jinja", drawn=drawn))
     boxes = [page.locator(f"#{name}").bounding_box() for name, _ in WIDTHS]
