@@ -287,6 +287,7 @@ class PartLibrary(codegen.JITCodeLibrary):  # type: ignore[misc]
 
     @property
     def codegen(self) -> "PartLibrary":
+        """What numba tells of a function's environment, see `set_env`."""
         return self
 
     def set_env(self, name: str, environment: object) -> None:

@@ -142,7 +142,7 @@ def _bounds(space: Space, dtype: np.dtype[Any]) -> tuple[Any, Any]:
 
 
 def to_action(space: Space, row: Any) -> Any:
-    """Action of a space from its row."""
+    """Action of a space, from its row in an array of actions."""
     if isinstance(space, Dict | Tuple):
         made = {key: to_action(part, row[key]) for key, part in _parts(space).items()}
         return made if isinstance(space, Dict) else tuple(made.values())

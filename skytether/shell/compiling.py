@@ -99,15 +99,22 @@ def compile_kernels(kernels: Sequence["Missing"], on_done: Callable[[], None]) -
     with ThreadPoolExecutor(max(helpers, 1)) as pool:
         for _ in range(helpers):
             pool.submit(_have_compiled, queue, on_done)
-        while queue:
-            with suppress(IndexError):  # a helper took the last one
-                queue.popleft().compile()
-                on_done()
+        while each := _next(queue):
+            each.compile()
+            on_done()
     for each in kernels:
         # Loads code that other processes have compiled, and compiles kernels for which they failed.
         each.compile()
         if not each.is_stored:
             on_done()
+
+
+def _next(kernels: "deque[Missing]") -> "Missing | None":
+    """Kernel at the front of a queue that several threads empty; None at its end."""
+    try:
+        return kernels.popleft()
+    except IndexError:
+        return None
 
 
 def _have_compiled(kernels: "deque[Missing]", on_done: Callable[[], None]) -> None:
@@ -121,12 +128,8 @@ def _have_compiled(kernels: "deque[Missing]", on_done: Callable[[], None]) -> No
     ) as helper:
         assert helper.stdin
         assert helper.stdout
-        while kernels:
-            try:
-                name = kernels.popleft().name
-            except IndexError:  # another thread took the last one
-                return
-            print(name, file=helper.stdin, flush=True)
+        while each := _next(kernels):
+            print(each.name, file=helper.stdin, flush=True)
             if not helper.stdout.readline():  # killed, by the system or by Ctrl-C
                 return
             on_done()

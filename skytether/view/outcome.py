@@ -71,14 +71,16 @@ class Ended:
     braked_s: float
     nearest_m: float | None
     """Smallest distance to another vehicle on the mission [m]."""
-    to: int | None
-    """Number of that vehicle."""
+    nearest: int | None
+    """Number of the vehicle that came so near."""
 
 
 class Outcome:
-    """Args:
-    recorded: recording in which a vehicle has flown a step.
-    epoch_ns: time of step 0 of the first vehicle, from the first frame on [ns].
+    """Outcome of a flight, by its recording.
+
+    Args:
+        recorded: recording in which a vehicle has flown a step.
+        epoch_ns: time of step 0 of the first vehicle, from the first frame on [ns].
     """
 
     def __init__(self, recorded: Recorded, epoch_ns: int) -> None:
@@ -147,7 +149,7 @@ class Outcome:
                 for pair, (apart_m, _) in self.least.items()
                 if number in pair
             ]
-            nearest_m, to = min(near, default=(None, None))
+            nearest_m, other = min(near, default=(None, None))
             found.append(
                 Ended(
                     number,
@@ -156,7 +158,7 @@ class Outcome:
                     float(np.nanmax(off_m)) if known and not self.scenario.is_mission else None,
                     float((rows["mode"] == Mode.BRAKE).sum() * self._dt_s),
                     nearest_m,
-                    to,
+                    other,
                 )
             )
         return found
@@ -170,7 +172,8 @@ class Outcome:
         """Sentences about a mission: who arrived, and the least separation."""
         late = [each.vehicle for each in self.ended if not self.arrived(each)]
         count = len(self.ended)
-        said = f"{count - len(late)} of {count} vehicles arrived"
+        first = "" if count == len(self.numbers) else f"Of the first {count} vehicles, "
+        said = f"{first}{count - len(late)} of {count} recorded vehicles arrived"
         if late:
             said += f", not {listed(late)}"
         if not self.least:

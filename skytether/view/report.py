@@ -105,7 +105,7 @@ def page(recorded: Recorded, figures: Sequence[tuple[str, str]]) -> str:
     }
     drawn = {
         "title": f"Flight of {about.scenario}, seed {scenario.seed}",
-        "about": f"{counted(fleet)}, {summary.duration_s:g} s {where}.",
+        "about": f"{fleet} vehicle{'s' * (fleet != 1)}, {summary.duration_s:g} s {where}.",
         "verdict": outcome.verdict if scenario.is_mission else _verdict(summary),
         "tables": _first(outcome),
         "pictures": [course(outcome)] if fleet > 1 else [timeline(flown)],
@@ -127,10 +127,6 @@ def _verdict(summary: Summary) -> str:
     return f"{off}a horizon was sent at {sent} of the steps."
 
 
-def counted(vehicles: int) -> str:
-    return f"{vehicles} vehicle{'s' * (vehicles != 1)}"
-
-
 def _first(outcome: Outcome) -> list[Table]:
     """Tables that come first: the vehicles, and what failed and took over."""
     found = []
@@ -148,7 +144,7 @@ def _first(outcome: Outcome) -> list[Table]:
             row += [] if is_mission else [as_text(each.error_max_m, ".3f")]
             row += [f"{each.braked_s:.1f}" if each.braked_s else "–"]
             if is_mission:
-                near = f"{as_text(each.nearest_m, '.3f')} ({each.to})" if each.to else "–"
+                near = f"{as_text(each.nearest_m, '.3f')} ({each.nearest})" if each.nearest else "–"
                 row += [near]
             rows.append(row)
         says = "Off: from where it should have been at its last step."

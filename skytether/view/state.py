@@ -560,7 +560,7 @@ class State:
 
     @property
     def directions(self) -> dict[int, str]:
-        """Words for both directions."""
+        """Names of both directions as the page shows them, by `UPLINK` and `DOWNLINK`."""
         if self.ways == FLIGHT:
             return DIRECTIONS
         return {way: name.replace("_", " ") for way, name in enumerate(self.ways)}

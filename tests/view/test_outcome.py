@@ -77,7 +77,7 @@ def test_a_mission_is_judged_by_its_goals_and_distances(recording: Path) -> None
         begin = record.client[record.client["vehicle"] == number]["state"][0, :2, 0]
         assert np.linalg.norm(place + begin) < 0.3
     assert all(map(found.arrived, found.ended))
-    assert "4 of 4 vehicles arrived" in found.verdict
+    assert "4 of 4 recorded vehicles arrived" in found.verdict
     least_m = min(apart_m for apart_m, _ in found.least.values())
     assert set(found.least) == set(combinations(found.numbers, 2))
     assert found.scenario.mission.separation_m < least_m < 1.2
@@ -88,7 +88,7 @@ def test_a_mission_is_judged_by_its_goals_and_distances(recording: Path) -> None
 def test_vehicles_that_are_under_way_at_the_end_have_not_arrived(tmp_path: Path) -> None:
     found = outcome(recorded(tmp_path, 26.0))
     assert not any(map(found.arrived, found.ended))
-    assert "0 of 4 vehicles arrived, not 1 to 4" in found.verdict
+    assert "0 of 4 recorded vehicles arrived, not 1 to 4" in found.verdict
 
 
 def test_what_failed_is_told_once_for_all_vehicles(recording: Path) -> None:
@@ -114,7 +114,12 @@ def test_the_report_begins_with_the_outcome(recording: Path, tmp_path: Path) -> 
     argv = [str(recording), "--html", str(out)]
     assert command.main(report, argv, "report") == 0
     first, _, folded = out.read_text().partition("<details>")
-    for shown in ("4 of 4 vehicles arrived", "0.5 m required", "leads it now", 'id="course"'):
+    for shown in (
+        "4 of 4 recorded vehicles arrived",
+        "0.5 m required",
+        "leads it now",
+        'id="course"',
+    ):
         assert shown in first
     rows = first[first.index('id="vehicles"') :].partition("</table>")[0]
     assert re.findall(r"<tr><td>(\d)</td>", rows) == ["1", "2", "3", "4"]
