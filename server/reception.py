@@ -120,7 +120,7 @@ class Reception:
 
     def hear(self, datagram: Datagram, *, now_ns: int) -> Drop | None:
         self._stopwatch.start()
-        if self._sessions.at_place and self._is_copy(datagram):
+        if self._sessions.at_place and self._is_copy(datagram, now_ns):
             self.dropped[Drop.COPY] += 1
             return Drop.COPY
         try:
@@ -160,13 +160,17 @@ class Reception:
             session.other, session.other_ns = datagram.peer, now_ns
         return session.paths is not None and session.paths.paths.is_copy(datagram.payload, None)
 
-    def _is_copy(self, datagram: Datagram) -> bool:
+    def _is_copy(self, datagram: Datagram, now_ns: int) -> bool:
         """Whether a datagram of a vehicle with several paths has come before."""
         place = Place(datagram.peer, datagram.socket)
         session = self._sessions.at_place.get(place)
         if session is None or session.paths is None:
             return False
-        return session.paths.paths.is_copy(datagram.payload, session.paths.number(place))
+        path = session.paths.number(place)
+        if not session.paths.paths.is_copy(datagram.payload, path):
+            return False
+        session.paths.hear(place, now_ns)
+        return True
 
     def _take(self, call: GateCall, datagram: Datagram, now_ns: int) -> None:
         """Process one message.
@@ -242,7 +246,7 @@ class Reception:
     ) -> int | None:
         """Note the report of a message; returns its path, None if its address is not proven."""
         assert session.paths
-        path = session.paths.number(Place(datagram.peer, datagram.socket))
+        path = session.paths.hear(Place(datagram.peer, datagram.socket), now_ns)
         session.paths.paths.heard(report, datagram.payload, path, now_ns, is_recent=is_recent)
         return path
 
@@ -255,7 +259,7 @@ class Reception:
         session.heard_ns = now_ns
         session.paths.set_prices(message.prices)
         place = Place(datagram.peer, datagram.socket)
-        question = session.paths.prove(message, place)
+        question = session.paths.prove(message, place, now_ns)
         if question:
             self._answer(question, call, datagram)
         elif place in session.paths.places and self._sessions.at_place.get(place) is not session:
