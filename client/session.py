@@ -419,12 +419,12 @@ class ServerSession:
         if self.paths is None:
             self._put(self.link.seal(payload), (0,))
             return
+        worth = EVERYWHERE if isinstance(message, Close) else 1.0
         if not on:
-            worth = EVERYWHERE if isinstance(message, Close) else 1.0
             on = self.paths.choose(worth, now_ns, range(len(self._addresses)))
         datagram = self.link.seal(self.paths.report() + payload)
         is_probe = isinstance(message, PathProof)
-        self.paths.sent(datagram, on, now_ns, is_probe=is_probe)
+        self.paths.sent(datagram, on, now_ns, worth=worth, is_probe=is_probe)
         self._put(datagram, on)
 
     def _put(self, datagram: bytes, on: Sequence[int]) -> None:

@@ -101,7 +101,8 @@ class ServerPaths:
 
     def sealed(self, payload: bytes, line: ReplyPath, now_ns: int, worth: float) -> list[Datagram]:
         among = sorted(self._places)
-        return self._put(payload, line, self.paths.choose(worth, now_ns, among), now_ns)
+        chosen = self.paths.choose(worth, now_ns, among)
+        return self._put(payload, line, chosen, now_ns, worth=worth)
 
     def watched(
         self, vehicle: int, session: int, line: ReplyPath, silence_ns: int, now_ns: int
@@ -133,10 +134,11 @@ class ServerPaths:
         on: Sequence[int],
         now_ns: int,
         *,
+        worth: float = 0.0,
         is_probe: bool = False,
     ) -> list[Datagram]:
         datagram = line.seal(self.paths.report() + payload)
-        self.paths.sent(datagram, on, now_ns, is_probe=is_probe)
+        self.paths.sent(datagram, on, now_ns, worth=worth, is_probe=is_probe)
         return [*chain.from_iterable(self._to(path, datagram, now_ns) for path in on)]
 
     def _to(self, path: int, datagram: bytes, now_ns: int) -> list[Datagram]:

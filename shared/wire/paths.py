@@ -266,6 +266,7 @@ class _Newest:
     """Newest packet that was sent: if it does not arrive, it is sent again."""
 
     sequence: int
+    worth: float
     datagram: bytes
     sent_on: set[int]
 
@@ -373,15 +374,26 @@ class Paths:
         return ALIVE_WORTH * min(share, 1.0) ** 2
 
     def sent(
-        self, datagram: bytes, on: Sequence[int], now_ns: int, *, is_probe: bool = False
+        self,
+        datagram: bytes,
+        on: Sequence[int],
+        now_ns: int,
+        *,
+        worth: float = 0.0,
+        is_probe: bool = False,
     ) -> None:
         """Note that a datagram with the newest report was sent.
 
         Args:
+            worth: what its loss costs, see `choose`. A sign of life is worth nothing: it does not
+                take the place of a message that may have to be sent again.
             is_probe: whether it only tries a path, so that it is not sent again.
         """
-        if not is_probe:
-            self._newest = _Newest(self._sequence, datagram, set(on))
+        newest = self._newest
+        if newest and _ahead(self._sequence, newest.sequence) >= WINDOW:
+            newest = None
+        if not is_probe and not (newest and newest.worth and not worth):
+            self._newest = _Newest(self._sequence, worth, datagram, set(on))
         self._sent_ns = now_ns
         self._note(self._sequence, datagram, on, now_ns)
 

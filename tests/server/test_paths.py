@@ -4,7 +4,7 @@ import numpy as np
 
 from helpers import packaged
 from skytether.server.endpoint import Server
-from skytether.server.paths import Place, ServerPaths
+from skytether.server.paths import FORMER_NS, Place, ServerPaths
 from skytether.shared.base.chance import stream
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.core.endpoint import Address, Datagram
@@ -23,6 +23,7 @@ from skytether.shared.wire.protocol import (
 )
 
 PRICES = (1000, 1000)
+NOW_NS = SECOND_NS
 FIRST, SECOND, MOVED = Place(("first", 1), 0), Place(("second", 1), 0), Place(("moved", 1), 0)
 
 
@@ -33,24 +34,24 @@ def made() -> ServerPaths:
 def test_an_address_is_proven_by_the_number_sent_to_it_and_by_no_other() -> None:
     paths = made()
     message = PathProof(1, 7, 0, 0, PRICES)
-    question, other = paths.prove(message, FIRST), paths.prove(message, MOVED)
+    question, other = paths.prove(message, FIRST, NOW_NS), paths.prove(message, MOVED, NOW_NS)
     assert question
     assert other
     assert question.proof != other.proof
-    assert paths.prove(other, FIRST)
+    assert paths.prove(other, FIRST, NOW_NS)
     assert not paths.is_ready
-    assert paths.prove(question, FIRST) is None
+    assert paths.prove(question, FIRST, NOW_NS) is None
     assert [*paths.places] == [FIRST]
 
 
 def test_questions_to_many_addresses_leave_that_to_the_vehicle_valid() -> None:
     paths = made()
     message = PathProof(1, 7, 0, 0, PRICES)
-    question = paths.prove(message, FIRST)
+    question = paths.prove(message, FIRST, NOW_NS)
     assert question
     for port in range(100):
-        assert paths.prove(message, Place(("stranger", port), 0))
-    assert paths.prove(question, FIRST) is None
+        assert paths.prove(message, Place(("stranger", port), 0), NOW_NS)
+    assert paths.prove(question, FIRST, NOW_NS) is None
 
 
 class Vehicle:
@@ -118,8 +119,31 @@ def test_addresses_that_a_path_has_left_are_forgotten() -> None:
     vehicle.observe(FIRST)
     for port in range(20):
         vehicle.prove(0, Place(("vehicle", port), 0))
+        vehicle.now_ns += SECOND_NS
     vehicle.prove(1, SECOND)
-    assert {*vehicle.server.sessions.at_place} == {Place(("vehicle", 19), 0), SECOND}
+    newest = {Place(("vehicle", port), 0) for port in (18, 19)}
+    assert {*vehicle.server.sessions.at_place} == {*newest, SECOND}
+
+
+def test_a_forwarder_of_copies_does_not_take_a_path_away() -> None:
+    """His addresses are proven like the vehicle's own, which stays in use while it is heard."""
+    vehicle = Vehicle()
+    vehicle.observe(FIRST)
+    vehicle.prove(0, FIRST)
+    for port in range(3):
+        vehicle.now_ns += SECOND_NS
+        vehicle.step += SECOND_NS // vehicle.dt_ns
+        vehicle.prove(0, Place(("forwarder", port), 0))
+        vehicle.observe(FIRST)
+    paths = next(iter(vehicle.server.sessions.with_paths.values())).paths
+    assert paths
+    assert {*paths.places} == {FIRST, Place(("forwarder", 2), 0)}
+    line = vehicle.server.sessions.with_paths[1].line
+    sent = paths.sealed(b"\x93plan", line, vehicle.now_ns, 1.0)
+    assert {each.peer for each in sent} == {FIRST.peer, ("forwarder", 2)}
+    later_ns = vehicle.now_ns + FORMER_NS + 1
+    sent = paths.sealed(b"\x93plan", line, later_ns, 1.0)
+    assert [each.peer for each in sent] == [("forwarder", 2)], "the vehicle has another address"
 
 
 def test_path_is_asked_for_a_proof_as_soon_as_it_is_heard_at_another_address() -> None:
@@ -132,7 +156,7 @@ def test_path_is_asked_for_a_proof_as_soon_as_it_is_heard_at_another_address() -
     assert peer == MOVED.peer
     assert isinstance(question, PathProof)
     assert vehicle.say(question._replace(path=0), MOVED) == []
-    assert {*vehicle.server.sessions.at_place} == {MOVED, SECOND}
+    assert {*vehicle.server.sessions.at_place} == {FIRST, MOVED, SECOND}
 
 
 def test_copy_over_another_path_is_dropped_as_a_copy() -> None:

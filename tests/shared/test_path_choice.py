@@ -28,7 +28,7 @@ class Ends:
         among = range(len(sender.each))
         on = on or sender.choose(worth, self.now_ns, among)
         datagram = sender.report() + b"\x93" + next(self._payloads).to_bytes(4)
-        sender.sent(datagram, on, self.now_ns)
+        sender.sent(datagram, on, self.now_ns, worth=worth)
         for path in on:
             if path not in self.dead:
                 self.arrive(receiver, datagram, path)
@@ -305,6 +305,23 @@ def test_a_probe_is_not_sent_again_and_displaces_no_message() -> None:
     resent = ends.near.again(SILENCE_NS, ends.now_ns + 3 * SECOND_NS, BOTH)
     assert resent
     assert resent[0] != probe
+
+
+def test_a_sign_of_life_displaces_no_message_that_may_have_to_be_sent_again() -> None:
+    ends = Ends()
+    ends.exchange(20)
+    ends.dead = {0}
+    plan = ends.near.report() + b"\x93plan"
+    ends.near.sent(plan, (0,), ends.now_ns, worth=0.8)
+    ends.send(worth=0.0, on=(1,))
+    resent = ends.near.again(SILENCE_NS, ends.now_ns + 3 * SECOND_NS, BOTH)
+    assert resent == (plan, 1)
+    for _ in range(WINDOW):
+        ends.send(worth=0.0, on=(1,))
+    ends.send(worth=0.0, on=(0,))
+    resent = ends.near.again(SILENCE_NS, ends.now_ns + 6 * SECOND_NS, BOTH)
+    assert resent
+    assert resent[0] != plan, "no report could tell any more whether it has arrived"
 
 
 def test_a_lost_packet_is_noticed_after_the_usual_silence_and_not_the_longest() -> None:
