@@ -142,7 +142,7 @@ class ServerPaths:
         return [*chain.from_iterable(self._to(path, datagram, now_ns) for path in on)]
 
     def _to(self, path: int, datagram: bytes, now_ns: int) -> list[Datagram]:
-        """A datagram to the newest address of a path, and to the former one if it is still heard."""
+        """A datagram to a path's newest address, and to the former one while that is heard."""
         places = self._places[path]
         newest = next(reversed(places))
         return [
