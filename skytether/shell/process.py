@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO, cast
 import msgspec
 import numpy as np
 
-from skytether.shared.base import files
+from skytether.shared.base import extras, files
 from skytether.shared.core.change import Running
 from skytether.shared.core.endpoint import Address, Endpoint, Form
 from skytether.shared.core.events import (
@@ -340,6 +340,8 @@ def _fed(process: str, options: ProcessOptions, *, secure: bool) -> Iterator[Fee
     if not (options.feed or record):
         yield None
         return
+    if record:
+        extras.need("record")
     with ExitStack() as stack:
         at = stack.enter_context(recorder_process.socket_of(options.feed))
         try:

@@ -150,10 +150,22 @@ def test_an_option_names_the_extra_that_it_misses_before_anything_flies(
 
 
 @pytest.mark.long
-def test_a_recording_names_the_extra_that_it_misses_before_anything_flies() -> None:
-    missing = run(["fly", "--virtual", "--record", "a.mcap"], ("server",))
+@pytest.mark.parametrize(
+    ("argv", "installed"),
+    [
+        (["fly", "--virtual", "--record", "a.mcap"], ("server",)),
+        (["client", "--record", "a.mcap"], ()),
+        (["netem", "--record", "a.mcap"], ()),
+        (["server", "--record", "a.mcap"], ("server",)),
+    ],
+    ids=lambda words: words[0] if words else "",
+)
+def test_a_recording_names_the_extra_that_it_misses_before_anything_flies(
+    argv: list[str], installed: tuple[str, ...]
+) -> None:
+    missing = run(argv, installed)
     assert (missing.returncode, missing.stdout) == (2, "")
-    assert missing.stderr in {refusal("fly", module, "record") for module in packages("record")}
+    assert missing.stderr in {refusal(argv[0], module, "record") for module in packages("record")}
 
 
 def test_a_library_call_names_the_extra_too(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -48,6 +48,7 @@ FAULTY_FLIGHT_S = 110
 """Duration of the flight with faults [s]; faults and the checks after them take 45 s of it."""
 STANDBY_FLIGHT_S = 40
 """Duration of the flight with a standby server [s]."""
+MISSION, MISSION_S, VEHICLES = "deploy/mission/compose.yml", 60, 4
 FAULT_S = 3.0
 """Duration of a fault [s]: more than the demo's `link.timeout_s`, so that the client detects it."""
 HORIZONS = 6
@@ -203,11 +204,42 @@ def test_a_flight_goes_on_with_the_standby_server(compose: list[str], tmp_path: 
         assert_safe(five.land(tmp_path), STANDBY_FLIGHT_S)
 
 
+@pytest.mark.long
+def test_a_mission_outlives_a_path_and_a_server(compose: list[str], tmp_path: Path) -> None:
+    """The four vehicles of deploy/mission arrive, though the netem of a path and then the leading
+    server are killed.
+    """
+    with containers(compose, MISSION_S, standby=True, more=MISSION) as all_of_them:
+        until("the vehicles", lambda: all_of_them.said("server").count(" flies, from ") == VEHICLES)
+        for service in ("netem-lte", "server"):
+            time.sleep(5.0)
+            all_of_them.compose("kill", service)
+            say(f"{service} is killed")
+        vehicles = ["client", *(f"client-{number}" for number in range(2, VEHICLES + 1))]
+        for service in vehicles:
+            until(
+                f"the end of {service}",
+                lambda service=service: all_of_them.state(service)["Status"] == "exited",
+                within_s=MISSION_S + PATIENCE_S,
+            )
+            assert all_of_them.state(service)["ExitCode"] == 0, all_of_them.said(service)
+        all_of_them.docker("cp", f"{all_of_them.id('client')}:/results/.", str(tmp_path))
+        for number in range(1, VEHICLES + 1):
+            file = tmp_path / f"{number}.json"
+            summary = msgspec.json.decode(file.read_bytes(), type=Summary)
+            assert summary.secure
+            assert summary.modes.keys() <= {"sync", "ready", "track", "coast"}
+            state = read(tmp_path / f"{number}")["state"][:, :, 0]
+            assert state[-1] == pytest.approx(-state[0], abs=0.1), "it changed places"
+
+
 @dataclass
 class Containers:
     command: list[str]
     seconds: int
     standby: bool = False
+    more: str = ""
+    """Another file of Compose, which is read after docker-compose.yml."""
     project: str = field(default_factory=lambda: f"skytether-test-{secrets.token_hex(4)}")
     ids: dict[str, str] = field(default_factory=dict)
     """Identifiers of the containers, by service; they stay the same from `up` to `down`."""
@@ -219,9 +251,9 @@ class Containers:
         return attempt(*self.argv(*arguments), within_s=300.0, more_env=self.flight)
 
     def argv(self, *arguments: str) -> list[str]:
-        file = str(ROOT / "docker-compose.yml")
+        files = [f"--file={ROOT / name}" for name in ("docker-compose.yml", self.more) if name]
         profile = ["--profile", "standby"] * self.standby
-        return [*self.command, "-f", file, "-p", self.project, *profile, *arguments]
+        return [*self.command, *files, "-p", self.project, *profile, *arguments]
 
     @property
     def flight(self) -> dict[str, str]:
@@ -419,9 +451,11 @@ class Containers:
 
 
 @contextlib.contextmanager
-def containers(compose: list[str], seconds: int, *, standby: bool = False) -> Iterator[Containers]:
+def containers(
+    compose: list[str], seconds: int, *, standby: bool = False, more: str = ""
+) -> Iterator[Containers]:
     """The three containers, running; removed at the end in any case."""
-    three = Containers(compose, seconds, standby)
+    three = Containers(compose, seconds, standby, more)
     try:
         three.compose("up", "--detach")
         say(f"up, for a flight of {seconds} s")
