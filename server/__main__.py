@@ -15,9 +15,9 @@ from pathlib import Path
 from socket import socket
 from typing import Annotated
 
-from skytether.server.controller import other_schemes
 from skytether.server.endpoint import VEHICLES_MAX, Server
 from skytether.server.gate import Gate, PlainGate
+from skytether.server.schemes import table
 from skytether.shared.base import kernel
 from skytether.shared.core.endpoint import PATH_SOCKETS, Address, Form
 from skytether.shared.core.events import address_text
@@ -102,7 +102,7 @@ def serve(argv: Sequence[str]) -> None:
 
 def _ready(scenario: Scenario) -> None:
     """Load the compiled planner now; before workers are forked, so that they share its memory."""
-    others = other_schemes(scenario)
+    others = table.others(scenario)
     terminal.prepare(kernel.missing(without=others))
     kernel.load(without=others)
 

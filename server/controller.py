@@ -14,9 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from skytether.server import missions
 from skytether.server.budget import SharedBudget
-from skytether.server.common import splines
 from skytether.server.common.clock import UNSEEN, ClockMap, Seen, shortest_ns
 from skytether.server.common.desired import Desired
 from skytether.server.common.scheme import (
@@ -25,14 +23,11 @@ from skytether.server.common.scheme import (
     Figures,
     Fleet,
     Planning,
-    Scheme,
     empty_foresight,
     in_turn,
 )
-from skytether.server.missions.mission_planner import MissionPlanner
-from skytether.server.missions.mission_state import MissionState
 from skytether.server.schemes import table
-from skytether.shared.base.kernel import B1, I1, KERNELS, kernel
+from skytether.shared.base.kernel import B1, I1, kernel
 from skytether.shared.core.stopwatch import Stopwatch
 from skytether.shared.law.model import Array, Flags, Indices
 from skytether.shared.law.terms import Terms
@@ -53,32 +48,6 @@ TAKEOVER_PLANS = 2
 BLOCK = 128
 """Number of vehicles planned for together: their data stay in the cache, and no array is so large
 (128 KiB) that the C library would get new memory from the kernel for it each time."""
-
-
-def _mission(fleet: Fleet) -> Scheme:
-    assert fleet.references is not None
-    state = MissionState(
-        fleet.scenario,
-        fleet.terms,
-        fleet.capacity,
-        fleet.block,
-        fleet.references,
-        fleet.desired.number,
-        fleet.clock,
-    )
-    return MissionPlanner(fleet, state)
-
-
-MISSION_KERNELS = (missions, splines)
-"""Modules and packages whose kernels are called on missions only."""
-
-
-def other_schemes(scenario: Scenario) -> set[str]:
-    """Names of the modules whose kernels are not called in a scenario."""
-    own = MISSION_KERNELS if scenario.is_mission else table.kernels(scenario.control.scheme)
-    every = {*MISSION_KERNELS}.union(*map(table.kernels, table.OURS))
-    names = tuple(f"{module.__name__}." for module in every.difference(own))
-    return {each.__module__ for each in KERNELS if f"{each.__module__}.".startswith(names)}
 
 
 class Decisions(NamedTuple):
@@ -135,7 +104,7 @@ class Controller:
             planning,
         )
         self._is_mission = scenario.is_mission and references is not None
-        self.scheme = _mission(fleet) if self._is_mission else table.make(fleet)
+        self.scheme = table.make(fleet)
         self.columns = control.properties.figures
         """Names of the recorded figures of plans."""
         self._terms, self._capacity, self._block = terms, capacity, block

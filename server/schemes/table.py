@@ -1,55 +1,83 @@
-"""Table of the schemes' code. Each built-in scheme is the module of its name in this package.
+"""Table of the schemes' code: the module of a scheme is loaded when a scenario flies with it.
 
-The module of a scheme has
+Each built-in scheme is the module of its name in this package; missions and plug-ins have a room
+each. The module of a scheme has
 
 - `make`, which makes the scheme from a `Fleet`, and
-- KERNELS, the other modules and packages whose kernels it calls. Kernels that every scheme calls
-  are left out.
+- KERNELS, the other modules and packages whose kernels it calls, or `kernels`, if these depend on
+  the scheme's text. Kernels that every scheme calls are left out.
 """
 
+from collections.abc import Iterator
 from importlib import import_module
 from types import ModuleType
+from typing import Any
 
-from skytether.server.common import splines
 from skytether.server.common.scheme import Fleet, Scheme
-from skytether.server.common.splines import SplineScheme
-from skytether.server.schemes import horizons
-from skytether.server.schemes.guarded import GuardedScheme
-from skytether.server.schemes.horizons import InputScheme
-from skytether.shared.base.errors import ConfigError
+from skytether.shared.base.kernel import KERNELS
 from skytether.shared.scenario import schemes
 from skytether.shared.scenario.registry import SCHEMES
+from skytether.shared.scenario.schema import Scenario
 
-OURS = {
-    name: import_module(f"{__package__}.{name}") for name, entry in SCHEMES.items() if entry.is_ours
-}
+MISSIONS = "skytether.server.missions.planning"
+PLUGINS = f"{__package__}.plugins"
+OF_SOME = tuple(
+    f"skytether.server.{each}."
+    for each in (
+        "schemes",
+        "missions",
+        "common.splines",
+        "mpc.exact",
+        "mpc.hierarchical",
+        "mpc.riccati",
+    )
+)
+"""Beginnings of the names of modules whose kernels only some schemes call."""
+
+
+def _module(scenario: Scenario, *, missions: bool = True) -> Any:
+    """Module that flies a scenario."""
+    if missions and scenario.is_mission:
+        return import_module(MISSIONS)
+    name = schemes.call(scenario.control.scheme).name
+    return import_module(f"{__package__}.{name}" if SCHEMES[name].is_ours else PLUGINS)
+
+
+def _called(scenario: Scenario) -> Iterator[ModuleType]:
+    """Module that flies a scenario, and the others whose kernels it calls."""
+    module = _module(scenario)
+    yield module
+    text = scenario.control.scheme
+    yield from module.kernels(text) if hasattr(module, "kernels") else module.KERNELS
+
+
+def load_all() -> None:
+    """Load every built-in scheme, and missions: what is flown is not known yet."""
+    for name, entry in SCHEMES.items():
+        if entry.is_ours:
+            import_module(f"{__package__}.{name}")
+    import_module(MISSIONS)
 
 
 def make(fleet: Fleet) -> Scheme:
-    """Make the scheme that a scenario names.
+    """Make the scheme that flies a scenario.
 
     Raises:
         ConfigError: a plug-in's scheme cannot be made.
     """
-    text = fleet.scenario.control.scheme
-    call = schemes.call(text)
-    if SCHEMES[call.name].is_ours:
-        scheme: Scheme = OURS[text].make(fleet)
-        return scheme
-    other = InputScheme if fleet.terms.splines else SplineScheme
-    try:
-        inner = SCHEMES.make(call, (), fleet)
-        if isinstance(inner, other):
-            flown_as = f"flown_as={fleet.terms.scheme!r}"
-            raise TypeError(f"a scheme with {flown_as} must not extend {other.__name__}")
-        return GuardedScheme(text, inner, fleet)
-    except Exception as error:
-        wrong = f"a scheme that can be made ({type(error).__name__}: {error})"
-        raise ConfigError(f"control.scheme: got {text!r}, expected {wrong}") from error
+    scheme: Scheme = _module(fleet.scenario, missions=fleet.references is not None).make(fleet)
+    return scheme
 
 
-def kernels(text: str) -> tuple[ModuleType, ...]:
-    """Modules and packages whose kernels a scheme calls, without those that every scheme calls."""
-    if text in OURS:
-        return (OURS[text], *OURS[text].KERNELS)
-    return (splines if schemes.properties(text).splines else horizons,)
+def others(*scenarios: Scenario) -> set[str]:
+    """Names of the loaded modules whose kernels none of these scenarios calls.
+
+    What they do call is loaded here, before a process compiles it or forks.
+    """
+    own = tuple(f"{each.__name__}." for one in scenarios for each in _called(one))
+    names = {f"{each.__module__}." for each in KERNELS}
+    return {
+        each.removesuffix(".")
+        for each in names
+        if each.startswith(OF_SOME) and not each.startswith(own)
+    }

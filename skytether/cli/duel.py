@@ -12,6 +12,7 @@ import msgspec
 import tyro
 
 from skytether.cli import page_process, processes
+from skytether.server.schemes import table
 from skytether.shared.base import kernel
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.schema import Scenario
@@ -56,7 +57,7 @@ def duel(argv: Sequence[str]) -> None:
     at = command.address("--page", options.page)
     scenarios = together(options)
     names = titles(options.scenarios)
-    terminal.prepare(kernel.missing())
+    terminal.prepare(kernel.missing(table.others(*scenarios)))
     if options.virtual:
         frames = [
             list(of_flight(scenario, name, flight.fly(scenario)))

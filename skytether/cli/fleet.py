@@ -18,6 +18,7 @@ from rich.text import Text
 from skytether.cli import page_process, processes
 from skytether.figures import film
 from skytether.figures import flights as figures
+from skytether.server.schemes import table
 from skytether.shared.base import kernel
 from skytether.shared.core.events import NotFlown
 from skytether.shared.core.stopwatch import Stopwatch
@@ -164,7 +165,7 @@ def fleet(argv: Sequence[str]) -> None:
     name = Path(options.config.reference.file).name or options.scenario
     count = terminal.counted(vehicles, "vehicle")
     title = f"{count}, {name}, {where}, seed {options.config.seed}"
-    terminal.prepare(kernel.missing())
+    terminal.prepare(kernel.missing(table.others(options.config)))
     with (
         command.interruptible() as interrupted,
         terminal.progress(f"flying {title}", options.config.duration) as on_second,
@@ -236,7 +237,7 @@ def _virtually(
     on_second: Callable[[float], None],
     interrupted: Callable[[], bool],
 ) -> FleetFlight:
-    kernel.load()
+    kernel.load(table.others(options.config))
     began_s = time.process_time()
     flown = sim.fly(
         options.config,

@@ -98,7 +98,7 @@ def fly(
         keys["control.planner"] = _planner(planner, udp=udp)
     name, flown = named(scenario, keys)
     if server is None:
-        prepare()
+        prepare(flown)
     if udp:
         return Flight(flown, _over_udp(flown, secure=secure), name=name, secure=secure)
     from skytether.sim import flight  # imports the planner and numba, which takes a while
@@ -131,7 +131,7 @@ def fly_batch(scenario: Given, seeds: Iterable[int], /, **keys: Any) -> list[Fli
     for number in numbers:
         if numbers.count(number) > 1:
             raise ConfigError(f"seeds: got {number} twice, expected seeds that differ")
-    prepare()
+    prepare(*each)
     from skytether.sim import flight  # imports the planner and numba, which takes a while
 
     records = flight.fly_batch(flown, numbers)
@@ -154,13 +154,18 @@ def named(scenario: Given, keys: Mapping[str, Any]) -> tuple[str, Scenario]:
     return name, _checked(name, base, keys)
 
 
-def prepare() -> None:
-    """Compile the server's kernels unless this machine has them already, with a note on stderr."""
+def prepare(*scenarios: Scenario) -> None:
+    """Compile the kernels that these scenarios call, or those of every scheme if there are none,
+    unless this machine has them already, with a note on stderr.
+    """
     import skytether.sim.flight  # noqa: F401 - its kernels are those of every flight
+    from skytether.server.schemes import table
     from skytether.shared.base import kernel
     from skytether.shell import terminal
 
-    terminal.prepare(kernel.missing())
+    if not scenarios:
+        table.load_all()
+    terminal.prepare(kernel.missing(table.others(*scenarios) if scenarios else ()))
 
 
 def _checked(name: str, scenario: Scenario, keys: Mapping[str, Any]) -> Scenario:

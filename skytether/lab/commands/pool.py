@@ -31,6 +31,7 @@ import skytether.lab.sweep
 from skytether.lab.journal import StudyJournal, name_of
 from skytether.lab.search import Point, Search, SearchPoint, Values, best
 from skytether.lab.sweep import Results, Runs, Sweep
+from skytether.server.schemes import table
 from skytether.shared.base import kernel
 from skytether.shared.scenario.schema import Scenario
 from skytether.shell import command, plugins, system, terminal
@@ -222,6 +223,7 @@ def crew(flags: Flags, title: str, total: float, unit: str = "runs") -> Iterator
     order.
     """
     if not flags.scheduler:  # Compile now: otherwise every worker would compile all kernels.
+        table.load_all()
         terminal.prepare(kernel.missing())
     with (
         command.interruptible() as interrupted,

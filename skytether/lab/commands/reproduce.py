@@ -20,6 +20,7 @@ from skytether.lab.plates import Samples
 from skytether.lab.report import Reproduction
 from skytether.lab.studies import EVENT, EVERY, PERIODIC, Cells, ReproductionSize, Study
 from skytether.lab.sweep import Runs
+from skytether.server.schemes.table import others
 from skytether.shared.base import files, kernel
 from skytether.shared.law.model import Array
 from skytether.shared.scenario import reading
@@ -87,7 +88,7 @@ def _measure(
     sweeps = options.out / "sweeps"
     # Refuse a folder of another reproduction before anything is flown.
     StudyJournal(sweeps / table.name, table.first().settings(), Runs).close()
-    terminal.prepare(kernel.missing())
+    terminal.prepare(kernel.missing(others(scenario)))
     # Real-time measurements come first, while the cores are idle.
     delay_ms = _delays(options.out, scenario, scale)
     real = {method: _really(options.out, table, method, scale) for method in (EVERY, EVENT)}
