@@ -181,6 +181,8 @@ class Page(HTMLParser):
         self.ids: list[str] = []
         self.addresses: list[str] = []
         self.tables: dict[str, list[list[str]]] = {}
+        """Rows of each table by its name, each with the heading of its group in front."""
+        self.group, self.names_group = "", False
         self.feed(text)
         self.close()
 
@@ -192,9 +194,11 @@ class Page(HTMLParser):
             self.ids.append(str(found["id"]))
         self.addresses += [str(found[name]) for name in ("src", "href") if name in found]
         if tag == "table":
-            self.tables[self.ids[-1]] = []
+            self.tables[self.ids[-1]], self.group = [], ""
         if tag == "tr":
-            self.tables[self.ids[-1]].append([])
+            self.names_group = found.get("class") == "group"
+            begins = [self.group] if self.group and not self.names_group else []
+            self.tables[self.ids[-1]].append(begins)
 
     def handle_endtag(self, tag: str) -> None:
         assert self.open.pop() == tag
@@ -202,6 +206,8 @@ class Page(HTMLParser):
     def handle_data(self, data: str) -> None:
         if self.open and self.open[-1] == "td":
             self.tables[self.ids[-1]][-1].append(data)
+        if self.open and self.open[-1] == "th" and self.names_group:
+            self.group = data
 
 
 @pytest.mark.long

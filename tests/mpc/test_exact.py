@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import lsq_linear
 
-from bench.problems import gradients
+from bench.problems import from_python, gradients
 from skytether.server.mpc import exact
 from skytether.server.mpc.exact import ExactSolver
 from skytether.server.mpc.hierarchical import make_solver
@@ -176,9 +176,9 @@ def test_a_horizon_rounded_to_float32_keeps_its_active_set() -> None:
     simd = simd_batch(work.memory)
 
     def rounds(previous: Array, at: tuple[int, ...]) -> int:
-        set_previous(previous, 0, False, simd, 0)
+        from_python(set_previous)(previous, 0, False, simd, 0)
         simd.gradient[:, 0] = gradient[at]
-        return int(active_sets(problem.mpc, at[1], LATER, simd, work.free, settled))
+        return int(from_python(active_sets)(problem.mpc, at[1], LATER, simd, work.free, settled))
 
     for at in np.ndindex(20, 2):
         assert rounds(rounded[at], at) == 1

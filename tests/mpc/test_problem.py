@@ -154,12 +154,12 @@ def test_prediction_is_the_model_flown_step_by_step(seed: int, H: int, axes: int
     for axis in range(axes):
         (simd.p[0], simd.v[0]), (simd.leader_p[0], simd.leader_v[0]) = follower, x[axis]
         from_python(set_inputs)(u[axis], simd, 0)
-        follow(problem.mpc, axis, simd)
+        from_python(follow)(problem.mpc, axis, simd)
         speeds, drift = simd.leader_speed[:, 0].copy(), simd.drift_p[:, 0].copy()
         np.testing.assert_allclose(speeds, flown[axis, :, 1], rtol=0, atol=1e-11)
         simd.p[0], simd.v[0] = follower
         from_python(set_target)(flown[axis], simd, 0)
-        lead(problem.mpc, axis, simd)
+        from_python(lead)(problem.mpc, axis, simd)
         np.testing.assert_allclose(drift, simd.drift_p[:, 0], rtol=0, atol=1e-8)
 
 

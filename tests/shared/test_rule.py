@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from bench.problems import from_python
 from skytether.client.compensator import Compensator
 from skytether.server.common import compiled as law
 from skytether.server.common.clock import ClockMap
@@ -140,7 +141,7 @@ def test_where_a_horizon_leads_is_that_step_by_step() -> None:
 
 speeds = st.floats(-3.0, 3.0)
 COMPILED = {
-    each.__name__: part(each)
+    each.__name__: from_python(part(each))
     for each in (lasting, entry, bounded, remaining, reference_input, feedback, flown, rule.step)
 }
 
