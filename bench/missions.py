@@ -52,10 +52,12 @@ from skytether.shared.base import files
 from skytether.shared.base.chance import stream
 from skytether.shared.law.model import Array, Indices
 from skytether.shared.law.motion import MARGIN_M
-from skytether.shared.scenario import reading, zone_texts
-from skytether.shared.scenario.mission import Mission
+from skytether.shared.missions import zone_texts
+from skytether.shared.missions.derived import clearances, zones
+from skytether.shared.missions.mission import Mission
+from skytether.shared.missions.zones import Zones
+from skytether.shared.scenario import reading
 from skytether.shared.scenario.schema import NetworkConfig, Scenario
-from skytether.shared.scenario.zones import Zones
 from skytether.shared.telemetry.record import Record
 from skytether.shared.telemetry.summary import least_separation
 from skytether.shared.wire.protocol import Mode
@@ -213,7 +215,7 @@ def fly_mission(
         late += last == len(rows)
         arrived_s.append(last * dt_s - (goal_at_s or min(began_s) - began))
         positions = rows["state"][int(np.argmax(rows["mode"] == Mode.TRACK)) :, :, 0]
-        clear_m.append(float(scenario.zones.clearance(positions).min(initial=np.inf)))
+        clear_m.append(float(zones(scenario).clearance(positions).min(initial=np.inf)))
     packets = sum(record.figures["netem"][way]["packets"] for way in ("uplink", "downlink"))
     counts = Counter[str]()
     for life in lives:
@@ -223,7 +225,7 @@ def fly_mission(
         vehicles=len(each),
         network=scenario.network.uplink,
         least_m=least,
-        clear_m=min(clear_m) if scenario.zones else None,
+        clear_m=min(clear_m) if zones(scenario) else None,
         late=late,
         arrived_s=None if late else max(arrived_s),
         left=counts["left_tube"],
@@ -310,7 +312,7 @@ def random_mission(options: RandomOptions, seed: int, folder: Path) -> Scenario:
     obstacles = int(rng.integers(0, 7))
     half_m = 0.5 * float(np.sqrt(ROOM_M2 * (vehicles + 2 * obstacles))) + 1.0
     shapes = list(_zones(rng, obstacles, half_m))
-    apart_m = reading.load("swap").clearances.apart_m
+    apart_m = clearances(reading.load("swap")).apart_m
     forbidden = zone_texts.parse(" & ".join(shapes), 2)
     places = _places(rng, vehicles, half_m, forbidden, apart_m)
     if options.space:

@@ -15,24 +15,15 @@ from fuzz.mutators import text_changed, words_of
 from fuzz.target import Target, flown
 from skytether.netem.proxy import Proxy
 from skytether.probe import recorded as captures
+from skytether.shared import formats
 from skytether.shared.base import toml
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.core import change
 from skytether.shared.core.change import REQUEST_BYTES_MAX, Answer, Running
 from skytether.shared.core.events import Counted
-from skytether.shared.scenario import (
-    bounded,
-    contradictions,
-    formats,
-    grammar,
-    mission,
-    plans,
-    reading,
-    tracks,
-    zone_files,
-    zone_texts,
-)
-from skytether.shared.scenario.air import pings, recorded, traces
+from skytether.shared.formats import bounded, pings, plans, recorded, traces, tracks, zone_files
+from skytether.shared.missions import mission, zone_texts
+from skytether.shared.scenario import contradictions, grammar, reading
 from skytether.shared.scenario.dotted import value
 from skytether.shared.scenario.grammar import GrammarError
 from skytether.shared.scenario.registry import REFERENCES, TRIGGERS, File

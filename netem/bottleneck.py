@@ -12,8 +12,8 @@ from math import ceil, sqrt
 from typing import Generic, TypeVar
 
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
-from skytether.shared.scenario.air.queues import Deliveries, Queued
-from skytether.shared.scenario.air.traces import DELIVERY_BYTES
+from skytether.shared.law.model import Array
+from skytether.shared.scenario.air.queues import DELIVERY_BYTES, Queued
 
 QUANTUM_BYTES = 300
 """Bytes that each flow may send per turn under fair queueing [B]: a few small packets; a larger
@@ -99,7 +99,7 @@ class Bottleneck(Generic[T]):
         self.dropped: list[T] = []
         """Dropped packets; the caller counts and removes them."""
         self._pace: _Rate | _Deliveries = (
-            _Deliveries(queue) if isinstance(queue, Deliveries) else _Rate(queue.bytes_per_s)
+            _Rate(queue.bytes_per_s) if queue.times_s is None else _Deliveries(queue.times_s)
         )
 
     def accept(self, item: T, size: int, flow: int, *, now_ns: int) -> None:
@@ -201,8 +201,8 @@ class _Deliveries:
     Packets share the bytes of a delivery opportunity; unused bytes are lost.
     """
 
-    def __init__(self, queue: Deliveries) -> None:
-        self._times_ns: list[int] = [round(time_s * SECOND_NS) for time_s in queue.times_s]
+    def __init__(self, times_s: Array) -> None:
+        self._times_ns: list[int] = [round(time_s * SECOND_NS) for time_s in times_s]
         self._began_ns: int | None = None
         self._used_bytes = 0
         """Bytes of the deliveries so far that were used or lost."""

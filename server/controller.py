@@ -103,7 +103,6 @@ class Controller:
             self.faults.append,
             planning,
         )
-        self._is_mission = scenario.is_mission and references is not None
         self.scheme = table.make(fleet)
         self.columns = control.properties.figures
         """Names of the recorded figures of plans."""
@@ -194,17 +193,17 @@ class Controller:
         if self._led[row]:
             self._sent_step[row] = -1
             self._trigger.forget(row)
-        if self._led[row] and told and told.number and not self._is_mission:
+        if self._led[row] and told and told.number and not self.scheme.is_one_fleet:
             self._owed[row] = TAKEOVER_PLANS
         else:
             self._owed.pop(row, None)
         self.scheme.follow(row, told)
 
     def known(self, number: int) -> int:
-        """Number of the leadership that a vehicle of a leadership `number` should follow: on a
-        mission all follow one server.
+        """Number of the leadership that a vehicle of a leadership `number` should follow: the
+        largest, if all follow one server.
         """
-        return self._known if self._is_mission else number
+        return self._known if self.scheme.is_one_fleet else number
 
     def observe(self, row: int, observation: Observation) -> bool:
         """Store an observation unless a newer one is stored (E11); True if stored."""

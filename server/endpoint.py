@@ -6,7 +6,7 @@ for all vehicles).
 
 from collections import Counter
 from collections.abc import Callable
-from functools import lru_cache, partial
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -16,6 +16,7 @@ from skytether.server.common.scheme import Planning, in_turn
 from skytether.server.controller import Controller
 from skytether.server.gate import Gate, PlainGate
 from skytether.server.reception import Reception
+from skytether.server.schemes import table
 from skytether.server.sessions import Session, Sessions
 from skytether.server.tick import Grid, Ticker
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS, seconds_to_ns
@@ -25,7 +26,6 @@ from skytether.shared.core.stopwatch import Stopwatch
 from skytether.shared.core.time_of_day import TimeOfDay
 from skytether.shared.law.heartbeat import Hearing
 from skytether.shared.scenario.catalogue import keys_of
-from skytether.shared.scenario.mission import Guided, parse_goals
 from skytether.shared.scenario.owners import InFlight
 from skytether.shared.scenario.pace import first_too_fast
 from skytether.shared.scenario.reference import Reference
@@ -46,8 +46,6 @@ TICK_EDGES_MS = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0)
 """Bin edges of the histogram of tick durations [ms]."""
 
 TRIGGER = keys_of(InFlight.TRIGGER)
-ZONES = keys_of(InFlight.ZONES)
-GOALS = keys_of(InFlight.GOALS)
 POINT = keys_of(InFlight.POINT)
 
 
@@ -85,36 +83,28 @@ class Server(Endpoint):
         self.changeable = TRIGGER
         if scenario.reference.shape == "live":
             self.changeable |= POINT
-        if scenario.is_mission:
-            self.changeable |= ZONES | GOALS
         terms = scenario.terms()
         self.patience_ns = terms.dt_ns // 4
-        own = scenario.is_mission or scenario.reference.shape == "target"
-        if references is None and own:
-            references = lru_cache(capacity)(scenario.measured_reference)
-        self._guided: Guided | None = None
-        """Goals of a mission; None without one."""
-        if scenario.is_mission and references:
-            goals = parse_goals(scenario.mission.goals, scenario.model.axes)
-            self._guided = Guided(references, goals)
-            references = lru_cache(capacity)(self._guided.of)
+        references = table.references(scenario, references, capacity)
         self.stopwatch = stopwatch or Stopwatch()
         self._clock = ClockMap(capacity, terms.dt_ns, seconds_to_ns(scenario.link.asymmetry_s))
         self.controller = Controller(
             scenario, terms, capacity, self._clock, self.stopwatch, references, planning
         )
+        scheme = self.controller.scheme
+        self.changeable |= scheme.changeable
         silence_ns = scenario.link.patience_ns
         self.sessions = Sessions(
             capacity,
             entropy,
             silence_ns,
             partial(Hearing, silence_ns, terms.dt_ns, scenario.link.fixed_ns),
-            keeps_rows=scenario.is_mission,
+            keeps_rows=scheme.is_one_fleet,
         )
         self._grid = Grid(terms.dt_ns, self._events)
         self._reception = Reception(
             terms,
-            scenario.limits(),
+            scheme.limits,
             scenario.link,
             boot_id,
             gate or PlainGate(),
@@ -216,11 +206,10 @@ class Server(Endpoint):
         """See `Endpoint`; the terms of the flight do not change."""
         if keys & TRIGGER:
             self.controller.change_trigger(scenario.control)
-        if keys & GOALS and self._guided:
-            self._guided.goals = parse_goals(scenario.mission.goals, scenario.model.axes)
-        if keys & ZONES:
-            self.controller.scheme.change_zones(scenario.zones)
-            self._reception.limits = scenario.limits()
+        scheme = self.controller.scheme
+        scheme.change(scenario, keys)
+        if scheme.limits is not self._reception.limits:
+            self._reception.limits = scheme.limits
             self._reception.limits_changes += 1
             self._limits_until_ns = now_ns + LIMITS_NS
         if keys & POINT:
@@ -230,9 +219,8 @@ class Server(Endpoint):
             self.controller.desired.move(position, velocity if velocity.size else None, now_ns)
 
     def objection(self, scenario: Scenario, keys: frozenset[str]) -> str:
-        """See `Endpoint`: a new zone must not be in the way of a vehicle."""
-        objection = self.controller.scheme.objection(scenario.zones) if keys & ZONES else ""
-        return f"mission.zones: got {objection}; nothing was changed" if objection else ""
+        """See `Endpoint`."""
+        return self.controller.scheme.objection(scenario, keys)
 
     @property
     def missed(self) -> int:
@@ -255,12 +243,7 @@ class Server(Endpoint):
         }
         if session.paths:
             vehicle_figures["paths"] = session.paths.paths.figures(self._ticked_ns)
-        scheme = self.controller.scheme
-        clock_m, waits = scheme.clock_m(row), scheme.waits(row)
-        mission_figures = {"clock_m": clock_m and round(clock_m, 3), "waits": waits or None}
-        return vehicle_figures | {
-            name: value for name, value in mission_figures.items() if value is not None
-        }
+        return vehicle_figures | self.controller.scheme.vehicle_figures(row)
 
     def figures(self) -> dict[str, Any]:
         ticks = self._ticker.durations
@@ -279,6 +262,6 @@ class Server(Endpoint):
             "dropped": by_name(self.dropped),
             "refused": by_name(self.refused),
             "by_vehicle": vehicle_figures,
-            **({"margins": dict(margins)} if (margins := self.controller.scheme.margins) else {}),
+            **self.controller.scheme.fleet_figures(),
             **({"budget": self.controller.budget.figures()} if self.controller.budget else {}),
         }

@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 
 from skytether.server.common.clock import ClockMap
@@ -14,15 +15,17 @@ from skytether.server.missions.vehicle_motions import SentMotion
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.core.stopwatch import Stopwatch
 from skytether.shared.law.motion import SPACING, Motion, resting
+from skytether.shared.missions.mission import Mission, swap
+from skytether.shared.missions.zones import Zones
 from skytether.shared.scenario import reading
-from skytether.shared.scenario.mission import Mission, swap
 from skytether.shared.scenario.schema import Scenario
-from skytether.shared.scenario.zones import Zones
 from skytether.shared.telemetry.record import Record, Rows
 from skytether.shared.telemetry.summary import least_separation
 from skytether.shared.wire.protocol import NO_HORIZON, NO_INPUT, Mode, Observation
 
 DT_S = 0.05
+KEY = frozenset({"mission.zones"})
+"""Key that `with_zones` changes."""
 
 
 def scenario(
@@ -35,6 +38,14 @@ def scenario(
     for way in ("uplink", "downlink"):
         table["network"][way] = f"paper(0.4, 0.02, 2.0) & {lost}"
     return reading.check(table, "swap")
+
+
+def with_zones(text: str) -> Scenario:
+    """Scenario of two vehicles with zones, which may be in the way of their goals."""
+    flown = scenario(2)
+    return msgspec.structs.replace(
+        flown, mission=msgspec.structs.replace(flown.mission, zones=text)
+    )
 
 
 def observation(step: int, in_force: int, place: tuple[float, float]) -> Observation:

@@ -1,12 +1,11 @@
 """Interface of a scheme of delay compensation, and the arrays that schemes fill in.
 
-`shared.scenario.schemes` lists the schemes. On a mission, `server.missions.mission_planner` is the
-scheme.
+`shared.scenario.schemes` lists the schemes, `server.schemes.table` loads the one of a scenario.
 """
 
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from typing import Annotated, Any, ClassVar, NamedTuple
 
@@ -19,11 +18,10 @@ from skytether.shared.base.kernel import F2, F3, F4, I1, S3, record, records
 from skytether.shared.core.events import Event
 from skytether.shared.core.stopwatch import Stopwatch
 from skytether.shared.law.model import Array, Flags, Indices
-from skytether.shared.law.terms import Terms
+from skytether.shared.law.terms import Limits, Terms
 from skytether.shared.scenario.reference import Reference
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.scenario.schemes import SchemeProperties
-from skytether.shared.scenario.zones import Zones
 from skytether.shared.wire.protocol import FEEDBACK, KNOTS_MAX, Lead, Observation
 
 
@@ -291,44 +289,42 @@ class Scheme(ABC):
     def sent_plans(self, batch: Batch) -> SentPlans:
         """Plans that are sent, for the record."""
 
-    # -- missions only -----------------------------------------------------------------------------
+    # -- what a room may add -----------------------------------------------------------------------
 
-    @property
-    def margins(self) -> Mapping[str, float]:
-        """How near vehicles have come to what the theorem of docs/together.md assumes, each as a
-        share: 1 is the bound. Empty without a mission.
-        """
+    changeable: frozenset[str] = frozenset()
+    """Keys that may be changed in flight, beside the server's own."""
+    is_one_fleet = False
+    """Whether all vehicles follow one server, and keep their rows when they fall silent."""
+    limits: Limits | None = None
+    """Limits of motions, which two servers of a vehicle must have in common."""
+
+    def change(self, scenario: Scenario, keys: frozenset[str]) -> None:  # noqa: B027
+        """Act on changed keys; the caller has asked `objection` first."""
+
+    def objection(self, scenario: Scenario, keys: frozenset[str]) -> str:  # noqa: ARG002
+        """Reason why the keys cannot be changed now; empty if they can."""
+        return ""
+
+    def fleet_figures(self) -> dict[str, Any]:
+        """Figures of all vehicles together, beside the server's own."""
         return {}
 
-    def change_zones(self, zones: Zones) -> None:  # noqa: B027 - most schemes fly no missions
-        """Replace the zones that vehicles keep out of."""
-
-    def objection(self, zones: Zones) -> str:  # noqa: ARG002
-        """Reason why the zones cannot be replaced by these now; empty if they can."""
-        return ""
+    def vehicle_figures(self, row: int) -> dict[str, Any]:  # noqa: ARG002
+        """Figures of a vehicle, beside the server's own."""
+        return {}
 
     def follow(self, row: int, told: Lead | None) -> None:  # noqa: B027
         """Note who leads a vehicle, and its motion in force; None if it has no other server."""
 
     def leave(self) -> int:
-        """Plan no further motion: the server ends. Returns the longest time until all motions have
-        ended [steps]; 0 without a mission.
+        """Plan nothing further: the server ends. Returns the longest time until all vehicles rest
+        [steps].
         """
         return 0
 
     def rests(self, row: int) -> bool:  # noqa: ARG002
-        """Whether a vehicle is at the end of every motion that it may fly, or another server leads
-        it; True without a mission.
-        """
+        """Whether a vehicle needs no further plan to be safe, or another server leads it."""
         return True
-
-    def waits(self, row: int) -> str:  # noqa: ARG002
-        """Reason why a vehicle waits; empty if it does not."""
-        return ""
-
-    def clock_m(self, row: int) -> float | None:  # noqa: ARG002
-        """Position error that the vehicle's clock error may cause [m]; None without a mission."""
-        return None
 
     def restart(self, row: int) -> bool:  # noqa: ARG002
         """Note that a vehicle's client has restarted; False if this was known already."""

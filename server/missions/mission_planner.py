@@ -28,10 +28,10 @@ vehicle, and `yielding` which vehicle makes way for another.
 """
 
 import math
-from collections.abc import Mapping
 from functools import partial
 from itertools import chain
 from operator import sub
+from typing import Any
 
 import numpy as np
 
@@ -52,7 +52,12 @@ from skytether.shared.base.chance import stream
 from skytether.shared.core.events import InZone
 from skytether.shared.law.model import ALTITUDE, Array, Flags, Indices
 from skytether.shared.law.motion import INTERVALS, SPACING, Motion
-from skytether.shared.scenario.zones import Zones
+from skytether.shared.missions.derived import clearances, lands, limits, rest_scale, zones
+from skytether.shared.missions.mission import Guided, parse_goals
+from skytether.shared.missions.zones import Zones
+from skytether.shared.scenario.catalogue import keys_of
+from skytether.shared.scenario.owners import InFlight
+from skytether.shared.scenario.schema import Scenario
 from skytether.shared.wire.protocol import KNOTS_MAX, Lead, Observation
 
 RESTS_MPS = 0.2
@@ -76,6 +81,8 @@ CLOCK_POINTS = 33
 BINDS_M = 1e-4
 """Distance from its half-plane within which a constraint counts as limiting a motion [m]."""
 
+ZONES, GOALS = keys_of(InFlight.ZONES), keys_of(InFlight.GOALS)
+
 SILENT = np.zeros((), dtype=FIGURES)
 """Figures of a vehicle without a packet to send."""
 SILENT["gap"], SILENT["solved"] = 1, True
@@ -83,6 +90,9 @@ SILENT["gap"], SILENT["solved"] = 1, True
 
 class MissionPlanner(SplineScheme):
     """Scheme "trajectory" for missions: motions that keep apart."""
+
+    changeable = ZONES | GOALS
+    is_one_fleet = True
 
     def __init__(self, fleet: Fleet, state: MissionState) -> None:
         super().__init__(fleet)
@@ -92,16 +102,18 @@ class MissionPlanner(SplineScheme):
         self.counts, self.events = state.counts, state.events
         self.observed_step = state.observed_step
         mission = scenario.mission
-        clearances = self._clearances = scenario.clearances
+        self.limits = limits(scenario)
+        self._references = fleet.references
+        apart = self._clearances = clearances(scenario)
         self._dt_s = terms.dt_s
         self._resend_after = terms.age_max // 3
         """Age at which a motion is sent again, before it is too old to be flown [steps]."""
         self._qp = TrajectoryQP(terms, mission.acceleration_mps2, mission.speed_mps)
-        self._zones, self._lands = scenario.zones, scenario.lands
+        self._zones, self._lands = zones(scenario), lands(scenario)
         self._waypoints = Waypoints(
             self._zones,
-            clearances.tube_m,
-            clearances.planned_apart_m,
+            apart.tube_m,
+            apart.planned_apart_m,
             round(DETOUR_S / terms.dt_s),
             stream(scenario.seed, "together"),
         )
@@ -110,12 +122,14 @@ class MissionPlanner(SplineScheme):
         self._repeating: list[VehicleMotions] = []
         """Vehicles whose latest motion is repeated at this step."""
         self._scale = state.possible.metric.scale.copy()
-        self._scale[ALTITUDE:] = scenario.rest_scale
+        self._scale[ALTITUDE:] = rest_scale(scenario)
         """Factors of the coordinates in distances between vehicles at rest; shape (axes,)."""
 
-    @property
-    def margins(self) -> Mapping[str, float]:
-        return self._state.margins
+    def fleet_figures(self) -> dict[str, Any]:
+        """How near vehicles have come to what the theorem of docs/together.md assumes, each as a
+        share: 1 is the bound.
+        """
+        return {"margins": dict(self._state.margins)}
 
     def forget(self, row: int) -> None:
         self._state.forget(row)
@@ -183,14 +197,21 @@ class MissionPlanner(SplineScheme):
 
     # -- zones -------------------------------------------------------------------------------------
 
-    def change_zones(self, zones: Zones) -> None:
-        """Use other zones from now on; the caller has asked `objection` first."""
-        self._zones = zones
-        self._waypoints.change_zones(zones)
-        for vehicle in self._state.vehicles.values():
-            vehicle.goal = None  # closed positions and progress belong to the old zones
+    def change(self, scenario: Scenario, keys: frozenset[str]) -> None:
+        if keys & GOALS and isinstance(self._references, Guided):
+            self._references.goals = parse_goals(scenario.mission.goals, scenario.model.axes)
+        if keys & ZONES:
+            self._zones, self.limits = zones(scenario), limits(scenario)
+            self._waypoints.change_zones(self._zones)
+            for vehicle in self._state.vehicles.values():
+                vehicle.goal = None  # closed positions and progress belong to the old zones
 
-    def objection(self, zones: Zones) -> str:
+    def objection(self, scenario: Scenario, keys: frozenset[str]) -> str:
+        """A new zone must not be in the way of a vehicle."""
+        objection = self._objection(zones(scenario)) if keys & ZONES else ""
+        return f"mission.zones: got {objection}; nothing was changed" if objection else ""
+
+    def _objection(self, zones: Zones) -> str:
         """Reason why these zones are refused; empty if they are accepted.
 
         A server that leads no vehicle leaves that to the one that does, and knows all motions.
@@ -228,10 +249,13 @@ class MissionPlanner(SplineScheme):
     def rests(self, row: int) -> bool:
         return self._state.rests(row)
 
-    def waits(self, row: int) -> str:
-        return self._state.vehicles[row].waits_for if row in self._state.vehicles else ""
+    def vehicle_figures(self, row: int) -> dict[str, Any]:
+        clock_m = self._clock_m(row)
+        waits = self._state.vehicles[row].waits_for if row in self._state.vehicles else ""
+        figures = {"clock_m": clock_m and round(clock_m, 3), "waits": waits or None}
+        return {name: value for name, value in figures.items() if value is not None}
 
-    def clock_m(self, row: int) -> float | None:
+    def _clock_m(self, row: int) -> float | None:
         """Displacement along its motion that a vehicle's clock error may cause [m]; or None.
 
         Other vehicles keep away by this much more, along its path.

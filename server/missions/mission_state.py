@@ -20,7 +20,8 @@ from skytether.shared.core.events import Event, LeftMotion, LeftTube
 from skytether.shared.law.model import ALTITUDE, Array, Indices
 from skytether.shared.law.motion import INTERVALS, JOIN_MAX, SPACING, Motion, resting
 from skytether.shared.law.terms import Terms
-from skytether.shared.scenario.mission import Mission
+from skytether.shared.missions.derived import lands
+from skytether.shared.missions.mission import Mission
 from skytether.shared.scenario.reference import Reference
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.wire.protocol import NO_HORIZON, Lead, Mode, Observation
@@ -114,7 +115,7 @@ class MissionState:
         self._dead_time_s = terms.dead_time_s
         self.kept_steps = -(-terms.join // SPACING) * SPACING
         """Steps after the first knot up to which a motion equals the one in force."""
-        self._land_after = terms.land_after if scenario.lands else NEVER
+        self._land_after = terms.land_after if lands(scenario) else NEVER
         """Steps of hovering without packets after which a vehicle lands."""
         self._tau_s, self._braking = max(terms.tau_s), 2.0 * terms.brake_mps2
         """Time constant [s] and deceleration [m/s²] of braking without a motion."""

@@ -1,13 +1,31 @@
 """The planner of missions, as the table of schemes sees it."""
 
+from collections.abc import Callable
+
 from skytether.server import missions
 from skytether.server.common import splines
 from skytether.server.common.scheme import Fleet, Scheme
 from skytether.server.missions.mission_planner import MissionPlanner
 from skytether.server.missions.mission_state import MissionState
+from skytether.shared.missions.mission import Guided, parse_goals
+from skytether.shared.scenario.reference import Reference
+from skytether.shared.scenario.schema import Scenario
 
 KERNELS = (missions, splines)
 """Package and module whose kernels are called on missions."""
+
+
+def references(
+    scenario: Scenario, given: Callable[[int], Reference] | None, most: int
+) -> Callable[[int], Reference]:
+    """Reference of each vehicle by its number, with goals that may be replaced in flight.
+
+    Args:
+        given: references without these goals; None: the scenario's.
+        most: largest number of vehicles.
+    """
+    goals = parse_goals(scenario.mission.goals, scenario.model.axes)
+    return Guided(given or scenario.measured_reference, goals, most)
 
 
 def make(fleet: Fleet) -> Scheme:

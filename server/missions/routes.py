@@ -11,7 +11,7 @@ import numpy as np
 
 from skytether.server.missions.zone_clearance import are_clear
 from skytether.shared.law.model import Array, Flags
-from skytether.shared.scenario.zones import Zones
+from skytether.shared.missions.zones import Zones
 
 NODES_MAX = 200
 """Largest number of nodes; with more, corners of the last zones are left out."""

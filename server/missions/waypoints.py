@@ -12,7 +12,7 @@ import numpy as np
 from skytether.server.missions.routes import Routes
 from skytether.server.missions.vehicle_motions import VehicleMotions
 from skytether.shared.law.model import Array
-from skytether.shared.scenario.zones import Zone, Zones
+from skytether.shared.missions.zones import Zone, Zones
 
 WAYPOINT_M = 3.0
 """Distance of a waypoint to the right of the route [m]."""

@@ -14,7 +14,7 @@ import numpy as np
 from skytether.server.missions.routes import Routes
 from skytether.server.missions.zone_clearance import comes_near
 from skytether.shared.law.model import Array
-from skytether.shared.scenario.zones import Zones
+from skytether.shared.missions.zones import Zones
 
 YIELD_S = 30.0
 """Longest time for which a vehicle yields [s]."""

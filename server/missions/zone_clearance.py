@@ -6,7 +6,7 @@ from skytether.shared.base.kernel import B1, F2, kernel, part, shared
 from skytether.shared.law import outlines
 from skytether.shared.law.model import Array, Flags
 from skytether.shared.law.outlines import Outlines
-from skytether.shared.scenario.zones import Zones
+from skytether.shared.missions.zones import Zones
 
 is_near = shared(outlines.is_near)
 

@@ -4,11 +4,13 @@ Each built-in scheme is the module of its name in this package; missions and plu
 each. The module of a scheme has
 
 - `make`, which makes the scheme from a `Fleet`, and
+- perhaps `references`, which makes the desired trajectories of several vehicles, and
 - KERNELS, the other modules and packages whose kernels it calls, or `kernels`, if these depend on
   the scheme's text. Kernels that every scheme calls are left out.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import lru_cache
 from importlib import import_module
 from types import ModuleType
 from typing import Any
@@ -16,7 +18,8 @@ from typing import Any
 from skytether.server.common.scheme import Fleet, Scheme
 from skytether.shared.base.kernel import KERNELS
 from skytether.shared.scenario import schemes
-from skytether.shared.scenario.registry import SCHEMES
+from skytether.shared.scenario.reference import Reference
+from skytether.shared.scenario.registry import SCHEMES, load
 from skytether.shared.scenario.schema import Scenario
 
 MISSIONS = "skytether.server.missions.planning"
@@ -38,7 +41,7 @@ OF_SOME = tuple(
 def _module(scenario: Scenario, *, missions: bool = True) -> Any:
     """Module that flies a scenario."""
     if missions and scenario.is_mission:
-        return import_module(MISSIONS)
+        return load(MISSIONS, "missions")
     name = schemes.call(scenario.control.scheme).name
     return import_module(f"{__package__}.{name}" if SCHEMES[name].is_ours else PLUGINS)
 
@@ -67,6 +70,25 @@ def make(fleet: Fleet) -> Scheme:
     """
     scheme: Scheme = _module(fleet.scenario, missions=fleet.references is not None).make(fleet)
     return scheme
+
+
+def references(
+    scenario: Scenario, given: Callable[[int], Reference] | None, most: int
+) -> Callable[[int], Reference] | None:
+    """Desired trajectory of each vehicle by its number, as what flies the scenario sees it; None if
+    all vehicles have the scenario's.
+
+    Args:
+        given: desired trajectories from outside, or None.
+        most: largest number of vehicles.
+    """
+    module = _module(scenario)
+    if hasattr(module, "references"):
+        seen: Callable[[int], Reference] = module.references(scenario, given, most)
+        return seen
+    if given is None and scenario.reference.shape == "target":
+        return lru_cache(most)(scenario.measured_reference)
+    return given
 
 
 def others(*scenarios: Scenario) -> set[str]:

@@ -7,13 +7,10 @@ from itertools import pairwise
 import numpy as np
 
 from skytether.shared.law.model import Array
-from skytether.shared.law.motion import INTERVALS, JOIN_MAX, SPACING, speed_bounds
 from skytether.shared.scenario import reference as shapes
-from skytether.shared.scenario import schemes
+from skytether.shared.scenario import rooms, schemes
 from skytether.shared.scenario.fence import inner_bounds, is_home_inside, margins
-from skytether.shared.scenario.geographic import NORTH_MAX
 from skytether.shared.scenario.grammar import GrammarError, leaves
-from skytether.shared.scenario.mission import Mission, format_goals, parse_goals
 from skytether.shared.scenario.planners import MPC
 from skytether.shared.scenario.registry import (
     PLANNERS,
@@ -38,8 +35,6 @@ TINY = 1e-9
 """Rounding tolerance of a product such as 40 · 0.011."""
 
 FENCED_STEPS_MAX = 100_000
-PLACES_MAX = 100_000_000
-"""Largest number of places of a show, which takes about ten seconds to check."""
 LOSSY = 0.3
 """Share of lost packets to the vehicle above which horizons must be longer."""
 
@@ -101,8 +96,9 @@ def contradictions(
     yield from wrong
     if wrong:
         return
+    mission = scenario.is_mission
     yield from _no_planner(scenario)
-    yield from _no_mission(scenario)
+    yield from rooms.of_missions().of_keys(scenario) if mission else _no_mission(scenario)
     no_network = list(_no_impairments(scenario))
     yield from no_network
     if not (no_network or any_network):
@@ -119,23 +115,24 @@ def contradictions(
 def _no_origin(scenario: Scenario) -> Iterator[Contradiction]:
     origin = scenario.reference.origin
     if origin and not (
-        len(origin) in (2, 3) and abs(origin[0]) <= NORTH_MAX and abs(origin[1]) <= 180.0
+        len(origin) in (2, 3) and abs(origin[0]) <= shapes.NORTH_MAX and abs(origin[1]) <= 180.0
     ):
-        north = f"up to {NORTH_MAX:g} degrees north or south"
+        north = f"up to {shapes.NORTH_MAX:g} degrees north or south"
         expected = f"latitude and longitude, {north}, and the altitude if it is known"
         yield "reference.origin", list(origin), expected
 
 
 def _no_way(scenario: Scenario, known: Scenario | None) -> Iterator[Contradiction]:
-    wrong = list(_no_zones(scenario)) or list(_no_goals(scenario))
+    mission = rooms.of_missions() if scenario.is_mission else None
+    wrong: list[Contradiction] = list(mission.of_changes(scenario)) if mission else []
     same = known and (scenario.reference, scenario.model.axes) == (
         known.reference,
         known.model.axes,
     )
     if not same:
         wrong += _no_shape(scenario) or _no_reference(scenario)
-        if scenario.is_mission and not wrong:
-            wrong += _no_places(scenario)
+        if mission and not wrong:
+            wrong += mission.of_places(scenario)
     yield from wrong
 
 
@@ -162,170 +159,19 @@ def _no_planner(scenario: Scenario) -> Iterator[Contradiction]:
         return
     if control.planner == MPC:
         return
-    if scenario.is_mission:
-        expected = f"{MPC!r} on a mission, whose vehicles keep apart by motions of the server's own"
-        yield "control.planner", repr(control.planner), expected
     if not SCHEMES[schemes.call(control.scheme).name].is_ours:
         expected = f"{MPC!r} with control.scheme = {control.scheme!r}, which plans itself"
         yield "control.planner", repr(control.planner), expected
 
 
 def _no_mission(scenario: Scenario) -> Iterator[Contradiction]:
-    """Contradictions of a mission, whose vehicles have to keep apart whichever packets are lost."""
-    control, link, vehicle = scenario.control, scenario.link, scenario.vehicle
-    if not scenario.is_mission:
-        if vehicle.on_loss == "return" and not is_home_inside(scenario.fence):
-            yield "vehicle.on_loss", "'return'", "'land', for home (0, 0) is outside the fence"
-        if scenario.mission.zones:
+    """Contradictions of what only missions have."""
+    if scenario.vehicle.on_loss == "return" and not is_home_inside(scenario.fence):
+        yield "vehicle.on_loss", "'return'", "'land', for home (0, 0) is outside the fence"
+    for key in ("zones", "goals"):
+        if given := getattr(scenario.mission, key):
             expected = "none without a mission: reference.shape = 'mission', or a swap"
-            yield "mission.zones", repr(scenario.mission.zones), expected
-        if scenario.mission.goals:
-            expected = "none without a mission: reference.shape = 'mission', or a swap"
-            yield "mission.goals", repr(scenario.mission.goals), expected
-        return
-    if not _is_one(control.trigger, "expected_gap"):
-        yield "control.trigger", repr(control.trigger), "'expected_gap' on a mission"
-    if vehicle.exhausted != "brake":
-        yield "vehicle.exhausted", repr(vehicle.exhausted), "'brake' on a mission"
-    most_s = JOIN_MAX * SPACING * control.dt
-    if not 0.0 < link.join_s <= most_s + TINY:
-        yield "link.join_s", link.join_s, f"more than 0, and at most {most_s:g} s, on a mission"
-    mission = scenario.mission
-    if 0.0 < mission.height_m < mission.separation_m - TINY:
-        # Heights are scaled by separation_m / height_m: a factor above 1 would make tubes, which
-        # are as high as wide, too high.
-        expected = f"0, or at least mission.separation_m ({mission.separation_m:g})"
-        yield "mission.height_m", mission.height_m, expected
-    if vehicle.on_loss == "return":
-        expected = "'land' on a mission: all other vehicles expect a vertical landing"
-        yield "vehicle.on_loss", repr(vehicle.on_loss), expected
-    # A vehicle that receives nothing flies its motion to the end before it brakes.
-    longest_s = (INTERVALS + JOIN_MAX) * SPACING * control.dt
-    for key, value in (("link.timeout_s", link.timeout_s), ("link.age_max_s", link.age_max_s)):
-        if value < longest_s - TINY:
-            yield key, value, f"at least {longest_s:g} s on a mission: no motion is longer"
-
-
-def _is_one(trigger: str, name: str) -> bool:
-    try:
-        return TRIGGERS.one(trigger).name == name
-    except GrammarError:
-        return False
-
-
-def _no_zones(scenario: Scenario) -> Iterator[Contradiction]:
-    least_m = scenario.mission.tube_m
-    try:
-        for zone in scenario.zones.zones:
-            long_m = float(np.ptp(zone.corners, axis=0).max())
-            if long_m < least_m:
-                what = f"zones of at least mission.tube_m = {least_m:g} m; this is {long_m:.2g} m"
-                yield "mission.zones", zone.name, f"{what} long, in metres"
-    except GrammarError as error:
-        yield "mission.zones", repr(error.given), error.expected
-
-
-def _no_goals(scenario: Scenario) -> Iterator[Contradiction]:
-    """Contradictions of `mission.goals`: unknown vehicle, in a zone, or too
-    near to another goal.
-    """
-    mission = scenario.mission
-    if not (mission.goals and scenario.is_mission):
-        return
-    try:
-        goals = parse_goals(mission.goals, scenario.model.axes)
-        flown = scenario.unallocated_reference()
-    except GrammarError as error:
-        yield "mission.goals", repr(error.given), error.expected
-        return
-    except ValueError:  # reported by `_no_reference`
-        return
-    assert isinstance(flown, Mission)
-    apart_m, clear_m = scenario.clearances.planned_apart_m, scenario.clearances.planned_clear_m
-    # Last goals of other vehicles; with `allocate` only the server knows them.
-    others = () if mission.allocate else flown.vehicles
-    ends = {each: flown.goals(each)[-1] for each in others if each not in goals}
-    beside = " to the side" if scenario.lands else ""
-    for vehicle, place in goals.items():
-        named = format_goals({vehicle: place})
-        near = [each for each, at in ends.items() if _away_m(scenario, at - place) < apart_m]
-        ends[vehicle] = place
-        if vehicle not in flown.vehicles:
-            yield "mission.goals", named, f"vehicles {', '.join(map(str, flown.vehicles))}"
-        elif zone := scenario.zones.in_the_way(place[None], clear_m):
-            yield "mission.goals", named, f"a place {clear_m:g} m from {zone}"
-        elif near:
-            yield (
-                "mission.goals",
-                named,
-                f"a place {apart_m:g} m{beside} from the goal of vehicle {near[0]}",
-            )
-
-
-def _away_m(scenario: Scenario, off: Array) -> float:
-    return math.hypot(*off[:2], *(scenario.rest_scale * off[2:]))
-
-
-def _no_places(scenario: Scenario) -> Iterator[Contradiction]:
-    """Contradictions of the goals of a mission's shape: too near to each other, or to zones."""
-    mission, goals = scenario.mission, scenario.unallocated_reference()
-    assert isinstance(goals, Mission)
-    if mission.allocate and (goals.is_show or not goals.in_step):
-        others = (
-            "a mission of goals" if goals.is_show else "goals of all vehicles at the same times"
-        )
-        yield "mission.allocate", "true", f"false, or {others}"
-        return
-    wrong = list(_too_fast(scenario, goals))
-    yield from wrong
-    if wrong:
-        return
-    zones, clear_m = scenario.zones, scenario.clearances.planned_clear_m
-    for vehicle in goals.vehicles if zones else ():
-        places = goals.goals(vehicle)
-        if goals.is_show and (zone_name := zones.in_the_way(places, clear_m)):
-            yield (
-                "mission.zones",
-                zone_name,
-                f"none within {clear_m:g} m of the path of vehicle {vehicle}",
-            )
-            return
-        near = np.argwhere(zones.clearance(places) < clear_m)
-        if len(near):
-            goal, zone = near[0]
-            at = ", ".join(f"{each:.3g}" for each in places[goal])
-            expected = f"none within {clear_m:g} m of the goal ({at}) of vehicle {vehicle}"
-            if zones.zones[zone].is_fence:
-                expected = (
-                    f"a fence {clear_m:g} m around the goal ({at}) of vehicle {vehicle}, for "
-                    "vehicles stay within every fence"
-                )
-            yield "mission.zones", zones.zones[zone].name, expected
-            return
-    too_near = goals.nearest(scenario.clearances.planned_apart_m, scenario.rest_scale)
-    if too_near:
-        one, other, at_s, away_m = too_near
-        margin_m = scenario.clearances.margin_m
-        most = f"with 2 · mission.tube_m and {margin_m:g} m at most {away_m:.3g} m"
-        what = "paths" if goals.is_show else "goals"
-        expected = f"{most}, as the {what} of vehicles {one} and {other} at {at_s:.6g} s"
-        if scenario.lands:
-            expected += " side by side, for both may land (vehicle.land_after_s = 0: never)"
-        yield "mission.separation_m", mission.separation_m, expected
-
-
-def _too_fast(scenario: Scenario, show: Mission) -> Iterator[Contradiction]:
-    """Contradictions of a show that is too fast for its vehicles, or too large to be checked."""
-    most_mps = speed_bounds(scenario.u_max, scenario.model_gain, scenario.mission.speed_mps)
-    if show.is_show and (found := show.too_fast(most_mps)):
-        vehicle, at_s, axis, speed_mps = found
-        bound = f"{most_mps[axis]:.3g} m/s on an axis, by model.u_max and mission.speed_mps"
-        asked = f"vehicle {vehicle} to fly {speed_mps:.3g} m/s from {at_s:.6g} s on"
-        expected = f"a show of at most {bound}; this asks {asked}"
-        yield "reference.file", repr(scenario.reference.file), expected
-    if show.is_show and (places := show.count_places()) > PLACES_MAX:
-        most = f"at most {PLACES_MAX} different times of all points, times vehicles"
-        yield "reference.file", repr(scenario.reference.file), f"a show of {most}, got {places}"
+            yield f"mission.{key}", repr(given), expected
 
 
 def _too_late(scenario: Scenario) -> Iterator[Contradiction]:
@@ -469,7 +315,7 @@ def _outside(scenario: Scenario) -> Iterator[Contradiction]:
         scenario.unallocated_reference(),
         np.arange(steps + 1) * scenario.control.dt,
     )
-    for vehicle in reference.vehicles if isinstance(reference, Mission) else (1,):
+    for vehicle in reference.vehicles if isinstance(reference, shapes.OfFleet) else (1,):
         states = scenario.unallocated_reference(vehicle)(times_s)
         wrong = list(_over_fence(scenario, scenario.start_m(vehicle), states))
         yield from wrong

@@ -4,8 +4,9 @@ A reference is a function from time since the epoch [s; any shape] to the desire
 [m, m/s; that shape + (axes, 2)], in the world frame with the third axis up.
 """
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +15,8 @@ from skytether.shared.law.model import Array
 
 FAR_M = 1e6
 """Largest coordinate of a trajectory [m]."""
+NORTH_MAX = 85.0
+"""Largest latitude of an origin [degrees]."""
 FAST_MPS = 1e6
 """Largest velocity along an axis of a trajectory made from points [m/s]."""
 GRID_S = 0.05
@@ -29,6 +32,27 @@ SAMPLED_S = np.concatenate([0.2347 * np.arange(512), np.geomspace(121.0, 86_400.
 increasingly sparse up to a day. No round numbers, since a trajectory may be special at those."""
 
 Reference = Callable[[NDArray[Any]], Array]
+
+
+class OfFleet(ABC):
+    """Desired trajectories of several vehicles, and one of them as a `Reference`."""
+
+    @property
+    @abstractmethod
+    def vehicles(self) -> tuple[int, ...]:
+        """Numbers of the vehicles."""
+
+    @abstractmethod
+    def __call__(self, t: NDArray[Any]) -> Array:
+        """See `Reference`."""
+
+    @abstractmethod
+    def of(self, vehicle: int) -> Self:
+        """The same with another vehicle's as the reference."""
+
+    @abstractmethod
+    def allocated(self) -> Self:
+        """The same with each vehicle's goals allocated anew."""
 
 
 def _planar(

@@ -19,6 +19,7 @@ import typing
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from importlib import import_module
 from types import MappingProxyType
 from typing import Annotated, Any, Literal, NamedTuple, TypeVar, overload
 
@@ -191,6 +192,27 @@ class Entry:
         return f"{name}({shown})" + (f" with {' and '.join(bounds)}" if bounds else "")
 
 
+def load(module: str, what: str) -> Any:
+    """Import a built-in module that a scenario needs; raises ConfigError if it is not installed.
+
+    Args:
+        what: what needs it, for the message.
+    """
+    try:
+        return import_module(module)
+    except ModuleNotFoundError as error:
+        if not f"{module}.".startswith(f"{error.name}."):
+            raise
+        raise ConfigError(f"{what}: {error.name} is not installed") from None
+
+
+def _offered() -> None:
+    """Stand-in for an entry whose module is not loaded yet."""
+
+
+_OFFERED = Entry(_offered, (), "")
+
+
 class PluginTable(dict[str, Entry]):
     """Entries of one kind by name, and the decorator that adds one.
 
@@ -211,6 +233,37 @@ class PluginTable(dict[str, Entry]):
         self.kind = kind
         self.form = form
         self._given, self._class, self._texts = given, class_, texts
+        self._modules: dict[str, str] = {}
+        """Module of each entry that is offered."""
+        self._built_in: dict[str, Entry] = {}
+        """Those entries of their modules that are loaded."""
+
+    # -- entries of modules that are not loaded yet --------------------------------------------
+
+    def offer(self, module: str, *names: str) -> None:
+        """Name entries of a built-in module, which is imported when one of them is first used."""
+        for name in names:
+            self._modules[name] = module
+            super().__setitem__(name, _OFFERED)
+
+    def __getitem__(self, name: str) -> Entry:
+        entry = super().__getitem__(name)
+        if entry is _OFFERED:
+            load(self._modules[name], f"{self.kind} {name}")
+            entry = self._built_in[name]
+            super().__setitem__(name, entry)
+        return entry
+
+    def get(self, name: str, default: Any = None) -> Any:
+        return self[name] if name in self else default  # noqa: SIM401 - that is this method
+
+    def items(self) -> Any:
+        return {name: self[name] for name in self}.items()
+
+    def values(self) -> Any:
+        return {name: self[name] for name in self}.values()
+
+    # -- texts ---------------------------------------------------------------------------------
 
     def parse(self, text: str) -> Expression:
         """Parse entries combined with & and |, and bind their arguments to parameters."""
@@ -354,15 +407,18 @@ class PluginTable(dict[str, Entry]):
         what = f"{self.kind} {name}"
         if not _NAME.fullmatch(name) or keyword.iskeyword(name):
             raise ConfigError(f"{what}: expected a name of letters, digits and _")
-        other = self.get(name)
-        if other and other.source != make.__module__:
-            raise ConfigError(f"{what}: expected another name, {other.source} has one of this name")
+        other = super().get(name)
+        source = self._modules.get(name) if other is _OFFERED else other and other.source
+        if source and source != make.__module__:
+            raise ConfigError(f"{what}: expected another name, {source} has one of this name")
         if lacking := sorted(getattr(make, "__abstractmethods__", ())):
             raise ConfigError(f"{what}: expected the methods {', '.join(lacking)}, too")
         passed = self._class if isinstance(make, type) else self._given
         parameters = _parameters(what, make, passed, texts=self._texts)
         about = inspect.cleandoc(make.__doc__ or "").partition("\n\n")[0]
         self[name] = Entry(make, parameters, " ".join(about.split()), needs)
+        if self._modules.get(name) == make.__module__:
+            self._built_in[name] = self[name]
 
 
 def _parameters(
@@ -448,7 +504,7 @@ VEHICLES = PluginTable(
 ZONES = PluginTable(
     "zone", "zones such as 'box(1, 2, -1, 1) & fence(-6, 6, -6, 6)'", given=0, class_=0, texts=True
 )
-"""Zones of `mission.zones`: functions that return a list of zones. See `shared.scenario.zones`;
+"""Zones of `mission.zones`: functions that return a list of zones. See `shared.missions.zones`;
 plug-ins cannot add any."""
 IMPAIRMENTS = PluginTable(
     "impairment",

@@ -21,13 +21,11 @@ from skytether.shared.base.chance import stream
 from skytether.shared.base.units import seconds_to_ns
 from skytether.shared.law.heartbeat import PATIENCE, SESSION_NS
 from skytether.shared.law.model import Array
-from skytether.shared.law.motion import Clearances, bend_m
-from skytether.shared.law.terms import Limits, Terms
+from skytether.shared.law.terms import Terms
 from skytether.shared.scenario import reference as shapes
-from skytether.shared.scenario import schemes, zone_texts
+from skytether.shared.scenario import schemes
 from skytether.shared.scenario.air import path as air
 from skytether.shared.scenario.grammar import TEXT_MAX, leaves
-from skytether.shared.scenario.mission import Mission
 from skytether.shared.scenario.owners import (
     InFlight,
     Key,
@@ -53,7 +51,6 @@ from skytether.shared.scenario.registry import (
     file_of,
 )
 from skytether.shared.scenario.schemes import SchemeProperties
-from skytether.shared.scenario.zones import Zones
 from skytether.shared.wire.paths import PATHS_MAX
 from skytether.shared.wire.protocol import INPUTS_MAX, PAYLOAD_BYTES_MAX
 
@@ -623,32 +620,19 @@ class Scenario(Section, frozen=True):
             radius_m=reference.radius_m,
             period_s=reference.period_s,
             altitude_m=reference.altitude_m,
-            points=_digest(repr(reference.points_m).encode() if reference.points_m else b""),
+            points=digest(repr(reference.points_m).encode() if reference.points_m else b""),
             speed_mps=reference.speed_mps,
             loop=reference.loop,
-            table=self._table_digest(),
+            table=self._tabledigest(),
             separation_m=self.mission.separation_m,
             height_m=self.mission.height_m,
             tube_m=self.mission.tube_m,
         )
 
-    def limits(self) -> Limits | None:
-        """Limits of the motions of a mission; None without one."""
-        if not self.is_mission:
-            return None
-        mission, zones = self.mission, self.zones.zones
-        plain = [(zone.corners.tolist(), *zone[2:]) for zone in zones]
-        return Limits(
-            speed_mps=mission.speed_mps,
-            acceleration_mps2=mission.acceleration_mps2,
-            asymmetry_s=self.link.asymmetry_s,
-            zones=_digest(repr(plain).encode() if plain else b""),
-        )
-
     def make_reference(self, vehicle: int = 1) -> shapes.Reference:
         """Desired trajectory of a vehicle, by its number; with the shape "target" each differs."""
         reference = self.unallocated_reference(vehicle)
-        if isinstance(reference, Mission) and self.mission.allocate:
+        if isinstance(reference, shapes.OfFleet) and self.mission.allocate:
             return reference.allocated().of(vehicle)
         return reference
 
@@ -672,7 +656,7 @@ class Scenario(Section, frozen=True):
             seed = int(stream(self.seed, "target", vehicle).integers(2**32))
             scenario = msgspec.structs.replace(self, seed=seed)
         reference: shapes.Reference = REFERENCES[shape.name].make(scenario, *shape.values)
-        return reference.of(vehicle) if isinstance(reference, Mission) else reference
+        return reference.of(vehicle) if isinstance(reference, shapes.OfFleet) else reference
 
     def start_m(self, vehicle: int = 1) -> Array:
         """Position of a vehicle at the start [m]; shape (axes,)."""
@@ -684,37 +668,6 @@ class Scenario(Section, frozen=True):
     def is_mission(self) -> bool:
         """Whether the flight is a mission: several vehicles with goals, which keep apart."""
         return self.reference.shape.partition("(")[0].strip() in MISSIONS
-
-    @property
-    def clearances(self) -> Clearances:
-        mission = self.mission
-        most_mps2 = float(np.sqrt(self.model.axes)) * mission.acceleration_mps2
-        return Clearances(
-            mission.separation_m + 2.0 * mission.tube_m,
-            mission.tube_m,
-            bend_m(most_mps2, self.control.dt),
-        )
-
-    @property
-    def lands(self) -> bool:
-        """Whether vehicles of a mission with three axes land if the server is silent."""
-        return self.is_mission and self.model.axes > 2 and self.vehicle.land_after_s > 0.0
-
-    @property
-    def rest_scale(self) -> float:
-        """Factor on distances along the third axis between vehicles at rest: 0 if they may land."""
-        return 0.0 if self.lands else self.mission.height_scale
-
-    @property
-    def zones(self) -> Zones:
-        """Zones of a mission. If vehicles may land, zones have no upper end, so that no vehicle
-        lands in one.
-
-        Raises:
-            GrammarError: the text is invalid.
-        """
-        parsed = zone_texts.parse(self.mission.zones, self.model.axes, self.files)
-        return parsed.to_the_sky() if self.lands else parsed
 
     def entries(self) -> Iterator[Entry]:
         """Entries of the scheme, the planner, the policies of the trigger, the shape and the
@@ -729,10 +682,10 @@ class Scenario(Section, frozen=True):
         if flies in VEHICLES:  # built-in ones are registered by the client, which may be missing
             yield VEHICLES[flies]
 
-    def _table_digest(self) -> str:
+    def _tabledigest(self) -> str:
         """Digest of `reference.file`, and of the origin of its coordinates."""
         origin = self.reference.origin
-        return _digest(self.table + repr(origin).encode() if self.table and origin else self.table)
+        return digest(self.table + repr(origin).encode() if self.table and origin else self.table)
 
     def _shape(self) -> str:
         """Shape as a term: its name; for a plug-in, its text and a digest of its states."""
@@ -740,7 +693,7 @@ class Scenario(Section, frozen=True):
         if REFERENCES[shape.name].is_ours:
             return shape.name
         states = shapes.sampled(self.unallocated_reference(), self.model.axes)
-        return f"{str(shape)[:SHAPE_CHARS]} {_digest(f'{shape}'.encode() + states)}"
+        return f"{str(shape)[:SHAPE_CHARS]} {digest(f'{shape}'.encode() + states)}"
 
 
 class WithFiles(Scenario, frozen=True):
@@ -753,5 +706,6 @@ class WithFiles(Scenario, frozen=True):
         return tuple(each._replace(origin=self.reference.origin) for each in self.contents)
 
 
-def _digest(content: bytes) -> str:
+def digest(content: bytes) -> str:
+    """Short digest of a file or text; "none" of nothing."""
     return hashlib.blake2s(content, digest_size=8).hexdigest() if content else "none"

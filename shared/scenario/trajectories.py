@@ -4,16 +4,11 @@ Each makes a trajectory (`shared.scenario.reference`) from the keys of the scena
 shape does.
 """
 
-from typing import Annotated
-
 import numpy as np
-from msgspec import Meta
 
 from skytether.shared.base.chance import stream
 from skytether.shared.law.model import Array
-from skytether.shared.scenario import mission as missions
 from skytether.shared.scenario import reference as curves
-from skytether.shared.scenario import tracks
 from skytether.shared.scenario.reference import Reference
 from skytether.shared.scenario.registry import REFERENCES
 from skytether.shared.scenario.schema import Scenario
@@ -62,13 +57,6 @@ def hover(scenario: Scenario) -> Reference:
 
 
 @reference
-def csv(scenario: Scenario) -> Reference:
-    """Timed path of one vehicle from `file`, straight from point to point."""
-    keys = scenario.reference
-    return tracks.path(scenario.table, scenario.model.axes, keys.origin, keys.speed_mps)
-
-
-@reference
 def target(scenario: Scenario) -> Reference:
     """Random walk known only to the server, of `agility`, within `speed_mps` and `radius_m`."""
     config = scenario.reference
@@ -87,35 +75,3 @@ def live(scenario: Scenario) -> Reference:
     """Point that is moved in flight, starting at the point in `points_m` or the origin."""
     points = _points(scenario)
     return curves.hover(points[0] if len(points) else np.zeros(scenario.model.axes))
-
-
-@reference
-def swap(scenario: Scenario, vehicles: Annotated[int, Meta(ge=2, le=1000)] = 16) -> Reference:
-    """Mission: vehicles on a circle of `radius_m`, each of which goes to the opposite place."""
-    config = scenario.reference
-    return missions.swap(vehicles, config.radius_m, scenario.model.axes, config.altitude_m)
-
-
-@reference
-def sphere(scenario: Scenario, vehicles: Annotated[int, Meta(ge=2, le=1000)] = 16) -> Reference:
-    """Mission: vehicles on a sphere of `radius_m`, each of which goes to the opposite place."""
-    config = scenario.reference
-    return missions.sphere(vehicles, config.radius_m, config.altitude_m)
-
-
-@reference
-def mission(scenario: Scenario) -> Reference:
-    """Mission with timed goals from `file`, at each of which a vehicle rests."""
-    return _mission(scenario, is_show=False)
-
-
-@reference
-def show(scenario: Scenario) -> Reference:
-    """Mission of timed paths from `file`: each point is reached at its time, and not after it."""
-    return _mission(scenario, is_show=True)
-
-
-def _mission(scenario: Scenario, *, is_show: bool) -> Reference:
-    axes, keys = scenario.model.axes, scenario.reference
-    found = tracks.tracks(scenario.table, axes, keys.origin, keys.speed_mps)
-    return missions.Mission(found, axes, 1, is_show=is_show)

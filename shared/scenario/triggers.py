@@ -23,7 +23,6 @@ from skytether.shared.scenario.grammar import Combination, Expression, Value
 from skytether.shared.scenario.registry import PERIOD_MAX, TRIGGERS
 from skytether.shared.scenario.schema import ControlConfig
 from skytether.shared.scenario.schemes import HELD, that_compute
-from skytether.shared.wire.protocol import AXES_MAX
 
 trigger = TRIGGERS
 """Decorator of a policy: a function of a `Situation` and its numbers, or a subclass of
@@ -219,7 +218,8 @@ def _all_of(n: int) -> Flags:
     return flags
 
 
-def _timed(event: Flags, figures: Figures) -> Verdict:
+def timed(event: Flags, figures: Figures) -> Verdict:
+    """Verdict of a policy that compares no figure."""
     return Verdict(event, figures["state_gap"], _constant(len(event), 0.0), Compared.NOTHING)
 
 
@@ -242,13 +242,13 @@ class _Stateless(Trigger):
         if isinstance(verdict, Verdict):
             return verdict
         new = situation.figures["fresh"] | (situation.arrays.sent_step[situation.rows] < 0)
-        return _timed(new | verdict, situation.figures)
+        return timed(new | verdict, situation.figures)
 
 
 @trigger
 def always(situation: Situation) -> Verdict:
     """Sends at every step."""
-    return _timed(_all_of(len(situation.rows)), situation.figures)
+    return timed(_all_of(len(situation.rows)), situation.figures)
 
 
 @trigger
@@ -280,7 +280,7 @@ class Periodic(Trigger):
         fresh = figures["fresh"]
         if fresh.any():
             self._sent_step[rows[fresh]] = figures["step"][fresh] - self._period
-        return _timed(due | fresh, figures)
+        return timed(due | fresh, figures)
 
     def sent(self, rows: Indices, figures: Figures) -> None:
         self._sent_step[rows] = figures["step"]
@@ -349,71 +349,6 @@ class ExpectedGap(Trigger):
         return above(situation, Compared.EXPECTED_GAP, self._most)
 
 
-@trigger(needs="deviation_m")
-def deviation(situation: Situation, metres: Amount = 0.05) -> Verdict:
-    """Sends if flying on with the inputs already sent leads farther than this many metres from the
-    plan.
-    """
-    return above(situation, Compared.DEVIATION_M, metres)
-
-
-@trigger(name="send_on_delta")
-class SendOnDelta(Trigger):
-    """Sends if the reference is more than so many metres from where it was at the last packet.
-
-    Level crossings with a hysteresis of one level; no model predicts the reference. Source:
-    Miskowicz, Send-on-delta concept, Sensors 6 (2006).
-    """
-
-    def __init__(self, control: ControlConfig, capacity: int, metres: Amount = 0.5) -> None:  # noqa: ARG002
-        self._metres = metres
-        self._latest, self._sent = np.zeros((2, capacity, AXES_MAX))
-
-    def forget(self, row: int) -> None:
-        self._latest[row] = self._sent[row] = 0.0
-
-    def test(self, situation: Situation) -> Verdict:
-        rows, desired_m = situation.rows, situation.desired[:, :, 0, 0]
-        axes = slice(desired_m.shape[1])
-        self._latest[rows, axes] = desired_m
-        moved_m = np.linalg.norm(desired_m - self._sent[rows, axes], axis=1)
-        return above(situation, moved_m, self._metres)
-
-    def sent(self, rows: Indices, figures: Figures) -> None:  # noqa: ARG002
-        self._sent[rows] = self._latest[rows]
-
-
-@trigger(name="self_triggered")
-class SelfTriggered(Trigger):
-    """Sends at a time fixed at the last packet: when the reference, at its velocity then, has moved
-    so many metres, but after so many seconds at the latest.
-
-    Source: Velasco, Fuertes, Marti, The self triggered task model for real-time control systems,
-    RTSS (2003).
-    """
-
-    def __init__(
-        self,
-        control: ControlConfig,  # noqa: ARG002
-        capacity: int,
-        metres: Amount = 0.5,
-        seconds: Annotated[float, Meta(ge=0.001, le=3600)] = 5.0,
-    ) -> None:
-        self._metres, self._most_s = metres, seconds
-        self._latest_s, self._wait_s = np.zeros((2, capacity))
-
-    def test(self, situation: Situation) -> Verdict:
-        rows = situation.rows
-        speed_mps = np.linalg.norm(situation.desired[:, :, 0, 1], axis=1)
-        self._latest_s[rows] = self._metres / np.maximum(speed_mps, self._metres / self._most_s)
-        # 1e-9: rounding errors of a time in steps.
-        due = situation.since_sent_s > self._wait_s[rows] - 1e-9
-        return _timed(situation.figures["fresh"] | due, situation.figures)
-
-    def sent(self, rows: Indices, figures: Figures) -> None:  # noqa: ARG002
-        self._wait_s[rows] = self._latest_s[rows]
-
-
 @trigger(name="silence")
 class Silence(Periodic):
     """Sends after this many seconds without a packet, or after half a horizon if that is shorter.
@@ -433,46 +368,6 @@ class Silence(Periodic):
         if not control.properties.splines:
             steps = min(steps, control.horizon // 2)
         super().__init__(control, capacity, steps)
-
-
-@trigger(name="budget")
-class Budget(Trigger):
-    """Sends while it has a token: combined by &, a hard limit on the rate of packets.
-
-    A token bucket: b ← min(b + g, burst) at every step, b ← b - 1 with a packet, and no packet if
-    b < 1. So T seconds have at most burst + packets_per_s · T packets. A packet that another policy
-    sends by a | without a token empties the bucket.
-    """
-
-    def __init__(
-        self,
-        control: ControlConfig,
-        capacity: int,
-        packets_per_s: Annotated[float, Meta(ge=0.001, le=1_000_000)],
-        burst: Annotated[float, Meta(ge=1, le=1_000_000)],
-    ) -> None:
-        self._gain = packets_per_s * control.dt
-        self._burst = burst
-        self._tokens = np.full(capacity, burst, dtype=np.float64)
-        """Tokens b after step `_step`; shape (capacity,)."""
-        self._step = np.zeros(capacity, dtype=np.int64)
-
-    def forget(self, row: int) -> None:
-        self._tokens[row], self._step[row] = self._burst, 0
-
-    def test(self, situation: Situation) -> Verdict:
-        filled = self._filled(situation.rows, situation.figures)
-        return _timed(filled >= 1.0, situation.figures)
-
-    def sent(self, rows: Indices, figures: Figures) -> None:
-        # Not below 0: a packet that another policy sends without a token leaves no debt.
-        self._tokens[rows] = np.maximum(self._filled(rows, figures) - 1.0, 0.0)
-        self._step[rows] = figures["step"]
-
-    def _filled(self, rows: Indices, figures: Figures) -> Array:
-        gained = self._gain * (figures["step"] - self._step[rows])
-        # Computed from the number of steps passed, so that missed ticks fill the bucket too.
-        return np.minimum(self._tokens[rows] + gained, self._burst)
 
 
 class Combined(Trigger):
@@ -536,7 +431,7 @@ class Guarded(Trigger):
             )
         except Exception as error:
             self._fail(error)
-            return _timed(_all_of(len(rows)), figures)
+            return timed(_all_of(len(rows)), figures)
 
     def sent(self, rows: Indices, figures: Figures) -> None:
         try:

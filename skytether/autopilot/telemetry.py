@@ -11,7 +11,7 @@ from skytether.mavlink.codec import Message
 from skytether.mavlink.dialect import dialect
 from skytether.mavlink.frames import turned
 from skytether.shared.base.units import MILLISECOND_NS
-from skytether.shared.scenario.geographic import EARTH_M
+from skytether.shared.formats.geographic import EARTH_M
 
 HEARTBEAT = int(dialect.MAVLINK_MSG_ID_HEARTBEAT)
 SENSORS = int(

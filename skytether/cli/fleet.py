@@ -19,12 +19,14 @@ from skytether.cli import page_process, processes
 from skytether.figures import film
 from skytether.figures import flights as figures
 from skytether.server.schemes import table
+from skytether.shared import formats
 from skytether.shared.base import kernel
 from skytether.shared.core.events import NotFlown
 from skytether.shared.core.stopwatch import Stopwatch
+from skytether.shared.formats import plans, tracks
 from skytether.shared.law.model import Array
-from skytether.shared.scenario import formats, plans, reading, tracks
-from skytether.shared.scenario.mission import Mission
+from skytether.shared.missions.mission import Mission
+from skytether.shared.scenario import reading
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.drops import drops
 from skytether.shared.telemetry.record import Record, sent_by

@@ -33,8 +33,8 @@ from skytether.shared.base import files
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.core.endpoint import Address
 from skytether.shared.core.events import Counted, Event, Listening
+from skytether.shared.formats.recorded import recorded_in
 from skytether.shared.scenario import reading
-from skytether.shared.scenario.air.recorded import recorded_in
 from skytether.shared.scenario.registry import File
 from skytether.shared.telemetry.record import PACKET_COLUMNS, RECORDING, Recorder, Rows
 from skytether.shared.wire import keys

@@ -27,7 +27,7 @@ from skytether.shared.core.change import Answer
 from skytether.shared.core.endpoint import VEHICLES_TOLD_MAX, Datagram
 from skytether.shared.core.events import ChangeRefused
 from skytether.shared.core.line import Line, parse_line
-from skytether.shared.scenario.mission import format_goals, parse_goals
+from skytether.shared.missions.mission import format_goals, parse_goals
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.feed import FeedError, Frame, Opened, Rows, columns_of, table
 from skytether.shell import system

@@ -11,6 +11,7 @@ import numpy as np
 from skytether.figures.page import blank
 from skytether.shared.base import files
 from skytether.shared.law.model import Array
+from skytether.shared.missions.derived import zones
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Rows
 
@@ -82,7 +83,7 @@ def _frames(
     canvas: Any = FigureCanvasAgg(figure)
     plane, nearest = figure.subplots(1, 2) if separations else (figure.subplots(), None)
     everywhere = client["state"][:, :2, 0]
-    for zone in scenario.zones.zones:
+    for zone in zones(scenario).zones:
         plane.fill(*zone.corners.T, facecolor="none", edgecolor="tab:red")
     plane.set_xlim(everywhere[:, 0].min() - 0.5, everywhere[:, 0].max() + 0.5)
     plane.set_ylim(everywhere[:, 1].min() - 0.5, everywhere[:, 1].max() + 0.5)

@@ -158,7 +158,9 @@ def fleet(
         faint = 0.5 if separations else max(0.05, 1 / len(flights))
         plane.plot(x, y, "k-", linewidth=0.6, alpha=faint)
     if separations:
-        for number, zone in enumerate(scenario.zones.zones):
+        from skytether.shared.missions.derived import zones  # a room
+
+        for number, zone in enumerate(zones(scenario).zones):
             label = "" if number else "zones"
             plane.fill(*zone.corners.T, facecolor="none", edgecolor="tab:red", label=label)
         for rows in flights:

@@ -28,10 +28,11 @@ from skytether.shared.base.errors import ConfigError
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS, seconds_to_ns
 from skytether.shared.core.endpoint import STANDBY_SOCKETS, Datagram, Endpoint
 from skytether.shared.law.terms import Terms
-from skytether.shared.scenario import mission
-from skytether.shared.scenario.mission import Mission
+from skytether.shared.missions import mission
+from skytether.shared.missions.derived import zones
+from skytether.shared.missions.mission import Mission
+from skytether.shared.missions.zones import Zones
 from skytether.shared.scenario.schema import Scenario
-from skytether.shared.scenario.zones import Zones
 from skytether.shared.telemetry.summary import Track, nearest
 from skytether.shared.wire.protocol import Lead, Observation, decode, encode
 from skytether.sim.flight import SERVER, STANDBY
@@ -214,7 +215,7 @@ class Approach(msgspec.Struct, frozen=True, kw_only=True):
     strays: int = 0
     """Number of motions left before their end, or accepted too late."""
     margins: dict[str, float] = {}
-    """How near vehicles came to what the theorem assumes, see `Scheme.margins`."""
+    """How near vehicles came to what the theorem assumes, see `Scheme.fleet_figures`."""
 
 
 class AdversaryNetwork(Endpoint):
@@ -310,7 +311,7 @@ class Raid:
             has_standby=self._has_standby,
         )
         self._world, self._vehicles = self._lives.world, self._lives.mission.vehicles
-        self._zones: list[tuple[float, Zones]] = [(0.0, scenario.zones)]
+        self._zones: list[tuple[float, Zones]] = [(0.0, zones(scenario))]
         """Zones set by the operator, and the time of each change on the hosts' clocks [s]."""
         for move in moves:
             if move.kind not in NETWORK:
@@ -400,7 +401,7 @@ class Raid:
         if up := self._lives.scenarios:
             agree = len({each.mission.zones for each in up}) == 1
             since_s = CLOCK.local(self._world.now_ns) / SECOND_NS
-            self._zones.append((since_s, (up[0] if agree else self._scenario).zones))
+            self._zones.append((since_s, zones(up[0] if agree else self._scenario)))
 
     # -- flight ------------------------------------------------------------------------------------
 
@@ -471,12 +472,12 @@ class Raid:
         """
         scale, found = self._scenario.mission.height_scale, NOWHERE
         ends = [since for since, _ in self._zones[1:]] + [math.inf]
-        for (since, zones), end in zip(self._zones, ends, strict=True):
+        for (since, around), end in zip(self._zones, ends, strict=True):
             for number, (times, at) in tracks.items():
                 in_force = np.flatnonzero((times >= since) & (times < end))
-                if zones and len(in_force):
+                if around and len(in_force):
                     points = at[in_force] / np.array([1.0, 1.0, scale])[: at.shape[1]]
-                    clear_m = zones.clearance(points).min(axis=1)
+                    clear_m = around.clearance(points).min(axis=1)
                     i = int(clear_m.argmin())
                     if clear_m[i] < found.away_m:
                         found = Near(float(clear_m[i]), world_s(times[in_force[i]]), (number,))
@@ -504,7 +505,7 @@ class Climb:
         """What the climb minimises, by its number: the distance between vehicles or from zones, or
         what is left to the bound of something that the theorem assumes.
         """
-        has_zones = bool(self.scenario.zones) or MoveKind.ZONES in self.kinds
+        has_zones = bool(zones(self.scenario)) or MoveKind.ZONES in self.kinds
         goals = (APART, *([CLEAR] if has_zones else []), *ASSUMED)
         return goals[self.number % len(goals)]
 

@@ -28,7 +28,7 @@ from skytether.shared.base.units import SECOND_NS, seconds_to_ns
 from skytether.shared.core.change import Running, with_values
 from skytether.shared.core.endpoint import Address, Endpoint
 from skytether.shared.core.events import Event
-from skytether.shared.scenario.mission import Mission
+from skytether.shared.missions.mission import Mission
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Recorder, client_columns, parse
 from skytether.shared.telemetry.summary import Track, track

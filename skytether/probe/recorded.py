@@ -1,6 +1,6 @@
 """Measurements from files: a log of round-trip times, or two captures of one UDP flow.
 
-A log (`scenario.air.recorded`) has one clock and one series of delays, which is used for both
+A log (`shared.formats.recorded`) has one clock and one series of delays, which is used for both
 directions.
 
 Two captures, one at each end, are matched by payload, for the flow with most packets in both. A
@@ -19,7 +19,7 @@ import numpy as np
 from skytether.probe.outages import RoundTrips
 from skytether.probe.prober import PROBES_MAX, MeasuredPath, Way
 from skytether.shared.base.units import SECOND_NS
-from skytether.shared.scenario.air.recorded import CAPTURES, CAPTURES_NEW, RecordedPath
+from skytether.shared.formats.recorded import CAPTURES, CAPTURES_NEW, RecordedPath
 
 RECORDS_MAX = 4 * PROBES_MAX
 """Largest number of records in a capture, those of other protocols included."""

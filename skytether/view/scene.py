@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from skytether.figures.colours import GREY, PALETTE, RED, Rgb
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.law.model import Array
-from skytether.shared.scenario.mission import Mission
+from skytether.shared.missions.mission import Mission
+from skytether.shared.missions.zones import Zones
 from skytether.shared.scenario.schema import Scenario
-from skytether.shared.scenario.zones import Zones
 from skytether.view.state import State, VehicleTrack
 
 FLIGHT_RGB: tuple[Rgb, ...] = ((56, 132, 255), (255, 140, 40), (160, 90, 220), (20, 170, 150))

@@ -24,10 +24,11 @@ from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS, seconds_to_ns
 from skytether.shared.core.events import DOES, Changed, Counted, Event, Listening, Plaintext
 from skytether.shared.core.ways import FLIGHT, Ways
 from skytether.shared.law.model import Array
-from skytether.shared.scenario import reading, zone_texts
+from skytether.shared.missions import zone_texts
+from skytether.shared.missions.zones import Zones
+from skytether.shared.scenario import reading
 from skytether.shared.scenario.grammar import GrammarError
 from skytether.shared.scenario.schema import Scenario
-from skytether.shared.scenario.zones import Zones
 from skytether.shared.telemetry.feed import (
     FeedError,
     Figures,

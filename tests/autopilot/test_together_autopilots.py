@@ -24,6 +24,7 @@ from skytether.netem.proxy import Proxy
 from skytether.server.endpoint import Server
 from skytether.shared.core.events import Counted
 from skytether.shared.law.model import Array
+from skytether.shared.missions.derived import zones
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.dotted import set_keys
 from skytether.shared.scenario.reading import check
@@ -103,7 +104,7 @@ def test_three_swap_places_within_a_fence(flavour: FlavourName, loss: float) -> 
         goal = flown.make_reference(number)(np.array(flown.duration))[:, 0]
         assert np.linalg.norm(path[-1, :2] - goal[:2]) < 0.5
         assert path[-1, 2] < 0.1
-        assert flown.zones.clearance(path).min() > 0.0
+        assert zones(flown).clearance(path).min() > 0.0
     assert apart_m(paths) > flown.mission.separation_m
     if flavour == "ardupilot":
         assert server.figures()["counts"].get("left_tube", 0) == 0

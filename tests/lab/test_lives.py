@@ -2,7 +2,8 @@
 
 from lives import Death, Lives
 from skytether.shared.core.events import InZone
-from skytether.shared.scenario import reading, zone_texts
+from skytether.shared.missions import zone_texts
+from skytether.shared.scenario import reading
 from skytether.shared.scenario.schema import Scenario
 
 BOX = "box(-1.5, 1.5, -1.5, 1.5)"

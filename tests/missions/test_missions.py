@@ -42,11 +42,13 @@ from skytether.shared.core.events import ChangeRefused, SessionEnded
 from skytether.shared.law.model import Array, Indices
 from skytether.shared.law.motion import INTERVALS, SAMPLES, SPACING, Motion, resting
 from skytether.shared.law.spline import spline_at
-from skytether.shared.scenario import reading, zone_texts
-from skytether.shared.scenario.mission import Mission
+from skytether.shared.missions import zone_texts
+from skytether.shared.missions.derived import clearances
+from skytether.shared.missions.mission import Mission
+from skytether.shared.missions.zones import Zones
+from skytether.shared.scenario import reading
 from skytether.shared.scenario.reading import ConfigError
 from skytether.shared.scenario.schema import Scenario
-from skytether.shared.scenario.zones import Zones
 from skytether.shared.telemetry.record import Rows
 from skytether.shared.telemetry.summary import least_separation
 from skytether.shared.wire.drop import Drop, ProtocolError
@@ -362,7 +364,7 @@ def test_a_motion_is_too_near_below_the_distance(beyond_m: float, is_hit: bool) 
     made.align(100)
     made.vehicles[1].outside_m = 0.1
     made.state.update_possible()
-    keep_m = flown.clearances.apart_m + 0.1
+    keep_m = clearances(flown).apart_m + 0.1
     near = resting(100, np.array([-4.0 + keep_m + beyond_m, 0.0]))
     planned = made.state.possible_motion(0, near)
     assert made._conflicts(0, near, planned).tolist() == [False, is_hit, False]

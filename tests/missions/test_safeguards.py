@@ -23,10 +23,11 @@ from skytether.shared.base.chance import stream
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
 from skytether.shared.core.events import InZone
 from skytether.shared.law.motion import SAMPLES, SPACING, Motion, bend_m, resting
-from skytether.shared.scenario import zone_texts
-from skytether.shared.scenario.zones import Zones
+from skytether.shared.missions import zone_texts
+from skytether.shared.missions.derived import clearances
+from skytether.shared.missions.zones import Zones
 from skytether.shared.wire.protocol import NO_HORIZON
-from two_vehicles import DT_S, alone, along, planned, ready, scenario
+from two_vehicles import DT_S, KEY, alone, along, planned, ready, scenario, with_zones
 
 FAR = 100.0
 
@@ -176,7 +177,7 @@ def test_a_plan_that_still_comes_too_near_is_not_sent() -> None:
 
 def test_a_vehicle_inside_a_zone_does_not_leave_it_through_another() -> None:
     made = ready()
-    made.change_zones(zone_texts.parse("cylinder(4, 0, 1) & cylinder(0, 0, 1)", 2))
+    made.change(with_zones("cylinder(4, 0, 1) & cylinder(0, 0, 1)"), KEY)
     way = np.stack([np.linspace(4.0, 0.0, 41), np.zeros(41)], axis=1)
     assert made._enters_zone(way)
     assert not made._enters_zone(way * [-1.0, 1.0] + [8.0, 0.0])
@@ -190,7 +191,7 @@ def test_a_vehicle_that_moves_is_not_told_to_rest_where_it_passes() -> None:
             made.hear(row, step, NO_HORIZON, x, 0.5)
     made.decide(101)
     assert made.vehicles[0].next is None
-    assert made.waits(0) == "coming to rest"
+    assert made.vehicle_figures(0)["waits"] == "coming to rest"
 
 
 def test_how_far_a_vehicle_is_outside_its_tube_is_kept_by_itself_and_for_its_next_motion() -> None:
@@ -257,7 +258,7 @@ def test_nothing_is_planned_for_a_vehicle_whose_client_has_begun_anew() -> None:
     made.state.restart(0)
     made.decide(101)
     assert made.vehicles[0].next is None
-    assert made.waits(0) == "its restarted client"
+    assert made.vehicle_figures(0)["waits"] == "its restarted client"
 
 
 def test_others_keep_away_from_all_of_its_motions() -> None:
@@ -310,19 +311,20 @@ def test_a_zone_is_refused_where_a_late_vehicle_still_passes() -> None:
 
 
 def test_no_zone_is_taken_before_it_is_known_where_all_vehicles_are() -> None:
-    made, zone = alone(), zone_texts.parse("cylinder(20, 20, 1)", 2)
+    made = alone()
     made.hear(0, 100, NO_HORIZON, 4.0)
     made.align(101)
-    assert made.objection(zone) == "zones before it is known where vehicle 2 is"
-    assert not made.objection(zone_texts.parse("", 2))
+    objection = made.objection(with_zones("cylinder(20, 20, 1)"), KEY)
+    assert "zones before it is known where vehicle 2 is" in objection
+    assert not made.objection(with_zones(""), KEY)
 
 
 def test_a_vehicle_that_rests_in_a_zone_leaves_it_the_shortest_way() -> None:
     """It has been there since the server started; the goal counts once it is out."""
     made, zone = ready(), zone_texts.parse("box(3, 4.2, -9, 9)", 2)
-    made.change_zones(zone)
+    made.change(with_zones("box(3, 4.2, -9, 9)"), KEY)
     end = planned(made).position[-1]
-    assert zone.clearance(end[None]).min() >= scenario(2).clearances.tube_m
+    assert zone.clearance(end[None]).min() >= clearances(scenario(2)).tube_m
     assert 4.2 < end[0] < 5.5
     (told,) = made.events
     assert isinstance(told, InZone)

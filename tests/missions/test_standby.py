@@ -14,7 +14,7 @@ from skytether.server.missions.led_vehicles import LedVehicles
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.core.events import LimitsDiffer, SessionRefused
 from skytether.shared.law.motion import SPACING, Motion, resting
-from skytether.shared.scenario.mission import Mission
+from skytether.shared.missions.mission import Mission
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.summary import nearest
 from skytether.shared.wire.protocol import NO_HORIZON, Lead
@@ -105,7 +105,7 @@ def test_a_vehicle_is_sent_nothing_before_it_was_observed_under_the_new_leader()
     made.align(201)
     made.decide(201)
     assert all(vehicle.next is None for vehicle in made.vehicles.values())
-    assert made.waits(0) == "its first observation"
+    assert made.vehicle_figures(0)["waits"] == "its first observation"
     made.hear(0, 205, NO_HORIZON, 2.0)
     made.align(211)
     made.decide(211)

@@ -27,9 +27,10 @@ from skytether.shared.core.events import ClockContradicted
 from skytether.shared.core.time_of_day import DRIFT
 from skytether.shared.law.model import Array
 from skytether.shared.law.motion import SPACING, Motion, resting
+from skytether.shared.missions.derived import zones
+from skytether.shared.missions.mission import Mission
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.air.path import path
-from skytether.shared.scenario.mission import Mission
 from skytether.shared.scenario.schema import Scenario
 from skytether.sim import flight
 from two_vehicles import clear_m, drawn, left_m, separation_m
@@ -458,7 +459,7 @@ def test_missions_over_delays_that_differ(
     flown = flight.fly(scenario, vehicles=len(goals.vehicles))
     assert separation_m(flown) >= scenario.mission.separation_m
     if scenario.mission.zones:
-        assert clear_m(flown, scenario.zones) > 0.0
+        assert clear_m(flown, zones(scenario)) > 0.0
     assert "left_tube" not in flown.figures["server"]["counts"]
     if name != "warehouse":  # goals change there until 150 s
         assert max(left_m(flown, scenario)) < 0.3

@@ -34,7 +34,7 @@ from skytether.shared.base.units import HEADER_BYTES, MILLISECOND_NS, SECOND_NS
 from skytether.shared.core.change import Answer, Running
 from skytether.shared.core.endpoint import Address, Datagram
 from skytether.shared.core.ways import FLIGHT, NAMES, RELAY, RUN, Ways
-from skytether.shared.scenario.air.recorded import recorded_in
+from skytether.shared.formats.recorded import recorded_in
 from skytether.shared.scenario.reading import load
 from skytether.shared.scenario.registry import File
 from skytether.shared.scenario.schema import Scenario

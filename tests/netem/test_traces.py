@@ -12,8 +12,8 @@ from skytether.probe.outages import compare
 from skytether.probe.recorded import round_trips
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.base.units import SECOND_NS
+from skytether.shared.formats import recorded
 from skytether.shared.scenario import reading
-from skytether.shared.scenario.air import recorded
 from skytether.shared.scenario.air.draws import SLOT_NS
 from skytether.shared.scenario.air.path import Path as AirPath
 from skytether.shared.scenario.air.path import path

@@ -14,9 +14,9 @@ from skytether.__main__ import main
 from skytether.probe import recorded
 from skytether.probe.outcome import outcome
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
+from skytether.shared.formats.recorded import recorded_in
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.air.path import path
-from skytether.shared.scenario.air.recorded import recorded_in
 from skytether.shared.scenario.registry import File
 from skytether.shared.telemetry.record import parse
 

@@ -6,11 +6,10 @@ import zipfile
 
 import pytest
 
-from skytether.shared.scenario import bounded, plans, tracks, zone_files
-from skytether.shared.scenario.air import recorded
+from skytether.shared.formats import bounded, plans, recorded, tracks, zone_files
+from skytether.shared.missions.zones import CORNERS_MAX
 from skytether.shared.scenario.grammar import GrammarError
 from skytether.shared.scenario.registry import File
-from skytether.shared.scenario.zones import CORNERS_MAX
 
 COMMAS = b"," * bounded.COLUMNS_MAX
 

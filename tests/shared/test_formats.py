@@ -17,9 +17,10 @@ from pymavlink.DFReader import DFReader_binary
 
 from helpers import ran
 from skytether.cli import fleet
+from skytether.shared import formats
 from skytether.shared.base.extras import ExtraMissing
-from skytether.shared.scenario import formats, reading, tracks, zone_files
-from skytether.shared.scenario.formats import ulog
+from skytether.shared.formats import tracks, ulog, zone_files
+from skytether.shared.scenario import reading
 from skytether.shared.scenario.registry import File
 
 ORIGIN = (47.0, 8.0)
@@ -59,7 +60,7 @@ def zipped(**files: Any) -> bytes:
 
 @pytest.mark.parametrize("name", sorted({name for name, *_ in formats.FORMATS}))
 def test_each_format_has_a_module(name: str) -> None:
-    module = importlib.import_module(f"skytether.shared.scenario.formats.{name}")
+    module = importlib.import_module(f"skytether.shared.formats.{name}")
     assert callable(module.tracks)
     assert callable(module.axes_of)
 
@@ -70,7 +71,7 @@ import sys
 from skytether.shared.scenario import reading
 
 reading.load("demo").make_reference()
-print([name for name in sys.modules if name.startswith("skytether.shared.scenario.formats.")])
+print([name for name in sys.modules if name.startswith("skytether.shared.formats.")])
 """
     shown = ran(sys.executable, "-P", "-c", code)
     assert (shown.stdout, shown.stderr) == ("[]\n", "")

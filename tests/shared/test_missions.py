@@ -5,9 +5,9 @@ from itertools import combinations
 import numpy as np
 import pytest
 
+from skytether.shared.formats.tracks import tracks
 from skytether.shared.law.model import Array
-from skytether.shared.scenario.mission import Mission
-from skytether.shared.scenario.tracks import tracks
+from skytether.shared.missions.mission import Mission
 
 Goals = dict[int, tuple[Array, Array]]
 MANY = 2_000

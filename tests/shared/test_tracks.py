@@ -12,8 +12,9 @@ import numpy as np
 import pytest
 
 from skytether.shared.base.errors import ConfigError
+from skytether.shared.formats import tracks
 from skytether.shared.law.model import Array
-from skytether.shared.scenario import reading, tracks
+from skytether.shared.scenario import reading
 from skytether.shared.scenario.reference import Reference
 
 ORIGIN = (47.0, 8.0)

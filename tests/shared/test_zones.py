@@ -13,12 +13,13 @@ from hypothesis import strategies as st
 from helpers import packaged, refusal
 from skytether.server.missions.routes import Routes
 from skytether.server.missions.zone_clearance import comes_near
+from skytether.shared.formats.zone_files import CRS84
 from skytether.shared.law.model import Array
-from skytether.shared.scenario import reading, zone_texts
+from skytether.shared.missions import zone_texts
+from skytether.shared.missions.zones import Zones
+from skytether.shared.scenario import reading
 from skytether.shared.scenario.grammar import GrammarError
 from skytether.shared.scenario.reading import ConfigError
-from skytether.shared.scenario.zone_files import CRS84
-from skytether.shared.scenario.zones import Zones
 from two_vehicles import with_goals
 
 BOX = "box(1, 2, -1, 1)"

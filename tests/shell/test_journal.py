@@ -14,6 +14,7 @@ from helpers import HandLoop
 from skytether.netem.proxy import Proxy
 from skytether.shared.core.change import Answer, Running
 from skytether.shared.core.events import Event, NotKept
+from skytether.shared.missions.derived import zones
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.schema import Scenario
 from skytether.shell import control, journal
@@ -125,7 +126,7 @@ def test_a_zone_that_was_set_in_flight_is_in_force_in_the_next_life_of_a_server(
     write(tmp_path, SWAP, {"mission.zones": BOX})
     again = begun(tmp_path, SWAP)
     assert again.scenario.mission.zones == BOX
-    assert [zone.name for zone in again.scenario.zones.zones] == [BOX]
+    assert [zone.name for zone in zones(again.scenario).zones] == [BOX]
 
 
 def test_a_journal_that_is_cut_or_flipped_anywhere_is_refused_or_exact(tmp_path: Path) -> None:

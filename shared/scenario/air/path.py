@@ -8,7 +8,6 @@ packet lost by one is lost.
 from copy import copy
 from functools import lru_cache
 
-from skytether.shared.scenario.air import delays, losses, queues, traces  # noqa: F401 - fills the table
 from skytether.shared.scenario.air.impairment import Impairment
 from skytether.shared.scenario.air.queues import Ordered, Queued
 from skytether.shared.scenario.grammar import Call, GrammarError

@@ -4,12 +4,14 @@ from typing import Annotated, Literal
 
 from msgspec import Meta
 
+from skytether.shared.law.model import Array
 from skytether.shared.scenario.air.impairment import Impairment, impairment
-from skytether.shared.scenario.air.traces import DELIVERY_BYTES, deliveries_in
-from skytether.shared.scenario.registry import File
 
 QUEUE_BYTES = 64_000
 """Default capacity of a queue [B]."""
+
+DELIVERY_BYTES = 1504
+"""Bytes delivered at each time of a mahimahi file."""
 
 Bytes = Annotated[int, Meta(ge=1, le=67_108_864)]
 Drop = Literal["tail", "codel"]
@@ -26,6 +28,9 @@ class Ordered(Impairment):
 class Queued(Impairment):
     """Finite rate with a queue that packets of all flows share."""
 
+    times_s: Array | None = None
+    """Times at which DELIVERY_BYTES may leave the queue [s]; the last is also the period. None: at
+    any time."""
     keeps_all = False
     """Whether nothing is dropped, because whoever sends waits for room."""
 
@@ -56,26 +61,3 @@ class Rate(Queued):
     @property
     def bytes_per_s(self) -> float:
         return self._bytes_per_s
-
-
-@impairment(name="deliveries")
-class Deliveries(Queued):
-    """Sends queued packets at the times in a mahimahi trace file, which is repeated."""
-
-    def __init__(
-        self,
-        file: File,
-        queue: Bytes = QUEUE_BYTES,
-        drop: Drop = "tail",
-        serve: Served = "first",
-    ) -> None:
-        super().__init__(queue, drop, serve)
-        try:
-            self.times_s = deliveries_in(file)
-        except ValueError as error:
-            raise ValueError(f"a file of mahimahi ({error})") from None
-        """Times at which DELIVERY_BYTES may leave the queue [s]; the last is also the period."""
-
-    @property
-    def bytes_per_s(self) -> float:
-        return len(self.times_s) * DELIVERY_BYTES / float(self.times_s[-1])

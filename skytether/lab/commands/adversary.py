@@ -31,8 +31,8 @@ from skytether.lab.commands.pool import Flags, Interrupted, crew, writing
 from skytether.lab.journal import ENTRIES, digests
 from skytether.shared.base import files
 from skytether.shared.base.errors import ConfigError
+from skytether.shared.missions.mission import Mission
 from skytether.shared.scenario import reading
-from skytether.shared.scenario.mission import Mission
 from skytether.shared.scenario.schema import Scenario
 from skytether.shell import command
 from skytether.shell.argument import Argument

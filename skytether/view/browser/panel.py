@@ -13,7 +13,7 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
-from skytether.shared.scenario.mission import format_goals, parse_goals
+from skytether.shared.missions.mission import format_goals, parse_goals
 from skytether.view import words
 from skytether.view.browser.flight import PageFlight
 from skytether.view.browser.play import NETEMS

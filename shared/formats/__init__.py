@@ -8,9 +8,9 @@ from collections.abc import Callable
 from importlib import import_module
 from typing import Any, Protocol
 
+from skytether.shared.formats import bounded
+from skytether.shared.formats.geographic import Origin
 from skytether.shared.law.model import Array
-from skytether.shared.scenario import bounded
-from skytether.shared.scenario.geographic import Origin
 
 Tracks = dict[int, tuple[Array, Array]]
 """Rising times from 0 [s; shape (n,)] and points [m; shape (n, axes)], by number of the vehicle."""

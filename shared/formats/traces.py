@@ -11,15 +11,20 @@ from typing import Literal
 import numpy as np
 
 from skytether.shared.base.units import seconds_to_ns
+from skytether.shared.formats.recorded import Way, recorded_in, table, text_in
 from skytether.shared.law.model import Array
 from skytether.shared.scenario.air.delays import interpolated
 from skytether.shared.scenario.air.draws import Draws, Fate
 from skytether.shared.scenario.air.impairment import Impairment, impairment
-from skytether.shared.scenario.air.recorded import Way, recorded_in, table, text_in
+from skytether.shared.scenario.air.queues import (
+    DELIVERY_BYTES,
+    QUEUE_BYTES,
+    Bytes,
+    Drop,
+    Queued,
+    Served,
+)
 from skytether.shared.scenario.registry import File
-
-DELIVERY_BYTES = 1504
-"""Bytes delivered at each time of a mahimahi file."""
 
 
 @impairment(name="trace")
@@ -74,3 +79,25 @@ def deliveries_in(file: File) -> Array:
     except ValueError as error:
         raise ValueError(f"{file.name}: {error}") from None
     return times * 1e-3
+
+
+@impairment(name="deliveries")
+class Deliveries(Queued):
+    """Sends queued packets at the times in a mahimahi trace file, which is repeated."""
+
+    def __init__(
+        self,
+        file: File,
+        queue: Bytes = QUEUE_BYTES,
+        drop: Drop = "tail",
+        serve: Served = "first",
+    ) -> None:
+        super().__init__(queue, drop, serve)
+        try:
+            self.times_s = self._times_s = deliveries_in(file)
+        except ValueError as error:
+            raise ValueError(f"a file of mahimahi ({error})") from None
+
+    @property
+    def bytes_per_s(self) -> float:
+        return len(self._times_s) * DELIVERY_BYTES / float(self._times_s[-1])

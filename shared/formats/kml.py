@@ -14,12 +14,12 @@ from xml.etree.ElementTree import Element
 import numpy as np
 from numpy.typing import NDArray
 
+from skytether.shared.formats import Tracks
+from skytether.shared.formats.bounded import POINTS_MAX
+from skytether.shared.formats.geographic import Origin, above_sea
+from skytether.shared.formats.timing import Line, moment_ns, together
+from skytether.shared.formats.zone_files import kml_root
 from skytether.shared.law.model import Array
-from skytether.shared.scenario.bounded import POINTS_MAX
-from skytether.shared.scenario.formats import Tracks
-from skytether.shared.scenario.formats.timing import Line, moment_ns, together
-from skytether.shared.scenario.geographic import Origin, above_sea
-from skytether.shared.scenario.zone_files import kml_root
 
 CLAMPED = "clampToGround"
 

@@ -13,11 +13,10 @@ from typing import Any
 
 import numpy as np
 
+from skytether.shared.formats import Tracks, bounded
+from skytether.shared.formats.bounded import POINTS_MAX, SAMPLE_S
+from skytether.shared.formats.geographic import Origin
 from skytether.shared.law.model import Array
-from skytether.shared.scenario import bounded
-from skytether.shared.scenario.bounded import POINTS_MAX, SAMPLE_S
-from skytether.shared.scenario.formats import Tracks
-from skytether.shared.scenario.geographic import Origin
 
 SHOW = "show.json"
 CONTROLS_MAX = 6

@@ -6,6 +6,7 @@ present point and velocity of its path.
 
 from bisect import bisect_right
 from collections.abc import Callable, Mapping, Sequence
+from functools import lru_cache
 from itertools import count, product
 from typing import Any, NamedTuple
 
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 
 from skytether.shared.law.model import Array
 from skytether.shared.scenario.grammar import GrammarError, calls
-from skytether.shared.scenario.reference import FAR_M, Reference, timed_path
+from skytether.shared.scenario.reference import FAR_M, OfFleet, Reference, timed_path
 
 SWAP_AT_S = 2.0
 """Time at which vehicles that swap places depart."""
@@ -28,7 +29,7 @@ CROWDED = 32
 """Number of simultaneous stays in neighbouring cells above which two are certainly too near."""
 
 
-class Mission:
+class Mission(OfFleet):
     """Timed goals of all vehicles, and the reference of one of them.
 
     A vehicle starts at its first goal. A vehicle without goals stays at the origin.
@@ -323,12 +324,19 @@ class Guided:
     Args:
         references: gives the reference of a vehicle by its number.
         goals: goals that replace those of the mission [m; shape (axes,)], by vehicle.
+        most: largest number of vehicles whose references are kept.
     """
 
-    def __init__(self, references: Callable[[int], Reference], goals: Mapping[int, Array]) -> None:
+    def __init__(
+        self, references: Callable[[int], Reference], goals: Mapping[int, Array], most: int
+    ) -> None:
         self._references, self.goals = references, goals
+        self._kept = lru_cache(most)(self._of)
 
-    def of(self, vehicle: int) -> Reference:
+    def __call__(self, vehicle: int) -> Reference:
+        return self._kept(vehicle)
+
+    def _of(self, vehicle: int) -> Reference:
         """Reference of a vehicle: after time 0 its replaced goal, if it has one; otherwise that of
         the mission.
         """

@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skytether.shared.base.units import SECOND_NS
+from skytether.shared.formats import Tracks
+from skytether.shared.formats.bounded import POINTS_MAX
 from skytether.shared.law.model import Array
-from skytether.shared.scenario.bounded import POINTS_MAX
-from skytether.shared.scenario.formats import Tracks
 
 _TIME = re.compile(
     r"(\d{4}-\d\d-\d\d[T ]\d\d:\d\d(?::\d\d(?:\.\d{1,9})?)?)\d*(?:Z|([+-])(\d\d):?(\d\d))?"

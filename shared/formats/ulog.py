@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skytether.shared.base import extras
+from skytether.shared.formats import Tracks
+from skytether.shared.formats.geographic import Origin, above_sea
+from skytether.shared.formats.timing import Line, together
 from skytether.shared.law.model import Array
-from skytether.shared.scenario.formats import Tracks
-from skytether.shared.scenario.formats.timing import Line, together
-from skytether.shared.scenario.geographic import Origin, above_sea
 
 GLOBAL, LOCAL, HOME = "vehicle_global_position", "vehicle_local_position", "home_position"
 READS_MAX, READS_LEAST, MESSAGE_BYTES = 4_000_000, 1000, 8

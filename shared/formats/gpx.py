@@ -13,11 +13,10 @@ from xml.etree.ElementTree import Element
 import numpy as np
 from numpy.typing import NDArray
 
+from skytether.shared.formats import Tracks, bounded
+from skytether.shared.formats.geographic import Origin, above_sea
+from skytether.shared.formats.timing import Line, moment_ns, together
 from skytether.shared.law.model import Array
-from skytether.shared.scenario import bounded
-from skytether.shared.scenario.formats import Tracks
-from skytether.shared.scenario.formats.timing import Line, moment_ns, together
-from skytether.shared.scenario.geographic import Origin, above_sea
 
 
 class Path(NamedTuple):

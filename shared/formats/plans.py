@@ -10,9 +10,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from skytether.shared.law.model import Array
-from skytether.shared.scenario import bounded
-from skytether.shared.scenario.geographic import (
+from skytether.shared.formats import bounded
+from skytether.shared.formats.geographic import (
     METRES_MAX,
     Origin,
     check_origin,
@@ -20,9 +19,10 @@ from skytether.shared.scenario.geographic import (
     number,
     within,
 )
+from skytether.shared.law.model import Array
+from skytether.shared.missions.zones import CORNERS_MAX, ROUND, Zone, around, ring
 from skytether.shared.scenario.grammar import GrammarError
 from skytether.shared.scenario.registry import File
-from skytether.shared.scenario.zones import CORNERS_MAX, ROUND, Zone, around, ring
 
 WAYPOINT, LOITER_TIME, RETURN, LAND, TAKEOFF, DELAY, SPEED = 16, 19, 20, 21, 22, 93, 178
 """MAV_CMD of the items that are flown."""

@@ -9,9 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from skytether.shared.scenario import bounded, plans
-from skytether.shared.scenario.formats import Tracks
-from skytether.shared.scenario.geographic import Origin, check_origin
+from skytether.shared.formats import Tracks, bounded, plans
+from skytether.shared.formats.geographic import Origin, check_origin
 
 HEAD = "QGC WPL 110"
 COLUMNS = 12

@@ -12,16 +12,14 @@ around it. `zone_files` reads the files.
 
 import math
 from collections.abc import Sequence
-from typing import Literal
 
 import numpy as np
 
 from skytether.shared.law.model import Array
-from skytether.shared.scenario import plans, zone_files
-from skytether.shared.scenario.geographic import METRES_MAX
+from skytether.shared.missions.zones import CORNERS_MAX, Zone, Zones, around, ring
 from skytether.shared.scenario.grammar import GrammarError
-from skytether.shared.scenario.registry import ZONES, File, Files
-from skytether.shared.scenario.zones import CORNERS_MAX, Zone, Zones, around, ring
+from skytether.shared.scenario.reference import FAR_M
+from skytether.shared.scenario.registry import ZONES, Files
 
 
 def parse(text: str, axes: int, files: Files = ()) -> Zones:
@@ -37,8 +35,8 @@ def parse(text: str, axes: int, files: Files = ()) -> Zones:
     zones: list[Zone] = []
     for call in ZONES.calls(text):
         try:
-            if any(not isinstance(each, str) and abs(each) > METRES_MAX for each in call.values):
-                raise ValueError(f"numbers of at most {METRES_MAX:g} m")
+            if any(not isinstance(each, str) and abs(each) > FAR_M for each in call.values):
+                raise ValueError(f"numbers of at most {FAR_M:g} m")
             parsed: list[Zone] = ZONES.make(call, files)
         except ValueError as error:
             raise GrammarError(call.text, str(error)) from None
@@ -108,24 +106,6 @@ def corridor(width: float, *middle: float) -> list[Zone]:
     ends[1:-1] *= 2.0 / square[1:-1]
     sides = [points + sign * width / 2.0 * ends for sign in (1.0, -1.0)]
     return [Zone("", np.concatenate([sides[0], sides[1][::-1]]), is_fence=True)]
-
-
-@ZONES
-def geojson(file: File) -> list[Zone]:
-    """Zones in a GeoJSON file, see docs/together.md."""
-    return zone_files.geojson(file)
-
-
-@ZONES
-def kml(file: File, kind: Literal["keep_out", "fence"] = "keep_out") -> list[Zone]:
-    """Polygons of a KML file, to keep out of, or to stay within each of them."""
-    return zone_files.kml(file, is_fence=kind == "fence")
-
-
-@ZONES
-def plan(file: File) -> list[Zone]:
-    """Geofence of a QGroundControl plan: inclusions to stay within, exclusions to keep out of."""
-    return plans.fences(file)
 
 
 def _corners(x0: float, x1: float, y0: float, y1: float) -> Array:

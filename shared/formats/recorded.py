@@ -20,9 +20,9 @@ from typing import Literal
 import msgspec
 import numpy as np
 
+from skytether.shared.formats import pings
+from skytether.shared.formats.pings import BACK_MAX_S, ROWS_MAX
 from skytether.shared.law.model import Array, Flags
-from skytether.shared.scenario.air import pings
-from skytether.shared.scenario.air.pings import BACK_MAX_S, ROWS_MAX
 from skytether.shared.scenario.registry import File
 
 DELAY_MAX_S = 3600.0

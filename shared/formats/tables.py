@@ -20,11 +20,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from skytether.shared.formats import Tracks, bounded
+from skytether.shared.formats.bounded import POINTS_MAX, SAMPLE_S
+from skytether.shared.formats.geographic import Origin, local
 from skytether.shared.law.model import Array, Indices
-from skytether.shared.scenario import bounded
-from skytether.shared.scenario.bounded import POINTS_MAX, SAMPLE_S
-from skytether.shared.scenario.formats import Tracks
-from skytether.shared.scenario.geographic import Origin, local
 
 VEHICLES_MAX = 65_535
 """Largest number of a vehicle."""

@@ -8,9 +8,8 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from skytether.shared.law.model import Array
-from skytether.shared.scenario import bounded
-from skytether.shared.scenario.geographic import (
+from skytether.shared.formats import bounded
+from skytether.shared.formats.geographic import (
     METRES_MAX,
     Origin,
     check_origin,
@@ -19,9 +18,10 @@ from skytether.shared.scenario.geographic import (
     number,
     within,
 )
+from skytether.shared.law.model import Array
+from skytether.shared.missions.zones import CORNERS_MAX, Zone, around, ring
 from skytether.shared.scenario.grammar import GrammarError
 from skytether.shared.scenario.registry import File
-from skytether.shared.scenario.zones import CORNERS_MAX, Zone, around, ring
 
 CRS84 = {"type": "name", "properties": {"name": "urn:ogc:def:crs:OGC:1.3:CRS84"}}
 """The only value of the member `crs` that is accepted: the coordinates of RFC 7946."""

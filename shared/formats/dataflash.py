@@ -14,10 +14,10 @@ from typing import Any
 
 import numpy as np
 
-from skytether.shared.scenario.bounded import POINTS_MAX
-from skytether.shared.scenario.formats import Tracks
-from skytether.shared.scenario.formats.timing import Line, together
-from skytether.shared.scenario.geographic import Origin, above_sea
+from skytether.shared.formats import Tracks
+from skytether.shared.formats.bounded import POINTS_MAX
+from skytether.shared.formats.geographic import Origin, above_sea
+from skytether.shared.formats.timing import Line, together
 
 HEAD = b"\xa3\x95"
 FMT, FMT_BYTES = 128, 89

@@ -1,8 +1,7 @@
 """Missions of QGroundControl plans, see `plans.route`."""
 
-from skytether.shared.scenario import plans
-from skytether.shared.scenario.formats import Tracks
-from skytether.shared.scenario.geographic import Origin
+from skytether.shared.formats import Tracks, plans
+from skytether.shared.formats.geographic import Origin
 
 
 def tracks(content: bytes, axes: int, origin: Origin | None, _: float) -> Tracks:

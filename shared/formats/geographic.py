@@ -6,14 +6,13 @@ from typing import Any
 import numpy as np
 
 from skytether.shared.law.model import Array
+from skytether.shared.scenario.reference import NORTH_MAX
 
 EARTH_M = 6_378_137.0
 """Equatorial radius of the earth, WGS 84 [m]."""
 METRES_MAX, DEGREES_MAX_M = 1e6, 1e5
 """Largest distance from the origin on each axis, for coordinates in metres and in degrees [m]. The
 latter is less because degrees are projected onto a plane."""
-NORTH_MAX = 85.0
-"""Largest latitude [degrees]."""
 Origin = tuple[float, ...]
 """Latitude and longitude of a scenario's origin [degrees], and its altitude above the sea [m] if
 that is known; empty: not known."""

@@ -7,9 +7,9 @@ from functools import lru_cache
 
 import numpy as np
 
-from skytether.shared.scenario import formats
-from skytether.shared.scenario.formats import Tracks
-from skytether.shared.scenario.geographic import Origin
+from skytether.shared import formats
+from skytether.shared.formats import Tracks
+from skytether.shared.formats.geographic import Origin
 from skytether.shared.scenario.reference import FAR_M, Reference, timed_path
 
 

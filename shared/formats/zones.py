@@ -1,0 +1,25 @@
+"""Zones of a mission from files."""
+
+from typing import Literal
+
+from skytether.shared.formats import plans, zone_files
+from skytether.shared.missions.zones import Zone
+from skytether.shared.scenario.registry import ZONES, File
+
+
+@ZONES
+def geojson(file: File) -> list[Zone]:
+    """Zones in a GeoJSON file, see docs/together.md."""
+    return zone_files.geojson(file)
+
+
+@ZONES
+def kml(file: File, kind: Literal["keep_out", "fence"] = "keep_out") -> list[Zone]:
+    """Polygons of a KML file, to keep out of, or to stay within each of them."""
+    return zone_files.kml(file, is_fence=kind == "fence")
+
+
+@ZONES
+def plan(file: File) -> list[Zone]:
+    """Geofence of a QGroundControl plan: inclusions to stay within, exclusions to keep out of."""
+    return plans.fences(file)
