@@ -33,6 +33,7 @@ from skytether.shared.wire.drop import ProtocolError
 from skytether.shared.wire.keys import Keyring
 from skytether.shared.wire.protocol import Hello, Welcome, encode
 from skytether.sim import flight
+from skytether.sim.sealed import make_keys
 
 PEER: Address = ("127.0.0.1", 1024)
 NOW_NS = 86_400 * SECOND_NS
@@ -173,7 +174,7 @@ def _packets(counts: LinkCounts, lateness: WakeLateness) -> dict[str, Any]:
 
 
 def _gate(vehicles: int) -> tuple[server.SecureGate, Keyring]:
-    keyring = flight.make_keys(1, vehicles)
+    keyring = make_keys(1, vehicles)
     return server.SecureGate(keyring, entropy=stream(1, "gate").bytes), keyring
 
 

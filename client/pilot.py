@@ -8,13 +8,13 @@ decides what the vehicle may do, `client.compensator` which input of a horizon i
 
 import math
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from skytether.client.clamp import clamped
 from skytether.client.compensator import Compensator
 from skytether.client.failsafe import DROPPING, LATE_SHARE, Failsafe
-from skytether.client.fence import Fence
 from skytether.client.navigation import Navigation
 from skytether.client.reporting import Reporter
 from skytether.client.session import ServerSession
@@ -23,6 +23,7 @@ from skytether.shared.base.units import MICROSECOND_NS
 from skytether.shared.law.model import ALTITUDE, Array
 from skytether.shared.law.rule import braked
 from skytether.shared.scenario.gain import regulator
+from skytether.shared.scenario.registry import load
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Reason, Recorder
 from skytether.shared.wire.drop import Drop, ProtocolError
@@ -35,6 +36,9 @@ from skytether.shared.wire.protocol import (
     Trajectory,
     stamp_us,
 )
+
+if TYPE_CHECKING:
+    from skytether.client.fence import Fence
 
 LAND_MPS = 0.5
 """Speed of descent when landing [m/s]."""
@@ -72,7 +76,9 @@ class Pilot:
         along = regulator(scenario) if self._terms.splines or self._holds else None
         self.compensator = Compensator(self._terms, along)
         self._reporter = Reporter(self._terms, scenario.vehicle.report, self.compensator)
-        self._fence = Fence(scenario) if scenario.fence.is_there else None
+        self._fence: Fence | None = None
+        if scenario.fence.is_there:
+            self._fence = load("skytether.client.fence", "fence").Fence(scenario)
         # The paper's vehicle does not bound the change of the input: with `exhausted = "hold"` the
         # clamp only keeps the input finite and bounded.
         self._change_max = (
@@ -320,7 +326,7 @@ class Pilot:
         is_measured = bool(np.isfinite(self._navigation.measured[:, 0]).all())
         return is_measured and (self._is_mission or failsafe.reason not in UNPLACED)
 
-    def _fenced(self, fence: Fence, flown: list[float]) -> list[float]:
+    def _fenced(self, fence: "Fence", flown: list[float]) -> list[float]:
         """Input limited by the fence, which does not stop a landing vehicle from descending."""
         within = fence.limited(flown, self._navigation.predicted.tolist(), self._terms.u_max)
         if self._failsafe.mode is Mode.LAND and self._terms.axes > ALTITUDE:

@@ -9,17 +9,19 @@ driven by datagrams and time. `client.vehicles` has the table of all kinds.
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import Annotated, NamedTuple
+from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 import msgspec
 import numpy as np
 
-from skytether.ros2.graph import Node
 from skytether.shared.core.endpoint import Endpoint
 from skytether.shared.core.events import Failure
 from skytether.shared.law.model import Array
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Reason
+
+if TYPE_CHECKING:
+    from skytether.ros2.graph import Node
 
 
 class Measurement(NamedTuple):
@@ -70,7 +72,7 @@ class Vehicle(ABC):
     """Keys of the scenario that may change in flight."""
     port: Endpoint | None = None
     """Endpoint that talks to the vehicle's own hardware; None if there is none."""
-    node: Node | None = None
+    node: "Node | None" = None
     """Node of the ROS graph whose topics the port is connected to; None: the port is connected to
     the line at `vehicle.address`."""
     drifts = False

@@ -4,15 +4,19 @@ A plug-in adds a vehicle in the same way. Packages that a vehicle needs beside n
 when it is made.
 """
 
+from typing import TYPE_CHECKING
+
 from skytether.client.simulated import vehicle as computed
 from skytether.client.vehicle import Vehicle
-from skytether.ros2.graph import Node
 from skytether.shared.base import extras
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.core.line import Line, parse_line
 from skytether.shared.scenario.grammar import GrammarError
 from skytether.shared.scenario.registry import VEHICLES
 from skytether.shared.scenario.schema import Scenario
+
+if TYPE_CHECKING:
+    from skytether.ros2.graph import Node
 
 vehicle = VEHICLES
 """Decorator that registers a vehicle: a function of the `Scenario` and its number that makes a
@@ -60,7 +64,7 @@ def make(scenario: Scenario, number: int) -> Vehicle:
     return instance
 
 
-def connection(flies: Vehicle, scenario: Scenario) -> Line | Node | None:
+def connection(flies: Vehicle, scenario: Scenario) -> "Line | Node | None":
     """Connection of a vehicle's port, which becomes its process's socket 1; None without a port."""
     if flies.port is None:
         return None

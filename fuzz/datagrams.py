@@ -24,7 +24,7 @@ from skytether.shared.scenario.schema import Scenario
 from skytether.shared.wire import protocol
 from skytether.shared.wire.drop import ProtocolError
 from skytether.shared.wire.protocol import decode, encode, kind_of
-from skytether.sim.flight import make_keys
+from skytether.sim.sealed import make_keys
 
 SCENARIOS = (
     reading.load("playback"),

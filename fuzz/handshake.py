@@ -22,7 +22,7 @@ from skytether.shared.core.endpoint import EVENTS_MAX, Address, Datagram, Endpoi
 from skytether.shared.wire import channel, handshake, noise_nnpsk0, protocol
 from skytether.shared.wire.noise_nnpsk0 import KEY_BYTES, Initiator, Responder
 from skytether.shared.wire.protocol import Hello, Welcome, encode
-from skytether.sim.flight import make_keys
+from skytether.sim.sealed import make_keys
 
 CODE = (channel, handshake, noise_nnpsk0, client_secure, server_secure, gate)
 SERVER: Address = ("server", 0)

@@ -5,16 +5,19 @@ packet → bottleneck, if the direction has a finite rate → lost, or delayed �
 
 from dataclasses import dataclass, field
 from heapq import heapify, heappop, heappush
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-from skytether.netem.bottleneck import Bottleneck
 from skytether.netem.fate import Fates
 from skytether.shared.base.units import HEADER_BYTES, MILLISECOND_NS
 from skytether.shared.core.endpoint import Datagram
 from skytether.shared.scenario.air.draws import SLOT_NS, Fate
 from skytether.shared.scenario.air.path import Path
+from skytether.shared.scenario.registry import load
 from skytether.shared.telemetry.histogram import Histogram
 from skytether.shared.telemetry.record import Recorder
+
+if TYPE_CHECKING:
+    from skytether.netem.bottleneck import Bottleneck
 
 QUEUE_MAX = 65536
 """Largest number of packets queued in one direction; further ones are dropped, not counted as lost.
@@ -240,7 +243,7 @@ class Link:
             self._delay(*entered, passed_ns)
         self._count_dropped(bottleneck)
 
-    def _count_dropped(self, bottleneck: Bottleneck[Entered]) -> None:
+    def _count_dropped(self, bottleneck: "Bottleneck[Entered]") -> None:
         for datagram, lane, number, fate, entered_ns in bottleneck.dropped:
             self.counts.dropped += 1
             self._record_lost(lane, number, len(datagram.payload), entered_ns, fate.delay_ns)
@@ -384,8 +387,11 @@ class Link:
         }
 
 
-def _bottleneck(path: Path) -> Bottleneck[Entered] | None:
-    return Bottleneck(path.queue) if path.queue is not None else None
+def _bottleneck(path: Path) -> "Bottleneck[Entered] | None":
+    if path.queue is None:
+        return None
+    made: Bottleneck[Entered] = load("skytether.netem.bottleneck", "rate").Bottleneck(path.queue)
+    return made
 
 
 def _flipped(payload: bytes, place: float) -> bytes:

@@ -10,11 +10,10 @@ every step, since planning is a small part of the cost of a step.
 
 from collections import Counter
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from skytether.server.budget import SharedBudget
 from skytether.server.common.clock import UNSEEN, ClockMap, Seen, shortest_ns
 from skytether.server.common.desired import Desired
 from skytether.server.common.scheme import (
@@ -32,6 +31,7 @@ from skytether.shared.core.stopwatch import Stopwatch
 from skytether.shared.law.model import Array, Flags, Indices
 from skytether.shared.law.terms import Terms
 from skytether.shared.scenario.reference import Reference
+from skytether.shared.scenario.registry import load
 from skytether.shared.scenario.schema import ControlConfig, Scenario
 from skytether.shared.scenario.triggers import (
     Situation,
@@ -41,6 +41,9 @@ from skytether.shared.scenario.triggers import (
     make_trigger,
 )
 from skytether.shared.wire.protocol import Idle, Lead, Observation, committed_max
+
+if TYPE_CHECKING:
+    from skytether.server.budget import SharedBudget
 
 PLANS, OBSERVATION, DELAY, UNSOLVED, STANDBY = map(int, Idle)
 TAKEOVER_PLANS = 2
@@ -133,7 +136,10 @@ class Controller:
         """Whether each vehicle accepts horizons, by its newest observation; shape (capacity,)."""
         self._counts: Counter[str] = Counter()
         shared = control.shared_bytes_per_s
-        self.budget = SharedBudget(shared, clock, capacity) if shared else None
+        self.budget: SharedBudget | None = None
+        if shared:
+            module = load("skytether.server.budget", "control.shared_bytes_per_s")
+            self.budget = module.SharedBudget(shared, clock, capacity)
 
     @property
     def counts(self) -> Counter[str]:

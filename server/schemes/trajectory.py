@@ -33,7 +33,7 @@ would be in force. With k + d alone, a trajectory that ends was replaced too lat
 lost. A vehicle that no trajectory has reached hovers at its observed position.
 """
 
-from typing import Annotated, NamedTuple
+from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,7 +45,6 @@ from skytether.server.common.scheme import Figures, Fleet, Foresight, Splines
 from skytether.server.common.splines import SplineScheme
 from skytether.server.mpc import riccati
 from skytether.server.mpc.nominal import Nominal, make_nominal, plan_nominal
-from skytether.server.mpc.plugin_planners import PluginPlanners
 from skytether.server.schemes import knots
 from skytether.server.schemes import sent as tracker
 from skytether.server.schemes.delay_bound import SAMPLES, DelayBound
@@ -76,7 +75,11 @@ from skytether.shared.law import spline
 from skytether.shared.law.model import Flags, Indices
 from skytether.shared.scenario.gain import regulator
 from skytether.shared.scenario.planners import MPC
+from skytether.shared.scenario.registry import load
 from skytether.shared.wire.protocol import KNOTS_MAX, NO_HORIZON, Observation, committed_max
+
+if TYPE_CHECKING:
+    from skytether.server.mpc.plugin_planners import PluginPlanners
 
 RING = 64
 """Number of sent trajectories that are stored for each vehicle."""
@@ -150,9 +153,10 @@ class Guidance(SplineScheme):
         # A plan shorter than h ends before the vehicle has come near the trajectory, and after its
         # end the spline is a straight line: measured errors reached 12 m (docs/studies.md).
         plans = desired.seen > 0 and terms.horizon * terms.dt_s >= lead_s.max()
-        self._own = (
-            None if control.planner == MPC else PluginPlanners(fleet, self.counts, states=True)
-        )
+        self._own: PluginPlanners | None = None
+        if control.planner != MPC:
+            planners = load("skytether.server.mpc.plugin_planners", "control.planner")
+            self._own = planners.PluginPlanners(fleet, self.counts, states=True)
         seen = terms.horizon if self._own else desired.seen
         self._desired, self._clock, self._stopwatch = desired, fleet.clock, fleet.stopwatch
         self._loop_gain = np.array(terms.gain)
@@ -226,7 +230,7 @@ class Guidance(SplineScheme):
         self.solve_ns = took_ns if self._stopwatch.runs else -1
 
     def _plan_own(
-        self, own: PluginPlanners, rows: Indices, step: Indices, foresight: Foresight
+        self, own: "PluginPlanners", rows: Indices, step: Indices, foresight: Foresight
     ) -> None:
         """Fill in the trajectories of planners; without a plan the desired one, which is not
         sent.

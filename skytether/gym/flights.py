@@ -33,7 +33,7 @@ from skytether.shared.scenario.reference import Reference
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.scenario.triggers import Compared, Figures, Situation, Trigger, Verdict
 from skytether.shared.telemetry.record import Rows
-from skytether.sim.flight import BOOT_ID, MIDNIGHT_NS, SERVER, Run
+from skytether.sim.flight import BOOT_ID, MIDNIGHT_NS, PLAIN, SERVER, Run
 from skytether.sim.world import Clock, World
 
 SINCE_MAX_S = 60.0
@@ -82,7 +82,7 @@ class Flight:
     def __init__(self, scenario: Scenario, vehicles: int) -> None:
         self._scenario, self._vehicles = scenario, vehicles
         self.world = World(lambda *_: None)
-        self.run = Run(self.world, scenario, lambda: 0, lambda _: {}, 0, vehicles, None)
+        self.run = Run(self.world, scenario, lambda: 0, lambda _: {}, 0, vehicles, PLAIN)
         self._references = [scenario.make_reference(i + 1) for i in range(vehicles)]
         server = Server(
             scenario,

@@ -54,7 +54,8 @@ from skytether.shared.scenario.schema import Scenario
 from skytether.shared.wire.channel import LIFE_NS
 from skytether.shared.wire.keys import Keyring
 from skytether.shared.wire.protocol import Mode
-from skytether.sim.flight import STANDBY, make_keys
+from skytether.sim.flight import STANDBY
+from skytether.sim.sealed import make_keys
 from skytether.sim.world import Clock, World
 
 CLOCK_NS = 10**7 * SECOND_NS

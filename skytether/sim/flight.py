@@ -40,6 +40,7 @@ from skytether.shared.core.events import Event, Fault
 from skytether.shared.core.stopwatch import Stopwatch
 from skytether.shared.scenario.dotted import text_key
 from skytether.shared.scenario.reference import Reference
+from skytether.shared.scenario.registry import load
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import (
     PACKET_COLUMNS,
@@ -52,9 +53,7 @@ from skytether.shared.telemetry.record import (
     plan_columns,
     server_columns,
 )
-from skytether.shared.wire import keys
 from skytether.shared.wire.drop import Drop
-from skytether.shared.wire.keys import Keyring
 from skytether.sim.world import Clock, World
 
 # Aboard the client's code is plain Python; thousands of clients in one process need it compiled.
@@ -73,6 +72,21 @@ ASK_NS = 10 * MILLISECOND_NS
 """Virtual time between two calls of `stopped` [ns]."""
 EVENTS_MAX = 65_536
 """Number of newest events of a flight that are kept."""
+
+
+class Plain:
+    """Ends of links without keys; `sealed.Sealed` has those with keys."""
+
+    def link(self, seed: int, vehicle: int, purpose: str = "") -> ClientLink | None:  # noqa: ARG002
+        """Link of a client."""
+        return None
+
+    def gate(self, entropy: Callable[[int], bytes]) -> Gate | None:  # noqa: ARG002
+        """Gate of a server."""
+        return None
+
+
+PLAIN = Plain()
 
 
 def fly(
@@ -109,7 +123,9 @@ def fly(
         on_second: called with the time flown [s], once per second of flight.
         stopped: called often; the flight ends once the result is true.
     """
-    keyring = make_keys(scenario.seed, vehicles) if secure else None
+    ends = PLAIN
+    if secure:
+        ends = load("skytether.sim.sealed", "keys").Sealed(scenario.seed, vehicles)
     columns, sink = plan_columns(scenario.model.axes, scenario.control.horizon), io.BytesIO()
     plans = Recorder(columns, sink)
     (flight,) = _fly(
@@ -119,7 +135,7 @@ def fly(
         stopped,
         vehicles,
         stopwatch,
-        keyring,
+        ends,
         changes,
         plans,
         server,
@@ -205,7 +221,7 @@ class Run:
         server_figures: Callable[[Sequence[str]], Mapping[str, Any]],
         number: int,
         vehicles: int,
-        keyring: Keyring | None,
+        ends: Plain,
         *,
         has_standby: bool = False,
     ) -> None:
@@ -246,9 +262,9 @@ class Run:
                 kinds.make(scenario, vehicle),
                 vehicle=self._before + vehicle,
                 boot_id=BOOT_ID,
-                link=_link(keyring, scenario.seed, self._before + vehicle),
+                link=ends.link(scenario.seed, self._before + vehicle),
                 standby=standby,
-                standby_link=_link(keyring, scenario.seed, self._before + vehicle, "standby"),
+                standby_link=ends.link(scenario.seed, self._before + vehicle, "standby"),
                 recorder=recorder,
                 **reached,
             )
@@ -319,33 +335,6 @@ class Run:
         return Record(client, server, netem, failure, figures, tuple(self._events))
 
 
-def make_keys(seed: int, vehicles: int) -> Keyring:
-    """Keys for the vehicles from 1 on; equal seeds give equal keys."""
-    entropy = stream(seed, "keys").bytes
-    lines = [
-        keys.write(vehicle, 1, entropy(keys.SECRET_BYTES)) for vehicle in range(1, vehicles + 1)
-    ]
-    return keys.parse("keys", "".join(lines).encode())
-
-
-def _link(
-    keyring: Keyring | None, seed: int, vehicle: int, purpose: str = "entropy"
-) -> ClientLink | None:
-    if keyring is None:
-        return None
-    from skytether.client.secure import SecureLink  # slow: imports ciphers
-
-    return SecureLink(keyring.of(vehicle), entropy=stream(seed, purpose, vehicle).bytes)
-
-
-def _gate(keyring: Keyring | None, entropy: Callable[[int], bytes]) -> Gate | None:
-    if keyring is None:
-        return None
-    from skytether.server.secure import SecureGate  # slow: imports ciphers
-
-    return SecureGate(keyring, entropy=entropy)
-
-
 def _fly(
     scenario: Scenario,
     seeds: Sequence[int],
@@ -353,7 +342,7 @@ def _fly(
     stopped: Callable[[], bool],
     vehicles: int = 1,
     stopwatch: Stopwatch | None = None,
-    keyring: Keyring | None = None,
+    ends: Plain = PLAIN,
     changes: Sequence[tuple[float, Mapping[str, Any]]] = (),
     plans: Recorder | None = None,
     own_server: Endpoint | None = None,
@@ -391,7 +380,7 @@ def _fly(
             scenario,
             boot_id=BOOT_ID,
             entropy=entropy,
-            gate=_gate(keyring, entropy),
+            gate=ends.gate(entropy),
             capacity=len(seeds) * vehicles,
             recorder=recorder,
             plans=plans,
@@ -421,7 +410,7 @@ def _fly(
             server_figures,
             number,
             vehicles,
-            keyring,
+            ends,
             has_standby=bool(standby),
         )
         for number, run in enumerate(each)

@@ -19,7 +19,7 @@ from skytether.shared.scenario.reading import load
 from skytether.shared.wire.drop import ProtocolError
 from skytether.shared.wire.protocol import Hello, Observation, Welcome, encode
 from skytether.shell.udp import admit_only, kernel_drops, open_socket
-from skytether.sim.flight import make_keys
+from skytether.sim.sealed import make_keys
 
 pytestmark = pytest.mark.long
 

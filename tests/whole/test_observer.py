@@ -21,7 +21,7 @@ from skytether.shared.scenario import reading
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Recorder, client_columns, parse
 from skytether.shared.telemetry.summary import summarise
-from skytether.sim.flight import make_keys
+from skytether.sim.sealed import make_keys
 from skytether.sim.world import World
 
 SERVER_SIDE, OWN, ADDRESSES = 1, 2, 50

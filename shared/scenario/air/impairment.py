@@ -42,6 +42,10 @@ class Impairment:
     """Mean delay that the impairment adds [s]."""
     loss: float = 0.0
     """Mean share of packets that the impairment loses."""
+    is_ordered: bool = False
+    """Whether packets of a flow stay in order."""
+    is_queue: bool = False
+    """Whether it is a finite rate with a queue, see `queues.Queued`."""
     only_packets: bool = False
     """Whether byte streams, such as connections of TCP, cannot have the impairment."""
 

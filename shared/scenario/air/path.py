@@ -7,11 +7,14 @@ packet lost by one is lost.
 
 from copy import copy
 from functools import lru_cache
+from typing import TYPE_CHECKING, Any
 
 from skytether.shared.scenario.air.impairment import Impairment
-from skytether.shared.scenario.air.queues import Ordered, Queued
 from skytether.shared.scenario.grammar import Call, GrammarError
 from skytether.shared.scenario.registry import IMPAIRMENTS, Entry, Files
+
+if TYPE_CHECKING:
+    from skytether.shared.scenario.air.queues import Queued
 
 TEXT_MAX = 1000
 PARTS_MAX = 16
@@ -29,10 +32,10 @@ class Path:
         self.impairments: tuple[tuple[str, Impairment], ...] = tuple(
             (call.name, each)
             for call, each in zip(calls, impairments, strict=True)
-            if not isinstance(each, Ordered | Queued)
+            if not (each.is_ordered or each.is_queue)
         )
-        self.is_ordered = any(isinstance(each, Ordered) for each in impairments)
-        finite = [each for each in impairments if isinstance(each, Queued)]
+        self.is_ordered = any(each.is_ordered for each in impairments)
+        finite: list[Any] = [each for each in impairments if each.is_queue]
         if len(finite) > 1:
             raise GrammarError(
                 " & ".join(each.text for each in calls), "one rate or deliveries in a direction"

@@ -24,10 +24,13 @@ Served = Literal["first", "fair"]
 class Ordered(Impairment):
     """Keeps packets of a flow in order: a packet waits for those before it."""
 
+    is_ordered = True
+
 
 class Queued(Impairment):
     """Finite rate with a queue that packets of all flows share."""
 
+    is_queue = True
     times_s: Array | None = None
     """Times at which DELIVERY_BYTES may leave the queue [s]; the last is also the period. None: at
     any time."""
