@@ -43,7 +43,7 @@ from skytether.shared.law.model import Array, Indices
 from skytether.shared.law.motion import INTERVALS, SAMPLES, SPACING, Motion, resting
 from skytether.shared.law.spline import spline_at
 from skytether.shared.missions import zone_texts
-from skytether.shared.missions.derived import clearances
+from skytether.shared.missions.derived import clearances, zones
 from skytether.shared.missions.mission import Mission
 from skytether.shared.missions.zones import Zones
 from skytether.shared.scenario import reading
@@ -716,7 +716,7 @@ def test_in_space_they_keep_further_apart_one_above_the_other(tmp_path: Path) ->
     steps = min(len(one), len(other))
     off = np.abs(one[:steps] - other[:steps])
     assert np.linalg.norm(off * [1.0, 1.0, 0.5], axis=1).min() > 0.5
-    assert clear_m(flown, high.zones) > 0.0
+    assert clear_m(flown, zones(high)) > 0.0
     assert np.abs(one[-1] - [3.0, 0.0, 1.0]).max() < 0.3
     assert np.abs(other[-1] - [-3.0, 0.0, 2.2]).max() < 0.3
     assert np.abs(one[:, 1]).max() < 0.8  # below the box, straight except for the other vehicle
@@ -835,7 +835,7 @@ def test_a_vehicle_at_its_goal_in_a_gap_yields(
         flown = flight.fly(gap, vehicles=2)
         one, other = (rows["state"][:, :, 0] for rows in each_of(flown))
         assert separation_m(flown) > 0.5
-        assert clear_m(flown, gap.zones) > 0.0
+        assert clear_m(flown, zones(gap)) > 0.0
         furthest_m = np.linalg.norm(one, axis=1).max()
         return furthest_m, float(np.linalg.norm(one[-1])), float(abs(other[-1, 0] - 3.0))
 
@@ -1086,7 +1086,7 @@ def test_goals_as_near_as_they_may_be_are_reached(tmp_path: Path) -> None:
         table["link"] |= {"timeout_s": 20.0, "age_max_s": 20.0}
         return reading.check(table, "near")
 
-    clear = made("1,0,0,0\n").clearances
+    clear = clearances(made("1,0,0,0\n"))
     half_m, wall_m = 0.5 * clear.planned_apart_m, 0.5 * clear.planned_apart_m
     wall_m += clear.planned_clear_m + 1e-3
     goals = [(x, y) for x in (-half_m - 1e-3, half_m) for y in (-half_m - 1e-3, half_m)]
@@ -1100,7 +1100,7 @@ def test_goals_as_near_as_they_may_be_are_reached(tmp_path: Path) -> None:
     near = made("".join(rows), zones=zone)
     flown = flight.fly(near, vehicles=4)
     assert separation_m(flown) > near.mission.separation_m
-    assert clear_m(flown, near.zones) > 0.0
+    assert clear_m(flown, zones(near)) > 0.0
     assert max(left_m(flown, near)) < 0.1
     assert "asides" not in flown.figures["server"]["counts"]
 

@@ -200,7 +200,7 @@ def test_how_far_a_vehicle_is_outside_its_tube_is_kept_by_itself_and_for_its_nex
     made.align(101)
     made.state.update_possible()
     made.vehicles[0].outside_m = 0.1
-    near = resting(101, np.array([-4.0 + scenario(2).clearances.apart_m + 0.05, 0.0]))
+    near = resting(101, np.array([-4.0 + clearances(scenario(2)).apart_m + 0.05, 0.0]))
     possible = made.state.possible_motion(0, near)
     assert made._conflicts(0, near, possible).tolist() == [False, True, False]
     made.vehicles[0].outside_m, made.vehicles[0].turned_rad = 0.4, 0.5
@@ -295,7 +295,7 @@ def test_no_zone_is_taken_while_a_vehicle_flies_a_motion_of_an_earlier_server() 
     made.hear(0, 100, NO_HORIZON, 4.0)
     made.hear(1, 100, 70, -4.0)
     made.align(101)
-    assert "vehicle 2" in made.objection(zone_texts.parse("cylinder(20, 20, 1)", 2))
+    assert "vehicle 2" in made.objection(with_zones("cylinder(20, 20, 1)"), KEY)
 
 
 def test_a_zone_is_refused_where_a_late_vehicle_still_passes() -> None:
@@ -303,11 +303,11 @@ def test_a_zone_is_refused_where_a_late_vehicle_still_passes() -> None:
     made = ready()
     made.vehicles[0].in_force = SentMotion(90, along([4.0, 0.0], [-0.8, 0.0], first=101))
     made.align(165)
-    zone = zone_texts.parse("cylinder(3.4, 0, 0.3)", 2)
+    zone = with_zones("cylinder(3.4, 0, 0.3)")
     made.state.rows.late[0] = 0.0
-    assert not made.objection(zone)
+    assert not made.objection(zone, KEY)
     made.state.rows.late[0] = 60.0
-    assert "vehicle 1" in made.objection(zone)
+    assert "vehicle 1" in made.objection(zone, KEY)
 
 
 def test_no_zone_is_taken_before_it_is_known_where_all_vehicles_are() -> None:
@@ -424,8 +424,8 @@ def test_who_is_stuck_flies_for_a_while_around_one_that_rests_on_its_way(
 def test_zones_are_checked_whatever_is_known_of_a_clock(late: float) -> None:
     made = ready()
     made.state.rows.late[0] = late
-    assert not made.objection(zone_texts.parse("cylinder(0, 9, 0.5)", 2))
-    assert "vehicle 1 hovers in" in made.objection(zone_texts.parse("cylinder(4, 0, 0.5)", 2))
+    assert not made.objection(with_zones("cylinder(0, 9, 0.5)"), KEY)
+    assert "vehicle 1 hovers in" in made.objection(with_zones("cylinder(4, 0, 0.5)"), KEY)
 
 
 @pytest.mark.parametrize("late", [0.0, 1e11])

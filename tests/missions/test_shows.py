@@ -9,8 +9,8 @@ import pytest
 
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.law.model import Array
-from skytether.shared.missions import mission
-from skytether.shared.scenario import contradictions, reading
+from skytether.shared.missions import contradictions, mission
+from skytether.shared.scenario import reading
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Record
 from skytether.sim import flight

@@ -11,7 +11,8 @@ from skytether.client.simulated.vehicle import SimulatedVehicle
 from skytether.lab import keys_document
 from skytether.netem.__main__ import emulate
 from skytether.netem.proxy import Proxy
-from skytether.server.endpoint import GOALS, POINT, TRIGGER, ZONES
+from skytether.server.endpoint import POINT, TRIGGER
+from skytether.server.missions.mission_planner import GOALS, ZONES
 from skytether.shared.base.meanings import meanings
 from skytether.shared.core.ways import RELAY, RUN
 from skytether.shared.scenario.catalogue import KEYS, keys, keys_of

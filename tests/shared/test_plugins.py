@@ -418,8 +418,8 @@ WRONG = {
         f"adds nothing, {ADDS}",
     ),
     "a name of ours": (
-        "@trigger\ndef budget(now):\n    return now\n",
-        f"policy budget: expected another name, {OURS} has one of this name",
+        "@trigger\ndef silence(now):\n    return now\n",
+        f"policy silence: expected another name, {OURS} has one of this name",
     ),
     "a text": (
         "@trigger\ndef slip(now, how: str):\n    return now\n",

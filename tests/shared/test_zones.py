@@ -16,6 +16,7 @@ from skytether.server.missions.zone_clearance import comes_near
 from skytether.shared.formats.zone_files import CRS84
 from skytether.shared.law.model import Array
 from skytether.shared.missions import zone_texts
+from skytether.shared.missions.derived import zones
 from skytether.shared.missions.zones import Zones
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.grammar import GrammarError
@@ -321,7 +322,7 @@ def test_a_file_lies_beside_the_scenario(tmp_path: Path) -> None:
     (tmp_path / "map.json").write_text(geojson([polygon([[9, 9], [10, 9], [9, 10]])]))
     file = tmp_path / "mine.toml"
     file.write_text('extends = "swap"\n[mission]\nzones = "geojson(map.json)"\n')
-    assert len(reading.load(str(file)).zones.zones) == 1
+    assert len(zones(reading.load(str(file))).zones) == 1
 
 
 # -- routes ----------------------------------------------------------------------------------------
