@@ -20,6 +20,7 @@ from skytether.client.pilot import Pilot
 from skytether.client.servers import LEADER_KEY, NAMES, Servers
 from skytether.client.session import ServerSession
 from skytether.client.vehicle import Vehicle
+from skytether.client.way import Way
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.base.units import MICROSECOND_NS, MILLISECOND_NS, SECOND_NS, seconds_to_ns
 from skytether.shared.core.endpoint import (
@@ -49,6 +50,7 @@ from skytether.shared.law.heartbeat import Hearing
 from skytether.shared.law.model import Array
 from skytether.shared.scenario.catalogue import keys_of
 from skytether.shared.scenario.owners import InFlight
+from skytether.shared.scenario.registry import load
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Reason, Recorder
 from skytether.shared.wire.drop import Drop, ProtocolError
@@ -166,18 +168,13 @@ class Client(Endpoint):
                     # not replace the session there.
                     boot_id=self._memory.boot_id ^ i,
                     server=i,
-                    sockets=sockets,
                     leadership=self._servers.leadership,
-                    paths=addresses,
-                    names=() if i else path_names,
-                    prices=prices if len(prices) == len(addresses) else (1.0,) * len(addresses),
-                    spread=scenario.link.spread,
+                    way=self._way(scenario, addresses, sockets, () if i else path_names, prices),
                     timeout_ns=self._timeout_ns,
                     connect_s=scenario.link.connect_s,
                     link=(link, standby_link)[i] or PlainLink(),
                     hearing=Hearing(self._timeout_ns, terms.dt_ns, scenario.link.fixed_ns),
                     watch=self._servers.watch(i),
-                    out=self._out,
                     events=self._events,
                 )
             )
@@ -197,6 +194,29 @@ class Client(Endpoint):
         self._leaves = False
         """Whether an operator has asked the client to end."""
         self.dropped: Counter[Drop] = Counter()
+
+    def _way(
+        self,
+        scenario: Scenario,
+        addresses: Sequence[Address],
+        sockets: Sequence[int],
+        names: Sequence[str],
+        prices: Sequence[float],
+    ) -> Way:
+        """Way to a server."""
+        if len(addresses) == 1:
+            return Way(addresses, sockets, self._out)
+        way: Way = load("skytether.client.paths", "paths").SeveralPaths(
+            addresses,
+            sockets,
+            self._out,
+            events=self._events,
+            names=names,
+            prices=prices if len(prices) == len(addresses) else (1.0,) * len(addresses),
+            spread=scenario.link.spread,
+            timeout_ns=self._timeout_ns,
+        )
+        return way
 
     @property
     def _session(self) -> ServerSession:
@@ -413,7 +433,7 @@ class Client(Endpoint):
                     observation = observation._replace(unsaved=1)
                 session.send(observation, now_ns=now_ns)
                 self._tell_time(session, now_ns)
-            session.watch_paths(now_ns)
+            session.way.watch(session, now_ns)
 
     def _tell_leap(self, leap_m: tuple[float, ...] | None) -> None:
         self._reported_leap = leap_m
@@ -552,8 +572,8 @@ class Client(Endpoint):
                 "number": self._servers.leadership.number,
                 "server": address_text(*self._session.address),
             }
-        if self._session.paths:
-            vehicle_figures["paths"] = self._session.paths.figures(pilot.starts_ns(pilot.flown))
+        if pilot.next_ns is not None:
+            vehicle_figures |= self._session.way.figures(pilot.starts_ns(pilot.flown))
         if self._port is not None:
             vehicle_figures["autopilot"] = self._port.figures()
         return vehicle_figures

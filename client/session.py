@@ -7,30 +7,27 @@ The client echoes the time stamp of every packet of the session, from which the 
 delays. `client.failsafe` decides how packets and silence change the vehicle's mode.
 """
 
-from collections.abc import Sequence
 from typing import Literal, Protocol
 
 from skytether.client.leadership import Leadership
 from skytether.client.link import AGAIN_NS, ClientLink
 from skytether.client.server_clock import ServerClock
+from skytether.client.way import Way
 from skytether.shared.base.units import SECOND_NS, seconds_to_ns
-from skytether.shared.core.endpoint import PATH_SOCKETS, Address, Datagram, Events
+from skytether.shared.core.endpoint import Address, Events
 from skytether.shared.core.events import (
     Failure,
     NoAnswer,
     NoSession,
-    PathDied,
-    PathHealed,
     SessionRefused,
     Unanswered,
-    address_text,
 )
 from skytether.shared.law.heartbeat import NUMBERS, RARE_TIMES, SESSION_NS, STANDBY_TIMES, Hearing
 from skytether.shared.law.terms import Terms
 from skytether.shared.scenario.catalogue import differences
 from skytether.shared.telemetry.record import Reason
 from skytether.shared.wire.drop import Drop, ProtocolError
-from skytether.shared.wire.paths import EVERYWHERE, Paths, split
+from skytether.shared.wire.framing import EVERYWHERE, split
 from skytether.shared.wire.protocol import (
     Close,
     Heartbeat,
@@ -89,16 +86,11 @@ class ServerSession:
         terms: terms that the server has to agree to.
         boot_id: number unique to this run of the client.
         server: which of the vehicle's servers this is, from 0.
-        sockets: number of the socket of each path.
         leadership: which server leads.
-        paths: address of the server, or of the netem in front of it, on each path.
-        names: what the log calls each path; its address unless given.
-        prices: price of a packet on each path.
-        spread: `link.spread`.
+        way: way to the server.
         timeout_ns: time without a packet after which an end takes the link for lost [ns].
         connect_s: time after which a vehicle that was never answered gives up [s].
         hearing: measures losses, and chooses the longest silence to allow the server.
-        out: list to which datagrams are appended.
         events: list to which events for the operator are appended.
     """
 
@@ -109,31 +101,18 @@ class ServerSession:
         vehicle: int,
         boot_id: int,
         server: int = 0,
-        sockets: Sequence[int] = PATH_SOCKETS,
         leadership: Leadership,
-        paths: Sequence[Address],
-        names: Sequence[str] = (),
-        prices: Sequence[float],
-        spread: str,
+        way: Way,
         timeout_ns: int,
         connect_s: float,
         link: ClientLink,
         hearing: Hearing,
         watch: Watch,
-        out: list[Datagram],
         events: Events,
     ) -> None:
-        self._terms, self._vehicle, self._boot_id = terms, vehicle, boot_id
-        self._index, self._sockets, self._leadership = server, sockets, leadership
-        self._addresses, self._prices, self._spread = paths, prices, spread
-        self._names = names or [address_text(*each) for each in paths]
-        self._server, self._timeout_ns = paths[0], timeout_ns
-        self.paths: Paths | None = None
-        """Knowledge of the paths of the present session; None with a single path."""
-        self._proofs: dict[int, int] = {}
-        """Number with which the server asked for a proof of each path."""
-        self._greeted = 0
-        """Path of the next HELLO."""
+        self._terms, self.vehicle, self._boot_id = terms, vehicle, boot_id
+        self._index, self._leadership = server, leadership
+        self.way, self._timeout_ns = way, timeout_ns
         self._connect_ns = seconds_to_ns(connect_s)
         self.link = link
         self.hearing = hearing
@@ -156,7 +135,6 @@ class ServerSession:
         """Time before which it is not told again."""
         self._asked = 0, -SESSION_NS
         """Vehicle's step, and time [ns], at which it was last told."""
-        self._out = out
         self._events = events
         self.hello_ns = 0
         """Time before which no further HELLO is sent."""
@@ -177,7 +155,7 @@ class ServerSession:
 
     @property
     def address(self) -> Address:
-        return self._server
+        return self.way.addresses[0]
 
     @property
     def leads(self) -> bool:
@@ -205,12 +183,12 @@ class ServerSession:
         Raises:
             ProtocolError: the datagram must be dropped.
         """
-        if self.paths and self.paths.is_copy(datagram, path):
+        if self.way.is_copy(datagram, path):
             raise ProtocolError(Drop.COPY)
         payload = self.link.open(datagram, now_ns=now_ns)
         if payload is None:
             for answer in self.link.outbox():
-                self._put(answer, (path,))
+                self.way.put(answer, path)
             # The answer to a CHALLENGE carries the HELLO, so none is due for a while.
             self.hello_ns = now_ns + AGAIN_NS
             return None
@@ -226,21 +204,16 @@ class ServerSession:
         server_ns = 0
         if isinstance(message, Stamped):
             server_ns = self.clock.sent_ns(message.server_us, now_ns)
-        if report and self.paths:
-            is_recent = not isinstance(message, PathProof)
-            self.paths.heard(report, datagram, path, now_ns, is_recent=is_recent)
+        if report:
+            self.way.heard(report, message, datagram, path, now_ns)
         if isinstance(message, Stamped):
             return self._take_stamped(message, server_ns, now_ns)
-        match message:
-            case Close():
-                self._watch.meet(Reason.CLOSED, now_ns=now_ns)
-            case PathProof():
-                self._note_heard(now_ns)
-                if message.proof:
-                    self._proofs[path] = message.proof
-                    self._name(path, now_ns)
-            case Lead():
-                self._hear_leader(message, now_ns)
+        if isinstance(message, Close):
+            self._watch.meet(Reason.CLOSED, now_ns=now_ns)
+        elif isinstance(message, Lead):
+            self._hear_leader(message, now_ns)
+        elif not self.way.take(self, message, path, now_ns):
+            raise ProtocolError(Drop.NOT_FOR_A_CLIENT)
         return None
 
     def _take_stamped(
@@ -272,7 +245,7 @@ class ServerSession:
         step, asked_ns = self._asked
         age_ns = now_ns - asked_ns + (step - answer.step) * self._terms.dt_ns
         if age_ns <= self.hearing.overtaken_ns:
-            self._note_heard(now_ns)
+            self.note_heard(now_ns)
 
     def _decode(self, payload: bytes, now_ns: int) -> Message:
         try:
@@ -284,7 +257,7 @@ class ServerSession:
             raise
 
     def _welcome(self, welcome: Welcome, now_ns: int) -> None:
-        if (welcome.vehicle, welcome.boot_id) != (self._vehicle, self._boot_id):
+        if (welcome.vehicle, welcome.boot_id) != (self.vehicle, self._boot_id):
             raise ProtocolError(Drop.FOR_ANOTHER_LIFE)
         if not self._awaits_welcome:
             # A late copy, or an answer to a late copy of a HELLO: it would lead to a session that
@@ -295,7 +268,7 @@ class ServerSession:
             # failsafe decides.
             if self.number is None and self.failure is None:
                 differing = differences(self._terms, welcome.terms)
-                self._fail(SessionRefused(vehicle=self._vehicle, differences=differing))
+                self._fail(SessionRefused(vehicle=self.vehicle, differences=differing))
             raise ProtocolError(Drop.OTHER_TERMS)
         if welcome.refusal != Refusal.ACCEPTED:
             refusal = Refusal(welcome.refusal)
@@ -309,9 +282,7 @@ class ServerSession:
             self.sent, self.sent_step, self.told = 0, -1, None
             self._leadership.begin(self._index)
             self.hearing.begin()
-            self._proofs.clear()
-            several = len(self._addresses) > 1
-            self.paths = Paths(self._prices, self._timeout_ns, self._spread) if several else None
+            self.way.begin()
         self.number, self._server_boot_id = welcome.session, welcome.server_boot_id
         self._is_open = True
         self.link.adopt(now_ns=now_ns)
@@ -324,25 +295,26 @@ class ServerSession:
         """Report why there is no session, once per reason; a late refusal is ignored."""
         if not self.is_lost(now_ns) or refusal not in (Refusal.FULL, Refusal.TAKEN):
             return
-        host, port = self._server
+        host, port = self.address
         reason: Literal["full", "taken"] = "full" if refusal is Refusal.FULL else "taken"
-        sent = NoSession(vehicle=self._vehicle, host=host, port=port, reason=reason)
+        sent = NoSession(vehicle=self.vehicle, host=host, port=port, reason=reason)
         if sent != self._refusal:
             self._refusal = sent
             self._events.append(sent)
 
     def _check(self, message: FromServer) -> None:
         named = message.vehicle, message.session
-        if not self._is_open or named != (self._vehicle, self.number):
+        if not self._is_open or named != (self.vehicle, self.number):
             raise ProtocolError(Drop.UNKNOWN_SESSION)
 
     def _heard(self, server_ns: int, now_ns: int) -> None:
         """Note a packet of the session that was sent at a time of the server [ns]."""
         if self.clock.hear(server_ns, now_ns):
             self._watch.meet(Reason.STALLED, now_ns=now_ns)
-        self._note_heard(now_ns)
+        self.note_heard(now_ns)
 
-    def _note_heard(self, now_ns: int) -> None:
+    def note_heard(self, now_ns: int) -> None:
+        """Note a packet of the session."""
         self._awaits_welcome = False
         self.heard_ns = self.useful_ns = now_ns
         self._watch.heard(now_ns=now_ns)
@@ -359,9 +331,8 @@ class ServerSession:
             again_ns = self.link.hello_ns if unheard else AGAIN_NS
             self.hello_ns = now_ns + again_ns * (1 if self.leads else RARE_TIMES)
             self._awaits_welcome = True
-            hello = encode(Hello(self._vehicle, self._boot_id, self._terms))
-            self._put(self.link.hello(hello, now_ns=now_ns), (self._greeted,))
-            self._greeted = (self._greeted + 1) % len(self._addresses)
+            hello = encode(Hello(self.vehicle, self._boot_id, self._terms))
+            self.way.greet(self.link.hello(hello, now_ns=now_ns))
 
     def rest(self, *, now_ns: int) -> None:
         """Delay the next HELLO of a session that waits for its vehicle to take off."""
@@ -377,7 +348,7 @@ class ServerSession:
     def tell_time(self, step: int, epoch_us: int, error_us: int, *, now_ns: int) -> None:
         """Send the time of day of step 0; this packet does not count in the loss statistics."""
         assert self.number is not None
-        self._post(Time(self._vehicle, self.number, step, epoch_us, error_us), now_ns)
+        self._post(Time(self.vehicle, self.number, step, epoch_us, error_us), now_ns)
 
     def tell_leader(self, flown: Lead, again_ns: int, *, now_ns: int) -> None:
         """Tell the server who leads, and in which motion the vehicle is; again after `again_ns`."""
@@ -388,48 +359,10 @@ class ServerSession:
         """Whether a server that does not lead is to be sent an observation."""
         return self.sent_step < 0 or 2 * (step - self.sent_step) >= self.hearing.rare
 
-    def watch_paths(self, now_ns: int) -> None:
-        """Send the newest packet again if it was lost, and try paths that are not known well."""
-        if self.paths is None:
-            return
-        if resent := self.paths.again(self.hearing.silence_ns, now_ns, range(len(self._addresses))):
-            datagram, path = resent
-            self._put(datagram, (path,))
-        for path in self.paths.looks(now_ns):
-            self._name(path, now_ns)
-        for path, is_dead in self.paths.turned(now_ns):
-            turned = PathDied if is_dead else PathHealed
-            self._events.append(turned(vehicle=self._vehicle, path=path, via=self._names[path]))
-
-    def _name(self, path: int, now_ns: int) -> None:
-        """Tell the server which path this is."""
-        if self.number is not None:
-            least, proof = min(self._prices), self._proofs.get(path, 0)
-            prices = tuple(round(1000 * price / least) for price in self._prices)
-            self._post(PathProof(self._vehicle, self.number, path, proof, prices), now_ns, (path,))
-
-    def _post(
-        self,
-        message: Observation | Close | Time | PathProof | Lead,
-        now_ns: int,
-        on: Sequence[int] = (),
-    ) -> None:
-        """Seal a message and send it on some paths; default: where its arrival costs least."""
-        payload = encode(message)
-        if self.paths is None:
-            self._put(self.link.seal(payload), (0,))
-            return
+    def _post(self, message: Observation | Close | Time | Lead, now_ns: int) -> None:
+        """Seal a message and send it."""
         worth = EVERYWHERE if isinstance(message, Close) else 1.0
-        if not on:
-            on = self.paths.choose(worth, now_ns, range(len(self._addresses)))
-        datagram = self.link.seal(self.paths.report() + payload)
-        is_probe = isinstance(message, PathProof)
-        self.paths.sent(datagram, on, now_ns, worth=worth, is_probe=is_probe)
-        self._put(datagram, on)
-
-    def _put(self, datagram: bytes, on: Sequence[int]) -> None:
-        for path in on:
-            self._out.append(Datagram(datagram, self._addresses[path], self._sockets[path]))
+        self.way.post(self.link.seal, encode(message), worth, now_ns)
 
     def close(self) -> None:
         """Close the session; only another WELCOME opens one."""
@@ -448,20 +381,15 @@ class ServerSession:
         self._give_up(waited_ns / SECOND_NS)
         return False
 
-    @property
-    def _others(self) -> tuple[str, ...]:
-        """Addresses of the server's paths but for the first."""
-        return tuple(address_text(*each) for each in self._addresses[1:])
-
     def _say_unanswered(self, left_ns: int, waited_ns: int) -> None:
         """Report once, after a while, that the server has not answered."""
         if self._is_unanswered or self._refusal is not None or waited_ns < UNANSWERED_NS:
             return
         self._is_unanswered = True
-        (host, port), others = self._server, self._others
+        (host, port), others = self.address, self.way.others
         left_s = left_ns / SECOND_NS
         self._events.append(
-            Unanswered(vehicle=self._vehicle, host=host, port=port, others=others, left_s=left_s)
+            Unanswered(vehicle=self.vehicle, host=host, port=port, others=others, left_s=left_s)
         )
 
     def _give_up(self, waited_s: float) -> None:
@@ -469,13 +397,13 @@ class ServerSession:
         if self._refusal is not None:
             self.failure = self._refusal
             return
-        host, port = self._server
+        host, port = self.address
         self._fail(
             NoAnswer(
-                vehicle=self._vehicle,
+                vehicle=self.vehicle,
                 host=host,
                 port=port,
-                others=self._others,
+                others=self.way.others,
                 waited_s=waited_s,
                 secure=self.link.secure,
             )

@@ -32,7 +32,7 @@ from skytether.shared.scenario.reference import Reference
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Recorder
 from skytether.shared.wire.drop import Drop
-from skytether.shared.wire.paths import EVERYWHERE
+from skytether.shared.wire.framing import EVERYWHERE
 from skytether.shared.wire.protocol import CLOSES, Close, Refusal, encode
 
 VEHICLES_MAX = 64

@@ -36,7 +36,7 @@ from skytether.shared.law.terms import Limits, Terms
 from skytether.shared.scenario.catalogue import differences
 from skytether.shared.scenario.schema import LinkConfig
 from skytether.shared.wire.drop import Drop, ProtocolError
-from skytether.shared.wire.paths import Report, split
+from skytether.shared.wire.framing import Report, split
 from skytether.shared.wire.protocol import (
     Close,
     Hello,

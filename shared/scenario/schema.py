@@ -51,7 +51,7 @@ from skytether.shared.scenario.registry import (
     file_of,
 )
 from skytether.shared.scenario.schemes import SchemeProperties
-from skytether.shared.wire.paths import PATHS_MAX
+from skytether.shared.wire.framing import PATHS_MAX
 from skytether.shared.wire.protocol import INPUTS_MAX, PAYLOAD_BYTES_MAX
 
 # Bounds of numbers are far beyond any vehicle, and low enough that no time overflows 63 bits of

@@ -20,9 +20,9 @@ from typing import NamedTuple
 
 from skytether.shared.wire.channel import VERSION
 from skytether.shared.wire.drop import Drop, ProtocolError
+from skytether.shared.wire.framing import split
 from skytether.shared.wire.keys import VehicleKey
 from skytether.shared.wire.noise_nnpsk0 import MESSAGE_BYTES
-from skytether.shared.wire.paths import split
 from skytether.shared.wire.protocol import kind_of
 
 INITIATION, CHALLENGE, RESPONSE = 1, 2, 3

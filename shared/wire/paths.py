@@ -29,12 +29,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import chain, combinations
 from struct import Struct
-from typing import NamedTuple
 
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
 from skytether.shared.wire.drop import Drop, ProtocolError
+from skytether.shared.wire.framing import BIN8, HEAD, PATHS_MAX, Report
 
-PATHS_MAX = 4
 SEQUENCES = 2**16
 """Modulus of sequence numbers: half of them are more than may be under way, so that a packet that
 is late, by however much, is never taken for one that is ahead."""
@@ -84,39 +83,10 @@ ALIKE = 1.25
 """Paths whose expected cost is within this factor of the least take turns."""
 ALIVE_WORTH = 40.0
 """What it costs, in packets, if the other end takes a working link for lost."""
-EVERYWHERE = 1e9
-"""Worth of a message that goes over every path."""
-
-_HEAD, _BIN8 = Struct("<HH"), 0xC4
 _SETS = {
     count: [*chain.from_iterable(combinations(range(count), size) for size in range(1, count + 1))]
     for count in range(1, PATHS_MAX + 1)
 }
-
-
-class Report(NamedTuple):
-    """Report in front of a message."""
-
-    sequence: int
-    newest: int
-    arrived: tuple[int, ...]
-
-
-def split(payload: bytes) -> tuple[Report | None, bytes]:
-    """Report in front of a message, if there is one, and the message.
-
-    Raises:
-        ProtocolError: the report is cut off, or not one of 2 to PATHS_MAX paths.
-    """
-    if not payload or payload[0] != _BIN8:
-        return None, payload
-    count, odd = divmod(payload[1] - _HEAD.size, 2) if len(payload) > 1 else (0, 0)
-    end = 2 + _HEAD.size + 2 * count
-    if odd or not 2 <= count <= PATHS_MAX or len(payload) < end:
-        raise ProtocolError(Drop.FIELD)
-    sequence, newest = _HEAD.unpack_from(payload, 2)
-    masks = Struct(f"<{count}H").unpack_from(payload, 2 + _HEAD.size)
-    return Report(sequence, newest, masks), payload[end:]
 
 
 def _ahead(sequence: int, of: int) -> int:
@@ -317,8 +287,8 @@ class Paths:
         """Report to put in front of the next message, which gets the next sequence number."""
         self._sequence = (self._sequence + 1) % SEQUENCES
         masks = Struct(f"<{len(self._masks)}H").pack(*self._masks)
-        head = _HEAD.pack(self._sequence, self._heard or 0)
-        return bytes((_BIN8, len(head) + len(masks))) + head + masks
+        head = HEAD.pack(self._sequence, self._heard or 0)
+        return bytes((BIN8, len(head) + len(masks))) + head + masks
 
     def choose(self, worth: float, now_ns: int, among: Sequence[int]) -> tuple[int, ...]:
         """Paths for the next message; of sets that cost about the same, the one that has rested

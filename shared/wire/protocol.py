@@ -46,7 +46,7 @@ from skytether.shared.law.heartbeat import NUMBERS
 from skytether.shared.law.model import Array
 from skytether.shared.law.terms import Limits, Terms
 from skytether.shared.wire.drop import Drop, ProtocolError
-from skytether.shared.wire.paths import PATHS_MAX
+from skytether.shared.wire.framing import PATHS_MAX
 
 # Below 0x80, so that msgpack writes it in one byte: `kind_of` and the quick decoder rely on that.
 VERSION = 1

@@ -38,7 +38,7 @@ from skytether.shared.scenario import reading
 from skytether.shared.scenario.registry import File
 from skytether.shared.telemetry.record import PACKET_COLUMNS, RECORDING, Recorder, Rows
 from skytether.shared.wire import keys
-from skytether.shared.wire.paths import PATHS_MAX
+from skytether.shared.wire.framing import PATHS_MAX
 from skytether.shared.wire.protocol import PAYLOAD_BYTES_MAX
 from skytether.shell import command, driver, terminal
 from skytether.shell.argument import Argument

@@ -29,7 +29,7 @@ from skytether.shared.law.terms import Terms
 from skytether.shared.scenario.gain import regulator
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Recorder, client_columns
-from skytether.shared.wire.paths import split
+from skytether.shared.wire.framing import split
 from skytether.shared.wire.protocol import (
     NO_HORIZON,
     Horizon,

@@ -26,7 +26,7 @@ from skytether.shared.telemetry.record import (
     plan_columns,
     server_columns,
 )
-from skytether.shared.wire.paths import PATHS_MAX
+from skytether.shared.wire.framing import PATHS_MAX
 from skytether.shared.wire.protocol import Mode
 
 AXES = "xyz"

@@ -41,7 +41,7 @@ from skytether.shared.telemetry.feed import (
 )
 from skytether.shared.telemetry.record import DOWNLINK, UPLINK, Reason, SentBy, compared, sent_by
 from skytether.shared.telemetry.record import Rows as Table
-from skytether.shared.wire.paths import PATHS_MAX
+from skytether.shared.wire.framing import PATHS_MAX
 from skytether.shared.wire.protocol import Mode
 from skytether.view.changes import Mark, mark, together
 from skytether.view.controls import WAYS

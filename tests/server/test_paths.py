@@ -9,7 +9,8 @@ from skytether.shared.base.chance import stream
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.core.endpoint import Address, Datagram
 from skytether.shared.wire.drop import Drop
-from skytether.shared.wire.paths import Paths, split
+from skytether.shared.wire.framing import split
+from skytether.shared.wire.paths import Paths
 from skytether.shared.wire.protocol import (
     NO_HORIZON,
     Hello,

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from skytether.shared.core.change import Answer
-from skytether.shared.wire.paths import PATHS_MAX
+from skytether.shared.wire.framing import PATHS_MAX
 from skytether.shell.control import Caller, ControlError
 
 NETEMS = ("netem", *(f"netem {number}" for number in range(2, PATHS_MAX + 2)))

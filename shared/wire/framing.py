@@ -1,0 +1,39 @@
+"""What may stand in front of a message: the report of a session with several paths.
+
+`shared.wire.paths` says what it reports; an end with a single link ignores it.
+"""
+
+from struct import Struct
+from typing import NamedTuple
+
+from skytether.shared.wire.drop import Drop, ProtocolError
+
+PATHS_MAX = 4
+EVERYWHERE = 1e9
+"""Worth of a message that goes over every path."""
+HEAD, BIN8 = Struct("<HH"), 0xC4
+
+
+class Report(NamedTuple):
+    """Report in front of a message."""
+
+    sequence: int
+    newest: int
+    arrived: tuple[int, ...]
+
+
+def split(payload: bytes) -> tuple[Report | None, bytes]:
+    """Report in front of a message, if there is one, and the message.
+
+    Raises:
+        ProtocolError: the report is cut off, or not one of 2 to PATHS_MAX paths.
+    """
+    if not payload or payload[0] != BIN8:
+        return None, payload
+    count, odd = divmod(payload[1] - HEAD.size, 2) if len(payload) > 1 else (0, 0)
+    end = 2 + HEAD.size + 2 * count
+    if odd or not 2 <= count <= PATHS_MAX or len(payload) < end:
+        raise ProtocolError(Drop.FIELD)
+    sequence, newest = HEAD.unpack_from(payload, 2)
+    masks = Struct(f"<{count}H").unpack_from(payload, 2 + HEAD.size)
+    return Report(sequence, newest, masks), payload[end:]
