@@ -55,8 +55,8 @@ class Way:
         self,
         seal: Callable[[bytes], bytes],
         payload: bytes,
-        worth: float,  # noqa: ARG002
-        now_ns: int,  # noqa: ARG002
+        worth: float,
+        now_ns: int,
     ) -> None:
         """Seal a message and send it.
 
@@ -70,7 +70,7 @@ class Way:
     def begin(self) -> None:
         """Begin a new session."""
 
-    def is_copy(self, datagram: bytes, path: int) -> bool:  # noqa: ARG002
+    def is_copy(self, datagram: bytes, path: int) -> bool:
         """Whether a datagram has come before."""
         return False
 
@@ -79,12 +79,12 @@ class Way:
     ) -> None:
         """Note a report that stood in front of a message of the session."""
 
-    def take(self, session: Conversation, message: Message, path: int, now_ns: int) -> bool:  # noqa: ARG002
+    def take(self, session: Conversation, message: Message, path: int, now_ns: int) -> bool:
         """Take a message of the room; False if it has none."""
         return False
 
     def watch(self, session: Conversation, now_ns: int) -> None:
         """Send what is due; called once a step."""
 
-    def figures(self, now_ns: int) -> dict[str, Any]:  # noqa: ARG002
+    def figures(self, now_ns: int) -> dict[str, Any]:
         return {}

@@ -11,12 +11,14 @@ import secrets
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from importlib import import_module
 from pathlib import Path
 from socket import socket
 from typing import Annotated
 
 from skytether.server.endpoint import VEHICLES_MAX, Server
 from skytether.server.gate import Gate, PlainGate
+from skytether.server.reception import PATHS
 from skytether.server.schemes import table
 from skytether.shared.base import kernel
 from skytether.shared.core.endpoint import PATH_SOCKETS, Address, Form
@@ -101,7 +103,10 @@ def serve(argv: Sequence[str]) -> None:
 
 
 def _ready(scenario: Scenario) -> None:
-    """Load the compiled planner now; before workers are forked, so that they share its memory."""
+    """Load the compiled planner, and what a vehicle's packet may call for, now: before workers are
+    forked, so that they share its memory, and before a tick would have to wait for it.
+    """
+    import_module(PATHS)
     others = table.others(scenario)
     terminal.prepare(kernel.missing(without=others))
     kernel.load(without=others)

@@ -241,8 +241,7 @@ class Server(Endpoint):
             "step": int(self.controller.last_step[row]),
             "clock_bound_ms": round(bound_ms, 3),
         }
-        if session.paths:
-            vehicle_figures["paths"] = session.paths.paths.figures(self._ticked_ns)
+        vehicle_figures |= self.sessions.ways.figures(session, self._ticked_ns)
         return vehicle_figures | self.controller.scheme.vehicle_figures(row)
 
     def figures(self) -> dict[str, Any]:

@@ -3,14 +3,21 @@
 import hashlib
 from collections.abc import Callable, Collection, Iterator, Sequence
 from itertools import chain
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import numpy as np
+
+from skytether.server.controller import Decisions
 from skytether.server.gate import ReplyPath
+from skytether.server.sessions import Session
+from skytether.server.ways import Ways
 from skytether.shared.base.units import SECOND_NS
-from skytether.shared.core.endpoint import Address, Datagram
+from skytether.shared.core.endpoint import Address, Datagram, Events
 from skytether.shared.core.events import PathDied, PathHealed, address_text
+from skytether.shared.wire.drop import Drop, ProtocolError
+from skytether.shared.wire.framing import Report
 from skytether.shared.wire.paths import Paths
-from skytether.shared.wire.protocol import PathProof, encode
+from skytether.shared.wire.protocol import Message, PathProof, encode
 
 PLACES = 2
 """Number of addresses of a path that are in use at once."""
@@ -154,3 +161,132 @@ class ServerPaths:
     @property
     def is_ready(self) -> bool:
         return bool(self._places)
+
+
+class SeveralWays(Ways):
+    """Ways to vehicles of which some have several paths.
+
+    Args:
+        entropy: returns this many random bytes.
+        spread: `link.spread`.
+        timeout_ns: time without a packet after which a vehicle takes the link for lost [ns].
+    """
+
+    def __init__(self, entropy: Callable[[int], bytes], spread: str, timeout_ns: int) -> None:
+        self._entropy, self._spread, self._timeout_ns = entropy, spread, timeout_ns
+        self.of: dict[int, tuple[Session, ServerPaths]] = {}
+        """Live sessions with several paths, by vehicle, and their paths."""
+        self.at: dict[Place, tuple[Session, ServerPaths]] = {}
+        """The same, by the proven address of each path."""
+
+    def is_copy(self, datagram: Datagram, now_ns: int) -> bool:
+        place = Place(datagram.peer, datagram.socket)
+        if place not in self.at:
+            return False
+        _, paths = self.at[place]
+        if not paths.paths.is_copy(datagram.payload, paths.number(place)):
+            return False
+        paths.hear(place, now_ns)
+        return True
+
+    def is_repeat(self, session: Session, datagram: Datagram) -> bool:
+        paths = self._paths(session)
+        return paths is not None and paths.paths.is_copy(datagram.payload, None)
+
+    def hear(
+        self, session: Session, report: Report, message: Message, datagram: Datagram, now_ns: int
+    ) -> None:
+        if paths := self._paths(session):
+            is_recent = not isinstance(message, PathProof)
+            _hear(paths, report, datagram, now_ns, is_recent=is_recent)
+
+    def observe(
+        self, session: Session, report: Report, datagram: Datagram, now_ns: int, *, is_newest: bool
+    ) -> PathProof | None:
+        """Note the report in front of an observation; returns the question for a proof if it comes
+        from a new address.
+        """
+        count, paths = len(report.arrived), self._paths(session)
+        if paths is None or len(paths.prices) != count:
+            paths = ServerPaths((1,) * count, self._spread, self._entropy, self._timeout_ns)
+            self._note(session, paths)
+        if _hear(paths, report, datagram, now_ns) is None and is_newest:
+            place = Place(datagram.peer, datagram.socket)
+            return paths.question(session.vehicle, session.number, place)
+        return None
+
+    def take(
+        self, session: Session, message: Message, datagram: Datagram, now_ns: int
+    ) -> PathProof | None:
+        """Note the address of a path once it is proven; until then return the question."""
+        paths = self._paths(session)
+        if paths is None or not isinstance(message, PathProof):
+            raise ProtocolError(Drop.FIELD)
+        paths.set_prices(message.prices)
+        place = Place(datagram.peer, datagram.socket)
+        question = paths.prove(message, place, now_ns)
+        is_known = self.at.get(place, (None, None))[0] is session
+        if question is None and place in paths.places and not is_known:
+            self._note(session, paths)
+        return question
+
+    def narrow(self, session: Session) -> None:
+        self.forget(session)
+
+    def restart(self, session: Session) -> None:
+        """Note that a client may have been started again: it keeps its session."""
+        if paths := self._paths(session):
+            paths.paths.peer_may_restart = True
+
+    def forget(self, session: Session) -> None:
+        session.way = None
+        if self.of.get(session.vehicle, (None,))[0] is session:
+            del self.of[session.vehicle]
+        for place in [place for place, (each, _) in self.at.items() if each is session]:
+            del self.at[place]
+
+    def worths(self, decisions: Decisions) -> dict[int, float]:
+        """See `Ways`.
+
+        A trigger sends if the cost of flying on exceeds its threshold, so the threshold is the
+        price of a packet.
+        """
+        rows, verdict = decisions.batch.rows, decisions.verdict
+        if not self.of or not verdict.compares:
+            return {}
+        with np.errstate(divide="ignore", invalid="ignore"):
+            worths = np.nan_to_num(verdict.figure / verdict.threshold, nan=0.0)
+        return dict(zip(rows.tolist(), worths.tolist(), strict=False))
+
+    def watch(
+        self, put: Callable[[int, Sequence[Datagram]], None], events: Events, now_ns: int
+    ) -> None:
+        for session, paths in self.of.values():
+            silence_ns = session.hearing.silence_ns
+            due = paths.watched(session.vehicle, session.number, session.line, silence_ns, now_ns)
+            put(session.row, due)
+            events += paths.turned(session.vehicle, now_ns)
+
+    def figures(self, session: Session, now_ns: int) -> dict[str, Any]:
+        paths = self._paths(session)
+        return {"paths": paths.paths.figures(now_ns)} if paths else {}
+
+    def _paths(self, session: Session) -> ServerPaths | None:
+        own, paths = self.of.get(session.vehicle, (None, None))
+        return paths if own is session else None
+
+    def _note(self, session: Session, paths: ServerPaths) -> None:
+        """Note the paths of a session and their proven addresses, in place of earlier ones."""
+        self.forget(session)
+        session.way = paths
+        self.of[session.vehicle] = session, paths
+        self.at |= dict.fromkeys(paths.places, (session, paths))
+
+
+def _hear(
+    paths: ServerPaths, report: Report, datagram: Datagram, now_ns: int, *, is_recent: bool = True
+) -> int | None:
+    """Note the report of a message; returns its path, None if its address is not proven."""
+    path = paths.hear(Place(datagram.peer, datagram.socket), now_ns)
+    paths.paths.heard(report, datagram.payload, path, now_ns, is_recent=is_recent)
+    return path

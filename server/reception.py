@@ -10,10 +10,10 @@ from collections import Counter, deque
 from skytether.server.common.clock import ClockMap, Contradiction
 from skytether.server.controller import Controller
 from skytether.server.gate import Gate, GateCall
-from skytether.server.paths import Place, ServerPaths
 from skytether.server.plausibility import ANEW, BELIEVED, Belief, Plausibility
 from skytether.server.sessions import Session, Sessions
 from skytether.server.tick import Grid
+from skytether.server.ways import Ways
 from skytether.shared.base.units import MICROSECOND_NS, SECOND_NS, seconds_to_ns
 from skytether.shared.core.endpoint import Address, Datagram, Events
 from skytether.shared.core.events import (
@@ -34,6 +34,7 @@ from skytether.shared.core.stopwatch import Stopwatch
 from skytether.shared.core.time_of_day import DRIFT, TimeOfDay
 from skytether.shared.law.terms import Limits, Terms
 from skytether.shared.scenario.catalogue import differences
+from skytether.shared.scenario.registry import load
 from skytether.shared.scenario.schema import LinkConfig
 from skytether.shared.wire.drop import Drop, ProtocolError
 from skytether.shared.wire.framing import Report, split
@@ -53,6 +54,8 @@ from skytether.shared.wire.protocol import (
     stamped_ns,
 )
 
+PATHS = "skytether.server.paths"
+"""Room for vehicles with several paths; the first report in front of an observation loads it."""
 REFUSALS_REPORTED = 64
 """Number of stored refusals; a repeated HELLO is not reported again."""
 REPORT_NS = 10 * SECOND_NS
@@ -120,7 +123,7 @@ class Reception:
 
     def hear(self, datagram: Datagram, *, now_ns: int) -> Drop | None:
         self._stopwatch.start()
-        if self._sessions.at_place and self._is_copy(datagram, now_ns):
+        if self._sessions.ways.is_copy(datagram, now_ns):
             self.dropped[Drop.COPY] += 1
             return Drop.COPY
         try:
@@ -158,19 +161,7 @@ class Reception:
             return False
         if datagram.peer not in (session.address, session.home):
             session.other, session.other_ns = datagram.peer, now_ns
-        return session.paths is not None and session.paths.paths.is_copy(datagram.payload, None)
-
-    def _is_copy(self, datagram: Datagram, now_ns: int) -> bool:
-        """Whether a datagram of a vehicle with several paths has come before."""
-        place = Place(datagram.peer, datagram.socket)
-        session = self._sessions.at_place.get(place)
-        if session is None or session.paths is None:
-            return False
-        path = session.paths.number(place)
-        if not session.paths.paths.is_copy(datagram.payload, path):
-            return False
-        session.paths.hear(place, now_ns)
-        return True
+        return self._sessions.ways.is_repeat(session, datagram)
 
     def _take(self, call: GateCall, datagram: Datagram, now_ns: int) -> None:
         """Process one message.
@@ -209,9 +200,8 @@ class Reception:
             raise ProtocolError(Drop.UNKNOWN_SESSION)
         if isinstance(message, Time | Lead):
             self._refuse_overtaken(session, message.step)
-        if report and session.paths:
-            is_recent = not isinstance(message, PathProof)
-            self._hear_report(session, report, datagram, now_ns, is_recent=is_recent)
+        if report:
+            self._sessions.ways.hear(session, report, message, datagram, now_ns)
         match message:
             case Close():
                 self._sessions.end(session)
@@ -235,35 +225,14 @@ class Reception:
         self._events.append(event)
         self._report_ns = now_ns + REPORT_NS
 
-    def _hear_report(
-        self,
-        session: Session,
-        report: Report,
-        datagram: Datagram,
-        now_ns: int,
-        *,
-        is_recent: bool = True,
-    ) -> int | None:
-        """Note the report of a message; returns its path, None if its address is not proven."""
-        assert session.paths
-        path = session.paths.hear(Place(datagram.peer, datagram.socket), now_ns)
-        session.paths.paths.heard(report, datagram.payload, path, now_ns, is_recent=is_recent)
-        return path
-
     def _prove(
         self, session: Session, message: PathProof, call: GateCall, datagram: Datagram, now_ns: int
     ) -> None:
         """Note the address of a path once it is proven; until then ask for the proof there."""
-        if session.paths is None:
-            raise ProtocolError(Drop.FIELD)
+        question = self._sessions.ways.take(session, message, datagram, now_ns)
         session.heard_ns = now_ns
-        session.paths.set_prices(message.prices)
-        place = Place(datagram.peer, datagram.socket)
-        question = session.paths.prove(message, place, now_ns)
         if question:
             self._answer(question, call, datagram)
-        elif place in session.paths.places and self._sessions.at_place.get(place) is not session:
-            self._sessions.set_paths(session, session.paths)
 
     def _note_leader(
         self, session: Session, message: Lead, call: GateCall, datagram: Datagram, now_ns: int
@@ -297,8 +266,7 @@ class Reception:
         if refusal is Refusal.ACCEPTED:
             session = self._sessions.welcome(hello, address, call.line, now_ns, datagram.socket)
             number = session.number
-            if session.paths:  # a client that was started again keeps its session
-                session.paths.paths.peer_may_restart = True
+            self._sessions.ways.restart(session)
         welcome = Welcome(
             hello.vehicle, number, hello.boot_id, self._boot_id, now_ns, refusal, self._terms
         )
@@ -376,8 +344,8 @@ class Reception:
         # elsewhere does not, once the original has arrived.
         if call.moves:
             session.move(datagram.peer, call.line, now_ns, datagram.socket)
-            if session.paths and not report:  # its client was started again with a single path
-                self._sessions.set_paths(session, None)
+            if not report:
+                self._sessions.ways.narrow(session)
         if observation.unsaved > session.unsaved:
             self._events.append(CannotResume(vehicle=session.vehicle))
         session.unsaved = bool(observation.unsaved)
@@ -392,16 +360,13 @@ class Reception:
         now_ns: int,
     ) -> None:
         """Note the report of an observation; ask for a proof where it comes from a new address."""
-        count = len(report.arrived)
-        if session.paths is None or len(session.paths.prices) != count:
-            ones, entropy = (1,) * count, self._sessions.entropy
-            paths = ServerPaths(ones, self._spread, entropy, self._timeout_ns)
-            self._sessions.set_paths(session, paths)
-        path = self._hear_report(session, report, datagram, now_ns)
-        if path is None and call.moves:
-            assert session.paths
-            place = Place(datagram.peer, datagram.socket)
-            question = session.paths.question(session.vehicle, session.number, place)
+        sessions = self._sessions
+        if type(sessions.ways) is Ways:
+            sessions.ways = load(PATHS, "paths").SeveralWays(
+                sessions.entropy, self._spread, self._timeout_ns
+            )
+        question = sessions.ways.observe(session, report, datagram, now_ns, is_newest=call.moves)
+        if question:
             self._answer(question, call, datagram)
 
     def _hear_time(self, session: Session, message: Time, now_ns: int) -> None:

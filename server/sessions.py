@@ -16,7 +16,7 @@ from itertools import islice
 import numpy as np
 
 from skytether.server.gate import ReplyPath
-from skytether.server.paths import Place, ServerPaths
+from skytether.server.ways import Way, Ways
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.core.endpoint import Address, Datagram
 from skytether.shared.law.heartbeat import NUMBERS, SESSION_NS, Hearing
@@ -74,8 +74,8 @@ class Session:
     """Time of the newest such repeat."""
     socket: int = 0
     """Number of the server's socket at which the vehicle was heard."""
-    paths: ServerPaths | None = None
-    """Paths to the vehicle; None with a single one."""
+    way: Way | None = None
+    """Way to the vehicle in place of its address; None without one."""
     leadership: int | None = None
     """Number of the leadership, as last told by the vehicle; None if it has no other server."""
     told_step: int = 0
@@ -115,8 +115,8 @@ class Session:
         Args:
             worth: what the loss of the message costs, in packets.
         """
-        if self.paths and self.paths.is_ready:
-            return self.paths.sealed(payload, self.line, now_ns, worth)
+        if self.way and self.way.is_ready:
+            return self.way.sealed(payload, self.line, now_ns, worth)
         # Sealed once: with keys the vehicle opens the first copy, and drops others as repeats.
         packet = self.line.seal(payload)
         if self.address == self.home and self.other is None:
@@ -170,10 +170,8 @@ class Sessions:
         """Rows in use, ascending; shape (n,)."""
         self.vehicle = np.zeros(capacity, dtype=np.int64)
         """Number of the vehicle in each row; shape (capacity,)."""
-        self.with_paths: dict[int, Session] = {}
-        """Live sessions with several paths, by vehicle."""
-        self.at_place: dict[Place, Session] = {}
-        """The same sessions, by the proven address of each path."""
+        self.ways = Ways()
+        """Ways to the vehicles; another once one of them has several paths."""
         self.idle = np.zeros(capacity, dtype=np.int64)
         """`Idle` reason of the vehicle in each row, as last reported; shape (capacity,)."""
 
@@ -293,7 +291,7 @@ class Sessions:
             raise ProtocolError(Drop.TAKEN)
         del waiting[session.vehicle]
         if before is not None:
-            self._forget_paths(before)
+            self.ways.forget(before)
             session.row = before.row
         elif session.vehicle in self._reserved:
             session.row = self._reserved.pop(session.vehicle)
@@ -315,7 +313,7 @@ class Sessions:
 
     def end(self, session: Session) -> None:
         del self._live[session.vehicle], self._by_row[session.row]
-        self._forget_paths(session)
+        self.ways.forget(session)
         if self._keeps_rows:
             self._reserved[session.vehicle] = session.row
         else:
@@ -325,20 +323,6 @@ class Sessions:
             if successor is not None:
                 self.welcomed_vehicles[session.vehicle] = successor
         self._note_rows()
-
-    def set_paths(self, session: Session, paths: ServerPaths | None) -> None:
-        """Note the paths of a session and their proven addresses, in place of earlier ones."""
-        self._forget_paths(session)
-        session.paths = paths
-        if paths:
-            self.with_paths[session.vehicle] = session
-            self.at_place |= dict.fromkeys(paths.places, session)
-
-    def _forget_paths(self, session: Session) -> None:
-        if self.with_paths.pop(session.vehicle, None):
-            gone = [place for place, each in self.at_place.items() if each is session]
-            for place in gone:
-                del self.at_place[place]
 
     def _note_rows(self) -> None:
         self.rows = np.array(sorted(self._by_row), dtype=np.int64)

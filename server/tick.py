@@ -141,17 +141,7 @@ class Ticker:
         # Last, since a horizon sent at this tick replaces a heartbeat.
         if heartbeats:
             self._send_heartbeats(heartbeats, now_ns)
-        for session in self._sessions.with_paths.values():
-            if session.paths:
-                due = session.paths.watched(
-                    session.vehicle,
-                    session.number,
-                    session.line,
-                    session.hearing.silence_ns,
-                    now_ns,
-                )
-                self._put(session.row, due, is_plan=False)
-                self._events += session.paths.turned(session.vehicle, now_ns)
+        self._sessions.ways.watch(self._put, self._events, now_ns)
         self._stopwatch.lap("encode")
         self.durations.add(self._stopwatch.total_ns - before_ns)
 
@@ -169,7 +159,7 @@ class Ticker:
         # The time of sending, not the tick's due time: the vehicle measures the delay by this
         # stamp.
         batch, sessions, sent_us = decisions.batch, self._sessions, stamp_us(now_ns)
-        worths = _worths(decisions) if sessions.with_paths else {}
+        worths = sessions.ways.worths(decisions)
 
         def header(row: int) -> Header:
             session = sessions.at(row)
@@ -207,7 +197,7 @@ class Ticker:
     ) -> None:
         self._put(session.row, session.sealed(payload, now_ns, worth), is_plan=is_plan)
 
-    def _put(self, row: int, datagrams: Sequence[Datagram], *, is_plan: bool) -> None:
+    def _put(self, row: int, datagrams: Sequence[Datagram], *, is_plan: bool = False) -> None:
         self._out += datagrams
         if budget := self._controller.budget:
             # The network also carries headers of IP and UDP: 28 bytes, more than a whole heartbeat.
@@ -264,17 +254,3 @@ class Ticker:
             **sent_plans._asdict(),
             disturbance=batch.foresight.disturbance[batch.sent],
         )
-
-
-def _worths(decisions: Decisions) -> dict[int, float]:
-    """What the loss of each vehicle's plan costs, in packets, by its row.
-
-    A trigger sends if the cost of flying on exceeds its threshold, so the threshold is the price of
-    a packet.
-    """
-    rows, verdict = decisions.batch.rows, decisions.verdict
-    if not verdict.compares:
-        return {}
-    with np.errstate(divide="ignore", invalid="ignore"):
-        worths = np.nan_to_num(verdict.figure / verdict.threshold, nan=0.0)
-    return dict(zip(rows.tolist(), worths.tolist(), strict=False))

@@ -4,7 +4,7 @@ import numpy as np
 
 from helpers import packaged
 from skytether.server.endpoint import Server
-from skytether.server.paths import FORMER_NS, Place, ServerPaths
+from skytether.server.paths import FORMER_NS, Place, ServerPaths, SeveralWays
 from skytether.shared.base.chance import stream
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.core.endpoint import Address, Datagram
@@ -115,6 +115,12 @@ class Vehicle:
         assert self.say(message._replace(proof=question.proof), place) == []
 
 
+def ways(vehicle: Vehicle) -> SeveralWays:
+    found = vehicle.server.sessions.ways
+    assert isinstance(found, SeveralWays)
+    return found
+
+
 def test_addresses_that_a_path_has_left_are_forgotten() -> None:
     vehicle = Vehicle()
     vehicle.observe(FIRST)
@@ -123,7 +129,7 @@ def test_addresses_that_a_path_has_left_are_forgotten() -> None:
         vehicle.now_ns += SECOND_NS
     vehicle.prove(1, SECOND)
     newest = {Place(("vehicle", port), 0) for port in (18, 19)}
-    assert {*vehicle.server.sessions.at_place} == {*newest, SECOND}
+    assert {*ways(vehicle).at} == {*newest, SECOND}
 
 
 def test_a_forwarder_of_copies_does_not_take_a_path_away() -> None:
@@ -136,10 +142,9 @@ def test_a_forwarder_of_copies_does_not_take_a_path_away() -> None:
         vehicle.step += SECOND_NS // vehicle.dt_ns
         vehicle.prove(0, Place(("forwarder", port), 0))
         vehicle.observe(FIRST)
-    paths = next(iter(vehicle.server.sessions.with_paths.values())).paths
-    assert paths
+    session, paths = ways(vehicle).of[1]
     assert {*paths.places} == {FIRST, Place(("forwarder", 2), 0)}
-    line = vehicle.server.sessions.with_paths[1].line
+    line = session.line
     sent = paths.sealed(b"\x93plan", line, vehicle.now_ns, 1.0)
     assert {each.peer for each in sent} == {FIRST.peer, ("forwarder", 2)}
     later_ns = vehicle.now_ns + FORMER_NS + 1
@@ -157,7 +162,7 @@ def test_path_is_asked_for_a_proof_as_soon_as_it_is_heard_at_another_address() -
     assert peer == MOVED.peer
     assert isinstance(question, PathProof)
     assert vehicle.say(question._replace(path=0), MOVED) == []
-    assert {*vehicle.server.sessions.at_place} == {FIRST, MOVED, SECOND}
+    assert {*ways(vehicle).at} == {FIRST, MOVED, SECOND}
 
 
 def test_copy_over_another_path_is_dropped_as_a_copy() -> None:
@@ -193,8 +198,8 @@ def test_client_that_was_started_again_with_more_paths_is_heard() -> None:
     vehicle.observe(FIRST)
     session = vehicle.server.sessions.live(1)
     assert session
-    assert session.paths
-    assert len(session.paths.prices) == 3
+    assert isinstance(session.way, ServerPaths)
+    assert len(session.way.prices) == 3
     assert not vehicle.server.dropped
 
 
@@ -205,8 +210,8 @@ def test_prices_are_those_that_the_vehicle_named_last() -> None:
     vehicle.say(PathProof(1, vehicle.session, 1, 0, (1000, 7000)), SECOND)
     session = vehicle.server.sessions.live(1)
     assert session
-    assert session.paths
-    assert [path.price for path in session.paths.paths.each] == [1.0, 7.0]
+    assert isinstance(session.way, ServerPaths)
+    assert [path.price for path in session.way.paths.each] == [1.0, 7.0]
 
 
 def test_client_that_was_started_again_in_its_session_is_acknowledged_at_once() -> None:
@@ -223,8 +228,8 @@ def test_client_that_was_started_again_in_its_session_is_acknowledged_at_once() 
     vehicle.observe(FIRST)
     session = vehicle.server.sessions.live(1)
     assert session
-    assert session.paths
-    report, _ = split(session.paths.paths.report())
+    assert isinstance(session.way, ServerPaths)
+    report, _ = split(session.way.paths.report())
     assert report
     assert (report.newest, report.arrived) == (1, (1, 0))
 
@@ -239,15 +244,15 @@ def test_a_path_message_that_was_overtaken_keeps_no_session_and_sets_no_price() 
         vehicle.observe(FIRST)
     session = vehicle.server.sessions.live(1)
     assert session
-    assert session.paths
+    assert isinstance(session.way, ServerPaths)
     heard_ns = session.heard_ns
     vehicle.now_ns += 1
     # Even where the vehicle may have begun its numbers anew.
-    session.paths.paths.peer_may_restart = True
+    session.way.paths.peer_may_restart = True
     assert vehicle.send(late, FIRST) == []
     assert vehicle.server.dropped == {Drop.OVERTAKEN: 1}
     assert session.heard_ns == heard_ns
-    assert session.paths.prices == PRICES
+    assert session.way.prices == PRICES
     vehicle.observe(FIRST)
     assert vehicle.server.dropped == {Drop.OVERTAKEN: 1}
-    assert session.paths.paths.peer_may_restart
+    assert session.way.paths.peer_may_restart
