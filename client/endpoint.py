@@ -7,17 +7,14 @@ losing the server does not shift its steps.
 
 from collections import Counter
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import msgspec
-
+from skytether.client.alone import LEADER_KEY, NAMES, Fresh, MotionInForce, OneServer
 from skytether.client.failsafe import CLOSING, GOOD_NS, HOLD, STALL_NS, TABLE, Failsafe, brake_ns
 from skytether.client.followers import SplineFollower
 from skytether.client.ground import GroundReports
 from skytether.client.link import ClientLink, PlainLink
-from skytether.client.memory import ClientMemory, FlownMotion, SavedState
 from skytether.client.pilot import Pilot
-from skytether.client.servers import LEADER_KEY, NAMES, Servers
 from skytether.client.session import ServerSession
 from skytether.client.vehicle import Vehicle
 from skytether.client.way import Way
@@ -55,6 +52,9 @@ from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Reason, Recorder
 from skytether.shared.wire.drop import Drop, ProtocolError
 from skytether.shared.wire.protocol import CLOSES, NO_HORIZON, Close, Mode, stamp_us
+
+if TYPE_CHECKING:
+    from skytether.client.memory import SavedState
 
 NOWHERE: Address = ("", 0)
 VEHICLE_SOCKET = 1
@@ -109,12 +109,15 @@ class Client(Endpoint):
         standby_link: ClientLink | None = None,
         recorder: Recorder | None = None,
         keeps: bool = False,
-        before: SavedState | None = None,
+        before: "SavedState | None" = None,
     ) -> None:
         super().__init__()
         terms = scenario.terms()
         self.keeps = keeps or before is not None
-        self._memory = ClientMemory(terms, boot_id, before)
+        self._memory = Fresh(boot_id)
+        if self.keeps:
+            module = load("skytether.client.memory", "a saved state")
+            self._memory = module.Saving(module.ClientMemory(terms, boot_id, before))
         self._is_mission, self._axes = scenario.is_mission, terms.axes
         if standby and 3 * (scenario.link.fixed_ns or 0) > seconds_to_ns(scenario.link.timeout_s):
             expected = "expected at most a third of link.timeout_s with a standby server"
@@ -144,17 +147,20 @@ class Client(Endpoint):
             returns=scenario.vehicle.on_loss == "return",
             changed=self._mode_changed,
         )
-        self._servers = Servers(
-            len(servers),
-            self._memory.before.leadership,
-            self._failsafe,
-            vehicle=vehicle,
-            timeout_ns=self._timeout_ns,
-            motion=self._flown_motion,
-            may_tell=self._may_tell,
-            events=self._events,
-        )
-        self._sessions = self._servers.sessions
+        self._servers = OneServer(self._failsafe)
+        if standby or self._memory.before.leadership:
+            self._servers = load("skytether.client.servers", "a standby server").Servers(
+                len(servers),
+                self._memory.before.leadership,
+                self._failsafe,
+                vehicle=vehicle,
+                timeout_ns=self._timeout_ns,
+                dt_ns=terms.dt_ns,
+                motion=self._motion_in_force,
+                may_tell=self._may_tell,
+                events=self._events,
+            )
+        self._sessions: list[ServerSession] = self._servers.sessions
         for i, (addresses, sockets) in enumerate(
             zip(servers, (PATH_SOCKETS, STANDBY_SOCKETS), strict=False)
         ):
@@ -168,7 +174,7 @@ class Client(Endpoint):
                     # not replace the session there.
                     boot_id=self._memory.boot_id ^ i,
                     server=i,
-                    leadership=self._servers.leadership,
+                    servers=self._servers,
                     way=self._way(scenario, addresses, sockets, () if i else path_names, prices),
                     timeout_ns=self._timeout_ns,
                     connect_s=scenario.link.connect_s,
@@ -221,7 +227,8 @@ class Client(Endpoint):
     @property
     def _session(self) -> ServerSession:
         """Session with the server that leads."""
-        return self._servers.leading
+        session: ServerSession = self._servers.leading
+        return session
 
     @property
     def failure(self) -> Failure | None:
@@ -305,43 +312,37 @@ class Client(Endpoint):
 
     # -- saved state -------------------------------------------------------------------------
 
-    def _to_keep(self) -> SavedState:
-        pilot = self._pilot
-        if pilot.next_ns is None:  # the flight of the previous run may still continue
-            return msgspec.structs.replace(
-                self._memory.before,
-                frame=self._flies.frame,
-                leadership=self._servers.leadership.number,
-            )
-        return SavedState(
-            boot_id=self._memory.boot_id,
-            began_ns=pilot.began_ns,
-            heard_ns=self._failsafe.heard_ns or pilot.began_ns,
-            motion=self._flown_motion(),
-            frame=self._flies.frame,
-            leadership=self._servers.leadership.number,
-        )
+    def _to_keep(self) -> dict[str, Any]:
+        """Fields of `memory.SavedState`; on the ground those that change there."""
+        pilot, known = self._pilot, {"frame": self._flies.frame, "leadership": self._servers.number}
+        if pilot.next_ns is None:
+            return known
+        return known | {
+            "began_ns": pilot.began_ns,
+            "heard_ns": self._failsafe.heard_ns or pilot.began_ns,
+            "motion": self._motion_in_force(),
+        }
 
-    def _flown_motion(self) -> FlownMotion | None:
+    def _motion_in_force(self) -> MotionInForce | None:
         """Motion in force; None without one, on the ground, or without a mission."""
         compensator = self._pilot.compensator
         flown = compensator.follower
         if not self._is_mission or compensator.in_force == NO_HORIZON:
             return None
         assert isinstance(flown, SplineFollower)
-        return FlownMotion(
-            step=compensator.in_force,
-            observed=compensator.observed,
-            since=compensator.flown_since(self._pilot.step),
-            spacing=flown.spacing,
-            numbers=flown.sent.tobytes(),
+        return MotionInForce(
+            compensator.in_force,
+            compensator.observed,
+            compensator.flown_since(self._pilot.step),
+            flown.spacing,
+            flown.sent.tobytes(),
         )
 
     def keep(self, *, now_ns: int) -> bytes | None:
-        return self._memory.keep(self._to_keep(), now_ns=now_ns) if self.keeps else None
+        return self._memory.keep(self._to_keep, now_ns=now_ns)
 
     def _may_tell(self, now_ns: int) -> bool:
-        return not self.keeps or self._memory.may_tell(self._to_keep(), now_ns=now_ns)
+        return self._memory.may_tell(self._to_keep, now_ns=now_ns)
 
     def kept(self, *, nothing: bool = False) -> None:
         self._memory.kept(nothing=nothing)
@@ -393,7 +394,7 @@ class Client(Endpoint):
 
     def _watch_ground(self, now_ns: int) -> None:
         session, waits_for = self._session, self._flies.waits_for
-        ground = self._ground[self._servers.leadership.leader]
+        ground = self._ground[self._servers.leader]
         if session.number is not None:
             ground.hear(session.number, session.clock.echo.received_ns, now_ns=now_ns)
         elif self._flies.is_ready:
@@ -419,17 +420,16 @@ class Client(Endpoint):
         if not may_tell:
             return
         self._servers.follow(step=pilot.flown, on_ground=False, now_ns=now_ns)
-        for session in self._sessions:
+        for server, session in enumerate(self._sessions):
             observation = None
-            # A server that does not know who leads would take itself for the leader.
-            if self._servers.are_told and session.told is None:
+            if not self._servers.may_observe(server):
                 continue
             if session.leads:
                 observation = pilot.observation(session)
             elif session.is_observation_due(pilot.flown):
                 observation = pilot.observe(session)
             if observation is not None:
-                if self.keeps and self._memory.unsaved:
+                if self._memory.unsaved:
                     observation = observation._replace(unsaved=1)
                 session.send(observation, now_ns=now_ns)
                 self._tell_time(session, now_ns)
@@ -567,11 +567,7 @@ class Client(Endpoint):
             observed_ns = pilot.starts_ns(compensator.observed)
             vehicle_figures["age_ms"] = (now_ns - observed_ns) / MILLISECOND_NS
             vehicle_figures["plan_age_ms"] = (now_ns - planned_ns) / MILLISECOND_NS
-        if self._servers.are_told:
-            vehicle_figures["leadership"] = {
-                "number": self._servers.leadership.number,
-                "server": address_text(*self._session.address),
-            }
+        vehicle_figures |= self._servers.figures()
         if pilot.next_ns is not None:
             vehicle_figures |= self._session.way.figures(pilot.starts_ns(pilot.flown))
         if self._port is not None:

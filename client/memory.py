@@ -17,12 +17,14 @@ cannot be saved, because a disk is full, read-only or stuck, the client goes on 
 each observation says so: to the servers, a restart of the client is then one without saved state.
 """
 
-from typing import Annotated, Self
+from collections.abc import Callable
+from typing import Annotated, Any, Self
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from skytether.client.alone import Fresh
 from skytether.client.leadership import NUMBER_MAX
 from skytether.client.vehicle import VehicleMemory
 from skytether.shared.base.units import MILLISECOND_NS
@@ -145,9 +147,9 @@ class ClientMemory:
     """
 
     def __init__(self, terms: Terms, boot_id: int, before: SavedState | None) -> None:
-        self._age_max_ns = age_max_ns(terms)
         self.before = before or SavedState()
         self.boot_id = boot_id if self.before.boot_id is None else self.before.boot_id
+        self._age_max_ns = age_max_ns(terms)
         self._handed: tuple[SavedState, int] | None = None
         """State returned last for writing, and when."""
         self._saved = None if self.before.boot_id is None else self.before
@@ -191,6 +193,39 @@ class ClientMemory:
             self._differs_ns = now_ns
         self.unsaved = self._is_removed or now_ns - self._differs_ns > WAIT_NS
         return self.unsaved or self._saved is None
+
+
+class Saving(Fresh):
+    """A client that saves its state, see `Fresh`."""
+
+    def __init__(self, memory: ClientMemory) -> None:
+        super().__init__(memory.boot_id)
+        self._memory, self.before = memory, memory.before
+
+    def keep(self, state: Callable[[], dict[str, Any]], *, now_ns: int) -> bytes | None:
+        return self._memory.keep(self._state(state()), now_ns=now_ns)
+
+    def may_tell(self, state: Callable[[], dict[str, Any]], *, now_ns: int) -> bool:
+        return self._memory.may_tell(self._state(state()), now_ns=now_ns)
+
+    def kept(self, *, nothing: bool) -> None:
+        self._memory.kept(nothing=nothing)
+
+    @property
+    def unsaved(self) -> bool:
+        return self._memory.unsaved
+
+    @property
+    def is_stale(self) -> bool:
+        return self._memory.is_stale
+
+    def _state(self, values: dict[str, Any]) -> SavedState:
+        """State to save; on the ground the flight of the previous run may still continue."""
+        if "began_ns" not in values:
+            return msgspec.structs.replace(self._memory.before, **values)
+        if motion := values["motion"]:
+            values["motion"] = FlownMotion(**motion._asdict())
+        return SavedState(boot_id=self.boot_id, **values)
 
 
 def _is_same(one: SavedState, other: SavedState) -> bool:

@@ -1,26 +1,26 @@
 """The servers of a vehicle: which one leads, and what each is told of it.
 
-With one server nothing is decided and nothing is told. With two the vehicle changes the leader by
-the rules of `client.leadership`; packets and faults of the leader alone reach the failsafe.
+The vehicle changes the leader by the rules of `client.leadership`; packets and faults of the leader
+alone reach the failsafe.
 """
 
 from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
 
+from skytether.client.alone import LEADER_KEY, NAMES, MotionInForce, OneServer, Watch
 from skytether.client.failsafe import CLOSING, Failsafe
 from skytether.client.leadership import Leadership
-from skytether.client.memory import FlownMotion
-from skytether.client.session import ServerSession, Watch
+from skytether.client.session import ServerSession
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
 from skytether.shared.core.endpoint import Events
 from skytether.shared.core.events import LeaderChanged, LimitsDiffer, address_text
+from skytether.shared.law.heartbeat import SESSION_NS
 from skytether.shared.law.terms import Difference
 from skytether.shared.scenario.catalogue import differences
 from skytether.shared.telemetry.record import Reason
-from skytether.shared.wire.protocol import Lead
+from skytether.shared.wire.protocol import Lead, Message
 
-LEADER_KEY = "link.leader"
-NAMES = ("server", "standby")
-"""Values of that key, by the number of the server."""
 SOON_NS = 200 * MILLISECOND_NS
 """Time after which a server that has to lead is told again that it does [ns]."""
 GROUND_NS = 3 * SECOND_NS
@@ -31,8 +31,20 @@ DEPARTURES = frozenset({Reason.CLOSED, Reason.RESTARTED})
 NEVER_NS = -(2**63)
 
 
-class Servers:
-    """Sessions of a vehicle with its servers.
+@dataclass(slots=True)
+class Told:
+    """What a server was told in its present session."""
+
+    number: int | None = None
+    """Number of the leadership that the server knows; None before it knows one."""
+    again_ns: int = 0
+    """Time before which it is not told again."""
+    asked: tuple[int, int] = 0, -SESSION_NS
+    """Vehicle's step, and time [ns], at which it was last told."""
+
+
+class Servers(OneServer):
+    """Servers of a vehicle that has a standby server, or has had one in an earlier run.
 
     Args:
         count: number of servers.
@@ -51,19 +63,19 @@ class Servers:
         *,
         vehicle: int,
         timeout_ns: int,
-        motion: Callable[[], FlownMotion | None],
+        dt_ns: int,
+        motion: Callable[[], MotionInForce | None],
         may_tell: Callable[[int], bool],
         events: Events,
     ) -> None:
+        super().__init__(failsafe)
         # A vehicle that has lost its standby server tells the other that it leads now.
         number += bool(number and count == 1)
-        self.are_told = number > 0 or count > 1
-        """Whether the servers are told who leads."""
         self.leadership = Leadership(count, number, timeout_ns)
         self.sessions: list[ServerSession] = []
-        """Session with each; the caller appends them."""
-        self.failsafe = failsafe
-        self._count, self._vehicle, self._events = count, vehicle, events
+        self._told = [Told() for _ in range(count)]
+        """What each server was told."""
+        self._count, self._vehicle, self._events, self._dt_ns = count, vehicle, events, dt_ns
         self._timeout_ns, self._motion, self._may_tell = timeout_ns, motion, may_tell
         self._reported = number
         """Number of the leadership that was last reported."""
@@ -78,11 +90,28 @@ class Servers:
         """When the leader that is, or was last, doubted had been heard last."""
 
     @property
-    def leading(self) -> ServerSession:
-        return self.sessions[self.leadership.leader]
+    def leader(self) -> int:
+        return self.leadership.leader
+
+    @property
+    def number(self) -> int:
+        return self.leadership.number
+
+    def begin(self, server: int) -> None:
+        self._told[server] = Told()
+        self.leadership.begin(server)
+
+    def may_observe(self, server: int) -> bool:
+        """See `OneServer`: a server that does not know who leads would take itself for the
+        leader.
+        """
+        return self._told[server].number is not None
+
+    def figures(self) -> dict[str, Any]:
+        address = address_text(*self.leading.address)
+        return {"leadership": {"number": self.number, "server": address}}
 
     def watch(self, server: int) -> Watch:
-        """What notes the packets and faults of a server."""
         return self.failsafe if self._count == 1 else _OfLeader(self, server)
 
     # -- deciding ----------------------------------------------------------------------------
@@ -93,8 +122,6 @@ class Servers:
         Args:
             step: step of the vehicle.
         """
-        if not self.are_told:
-            return
         lead, self._now_ns = self.leadership, now_ns
         if self._named_ns is None or (self._was_on_ground and not on_ground):
             self._named_ns = now_ns
@@ -161,13 +188,31 @@ class Servers:
         if doubts and leader_ns != self._doubted_ns and not self._is_alone(now_ns):
             self._doubted_ns = leader_ns
             self.failsafe.heard(now_ns=now_ns)  # the other server gets a time-out to answer
-        for session in self.sessions:
-            if session.number is None or now_ns < session.lead_ns:
+        for told, session in zip(self._told, self.sessions, strict=True):
+            if session.number is None or now_ns < told.again_ns:
                 continue
             asks = doubts and not session.leads
-            if asks or (session.told != self.leadership.number and not session.is_lost(now_ns)):
+            if asks or (told.number != self.number and not session.is_lost(now_ns)):
                 again_ns = SOON_NS if asks or session.leads else SECOND_NS
-                session.tell_leader(self._lead(session, step), again_ns, now_ns=now_ns)
+                told.again_ns, told.asked = now_ns + again_ns, (step, now_ns)
+                session.post(self._lead(session, step), now_ns)
+
+    def take(self, server: int, message: Message, now_ns: int) -> bool:
+        """Note what a server knows of the leadership: its numbers only rise, so that a late answer
+        tells nothing new, and is a sign of life only if the question is recent.
+        """
+        if not isinstance(message, Lead):
+            return False
+        told, session = self._told[server], self.sessions[server]
+        told.number = max(told.number or 0, message.number)
+        self.leadership.hear_limits(server, message.limits, message.changes)
+        self.leadership.exceed(message.number, server)
+        self.leadership.learn(message.known, server)
+        step, asked_ns = told.asked
+        age_ns = now_ns - asked_ns + (step - message.step) * self._dt_ns
+        if age_ns <= session.hearing.overtaken_ns:
+            session.note_heard(now_ns)
+        return True
 
     def _is_alone(self, now_ns: int) -> bool:
         """Whether no server is heard that could lead in place of the leader."""

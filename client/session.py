@@ -7,9 +7,9 @@ The client echoes the time stamp of every packet of the session, from which the 
 delays. `client.failsafe` decides how packets and silence change the vehicle's mode.
 """
 
-from typing import Literal, Protocol
+from typing import Literal
 
-from skytether.client.leadership import Leadership
+from skytether.client.alone import OneServer, Watch
 from skytether.client.link import AGAIN_NS, ClientLink
 from skytether.client.server_clock import ServerClock
 from skytether.client.way import Way
@@ -66,19 +66,6 @@ FromServer = Stamped | Close | PathProof | Lead
 """Messages of a server in a session."""
 
 
-class Watch(Protocol):
-    """What has to know of a server's packets and faults: the failsafe, or nobody."""
-
-    def heard(self, *, now_ns: int) -> None:
-        """Note a packet of the session."""
-
-    def malformed(self, *, now_ns: int) -> None:
-        """Note a malformed message that was sent by the server itself."""
-
-    def meet(self, cause: Reason, *, now_ns: int) -> None:
-        """Act on a cause on the server's side."""
-
-
 class ServerSession:
     """Conversation between one vehicle and one of its servers, over all sessions.
 
@@ -86,7 +73,7 @@ class ServerSession:
         terms: terms that the server has to agree to.
         boot_id: number unique to this run of the client.
         server: which of the vehicle's servers this is, from 0.
-        leadership: which server leads.
+        servers: all servers, of which one leads.
         way: way to the server.
         timeout_ns: time without a packet after which an end takes the link for lost [ns].
         connect_s: time after which a vehicle that was never answered gives up [s].
@@ -101,7 +88,7 @@ class ServerSession:
         vehicle: int,
         boot_id: int,
         server: int = 0,
-        leadership: Leadership,
+        servers: OneServer,
         way: Way,
         timeout_ns: int,
         connect_s: float,
@@ -111,7 +98,7 @@ class ServerSession:
         events: Events,
     ) -> None:
         self._terms, self.vehicle, self._boot_id = terms, vehicle, boot_id
-        self._index, self._leadership = server, leadership
+        self._index, self._servers = server, servers
         self.way, self._timeout_ns = way, timeout_ns
         self._connect_ns = seconds_to_ns(connect_s)
         self.link = link
@@ -129,12 +116,6 @@ class ServerSession:
         """The same without heartbeats that say that the server cannot plan."""
         self.sent_step = -1
         """Step of the newest observation; -1 before the first of the session."""
-        self.told: int | None = None
-        """Number of the leadership that the server knows; None before it knows one."""
-        self.lead_ns = 0
-        """Time before which it is not told again."""
-        self._asked = 0, -SESSION_NS
-        """Vehicle's step, and time [ns], at which it was last told."""
         self._events = events
         self.hello_ns = 0
         """Time before which no further HELLO is sent."""
@@ -159,7 +140,7 @@ class ServerSession:
 
     @property
     def leads(self) -> bool:
-        return self._leadership.leader == self._index
+        return self._servers.leader == self._index
 
     def is_lost(self, now_ns: int) -> bool:
         timeout_ns = self._timeout_ns
@@ -210,9 +191,10 @@ class ServerSession:
             return self._take_stamped(message, server_ns, now_ns)
         if isinstance(message, Close):
             self._watch.meet(Reason.CLOSED, now_ns=now_ns)
-        elif isinstance(message, Lead):
-            self._hear_leader(message, now_ns)
-        elif not self.way.take(self, message, path, now_ns):
+        elif not (
+            self.way.take(self, message, path, now_ns)
+            or self._servers.take(self._index, message, now_ns)
+        ):
             raise ProtocolError(Drop.NOT_FOR_A_CLIENT)
         return None
 
@@ -224,7 +206,7 @@ class ServerSession:
         self.silence_asked = message.silence
         self.hearing.hear(message.number, server_ns)
         if not isinstance(message, Heartbeat):
-            if not self.leads or message.leadership != self._leadership.number:
+            if not self.leads or message.leadership != self._servers.number:
                 raise ProtocolError(Drop.NOT_THE_LEADER)
             self.idle = str(Idle.PLANS)
             return message
@@ -233,19 +215,6 @@ class ServerSession:
         is_degraded = message.idle == Idle.PLANS and message.degraded
         self.idle = DEGRADED if is_degraded else str(Idle(message.idle))
         return None
-
-    def _hear_leader(self, answer: Lead, now_ns: int) -> None:
-        """Note what the server knows of the leadership: its numbers only rise, so that a late one
-        tells nothing new, and is a sign of life only as the answer to a recent question.
-        """
-        self.told = max(self.told or 0, answer.number)
-        self._leadership.hear_limits(self._index, answer.limits, answer.changes)
-        self._leadership.exceed(answer.number, self._index)
-        self._leadership.learn(answer.known, self._index)
-        step, asked_ns = self._asked
-        age_ns = now_ns - asked_ns + (step - answer.step) * self._terms.dt_ns
-        if age_ns <= self.hearing.overtaken_ns:
-            self.note_heard(now_ns)
 
     def _decode(self, payload: bytes, now_ns: int) -> Message:
         try:
@@ -279,8 +248,8 @@ class ServerSession:
         if restarted:
             self.clock.begin()
         if self.number != welcome.session:
-            self.sent, self.sent_step, self.told = 0, -1, None
-            self._leadership.begin(self._index)
+            self.sent, self.sent_step = 0, -1
+            self._servers.begin(self._index)
             self.hearing.begin()
             self.way.begin()
         self.number, self._server_boot_id = welcome.session, welcome.server_boot_id
@@ -343,23 +312,18 @@ class ServerSession:
         self.sent = (self.sent + 1) % NUMBERS
         if isinstance(message, Observation):
             self.sent_step = message.step
-        self._post(message, now_ns)
+        self.post(message, now_ns)
 
     def tell_time(self, step: int, epoch_us: int, error_us: int, *, now_ns: int) -> None:
         """Send the time of day of step 0; this packet does not count in the loss statistics."""
         assert self.number is not None
-        self._post(Time(self.vehicle, self.number, step, epoch_us, error_us), now_ns)
-
-    def tell_leader(self, flown: Lead, again_ns: int, *, now_ns: int) -> None:
-        """Tell the server who leads, and in which motion the vehicle is; again after `again_ns`."""
-        self.lead_ns, self._asked = now_ns + again_ns, (flown.step, now_ns)
-        self._post(flown, now_ns)
+        self.post(Time(self.vehicle, self.number, step, epoch_us, error_us), now_ns)
 
     def is_observation_due(self, step: int) -> bool:
         """Whether a server that does not lead is to be sent an observation."""
         return self.sent_step < 0 or 2 * (step - self.sent_step) >= self.hearing.rare
 
-    def _post(self, message: Observation | Close | Time | Lead, now_ns: int) -> None:
+    def post(self, message: Message, now_ns: int) -> None:
         """Seal a message and send it."""
         worth = EVERYWHERE if isinstance(message, Close) else 1.0
         self.way.post(self.link.seal, encode(message), worth, now_ns)

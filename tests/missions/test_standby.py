@@ -186,7 +186,7 @@ def test_a_stolen_vehicle_that_speaks_of_a_standby_costs_the_others_its_room_onl
     session = client._servers.leading
     assert session.number is not None
     lead = Lead(1, session.number, 1, 0)
-    lives.world.act("client 1", lambda *, now_ns: session.tell_leader(lead, 0, now_ns=now_ns))
+    lives.world.act("client 1", lambda *, now_ns: session.post(lead, now_ns))
     lives.run(40.0)
     for number in (2, 3, 4):
         goal = lives.mission.of(number)(np.array(40.0))[:, 0]
