@@ -170,8 +170,10 @@ class ServerSession:
         if payload is None:
             for answer in self.link.outbox():
                 self.way.put(answer, path)
-            # The answer to a CHALLENGE carries the HELLO, so none is due for a while.
-            self.hello_ns = now_ns + AGAIN_NS
+            # The answer to a CHALLENGE carries the HELLO, so none is due for a while, unless a
+            # stranger has provoked it by repeating an earlier one: its WELCOME is not taken.
+            if self._awaits_welcome:
+                self.hello_ns = now_ns + AGAIN_NS
             return None
         report, payload = split(payload)
         message = self._decode(payload, now_ns)
