@@ -14,7 +14,8 @@ from typing import Any
 
 from skytether.shared.base import files
 from skytether.shared.core.endpoint import Address
-from skytether.shared.core.events import Counted, Event, Listening, address_text
+from skytether.shared.core.events import Event, address_text
+from skytether.shared.core.process_events import Counted, Listening
 from skytether.shared.scenario.reading import to_toml
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.wire import keys

@@ -23,7 +23,8 @@ from typing import Any, NamedTuple
 from bench.children import HOST, PATIENCE_S
 from bench.harness import TextTable, median, progress
 from skytether.shared.base.units import SECOND_NS
-from skytether.shared.core.events import Listening, address_text
+from skytether.shared.core.events import address_text
+from skytether.shared.core.process_events import Listening
 from skytether.shell.log import line_of
 from skytether.shell.workers import die_with_parent
 

@@ -26,14 +26,8 @@ from skytether.client.memory import SavedState, recall
 from skytether.client.vehicle import Vehicle, VehicleMemory
 from skytether.shared.core.aboard import ParametersUnsafe
 from skytether.shared.core.endpoint import PATH_SOCKETS, STANDBY_SOCKETS
-from skytether.shared.core.events import (
-    Event,
-    NoSession,
-    NotRecalled,
-    Recalled,
-    SessionRefused,
-    address_text,
-)
+from skytether.shared.core.events import Event, NoSession, SessionRefused, address_text
+from skytether.shared.core.process_events import NotRecalled, Recalled
 from skytether.shared.core.steady import Steady
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import client_columns

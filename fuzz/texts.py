@@ -20,7 +20,7 @@ from skytether.shared.base import toml
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.core import change
 from skytether.shared.core.change import REQUEST_BYTES_MAX, Answer, Running
-from skytether.shared.core.events import Counted
+from skytether.shared.core.process_events import Counted
 from skytether.shared.formats import bounded, pings, plans, recorded, traces, tracks, zone_files
 from skytether.shared.missions import mission, zone_texts
 from skytether.shared.scenario import contradictions, grammar, reading

@@ -31,13 +31,9 @@ from skytether.client.vehicle import VehicleMemory
 from skytether.mavlink.codec import Message
 from skytether.mavlink.dialect import dialect
 from skytether.shared.base.units import seconds_to_ns
-from skytether.shared.core.aboard import (
-    AboardFailure,
-    AutopilotMode,
-    AutopilotRefused,
-    NotTakenOff,
-)
+from skytether.shared.core.aboard import AutopilotMode, AutopilotRefused, NotTakenOff
 from skytether.shared.core.endpoint import Events
+from skytether.shared.core.events import Failure
 from skytether.shared.scenario.schema import Scenario
 
 WARNING = int(dialect.MAV_SEVERITY_WARNING)
@@ -102,7 +98,7 @@ class Autopilot:
         return launch.waits_for if self.clock.is_known else self.timesync.fault
 
     @property
-    def failure(self) -> AboardFailure | None:
+    def failure(self) -> Failure | None:
         if self._unfit or self.parts is None:
             return self._unfit
         return self.parts.setup.failure or self.parts.launch.failure

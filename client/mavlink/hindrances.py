@@ -10,13 +10,9 @@ from skytether.client.mavlink.rivals import Rivals
 from skytether.client.mavlink.texts import SAME_TEXT_NS
 from skytether.client.positions import Positions, Vector
 from skytether.shared.base.units import MILLISECOND_NS, seconds_to_ns
-from skytether.shared.core.aboard import (
-    AboardEvent,
-    PositionsDropped,
-    SecondCommander,
-    Strays,
-)
+from skytether.shared.core.aboard import PositionsDropped, SecondCommander, Strays
 from skytether.shared.core.endpoint import Events
+from skytether.shared.core.events import VehicleEvent
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Reason
 
@@ -92,7 +88,7 @@ class Hindrances:
 
     def _rival(self, now_ns: int) -> Reason | None:
         """Second commander, by the way it was detected; None if there is none."""
-        event: AboardEvent
+        event: VehicleEvent
         if self.rivals.are_there(now_ns=now_ns):
             system, component, content = self.rivals.newest
             cause = Reason.RIVAL

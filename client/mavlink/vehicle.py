@@ -8,7 +8,7 @@ from skytether.client.mavlink.port import Port
 from skytether.client.mavlink.positions import given_origin
 from skytether.client.vehicle import Measurement, Vehicle, VehicleMemory
 from skytether.shared.base.errors import ConfigError
-from skytether.shared.core.aboard import AboardFailure
+from skytether.shared.core.events import Failure
 from skytether.shared.core.line import parse_line
 from skytether.shared.law.model import Array
 from skytether.shared.scenario.catalogue import keys_of
@@ -40,7 +40,7 @@ class MavlinkVehicle(Vehicle):
         self._autopilot = self._port.autopilot
 
     @property
-    def failure(self) -> AboardFailure | None:  # type: ignore[override] # set in flight
+    def failure(self) -> Failure | None:  # type: ignore[override] # set in flight
         return self._autopilot.failure
 
     def set_parameters(self) -> bool:

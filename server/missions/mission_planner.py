@@ -49,10 +49,10 @@ from skytether.server.missions.waypoints import DETOUR_S, TURN_BACK, Waypoints
 from skytether.server.missions.yielding import YIELD_S, Yielding
 from skytether.server.missions.zone_clearance import comes_near
 from skytether.shared.base.chance import stream
-from skytether.shared.core.events import InZone
 from skytether.shared.law.model import ALTITUDE, Array, Flags, Indices
 from skytether.shared.law.motion import INTERVALS, SPACING, Motion
 from skytether.shared.missions.derived import clearances, lands, limits, rest_scale, zones
+from skytether.shared.missions.events import InZone
 from skytether.shared.missions.mission import Guided, parse_goals
 from skytether.shared.missions.zones import Zones
 from skytether.shared.scenario.catalogue import keys_of

@@ -16,11 +16,12 @@ from skytether.server.missions.led_vehicles import LedVehicles
 from skytether.server.missions.possible_motions import NEVER, PossibleMotion, PossibleMotions
 from skytether.server.missions.vehicle_motions import SentMotion, VehicleMotions, repeats_after
 from skytether.shared.base.kernel import B1, F1, I1, kernel
-from skytether.shared.core.events import Event, LeftMotion, LeftTube
+from skytether.shared.core.events import Event
 from skytether.shared.law.model import ALTITUDE, Array, Indices
 from skytether.shared.law.motion import INTERVALS, JOIN_MAX, SPACING, Motion, resting
 from skytether.shared.law.terms import Terms
 from skytether.shared.missions.derived import lands
+from skytether.shared.missions.events import LeftMotion, LeftTube
 from skytether.shared.missions.mission import Mission
 from skytether.shared.scenario.reference import Reference
 from skytether.shared.scenario.schema import Scenario

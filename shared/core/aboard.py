@@ -2,9 +2,7 @@
 
 import msgspec
 
-
-class VehicleEvent(msgspec.Struct, frozen=True, tag=True, kw_only=True):
-    vehicle: int
+from skytether.shared.core.events import Event, Failure, VehicleEvent
 
 
 class AutopilotParameter(msgspec.Struct, frozen=True, kw_only=True):
@@ -21,26 +19,24 @@ class AutopilotParameter(msgspec.Struct, frozen=True, kw_only=True):
         return f"{self.name} = {value}: {self.meaning}{expected}"
 
 
-class ParametersEvent(VehicleEvent, frozen=True, kw_only=True):
+class ParametersEvent(VehicleEvent):
     parameters: tuple[AutopilotParameter, ...]
 
     def __str__(self) -> str:
         return "\n".join(f"vehicle {self.vehicle}: {parameter}" for parameter in self.parameters)
 
 
-class AutopilotFound(VehicleEvent, frozen=True, kw_only=True):
+class AutopilotFound(VehicleEvent):
+    sentence = "vehicle {vehicle} has {name}, system {system}"
     name: str
     system: int
 
-    def __str__(self) -> str:
-        return f"vehicle {self.vehicle} has {self.name}, system {self.system}"
 
-
-class ParametersRead(ParametersEvent, frozen=True, kw_only=True):
+class ParametersRead(ParametersEvent):
     """The client has read the parameters that decide how the autopilot reacts to silence."""
 
 
-class ParametersSet(VehicleEvent, frozen=True, kw_only=True):
+class ParametersSet(VehicleEvent):
     """The client has set parameters of the autopilot, and read them back."""
 
     changes: tuple[tuple[str, float, float], ...]
@@ -53,80 +49,70 @@ class ParametersSet(VehicleEvent, frozen=True, kw_only=True):
         return "\n".join(lines)
 
 
-class AutopilotRefused(VehicleEvent, frozen=True, kw_only=True):
+class AutopilotRefused(VehicleEvent):
+    sentence = "vehicle {vehicle}: its autopilot refuses to {asked}: {answer}"
     asked: str
     answer: str
     """Name of the MAV_RESULT."""
 
-    def __str__(self) -> str:
-        return f"vehicle {self.vehicle}: its autopilot refuses to {self.asked}: {self.answer}"
+
+class AutopilotText(VehicleEvent):
+    sentence = "vehicle {vehicle}, its autopilot: {text}"
+    text: str
+    severity: int
+    """MAVLink severity, from 0 (emergency) to 7."""
 
 
-class AutopilotText(VehicleEvent, frozen=True, kw_only=True):
+class AutopilotSaid(Event):
+    """Text of the stand-in of an autopilot (`skytether.autopilot`)."""
+
     text: str
     severity: int
     """MAVLink severity, from 0 (emergency) to 7."""
 
     def __str__(self) -> str:
-        return f"vehicle {self.vehicle}, its autopilot: {self.text}"
+        return self.text or "an empty text"
 
 
-class TextsOmitted(VehicleEvent, frozen=True, kw_only=True):
+class TextsOmitted(VehicleEvent):
+    sentence = "vehicle {vehicle}: {count} more texts of its autopilot are not logged"
     count: int
 
-    def __str__(self) -> str:
-        return f"vehicle {self.vehicle}: {self.count} more texts of its autopilot are not logged"
 
-
-class AutopilotWaits(VehicleEvent, frozen=True, kw_only=True):
-    waits_for: str
-
-    def __str__(self) -> str:
-        return f"vehicle {self.vehicle} waits for {self.waits_for}"
-
-
-class AutopilotElsewhere(VehicleEvent, frozen=True, kw_only=True):
-    """Datagrams arrive from another address than that of a silent autopilot, and are dropped."""
-
+class AutopilotElsewhere(VehicleEvent):
+    sentence = (
+        "vehicle {vehicle}: nothing comes from its autopilot at {expected}; {content} from "
+        "{came_from} is dropped"
+    )
     came_from: str
     expected: str
     content: str
 
-    def __str__(self) -> str:
-        silent = f"vehicle {self.vehicle}: nothing comes from its autopilot at {self.expected}"
-        return f"{silent}; {self.content} from {self.came_from} is dropped"
 
-
-class AutopilotMoved(VehicleEvent, frozen=True, kw_only=True):
+class AutopilotMoved(VehicleEvent):
     """The autopilot of a vehicle on the ground has restarted at another address."""
 
+    sentence = "vehicle {vehicle}: its autopilot is at {after}, it was at {before}"
     before: str
     after: str
 
-    def __str__(self) -> str:
-        return f"vehicle {self.vehicle}: its autopilot is at {self.after}, it was at {self.before}"
 
-
-class PositionsDropped(VehicleEvent, frozen=True, kw_only=True):
+class PositionsDropped(VehicleEvent):
+    sentence = "vehicle {vehicle}: its positions are dropped: {why}"
     why: str
 
-    def __str__(self) -> str:
-        return f"vehicle {self.vehicle}: its positions are dropped: {self.why}"
 
-
-class ClockSilent(VehicleEvent, frozen=True, kw_only=True):
+class ClockSilent(VehicleEvent):
     """A vehicle's autopilot sends messages, but no longer answers TIMESYNC."""
 
+    sentence = (
+        "vehicle {vehicle}: its autopilot has not answered TIMESYNC for {silent_s:.0f} s: its time "
+        "is extrapolated from earlier answers"
+    )
     silent_s: float
 
-    def __str__(self) -> str:
-        return (
-            f"vehicle {self.vehicle}: its autopilot has not answered TIMESYNC for "
-            f"{self.silent_s:.0f} s: its time is extrapolated from earlier answers"
-        )
 
-
-class AutopilotMode(VehicleEvent, frozen=True, kw_only=True):
+class AutopilotMode(VehicleEvent):
     mode: str
     armed: bool
 
@@ -135,20 +121,18 @@ class AutopilotMode(VehicleEvent, frozen=True, kw_only=True):
         return f"vehicle {self.vehicle}: its autopilot is in {self.mode}, {armed}"
 
 
-class SecondCommander(VehicleEvent, frozen=True, kw_only=True):
+class SecondCommander(VehicleEvent):
+    sentence = (
+        "vehicle {vehicle}: system {system}, component {component} commands its autopilot as "
+        "well: {said}"
+    )
     system: int
     component: int
     said: str
     """Type of the newest message of that sender."""
 
-    def __str__(self) -> str:
-        who = f"system {self.system}, component {self.component}"
-        return f"vehicle {self.vehicle}: {who} commands its autopilot as well: {self.said}"
 
-
-class SecondPublisher(VehicleEvent, frozen=True, kw_only=True):
-    """Somebody else publishes commands for a robot."""
-
+class SecondPublisher(VehicleEvent):
     topic: str
     nodes: tuple[str, ...]
     """Other nodes of the ROS graph that may publish on the topic; empty if none has told."""
@@ -158,25 +142,23 @@ class SecondPublisher(VehicleEvent, frozen=True, kw_only=True):
         return f"vehicle {self.vehicle}: {who} publishes on {self.topic} as well"
 
 
-class OdometryDropped(VehicleEvent, frozen=True, kw_only=True):
+class OdometryDropped(VehicleEvent):
+    sentence = "vehicle {vehicle}: messages of its odometry are dropped: {why}"
     why: str
 
-    def __str__(self) -> str:
-        return f"vehicle {self.vehicle}: messages of its odometry are dropped: {self.why}"
 
-
-class Strays(VehicleEvent, frozen=True, kw_only=True):
+class Strays(VehicleEvent):
     """A vehicle deviates from its commands by more than wind and model errors explain."""
 
+    sentence = (
+        "vehicle {vehicle} deviates by {off_mps:.1f} m/s from its commands: somebody else commands "
+        "it, or it fails"
+    )
     off_mps: float
     """Distance of the velocity from the range that the commands explain [m/s]."""
 
-    def __str__(self) -> str:
-        off = f"deviates by {self.off_mps:.1f} m/s from its commands"
-        return f"vehicle {self.vehicle} {off}: somebody else commands it, or it fails"
 
-
-class ParametersUnsafe(ParametersEvent, frozen=True, kw_only=True):
+class ParametersUnsafe(ParametersEvent, Failure):
     """A vehicle is not armed because its autopilot would react unsafely to silence: parameters are
     unsafe or could not be set.
     """
@@ -195,23 +177,21 @@ class ParametersUnsafe(ParametersEvent, frozen=True, kw_only=True):
         return f"vehicle {self.vehicle} is not armed: {'; '.join(problems)}"
 
 
-class NotTakenOff(VehicleEvent, frozen=True, kw_only=True):
+class NotTakenOff(Failure):
+    sentence = "vehicle {vehicle}: {doing}: {why}"
     doing: str
     why: str
 
-    def __str__(self) -> str:
-        return f"vehicle {self.vehicle}: {self.doing}: {self.why}"
 
-
-class ArmingAwaited(VehicleEvent, frozen=True, kw_only=True):
+class ArmingAwaited(VehicleEvent):
+    sentence = (
+        "vehicle {vehicle} is not armed: {why}; arm it again: skytether set SOCKET armed=true, or "
+        "on the page"
+    )
     why: str
 
-    def __str__(self) -> str:
-        instruction = "arm it again: skytether set SOCKET armed=true, or on the page"
-        return f"vehicle {self.vehicle} is not armed: {self.why}; {instruction}"
 
-
-class OriginAwaited(VehicleEvent, frozen=True, kw_only=True):
+class OriginAwaited(VehicleEvent):
     """A vehicle in the air hovers because the scenario's origin is unknown."""
 
     place: tuple[float, float, float]
@@ -226,27 +206,3 @@ class OriginAwaited(VehicleEvent, frozen=True, kw_only=True):
             f"vehicle {self.vehicle} hovers at [{at}] of its autopilot's local frame "
             f"(north, east, up), and its origin is not known; {instruction}"
         )
-
-
-AboardFailure = ParametersUnsafe | NotTakenOff
-AboardEvent = (
-    AutopilotFound
-    | ParametersRead
-    | ParametersSet
-    | AutopilotRefused
-    | AutopilotText
-    | TextsOmitted
-    | AutopilotWaits
-    | AutopilotElsewhere
-    | AutopilotMoved
-    | PositionsDropped
-    | ClockSilent
-    | AutopilotMode
-    | ArmingAwaited
-    | OriginAwaited
-    | SecondCommander
-    | SecondPublisher
-    | OdometryDropped
-    | Strays
-    | AboardFailure
-)

@@ -1,15 +1,18 @@
-"""Events: reports of an endpoint, or of the process around it, as typed values.
+"""Events: reports of an endpoint, as typed values; also the base of all other events.
 
 An endpoint returns its events (`Endpoint.events`); a driver passes them to a log, a flight in
 virtual time, or the command that started the process. `str(event)` is a sentence for the operator.
 For programs an event is a JSON object whose key `type` is the name of the class.
+
+Here are the events of any flight. Those of autopilots are in `aboard`, of processes in
+`process_events`, of missions in `shared.missions.events`; a new module of events is imported by
+`shared.telemetry.every_event`, which decodes them all.
 """
 
-from typing import Any, Literal
+from typing import Any, Literal, dataclass_transform
 
 import msgspec
 
-from skytether.shared.core.aboard import AboardEvent, AboardFailure, VehicleEvent
 from skytether.shared.law.terms import Difference
 from skytether.shared.wire.drop import Drop
 
@@ -19,138 +22,57 @@ def address_text(host: str, port: int) -> str:
     return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
 
 
-class Listening(msgspec.Struct, frozen=True, tag=True, kw_only=True):
-    host: str
-    port: int
-    waiting_for: str
+@dataclass_transform(frozen_default=True, kw_only_default=True)
+class Event(msgspec.Struct, frozen=True, tag=True):
+    """Base of all events; what it is to msgspec and to mypy, its subclasses inherit."""
+
+    sentence = ""
+    """Sentence for the operator, with fields and properties in braces; an event that needs more
+    defines `__str__`."""
 
     def __str__(self) -> str:
-        address = address_text(self.host, self.port)
-        return f"listening on {address}, waiting for {self.waiting_for}"
+        return self.sentence.format_map(self)
+
+    def __getitem__(self, name: str) -> Any:
+        """Value for a name in braces."""
+        return getattr(self, name)
 
 
-class HostMissing(msgspec.Struct, frozen=True, tag=True, kw_only=True):
-    host: str
-    reason: str
-
-    def __str__(self) -> str:
-        return f"cannot find {self.host}: {self.reason}; it is looked up again until it is found"
+class VehicleEvent(Event):
+    vehicle: int
 
 
-class HostFound(msgspec.Struct, frozen=True, tag=True, kw_only=True):
-    host: str
-    address: str
-
-    def __str__(self) -> str:
-        return f"found {self.host}: it is {self.address}"
+class Failure(VehicleEvent):
+    """Event after which a vehicle cannot fly, or cannot go on."""
 
 
-class PathMissing(msgspec.Struct, frozen=True, tag=True, kw_only=True):
-    path: str
-    """LOCAL=HOST:PORT, as the user has written it."""
-    reason: str
-
-    def __str__(self) -> str:
-        return f"the path {self.path} is down: {self.reason}; it is tried again every second"
-
-
-class PathFound(msgspec.Struct, frozen=True, tag=True, kw_only=True):
-    path: str
-
-    def __str__(self) -> str:
-        return f"the path {self.path} is up"
-
-
-class PathDied(VehicleEvent, frozen=True, kw_only=True):
-    """Nothing arrives any more over one of a session's paths."""
-
+class PathDied(VehicleEvent):
+    sentence = "vehicle {vehicle}: nothing arrives over path {path} ({via})"
     path: int
     """Number of the path, from 0."""
     via: str
     """Its interface or address."""
 
-    def __str__(self) -> str:
-        return f"vehicle {self.vehicle}: nothing arrives over path {self.path} ({self.via})"
 
-
-class PathHealed(VehicleEvent, frozen=True, kw_only=True):
+class PathHealed(VehicleEvent):
+    sentence = "vehicle {vehicle}: path {path} ({via}) is well again"
     path: int
     via: str
 
-    def __str__(self) -> str:
-        return f"vehicle {self.vehicle}: path {self.path} ({self.via}) is well again"
 
-
-class PageServed(msgspec.Struct, frozen=True, tag=True, kw_only=True):
-    address: str
-    """Address for a browser; includes a token if the page may change the flight."""
-    taken: str = ""
-    """Requested HOST:PORT if another process uses that address."""
-
-    def __str__(self) -> str:
-        # Only a space may follow the address: it is copied, or clicked.
-        return f"the page is at {self.address}" + (
-            f" ({self.taken} is taken)" if self.taken else ""
-        )
-
-
-class BrowserRefused(msgspec.Struct, frozen=True, tag=True, kw_only=True):
-    why: str
-    count: int
-
-    def __str__(self) -> str:
-        return f"refused, {self.count} so far: {self.why}"
-
-
-class Measured(msgspec.Struct, frozen=True, tag=True, kw_only=True):
-    host: str
-    port: int
-    local: bool = True
-
-    def __str__(self) -> str:
-        whose = "" if self.local else ", WITHOUT A PASSWORD: anybody on the network can read them"
-        return f"metrics at http://{address_text(self.host, self.port)}/metrics{whose}"
-
-
-class ReferenceTooFast(msgspec.Struct, frozen=True, tag=True, kw_only=True):
+class ReferenceTooFast(Event):
+    sentence = (
+        "the desired trajectory needs {speed_mps:.3g} m/s at {at_s:g} s, and the vehicle flies at "
+        "most {most_mps:.3g} m/s (model.u_max times model.gain): it cannot follow"
+    )
     at_s: float
     """First time in the flight at which the trajectory is too fast [s]."""
     speed_mps: float
     most_mps: float
     """Largest speed of the vehicle along the same axis [m/s]."""
 
-    def __str__(self) -> str:
-        required = f"the desired trajectory needs {self.speed_mps:.3g} m/s at {self.at_s:g} s"
-        most = f"{self.most_mps:.3g} m/s (model.u_max times model.gain)"
-        return f"{required}, and the vehicle flies at most {most}: it cannot follow"
 
-
-class NoFailsafe(msgspec.Struct, frozen=True, tag=True, kw_only=True):
-    """A vehicle is flown without a failsafe: with a lost link it keeps its last input for ever."""
-
-    def __str__(self) -> str:
-        flown = "without a packet it holds its last input for ever"
-        return f'NO FAILSAFE: {flown}; vehicle.exhausted = "brake" has one'
-
-
-class Plaintext(msgspec.Struct, frozen=True, tag=True, kw_only=True):
-    """A process has no keys: anybody can read and forge its packets."""
-
-    local: bool
-
-    def __str__(self) -> str:
-        who = "on this machine" if self.local else "on the network"
-        return f"PLAINTEXT, no keys: anybody {who} can fly the vehicle; see skytether keygen"
-
-
-class Counted(msgspec.Struct, frozen=True, tag=True, kw_only=True):
-    figures: dict[str, Any]
-
-    def __str__(self) -> str:
-        return "counted so far:"
-
-
-class Omitted(msgspec.Struct, frozen=True, tag=True, kw_only=True):
+class Omitted(Event):
     kind: str
     """Name of the events' class; "lines" if the output was not read in time."""
     count: int
@@ -159,23 +81,21 @@ class Omitted(msgspec.Struct, frozen=True, tag=True, kw_only=True):
         return f"… and {self.count:,} more {self.kind}".replace(",", " ")
 
 
-class RecordIncomplete(msgspec.Struct, frozen=True, tag=True, kw_only=True):
+class RecordIncomplete(Event):
+    sentence = "{file}: {reason}: the record is incomplete, the flight goes on"
     file: str
     reason: str
     """System's message, such as "No space left on device"."""
 
-    def __str__(self) -> str:
-        return f"{self.file}: {self.reason}: the record is incomplete, the flight goes on"
 
-
-class Fault(msgspec.Struct, frozen=True, tag=True, kw_only=True):
+class Fault(Event):
     traceback: str
 
     def __str__(self) -> str:
         return f"an error in its code, the flight goes on\n{self.traceback.rstrip()}"
 
 
-class FlowOpened(msgspec.Struct, frozen=True, tag=True, kw_only=True):
+class FlowOpened(Event):
     flow: int
     host: str
     port: int
@@ -184,34 +104,27 @@ class FlowOpened(msgspec.Struct, frozen=True, tag=True, kw_only=True):
         return f"flow {self.flow} for {address_text(self.host, self.port)}"
 
 
-class Returned(msgspec.Struct, frozen=True, tag=True, kw_only=True):
-    """A packet of netem has returned to netem, while the server has never answered."""
-
+class Returned(Event):
+    sentence = (
+        "a packet has returned from {times} new addresses, and opens no more flows: the server has "
+        "never answered, and its address may lead back to this netem"
+    )
     times: int
     """Number of successive new addresses that the packet came from."""
 
-    def __str__(self) -> str:
-        return (
-            f"a packet has returned from {self.times} new addresses, and opens no more flows: the "
-            "server has never answered, and its address may lead back to this netem"
-        )
 
-
-class TooLong(msgspec.Struct, frozen=True, tag=True, kw_only=True):
+class TooLong(Event):
     """The first packet that netem has dropped because of its length."""
 
+    sentence = (
+        "a packet of {size} B is dropped, and so are all longer than network.mtu, which is {most} B"
+    )
     size: int
     """UDP payload [B]."""
     most: int
 
-    def __str__(self) -> str:
-        return (
-            f"a packet of {self.size} B is dropped, and so are all longer than network.mtu, which "
-            f"is {self.most} B"
-        )
 
-
-class Unreachable(msgspec.Struct, frozen=True, tag=True, kw_only=True):
+class Unreachable(Event):
     host: str
     port: int
     reason: str
@@ -221,18 +134,7 @@ class Unreachable(msgspec.Struct, frozen=True, tag=True, kw_only=True):
         return f"packets to {at} are lost until it answers: {self.reason}"
 
 
-class AutopilotSaid(msgspec.Struct, frozen=True, tag=True, kw_only=True):
-    text: str
-    severity: int
-    """MAVLink severity, from 0 (emergency) to 7."""
-
-    def __str__(self) -> str:
-        return self.text or "an empty text"
-
-
-class Unauthenticated(msgspec.Struct, frozen=True, tag=True, kw_only=True):
-    """A server with keys has dropped datagrams that were forged, repeated or too old."""
-
+class Unauthenticated(Event):
     count: int
     host: str
     port: int
@@ -243,7 +145,7 @@ class Unauthenticated(msgspec.Struct, frozen=True, tag=True, kw_only=True):
         return f"{self.count} datagrams dropped so far as forged, repeated or too old, {newest}"
 
 
-class Degraded(msgspec.Struct, frozen=True, tag=True, kw_only=True):
+class Degraded(Event):
     """The server has begun to miss too many ticks, or has stopped missing them."""
 
     degraded: bool
@@ -252,7 +154,7 @@ class Degraded(msgspec.Struct, frozen=True, tag=True, kw_only=True):
         return "degraded: ticks are missed" if self.degraded else "ticks are in time again"
 
 
-class Changed(msgspec.Struct, frozen=True, tag=True, kw_only=True, omit_defaults=True):
+class Changed(Event, omit_defaults=True):
     key: str
     before: str
     after: str
@@ -263,15 +165,13 @@ class Changed(msgspec.Struct, frozen=True, tag=True, kw_only=True, omit_defaults
         return f"{self.name or self.key} is {self.after} from now on, it was {self.before}"
 
 
-class ChangeRefused(msgspec.Struct, frozen=True, tag=True, kw_only=True):
+class ChangeRefused(Event):
+    sentence = "a change is refused: {reason}"
     reason: str
     """Reason, which names the key, the given and the expected value."""
 
-    def __str__(self) -> str:
-        return f"a change is refused: {self.reason}"
 
-
-class PeerEvent(VehicleEvent, frozen=True, kw_only=True):
+class PeerEvent(VehicleEvent):
     host: str
     """Host of the vehicle in an event of the server, of the server in an event of the vehicle."""
     port: int
@@ -281,12 +181,11 @@ class PeerEvent(VehicleEvent, frozen=True, kw_only=True):
         return address_text(self.host, self.port)
 
 
-class SessionOpened(PeerEvent, frozen=True, kw_only=True):
-    def __str__(self) -> str:
-        return f"vehicle {self.vehicle} flies, from {self.peer}"
+class SessionOpened(PeerEvent):
+    sentence = "vehicle {vehicle} flies, from {peer}"
 
 
-class Leaving(msgspec.Struct, frozen=True, tag=True, kw_only=True):
+class Leaving(Event):
     """The process is asked to end while vehicles of a mission are on their motions."""
 
     vehicles: tuple[int, ...]
@@ -300,14 +199,13 @@ class Leaving(msgspec.Struct, frozen=True, tag=True, kw_only=True):
         return f"asked to end: no new motion begins; {waits} (ask again to end at once)"
 
 
-class SessionEnded(VehicleEvent, frozen=True, kw_only=True):
+class SessionEnded(VehicleEvent):
     """A session has ended: the vehicle has closed it, or was silent for too long."""
 
-    def __str__(self) -> str:
-        return f"the session of vehicle {self.vehicle} has ended"
+    sentence = "the session of vehicle {vehicle} has ended"
 
 
-class SessionRefused(VehicleEvent, frozen=True, kw_only=True):
+class SessionRefused(Failure):
     """Server and vehicle fly different scenarios; each end reports it."""
 
     differences: tuple[Difference, ...]
@@ -320,45 +218,41 @@ class SessionRefused(VehicleEvent, frozen=True, kw_only=True):
         return f"vehicle {self.vehicle} is refused, it flies another scenario: {keys}"
 
 
-class ServerFull(PeerEvent, frozen=True, kw_only=True):
+class ServerFull(PeerEvent):
+    sentence = (
+        "vehicle {vehicle} from {peer} is refused: the server is full (room for {room}); "
+        "see --vehicles"
+    )
     room: int
     """Largest number of vehicles."""
 
-    def __str__(self) -> str:
-        full = f"the server is full (room for {self.room}); see --vehicles"
-        return f"vehicle {self.vehicle} from {self.peer} is refused: {full}"
 
-
-class BegunAnew(VehicleEvent, frozen=True, kw_only=True):
+class BegunAnew(VehicleEvent):
     """The client of a vehicle on a mission has restarted, and does not continue its motion."""
 
-    def __str__(self) -> str:
-        return (
-            f"vehicle {self.vehicle}: its client has restarted without its motion; until its "
-            "first packet arrives, others keep clear of every place where it may be"
-        )
+    sentence = (
+        "vehicle {vehicle}: its client has restarted without its motion; until its first packet "
+        "arrives, others keep clear of every place where it may be"
+    )
 
 
-class CannotResume(VehicleEvent, frozen=True, kw_only=True):
-    """A client has told its server that it cannot save the state for its next run."""
-
-    def __str__(self) -> str:
-        return (
-            f"vehicle {self.vehicle}: its client cannot save its state; if it restarts, the "
-            "vehicle stops where it is"
-        )
+class CannotResume(VehicleEvent):
+    sentence = (
+        "vehicle {vehicle}: its client cannot save its state; if it restarts, the vehicle stops "
+        "where it is"
+    )
 
 
-class NumberTaken(PeerEvent, frozen=True, kw_only=True):
+class NumberTaken(PeerEvent):
+    sentence = (
+        "vehicle {vehicle} from {peer} is refused: another client flies under this number, from "
+        "{holder}; see --id"
+    )
     holder: str
     """HOST:PORT of the vehicle that already uses this number."""
 
-    def __str__(self) -> str:
-        conflict = f"another client flies under this number, from {self.holder}; see --id"
-        return f"vehicle {self.vehicle} from {self.peer} is refused: {conflict}"
 
-
-class NoSession(PeerEvent, frozen=True, kw_only=True):
+class NoSession(PeerEvent, Failure):
     """The server opens no session for a vehicle, which keeps asking."""
 
     reason: Literal["full", "taken"]
@@ -371,7 +265,7 @@ class NoSession(PeerEvent, frozen=True, kw_only=True):
         return f"vehicle {self.vehicle} is refused by {self.peer}: {why}"
 
 
-class UnansweredEvent(PeerEvent, frozen=True, kw_only=True):
+class UnansweredEvent(PeerEvent):
     others: tuple[str, ...] = ()
     """Addresses of the server's other paths, from which no answer has come either."""
 
@@ -380,7 +274,7 @@ class UnansweredEvent(PeerEvent, frozen=True, kw_only=True):
         return ", ".join((self.peer, *self.others))
 
 
-class NoAnswer(UnansweredEvent, frozen=True, kw_only=True):
+class NoAnswer(UnansweredEvent, Failure, kw_only=True):
     waited_s: float
     secure: bool = False
     """Whether the vehicle has a key, so that only answers with that key count."""
@@ -391,44 +285,41 @@ class NoAnswer(UnansweredEvent, frozen=True, kw_only=True):
         return f"vehicle {self.vehicle}: {no_answer}: is a server running there{and_key}?"
 
 
-class Unanswered(UnansweredEvent, frozen=True, kw_only=True):
+class Unanswered(UnansweredEvent, kw_only=True):
+    sentence = (
+        "vehicle {vehicle}: no answer from {everywhere} yet, asking for another {left_s:.0f} s"
+    )
     left_s: float
 
-    def __str__(self) -> str:
-        left = f"{self.left_s:.0f} s"
-        unheard = f"vehicle {self.vehicle}: no answer from {self.everywhere} yet"
-        return f"{unheard}, asking for another {left}"
+
+class Welcomed(PeerEvent):
+    sentence = "vehicle {vehicle}: session open with the server at {peer}"
 
 
-class Welcomed(PeerEvent, frozen=True, kw_only=True):
-    def __str__(self) -> str:
-        return f"vehicle {self.vehicle}: session open with the server at {self.peer}"
+class AutopilotWaits(VehicleEvent):
+    sentence = "vehicle {vehicle} waits for {waits_for}"
+    waits_for: str
 
 
-class ServerSilent(VehicleEvent, frozen=True, kw_only=True):
+class ServerSilent(VehicleEvent):
     """Packets of the server no longer arrive at a vehicle on the ground."""
 
+    sentence = "vehicle {vehicle}: the server has been silent for {silent_s:.1f} s"
     silent_s: float
 
-    def __str__(self) -> str:
-        return f"vehicle {self.vehicle}: the server has been silent for {self.silent_s:.1f} s"
 
-
-class ServerHeard(VehicleEvent, frozen=True, kw_only=True):
+class ServerHeard(VehicleEvent):
     """Packets of the server arrive again at a vehicle on the ground."""
 
+    sentence = "vehicle {vehicle}: its server answers again, after {silent_s:.1f} s"
     silent_s: float
 
-    def __str__(self) -> str:
-        return f"vehicle {self.vehicle}: its server answers again, after {self.silent_s:.1f} s"
+
+class Flying(VehicleEvent):
+    sentence = "vehicle {vehicle}: session open, flying"
 
 
-class Flying(VehicleEvent, frozen=True, kw_only=True):
-    def __str__(self) -> str:
-        return f"vehicle {self.vehicle}: session open, flying"
-
-
-class LimitsDiffer(PeerEvent, frozen=True, kw_only=True):
+class LimitsDiffer(PeerEvent):
     """A server must not lead a vehicle: it plans a mission within other limits than the leader."""
 
     differences: tuple[Difference, ...]
@@ -441,18 +332,13 @@ class LimitsDiffer(PeerEvent, frozen=True, kw_only=True):
         return f"vehicle {self.vehicle}: the server at {self.peer} will not lead it: {keys}"
 
 
-class LeaderChanged(PeerEvent, frozen=True, kw_only=True):
-    """Another server leads a vehicle."""
-
+class LeaderChanged(PeerEvent):
+    sentence = "vehicle {vehicle}: the server at {peer} leads it now (leadership {number})"
     number: int
     """Number of the leadership."""
 
-    def __str__(self) -> str:
-        at = address_text(self.host, self.port)
-        return f"vehicle {self.vehicle}: the server at {at} leads it now (leadership {self.number})"
 
-
-class ModeChanged(VehicleEvent, frozen=True, kw_only=True):
+class ModeChanged(VehicleEvent):
     """A vehicle has changed its mode, or the reason for it.
 
     Coasting along a plan that still lasts is not reported.
@@ -486,67 +372,39 @@ DOES = {
 """Words for each mode, except coasting along a plan, which is not reported."""
 
 
-class PlanningStopped(VehicleEvent, frozen=True, kw_only=True):
+class PlanningStopped(VehicleEvent):
     """The server makes no plan for a vehicle with an open session, or sends none."""
 
+    sentence = "vehicle {vehicle} is sent no plan: {why}"
     why: str
 
-    def __str__(self) -> str:
-        return f"vehicle {self.vehicle} is sent no plan: {self.why}"
+
+class PlanningResumed(VehicleEvent):
+    sentence = "vehicle {vehicle} gets plans again"
 
 
-class StateDoubted(VehicleEvent, frozen=True, kw_only=True):
-    def __str__(self) -> str:
-        return f"vehicle {self.vehicle} reports an impossible state: the observation is dropped"
+class StateDoubted(VehicleEvent):
+    sentence = "vehicle {vehicle} reports an impossible state: the observation is dropped"
 
 
-class InZone(VehicleEvent, frozen=True, kw_only=True):
-    zone: str
-
-    def __str__(self) -> str:
-        return f"vehicle {self.vehicle} is at rest in {self.zone}, tube included: it is guided out"
-
-
-class LeftTube(VehicleEvent, frozen=True, kw_only=True):
-    """A vehicle on a mission is farther from its motion than allowed."""
-
-    off_m: float
-    """Distance of the vehicle outside its tube [m]."""
-
-    def __str__(self) -> str:
-        off = f"{self.off_m:.2g} m outside its tube (mission.tube_m)"
-        return f"vehicle {self.vehicle} is {off}: the others keep further away"
-
-
-class LeftMotion(VehicleEvent, frozen=True, kw_only=True):
-    """A vehicle on a mission has left its motion before its end."""
-
-    left_s: float
-    """Time until the motion would have ended [s]."""
-
-    def __str__(self) -> str:
-        left = f"has left its motion {self.left_s:.1f} s before its end"
-        return f"vehicle {self.vehicle} {left}: the others keep away from where it is"
-
-
-class SteppedLate(VehicleEvent, frozen=True, kw_only=True):
+class SteppedLate(VehicleEvent):
     """A step of a vehicle on a mission began later than any before, and too late: until then the
     last input was flown.
     """
 
+    sentence = (
+        "a step of vehicle {vehicle} began {late_s:.2f} s late: its computer was busy or stood "
+        "still"
+    )
     late_s: float
     """Time by which it began late [s]."""
-
-    def __str__(self) -> str:
-        late = f"{self.late_s:.2f} s late: its computer was busy or stood still"
-        return f"a step of vehicle {self.vehicle} began {late}"
 
 
 def metres(leap_m: tuple[float, ...]) -> str:
     return f"({', '.join(f'{each:+.2f}' for each in leap_m)}) m"
 
 
-class StateLeapt(VehicleEvent, frozen=True, kw_only=True):
+class StateLeapt(VehicleEvent):
     """A vehicle's measured state has leapt, and the operator has to choose a frame."""
 
     by_m: tuple[float, ...]
@@ -564,37 +422,18 @@ class StateLeapt(VehicleEvent, frozen=True, kw_only=True):
         return f"vehicle {self.vehicle}: its {leap}: {what}{lands if self.land_after_s else ''}"
 
 
-class ClockContradicted(VehicleEvent, frozen=True, kw_only=True):
+class ClockContradicted(VehicleEvent):
     """The packets of a vehicle contradict the bounds of its clock's offset."""
 
+    sentence = "vehicle {vehicle}: {what}"
     what: str
 
-    def __str__(self) -> str:
-        return f"vehicle {self.vehicle}: {self.what}"
+
+class FenceHolds(VehicleEvent):
+    sentence = "vehicle {vehicle} is held back by its fence"
 
 
-class TimeUnknown(msgspec.Struct, frozen=True, tag=True, kw_only=True):
-    """`link.time_of_day` is "host", but the error of the host's clock is unknown."""
-
-    def __str__(self) -> str:
-        return (
-            'link.time_of_day is "host", and the kernel of this host does not say how wrong its '
-            "clock is: clocks are compared by delays alone (chrony needs `rtcsync` in its "
-            "configuration; systemd-timesyncd states no error)"
-        )
-
-
-class FenceHolds(VehicleEvent, frozen=True, kw_only=True):
-    def __str__(self) -> str:
-        return f"vehicle {self.vehicle} is held back by its fence"
-
-
-class PlanningResumed(VehicleEvent, frozen=True, kw_only=True):
-    def __str__(self) -> str:
-        return f"vehicle {self.vehicle} gets plans again"
-
-
-class NotFlown(VehicleEvent, frozen=True, kw_only=True):
+class NotFlown(Failure):
     """A flight has ended without a plan, or never had one."""
 
     covered: int
@@ -607,116 +446,7 @@ class NotFlown(VehicleEvent, frozen=True, kw_only=True):
         return f"vehicle {self.vehicle} {flown if self.covered else 'was never flown'}: {self.why}"
 
 
-class Recalled(VehicleEvent, frozen=True, kw_only=True):
-    goes_on: bool
-
-    def __str__(self) -> str:
-        if self.goes_on:
-            return f"vehicle {self.vehicle} goes on with the flight of an earlier run"
-        return f"vehicle {self.vehicle}: the flight of an earlier run is too long ago to go on"
-
-
-class NotRecalled(VehicleEvent, frozen=True, kw_only=True):
-    reason: str
-
-    def __str__(self) -> str:
-        return (
-            f"vehicle {self.vehicle}: the state saved by an earlier run is not used: {self.reason}"
-        )
-
-
-class SettingsRecalled(msgspec.Struct, frozen=True, tag=True, kw_only=True):
-    path: str
-    values: dict[str, Any]
-
-    def __str__(self) -> str:
-        settings = ", ".join(f"{key} = {value!r}" for key, value in self.values.items())
-        return f"set in flight and in force again, from {self.path}: {settings}"
-
-
-class NotKept(msgspec.Struct, frozen=True, tag=True, kw_only=True):
-    reason: str
-    removed: bool = False
-    """Whether the file of an earlier state was removed: the next run would follow it."""
-
-    def __str__(self) -> str:
-        hovers = "; a client that is restarted now hovers where it is" if self.removed else ""
-        return f"the state for the next run of this process cannot be saved: {self.reason}{hovers}"
-
-
-class Finished(VehicleEvent, frozen=True, kw_only=True):
+class Finished(VehicleEvent):
+    sentence = "vehicle {vehicle}: flown to the end, {missed} of {steps} steps missed"
     steps: int
     missed: int
-
-    def __str__(self) -> str:
-        return (
-            f"vehicle {self.vehicle}: flown to the end, {self.missed} of {self.steps} steps missed"
-        )
-
-
-Failure = SessionRefused | NoSession | NoAnswer | NotFlown | AboardFailure
-
-Event = (
-    Listening
-    | PageServed
-    | BrowserRefused
-    | Measured
-    | Plaintext
-    | NoFailsafe
-    | ReferenceTooFast
-    | Counted
-    | Omitted
-    | RecordIncomplete
-    | Fault
-    | FlowOpened
-    | Returned
-    | TooLong
-    | Unreachable
-    | AutopilotSaid
-    | AboardEvent
-    | Unauthenticated
-    | Degraded
-    | Changed
-    | ChangeRefused
-    | SessionOpened
-    | Leaving
-    | PathDied
-    | PathHealed
-    | SessionEnded
-    | SessionRefused
-    | ServerFull
-    | BegunAnew
-    | CannotResume
-    | NumberTaken
-    | NoSession
-    | NoAnswer
-    | Unanswered
-    | HostMissing
-    | HostFound
-    | PathMissing
-    | PathFound
-    | Welcomed
-    | ServerSilent
-    | ServerHeard
-    | Flying
-    | LeaderChanged
-    | LimitsDiffer
-    | ModeChanged
-    | PlanningStopped
-    | StateDoubted
-    | InZone
-    | ClockContradicted
-    | TimeUnknown
-    | LeftMotion
-    | LeftTube
-    | SteppedLate
-    | StateLeapt
-    | FenceHolds
-    | PlanningResumed
-    | NotFlown
-    | Recalled
-    | NotRecalled
-    | NotKept
-    | SettingsRecalled
-    | Finished
-)

@@ -12,9 +12,9 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from skytether.shared.core.events import Event
 from skytether.shared.core.ways import FLIGHT, Ways
 from skytether.shared.telemetry import record
+from skytether.shared.telemetry.every_event import EveryEvent
 from skytether.shared.telemetry.record import Rows as Table
 
 LENGTH_BYTES = 4
@@ -56,7 +56,7 @@ class Rows(msgspec.Struct, frozen=True, tag=True, kw_only=True):
 
 class Said(msgspec.Struct, frozen=True, tag=True, kw_only=True):
     time_ns: int
-    event: Event
+    event: EveryEvent
 
 
 class Figures(msgspec.Struct, frozen=True, tag=True, kw_only=True):

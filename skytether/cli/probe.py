@@ -32,7 +32,8 @@ from skytether.server.gate import Gate, PlainGate
 from skytether.shared.base import files
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.core.endpoint import Address
-from skytether.shared.core.events import Counted, Event, Listening
+from skytether.shared.core.events import Event
+from skytether.shared.core.process_events import Counted, Listening
 from skytether.shared.formats.recorded import recorded_in
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.registry import File

@@ -24,15 +24,8 @@ from skytether.cli.page_process import say
 from skytether.netem.proxy import of_paths
 from skytether.shared.base import files
 from skytether.shared.core.endpoint import Address
-from skytether.shared.core.events import (
-    Counted,
-    Failure,
-    Flying,
-    Listening,
-    NotFlown,
-    RecordIncomplete,
-    address_text,
-)
+from skytether.shared.core.events import Failure, Flying, NotFlown, RecordIncomplete, address_text
+from skytether.shared.core.process_events import Counted, Listening
 from skytether.shared.scenario.reading import to_toml
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import (

@@ -23,8 +23,9 @@ from skytether.shared.base.errors import ConfigError, RecordingError
 from skytether.shared.base.extras import ExtraMissing
 from skytether.shared.base.printable import printable
 from skytether.shared.core.endpoint import PATH_SOCKETS, Address
-from skytether.shared.core.events import Event, NoFailsafe, address_text
+from skytether.shared.core.events import Event, address_text
 from skytether.shared.core.line import HOST_PORT, parse_address
+from skytether.shared.core.process_events import NoFailsafe
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.dotted import set_keys
 from skytether.shared.scenario.schema import Scenario

@@ -18,7 +18,7 @@ from typing import Any
 import msgspec
 
 from skytether.shared.core.change import REQUEST_BYTES_MAX, Answer, Running
-from skytether.shared.core.events import NotKept
+from skytether.shared.core.process_events import NotKept
 from skytether.shell import system
 from skytether.shell.journal import Journal
 from skytether.shell.local import Local

@@ -18,7 +18,8 @@ from skytether.shared.base import files
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.core.change import Running, with_values
 from skytether.shared.core.endpoint import Endpoint
-from skytether.shared.core.events import Event, SettingsRecalled
+from skytether.shared.core.events import Event
+from skytether.shared.core.process_events import SettingsRecalled
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.schema import Scenario
 from skytether.shell.command import CONFIGURATION, CommandError

@@ -15,7 +15,9 @@ from typing import Any, Literal
 import msgspec
 
 from skytether.shared.base.printable import printable
-from skytether.shared.core.events import Counted, Event, Omitted
+from skytether.shared.core.events import Event, Omitted
+from skytether.shared.core.process_events import Counted
+from skytether.shared.telemetry.every_event import EveryEvent
 from skytether.shell.limit import Limit
 from skytether.shell.writer import Writer
 
@@ -35,7 +37,7 @@ class LogLine(msgspec.Struct, frozen=True, kw_only=True):
     """Server, netem or client; `server.N` is worker N of a server, `netem N` that of path N."""
     time_ns: int
     """Time of the event [ns; CLOCK_MONOTONIC]."""
-    event: Event
+    event: EveryEvent
 
 
 _DECODER = msgspec.json.Decoder(LogLine)

@@ -24,7 +24,7 @@ import msgspec
 
 from skytether.shared.base import files
 from skytether.shared.core.endpoint import Endpoint
-from skytether.shared.core.events import NotKept
+from skytether.shared.core.process_events import NotKept
 
 MAGIC = b"skytether memory 1\n"
 DIGEST_BYTES = 32

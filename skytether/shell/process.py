@@ -17,14 +17,8 @@ import numpy as np
 from skytether.shared.base import extras, files
 from skytether.shared.core.change import Running
 from skytether.shared.core.endpoint import Address, Endpoint, Form
-from skytether.shared.core.events import (
-    Counted,
-    Event,
-    Listening,
-    Measured,
-    Plaintext,
-    address_text,
-)
+from skytether.shared.core.events import Event, address_text
+from skytether.shared.core.process_events import Counted, Listening, Measured, Plaintext
 from skytether.shared.core.stopwatch import Stopwatch
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.schema import Scenario

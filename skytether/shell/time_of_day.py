@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 from skytether.shared.base.units import MICROSECOND_NS
 from skytether.shared.core.endpoint import Endpoint
-from skytether.shared.core.events import TimeUnknown
+from skytether.shared.core.process_events import TimeUnknown
 from skytether.shell import system
 
 UNSYNCHRONISED, CLOCK_ERROR = 0x40, 5

@@ -33,10 +33,9 @@ from skytether.shared.base.chance import stream
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.base.kernel import compile_all
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS, seconds_to_ns
-from skytether.shared.core.aboard import VehicleEvent
 from skytether.shared.core.change import Running
 from skytether.shared.core.endpoint import Address, Datagram, Endpoint, by_name
-from skytether.shared.core.events import Event, Fault
+from skytether.shared.core.events import Event, Fault, VehicleEvent
 from skytether.shared.core.stopwatch import Stopwatch
 from skytether.shared.scenario.dotted import text_key
 from skytether.shared.scenario.reference import Reference

@@ -18,26 +18,27 @@ from skytether.shared.core.events import (
     Event,
     Fault,
     FenceHolds,
-    HostFound,
-    HostMissing,
     LeaderChanged,
-    LeftMotion,
-    LeftTube,
     ModeChanged,
     NotFlown,
-    NotRecalled,
     PathDied,
     PathHealed,
-    PathMissing,
-    Recalled,
     RecordIncomplete,
     ServerHeard,
     ServerSilent,
     StateLeapt,
     SteppedLate,
+)
+from skytether.shared.core.process_events import (
+    HostFound,
+    HostMissing,
+    NotRecalled,
+    PathMissing,
+    Recalled,
     TimeUnknown,
 )
 from skytether.shared.law.model import Array
+from skytether.shared.missions.events import LeftMotion, LeftTube
 from skytether.shared.telemetry.record import Rows
 from skytether.shared.telemetry.summary import Track, nearest, position_error, track
 from skytether.shared.wire.protocol import Mode

@@ -57,7 +57,7 @@ VEHICLES_MAX = 64
 """Largest number of vehicles that are drawn; of further vehicles only rows are recorded."""
 CHUNK_BYTES = 256 * 1024
 POINTS_MAX = 400
-WARNINGS = RecordIncomplete, Fault, Degraded, ChangeRefused, *Failure.__args__
+WARNINGS = RecordIncomplete, Fault, Degraded, ChangeRefused, Failure
 
 _TOPICS = {"client": "flown", "server": "decided", "plan": "plan"}
 _SAID = {

@@ -21,7 +21,8 @@ from skytether.figures.colours import AMBER, GREEN, GREY, MODE_COLOURS, RED
 from skytether.shared.base import toml
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS, seconds_to_ns
-from skytether.shared.core.events import DOES, Changed, Counted, Event, Listening, Plaintext
+from skytether.shared.core.events import DOES, Changed, Event
+from skytether.shared.core.process_events import Counted, Listening, Plaintext
 from skytether.shared.core.ways import FLIGHT, Ways
 from skytether.shared.law.model import Array
 from skytether.shared.missions import zone_texts

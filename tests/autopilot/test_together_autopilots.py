@@ -22,7 +22,7 @@ from skytether.client import vehicles
 from skytether.client.endpoint import Client
 from skytether.netem.proxy import Proxy
 from skytether.server.endpoint import Server
-from skytether.shared.core.events import Counted
+from skytether.shared.core.process_events import Counted
 from skytether.shared.law.model import Array
 from skytether.shared.missions.derived import zones
 from skytether.shared.scenario import reading

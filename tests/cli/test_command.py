@@ -18,15 +18,8 @@ import pytest
 from helpers import PATIENCE_S, refused, until
 from skytether.__main__ import COMMANDS, main
 from skytether.shared.core.endpoint import Address
-from skytether.shared.core.events import (
-    Counted,
-    Finished,
-    Flying,
-    Listening,
-    ModeChanged,
-    Plaintext,
-    address_text,
-)
+from skytether.shared.core.events import Finished, Flying, ModeChanged, address_text
+from skytether.shared.core.process_events import Counted, Listening, Plaintext
 from skytether.shared.scenario import reading
 from skytether.shared.telemetry.record import client_columns
 from skytether.shared.wire.protocol import Hello, encode

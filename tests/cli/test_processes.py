@@ -16,18 +16,14 @@ import pytest
 from skytether.cli.fly import _tell
 from skytether.cli.processes import Child, _read, feeds_in, record_of, started
 from skytether.shared.core.events import (
-    Counted,
     Finished,
     FlowOpened,
     Flying,
-    Listening,
-    Measured,
     ModeChanged,
-    NoFailsafe,
-    Plaintext,
     RecordIncomplete,
     SessionEnded,
 )
+from skytether.shared.core.process_events import Counted, Listening, Measured, NoFailsafe, Plaintext
 from skytether.shared.scenario.reading import load
 from skytether.shared.telemetry.record import PACKET_COLUMNS, Recorder, server_columns
 from skytether.shell.command import CommandError, flight_warnings

@@ -14,7 +14,6 @@ from skytether.shared.core.aboard import (
     AutopilotMoved,
     AutopilotRefused,
     AutopilotText,
-    AutopilotWaits,
     ClockSilent,
     NotTakenOff,
     ParametersRead,
@@ -23,6 +22,7 @@ from skytether.shared.core.aboard import (
 )
 from skytether.shared.core.endpoint import Datagram
 from skytether.shared.core.events import (
+    AutopilotWaits,
     ServerHeard,
     ServerSilent,
     Welcomed,

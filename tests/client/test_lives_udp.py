@@ -11,8 +11,9 @@ import pytest
 from airborne import scenario
 from skytether.cli.processes import Child, started
 from skytether.shared.core.aboard import ArmingAwaited, AutopilotMode
-from skytether.shared.core.events import Flying, Recalled
+from skytether.shared.core.events import Flying
 from skytether.shared.core.events import address_text as text
+from skytether.shared.core.process_events import Recalled
 from skytether.shared.scenario.reading import to_toml
 from skytether.shell.control import Caller
 

@@ -1,8 +1,8 @@
 """Missions whose server restarts: keys set by an operator, and vehicles found inside a zone."""
 
 from lives import Death, Lives
-from skytether.shared.core.events import InZone
 from skytether.shared.missions import zone_texts
+from skytether.shared.missions.events import InZone
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.schema import Scenario
 

@@ -21,10 +21,10 @@ from skytether.server.missions.waypoints import Waypoints
 from skytether.server.missions.zone_clearance import comes_near
 from skytether.shared.base.chance import stream
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
-from skytether.shared.core.events import InZone
 from skytether.shared.law.motion import SAMPLES, SPACING, Motion, bend_m, resting
 from skytether.shared.missions import zone_texts
 from skytether.shared.missions.derived import clearances
+from skytether.shared.missions.events import InZone
 from skytether.shared.missions.zones import Zones
 from skytether.shared.wire.protocol import NO_HORIZON
 from two_vehicles import DT_S, KEY, alone, along, planned, ready, scenario, with_zones

@@ -13,7 +13,8 @@ import pytest
 from helpers import HandLoop
 from skytether.netem.proxy import Proxy
 from skytether.shared.core.change import Answer, Running
-from skytether.shared.core.events import Event, NotKept
+from skytether.shared.core.events import Event
+from skytether.shared.core.process_events import NotKept
 from skytether.shared.missions.derived import zones
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.schema import Scenario

@@ -22,7 +22,7 @@ from skytether.client.endpoint import Client
 from skytether.client.fleet import ClientFleet
 from skytether.client.simulated.vehicle import simulated
 from skytether.shared.core.endpoint import VEHICLES_TOLD_MAX
-from skytether.shared.core.events import Measured
+from skytether.shared.core.process_events import Measured
 from skytether.shared.core.stopwatch import Stopwatch
 from skytether.shared.scenario import reading
 from skytether.shared.wire.drop import Drop

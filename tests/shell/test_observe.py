@@ -19,7 +19,8 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from skytether.cli.processes import Child, started
 from skytether.shared.core.endpoint import Address
-from skytether.shared.core.events import Measured, ModeChanged
+from skytether.shared.core.events import ModeChanged
+from skytether.shared.core.process_events import Measured
 from skytether.shell.log import LogLine
 from skytether.shell.metrics import TABLES, names
 

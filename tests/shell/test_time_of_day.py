@@ -5,7 +5,7 @@ from unittest.mock import call, create_autospec
 import pytest
 
 from skytether.shared.core.endpoint import Endpoint
-from skytether.shared.core.events import TimeUnknown
+from skytether.shared.core.process_events import TimeUnknown
 from skytether.shell import time_of_day
 from skytether.shell.time_of_day import HostTime, TimeTeller, stated
 

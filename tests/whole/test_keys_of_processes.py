@@ -7,7 +7,8 @@ from typing import Any
 import pytest
 
 from helpers import refused
-from skytether.shared.core.events import Plaintext, Unauthenticated
+from skytether.shared.core.events import Unauthenticated
+from skytether.shared.core.process_events import Plaintext
 from skytether.shell import process
 from skytether.shell.driver import Shell
 from warm import Process, skytether

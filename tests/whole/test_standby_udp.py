@@ -10,13 +10,8 @@ import pytest
 
 from helpers import packaged, until
 from skytether.__main__ import main
-from skytether.shared.core.events import (
-    Changed,
-    ChangeRefused,
-    HostMissing,
-    LeaderChanged,
-    Listening,
-)
+from skytether.shared.core.events import Changed, ChangeRefused, LeaderChanged
+from skytether.shared.core.process_events import HostMissing, Listening
 from skytether.sim.flight import fly
 from warm import Process
 

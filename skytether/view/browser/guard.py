@@ -33,7 +33,7 @@ import websockets.asyncio.server as sockets
 from websockets.frames import CloseCode, Frame, Opcode
 from websockets.http11 import Request, Response
 
-from skytether.shared.core.events import BrowserRefused
+from skytether.shared.core.process_events import BrowserRefused
 from skytether.shell.web import HEADERS
 from skytether.view.browser.access import TurnedAway, Visitor, refusal
 

@@ -9,7 +9,8 @@ from contextlib import closing, contextmanager
 from pathlib import Path
 
 from skytether.shared.core.endpoint import Address
-from skytether.shared.core.events import PageServed, address_text
+from skytether.shared.core.events import address_text
+from skytether.shared.core.process_events import PageServed
 from skytether.shell.command import RUN, CommandError, interruptible
 from skytether.shell.feed import Subscriber
 from skytether.shell.log import Log, LogFormat

@@ -1,0 +1,24 @@
+"""Every kind of event, as one union: what reads a log, a feed or a recording decodes into it."""
+
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Union
+
+from skytether.shared.core import aboard, process_events  # noqa: F401 - define events
+from skytether.shared.core.events import Event
+from skytether.shared.missions import events  # noqa: F401 - the same
+
+
+def kinds(base: type[Event] = Event) -> Iterator[type[Event]]:
+    """Classes of events, in order of definition: those without subclasses."""
+    for kind in base.__subclasses__():
+        if kind.__subclasses__():
+            yield from kinds(kind)
+        else:
+            yield kind
+
+
+# The classes are found, not listed, so none can be forgotten. For mypy the union is its base.
+if TYPE_CHECKING:
+    EveryEvent = Event
+else:
+    EveryEvent = Union[tuple(kinds())]  # noqa: UP007 - its classes are not known here
