@@ -13,7 +13,8 @@ from skytether.server.sessions import Session
 from skytether.server.ways import Ways
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.core.endpoint import Address, Datagram, Events
-from skytether.shared.core.events import PathDied, PathHealed, address_text
+from skytether.shared.core.events import address_text
+from skytether.shared.core.path_events import PathDied, PathHealed
 from skytether.shared.wire.drop import Drop, ProtocolError
 from skytether.shared.wire.framing import Report
 from skytether.shared.wire.paths import Paths

@@ -4,9 +4,9 @@ An endpoint returns its events (`Endpoint.events`); a driver passes them to a lo
 virtual time, or the command that started the process. `str(event)` is a sentence for the operator.
 For programs an event is a JSON object whose key `type` is the name of the class.
 
-Here are the events of any flight. Those of autopilots are in `aboard`, of processes in
-`process_events`, of missions in `shared.missions.events`; a new module of events is imported by
-`shared.telemetry.every_event`, which decodes them all.
+Here are the events of any flight. Those of autopilots are in `aboard`, of several paths in
+`path_events`, of processes in `process_events`, of missions in `shared.missions.events`. What
+decodes them all, `shared.telemetry.every_event`, imports each of these modules.
 """
 
 from typing import Any, Literal, dataclass_transform
@@ -44,20 +44,6 @@ class VehicleEvent(Event):
 
 class Failure(VehicleEvent):
     """Event after which a vehicle cannot fly, or cannot go on."""
-
-
-class PathDied(VehicleEvent):
-    sentence = "vehicle {vehicle}: nothing arrives over path {path} ({via})"
-    path: int
-    """Number of the path, from 0."""
-    via: str
-    """Its interface or address."""
-
-
-class PathHealed(VehicleEvent):
-    sentence = "vehicle {vehicle}: path {path} ({via}) is well again"
-    path: int
-    via: str
 
 
 class ReferenceTooFast(Event):

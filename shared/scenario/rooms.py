@@ -16,6 +16,9 @@ from skytether.shared.scenario.registry import (
 
 SHARED = "skytether.shared."
 
+EVENTS = (f"{SHARED}missions.events",)
+"""Modules with events of rooms, see `shared.telemetry.every_event`."""
+
 
 def of_missions() -> Any:
     """Module with the contradictions of missions."""

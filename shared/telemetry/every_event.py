@@ -1,15 +1,25 @@
-"""Every kind of event, as one union: what reads a log, a feed or a recording decodes into it."""
+"""Every kind of event, as one union: what reads a log, a feed or a recording decodes into it.
+
+Of a room that is not installed there are no events.
+"""
 
 from collections.abc import Iterator
+from contextlib import suppress
 from typing import TYPE_CHECKING, Union
 
-from skytether.shared.core import aboard, process_events  # noqa: F401 - define events
+from skytether.shared.base.errors import ConfigError
+from skytether.shared.core import aboard, path_events, process_events  # noqa: F401 - define events
 from skytether.shared.core.events import Event
-from skytether.shared.missions import events  # noqa: F401 - the same
+from skytether.shared.scenario.registry import load
+from skytether.shared.scenario.rooms import EVENTS
+
+for module in EVENTS:
+    with suppress(ConfigError):
+        load(module, "events")
 
 
 def kinds(base: type[Event] = Event) -> Iterator[type[Event]]:
-    """Classes of events, in order of definition: those without subclasses."""
+    """Classes of events that are defined so far: those without subclasses."""
     for kind in base.__subclasses__():
         if kind.__subclasses__():
             yield from kinds(kind)

@@ -26,7 +26,8 @@ from skytether.shared.base.units import SECOND_NS
 from skytether.shared.core.endpoint import Address, Datagram, Endpoint, Form, make_datagram
 from skytether.shared.core.events import Event, Fault
 from skytether.shared.core.line import LINE, Line, Listen
-from skytether.shared.core.process_events import HostFound, HostMissing, PathFound, PathMissing
+from skytether.shared.core.path_events import PathFound, PathMissing
+from skytether.shared.core.process_events import HostFound, HostMissing
 from skytether.shared.core.stopwatch import Stopwatch
 from skytether.shell import system
 from skytether.shell.batch import BATCH_MAX, DatagramBatch, Segments

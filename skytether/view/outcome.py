@@ -21,19 +21,17 @@ from skytether.shared.core.events import (
     LeaderChanged,
     ModeChanged,
     NotFlown,
-    PathDied,
-    PathHealed,
     RecordIncomplete,
     ServerHeard,
     ServerSilent,
     StateLeapt,
     SteppedLate,
 )
+from skytether.shared.core.path_events import PathDied, PathHealed, PathMissing
 from skytether.shared.core.process_events import (
     HostFound,
     HostMissing,
     NotRecalled,
-    PathMissing,
     Recalled,
     TimeUnknown,
 )

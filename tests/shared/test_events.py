@@ -7,6 +7,8 @@ import typing
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from datetime import datetime, timedelta
+from importlib import import_module
+from pathlib import Path
 from typing import IO
 
 import msgspec
@@ -14,10 +16,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import skytether
 from skytether.shared.core.endpoint import EVENTS_MAX, Datagram, Endpoint
 from skytether.shared.core.events import Event, Fault, Flying, Omitted, VehicleEvent, address_text
 from skytether.shared.core.process_events import Counted, Plaintext
-from skytether.shared.telemetry.every_event import EveryEvent
+from skytether.shared.telemetry.every_event import EveryEvent, kinds
 from skytether.shell.log import Log, LogLine, line_of, rendered
 
 # Numbers that msgspec can encode: of 64 bits, and finite.
@@ -40,6 +43,15 @@ def any_of(kind: type[Event]) -> st.SearchStrategy[Event]:
 def test_an_event_has_a_text_and_survives_its_line_of_json() -> None:
     for kind in typing.get_args(EveryEvent):
         settings(max_examples=4)(given(any_of(kind))(survives))()
+
+
+def test_every_event_of_the_package_can_be_decoded() -> None:
+    """A module of events that `every_event` does not import would be missing."""
+    package = Path(skytether.__file__).parent
+    for path in package.glob("shared/**/*.py"):
+        import_module(".".join(path.relative_to(package.parent).with_suffix("").parts))
+    ours = {kind for kind in kinds() if kind.__module__.startswith("skytether.")}
+    assert ours == set(typing.get_args(EveryEvent))
 
 
 def survives(event: Event) -> None:

@@ -17,7 +17,8 @@ import pytest
 from helpers import LOOPBACK, Idle, ran
 from skytether.shared.core.endpoint import PATH_SOCKETS, Address, Datagram
 from skytether.shared.core.events import Event
-from skytether.shared.core.process_events import HostFound, HostMissing, PathFound, PathMissing
+from skytether.shared.core.path_events import PathFound, PathMissing
+from skytether.shared.core.process_events import HostFound, HostMissing
 from skytether.shell import driver, udp
 from skytether.shell import paths as path_sockets
 from skytether.shell.driver import Shell

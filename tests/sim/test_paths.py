@@ -12,7 +12,8 @@ from skytether.client.endpoint import Client
 from skytether.netem.fate import Fates
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.core.endpoint import Address
-from skytether.shared.core.events import FlowOpened, PathDied, PathHealed
+from skytether.shared.core.events import FlowOpened
+from skytether.shared.core.path_events import PathDied, PathHealed
 from skytether.shared.scenario.air.draws import SLOT_NS
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import DOWNLINK, UPLINK, Record

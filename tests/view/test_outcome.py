@@ -13,7 +13,7 @@ from helpers import packaged
 from skytether.cli import recorder
 from skytether.cli.join import join
 from skytether.cli.report import report
-from skytether.shared.core.events import PathDied, PathHealed
+from skytether.shared.core.path_events import PathDied, PathHealed
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import FlightEvent, Record
 from skytether.shared.telemetry.summary import summarise
