@@ -13,7 +13,7 @@ from bench.harness import TextTable
 from skytether.lab.commands.pool import Flags, study
 from skytether.shared.base.chance import stream
 from skytether.shared.base.units import SECOND_NS
-from skytether.shared.core.events import LeaderChanged
+from skytether.shared.core.standby_events import LeaderChanged
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.dotted import set_keys
 from skytether.shared.telemetry.record import Record

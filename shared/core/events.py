@@ -5,8 +5,9 @@ virtual time, or the command that started the process. `str(event)` is a sentenc
 For programs an event is a JSON object whose key `type` is the name of the class.
 
 Here are the events of any flight. Those of autopilots are in `aboard`, of several paths in
-`path_events`, of processes in `process_events`, of missions in `shared.missions.events`. What
-decodes them all, `shared.telemetry.every_event`, imports each of these modules.
+`path_events`, of a standby server in `standby_events`, of processes in `process_events`, of
+missions in `shared.missions.events`. What decodes them all, `shared.telemetry.every_event`, imports
+each of these modules.
 """
 
 from typing import Any, Literal, dataclass_transform
@@ -303,25 +304,6 @@ class ServerHeard(VehicleEvent):
 
 class Flying(VehicleEvent):
     sentence = "vehicle {vehicle}: session open, flying"
-
-
-class LimitsDiffer(PeerEvent):
-    """A server must not lead a vehicle: it plans a mission within other limits than the leader."""
-
-    differences: tuple[Difference, ...]
-
-    def __str__(self) -> str:
-        keys = "; ".join(
-            f"{difference.key} is {difference.there} there and {difference.here} at the leader"
-            for difference in self.differences
-        )
-        return f"vehicle {self.vehicle}: the server at {self.peer} will not lead it: {keys}"
-
-
-class LeaderChanged(PeerEvent):
-    sentence = "vehicle {vehicle}: the server at {peer} leads it now (leadership {number})"
-    number: int
-    """Number of the leadership."""
 
 
 class ModeChanged(VehicleEvent):

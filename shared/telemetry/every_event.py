@@ -8,7 +8,12 @@ from contextlib import suppress
 from typing import TYPE_CHECKING, Union
 
 from skytether.shared.base.errors import ConfigError
-from skytether.shared.core import aboard, path_events, process_events  # noqa: F401 - define events
+from skytether.shared.core import (  # noqa: F401 - define events
+    aboard,
+    path_events,
+    process_events,
+    standby_events,
+)
 from skytether.shared.core.events import Event
 from skytether.shared.scenario.registry import load
 from skytether.shared.scenario.rooms import EVENTS

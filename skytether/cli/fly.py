@@ -24,12 +24,12 @@ from skytether.shared.core.events import (
     ChangeRefused,
     Event,
     Fault,
-    LeaderChanged,
     ModeChanged,
     PlanningStopped,
     RecordIncomplete,
     ReferenceTooFast,
 )
+from skytether.shared.core.standby_events import LeaderChanged
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Record

@@ -18,7 +18,6 @@ from skytether.shared.core.events import (
     Event,
     Fault,
     FenceHolds,
-    LeaderChanged,
     ModeChanged,
     NotFlown,
     RecordIncomplete,
@@ -35,6 +34,7 @@ from skytether.shared.core.process_events import (
     Recalled,
     TimeUnknown,
 )
+from skytether.shared.core.standby_events import LeaderChanged
 from skytether.shared.law.model import Array
 from skytether.shared.missions.events import LeftMotion, LeftTube
 from skytether.shared.telemetry.record import Rows

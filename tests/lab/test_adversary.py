@@ -43,7 +43,7 @@ from skytether.server.missions.vehicle_motions import VehicleMotions
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.base.units import SECOND_NS, seconds_to_ns
 from skytether.shared.core.endpoint import Datagram
-from skytether.shared.core.events import LeaderChanged
+from skytether.shared.core.standby_events import LeaderChanged
 from skytether.shared.law.model import Array, Indices
 from skytether.shared.law.motion import Motion
 from skytether.shared.scenario import reading

@@ -15,7 +15,8 @@ from skytether.netem.proxy import Proxy
 from skytether.server.endpoint import Server
 from skytether.shared.core.change import Running
 from skytether.shared.core.endpoint import Address, Datagram, Endpoint
-from skytether.shared.core.events import LeaderChanged, ModeChanged, SessionEnded
+from skytether.shared.core.events import ModeChanged, SessionEnded
+from skytether.shared.core.standby_events import LeaderChanged
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Record
 from skytether.shared.telemetry.summary import summarise
