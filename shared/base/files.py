@@ -1,4 +1,4 @@
-"""Files named by a user: read with a size limit, and written without destroying others.
+"""Files that a command writes, without destroying others; `input_files` reads them.
 
 Everything that a command writes is a plain file: a device, a pipe or a link in its place is
 refused. Otherwise `--out /dev/sda`, or a link left there by somebody else, would write elsewhere.
@@ -15,53 +15,30 @@ Nothing else in this package opens a file for writing; tests/whole/test_writes.p
 
 import os
 import stat
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import dataclass, field
-from errno import EACCES, EBUSY, EEXIST, EFBIG, EINVAL, EISDIR, ELOOP, EOPNOTSUPP
-from functools import partial, reduce
+from errno import EACCES, EBUSY, EEXIST, EINVAL, EOPNOTSUPP
 from itertools import count
-from operator import or_
 from pathlib import Path
-from typing import BinaryIO, TypeVar
+from typing import BinaryIO
+
+from skytether.shared.base.input_files import Inode, inode, open_flags, use, uses
 
 try:
     import fcntl
 except ImportError:  # Windows
     fcntl = None  # type: ignore[assignment]
 
-
-def open_flags(*names: str) -> int:
-    """Flags for `os.open` by their names, without those that this system lacks."""
-    # Windows would translate line ends.
-    return reduce(or_, (getattr(os, name, 0) for name in ("O_BINARY", *names)))
-
-
-FLAGS = open_flags("O_NOFOLLOW", "O_NONBLOCK", "O_CLOEXEC")
+FLAGS = open_flags("O_NOFOLLOW", "O_NONBLOCK")
 """Flags for files to be written: they guard against a link or a pipe in the file's place."""
 MODE = 0o666
 """Permissions of a new file, before the user's umask."""
 
-T = TypeVar("T")
-Inode = tuple[int, int]
-"""Device and inode of a file, the same under any of its names."""
+# -- files of a command -----------------------------------------------------------------------
 
-
-# -- one command's files ----------------------------------------------------------------------
-
-
-@dataclass(slots=True)
-class _Command:
-    inputs: set[Inode] = field(default_factory=set)
-    outputs: set[Inode] = field(default_factory=set)
-    """Files and folders that the command will write, each locked."""
-    ending: ExitStack = field(default_factory=ExitStack)
-    """Releases locks, and removes new files to which nothing was written."""
-
-
-_commands: list[_Command] = []
-"""Stack of running commands, the newest last, since a command may call another; empty outside
-`apart`."""
+_ending: list[ExitStack] = []
+"""For each running command, see `uses`: releases its locks, and removes new files to which nothing
+was written."""
 
 
 @contextmanager
@@ -70,53 +47,29 @@ def apart() -> Iterator[None]:
 
     Locks of `claim` last until the end of the block.
     """
-    _commands.append(_Command())
-    try:
-        with _commands[-1].ending:
-            yield
-    finally:
-        _commands.pop()
+    uses.append({})
+    with ExitStack() as stack:
+        stack.callback(uses.pop)
+        stack.callback(_ending.pop)
+        _ending.append(stack)
+        yield
 
 
-def note(path: Path, file: BinaryIO) -> None:
-    """Note that the command reads an open file, and so must not write it.
-
-    Raises:
-        OSError: the command has claimed the file for writing.
-    """
-    inode = _inode(os.fstat(file.fileno()))
-    for each in _commands:
-        if inode in each.outputs:
-            raise OSError(EBUSY, "it is an output as well, expected another file", str(path))
-        each.inputs.add(inode)
-
-
-def claim(path: Path, *, is_input: bool = False) -> None:
+def claim(path: Path) -> None:
     """Lock a file that will be written, until the command ends; a missing one is created empty.
 
     A new file that is still empty at the end is removed.
-
-    Args:
-        is_input: whether the command reads the file as well; then it is not created.
 
     Raises:
         OSError: the file cannot be written, the command reads it, another option names it, or
             another command has locked it.
     """
-    is_new = check(path, is_input=is_input) is None
-    if is_new and is_input:
-        return
-    folder = path.absolute().parent
-    if not os.access(folder, os.W_OK | os.X_OK):
-        folder.stat()  # raises if the folder is missing
-        raise OSError(EACCES, os.strerror(EACCES), str(path))
-    with ExitStack() as stack:
-        flags = os.O_WRONLY | FLAGS | (os.O_CREAT | os.O_EXCL if is_new else 0)
-        descriptor = os.open(path, flags, MODE)
-        stack.callback(os.close, descriptor)
+    is_new = not check(path)
+    with _claimed(path, os.open(path, os.O_WRONLY | os.O_CREAT | FLAGS, MODE)) as ending:
+        if not os.access(path.absolute().parent, os.W_OK | os.X_OK):  # for `replacing`
+            raise OSError(EACCES, os.strerror(EACCES), str(path))
         if is_new:
-            stack.callback(_remove_empty, path, descriptor)
-        _hold(path, descriptor, stack, is_input=is_input)
+            ending.callback(_remove_empty, path, inode(path))
 
 
 def claim_folder(path: Path) -> None:
@@ -126,31 +79,26 @@ def claim_folder(path: Path) -> None:
         OSError: the folder cannot be created, or another command has locked it.
     """
     path.mkdir(parents=True, exist_ok=True)
-    if not hasattr(os, "O_DIRECTORY"):  # Windows opens no folders
-        return
-    with ExitStack() as stack:
-        descriptor = os.open(path, open_flags("O_RDONLY", "O_DIRECTORY", "O_CLOEXEC"))
-        stack.callback(os.close, descriptor)
-        # Two options may name the same folder.
-        if not _is_claimed(_inode(os.fstat(descriptor))):
-            _hold(path, descriptor, stack)
+    # Windows opens no folders. Two options may name the same folder.
+    if hasattr(os, "O_DIRECTORY") and not use(inode(path)):
+        with _claimed(path, os.open(path, os.O_RDONLY | os.O_DIRECTORY)):
+            pass
 
 
-def _hold(path: Path, descriptor: int, stack: ExitStack, *, is_input: bool = False) -> None:
-    """Lock an open file or folder against other commands until this one ends, see `claim`."""
-    inode = _inode(os.fstat(descriptor))
-    if _is_claimed(inode):
-        raise OSError(EEXIST, "another option names it as well", str(path))
-    if not _locked(path, descriptor):
-        raise OSError(EBUSY, "another command is writing it", str(path))
-    if _commands:
-        if not is_input:
-            _commands[-1].outputs.add(inode)
-        _commands[-1].ending.push(stack.pop_all())
-
-
-def _is_claimed(inode: Inode) -> bool:
-    return any(inode in each.outputs for each in _commands)
+@contextmanager
+def _claimed(path: Path, descriptor: int) -> Iterator[ExitStack]:
+    """Lock an open file or folder until the command ends, or close it after an error; yields
+    what releases it.
+    """
+    with ExitStack() as ending:
+        ending.callback(os.close, descriptor)
+        if use(inode(descriptor)) == "output":
+            raise OSError(EEXIST, "another option names it as well", str(path))
+        _lock(path, descriptor)
+        yield ending
+        if uses:
+            uses[-1][inode(descriptor)] = "output"
+            _ending[-1].push(ending.pop_all())
 
 
 def lock(descriptor: int) -> None:
@@ -165,89 +113,33 @@ def lock(descriptor: int) -> None:
     fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
 
 
-def _locked(path: Path, descriptor: int) -> bool:
-    """Lock an open file; False if another command has locked it, or has just replaced it."""
+def _lock(path: Path, descriptor: int) -> None:
+    """Lock an open file, unless its file system has no locks.
+
+    Raises:
+        OSError: another command has locked the file, or has just replaced it.
+    """
+    is_ours = True
     try:
         lock(descriptor)
-    except BlockingIOError:
-        return False
-    except OSError:  # a file system without locks
-        pass
-    return path.exists() and _inode(path.stat()) == _inode(os.fstat(descriptor))
+    except OSError as error:
+        is_ours = not isinstance(error, BlockingIOError)
+    if not (is_ours and path.exists() and inode(path) == inode(descriptor)):
+        raise OSError(EBUSY, "another command is writing it", str(path))
 
 
-def _remove_empty(path: Path, descriptor: int) -> None:
+def _remove_empty(path: Path, created: Inode) -> None:
     """Remove a file created for locking, unless something was written to it."""
     with suppress(OSError):
-        status = path.lstat()
-        if not status.st_size and _inode(status) == _inode(os.fstat(descriptor)):
+        if inode(path) == created and not path.stat().st_size:
             path.unlink()
-
-
-def _inode(status: os.stat_result) -> Inode:
-    return status.st_dev, status.st_ino
-
-
-# -- reading ----------------------------------------------------------------------------------
-
-
-def read(path: Path, most: int, *, private: bool = False) -> bytes:
-    """Content of a file of at most `most` bytes.
-
-    Args:
-        private: whether only its owner may be able to read, write or replace it.
-
-    Raises:
-        OSError: the file cannot be read, is too large, is a pipe or device (which might never
-            end), is not private as required, or will be written by the command.
-        ValueError: the name is invalid.
-    """
-    # Without O_NONBLOCK, opening a pipe waits for a writer.
-    flags = open_flags("O_RDONLY", "O_NONBLOCK", "O_CLOEXEC")
-    if private:
-        check_private(path)
-        flags |= open_flags("O_NOFOLLOW")
-    with os.fdopen(os.open(path, flags), "rb") as file:
-        mode = os.fstat(file.fileno()).st_mode
-        if not stat.S_ISREG(mode):
-            raise OSError(EINVAL, "it is not a plain file")
-        if private and stat.S_IMODE(mode) & 0o177:
-            problem = f"its mode is {stat.S_IMODE(mode):04o}"
-            raise OSError(EACCES, f"{problem}, expected 0600: nobody else may read or write it")
-        note(path, file)
-        content = file.read(most + 1)
-    if len(content) > most:
-        raise OSError(EFBIG, f"it is larger than {most} bytes")
-    return content
-
-
-def check_private(path: Path) -> None:
-    """Refuse a private file if others can put another file in its place: if it is a link, or in a
-    folder that anybody may write to or replace.
-
-    Raises:
-        OSError: says what was found and what was expected.
-        ValueError: the name is invalid.
-    """
-    if path.is_symlink():
-        raise OSError(ELOOP, "it is a link, expected the file itself")
-    for folder in (path.absolute().parent, path.parent.resolve()):
-        for each in (folder, *folder.parents):
-            mode = stat.S_IMODE(each.stat().st_mode)
-            # With the sticky bit, the folders within belong to their owners.
-            if mode & stat.S_IWOTH and (each == folder or not mode & stat.S_ISVTX):
-                problem = f"anybody may write to the folder {each}, whose mode is {mode:04o}"
-                raise OSError(EACCES, f"{problem}: expected one where nobody else may")
 
 
 # -- writing ----------------------------------------------------------------------------------
 
 
-def check(path: Path, *, is_input: bool = False) -> os.stat_result | None:
-    """Refuse a path at which no plain file can be written.
-
-    Args:
-        is_input: whether the file may be one that the command reads.
+def check(path: Path) -> os.stat_result | None:
+    """Refuse a path at which no plain file can be written, or whose file the command reads.
 
     Returns:
         status of the present file; None if there is none.
@@ -259,12 +151,11 @@ def check(path: Path, *, is_input: bool = False) -> os.stat_result | None:
         status = path.lstat()
     except FileNotFoundError:
         return None
-    if stat.S_ISDIR(status.st_mode):
-        raise IsADirectoryError(EISDIR, os.strerror(EISDIR), str(path))
     if not stat.S_ISREG(status.st_mode):
-        found = "a link" if stat.S_ISLNK(status.st_mode) else "no plain file"
+        kinds = {stat.S_IFDIR: "a folder", stat.S_IFLNK: "a link"}
+        found = kinds.get(stat.S_IFMT(status.st_mode), "no plain file")
         raise OSError(EINVAL, f"it is {found}, expected a plain file or a new name", str(path))
-    if not is_input and any(_inode(status) in each.inputs for each in _commands):
+    if use((status.st_dev, status.st_ino)) == "input":
         raise OSError(EBUSY, "it is an input as well, expected another file", str(path))
     return status
 
@@ -276,22 +167,15 @@ def write(path: Path, content: bytes) -> None:
 
 @contextmanager
 def replacing(
-    path: Path,
-    *,
-    is_input: bool = False,
-    mode: int | None = None,
-    is_new: bool = False,
-    is_synced: bool = True,
+    path: Path, *, mode: int | None = None, is_new: bool = False, is_synced: bool = True
 ) -> Iterator[BinaryIO]:
     """File for new content, which takes its name at the end of the block; after an error nothing
     has changed.
 
-    If the file system supports it, the file has no name until then, so that a killed process leaves
-    nothing. It has the permissions of the file that it replaces.
+    A process that is killed meanwhile leaves NAME.part1.SUFFIX, with what it has written.
 
     Args:
         path: final path of the file.
-        is_input: whether the file may be one that the command reads.
         mode: its permissions; None: those of the file that it replaces.
         is_new: whether an existing file is an error.
         is_synced: whether it is synced to disk at the end.
@@ -299,39 +183,21 @@ def replacing(
     Raises:
         OSError: it cannot be written, is no plain file, or exists although it must be new.
     """
-    status = check(path, is_input=is_input)
+    status = check(path)
     if mode is None and status:
         mode = stat.S_IMODE(status.st_mode)
-    part: Path | None = None
+    part, file = _beside(path, MODE if mode is None else mode)
     try:
-        if not hasattr(os, "O_TMPFILE"):
-            raise OSError(EOPNOTSUPP, "this system has no files without a name")
-        flags = open_flags("O_TMPFILE", "O_RDWR", "O_CLOEXEC")
-        descriptor = os.open(path.absolute().parent, flags, MODE if mode is None else mode)
-    except OSError as error:
-        if error.errno not in (EISDIR, EOPNOTSUPP):  # EOPNOTSUPP for example on NFS
-            raise
-        part, descriptor = _unused(path, partial(_new, mode=MODE if mode is None else mode))
-    try:
-        with os.fdopen(descriptor, "r+b") as file:
+        with file:
             yield file
             file.flush()
             if mode is not None and hasattr(os, "fchmod"):
-                os.fchmod(descriptor, mode)
+                os.fchmod(file.fileno(), mode)
             if is_synced:
-                os.fsync(descriptor)
-            if is_new:
-                if part is None:
-                    _link(descriptor, path)
-                else:
-                    os.link(part, path)
-                return
-            if part is None:
-                part, _ = _unused(path, partial(_link, descriptor))
-        part.replace(path)
+                os.fsync(file.fileno())
+        (os.link if is_new else os.replace)(part, path)
     finally:
-        if part:
-            part.unlink(missing_ok=True)
+        part.unlink(missing_ok=True)
 
 
 def appending(path: Path) -> BinaryIO:
@@ -340,7 +206,7 @@ def appending(path: Path) -> BinaryIO:
     Raises:
         OSError: the file cannot be written, is not a plain file, or another command has locked it.
     """
-    return _held(path, os.O_RDWR | os.O_CREAT, "r+b")
+    return _held(path, os.O_RDWR | os.O_CREAT)
 
 
 def held(path: Path) -> BinaryIO:
@@ -349,15 +215,17 @@ def held(path: Path) -> BinaryIO:
     Raises:
         OSError: the file cannot be read, is not a plain file, or another command has locked it.
     """
-    return _held(path, os.O_RDONLY, "rb")
+    return _held(path, os.O_RDONLY)
 
 
-def _held(path: Path, flags: int, mode: str) -> BinaryIO:
+def _held(path: Path, flags: int) -> BinaryIO:
     check(path)
-    file: BinaryIO = os.fdopen(os.open(path, flags | FLAGS, MODE), mode)  # type: ignore[assignment]
-    if not stat.S_ISREG(os.fstat(file.fileno()).st_mode) or not _locked(path, file.fileno()):
+    file = _opened(path, flags)
+    try:
+        _lock(path, file.fileno())
+    except OSError:
         file.close()
-        raise OSError(EBUSY, "another command is writing it", str(path))
+        raise
     return file
 
 
@@ -375,19 +243,12 @@ class Growing:
     """
 
     def __init__(self, path: Path, buffering: int = -1) -> None:
-        self._path = path
-        status = check(path)
-        self.at = path
-        if status and status.st_size:
-            self.at, descriptor = _unused(path, _new)
-        else:
-            descriptor = os.open(path, os.O_RDWR | os.O_CREAT | FLAGS, MODE)
-        self.file: BinaryIO = os.fdopen(descriptor, "r+b", buffering=buffering)
-        status = os.fstat(descriptor)
-        if not stat.S_ISREG(status.st_mode) or status.st_size:
+        check(path)
+        self._path = self.at = path
+        self.file = _opened(path, os.O_RDWR | os.O_CREAT, buffering=buffering)
+        if os.fstat(self.file.fileno()).st_size:
             self.file.close()
-            what = "expected a regular file; or another process wrote to it while it was opened"
-            raise OSError(EINVAL, what, str(path))
+            self.at, self.file = _beside(path, buffering=buffering)
 
     def end(self, *, empty: bool, whole: bool) -> None:
         """Close the file; if there is an older one, replace it, or stay beside it, or be removed.
@@ -409,21 +270,21 @@ class Growing:
             self.at = self.at.replace(self._path)
 
 
-def _new(path: Path, mode: int = MODE) -> int:
-    return os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL | FLAGS, mode)
+def _opened(path: Path, flags: int, *, mode: int = MODE, buffering: int = -1) -> BinaryIO:
+    descriptor = os.open(path, flags | FLAGS, mode)
+    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+        os.close(descriptor)
+        raise OSError(EINVAL, "it is no plain file, expected a plain file or a new name", str(path))
+    how = "r+b" if flags & os.O_RDWR else "rb"
+    return os.fdopen(descriptor, how, buffering)  # type: ignore[return-value]
 
 
-def _link(descriptor: int, path: Path) -> None:
-    """Give an open file a name; raises OSError if the name is in use."""
-    # link(2) would not follow the link in /proc; with `src_dir_fd` Python calls linkat(2).
-    own = f"/proc/self/fd/{descriptor}"
-    os.link(own, path, src_dir_fd=descriptor, follow_symlinks=True)
-
-
-def _unused(path: Path, make: Callable[[Path], T]) -> tuple[Path, T]:
+def _beside(path: Path, mode: int = MODE, *, buffering: int = -1) -> tuple[Path, BinaryIO]:
     """Create a file beside another, with the first unused name."""
     for number in count(1):
+        at = path.with_stem(f"{path.stem}.part{number}")
         with suppress(FileExistsError):
-            at = path.with_stem(f"{path.stem}.part{number}")
-            return at, make(at)
+            return at, _opened(
+                at, os.O_RDWR | os.O_CREAT | os.O_EXCL, mode=mode, buffering=buffering
+            )
     raise AssertionError  # unreachable

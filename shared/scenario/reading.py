@@ -19,7 +19,7 @@ from typing import Any, Literal
 import msgspec
 
 from skytether import scenarios
-from skytether.shared.base import files, toml
+from skytether.shared.base import input_files, toml
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.base.hint import hint
 from skytether.shared.scenario.contradictions import Contradiction, contradictions
@@ -264,7 +264,7 @@ def files_of(key: str, text: str, source: str = "", known: Files = ()) -> Files:
 def _content(where: str, name: str, most: int) -> bytes:
     try:
         path = Path(name)
-        return _zipped(path, most) if path.is_dir() else files.read(path, most)
+        return _zipped(path, most) if path.is_dir() else input_files.read(path, most)
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else error
         expected = f"a file that can be read ({reason})"
@@ -277,7 +277,7 @@ def _zipped(folder: Path, most: int) -> bytes:
     with zipfile.ZipFile(content, "w") as archive:
         for path in sorted(folder.glob("*.[cC][sS][vV]")):
             try:
-                own = files.read(path, left)
+                own = input_files.read(path, left)
             except OSError as error:
                 raise ValueError(f"{path.name}: {error.strerror}") from None
             left -= len(own)
@@ -331,7 +331,7 @@ def _path(file: str) -> Path:
 
 def read_toml(path: Path, file: str) -> dict[str, Any]:
     try:
-        return toml.loads(files.read(path, toml.BYTES_MAX).decode())
+        return toml.loads(input_files.read(path, toml.BYTES_MAX).decode())
     except OSError as error:
         raise ConfigError(f"{file}: cannot be read: {error.strerror}") from None
     except ValueError as error:

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
 
-from skytether.shared.base import files
+from skytether.shared.base import input_files
 from skytether.shared.base.errors import ConfigError
 
 SECRET_BYTES = 32
@@ -82,15 +82,18 @@ class Keyring:
         return self.keys[vehicle, number]
 
 
-def load(path: Path) -> Keyring:
+def load(path: Path, *, is_input: bool = True) -> Keyring:
     """Keys in a file.
+
+    Args:
+        is_input: whether the command must not write the file.
 
     Raises:
         ConfigError: the file has none, or others than its owner can read or write it.
     """
     name = str(path)
     try:
-        content = files.read(path, FILE_BYTES_MAX, private=True)
+        content = input_files.read(path, FILE_BYTES_MAX, private=True, is_input=is_input)
     except OSError as error:
         raise ConfigError(f"{name}: cannot be read: {error.strerror}") from None
     except ValueError as error:

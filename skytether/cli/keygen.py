@@ -2,13 +2,14 @@
 
 import secrets
 from collections.abc import Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 
-from skytether.shared.base import files
+from skytether.shared.base import files, input_files
 from skytether.shared.wire import keys
 from skytether.shared.wire.keys import KEYS_MAX, NUMBERS, SECRET_BYTES, VEHICLES
 from skytether.shell import command
@@ -76,14 +77,17 @@ def make(
         CommandError: a vehicle cannot have another key, or the file cannot be written.
         ConfigError: the existing file holds no keys.
     """
-    if add:
-        command.claim_output("--add", file, is_input=True)
-    present = keys.load(file) if add else keys.Keyring(str(file), {})
-    lines = []
-    for vehicle in vehicles:
-        key_number = _number(present, vehicle, number)
-        lines.append(keys.write(vehicle, key_number, secrets.token_bytes(SECRET_BYTES)))
-    _write(file, lines, add=add)
+    try:
+        lock = files.held(file) if add and file.exists() else nullcontext()
+    except OSError as error:
+        raise _refused(file, error.strerror) from None
+    with lock:
+        present = keys.load(file, is_input=False) if add else keys.Keyring(str(file), {})
+        lines = []
+        for vehicle in vehicles:
+            key_number = _number(present, vehicle, number)
+            lines.append(keys.write(vehicle, key_number, secrets.token_bytes(SECRET_BYTES)))
+        _write(file, lines, add=add)
 
 
 def _number(present: keys.Keyring, vehicle: int, asked: int | None) -> int:
@@ -112,18 +116,22 @@ def _number(present: keys.Keyring, vehicle: int, asked: int | None) -> int:
 def _write(path: Path, lines: Sequence[str], *, add: bool) -> None:
     """Write lines to a new file of mode 0600, or to the end of an existing one."""
     try:
-        files.check_private(path)
+        input_files.check_private(path)
         before = HEAD.encode()
         if add:
-            before = files.read(path, keys.FILE_BYTES_MAX, private=True)
+            before = input_files.read(path, keys.FILE_BYTES_MAX, private=True, is_input=False)
             before += b"" if before.endswith(b"\n") else b"\n"
-        with files.replacing(path, is_input=add, mode=0o600, is_new=not add) as file:
+        with files.replacing(path, mode=0o600, is_new=not add) as file:
             file.write(before + "".join(lines).encode())
     except FileExistsError:
         raise CommandError(
             f"{path}: exists already, expected a new file (or --add)", CONFIGURATION
         ) from None
     except OSError as error:
-        raise CommandError(f"{path}: cannot be written: {error.strerror}", CONFIGURATION) from None
+        raise _refused(path, error.strerror) from None
     except ValueError as error:
-        raise CommandError(f"{str(path)!r}: cannot be written: {error}", CONFIGURATION) from None
+        raise _refused(repr(str(path)), error) from None
+
+
+def _refused(file: Path | str, why: object) -> CommandError:
+    return CommandError(f"{file}: cannot be written: {why}", CONFIGURATION)

@@ -29,7 +29,7 @@ from skytether.probe.outcome import (
 from skytether.probe.prober import BYTES_MIN, PROBES_MAX, MeasuredPath, Prober
 from skytether.probe.wire import NONCE_BYTES
 from skytether.server.gate import Gate, PlainGate
-from skytether.shared.base import files
+from skytether.shared.base import files, input_files
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.core.endpoint import Address
 from skytether.shared.core.events import Event
@@ -312,7 +312,7 @@ def _of_file(file: File) -> Measured:
 
 def _content(path: Path) -> bytes:
     try:
-        return files.read(path, reading.FILES["network.uplink"][1])
+        return input_files.read(path, reading.FILES["network.uplink"][1])
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else error
         raise CommandError(f"--from: {path}: cannot be read: {reason}", CONFIGURATION) from None

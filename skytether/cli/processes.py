@@ -371,7 +371,11 @@ def record_of(
     netem = np.concatenate([_rows(parts / name, PACKET_COLUMNS) for name in names])
     zero_ns = said[0].time_ns if said else 0
     netem["arrived_ns"] -= zero_ns
-    counted = {path.name.replace(".json", ""): path.read_bytes() for path in parts.glob("*.json*")}
+    counted = {
+        path.name.replace(".json", ""): path.read_bytes()
+        for path in parts.glob("*.json*")
+        if ".part" not in path.name  # of a process killed while it wrote
+    }
     figures = {name: json.loads(text) for name, text in counted.items() if text}
     server = _rows(parts / "server", server_columns(axes, scenario.control.scheme))
     if standby:

@@ -12,7 +12,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from errno import EMFILE
-from functools import partial
 from pathlib import Path
 from typing import Annotated, Protocol, TypeVar
 
@@ -194,16 +193,13 @@ def check_sockets(flag: str, given: int) -> None:
     allow_sockets(given)
 
 
-def claim_output(flag: str, path: Path | None, *, is_input: bool = False) -> None:
+def claim_output(flag: str, path: Path | None) -> None:
     """Lock an output file until the command ends, before anything is flown.
-
-    Args:
-        is_input: whether the command may also read the file.
 
     Raises:
         CommandError: the file cannot be written, is an input, or is locked by another command.
     """
-    _claim(partial(files.claim, is_input=is_input), flag, path)
+    _claim(files.claim, flag, path)
 
 
 def claim_folder(flag: str, path: Path | None, *names: str) -> None:

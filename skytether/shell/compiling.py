@@ -16,7 +16,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from skytether.shared.base import files
+from skytether.shared.base import files, input_files
 from skytether.shell import system
 
 # for type checking only: the client aboard is installed without numba
@@ -83,7 +83,7 @@ def tell(folder: Path | None, text: str) -> None:
 def told(folder: Path | None) -> str:
     """What a command has told of its compiling; empty if nothing, or once it is over."""
     with suppress(OSError, ValueError):
-        return files.read(folder / TOLD, TOLD_BYTES).decode() if folder else ""
+        return input_files.read(folder / TOLD, TOLD_BYTES).decode() if folder else ""
     return ""
 
 

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import msgspec
 
-from skytether.shared.base import files
+from skytether.shared.base import files, input_files
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.core.change import Running, with_values
 from skytether.shared.core.endpoint import Endpoint
@@ -63,7 +63,7 @@ class Journal:
             CommandError: the journal cannot be used.
         """
         try:
-            content = files.read(self._path, BYTES_MAX, private=True)
+            content = input_files.read(self._path, BYTES_MAX, private=True, is_input=False)
             entry = msgspec.json.decode(content, type=_Entry)
             self._check(entry)
             self.scenario, self.values = with_values(self._base, entry.values), entry.values
@@ -100,7 +100,7 @@ class Journal:
             OSError: the file cannot be written.
         """
         entry = _Entry(scenario=self._name, time_s=time.time(), values=dict(values)).sealed()
-        with files.replacing(self._path, is_input=True, mode=0o600) as file:
+        with files.replacing(self._path, mode=0o600) as file:
             file.write(msgspec.json.encode(entry))
 
     def forget(self) -> None:

@@ -22,7 +22,7 @@ from typing import BinaryIO
 
 import msgspec
 
-from skytether.shared.base import files
+from skytether.shared.base import files, input_files
 from skytether.shared.core.endpoint import Endpoint
 from skytether.shared.core.process_events import NotKept
 
@@ -115,7 +115,7 @@ class MemoryFile:
             MemoryRefused: the file must not be used.
         """
         try:
-            content = files.read(self._path, FILE_BYTES_MAX, private=True)
+            content = input_files.read(self._path, FILE_BYTES_MAX, private=True, is_input=False)
         except FileNotFoundError:
             return None
         except OSError as error:
@@ -219,7 +219,7 @@ class MemoryFile:
                     self._loop.call_soon_threadsafe(self._tell)
 
     def _write(self, content: bytes) -> None:
-        with files.replacing(self._path, is_input=True, mode=0o600, is_synced=False) as file:
+        with files.replacing(self._path, mode=0o600, is_synced=False) as file:
             file.write(content)
 
     def _remove(self) -> None:

@@ -17,7 +17,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, NamedTuple
 
-from skytether.shared.base import files
+from skytether.shared.base import input_files
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.scenario.registry import (
     IMPAIRMENTS,
@@ -79,7 +79,7 @@ def load(paths: Iterable[str] = ()) -> None:
     _load_installed()
     for path in paths:
         try:
-            code = files.read(Path(path), FILE_BYTES_MAX)
+            code = input_files.read(Path(path), FILE_BYTES_MAX)
         except OSError as error:
             raise ConfigError(f"{FLAG}: {path}: cannot be read: {error.strerror}") from None
         except ValueError as error:

@@ -8,10 +8,10 @@ was killed, can be read as well. After a damaged record reading goes on at the n
 
 import os
 import re
-import stat
 import struct
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from errno import EINVAL, EISDIR
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -34,7 +34,7 @@ from mcap.records import (
 )
 from mcap.stream_reader import CRCValidationError, breakup_chunk
 
-from skytether.shared.base import files
+from skytether.shared.base import input_files
 from skytether.shared.base.errors import ConfigError, RecordingError
 from skytether.shared.telemetry.record import RECORDING
 
@@ -113,21 +113,19 @@ class Container:
     """
 
     def __init__(self, path: Path) -> None:
-        descriptor = os.open(path, files.open_flags("O_RDONLY", "O_NONBLOCK", "O_CLOEXEC"))
-        status = os.fstat(descriptor)
-        if not stat.S_ISREG(status.st_mode):
-            os.close(descriptor)
-            raise RecordingError(
-                f"{path}: it is not a plain file, expected a recording ({RECORDING})"
-            )
-        self._file = os.fdopen(descriptor, "rb")
-        self._size = status.st_size
+        try:
+            self._file = input_files.opened(path)
+        except OSError as error:
+            if error.errno not in (EINVAL, EISDIR):
+                raise
+            what = "it is not a plain file"
+            raise RecordingError(f"{path}: {what}, expected a recording ({RECORDING})") from None
+        self._size = os.fstat(self._file.fileno()).st_size
         self.lost_bytes = 0
         """Bytes lost at the end of a file that was not completed; valid after `messages`."""
         self.damaged_bytes = 0
         """Bytes of damaged records, which are left out; valid after `messages`."""
         try:
-            files.note(path, self._file)
             if self._file.read(len(MAGIC)) != MAGIC:
                 what = "it is not an MCAP file" if self._size else "it is empty"
                 raise RecordingError(f"{path}: {what}, expected a recording ({RECORDING})")

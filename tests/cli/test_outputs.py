@@ -334,11 +334,7 @@ def test_a_full_disk_leaves_the_older_file(
         )
 
 
-def test_without_unnamed_files_a_file_is_replaced_as_well(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """As on NFS: the file has a temporary name while it is written."""
-    monkeypatch.setattr(files.os, "O_TMPFILE", os.O_DIRECTORY | os.O_RDWR)
+def test_a_new_file_takes_its_name_once_it_is_whole(tmp_path: Path) -> None:
     at = tmp_path / "it"
     with files.replacing(at) as file:
         file.write(b"content")

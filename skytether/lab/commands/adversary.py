@@ -29,7 +29,7 @@ from skytether.lab.adversary import (
 from skytether.lab.commands import tables
 from skytether.lab.commands.pool import Flags, Interrupted, crew, writing
 from skytether.lab.journal import ENTRIES, digests
-from skytether.shared.base import files
+from skytether.shared.base import input_files
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.missions.mission import Mission
 from skytether.shared.scenario import reading
@@ -173,7 +173,7 @@ def _moves(text: str) -> Moves:
     if text.startswith("["):
         return loads(text)
     try:
-        content = files.read(Path(text), ATTACK_BYTES_MAX)
+        content = input_files.read(Path(text), ATTACK_BYTES_MAX)
         return msgspec.json.decode(content, type=Kept).nearest.moves
     except OSError as error:
         raise CommandError(f"--attack: {text}: {error.strerror}", command.CONFIGURATION) from None

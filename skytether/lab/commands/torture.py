@@ -15,7 +15,7 @@ from skytether.lab.commands import tables
 from skytether.lab.commands.pool import Flags, Interrupted, crew
 from skytether.lab.faults import Trial, dumps, loads
 from skytether.lab.torture import TrialOutcome, fly, long_trial, short_trial, shrunk
-from skytether.shared.base import files
+from skytether.shared.base import input_files
 from skytether.shared.base.errors import ConfigError
 from skytether.shell import command, terminal
 from skytether.shell.argument import Argument
@@ -129,7 +129,7 @@ def _read(path: Path) -> list[Trial]:
         ConfigError: a line is not a schedule, or the file has none.
     """
     try:
-        lines = files.read(path, SCHEDULES_BYTES_MAX).decode().splitlines()
+        lines = input_files.read(path, SCHEDULES_BYTES_MAX).decode().splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise CommandError(f"--replay: {path}: {error}", command.CONFIGURATION) from None
     trials = []

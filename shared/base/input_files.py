@@ -1,0 +1,110 @@
+"""Files named by a user: read with a size limit, and noted as inputs of the command.
+
+`files` writes files, and refuses those that are noted here. A flight in virtual time loads this
+module alone.
+"""
+
+import os
+import stat
+from errno import EACCES, EBUSY, EFBIG, EINVAL, ELOOP
+from functools import reduce
+from operator import or_
+from pathlib import Path
+from typing import BinaryIO, Literal
+
+Inode = tuple[int, int]
+"""Device and inode of a file, the same under any of its names."""
+Use = Literal["input", "output"]
+
+uses: list[dict[Inode, Use]] = []
+"""Files of the running commands, the newest command last, since a command may call another; empty
+outside `files.apart`."""
+
+
+def inode(file: Path | int) -> Inode:
+    """Inode of a file or folder, given by its path or descriptor."""
+    status = os.stat(file)  # noqa: PTH116 - of a path or a descriptor
+    return status.st_dev, status.st_ino
+
+
+def use(of: Inode) -> Use | None:
+    """What a running command does with a file."""
+    return next((each[of] for each in uses if of in each), None)
+
+
+def open_flags(*names: str) -> int:
+    """Flags for `os.open` by their names, without those that this system lacks."""
+    # Windows would translate line ends.
+    return reduce(or_, (getattr(os, name, 0) for name in ("O_BINARY", *names)))
+
+
+def opened(path: Path, *, follows: bool = True, is_input: bool = True) -> BinaryIO:
+    """Open a plain file for reading.
+
+    Args:
+        follows: whether the path may be a link.
+        is_input: whether the command must not write the file.
+
+    Raises:
+        OSError: the file cannot be opened, is a pipe or device (which might never end), or will be
+            written by the command.
+    """
+    # Without O_NONBLOCK, opening a pipe waits for a writer.
+    flags = open_flags("O_NONBLOCK", *() if follows else ("O_NOFOLLOW",))
+    file = open(path, "rb", opener=lambda name, given: os.open(name, given | flags))  # noqa: SIM115
+    try:
+        if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+            raise OSError(EINVAL, "it is not a plain file")
+        at = inode(file.fileno())
+        if use(at) == "output":
+            raise OSError(EBUSY, "it is an output as well, expected another file", str(path))
+        if is_input:
+            for each in uses:
+                each[at] = "input"
+    except OSError:
+        file.close()
+        raise
+    return file
+
+
+def read(path: Path, most: int, *, private: bool = False, is_input: bool = True) -> bytes:
+    """Content of a file of at most `most` bytes.
+
+    Args:
+        private: whether only its owner may be able to read, write or replace it.
+        is_input: see `opened`.
+
+    Raises:
+        OSError: as `opened`; or the file is too large, or not private as required.
+        ValueError: the name is invalid.
+    """
+    if private:
+        check_private(path)
+    with opened(path, follows=not private, is_input=is_input) as file:
+        mode = stat.S_IMODE(os.fstat(file.fileno()).st_mode)
+        if private and mode & 0o177:
+            problem = f"its mode is {mode:04o}"
+            raise OSError(EACCES, f"{problem}, expected 0600: nobody else may read or write it")
+        content = file.read(most + 1)
+    if len(content) > most:
+        raise OSError(EFBIG, f"it is larger than {most} bytes")
+    return content
+
+
+def check_private(path: Path) -> None:
+    """Refuse a private file if others can put another file in its place: if it is a link, or in a
+    folder that anybody may write to or replace.
+
+    Raises:
+        OSError: says what was found and what was expected.
+        ValueError: the name is invalid.
+    """
+    if path.is_symlink():
+        raise OSError(ELOOP, "it is a link, expected the file itself")
+    for folder in (path.absolute().parent, path.parent.resolve()):
+        for each in (folder, *folder.parents):
+            mode = stat.S_IMODE(each.stat().st_mode)
+            # With the sticky bit, the folders within belong to their owners.
+            if mode & stat.S_IWOTH and (each == folder or not mode & stat.S_ISVTX):
+                problem = f"anybody may write to the folder {each}, whose mode is {mode:04o}"
+                raise OSError(EACCES, f"{problem}: expected one where nobody else may")
