@@ -201,24 +201,16 @@ def replacing(
 
 
 def appending(path: Path) -> BinaryIO:
-    """Open a file for reading and appending, locked until it is closed.
+    """Open a file for reading and appending, locked as by `held`; a missing one is created."""
+    return held(path, os.O_RDWR | os.O_CREAT)
+
+
+def held(path: Path, flags: int = os.O_RDONLY) -> BinaryIO:
+    """Open a file, by default for reading, locked until it is closed.
 
     Raises:
-        OSError: the file cannot be written, is not a plain file, or another command has locked it.
+        OSError: the file cannot be opened, is not a plain file, or another command has locked it.
     """
-    return _held(path, os.O_RDWR | os.O_CREAT)
-
-
-def held(path: Path) -> BinaryIO:
-    """Open a file for reading, locked as by `appending` until it is closed.
-
-    Raises:
-        OSError: the file cannot be read, is not a plain file, or another command has locked it.
-    """
-    return _held(path, os.O_RDONLY)
-
-
-def _held(path: Path, flags: int) -> BinaryIO:
     check(path)
     file = _opened(path, flags)
     try:

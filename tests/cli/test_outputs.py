@@ -20,7 +20,7 @@ import pytest
 
 from helpers import until
 from skytether.__main__ import COMMANDS, main
-from skytether.shared.base import files
+from skytether.shared.base import files, input_files
 from skytether.shared.telemetry.record import PACKET_COLUMNS, read
 from skytether.shell.command import CommandError
 from skytether.shell.process import recorded
@@ -208,6 +208,19 @@ def test_two_options_do_not_name_one_file(
     assert main(["fly", "demo", *SHORT, "--json", at, "--figure", at]) == 2
     assert "another option names it as well" in capsys.readouterr().err
     assert not Path(at).exists()
+
+
+def test_a_file_read_in_place_is_written_unless_an_option_names_it(tmp_path: Path) -> None:
+    """As are keys by `keygen --add`, and the memory of a client."""
+    at = tmp_path / "it"
+    at.write_bytes(b"older")
+    with files.apart():
+        assert input_files.read(at, 9, is_input=False) == b"older"
+        files.write(at, b"newer")
+        files.claim(at)
+        with pytest.raises(OSError, match="it is an output as well"):
+            input_files.read(at, 9, is_input=False)
+    assert at.read_bytes() == b"newer"
 
 
 # -- concurrent commands -------------------------------------------------------------------------

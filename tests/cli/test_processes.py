@@ -151,6 +151,7 @@ def test_the_record_has_the_rows_of_both_servers_in_order(tmp_path: Path) -> Non
         with (tmp_path / name).open("wb") as file:
             Recorder(columns, file).append(3, step=np.array(steps))
         (tmp_path / f"{name}.json").write_bytes(b'{"vehicles": 1}')
+    (tmp_path / "server.part1.json").write_bytes(b'{"vehi')  # of one that was killed
     record = record_of(tmp_path, scenario, ())
     assert record.server["step"].tolist() == [3, 4, 5, 6, 7, 8]
     assert record.figures == {"server": {"vehicles": 1}, "server 2": {"vehicles": 1}}
