@@ -17,7 +17,7 @@ import os
 import stat
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
-from errno import EACCES, EBUSY, EEXIST, EINVAL, EOPNOTSUPP
+from errno import EACCES, EBUSY, EEXIST, EINVAL, EISDIR, EOPNOTSUPP
 from itertools import count
 from pathlib import Path
 from typing import BinaryIO
@@ -151,9 +151,10 @@ def check(path: Path) -> os.stat_result | None:
         status = path.lstat()
     except FileNotFoundError:
         return None
+    if stat.S_ISDIR(status.st_mode):
+        raise OSError(EISDIR, os.strerror(EISDIR), str(path))
     if not stat.S_ISREG(status.st_mode):
-        kinds = {stat.S_IFDIR: "a folder", stat.S_IFLNK: "a link"}
-        found = kinds.get(stat.S_IFMT(status.st_mode), "no plain file")
+        found = "a link" if stat.S_ISLNK(status.st_mode) else "no plain file"
         raise OSError(EINVAL, f"it is {found}, expected a plain file or a new name", str(path))
     if use((status.st_dev, status.st_ino)) == "input":
         raise OSError(EBUSY, "it is an input as well, expected another file", str(path))
