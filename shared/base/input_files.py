@@ -50,7 +50,7 @@ def opened(path: Path, *, follows: bool = True, is_input: bool = True) -> Binary
             written by the command.
     """
     # Without O_NONBLOCK, opening a pipe waits for a writer.
-    flags = open_flags("O_NONBLOCK", *() if follows else ("O_NOFOLLOW",))
+    flags = open_flags("O_NONBLOCK") if follows else open_flags("O_NONBLOCK", "O_NOFOLLOW")
     file = open(path, "rb", opener=lambda name, given: os.open(name, given | flags))  # noqa: SIM115
     try:
         if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
