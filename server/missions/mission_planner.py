@@ -216,7 +216,7 @@ class MissionPlanner(SplineScheme):
 
         A server that leads no vehicle leaves that to the one that does, and knows all motions.
         """
-        if self._state.led.is_standby:
+        if self.is_standby:
             return ""
         if zones and (number := self._state.unknown()) is not None:
             return f"zones before it is known where vehicle {number} is"
@@ -241,6 +241,11 @@ class MissionPlanner(SplineScheme):
                     number = self._state.number_of(row)
                     return f"{zone}, which vehicle {number} {does}, tube included"
         return ""
+
+    @property
+    def is_standby(self) -> bool:
+        """Whether all vehicles that were heard are led by another server."""
+        return self._state.led.is_standby
 
     def leave(self) -> int:
         self._leaves = True

@@ -22,6 +22,7 @@ from skytether.client.simulated.weather import Weather
 from skytether.client.vehicle import Measurement
 from skytether.netem.proxy import Proxy
 from skytether.server.endpoint import Server
+from skytether.server.missions.mission_planner import MissionPlanner
 from skytether.shared.base.chance import stream
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.base.units import SECOND_NS, seconds_to_ns
@@ -143,8 +144,8 @@ class Lives:
 
     @property
     def scenarios(self) -> list[Scenario]:
-        """Scenario of each server that is up, with the keys set in flight."""
-        return [each.scenario for each in self._running.values()]
+        """Scenario of each server that leads, with the keys set in flight."""
+        return [each.scenario for each in self._running.values() if _leads(each)]
 
     def _server(self, scenario: Scenario, name: str) -> Server:
         number = len(self.servers) + 1
@@ -329,3 +330,11 @@ class Lives:
 def world_s(time_s: float) -> float:
     """Virtual time for a time on the hosts' clock [s]."""
     return float(time_s) - CLOCK.offset_ns / SECOND_NS
+
+
+def _leads(running: Running) -> bool:
+    """Whether a server may lead a vehicle: none follows a standby with other zones."""
+    server = running.endpoint
+    assert isinstance(server, Server)
+    scheme = server.controller.scheme
+    return not (isinstance(scheme, MissionPlanner) and scheme.is_standby)
