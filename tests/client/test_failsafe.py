@@ -313,11 +313,14 @@ def test_rounding_of_a_speed_is_not_clamped() -> None:
     assert flown == wanted
 
 
-class Challenged(PlainLink):
-    """Link whose handshake answers each datagram with another one."""
+CHALLENGE = b"challenge"
 
-    def open(self, datagram: bytes, *, now_ns: int) -> None:  # type: ignore[override]
-        """Nothing for the session."""
+
+class Challenged(PlainLink):
+    """Link whose handshake answers a challenge."""
+
+    def open(self, datagram: bytes, *, now_ns: int) -> bytes | None:  # type: ignore[override]  # noqa: ARG002
+        return None if datagram == CHALLENGE else datagram
 
     def outbox(self) -> list[bytes]:
         return [b"answer"]
@@ -327,9 +330,24 @@ def test_no_hello_is_due_for_a_while_after_the_answer_to_a_challenge() -> None:
     hand = ByHand(scenario(), link=Challenged())
     hand.wake()
     hand.now_ns += 900 * MILLISECOND_NS
-    hand.client.receive(Datagram(b"challenge", SERVER), now_ns=hand.now_ns)
+    hand.client.receive(Datagram(CHALLENGE, SERVER), now_ns=hand.now_ns)
     assert [each.payload for each in hand.client.outbox()] == [b"answer"]
     assert hand.client.next_wake_ns() == hand.now_ns + AGAIN_NS
+
+
+def test_a_challenge_that_a_stranger_has_provoked_puts_off_no_hello() -> None:
+    """He repeats an earlier HELLO of the vehicle, again and again, while the server is gone."""
+    hand = ByHand(scenario(), link=Challenged())
+    hand.wake()
+    hand.welcome()
+    hand.say(Heartbeat(4, hand.session, 1300, 0, 0, 1, 0))
+    gone_ns = hand.now_ns + round(1.5 * hand.client._timeout_ns)
+    asks = 0
+    while hand.now_ns < gone_ns:
+        hand.client.receive(Datagram(CHALLENGE, SERVER), now_ns=hand.now_ns)
+        assert [each.payload for each in hand.client.outbox()] == [b"answer"]
+        asks += sum(isinstance(each, Hello) for each in hand.wake())
+    assert asks == 1
 
 
 def test_a_link_that_stutters_is_not_good() -> None:
