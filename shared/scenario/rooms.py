@@ -3,8 +3,11 @@
 The order is that of help texts and documents. Nothing is imported here.
 """
 
+from collections.abc import Collection
+from contextlib import suppress
 from typing import Any
 
+from skytether.shared.base.errors import ConfigError
 from skytether.shared.scenario.registry import (
     IMPAIRMENTS,
     REFERENCES,
@@ -67,3 +70,19 @@ IMPAIRMENTS.offer(f"{SHARED}formats.traces", "deliveries")
 
 ZONES.offer(f"{SHARED}missions.zone_texts", "box", "cylinder", "polygon", "fence", "corridor")
 ZONES.offer(f"{SHARED}formats.zones", "geojson", "kml", "plan")
+
+
+def preload(changeable: Collection[str]) -> None:
+    """Import what a change of these keys in flight may name, before the first packet: a step or a
+    packet would have to wait for it.
+    """
+    for key, table in (
+        ("control.trigger", TRIGGERS),
+        ("mission.zones", ZONES),
+        ("network.uplink", IMPAIRMENTS),
+    ):
+        for name in table if key in changeable else ():
+            with suppress(ConfigError):  # a room that is not installed
+                _ = table[name]
+    if "network.uplink" in changeable:
+        load("skytether.netem.bottleneck", "rate")

@@ -20,7 +20,7 @@ from skytether.shared.core.endpoint import Address, Endpoint, Form
 from skytether.shared.core.events import Event, address_text
 from skytether.shared.core.process_events import Counted, Listening, Measured, Plaintext
 from skytether.shared.core.stopwatch import Stopwatch
-from skytether.shared.scenario import reading
+from skytether.shared.scenario import reading, rooms
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.feed import Opened
 from skytether.shared.telemetry.record import RECORDING, Recorder
@@ -130,6 +130,12 @@ class Process:
         to_stderr = isinstance(line, Program)
         return Log(self.name, self.options.log, beside, to_stderr=to_stderr)
 
+    def _running(self, endpoint: Endpoint) -> Running:
+        """The endpoint with its scenario, ready for changes in flight."""
+        rooms.preload(endpoint.changeable)
+        journal = self.journal
+        return journal.running(endpoint) if journal else Running(endpoint, self.options.config)
+
     def drive(
         self,
         endpoint: Endpoint,
@@ -159,7 +165,7 @@ class Process:
         """
         options, feed, journal = self.options, self.feed, self.journal
         clocks = [TimeTeller(endpoint)] if options.config.link.time_of_day == "host" else []
-        running = journal.running(endpoint) if journal else Running(endpoint, options.config)
+        running = self._running(endpoint)
         if feed:
             feed.open(opened(self.name, options.scenario, running, feed))
         with ExitStack() as stack:

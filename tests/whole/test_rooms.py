@@ -55,6 +55,32 @@ def test_a_flight_of_one_vehicle_loads_no_room_and_few_lines() -> None:
     assert sum(lines.values()) <= LINES
 
 
+CHANGE = """
+import sys
+from skytether.netem.proxy import Proxy
+from skytether.server.endpoint import Server
+from skytether.shared.scenario import reading, rooms
+
+swap = reading.to_table(reading.load("swap"))
+one = reading.check(swap, "swap")
+netem = Proxy(one, server=("server", 0), flows=1)
+server = Server(one, boot_id=1, entropy=bytes)
+rooms.preload(server.changeable | netem.changeable)
+before = {*sys.modules}
+swap["network"]["uplink"] = "rate(9000) & uniform(0.1, 0.2)"
+swap["mission"]["zones"] = "box(9, 10, 9, 10)"
+other = reading.check(swap, "swap")
+netem.change(other, frozenset({"network.uplink"}), now_ns=0)
+server.change(other, frozenset({"mission.zones"}), now_ns=0)
+print(*sorted({*sys.modules} - before))
+"""
+
+
+def test_a_change_in_flight_imports_nothing() -> None:
+    changed = ran(sys.executable, "-P", "-c", CHANGE)
+    assert (changed.stdout, changed.stderr) == ("\n", "")
+
+
 @pytest.mark.long
 @pytest.mark.parametrize("room", ROOMS)
 def test_the_kernel_flies_without_a_room(room: str, tmp_path: Path) -> None:
