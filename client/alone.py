@@ -50,7 +50,7 @@ class Fresh:
 
     @property
     def is_stale(self) -> bool:
-        """Whether the next run would follow an earlier state."""
+        """Whether the client, if it was started again now, would go on from an earlier state."""
         return False
 
     def keep(self, state: Callable[[], dict[str, Any]], *, now_ns: int) -> bytes | None:

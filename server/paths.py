@@ -175,29 +175,28 @@ class SeveralWays(Ways):
 
     def __init__(self, entropy: Callable[[int], bytes], spread: str, timeout_ns: int) -> None:
         self._entropy, self._spread, self._timeout_ns = entropy, spread, timeout_ns
-        self.of: dict[int, tuple[Session, ServerPaths]] = {}
-        """Live sessions with several paths, by vehicle, and their paths."""
-        self.at: dict[Place, tuple[Session, ServerPaths]] = {}
-        """The same, by the proven address of each path."""
+        self.of: dict[int, Session] = {}
+        """Live sessions with several paths, by vehicle."""
+        self.at: dict[Place, Session] = {}
+        """The same sessions, by the proven address of each path."""
 
     def is_copy(self, datagram: Datagram, now_ns: int) -> bool:
         place = Place(datagram.peer, datagram.socket)
-        if place not in self.at:
-            return False
-        _, paths = self.at[place]
-        if not paths.paths.is_copy(datagram.payload, paths.number(place)):
+        session = self.at.get(place)
+        paths = session and _paths(session)
+        if not paths or not paths.paths.is_copy(datagram.payload, paths.number(place)):
             return False
         paths.hear(place, now_ns)
         return True
 
     def is_repeat(self, session: Session, datagram: Datagram) -> bool:
-        paths = self._paths(session)
+        paths = _paths(session)
         return paths is not None and paths.paths.is_copy(datagram.payload, None)
 
     def hear(
         self, session: Session, report: Report, message: Message, datagram: Datagram, now_ns: int
     ) -> None:
-        if paths := self._paths(session):
+        if paths := _paths(session):
             is_recent = not isinstance(message, PathProof)
             _hear(paths, report, datagram, now_ns, is_recent=is_recent)
 
@@ -207,7 +206,7 @@ class SeveralWays(Ways):
         """Note the report in front of an observation; returns the question for a proof if it comes
         from a new address.
         """
-        count, paths = len(report.arrived), self._paths(session)
+        count, paths = len(report.arrived), _paths(session)
         if paths is None or len(paths.prices) != count:
             paths = ServerPaths((1,) * count, self._spread, self._entropy, self._timeout_ns)
             self._note(session, paths)
@@ -220,31 +219,31 @@ class SeveralWays(Ways):
         self, session: Session, message: Message, datagram: Datagram, now_ns: int
     ) -> PathProof | None:
         """Note the address of a path once it is proven; until then return the question."""
-        paths = self._paths(session)
+        paths = _paths(session)
         if paths is None or not isinstance(message, PathProof):
             raise ProtocolError(Drop.FIELD)
         paths.set_prices(message.prices)
         place = Place(datagram.peer, datagram.socket)
         question = paths.prove(message, place, now_ns)
-        is_known = self.at.get(place, (None, None))[0] is session
-        if question is None and place in paths.places and not is_known:
+        if question is None and place in paths.places and self.at.get(place) is not session:
             self._note(session, paths)
         return question
 
     def narrow(self, session: Session) -> None:
-        self.forget(session)
+        if session.way:
+            self.forget(session)
 
     def restart(self, session: Session) -> None:
         """Note that a client may have been started again: it keeps its session."""
-        if paths := self._paths(session):
+        if paths := _paths(session):
             paths.paths.peer_may_restart = True
 
     def forget(self, session: Session) -> None:
         session.way = None
-        if self.of.get(session.vehicle, (None,))[0] is session:
+        if self.of.get(session.vehicle) is session:
             del self.of[session.vehicle]
-        for place in [place for place, (each, _) in self.at.items() if each is session]:
-            del self.at[place]
+            for place in [place for place, each in self.at.items() if each is session]:
+                del self.at[place]
 
     def worths(self, decisions: Decisions) -> dict[int, float]:
         """See `Ways`.
@@ -262,26 +261,28 @@ class SeveralWays(Ways):
     def watch(
         self, put: Callable[[int, Sequence[Datagram]], None], events: Events, now_ns: int
     ) -> None:
-        for session, paths in self.of.values():
-            silence_ns = session.hearing.silence_ns
+        for session in self.of.values():
+            silence_ns, paths = session.hearing.silence_ns, _paths(session)
+            assert paths
             due = paths.watched(session.vehicle, session.number, session.line, silence_ns, now_ns)
             put(session.row, due)
             events += paths.turned(session.vehicle, now_ns)
 
     def figures(self, session: Session, now_ns: int) -> dict[str, Any]:
-        paths = self._paths(session)
+        paths = _paths(session)
         return {"paths": paths.paths.figures(now_ns)} if paths else {}
-
-    def _paths(self, session: Session) -> ServerPaths | None:
-        own, paths = self.of.get(session.vehicle, (None, None))
-        return paths if own is session else None
 
     def _note(self, session: Session, paths: ServerPaths) -> None:
         """Note the paths of a session and their proven addresses, in place of earlier ones."""
         self.forget(session)
         session.way = paths
-        self.of[session.vehicle] = session, paths
-        self.at |= dict.fromkeys(paths.places, (session, paths))
+        self.of[session.vehicle] = session
+        self.at |= dict.fromkeys(paths.places, session)
+
+
+def _paths(session: Session) -> ServerPaths | None:
+    """Paths of a session; None with a single address."""
+    return session.way if isinstance(session.way, ServerPaths) else None
 
 
 def _hear(

@@ -310,7 +310,7 @@ class Scheme(ABC):
         return {}
 
     def vehicle_figures(self, row: int) -> dict[str, Any]:  # noqa: ARG002
-        """Figures of a vehicle, beside the server's own."""
+        """Figures of a vehicle that the scheme adds to the server's own."""
         return {}
 
     def follow(self, row: int, told: Lead | None) -> None:  # noqa: B027

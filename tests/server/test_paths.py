@@ -142,7 +142,9 @@ def test_a_forwarder_of_copies_does_not_take_a_path_away() -> None:
         vehicle.step += SECOND_NS // vehicle.dt_ns
         vehicle.prove(0, Place(("forwarder", port), 0))
         vehicle.observe(FIRST)
-    session, paths = ways(vehicle).of[1]
+    session = ways(vehicle).of[1]
+    paths = session.way
+    assert isinstance(paths, ServerPaths)
     assert {*paths.places} == {FIRST, Place(("forwarder", 2), 0)}
     line = session.line
     sent = paths.sealed(b"\x93plan", line, vehicle.now_ns, 1.0)
