@@ -8,16 +8,16 @@ from collections import deque
 
 import numpy as np
 
-from skytether.server.common.desired import Desired
-from skytether.server.common.scheme import empty_foresight
 from skytether.server.controller import BLOCK
 from skytether.server.endpoint import Server
 from skytether.server.mpc.hierarchical import Planner
+from skytether.server.planning.desired import Desired
+from skytether.server.planning.scheme import empty_foresight
 from skytether.server.schemes.horizons import HorizonScheme
 from skytether.shared.base.chance import stream
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
-from skytether.shared.core.endpoint import Address, Datagram
-from skytether.shared.core.stopwatch import Stopwatch
+from skytether.shared.endpoints.endpoint import Address, Datagram
+from skytether.shared.endpoints.stopwatch import Stopwatch
 from skytether.shared.law.heartbeat import NUMBERS
 from skytether.shared.law.model import Array, Indices, discretise
 from skytether.shared.scenario.schema import Scenario

@@ -25,13 +25,13 @@ from skytether.autopilot.faults import ScriptedFault
 from skytether.autopilot.flavours import FlavourName
 from skytether.lab.commands.pool import Flags, study
 from skytether.shared.base.units import SECOND_NS
-from skytether.shared.core.events import Flying
+from skytether.shared.events.flight import Flying
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import TRUTH_COLUMNS, Record, Recorder, Rows, parse
 from skytether.shared.telemetry.summary import Summary, position_error, summarise
 from skytether.shared.wire.protocol import Mode
-from skytether.shell import command
+from skytether.shell.commandline import command
 from skytether.sim import flight, straight
 from skytether.station import laws
 from skytether.station.joined import state_at, summary_of, within

@@ -13,14 +13,14 @@ from pathlib import Path
 from typing import Any
 
 from skytether.shared.base import files
-from skytether.shared.core.endpoint import Address
-from skytether.shared.core.events import Event, address_text
-from skytether.shared.core.process_events import Counted, Listening
+from skytether.shared.endpoints.endpoint import Address
+from skytether.shared.events.flight import Event, address_text
+from skytether.shared.events.processes import Counted, Listening
 from skytether.shared.scenario.reading import to_toml
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.wire import keys
-from skytether.shell.log import LogLine, line_of
-from skytether.shell.workers import die_with_parent
+from skytether.shell.processes.log import LogLine, line_of
+from skytether.shell.processes.workers import die_with_parent
 
 HOST = "127.0.0.1"
 PATIENCE_S = 60.0

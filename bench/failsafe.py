@@ -25,12 +25,12 @@ from skytether.autopilot.flavours import FlavourName, FlightMode
 from skytether.autopilot.flight import PilotedVehicle
 from skytether.lab.commands.pool import Flags, study
 from skytether.shared.base.units import SECOND_NS, seconds_to_ns
-from skytether.shared.core.events import ModeChanged
+from skytether.shared.events.flight import ModeChanged
 from skytether.shared.law.model import Array
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import parse
 from skytether.shared.wire.protocol import Mode
-from skytether.shell import command
+from skytether.shell.commandline import command
 from skytether.sim import flight
 from skytether.sim.world import World
 

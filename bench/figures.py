@@ -34,7 +34,7 @@ from skytether.lab.commands.machine import commit
 from skytether.lab.commands.pool import Flags, crew
 from skytether.lab.intervals import interval
 from skytether.shared.base import files, toml
-from skytether.shell import command
+from skytether.shell.commandline import command
 
 ROOT = Path(__file__).parents[1]
 REGISTER = Path(__file__).with_name("figures.toml")

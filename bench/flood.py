@@ -31,14 +31,14 @@ from bench.problems import derive
 from skytether.netem.proxy import Proxy
 from skytether.server.secure import FORMS
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
-from skytether.shared.core.endpoint import Datagram
-from skytether.shared.core.events import Flying
+from skytether.shared.endpoints.endpoint import Datagram
+from skytether.shared.events.flight import Flying
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry import record
 from skytether.shared.telemetry.summary import position_error
 from skytether.shared.wire import channel, handshake
-from skytether.shell import driver
-from skytether.shell.batch import BATCH_MAX, DatagramBatch, pack_address
+from skytether.shell.driving import driver
+from skytether.shell.host.batch import BATCH_MAX, DatagramBatch, pack_address
 
 VEHICLES = 5
 NEWCOMER = VEHICLES + 1

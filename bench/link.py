@@ -24,8 +24,8 @@ from skytether.server import secure as server
 from skytether.server.gate import GateCall
 from skytether.shared.base.chance import stream
 from skytether.shared.base.units import SECOND_NS
-from skytether.shared.core.endpoint import Address, Datagram
-from skytether.shared.core.stopwatch import Stopwatch
+from skytether.shared.endpoints.endpoint import Address, Datagram
+from skytether.shared.endpoints.stopwatch import Stopwatch
 from skytether.shared.scenario.reading import load
 from skytether.shared.telemetry.summary import summarise
 from skytether.shared.wire import channel

@@ -44,10 +44,10 @@ import tyro
 
 from bench.harness import TextTable
 from skytether.lab.commands.pool import Flags, study
-from skytether.server.common.scheme import Foresight
 from skytether.server.endpoint import Server
 from skytether.server.missions.mission_planner import MissionPlanner
 from skytether.server.missions.routes import Routes
+from skytether.server.planning.scheme import Foresight
 from skytether.shared.base import files
 from skytether.shared.base.chance import stream
 from skytether.shared.law.model import Array, Indices
@@ -61,7 +61,7 @@ from skytether.shared.scenario.schema import NetworkConfig, Scenario
 from skytether.shared.telemetry.record import Record
 from skytether.shared.telemetry.summary import least_separation
 from skytether.shared.wire.protocol import Mode
-from skytether.shell import command
+from skytether.shell.commandline import command
 from skytether.sim import flight
 from skytether.sim.world import World
 

@@ -34,9 +34,9 @@ from numpy.typing import NDArray
 from bench.children import HOST, ChildProcess
 from bench.harness import TextTable, median, progress, quantile_ms, sleep_until
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
-from skytether.shared.core.process_events import Counted
+from skytether.shared.events.processes import Counted
 from skytether.shared.telemetry.record import DOWNLINK, read
-from skytether.shell.udp import kernel_drops, open_socket
+from skytether.shell.host.udp import kernel_drops, open_socket
 
 HEAD = struct.Struct("<qq")
 """Header of a packet: its number and time of sending [ns]; the rest is zeros."""

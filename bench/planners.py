@@ -18,13 +18,13 @@ import tyro
 from bench.harness import TextTable
 from skytether.lab.commands.pool import Flags, study
 from skytether.lab.intervals import interval
-from skytether.shared.core.stopwatch import Stopwatch
+from skytether.shared.endpoints.stopwatch import Stopwatch
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.dotted import set_keys
 from skytether.shared.scenario.planners import MPC
 from skytether.shared.telemetry.summary import summarise
-from skytether.shell import command, plugins
-from skytether.shell.plugins import Plugin
+from skytether.shell.commandline import command, plugins
+from skytether.shell.commandline.plugins import Plugin
 from skytether.sim.flight import fly
 
 PAGE = Path(__file__).parents[1] / "docs" / "planners.md"

@@ -41,7 +41,7 @@ from skytether.gym.players import Row
 from skytether.lab.commands.pool import Flags, study
 from skytether.lab.intervals import interval
 from skytether.shared.base import files
-from skytether.shell import command
+from skytether.shell.commandline import command
 
 Rows = NDArray[np.float64]
 PLAYERS: dict[str, tuple[str, Callable[[], Player]]] = {

@@ -37,7 +37,7 @@ from bench.children import HOST, ChildProcess, Lab
 from bench.harness import TextTable, WakeLateness, progress
 from bench.problems import derive
 from skytether.shared.base.units import SECOND_NS
-from skytether.shared.core.events import Flying, ModeChanged
+from skytether.shared.events.flight import Flying, ModeChanged
 from skytether.shared.law.model import Array
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry import record

@@ -13,13 +13,13 @@ from bench.harness import TextTable
 from skytether.lab.commands.pool import Flags, study
 from skytether.shared.base.chance import stream
 from skytether.shared.base.units import SECOND_NS
-from skytether.shared.core.standby_events import LeaderChanged
+from skytether.shared.events.standby import LeaderChanged
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.dotted import set_keys
 from skytether.shared.telemetry.record import Record
 from skytether.shared.telemetry.summary import summarise
 from skytether.shared.wire.protocol import Mode
-from skytether.shell import command
+from skytether.shell.commandline import command
 from skytether.sim.flight import SERVER, fly
 
 FLIGHT_S, SEEDS = 30.0, 50

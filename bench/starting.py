@@ -23,10 +23,10 @@ from typing import Any, NamedTuple
 from bench.children import HOST, PATIENCE_S
 from bench.harness import TextTable, median, progress
 from skytether.shared.base.units import SECOND_NS
-from skytether.shared.core.events import address_text
-from skytether.shared.core.process_events import Listening
-from skytether.shell.log import line_of
-from skytether.shell.workers import die_with_parent
+from skytether.shared.events.flight import address_text
+from skytether.shared.events.processes import Listening
+from skytether.shell.processes.log import line_of
+from skytether.shell.processes.workers import die_with_parent
 
 MB = 1_000_000
 POLL_S = 0.01

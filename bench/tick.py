@@ -32,7 +32,7 @@ from bench.harness import (
 from bench.problems import ByTurns, derive, listening, record, saturated, solving
 from skytether.figures.flights import save
 from skytether.server.mpc.exact import ExactSolver
-from skytether.shared.core.stopwatch import Stopwatch
+from skytether.shared.endpoints.stopwatch import Stopwatch
 from skytether.shared.scenario.schema import Scenario
 
 PERIOD_MS = 20.0

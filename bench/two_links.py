@@ -23,7 +23,7 @@ from skytether.shared.scenario import reading
 from skytether.shared.scenario.dotted import set_keys
 from skytether.shared.telemetry.summary import summarise
 from skytether.shared.wire.protocol import Mode
-from skytether.shell import command
+from skytether.shell.commandline import command
 from skytether.sim.flight import fly
 
 DELAYS = "uniform(0.05, 0.15)"

@@ -19,7 +19,7 @@ from bench.airspace import Airspace
 from bench.harness import HOT, PACED, machine
 from bench.problems import derive
 from skytether.shared.base.units import SECOND_NS
-from skytether.shared.core.stopwatch import Stopwatch
+from skytether.shared.endpoints.stopwatch import Stopwatch
 from skytether.shared.scenario.schema import Scenario
 from skytether.sim.flight import fly, fly_batch
 

@@ -2,7 +2,7 @@
 
 import sys
 
-from skytether.shell.start import run
+from skytether.shell.commandline.start import run
 
 if __name__ == "__main__":  # called before the slow imports below
     sys.exit(run("skytether.client.__main__:fly", "client"))
@@ -24,22 +24,23 @@ from skytether.client.fleet import ClientFleet, apart_ns
 from skytether.client.link import ClientLink, PlainLink
 from skytether.client.memory import SavedState, recall
 from skytether.client.vehicle import Vehicle, VehicleMemory
-from skytether.shared.core.aboard import ParametersUnsafe
-from skytether.shared.core.endpoint import PATH_SOCKETS, STANDBY_SOCKETS
-from skytether.shared.core.events import Event, NoSession, SessionRefused, address_text
-from skytether.shared.core.process_events import NotRecalled, Recalled
-from skytether.shared.core.steady import Steady
+from skytether.shared.endpoints.endpoint import PATH_SOCKETS, STANDBY_SOCKETS
+from skytether.shared.endpoints.steady import Steady
+from skytether.shared.events.aboard import ParametersUnsafe
+from skytether.shared.events.flight import Event, NoSession, SessionRefused, address_text
+from skytether.shared.events.processes import NotRecalled, Recalled
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import client_columns
 from skytether.shared.telemetry.summary import summarise
 from skytether.shared.wire import keys
 from skytether.shared.wire.keys import Keyring
-from skytether.shell import command, process, terminal
-from skytether.shell.argument import Argument
-from skytether.shell.command import CommandError, ScenarioName
-from skytether.shell.memory import MemoryFile, folder
-from skytether.shell.paths import NetworkPath
-from skytether.shell.process import ProcessOptions
+from skytether.shell.commandline import command, terminal
+from skytether.shell.commandline.argument import Argument
+from skytether.shell.commandline.command import CommandError, ScenarioName
+from skytether.shell.driving.memory import MemoryFile, folder
+from skytether.shell.host.paths import NetworkPath
+from skytether.shell.processes import process
+from skytether.shell.processes.process import ProcessOptions
 
 NONE = "none"
 """Value of --standby for no standby server."""

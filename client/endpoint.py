@@ -20,7 +20,7 @@ from skytether.client.vehicle import Vehicle
 from skytether.client.way import Way
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.base.units import MICROSECOND_NS, MILLISECOND_NS, SECOND_NS, seconds_to_ns
-from skytether.shared.core.endpoint import (
+from skytether.shared.endpoints.endpoint import (
     PATH_SOCKETS,
     STANDBY_SOCKETS,
     VEHICLES_TOLD_MAX,
@@ -29,7 +29,8 @@ from skytether.shared.core.endpoint import (
     Endpoint,
     by_name,
 )
-from skytether.shared.core.events import (
+from skytether.shared.endpoints.time_of_day import TimeOfDay
+from skytether.shared.events.flight import (
     Failure,
     FenceHolds,
     Finished,
@@ -42,7 +43,6 @@ from skytether.shared.core.events import (
     address_text,
     metres,
 )
-from skytether.shared.core.time_of_day import TimeOfDay
 from skytether.shared.law.heartbeat import Hearing
 from skytether.shared.law.model import Array
 from skytether.shared.scenario.catalogue import keys_of

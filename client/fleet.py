@@ -6,8 +6,8 @@ from typing import Any
 
 from skytether.client.endpoint import Client, figures
 from skytether.shared.base.units import SECOND_NS
-from skytether.shared.core.endpoint import Datagram, Endpoint
-from skytether.shared.core.events import Failure
+from skytether.shared.endpoints.endpoint import Datagram, Endpoint
+from skytether.shared.events.flight import Failure
 from skytether.shared.scenario.schema import Scenario
 
 START_NS = 5 * SECOND_NS

@@ -3,8 +3,8 @@ server.
 """
 
 from skytether.shared.base.units import SECOND_NS
-from skytether.shared.core.endpoint import Address, Events
-from skytether.shared.core.events import AutopilotWaits, ServerHeard, ServerSilent, Welcomed
+from skytether.shared.endpoints.endpoint import Address, Events
+from skytether.shared.events.flight import AutopilotWaits, ServerHeard, ServerSilent, Welcomed
 
 WAITED_NS = 2 * SECOND_NS
 """Delay before the log gives the reason why the vehicle cannot fly."""

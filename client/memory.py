@@ -11,10 +11,11 @@ saves, outside the process:
     whether the vehicle was armed         starting a process must not arm it
 
 A core opens no file: `Client.keep` returns bytes when they have changed, the shell writes them
-(`shell.memory`) and confirms by `Client.kept`. **Nothing is sent to a server before the state is
-saved**: otherwise the next run might fly a motion that the server no longer counts with. Where it
-cannot be saved, because a disk is full, read-only or stuck, the client goes on after `WAIT_NS`, and
-each observation says so: to the servers, a restart of the client is then one without saved state.
+(`shell.driving.memory`) and confirms by `Client.kept`. **Nothing is sent to a server before the
+state is saved**: otherwise the next run might fly a motion that the server no longer counts with.
+Where it cannot be saved, because a disk is full, read-only or stuck, the client goes on after
+`WAIT_NS`, and each observation says so: to the servers, a restart of the client is then one without
+saved state.
 """
 
 from collections.abc import Callable

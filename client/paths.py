@@ -4,9 +4,9 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from skytether.client.way import Conversation, Way
-from skytether.shared.core.endpoint import Address, Datagram, Events
-from skytether.shared.core.events import address_text
-from skytether.shared.core.path_events import PathDied, PathHealed
+from skytether.shared.endpoints.endpoint import Address, Datagram, Events
+from skytether.shared.events.flight import address_text
+from skytether.shared.events.paths import PathDied, PathHealed
 from skytether.shared.wire.framing import Report
 from skytether.shared.wire.paths import Paths
 from skytether.shared.wire.protocol import Message, PathProof, encode

@@ -11,10 +11,10 @@ import math
 import numpy as np
 
 from skytether.client.compensator import Compensator
+from skytether.client.reports import Unreported, is_always, make_report
 from skytether.shared.base.compilable import Numbers, Table, compilable
 from skytether.shared.law.model import Array
 from skytether.shared.law.terms import Terms
-from skytether.shared.scenario.observing import Unreported, is_always, make_report
 from skytether.shared.wire.protocol import Mode
 
 RETRY_STEPS = 4

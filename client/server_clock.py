@@ -7,7 +7,7 @@ time: it answers a HELLO, and lets a server go on whose clock was set back.
 
 from typing import NamedTuple
 
-from skytether.shared.core.steady import JUMP_NS
+from skytether.shared.endpoints.steady import JUMP_NS
 from skytether.shared.law.heartbeat import NUMBERS
 from skytether.shared.wire.drop import Drop, ProtocolError
 from skytether.shared.wire.protocol import stamped_ns
@@ -64,9 +64,9 @@ class ServerClock:
         """Note a packet sent at a time of the server; returns whether this machine was suspended.
 
         The client's clock may have stood still, or its jump was mistaken for a clock that was set
-        (`shared.core.steady`); the server's clock has gone on in both cases. After a suspension
-        longer than time stamps can express, the server has forgotten the session, and its WELCOME
-        contains the full time.
+        (`shared.endpoints.steady`); the server's clock has gone on in both cases. After a
+        suspension longer than time stamps can express, the server has forgotten the session, and
+        its WELCOME contains the full time.
         """
         slept = self.echo != NEVER and server_ns - self._expected_ns(now_ns) > SLEPT_NS
         self.echo = Echo(server_ns, now_ns, (self.echo.heard + 1) % NUMBERS)

@@ -13,9 +13,9 @@ from skytether.client.failsafe import CLOSING, Failsafe
 from skytether.client.leadership import Leadership
 from skytether.client.session import ServerSession
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
-from skytether.shared.core.endpoint import Events
-from skytether.shared.core.events import address_text
-from skytether.shared.core.standby_events import LeaderChanged, LimitsDiffer
+from skytether.shared.endpoints.endpoint import Events
+from skytether.shared.events.flight import address_text
+from skytether.shared.events.standby import LeaderChanged, LimitsDiffer
 from skytether.shared.law.heartbeat import SESSION_NS
 from skytether.shared.law.terms import Difference
 from skytether.shared.scenario.catalogue import differences

@@ -14,8 +14,8 @@ from skytether.client.link import AGAIN_NS, ClientLink
 from skytether.client.server_clock import ServerClock
 from skytether.client.way import Way
 from skytether.shared.base.units import SECOND_NS, seconds_to_ns
-from skytether.shared.core.endpoint import Address, Events
-from skytether.shared.core.events import (
+from skytether.shared.endpoints.endpoint import Address, Events
+from skytether.shared.events.flight import (
     Failure,
     NoAnswer,
     NoSession,

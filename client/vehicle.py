@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Annotated, NamedTuple
 import msgspec
 import numpy as np
 
-from skytether.shared.core.endpoint import Endpoint
-from skytether.shared.core.events import Failure
+from skytether.shared.endpoints.endpoint import Endpoint
+from skytether.shared.events.flight import Failure
 from skytether.shared.law.model import Array
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Reason

@@ -10,7 +10,7 @@ from skytether.client.simulated import vehicle as computed
 from skytether.client.vehicle import Vehicle
 from skytether.shared.base import extras
 from skytether.shared.base.errors import ConfigError
-from skytether.shared.core.line import Line, parse_line
+from skytether.shared.endpoints.line import Line, parse_line
 from skytether.shared.scenario.grammar import GrammarError
 from skytether.shared.scenario.registry import VEHICLES
 from skytether.shared.scenario.schema import Scenario

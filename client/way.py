@@ -6,8 +6,8 @@ from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
 from skytether.client.link import ClientLink
-from skytether.shared.core.endpoint import Address, Datagram
-from skytether.shared.core.events import address_text
+from skytether.shared.endpoints.endpoint import Address, Datagram
+from skytether.shared.events.flight import address_text
 from skytether.shared.law.heartbeat import Hearing
 from skytether.shared.wire.framing import Report
 from skytether.shared.wire.protocol import Message

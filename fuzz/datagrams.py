@@ -18,7 +18,7 @@ from skytether.server import secure as server_secure
 from skytether.server.endpoint import Server
 from skytether.shared.base.chance import stream
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
-from skytether.shared.core.endpoint import EVENTS_MAX, Datagram, Endpoint
+from skytether.shared.endpoints.endpoint import EVENTS_MAX, Datagram, Endpoint
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.wire import protocol

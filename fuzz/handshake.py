@@ -18,7 +18,7 @@ from skytether.server import secure as server_secure
 from skytether.server.endpoint import Server
 from skytether.shared.base.chance import stream
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
-from skytether.shared.core.endpoint import EVENTS_MAX, Address, Datagram, Endpoint
+from skytether.shared.endpoints.endpoint import EVENTS_MAX, Address, Datagram, Endpoint
 from skytether.shared.wire import channel, handshake, noise_nnpsk0, protocol
 from skytether.shared.wire.noise_nnpsk0 import KEY_BYTES, Initiator, Responder
 from skytether.shared.wire.protocol import Hello, Welcome, encode

@@ -13,15 +13,16 @@ import numpy as np
 from fuzz.datagrams import SCENARIOS, EndpointInFlight
 from fuzz.mutators import text_changed, words_of
 from fuzz.target import Target, flown
+from skytether.netem.impairments import traces
 from skytether.netem.proxy import Proxy
 from skytether.probe import recorded as captures
 from skytether.shared import formats
 from skytether.shared.base import toml
 from skytether.shared.base.errors import ConfigError
-from skytether.shared.core import change
-from skytether.shared.core.change import REQUEST_BYTES_MAX, Answer, Running
-from skytether.shared.core.process_events import Counted
-from skytether.shared.formats import bounded, pings, plans, recorded, traces, tracks, zone_files
+from skytether.shared.endpoints import change
+from skytether.shared.endpoints.change import REQUEST_BYTES_MAX, Answer, Running
+from skytether.shared.events.processes import Counted
+from skytether.shared.formats import bounded, pings, plans, recorded, tracks, zone_files
 from skytether.shared.missions import mission, zone_texts
 from skytether.shared.scenario import contradictions, grammar, reading
 from skytether.shared.scenario.dotted import value
@@ -29,9 +30,9 @@ from skytether.shared.scenario.grammar import GrammarError
 from skytether.shared.scenario.registry import REFERENCES, TRIGGERS, File
 from skytether.shared.wire import handshake, keys
 from skytether.shared.wire.protocol import Hello, Welcome, decode, encode
-from skytether.shell import log
-from skytether.shell.control import ANSWER_BYTES_MAX, ControlError, answer_of
-from skytether.shell.log import LogLine, line_of
+from skytether.shell.driving.control import ANSWER_BYTES_MAX, ControlError, answer_of
+from skytether.shell.processes import log
+from skytether.shell.processes.log import LogLine, line_of
 
 SAMPLES_S = np.array([-1.0, 0.0, 0.05, 7.3, 1e3, 1e5])
 """Times at which a scenario's trajectory must be finite [s]."""

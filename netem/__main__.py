@@ -2,7 +2,7 @@
 
 import sys
 
-from skytether.shell.start import run
+from skytether.shell.commandline.start import run
 
 if __name__ == "__main__":  # called before the slow imports below
     sys.exit(run("skytether.netem.__main__:emulate", "netem"))
@@ -21,18 +21,20 @@ from skytether.netem.proxy import FLOWS_MAX, Proxy
 from skytether.netem.relay import Relay
 from skytether.netem.tunnel import Tunnel
 from skytether.shared.base.errors import ConfigError
-from skytether.shared.core.endpoint import Address
-from skytether.shared.core.events import address_text
-from skytether.shared.core.line import CONNECTIONS_MAX, Listen, parse_address
-from skytether.shared.core.ways import FLIGHT, KEYS, RELAY, RUN, Ways, named
+from skytether.shared.endpoints.endpoint import Address
+from skytether.shared.endpoints.line import CONNECTIONS_MAX, Listen, parse_address
+from skytether.shared.endpoints.ways import FLIGHT, KEYS, RELAY, RUN, Ways, named
+from skytether.shared.events.flight import address_text
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import PACKET_COLUMNS
-from skytether.shell import command, process, system
-from skytether.shell.argument import Argument
-from skytether.shell.process import ProcessOptions
-from skytether.shell.program import Program, ProgramError, program
-from skytether.shell.udp import leads_back, look_up, sockets_max
+from skytether.shell.commandline import command
+from skytether.shell.commandline.argument import Argument
+from skytether.shell.driving.program import Program, ProgramError, program
+from skytether.shell.host import system
+from skytether.shell.host.udp import leads_back, look_up, sockets_max
+from skytether.shell.processes import process
+from skytether.shell.processes.process import ProcessOptions
 
 NETWORK = "transparent"
 """Scenario of a relay that belongs to no flight."""

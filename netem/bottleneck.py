@@ -11,9 +11,9 @@ from dataclasses import dataclass, field
 from math import ceil, sqrt
 from typing import Generic, TypeVar
 
+from skytether.netem.impairments.queues import DELIVERY_BYTES, Queued
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
 from skytether.shared.law.model import Array
-from skytether.shared.scenario.air.queues import DELIVERY_BYTES, Queued
 
 QUANTUM_BYTES = 300
 """Bytes that each flow may send per turn under fair queueing [B]: a few small packets; a larger

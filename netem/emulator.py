@@ -2,7 +2,7 @@
 `relay` for byte streams and `tunnel` for packets of IP.
 
 As in the paper, uplink is to the vehicle, or to whoever takes its place: a proxy's client, a
-tunnel's program. Users of other programs read names of their own (`shared.core.ways`).
+tunnel's program. Users of other programs read names of their own (`shared.endpoints.ways`).
 """
 
 from abc import abstractmethod
@@ -10,12 +10,12 @@ from collections.abc import Iterable
 from typing import Any, Literal
 
 from skytether.netem.fate import Fates
+from skytether.netem.impairments.direction import Impairments
 from skytether.netem.link import Lane, Link
 from skytether.shared.base.units import HEADER_BYTES
-from skytether.shared.core.endpoint import Datagram, Endpoint
-from skytether.shared.core.events import Fault
-from skytether.shared.core.ways import FLIGHT, Ways
-from skytether.shared.scenario.air.path import Path
+from skytether.shared.endpoints.endpoint import Datagram, Endpoint
+from skytether.shared.endpoints.ways import FLIGHT, Ways
+from skytether.shared.events.flight import Fault
 from skytether.shared.scenario.catalogue import keys_of
 from skytether.shared.scenario.owners import InFlight
 from skytether.shared.scenario.schema import Scenario
@@ -51,7 +51,7 @@ class Emulator(Endpoint):
         self._scenario, self.ways = scenario, ways
 
         def make(direction: int, name: Direction) -> Link:
-            of = self.path(name)
+            of = self.impairments(name)
             return Link(direction, mtu, recorder, of, path, header_bytes=header_bytes)
 
         self.uplink, self.downlink = make(UPLINK, "uplink"), make(DOWNLINK, "downlink")
@@ -64,10 +64,9 @@ class Emulator(Endpoint):
     def lanes(self) -> Iterable[tuple[Lane, Lane]]:
         """Uplink and downlink of each flow."""
 
-    def path(self, name: Direction) -> Path:
-        """Impairments of a direction."""
-        path: Path = getattr(self._scenario, name)
-        return path
+    def impairments(self, name: Direction) -> Impairments:
+        of: Impairments = getattr(self._scenario, name)
+        return of
 
     def link(self, name: Direction) -> Link:
         return self.uplink if name == "uplink" else self.downlink
@@ -75,7 +74,7 @@ class Emulator(Endpoint):
     def fates(self, name: Direction, flow: int) -> Fates:
         """What the packets of one flow meet in a direction."""
         at = self._scenario.seed, name, flow
-        return Fates(self.link(name).path, *at, by_number=self.ways != FLIGHT)
+        return Fates(self.link(name).impairments, *at, by_number=self.ways != FLIGHT)
 
     def _open_lanes(self, began_ns: int) -> tuple[Lane, Lane]:
         """Uplink and downlink of a new flow, whose fates count from `began_ns`."""
@@ -110,8 +109,8 @@ class Emulator(Endpoint):
     ) -> None:
         """See `Endpoint`; queued packets keep their fate."""
         self._scenario = scenario
-        self.uplink.change(self.path("uplink"), now_ns=now_ns)
-        self.downlink.change(self.path("downlink"), now_ns=now_ns)
+        self.uplink.change(self.impairments("uplink"), now_ns=now_ns)
+        self.downlink.change(self.impairments("downlink"), now_ns=now_ns)
         for up, down in self.lanes():
             up.fates, down.fates = self.fates("uplink", up.flow), self.fates("downlink", down.flow)
 

@@ -1,10 +1,10 @@
 """Fates of packets: delay, loss, and other impairments of each packet.
 
-Each direction has a list of impairments (`shared.scenario.air`), which modify the fate of a packet
+Each direction has a list of impairments (`netem.impairments`), which modify the fate of a packet
 one after another. In a flight a fate depends on the seed, the direction, the flow and the time slot
 in which the packet enters, but not on earlier packets: so two controllers meet the same network,
 however often each of them sends. For any other program it depends on the packet's number in its
-flow, see `shared.scenario.air.draws`. Packets of a flight that enter in the same slot have
+flow, see `netem.impairments.draws`. Packets of a flight that enter in the same slot have
 different fates, by their rank in the slot: otherwise three CLOSEs sent at once would all be lost
 together. Control traffic is so sparse that nearly every packet is the first of its slot.
 
@@ -16,10 +16,10 @@ import traceback
 from collections import Counter
 from dataclasses import replace
 
+from skytether.netem.impairments.direction import Impairments
+from skytether.netem.impairments.draws import Draws, Fate, Stream
+from skytether.netem.impairments.impairment import Impairment
 from skytether.shared.base.units import SECOND_NS
-from skytether.shared.scenario.air.draws import Draws, Fate, Stream
-from skytether.shared.scenario.air.impairment import Impairment
-from skytether.shared.scenario.air.path import Path
 from skytether.shared.scenario.registry import IMPAIRMENTS
 
 DELAY_MAX_NS = 86_400 * SECOND_NS
@@ -41,7 +41,7 @@ class Fates:
 
     def __init__(
         self,
-        direction: Path,
+        of: Impairments,
         seed: int,
         name: str,
         flow: int,
@@ -58,7 +58,7 @@ class Fates:
         self._guarded = False
         kinds: Counter[str] = Counter()
         names: Counter[str] = Counter()
-        for name_, each in direction.impairments:
+        for name_, each in of.parts:
             kinds[each.kind] += 1
             names[name_] += 1
             # The first delay and the first loss use fixed streams, so that their numbers do not

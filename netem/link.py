@@ -8,10 +8,10 @@ from heapq import heapify, heappop, heappush
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from skytether.netem.fate import Fates
+from skytether.netem.impairments.direction import Impairments
+from skytether.netem.impairments.draws import SLOT_NS, Fate
 from skytether.shared.base.units import HEADER_BYTES, MILLISECOND_NS
-from skytether.shared.core.endpoint import Datagram
-from skytether.shared.scenario.air.draws import SLOT_NS, Fate
-from skytether.shared.scenario.air.path import Path
+from skytether.shared.endpoints.endpoint import Datagram
 from skytether.shared.scenario.registry import load
 from skytether.shared.telemetry.histogram import Histogram
 from skytether.shared.telemetry.record import Recorder
@@ -170,7 +170,7 @@ class Link:
         direction: int,
         mtu: int,
         recorder: Recorder | None,
-        path: Path | None = None,
+        impairments: Impairments | None = None,
         number: int = 0,
         *,
         header_bytes: int = HEADER_BYTES,
@@ -184,18 +184,19 @@ class Link:
         self._bytes = 0
         """UDP payload in the queue [B]."""
         self._entered = 0
-        self.path = path or Path()
-        self._is_ordered = self.path.is_ordered
-        self._bottleneck = _bottleneck(self.path)
+        self.impairments = impairments or Impairments()
+        self._is_ordered = self.impairments.is_ordered
+        self._bottleneck = _bottleneck(self.impairments)
         self.counts = Counts()
 
-    def change(self, path: Path, *, now_ns: int) -> None:
+    def change(self, impairments: Impairments, *, now_ns: int) -> None:
         """Change order and rate; packets at the bottleneck are queued again if they fit."""
         self._pass(now_ns)
-        previous, self.path, self._is_ordered = self.path, path, path.is_ordered
-        if path.queue is previous.queue:
+        previous, self.impairments = self.impairments, impairments
+        self._is_ordered = impairments.is_ordered
+        if impairments.queue is previous.queue:
             return
-        before, self._bottleneck = self._bottleneck, _bottleneck(path)
+        before, self._bottleneck = self._bottleneck, _bottleneck(impairments)
         for waiting in before.drain() if before else ():
             self._wait(waiting.item, now_ns)
 
@@ -387,10 +388,12 @@ class Link:
         }
 
 
-def _bottleneck(path: Path) -> "Bottleneck[Entered] | None":
-    if path.queue is None:
+def _bottleneck(impairments: Impairments) -> "Bottleneck[Entered] | None":
+    if impairments.queue is None:
         return None
-    made: Bottleneck[Entered] = load("skytether.netem.bottleneck", "rate").Bottleneck(path.queue)
+    made: Bottleneck[Entered] = load("skytether.netem.bottleneck", "rate").Bottleneck(
+        impairments.queue
+    )
     return made
 
 

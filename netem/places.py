@@ -21,7 +21,7 @@ from dataclasses import dataclass
 
 from skytether.netem.link import Lane
 from skytether.shared.base.units import SECOND_NS
-from skytether.shared.core.endpoint import Address
+from skytether.shared.endpoints.endpoint import Address
 
 # A vehicle and its server each send a packet at least three times within `link.timeout_s`.
 EXCHANGES = 8
@@ -46,7 +46,7 @@ class Flow:
     used_ns: int
     """Time of the newest packet of the flow, in either direction [ns]."""
     host: str
-    """Host of the client, see `shared.core.endpoint.host_of`."""
+    """Host of the client, see `shared.endpoints.endpoint.host_of`."""
     order: "Order"
     """Flows among which this flow is ordered: `Places._earned` or `Places.others`."""
     laps: int

@@ -18,14 +18,14 @@ from skytether.netem.emulator import Emulator
 from skytether.netem.link import QUEUE_MAX, Lane
 from skytether.netem.places import Flow, Places
 from skytether.shared.base.units import MILLISECOND_NS
-from skytether.shared.core.endpoint import (
+from skytether.shared.endpoints.endpoint import (
     Address,
     Datagram,
     host_of,
     make_datagram,
 )
-from skytether.shared.core.events import FlowOpened, Returned, TooLong, Unreachable
-from skytether.shared.core.ways import FLIGHT, Ways
+from skytether.shared.endpoints.ways import FLIGHT, Ways
+from skytether.shared.events.flight import FlowOpened, Returned, TooLong, Unreachable
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Recorder
 

@@ -17,14 +17,14 @@ from typing import Any
 
 from skytether.netem.emulator import Direction, Emulator
 from skytether.netem.fate import Fates
+from skytether.netem.impairments.direction import Impairments
+from skytether.netem.impairments.draws import SLOT_NS, Fate
 from skytether.netem.link import Lane, Link
 from skytether.shared.base.units import MILLISECOND_NS
-from skytether.shared.core.endpoint import Address, Datagram, make_datagram
-from skytether.shared.core.events import FlowOpened, Unreachable
-from skytether.shared.core.line import CLIENT, PIECE_BYTES, SERVER
-from skytether.shared.core.ways import KEYS, RELAY
-from skytether.shared.scenario.air.draws import SLOT_NS, Fate
-from skytether.shared.scenario.air.path import Path
+from skytether.shared.endpoints.endpoint import Address, Datagram, make_datagram
+from skytether.shared.endpoints.line import CLIENT, PIECE_BYTES, SERVER
+from skytether.shared.endpoints.ways import KEYS, RELAY
+from skytether.shared.events.flight import FlowOpened, Unreachable
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Recorder
 
@@ -159,12 +159,12 @@ class Relay(Emulator):
             if side == SERVER:
                 yield stream.lane, self._streams[CLIENT, number].lane
 
-    def path(self, name: Direction) -> Path:
-        return super().path(name).for_streams()
+    def impairments(self, name: Direction) -> Impairments:
+        return super().impairments(name).for_streams()
 
     def fates(self, name: Direction, flow: int) -> Fates:
         at = self._scenario.seed, name, flow
-        return LosslessFates(self.link(name).path, *at, by_number=True)
+        return LosslessFates(self.link(name).impairments, *at, by_number=True)
 
     def objection(self, scenario: Scenario, keys: frozenset[str]) -> str:  # noqa: ARG002
         return objection(scenario)
@@ -182,8 +182,8 @@ class Relay(Emulator):
 
 def objection(scenario: Scenario) -> str:
     """Why the network of a scenario suits no byte streams, in words; empty if it does."""
-    for key, path in zip(KEYS, (scenario.uplink, scenario.downlink), strict=True):
-        if names := path.only_packets():
+    for key, of in zip(KEYS, (scenario.uplink, scenario.downlink), strict=True):
+        if names := of.only_packets():
             expected = "nothing that acts on packets alone, for TCP is relayed as a stream of bytes"
             what = f"{key}: got {' and '.join(names)}, expected {expected}"
             return f"{what}; under `skytether netem run` its packets pass"

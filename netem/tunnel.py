@@ -1,7 +1,7 @@
 """Tunnel: the network of one program, whose packets of IP pass it both ways.
 
 As for a vehicle, uplink is to the program and downlink is from it. A program that sends alike meets
-the same network in each run, see `shared.scenario.air.draws`.
+the same network in each run, see `netem.impairments.draws`.
 """
 
 from collections import OrderedDict
@@ -12,8 +12,8 @@ from skytether.netem.emulator import Direction, Emulator
 from skytether.netem.fate import Fates
 from skytether.netem.link import Lane
 from skytether.shared.base.packets import OUTSIDE, PROGRAM, flow_of, too_long
-from skytether.shared.core.endpoint import Datagram
-from skytether.shared.core.ways import RUN
+from skytether.shared.endpoints.endpoint import Datagram
+from skytether.shared.endpoints.ways import RUN
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Recorder
 
@@ -81,7 +81,7 @@ class Tunnel(Emulator):
 
     def fates(self, name: Direction, flow: int) -> Fates:
         at = self._scenario.seed, name, flow
-        return Fates(self.link(name).path, *at, by_number=True, is_common=True)
+        return Fates(self.link(name).impairments, *at, by_number=True, is_common=True)
 
     def figures(self) -> dict[str, Any]:
         counts = {"flows": len(self._flows), "refused": self.refused, "header_bytes": 0}

@@ -2,7 +2,7 @@
 
 import sys
 
-from skytether.shell.start import run
+from skytether.shell.commandline.start import run
 
 if __name__ == "__main__":  # called before the slow imports below
     sys.exit(run("skytether.server.__main__:serve", "server"))
@@ -21,20 +21,22 @@ from skytether.server.gate import Gate, PlainGate
 from skytether.server.reception import PATHS
 from skytether.server.schemes import table
 from skytether.shared.base import kernel
-from skytether.shared.core.endpoint import PATH_SOCKETS, Address, Form
-from skytether.shared.core.events import address_text
-from skytether.shared.core.steady import Steady
-from skytether.shared.core.stopwatch import Stopwatch
+from skytether.shared.endpoints.endpoint import PATH_SOCKETS, Address, Form
+from skytether.shared.endpoints.steady import Steady
+from skytether.shared.endpoints.stopwatch import Stopwatch
+from skytether.shared.events.flight import address_text
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import RECORDING, plan_columns, server_columns
 from skytether.shared.wire import keys
 from skytether.shared.wire.keys import Keyring
-from skytether.shell import command, process, system, terminal, workers
-from skytether.shell.argument import Argument
-from skytether.shell.command import CommandError
-from skytether.shell.planning import SHARE, Planners
-from skytether.shell.process import ProcessOptions
-from skytether.shell.udp import AddressError
+from skytether.shell.commandline import command, terminal
+from skytether.shell.commandline.argument import Argument
+from skytether.shell.commandline.command import CommandError
+from skytether.shell.driving.planning import SHARE, Planners
+from skytether.shell.host import system
+from skytether.shell.host.udp import AddressError
+from skytether.shell.processes import process, workers
+from skytether.shell.processes.process import ProcessOptions
 
 
 @dataclass(frozen=True)

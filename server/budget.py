@@ -21,7 +21,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from skytether.server.common.clock import ClockMap
+from skytether.server.planning.clock import ClockMap
 from skytether.server.rate import RateControl
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.law.model import Array, Flags, Indices

@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from skytether.server.common.clock import UNSEEN, ClockMap, Seen, shortest_ns
-from skytether.server.common.desired import Desired
-from skytether.server.common.scheme import (
+from skytether.server.planning.clock import UNSEEN, ClockMap, Seen, shortest_ns
+from skytether.server.planning.desired import Desired
+from skytether.server.planning.scheme import (
     LOSS_CASES,
     Batch,
     Figures,
@@ -26,20 +26,20 @@ from skytether.server.common.scheme import (
     in_turn,
 )
 from skytether.server.schemes import table
-from skytether.shared.base.kernel import B1, I1, kernel
-from skytether.shared.core.stopwatch import Stopwatch
-from skytether.shared.law.model import Array, Flags, Indices
-from skytether.shared.law.terms import Terms
-from skytether.shared.scenario.reference import Reference
-from skytether.shared.scenario.registry import load
-from skytether.shared.scenario.schema import ControlConfig, Scenario
-from skytether.shared.scenario.triggers import (
+from skytether.server.triggers.trigger import (
     Situation,
     SituationArrays,
     Trigger,
     Verdict,
     make_trigger,
 )
+from skytether.shared.base.kernel import B1, I1, kernel
+from skytether.shared.endpoints.stopwatch import Stopwatch
+from skytether.shared.law.model import Array, Flags, Indices
+from skytether.shared.law.terms import Terms
+from skytether.shared.scenario.reference import Reference
+from skytether.shared.scenario.registry import load
+from skytether.shared.scenario.schema import ControlConfig, Scenario
 from skytether.shared.wire.protocol import Idle, Lead, Observation, committed_max
 
 if TYPE_CHECKING:

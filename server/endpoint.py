@@ -11,19 +11,19 @@ from typing import Any
 
 import numpy as np
 
-from skytether.server.common.clock import ClockMap
-from skytether.server.common.scheme import Planning, in_turn
 from skytether.server.controller import Controller
 from skytether.server.gate import Gate, PlainGate
+from skytether.server.planning.clock import ClockMap
+from skytether.server.planning.scheme import Planning, in_turn
 from skytether.server.reception import Reception
 from skytether.server.schemes import table
 from skytether.server.sessions import Session, Sessions
 from skytether.server.tick import Grid, Ticker
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS, seconds_to_ns
-from skytether.shared.core.endpoint import VEHICLES_TOLD_MAX, Datagram, Endpoint, by_name
-from skytether.shared.core.events import Leaving, ReferenceTooFast, SessionEnded
-from skytether.shared.core.stopwatch import Stopwatch
-from skytether.shared.core.time_of_day import TimeOfDay
+from skytether.shared.endpoints.endpoint import VEHICLES_TOLD_MAX, Datagram, Endpoint, by_name
+from skytether.shared.endpoints.stopwatch import Stopwatch
+from skytether.shared.endpoints.time_of_day import TimeOfDay
+from skytether.shared.events.flight import Leaving, ReferenceTooFast, SessionEnded
 from skytether.shared.law.heartbeat import Hearing
 from skytether.shared.scenario.catalogue import keys_of
 from skytether.shared.scenario.owners import InFlight

@@ -5,7 +5,7 @@
 
 from typing import NamedTuple, Protocol
 
-from skytether.shared.core.endpoint import Datagram
+from skytether.shared.endpoints.endpoint import Datagram
 
 
 class ReplyPath(Protocol):

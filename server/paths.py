@@ -12,9 +12,9 @@ from skytether.server.gate import ReplyPath
 from skytether.server.sessions import Session
 from skytether.server.ways import Ways
 from skytether.shared.base.units import SECOND_NS
-from skytether.shared.core.endpoint import Address, Datagram, Events
-from skytether.shared.core.events import address_text
-from skytether.shared.core.path_events import PathDied, PathHealed
+from skytether.shared.endpoints.endpoint import Address, Datagram, Events
+from skytether.shared.events.flight import address_text
+from skytether.shared.events.paths import PathDied, PathHealed
 from skytether.shared.wire.drop import Drop, ProtocolError
 from skytether.shared.wire.framing import Report
 from skytether.shared.wire.paths import Paths

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from skytether.shared.base.kernel import F4, R2, kernel, part, record, records, shared
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
-from skytether.shared.core.time_of_day import DRIFT
+from skytether.shared.endpoints.time_of_day import DRIFT
 from skytether.shared.law import leap
 from skytether.shared.law.leap import NOISE_M, NOISE_MPS
 from skytether.shared.law.terms import Terms
@@ -42,9 +42,9 @@ class Statement:
     since: int
     """First step flown with the horizon in force."""
     forward: int
-    """F of `server.common.clock` [ns]."""
+    """F of `server.planning.clock` [ns]."""
     backward: int
-    """G of `server.common.clock` [ns]."""
+    """G of `server.planning.clock` [ns]."""
     count: int
     """Number of consistent rejected observations in a row, this one included; 0 if accepted."""
 

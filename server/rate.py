@@ -2,8 +2,8 @@
 
 A shared radio channel carries a limited number of bytes a second; further bytes have to queue.
 Every echo reports the delay G of a packet; its excess over the vehicle's smallest G in 20 s
-(`server.common.clock`) is jitter and queue. A standing queue delays all packets, jitter only some.
-With the low quantile Q and the median M of this excess over an epoch,
+(`server.planning.clock`) is jitter and queue. A standing queue delays all packets, jitter only
+some. With the low quantile Q and the median M of this excess over an epoch,
 
     q = Q - min Q of the last BASE epochs        queueing delay
     s = TARGET_S + M - Q                         largest delay not certainly due to a queue
@@ -27,7 +27,7 @@ from collections import deque
 
 import numpy as np
 
-from skytether.server.common.clock import UNSEEN, ClockMap
+from skytether.server.planning.clock import UNSEEN, ClockMap
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.law.model import Array, Indices
 

@@ -7,16 +7,18 @@ counted by reason.
 
 from collections import Counter, deque
 
-from skytether.server.common.clock import ClockMap, Contradiction
 from skytether.server.controller import Controller
 from skytether.server.gate import Gate, GateCall
+from skytether.server.planning.clock import ClockMap, Contradiction
 from skytether.server.plausibility import ANEW, BELIEVED, Belief, Plausibility
 from skytether.server.sessions import Session, Sessions
 from skytether.server.tick import Grid
 from skytether.server.ways import Ways
 from skytether.shared.base.units import MICROSECOND_NS, SECOND_NS, seconds_to_ns
-from skytether.shared.core.endpoint import Address, Datagram, Events
-from skytether.shared.core.events import (
+from skytether.shared.endpoints.endpoint import Address, Datagram, Events
+from skytether.shared.endpoints.stopwatch import Stopwatch
+from skytether.shared.endpoints.time_of_day import DRIFT, TimeOfDay
+from skytether.shared.events.flight import (
     BegunAnew,
     CannotResume,
     ClockContradicted,
@@ -30,8 +32,6 @@ from skytether.shared.core.events import (
     Unauthenticated,
     address_text,
 )
-from skytether.shared.core.stopwatch import Stopwatch
-from skytether.shared.core.time_of_day import DRIFT, TimeOfDay
 from skytether.shared.law.terms import Limits, Terms
 from skytether.shared.scenario.catalogue import differences
 from skytether.shared.scenario.registry import load

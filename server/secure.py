@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 from skytether.server.gate import GateCall
 from skytether.shared.base.units import SECOND_NS
-from skytether.shared.core.endpoint import Address, Datagram, Form
+from skytether.shared.endpoints.endpoint import Address, Datagram, Form
 from skytether.shared.wire import channel, handshake
 from skytether.shared.wire.channel import OVERHEAD_BYTES, VERSION, Channel, kind
 from skytether.shared.wire.drop import Drop, ProtocolError

@@ -18,7 +18,7 @@ import numpy as np
 from skytether.server.gate import ReplyPath
 from skytether.server.ways import Way, Ways
 from skytether.shared.base.units import SECOND_NS
-from skytether.shared.core.endpoint import Address, Datagram
+from skytether.shared.endpoints.endpoint import Address, Datagram
 from skytether.shared.law.heartbeat import NUMBERS, SESSION_NS, Hearing
 from skytether.shared.law.model import Indices
 from skytether.shared.law.terms import Limits

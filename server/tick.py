@@ -8,23 +8,22 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from skytether.server.common.clock import ClockMap
-from skytether.server.common.scheme import Batch, Header, make_header
 from skytether.server.controller import BLOCK, Controller, Decisions
+from skytether.server.planning.clock import ClockMap
+from skytether.server.planning.scheme import Batch, Header, make_header
 from skytether.server.sessions import Session, Sessions
 from skytether.shared.base.units import HEADER_BYTES, MILLISECOND_NS, SECOND_NS
-from skytether.shared.core.endpoint import Datagram, Events
-from skytether.shared.core.events import (
+from skytether.shared.endpoints.endpoint import Datagram, Events
+from skytether.shared.endpoints.stopwatch import Stopwatch
+from skytether.shared.events.flight import (
     Degraded,
     Fault,
     PlanningResumed,
     PlanningStopped,
 )
-from skytether.shared.core.stopwatch import Stopwatch
 from skytether.shared.law.model import Array
-from skytether.shared.scenario.triggers import Compared
 from skytether.shared.telemetry.histogram import Histogram
-from skytether.shared.telemetry.record import Recorder
+from skytether.shared.telemetry.record import Compared, Recorder
 from skytether.shared.wire.protocol import Heartbeat, Idle, encode, led, stamp_us
 
 MISSES_MAX = 5

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
 from skytether.server.gate import ReplyPath
-from skytether.shared.core.endpoint import Datagram, Events
+from skytether.shared.endpoints.endpoint import Datagram, Events
 from skytether.shared.wire.drop import Drop, ProtocolError
 from skytether.shared.wire.framing import Report
 from skytether.shared.wire.protocol import Message

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from skytether.library.flying import check, fly, fly_batch, load
     from skytether.library.sweeping import Swept, sweep
     from skytether.shared.base.errors import ConfigError, FlightError, RecordingError
-    from skytether.shared.core.endpoint import Datagram, Endpoint
+    from skytether.shared.endpoints.endpoint import Datagram, Endpoint
     from skytether.shared.scenario.schema import Scenario
     from skytether.shared.telemetry.summary import Summary
     from skytether.sim.world import World
@@ -53,7 +53,7 @@ _HOMES = {
     "skytether.library.flying": ("check", "fly", "fly_batch", "load"),
     "skytether.library.sweeping": ("Swept", "sweep"),
     "skytether.shared.base.errors": ("ConfigError", "FlightError", "RecordingError"),
-    "skytether.shared.core.endpoint": ("Datagram", "Endpoint"),
+    "skytether.shared.endpoints.endpoint": ("Datagram", "Endpoint"),
     "skytether.shared.scenario.schema": ("Scenario",),
     "skytether.shared.telemetry.summary": ("Summary",),
     "skytether.sim.world": ("World",),

@@ -4,12 +4,12 @@ import sys
 from collections.abc import Sequence
 
 from skytether.cli.commands import COMMANDS, usage
-from skytether.shell import start
+from skytether.shell.commandline import start
 
 
 def list_scenarios(argv: Sequence[str]) -> None:
     from skytether.shared.scenario import reading
-    from skytether.shell.command import CommandError
+    from skytether.shell.commandline.command import CommandError
 
     match argv:
         case ["-h" | "--help", *_]:
@@ -36,7 +36,7 @@ def introduce(argv: Sequence[str]) -> None:
     from importlib import metadata
 
     from skytether.shared.base.hint import hint
-    from skytether.shell.command import CONFIGURATION, CommandError
+    from skytether.shell.commandline.command import CONFIGURATION, CommandError
 
     match argv:
         case [] | ["-h" | "--help", *_]:

@@ -7,13 +7,14 @@ docs/vehicles.md vehicles, docs/network.md impairments. A scheme also imports
 
 from skytether.client.vehicle import Measurement, Vehicle
 from skytether.client.vehicles import vehicle
-from skytether.shared.scenario.air.draws import Draws, Fate
-from skytether.shared.scenario.air.impairment import Impairment, Share, Time, impairment
+from skytether.netem.impairments.draws import Draws, Fate
+from skytether.netem.impairments.impairment import Impairment, Share, Time, impairment
+from skytether.server.triggers.trigger import Situation, Trigger, Verdict, above, trigger
 from skytether.shared.scenario.planners import Planner, Problem, planner
 from skytether.shared.scenario.reference import Reference
 from skytether.shared.scenario.schema import ControlConfig, Scenario
 from skytether.shared.scenario.trajectories import reference
-from skytether.shared.scenario.triggers import Compared, Situation, Trigger, Verdict, above, trigger
+from skytether.shared.telemetry.record import Compared
 
 __all__ = [
     "Compared",

@@ -4,8 +4,8 @@ A module of their own, because they import the server's packages, which no other
 docs/schemes.md has such a plug-in.
 """
 
-from skytether.server.common.scheme import Batch, Fleet, Foresight, Header, Scheme, SentPlans
-from skytether.server.common.splines import SplineScheme
+from skytether.server.planning.scheme import Batch, Fleet, Foresight, Header, Scheme, SentPlans
+from skytether.server.planning.splines import SplineScheme
 from skytether.server.schemes.horizons import InputScheme
 from skytether.shared.law.model import Flags, Indices
 from skytether.shared.scenario.schemes import SchemeProperties, scheme

@@ -18,9 +18,9 @@ from skytether.client.memory import SavedState, recall
 from skytether.mavlink.codec import Codec, Message
 from skytether.netem.proxy import Proxy
 from skytether.server.endpoint import Server
-from skytether.shared.core.change import Running
-from skytether.shared.core.endpoint import Datagram, Endpoint
-from skytether.shared.core.events import Event, ModeChanged
+from skytether.shared.endpoints.change import Running
+from skytether.shared.endpoints.endpoint import Datagram, Endpoint
+from skytether.shared.events.flight import Event, ModeChanged
 from skytether.shared.scenario.reading import check
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import TRUTH_COLUMNS, Recorder, Rows, client_columns, parse

@@ -19,9 +19,9 @@ from skytether.mavlink.codec import Codec, Message
 from skytether.mavlink.dialect import dialect
 from skytether.mavlink.text import chunks
 from skytether.shared.base.units import MILLISECOND_NS
-from skytether.shared.core.aboard import AutopilotMode
-from skytether.shared.core.endpoint import Address, Datagram, Endpoint
-from skytether.shared.core.events import Flying
+from skytether.shared.endpoints.endpoint import Address, Datagram, Endpoint
+from skytether.shared.events.aboard import AutopilotMode
+from skytether.shared.events.flight import Flying
 from skytether.shared.scenario import reading
 from skytether.shared.telemetry.record import parse
 from skytether.shared.wire.protocol import Mode

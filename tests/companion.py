@@ -13,7 +13,7 @@ from skytether.mavlink.codec import Codec, Message
 from skytether.mavlink.dialect import dialect
 from skytether.mavlink.frames import turned
 from skytether.mavlink.text import Texts
-from skytether.shared.core.endpoint import Datagram
+from skytether.shared.endpoints.endpoint import Datagram
 from skytether.shared.scenario.reading import check
 
 VELOCITY_ONLY = 0b110111000111

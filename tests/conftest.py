@@ -19,7 +19,7 @@ import pytest
 
 from skytether.shared.base import kernel
 from skytether.shared.scenario.registry import TABLES
-from skytether.shell import plugins
+from skytether.shell.commandline import plugins
 
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     # A shell's background job ignores SIGINT, and so would every command that a test starts.

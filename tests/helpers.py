@@ -16,13 +16,13 @@ import pytest
 from skytether.__main__ import main
 from skytether.shared.base import kernel
 from skytether.shared.base.errors import ConfigError
-from skytether.shared.core.endpoint import Address, Datagram, Endpoint
-from skytether.shared.core.events import Fault
+from skytether.shared.endpoints.endpoint import Address, Datagram, Endpoint
+from skytether.shared.events.flight import Fault
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.dotted import set_keys
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Record
-from skytether.shell.driver import Shell
+from skytether.shell.driving.driver import Shell
 
 LOOPBACK: Address = ("127.0.0.1", 0)
 SKYTETHER = (sys.executable, "-P", "-m", "skytether")

@@ -9,11 +9,11 @@ from typing import NamedTuple
 
 from skytether.client.failsafe import TABLE, Failsafe
 from skytether.netem.fate import Fates
+from skytether.netem.impairments.direction import impairments
+from skytether.netem.impairments.draws import SLOT_NS
 from skytether.server.sessions import Session
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS, seconds_to_ns
 from skytether.shared.law.heartbeat import NUMBERS, Hearing
-from skytether.shared.scenario.air.draws import SLOT_NS
-from skytether.shared.scenario.air.path import path
 from skytether.shared.scenario.schema import LinkConfig
 
 STEP_NS = 50 * MILLISECOND_NS
@@ -42,7 +42,7 @@ def keep(network: str, sessions: int, link: LinkConfig | None = None) -> Alive:
 def _session(network: str, link: LinkConfig, seed: int) -> tuple[int, float, int]:
     """False losses of a session, time to detect its end [s], and packets of the vehicle."""
     timeout_ns, end_ns = seconds_to_ns(link.timeout_s), SESSION_S * SECOND_NS
-    up, down = (Fates(path(network), seed, name, 0) for name in ("uplink", "downlink"))
+    up, down = (Fates(impairments(network), seed, name, 0) for name in ("uplink", "downlink"))
     ear = Hearing(timeout_ns, STEP_NS, link.fixed_ns)
     failsafe = Failsafe(
         TABLE,

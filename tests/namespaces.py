@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from skytether.shell.inside import ADMIN
+from skytether.shell.driving.inside import ADMIN
 
 
 @cache

@@ -24,8 +24,8 @@ from skytether.netem.proxy import Proxy
 from skytether.ros2 import graph, messages
 from skytether.ros2.graph import Node
 from skytether.server.endpoint import Server
-from skytether.shared.core.endpoint import Datagram, Endpoint
-from skytether.shared.core.events import Event
+from skytether.shared.endpoints.endpoint import Datagram, Endpoint
+from skytether.shared.events.flight import Event
 from skytether.shared.scenario.reading import check
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Recorder, Rows, client_columns, parse

@@ -6,14 +6,14 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from skytether.server.common.clock import ClockMap
-from skytether.server.common.desired import Desired
-from skytether.server.common.scheme import Fleet
 from skytether.server.missions.mission_planner import MissionPlanner
 from skytether.server.missions.mission_state import MissionState
 from skytether.server.missions.vehicle_motions import SentMotion
+from skytether.server.planning.clock import ClockMap
+from skytether.server.planning.desired import Desired
+from skytether.server.planning.scheme import Fleet
 from skytether.shared.base.units import SECOND_NS
-from skytether.shared.core.stopwatch import Stopwatch
+from skytether.shared.endpoints.stopwatch import Stopwatch
 from skytether.shared.law.motion import SPACING, Motion, resting
 from skytether.shared.missions.mission import Mission, swap
 from skytether.shared.missions.zones import Zones

@@ -17,8 +17,9 @@ from typing import Any
 import pytest
 
 from skytether.shared.base.units import SECOND_NS
-from skytether.shell import driver, timer
-from skytether.shell.batch import DatagramBatch
+from skytether.shell.driving import driver
+from skytether.shell.host import timer
+from skytether.shell.host.batch import DatagramBatch
 
 DELIVERY_S = 0.001
 """Real time for the kernel to deliver what was sent, before the clock jumps [s]."""

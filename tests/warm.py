@@ -22,8 +22,8 @@ import msgspec
 
 from helpers import PATIENCE_S
 from skytether.__main__ import main
-from skytether.shared.core.events import Event, address_text
-from skytether.shell.log import LogLine
+from skytether.shared.events.flight import Event, address_text
+from skytether.shell.processes.log import LogLine
 
 FORK = multiprocessing.get_context("forkserver")
 FORK.set_forkserver_preload(

@@ -8,7 +8,7 @@ import skytether.server.__main__
 import skytether.sim.flight  # noqa: F401 - they are the kernels of flights
 from skytether.server.schemes import table
 from skytether.shared.base import kernel
-from skytether.shell import terminal
+from skytether.shell.commandline import terminal
 
 table.load_all()
 kernel.check_types()

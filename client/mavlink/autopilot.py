@@ -31,9 +31,9 @@ from skytether.client.vehicle import VehicleMemory
 from skytether.mavlink.codec import Message
 from skytether.mavlink.dialect import dialect
 from skytether.shared.base.units import seconds_to_ns
-from skytether.shared.core.aboard import AutopilotMode, AutopilotRefused, NotTakenOff
-from skytether.shared.core.endpoint import Events
-from skytether.shared.core.events import Failure
+from skytether.shared.endpoints.endpoint import Events
+from skytether.shared.events.aboard import AutopilotMode, AutopilotRefused, NotTakenOff
+from skytether.shared.events.flight import Failure
 from skytether.shared.scenario.schema import Scenario
 
 WARNING = int(dialect.MAV_SEVERITY_WARNING)

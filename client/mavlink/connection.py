@@ -11,10 +11,10 @@ from typing import NamedTuple
 
 from skytether.mavlink.codec import Codec, Message
 from skytether.mavlink.dialect import dialect
-from skytether.shared.core.aboard import AutopilotElsewhere, AutopilotMoved
-from skytether.shared.core.endpoint import Address, Datagram, Events
-from skytether.shared.core.events import address_text
-from skytether.shared.core.line import Line
+from skytether.shared.endpoints.endpoint import Address, Datagram, Events
+from skytether.shared.endpoints.line import Line
+from skytether.shared.events.aboard import AutopilotElsewhere, AutopilotMoved
+from skytether.shared.events.flight import address_text
 from skytether.shared.scenario.schema import Scenario
 
 ADDRESSES_REPORTED = 4

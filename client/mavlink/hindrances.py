@@ -10,9 +10,9 @@ from skytether.client.mavlink.rivals import Rivals
 from skytether.client.mavlink.texts import SAME_TEXT_NS
 from skytether.client.positions import Positions, Vector
 from skytether.shared.base.units import MILLISECOND_NS, seconds_to_ns
-from skytether.shared.core.aboard import PositionsDropped, SecondCommander, Strays
-from skytether.shared.core.endpoint import Events
-from skytether.shared.core.events import VehicleEvent
+from skytether.shared.endpoints.endpoint import Events
+from skytether.shared.events.aboard import PositionsDropped, SecondCommander, Strays
+from skytether.shared.events.flight import VehicleEvent
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Reason
 

@@ -21,13 +21,13 @@ from skytether.client.positions import Positions
 from skytether.mavlink.codec import Message
 from skytether.mavlink.dialect import dialect
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
-from skytether.shared.core.aboard import (
+from skytether.shared.endpoints.endpoint import Events
+from skytether.shared.events.aboard import (
     ArmingAwaited,
     AutopilotRefused,
     NotTakenOff,
     OriginAwaited,
 )
-from skytether.shared.core.endpoint import Events
 
 AGAIN_NS = SECOND_NS
 STREAM_NS = 500 * MILLISECOND_NS

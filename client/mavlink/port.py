@@ -18,8 +18,8 @@ from skytether.client.positions import Vector
 from skytether.mavlink.codec import Message
 from skytether.mavlink.dialect import dialect
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS, seconds_to_ns
-from skytether.shared.core.endpoint import Datagram, Endpoint, by_name
-from skytether.shared.core.line import Line
+from skytether.shared.endpoints.endpoint import Datagram, Endpoint, by_name
+from skytether.shared.endpoints.line import Line
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Reason
 

@@ -12,7 +12,7 @@ import math
 from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
-from skytether.shared.core.aboard import AutopilotParameter
+from skytether.shared.events.aboard import AutopilotParameter
 from skytether.shared.law.model import ALTITUDE
 from skytether.shared.scenario.schema import Scenario
 

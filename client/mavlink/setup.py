@@ -16,14 +16,14 @@ from skytether.mavlink import parameters
 from skytether.mavlink.codec import Message
 from skytether.mavlink.dialect import dialect
 from skytether.shared.base.units import MILLISECOND_NS
-from skytether.shared.core.aboard import (
+from skytether.shared.endpoints.endpoint import Events
+from skytether.shared.events.aboard import (
     AutopilotFound,
     AutopilotParameter,
     ParametersRead,
     ParametersSet,
     ParametersUnsafe,
 )
-from skytether.shared.core.endpoint import Events
 
 AGAIN_NS = 400 * MILLISECOND_NS
 TRIES = 10

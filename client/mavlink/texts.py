@@ -3,8 +3,8 @@
 from skytether.mavlink.codec import Message
 from skytether.mavlink.text import Texts
 from skytether.shared.base.units import SECOND_NS
-from skytether.shared.core.aboard import AutopilotText, TextsOmitted
-from skytether.shared.core.endpoint import Events
+from skytether.shared.endpoints.endpoint import Events
+from skytether.shared.events.aboard import AutopilotText, TextsOmitted
 
 SAME_TEXT_NS = 30 * SECOND_NS
 """Time for which a text is not logged again."""

@@ -6,8 +6,8 @@ from skytether.client.clock import BootClock
 from skytether.mavlink.codec import Message
 from skytether.mavlink.dialect import dialect
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
-from skytether.shared.core.aboard import ClockSilent
-from skytether.shared.core.endpoint import Events
+from skytether.shared.endpoints.endpoint import Events
+from skytether.shared.events.aboard import ClockSilent
 
 BEGIN_NS, INTERVAL_NS = 100 * MILLISECOND_NS, SECOND_NS
 """Interval between questions before the clock is known, and after."""

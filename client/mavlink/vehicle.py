@@ -8,8 +8,8 @@ from skytether.client.mavlink.port import Port
 from skytether.client.mavlink.positions import given_origin
 from skytether.client.vehicle import Measurement, Vehicle, VehicleMemory
 from skytether.shared.base.errors import ConfigError
-from skytether.shared.core.events import Failure
-from skytether.shared.core.line import parse_line
+from skytether.shared.endpoints.line import parse_line
+from skytether.shared.events.flight import Failure
 from skytether.shared.law.model import Array
 from skytether.shared.scenario.catalogue import keys_of
 from skytether.shared.scenario.owners import InFlight

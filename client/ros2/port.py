@@ -20,9 +20,9 @@ from skytether.client.ros2.odometry import OdometryFilter
 from skytether.ros2 import messages
 from skytether.ros2.graph import PUBLISHER, SUBSCRIBER, TOKENS, Entity, Node, Topic, entity_of
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS, seconds_to_ns
-from skytether.shared.core.aboard import OdometryDropped, SecondPublisher
-from skytether.shared.core.endpoint import Datagram, Endpoint, by_name
-from skytether.shared.core.line import Line
+from skytether.shared.endpoints.endpoint import Datagram, Endpoint, by_name
+from skytether.shared.endpoints.line import Line
+from skytether.shared.events.aboard import OdometryDropped, SecondPublisher
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Reason
 

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from skytether.client.ros2.port import Port
 from skytether.client.vehicle import Measurement, Vehicle, VehicleMemory
 from skytether.shared.base.errors import ConfigError
-from skytether.shared.core.line import parse_line
+from skytether.shared.endpoints.line import parse_line
 from skytether.shared.law.model import Array
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Reason

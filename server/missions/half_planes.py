@@ -8,7 +8,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from skytether.server.common.clock import EXACT, StepError
 from skytether.server.missions.compiled_motion import MotionMetric, position_at
 from skytether.server.missions.possible_motions import (
     KNOTS,
@@ -21,8 +20,9 @@ from skytether.server.missions.possible_motions import (
     moving_shifts,
     shifts,
 )
+from skytether.server.planning.clock import EXACT, StepError
 from skytether.shared.base.kernel import F1, F2, I1, making_kernel, part
-from skytether.shared.core.time_of_day import DRIFT
+from skytether.shared.endpoints.time_of_day import DRIFT
 from skytether.shared.law.model import ALTITUDE, Array, Flags
 from skytether.shared.law.motion import SAMPLES, SPACING, Motion
 

@@ -35,8 +35,6 @@ from typing import Any
 
 import numpy as np
 
-from skytether.server.common.scheme import FIGURES, Fleet, Foresight
-from skytether.server.common.splines import SplineScheme
 from skytether.server.missions import yielding
 from skytether.server.missions.compiled_motion import pieces_of, states
 from skytether.server.missions.half_planes import HalfPlanes, half_planes
@@ -48,6 +46,8 @@ from skytether.server.missions.vehicle_motions import VehicleMotions
 from skytether.server.missions.waypoints import DETOUR_S, TURN_BACK, Waypoints
 from skytether.server.missions.yielding import YIELD_S, Yielding
 from skytether.server.missions.zone_clearance import comes_near
+from skytether.server.planning.scheme import FIGURES, Fleet, Foresight
+from skytether.server.planning.splines import SplineScheme
 from skytether.shared.base.chance import stream
 from skytether.shared.law.model import ALTITUDE, Array, Flags, Indices
 from skytether.shared.law.motion import INTERVALS, SPACING, Motion

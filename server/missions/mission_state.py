@@ -11,12 +11,12 @@ from typing import NamedTuple, Self
 
 import numpy as np
 
-from skytether.server.common.clock import ClockMap, StepError
 from skytether.server.missions.led_vehicles import LedVehicles
 from skytether.server.missions.possible_motions import NEVER, PossibleMotion, PossibleMotions
 from skytether.server.missions.vehicle_motions import SentMotion, VehicleMotions, repeats_after
+from skytether.server.planning.clock import ClockMap, StepError
 from skytether.shared.base.kernel import B1, F1, I1, kernel
-from skytether.shared.core.events import Event
+from skytether.shared.events.flight import Event
 from skytether.shared.law.model import ALTITUDE, Array, Indices
 from skytether.shared.law.motion import INTERVALS, JOIN_MAX, SPACING, Motion, resting
 from skytether.shared.law.terms import Terms

@@ -3,10 +3,10 @@
 from collections.abc import Callable
 
 from skytether.server import missions
-from skytether.server.common import splines
-from skytether.server.common.scheme import Fleet, Scheme
 from skytether.server.missions.mission_planner import MissionPlanner
 from skytether.server.missions.mission_state import MissionState
+from skytether.server.planning import splines
+from skytether.server.planning.scheme import Fleet, Scheme
 from skytether.shared.missions.mission import Guided, parse_goals
 from skytether.shared.scenario.reference import Reference
 from skytether.shared.scenario.schema import Scenario

@@ -16,8 +16,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from skytether.server.common.clock import EXACT, StepError
 from skytether.server.missions.compiled_motion import MotionMetric, bounding_box, last_step
+from skytether.server.planning.clock import EXACT, StepError
 from skytether.shared.base.kernel import F1, F2, F3, I1, kernel, making_kernel, making_part, part
 from skytether.shared.law.model import Array, Indices
 from skytether.shared.law.motion import INTERVALS, JOIN_MAX, Motion

@@ -24,7 +24,7 @@ from skytether.server.missions.possible_motions import (
     shifts,
 )
 from skytether.shared.base.kernel import B1, F2, making_kernel, making_part, part
-from skytether.shared.core.time_of_day import DRIFT
+from skytether.shared.endpoints.time_of_day import DRIFT
 from skytether.shared.law.model import ALTITUDE, Flags
 from skytether.shared.law.motion import SAMPLES, SPACING, Motion
 

@@ -4,9 +4,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from skytether.server.common.compiled import advance, axis_at
-from skytether.server.common.scheme import Foresight, PlanFigures
 from skytether.server.mpc.problem import MPC, Inputs, add_cost
+from skytether.server.planning.compiled import advance, axis_at
+from skytether.server.planning.scheme import Foresight, PlanFigures
 from skytether.shared.base.kernel import B1, F1, F3, I1, S4, inline, lanes
 
 GENERATOR, TRACKER = 0, 1

@@ -14,8 +14,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from skytether.server.common.desired import Desired, Window
-from skytether.server.common.scheme import FIGURES, Figures, Foresight
 from skytether.server.mpc.appraisal import (
     GENERATOR,
     TRACKER,
@@ -48,8 +46,10 @@ from skytether.server.mpc.problem import (
 )
 from skytether.server.mpc.riccati import RiccatiWorkspace, active_sets
 from skytether.server.mpc.solver import Solver
+from skytether.server.planning.desired import Desired, Window
+from skytether.server.planning.scheme import FIGURES, Figures, Foresight
 from skytether.shared.base.kernel import B1, F1, F3, I1, kernel, part
-from skytether.shared.core.stopwatch import Stopwatch
+from skytether.shared.endpoints.stopwatch import Stopwatch
 from skytether.shared.law.model import Flags, Indices
 from skytether.shared.law.terms import Terms
 from skytether.shared.scenario.schema import ControlConfig

@@ -10,7 +10,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from skytether.server.common.compiled import advance, axis_at
 from skytether.server.mpc.problem import (
     FIRST,
     MPC,
@@ -23,6 +22,7 @@ from skytether.server.mpc.problem import (
     simd_batch,
 )
 from skytether.server.mpc.riccati import RiccatiWorkspace, active_sets, workspace
+from skytether.server.planning.compiled import advance, axis_at
 from skytether.shared.base.kernel import B1, F3, I1, part
 from skytether.shared.law.terms import Terms
 from skytether.shared.scenario.schema import ControlConfig

@@ -2,7 +2,7 @@
 
 A planner that raises, takes too long, or returns what cannot be flown makes no plan for its vehicle
 at that step: the vehicle flies its present plan to the end, and then its failsafe acts. What takes
-too long is decided by the caller of planners (`server.common.scheme.Planning`): a core has no
+too long is decided by the caller of planners (`server.planning.scheme.Planning`): a core has no
 clock.
 
 A planner optimises a cost that nobody else knows. So its plan counts as the optimum, and the cost
@@ -20,9 +20,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from skytether.server.common.scheme import Fleet
 from skytether.server.mpc.appraisal import GENERATOR, TRACKER
 from skytether.server.mpc.hierarchical import PlanBatch, Planner, conclude_given, start_plans
+from skytether.server.planning.scheme import Fleet
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.law.model import Array, Flags, Indices
 from skytether.shared.scenario.planners import Problem

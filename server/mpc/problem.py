@@ -21,7 +21,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from skytether.server.common.compiled import Axes, advance, axes_of, axis_at
+from skytether.server.planning.compiled import Axes, advance, axes_of, axis_at
 from skytether.shared.base.kernel import F1, F2, F3, S1, inline, lanes, part, shared
 from skytether.shared.law.model import Array, Axis, Model
 from skytether.shared.law.terms import Terms

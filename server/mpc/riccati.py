@@ -17,9 +17,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from skytether.server.common.compiled import advance, axis_at
 from skytether.server.mpc.problem import MPC, WIDTH, SimdBatch, simd_memory
 from skytether.server.mpc.solver import NEAR
+from skytether.server.planning.compiled import advance, axis_at
 from skytether.shared.base.kernel import B1, F1, F2, F3, F4, inline, kernel, lanes, part
 from skytether.shared.law.model import Axis
 

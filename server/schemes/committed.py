@@ -28,10 +28,10 @@ from collections import Counter
 
 import numpy as np
 
-from skytether.server.common.clock import ClockMap, Seen
-from skytether.server.common.compiled import lasting, laws_of
-from skytether.server.common.scheme import Fleet, Foresight
 from skytether.server.mpc import exact, hierarchical, riccati
+from skytether.server.planning.clock import ClockMap, Seen
+from skytether.server.planning.compiled import lasting, laws_of
+from skytether.server.planning.scheme import Fleet, Foresight
 from skytether.server.schemes import horizons, sent_horizons
 from skytether.server.schemes import sent as tracker
 from skytether.server.schemes.disturbance import FOLLOW_S, observe_disturbance

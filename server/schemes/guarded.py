@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from skytether.server.common.scheme import (
+from skytether.server.planning.scheme import (
     Batch,
     Figures,
     Fleet,

@@ -10,9 +10,9 @@ from typing import Protocol
 
 import numpy as np
 
-from skytether.server.common.scheme import Batch, Fleet, Foresight, Header, Scheme, SentPlans
 from skytether.server.mpc.hierarchical import Planner
 from skytether.server.mpc.plugin_planners import InputPlanner
+from skytether.server.planning.scheme import Batch, Fleet, Foresight, Header, Scheme, SentPlans
 from skytether.shared.base.kernel import I1, I2, S1, S3, kernel
 from skytether.shared.law.model import Flags, Indices
 from skytether.shared.scenario.planners import MPC

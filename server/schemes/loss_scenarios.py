@@ -4,7 +4,7 @@ In case j exactly the newest j + 1 horizons are lost; the last case also stands 
 Losses are assumed independent, with the loss rate of recent horizons.
 """
 
-from skytether.server.common.scheme import Foresight
+from skytether.server.planning.scheme import Foresight
 from skytether.server.schemes.replay import (
     FlownTrack,
     HorizonSchedule,

@@ -11,7 +11,7 @@ record of the flown inputs.
 
 import numpy as np
 
-from skytether.server.common.compiled import bounded
+from skytether.server.planning.compiled import bounded
 from skytether.shared.base.kernel import inline
 from skytether.shared.law.terms import Terms
 from skytether.shared.scenario.schema import ControlConfig

@@ -2,9 +2,9 @@
 
 from types import ModuleType
 
-from skytether.server.common import splines
-from skytether.server.common.scheme import Fleet, Scheme
-from skytether.server.common.splines import SplineScheme
+from skytether.server.planning import splines
+from skytether.server.planning.scheme import Fleet, Scheme
+from skytether.server.planning.splines import SplineScheme
 from skytether.server.schemes import horizons
 from skytether.server.schemes.guarded import GuardedScheme
 from skytether.server.schemes.horizons import InputScheme

@@ -17,9 +17,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from skytether.server.common.compiled import Laws, advance, laws_of
-from skytether.server.common.scheme import Fleet, Foresight
 from skytether.server.mpc import exact, hierarchical, riccati
+from skytether.server.planning.compiled import Laws, advance, laws_of
+from skytether.server.planning.scheme import Fleet, Foresight
 from skytether.server.schemes import horizons
 from skytether.server.schemes.horizons import HorizonScheme
 from skytether.server.schemes.observer import decay_of, updated_disturbance

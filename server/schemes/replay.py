@@ -10,7 +10,7 @@ The scheme "committed", its disturbance observer and its loss scenarios use it.
 
 from typing import NamedTuple
 
-from skytether.server.common.compiled import advance, axis_of, reference_at, step
+from skytether.server.planning.compiled import advance, axis_of, reference_at, step
 from skytether.server.schemes.sent import HOVERS, Sent
 from skytether.server.schemes.sent_horizons import ReplayMemory, ReplaySettings
 from skytether.shared.base.kernel import F1, F2, I1, inline, part

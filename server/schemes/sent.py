@@ -11,7 +11,7 @@ from typing import Annotated, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from skytether.server.common.clock import Seen, half_trip_ns, shortest_ns
+from skytether.server.planning.clock import Seen, half_trip_ns, shortest_ns
 from skytether.server.schemes import delay_bound as delay
 from skytether.server.schemes.delay_bound import (
     DelayBound,

@@ -8,8 +8,8 @@ from typing import Annotated, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from skytether.server.common.compiled import Laws, bounded, lasting
-from skytether.server.common.scheme import Foresight
+from skytether.server.planning.compiled import Laws, bounded, lasting
+from skytether.server.planning.scheme import Foresight
 from skytether.server.schemes import sent as tracker
 from skytether.server.schemes.sent import Sent
 from skytether.shared.base.kernel import B1, I1, R1, R2, S4, kernel, part, record, records

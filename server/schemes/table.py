@@ -15,7 +15,7 @@ from importlib import import_module
 from types import ModuleType
 from typing import Any
 
-from skytether.server.common.scheme import Fleet, Scheme
+from skytether.server.planning.scheme import Fleet, Scheme
 from skytether.shared.base.kernel import KERNELS
 from skytether.shared.scenario import schemes
 from skytether.shared.scenario.reference import Reference

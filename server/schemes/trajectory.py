@@ -38,13 +38,13 @@ from typing import TYPE_CHECKING, Annotated, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from skytether.server.common import splines
-from skytether.server.common.clock import Seen
-from skytether.server.common.desired import Window
-from skytether.server.common.scheme import Figures, Fleet, Foresight, Splines
-from skytether.server.common.splines import SplineScheme
 from skytether.server.mpc import riccati
 from skytether.server.mpc.nominal import Nominal, make_nominal, plan_nominal
+from skytether.server.planning import splines
+from skytether.server.planning.clock import Seen
+from skytether.server.planning.desired import Window
+from skytether.server.planning.scheme import Figures, Fleet, Foresight, Splines
+from skytether.server.planning.splines import SplineScheme
 from skytether.server.schemes import knots
 from skytether.server.schemes import sent as tracker
 from skytether.server.schemes.delay_bound import SAMPLES, DelayBound

@@ -1,6 +1,6 @@
 """Events of a mission's vehicles, reported by the server that plans it."""
 
-from skytether.shared.core.events import VehicleEvent
+from skytether.shared.events.flight import VehicleEvent
 
 
 class InZone(VehicleEvent):

@@ -25,7 +25,6 @@ from skytether.shared.scenario.schema import (
     ControlConfig,
     Scenario,
 )
-from skytether.shared.scenario.triggers import make_trigger
 from skytether.shared.wire.protocol import INPUTS_MAX
 
 Contradiction = tuple[str, object, str]
@@ -238,7 +237,7 @@ def _no_impairments(scenario: Scenario) -> Iterator[Contradiction]:
 
 def _no_trigger(control: ControlConfig) -> Iterator[Contradiction]:
     try:
-        make_trigger(control, 1)
+        rooms.trigger(control, 1)
     except GrammarError:
         pass
     except Exception as error:

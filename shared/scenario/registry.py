@@ -7,8 +7,8 @@
 A table is used as the decorator of its entries, built-in or from a plug-in. The entry's name,
 bounds and help come from the decorated function or class. The program passes a fixed number of
 arguments (here `now`); the others are written in the scenario, as in `slip(0.3)` (`grammar.py`):
-numbers, and for impairments and zones also words and file names. `shell.plugins` imports plug-ins
-before a scenario is read.
+numbers, and for impairments and zones also words and file names. `shell.commandline.plugins`
+imports plug-ins before a scenario is read.
 """
 
 import inspect
@@ -483,15 +483,15 @@ TRIGGERS = PluginTable(
 )
 """Policies of `control.trigger`. A function is called with a `triggers.Situation` at each step; a
 class once, with the control section and the largest number of vehicles. See
-`shared.scenario.triggers`."""
+`server.triggers.trigger`."""
 REPORTS = PluginTable("report", "reports such as 'deviation(0.05) | silence(1)'", given=1, class_=1)
-"""Policies of `vehicle.report`, called with an `observing.Unreported` at each step. See
-`shared.scenario.observing`; plug-ins cannot add any."""
+"""Policies of `vehicle.report`, called with a `reports.Unreported` at each step. See
+`client.reports`; plug-ins cannot add any."""
 REFERENCES = PluginTable("shape", "a shape such as 'circle', or 'name(1.5)'", given=1, class_=1)
 """Shapes of `reference.shape`, called with the `Scenario`. See `shared.scenario.trajectories`."""
 SCHEMES = PluginTable("scheme", "a scheme such as 'trajectory', or 'name(1.5)'", given=0, class_=1)
 """Schemes of `control.scheme`. A built-in one is a function that returns its properties; a
-plug-in's is the class itself, called with a `server.common.scheme.Fleet`. See
+plug-in's is the class itself, called with a `server.planning.scheme.Fleet`. See
 `shared.scenario.schemes`."""
 PLANNERS = PluginTable("planner", "a planner such as 'mpc', or 'name(1.5)'", given=1, class_=1)
 """Planners of `control.planner`, called with a `planners.Problem`. See
@@ -513,6 +513,6 @@ IMPAIRMENTS = PluginTable(
     class_=0,
     texts=True,
 )
-"""Impairments of a direction of the network: classes. See `shared.scenario.air`."""
+"""Impairments of a direction of the network: classes. See `netem.impairments`."""
 TABLES = (SCHEMES, PLANNERS, TRIGGERS, REFERENCES, VEHICLES, IMPAIRMENTS)
 """Tables to which plug-ins can add entries."""

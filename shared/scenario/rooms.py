@@ -14,10 +14,12 @@ from skytether.shared.scenario.registry import (
     REPORTS,
     TRIGGERS,
     ZONES,
+    Files,
     load,
 )
 
-SHARED = "skytether.shared."
+SHARED, NETEM = "skytether.shared.", "skytether.netem."
+TRIGGER, FURTHER = "skytether.server.triggers.policies", "skytether.server.triggers.further"
 
 EVENTS = (f"{SHARED}missions.events",)
 """Modules with events of rooms, see `shared.telemetry.every_event`."""
@@ -28,6 +30,17 @@ def of_missions() -> Any:
     return load(f"{SHARED}missions.contradictions", "missions")
 
 
+def trigger(control: Any, capacity: int) -> Any:
+    """See `server.triggers.trigger.make_trigger`."""
+    made = load("skytether.server.triggers.trigger", "control.trigger")
+    return made.make_trigger(control, capacity)
+
+
+def impairments(text: str, files: Files) -> Any:
+    """See `netem.impairments.direction.impairments`."""
+    return load(f"{NETEM}impairments.direction", "network.uplink").impairments(text, files)
+
+
 REFERENCES.offer(
     f"{SHARED}scenario.trajectories", "circle", "figure-eight", "square", "waypoints", "hover"
 )
@@ -36,10 +49,10 @@ REFERENCES.offer(f"{SHARED}scenario.trajectories", "target", "live")
 REFERENCES.offer(f"{SHARED}missions.shapes", "swap", "sphere")
 REFERENCES.offer(f"{SHARED}formats.shapes", "mission", "show")
 
-REPORTS.offer(f"{SHARED}scenario.observing", "always", "periodic", "deviation", "silence")
+REPORTS.offer("skytether.client.reports", "always", "periodic", "deviation", "silence")
 
 TRIGGERS.offer(
-    f"{SHARED}scenario.triggers",
+    TRIGGER,
     "always",
     "heartbeat",
     "periodic",
@@ -47,15 +60,15 @@ TRIGGERS.offer(
     "cost_gap",
     "expected_gap",
 )
-TRIGGERS.offer("skytether.server.triggers", "deviation", "send_on_delta", "self_triggered")
-TRIGGERS.offer(f"{SHARED}scenario.triggers", "silence")
-TRIGGERS.offer("skytether.server.triggers", "budget")
+TRIGGERS.offer(FURTHER, "deviation", "send_on_delta", "self_triggered")
+TRIGGERS.offer(TRIGGER, "silence")
+TRIGGERS.offer(FURTHER, "budget")
 
 IMPAIRMENTS.offer(
-    f"{SHARED}scenario.air.delays", "constant", "paper", "uniform", "normal", "lognormal", "gamma"
+    f"{NETEM}impairments.delays", "constant", "paper", "uniform", "normal", "lognormal", "gamma"
 )
 IMPAIRMENTS.offer(
-    f"{SHARED}scenario.air.losses",
+    f"{NETEM}impairments.losses",
     "none",
     "loss",
     "gilbert_elliott",
@@ -64,9 +77,9 @@ IMPAIRMENTS.offer(
     "duplicate",
     "corrupt",
 )
-IMPAIRMENTS.offer(f"{SHARED}formats.traces", "trace")
-IMPAIRMENTS.offer(f"{SHARED}scenario.air.queues", "ordered", "rate")
-IMPAIRMENTS.offer(f"{SHARED}formats.traces", "deliveries")
+IMPAIRMENTS.offer(f"{NETEM}impairments.traces", "trace")
+IMPAIRMENTS.offer(f"{NETEM}impairments.queues", "ordered", "rate")
+IMPAIRMENTS.offer(f"{NETEM}impairments.traces", "deliveries")
 
 ZONES.offer(f"{SHARED}missions.zone_texts", "box", "cylinder", "polygon", "fence", "corridor")
 ZONES.offer(f"{SHARED}formats.zones", "geojson", "kml", "plan")

@@ -11,7 +11,7 @@ valid, but not together.
 
 import hashlib
 from collections.abc import Callable, Iterator
-from typing import Annotated, Literal, Self, TypeVar
+from typing import Annotated, Any, Literal, Self, TypeVar
 
 import msgspec
 import numpy as np
@@ -24,7 +24,6 @@ from skytether.shared.law.model import Array
 from skytether.shared.law.terms import Terms
 from skytether.shared.scenario import reference as shapes
 from skytether.shared.scenario import schemes
-from skytether.shared.scenario.air import path as air
 from skytether.shared.scenario.grammar import TEXT_MAX, leaves
 from skytether.shared.scenario.owners import (
     InFlight,
@@ -50,6 +49,7 @@ from skytether.shared.scenario.registry import (
     Files,
     file_of,
 )
+from skytether.shared.scenario.rooms import impairments
 from skytether.shared.scenario.schemes import SchemeProperties
 from skytether.shared.wire.framing import PATHS_MAX
 from skytether.shared.wire.protocol import INPUTS_MAX, PAYLOAD_BYTES_MAX
@@ -69,7 +69,7 @@ Duration = Annotated[float, Meta(ge=0, le=3600)]
 Interval = Annotated[float, Meta(ge=1e-3, le=3600)]
 MeanTime = Annotated[float, Meta(ge=1e-9, le=1e9)]
 Text = Annotated[str, Meta(max_length=TEXT_MAX)]
-Direction = Annotated[str, Meta(max_length=air.TEXT_MAX)]
+Direction = Annotated[str, Meta(max_length=1000)]
 TopicName = Annotated[str, Meta(max_length=200, pattern=r"^(/[A-Za-z_][A-Za-z0-9_]*)+$")]
 """Name of a ROS topic, with its namespace."""
 
@@ -545,16 +545,16 @@ class Scenario(Section, frozen=True):
         return msgspec.structs.replace(self, network=network)
 
     @property
-    def uplink(self) -> air.Path:
-        """Impairments from server to vehicle, of the first path; raises GrammarError if the text
-        is invalid.
+    def uplink(self) -> Any:
+        """`netem.impairments.direction.Impairments` from server to vehicle, of the first path;
+        raises GrammarError if the text is invalid.
         """
-        return air.path(self.network.uplink, self.files)
+        return impairments(self.network.uplink, self.files)
 
     @property
-    def downlink(self) -> air.Path:
+    def downlink(self) -> Any:
         """Impairments from vehicle to server; see `uplink`."""
-        return air.path(self.network.downlink, self.files)
+        return impairments(self.network.downlink, self.files)
 
     @property
     def dt_ns(self) -> int:

@@ -8,13 +8,8 @@ from contextlib import suppress
 from typing import TYPE_CHECKING, Union
 
 from skytether.shared.base.errors import ConfigError
-from skytether.shared.core import (  # noqa: F401 - define events
-    aboard,
-    path_events,
-    process_events,
-    standby_events,
-)
-from skytether.shared.core.events import Event
+from skytether.shared.events import aboard  # noqa: F401 - define events
+from skytether.shared.events.flight import Event
 from skytether.shared.scenario.registry import load
 from skytether.shared.scenario.rooms import EVENTS
 

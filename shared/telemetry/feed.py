@@ -3,7 +3,7 @@
 A feed is a stream of frames, each a length (`LENGTH_BYTES`, big-endian) followed by as many bytes
 of msgpack. The first is `Opened`; `Rows` follow for the parts of the record that it names. An
 observer that connects late gets the most recent frames, starting with a whole one. A reader that is
-too slow is dropped; the process never waits for one (`shell.feed`).
+too slow is dropped; the process never waits for one (`shell.driving.feed`).
 """
 
 from collections.abc import Mapping
@@ -12,7 +12,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from skytether.shared.core.ways import FLIGHT, Ways
+from skytether.shared.endpoints.ways import FLIGHT, Ways
 from skytether.shared.telemetry import record
 from skytether.shared.telemetry.every_event import EveryEvent
 from skytether.shared.telemetry.record import Rows as Table

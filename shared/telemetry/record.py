@@ -20,10 +20,9 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from skytether.shared.core.events import Event, Failure, RecordIncomplete
+from skytether.shared.events.flight import Event, Failure, RecordIncomplete
 from skytether.shared.law.model import Array
 from skytether.shared.scenario.schemes import properties
-from skytether.shared.scenario.triggers import Compared
 
 Rows = NDArray[np.void]
 
@@ -107,6 +106,24 @@ REASON_TEXTS = {
 }
 
 
+class Compared(IntEnum):
+    """Figure that a trigger compares with its threshold; its name is a column of the record.
+
+    `server.planning.scheme.PlanFigures` defines the figures.
+    """
+
+    NOTHING = 0
+    STATE_GAP = 1
+    COST_GAP = 2
+    EXPECTED_GAP = 3
+    DEVIATION_M = 4
+    OWN = 5
+    """A figure that a plug-in's policy computes, in its own unit."""
+
+    def __str__(self) -> str:
+        return self.name.lower()
+
+
 def client_columns(axes: int) -> np.dtype[np.void]:
     """Columns of the client's part: one row for each step of each vehicle."""
     return np.dtype(
@@ -132,7 +149,7 @@ def server_columns(axes: int, scheme: str) -> np.dtype[np.void]:
     """Columns of the server's part: one row for each vehicle and tick.
 
     The columns include the figures for triggers that `control.scheme` computes, see
-    `server.common.scheme.PlanFigures`.
+    `server.planning.scheme.PlanFigures`.
     """
     return np.dtype(
         [

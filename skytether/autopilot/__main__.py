@@ -2,7 +2,7 @@
 
 import sys
 
-from skytether.shell.start import run
+from skytether.shell.commandline.start import run
 
 if __name__ == "__main__":  # called before the slow imports below
     sys.exit(run("skytether.autopilot.__main__:pilot", "autopilot"))
@@ -16,12 +16,13 @@ from skytether.autopilot.endpoint import Autopilot
 from skytether.autopilot.flavours import FlavourName
 from skytether.shared.base import kernel
 from skytether.shared.telemetry.record import TRUTH_COLUMNS
-from skytether.shell import command, process, terminal
-from skytether.shell.argument import Argument
-from skytether.shell.command import CommandError, ScenarioName
-from skytether.shell.paths import NetworkPath
-from skytether.shell.process import ProcessOptions
-from skytether.shell.udp import is_loopback, look_up
+from skytether.shell.commandline import command, terminal
+from skytether.shell.commandline.argument import Argument
+from skytether.shell.commandline.command import CommandError, ScenarioName
+from skytether.shell.host.paths import NetworkPath
+from skytether.shell.host.udp import is_loopback, look_up
+from skytether.shell.processes import process
+from skytether.shell.processes.process import ProcessOptions
 
 BIND = "127.0.0.1:14550"
 

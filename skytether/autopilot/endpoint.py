@@ -26,8 +26,8 @@ from skytether.quadrotor.frames import FRAMES
 from skytether.quadrotor.quadrotor import Quadrotor
 from skytether.shared.base.chance import stream
 from skytether.shared.base.units import SECOND_NS
-from skytether.shared.core.aboard import AutopilotSaid
-from skytether.shared.core.endpoint import Address, Datagram, Endpoint
+from skytether.shared.endpoints.endpoint import Address, Datagram, Endpoint
+from skytether.shared.events.aboard import AutopilotSaid
 from skytether.shared.scenario.catalogue import keys_of
 from skytether.shared.scenario.owners import InFlight
 from skytether.shared.scenario.schema import Scenario

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 from skytether.cli.commands import COMMANDS
-from skytether.shell.command import CONFIGURATION, CommandError
+from skytether.shell.commandline.command import CONFIGURATION, CommandError
 
 HELP = """usage: skytether completion bash|zsh|fish
 

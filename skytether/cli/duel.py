@@ -18,10 +18,11 @@ from skytether.shared.scenario import reading
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Record
 from skytether.shared.telemetry.summary import summarise
-from skytether.shell import command, temporary, terminal
-from skytether.shell.argument import Argument
-from skytether.shell.command import CommandError
-from skytether.shell.options import read
+from skytether.shell.commandline import command, terminal
+from skytether.shell.commandline.argument import Argument
+from skytether.shell.commandline.command import CommandError
+from skytether.shell.commandline.options import read
+from skytether.shell.host import temporary
 from skytether.sim import flight
 from skytether.view.browser.access import HOST_PORT
 from skytether.view.browser.flight import PageFlight

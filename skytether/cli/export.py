@@ -10,10 +10,10 @@ import tyro
 from skytether.cli import recordings
 from skytether.shared.base import files
 from skytether.shared.base.units import HEADER_BYTES
-from skytether.shell import command
-from skytether.shell.argument import Argument
-from skytether.shell.command import CONFIGURATION, CommandError
-from skytether.shell.options import read
+from skytether.shell.commandline import command
+from skytether.shell.commandline.argument import Argument
+from skytether.shell.commandline.command import CONFIGURATION, CommandError
+from skytether.shell.commandline.options import read
 from skytether.view import export as view
 from skytether.view import traffic
 from skytether.view.recorded import Recorded

@@ -21,8 +21,8 @@ from skytether.figures import flights as figures
 from skytether.server.schemes import table
 from skytether.shared import formats
 from skytether.shared.base import kernel
-from skytether.shared.core.events import NotFlown
-from skytether.shared.core.stopwatch import Stopwatch
+from skytether.shared.endpoints.stopwatch import Stopwatch
+from skytether.shared.events.flight import NotFlown
 from skytether.shared.formats import plans, tracks
 from skytether.shared.law.model import Array
 from skytether.shared.missions.mission import Mission
@@ -31,9 +31,9 @@ from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.drops import drops
 from skytether.shared.telemetry.record import Record, sent_by
 from skytether.shared.telemetry.summary import plugin_errors, separations, summarise
-from skytether.shell import command, plugins, terminal
-from skytether.shell.argument import Argument
-from skytether.shell.command import CommandError, ScenarioName, ScenarioOptions
+from skytether.shell.commandline import command, plugins, terminal
+from skytether.shell.commandline.argument import Argument
+from skytether.shell.commandline.command import CommandError, ScenarioName, ScenarioOptions
 from skytether.sim import flight as sim
 
 VEHICLES = 20

@@ -19,7 +19,7 @@ from skytether.figures import flights as figures
 from skytether.server.schemes import table
 from skytether.shared.base import kernel
 from skytether.shared.base.errors import ConfigError
-from skytether.shared.core.events import (
+from skytether.shared.events.flight import (
     Changed,
     ChangeRefused,
     Event,
@@ -29,16 +29,18 @@ from skytether.shared.core.events import (
     RecordIncomplete,
     ReferenceTooFast,
 )
-from skytether.shared.core.standby_events import LeaderChanged
+from skytether.shared.events.standby import LeaderChanged
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Record
 from skytether.shared.telemetry.summary import Summary, summarise
 from skytether.shared.wire.protocol import Idle, Mode
-from skytether.shell import command, plugins, pool, system, temporary, terminal
-from skytether.shell.argument import Argument
-from skytether.shell.command import CommandError, ScenarioOptions
-from skytether.shell.plugins import Plugin
+from skytether.shell.commandline import command, plugins, terminal
+from skytether.shell.commandline.argument import Argument
+from skytether.shell.commandline.command import CommandError, ScenarioOptions
+from skytether.shell.commandline.plugins import Plugin
+from skytether.shell.host import system, temporary
+from skytether.shell.processes import pool
 from skytether.sim import flight
 from skytether.view.browser.access import HOST_PORT
 

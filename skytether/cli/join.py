@@ -9,9 +9,9 @@ import tyro
 
 from skytether.cli import recorder, recordings
 from skytether.shared.base import files
-from skytether.shell import command
-from skytether.shell.argument import Argument
-from skytether.shell.options import read
+from skytether.shell.commandline import command
+from skytether.shell.commandline.argument import Argument
+from skytether.shell.commandline.options import read
 from skytether.view.joining import join as joined
 
 

@@ -12,10 +12,10 @@ import tyro
 from skytether.shared.base import files, input_files
 from skytether.shared.wire import keys
 from skytether.shared.wire.keys import KEYS_MAX, NUMBERS, SECRET_BYTES, VEHICLES
-from skytether.shell import command
-from skytether.shell.argument import Argument
-from skytether.shell.command import CONFIGURATION, CommandError
-from skytether.shell.options import read
+from skytether.shell.commandline import command
+from skytether.shell.commandline.argument import Argument
+from skytether.shell.commandline.command import CONFIGURATION, CommandError
+from skytether.shell.commandline.options import read
 
 HEAD = "# VEHICLE KEY SECRET. Whoever reads a vehicle's secret can fly the vehicle.\n"
 

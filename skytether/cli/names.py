@@ -8,7 +8,7 @@ from skytether.client.vehicles import vehicle
 from skytether.shared.scenario import registry
 from skytether.shared.scenario.planners import planner
 from skytether.shared.scenario.schemes import scheme
-from skytether.shell import command, options
+from skytether.shell.commandline import command, options
 
 
 @dataclass(frozen=True)

@@ -8,9 +8,10 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from skytether.shared.base.printable import printable
-from skytether.shell import command, plugins, temporary
-from skytether.shell.log import line_of
-from skytether.shell.workers import die_with_parent
+from skytether.shell.commandline import command, plugins
+from skytether.shell.host import temporary
+from skytether.shell.processes.log import line_of
+from skytether.shell.processes.workers import die_with_parent
 
 STOP_S = 5.0
 """Longest time for the page to end after SIGTERM."""

@@ -31,9 +31,9 @@ from skytether.probe.wire import NONCE_BYTES
 from skytether.server.gate import Gate, PlainGate
 from skytether.shared.base import files, input_files
 from skytether.shared.base.units import SECOND_NS
-from skytether.shared.core.endpoint import Address
-from skytether.shared.core.events import Event
-from skytether.shared.core.process_events import Counted, Listening
+from skytether.shared.endpoints.endpoint import Address
+from skytether.shared.events.flight import Event
+from skytether.shared.events.processes import Counted, Listening
 from skytether.shared.formats.recorded import recorded_in
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.registry import File
@@ -41,13 +41,14 @@ from skytether.shared.telemetry.record import PACKET_COLUMNS, RECORDING, Recorde
 from skytether.shared.wire import keys
 from skytether.shared.wire.framing import PATHS_MAX
 from skytether.shared.wire.protocol import PAYLOAD_BYTES_MAX
-from skytether.shell import command, driver, terminal
-from skytether.shell.argument import Argument
-from skytether.shell.command import CONFIGURATION, INTERRUPTED, CommandError
-from skytether.shell.log import Log
-from skytether.shell.options import read
-from skytether.shell.paths import NetworkPath
-from skytether.shell.udp import AddressError
+from skytether.shell.commandline import command, terminal
+from skytether.shell.commandline.argument import Argument
+from skytether.shell.commandline.command import CONFIGURATION, INTERRUPTED, CommandError
+from skytether.shell.commandline.options import read
+from skytether.shell.driving import driver
+from skytether.shell.host.paths import NetworkPath
+from skytether.shell.host.udp import AddressError
+from skytether.shell.processes.log import Log
 
 if TYPE_CHECKING:
     from rich.table import Table

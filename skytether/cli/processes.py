@@ -23,9 +23,9 @@ import numpy as np
 from skytether.cli.page_process import say
 from skytether.netem.proxy import of_paths
 from skytether.shared.base import files
-from skytether.shared.core.endpoint import Address
-from skytether.shared.core.events import Failure, Flying, NotFlown, RecordIncomplete, address_text
-from skytether.shared.core.process_events import Counted, Listening
+from skytether.shared.endpoints.endpoint import Address
+from skytether.shared.events.flight import Failure, Flying, NotFlown, RecordIncomplete, address_text
+from skytether.shared.events.processes import Counted, Listening
 from skytether.shared.scenario.reading import to_toml
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import (
@@ -38,10 +38,11 @@ from skytether.shared.telemetry.record import (
     read,
     server_columns,
 )
-from skytether.shell import plugins, system, temporary
-from skytether.shell.command import INTERRUPTED, CommandError
-from skytether.shell.log import LogLine, line_of
-from skytether.shell.workers import die_with_parent
+from skytether.shell.commandline import plugins
+from skytether.shell.commandline.command import INTERRUPTED, CommandError
+from skytether.shell.host import system, temporary
+from skytether.shell.processes.log import LogLine, line_of
+from skytether.shell.processes.workers import die_with_parent
 from skytether.view.browser.play import NETEMS
 
 ANYWHERE = ("--bind", "127.0.0.1:0")

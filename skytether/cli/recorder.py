@@ -12,16 +12,16 @@ from pathlib import Path
 import msgspec
 
 from skytether.shared.base import files, toml
-from skytether.shared.core.events import RecordIncomplete
+from skytether.shared.events.flight import RecordIncomplete
 from skytether.shared.scenario.reading import check as checked
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.feed import Frame, Opened, Rows
 from skytether.shared.telemetry.record import RECORDING, Record
 from skytether.shared.telemetry.summary import Summary
-from skytether.shell import command, plugins
-from skytether.shell.command import CommandError
-from skytether.shell.feed import Subscriber
-from skytether.shell.recorder_process import RecorderOrder
+from skytether.shell.commandline import command, plugins
+from skytether.shell.commandline.command import CommandError
+from skytether.shell.driving.feed import Subscriber
+from skytether.shell.processes.recorder_process import RecorderOrder
 from skytether.view.frames import of_flight
 from skytether.view.recording import About, Recording
 

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from skytether.cli.page_process import say
-from skytether.shell.command import CONFIGURATION, CommandError
+from skytether.shell.commandline.command import CONFIGURATION, CommandError
 from skytether.view.recorded import Recorded, read
 
 

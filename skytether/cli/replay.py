@@ -9,9 +9,9 @@ from typing import Annotated
 import tyro
 
 from skytether.cli import recordings
-from skytether.shell import command
-from skytether.shell.argument import Argument
-from skytether.shell.options import read
+from skytether.shell.commandline import command
+from skytether.shell.commandline.argument import Argument
+from skytether.shell.commandline.options import read
 from skytether.view.browser.access import HOST_PORT
 from skytether.view.browser.flight import PageFlight
 from skytether.view.browser.replay import Player

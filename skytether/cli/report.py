@@ -9,10 +9,10 @@ import tyro
 
 from skytether.cli import recordings
 from skytether.shared.base import files
-from skytether.shell import command, terminal
-from skytether.shell.argument import Argument
-from skytether.shell.command import CommandError
-from skytether.shell.options import read
+from skytether.shell.commandline import command, terminal
+from skytether.shell.commandline.argument import Argument
+from skytether.shell.commandline.command import CommandError
+from skytether.shell.commandline.options import read
 from skytether.view.report import page
 
 

@@ -23,21 +23,21 @@ from skytether.ros2 import messages
 from skytether.ros2.graph import Node
 from skytether.ros2.messages import MessageError, Vector
 from skytether.shared.base import toml
-from skytether.shared.core.change import Answer
-from skytether.shared.core.endpoint import VEHICLES_TOLD_MAX, Datagram
-from skytether.shared.core.events import ChangeRefused
-from skytether.shared.core.line import Line, parse_line
+from skytether.shared.endpoints.change import Answer
+from skytether.shared.endpoints.endpoint import VEHICLES_TOLD_MAX, Datagram
+from skytether.shared.endpoints.line import Line, parse_line
+from skytether.shared.events.flight import ChangeRefused
 from skytether.shared.missions.mission import format_goals, parse_goals
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.feed import FeedError, Frame, Opened, Rows, columns_of, table
-from skytether.shell import system
-from skytether.shell.argument import Argument
-from skytether.shell.command import CONFIGURATION, CommandError
-from skytether.shell.control import Caller, ControlError
-from skytether.shell.feed import Subscriber
-from skytether.shell.graph import GraphSession
-from skytether.shell.log import Log
-from skytether.shell.options import read
+from skytether.shell.commandline.argument import Argument
+from skytether.shell.commandline.command import CONFIGURATION, CommandError
+from skytether.shell.commandline.options import read
+from skytether.shell.driving.control import Caller, ControlError
+from skytether.shell.driving.feed import Subscriber
+from skytether.shell.driving.graph import GraphSession
+from skytether.shell.host import system
+from skytether.shell.processes.log import Log
 from skytether.view.rows import check_columns, planned
 
 REPEAT_S = 1.0

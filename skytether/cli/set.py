@@ -8,11 +8,11 @@ from typing import Annotated, Any
 import msgspec
 import tyro
 
-from skytether.shared.core.change import REQUEST_BYTES_MAX
-from skytether.shell.argument import Argument
-from skytether.shell.command import CONFIGURATION, CommandError
-from skytether.shell.control import Caller, ControlError
-from skytether.shell.options import read, toml_value
+from skytether.shared.endpoints.change import REQUEST_BYTES_MAX
+from skytether.shell.commandline.argument import Argument
+from skytether.shell.commandline.command import CONFIGURATION, CommandError
+from skytether.shell.commandline.options import read, toml_value
+from skytether.shell.driving.control import Caller, ControlError
 
 
 @dataclass(frozen=True)

@@ -10,12 +10,13 @@ from skytether.autopilot.flavours import FlavourName
 from skytether.cli import page_process, processes
 from skytether.figures import flights as figures
 from skytether.shared.base import files, kernel
-from skytether.shared.core.aboard import AutopilotRefused, AutopilotText
-from skytether.shared.core.events import Event, Fault
+from skytether.shared.events.aboard import AutopilotRefused, AutopilotText
+from skytether.shared.events.flight import Event, Fault
 from skytether.shared.scenario.reading import to_toml
 from skytether.shared.telemetry.record import Record, read
-from skytether.shell import command, temporary, terminal
-from skytether.shell.command import CommandError, ScenarioName, ScenarioOptions
+from skytether.shell.commandline import command, terminal
+from skytether.shell.commandline.command import CommandError, ScenarioName, ScenarioOptions
+from skytether.shell.host import temporary
 from skytether.sim import straight as virtual
 from skytether.station import laws
 from skytether.station.joined import joined, summary_of

@@ -5,11 +5,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from skytether.figures.page import blank
+from skytether.netem.impairments.delays import Delay
+from skytether.netem.impairments.direction import impairments
 from skytether.probe.outcome import ProbeOutcome
 from skytether.probe.prober import TRAIN, TRAIN_SLOTS
 from skytether.shared.base.units import HEADER_BYTES, SECOND_NS
-from skytether.shared.scenario.air.delays import Delay
-from skytether.shared.scenario.air.path import path
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -49,7 +49,7 @@ def drawn(*outcomes: ProbeOutcome) -> "Figure":
         at = (np.arange(len(sorted_ms)) + 0.5) / len(sorted_ms)
         shares.step(sorted_ms, at, color="tab:blue", label="measured", where="post")
         if figures.delay_models:
-            _, model = path(figures.delay_models[0].text).impairments[0]
+            _, model = impairments(figures.delay_models[0].text).parts[0]
             assert isinstance(model, Delay)
             passes_s = (
                 (outcome.told.bytes + HEADER_BYTES) / figures.rate_bytes_per_s

@@ -23,6 +23,7 @@ from pettingzoo import ParallelEnv
 
 from skytether.gym.networked import number
 from skytether.server.endpoint import Server
+from skytether.server.triggers.trigger import Figures, Situation, Trigger, Verdict
 from skytether.shared.base.chance import stream
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.base.units import SECOND_NS, seconds_to_ns
@@ -31,8 +32,7 @@ from skytether.shared.scenario import reading
 from skytether.shared.scenario.dotted import set_keys
 from skytether.shared.scenario.reference import Reference
 from skytether.shared.scenario.schema import Scenario
-from skytether.shared.scenario.triggers import Compared, Figures, Situation, Trigger, Verdict
-from skytether.shared.telemetry.record import Rows
+from skytether.shared.telemetry.record import Compared, Rows
 from skytether.sim.flight import BOOT_ID, MIDNIGHT_NS, PLAIN, SERVER, Run
 from skytether.sim.world import Clock, World
 

@@ -29,13 +29,13 @@ from skytether.gym.players import Chunk, Clocked, Player, Row
 from skytether.gym.remote import PART_BYTES, ROWS_MAX, Network, Remote
 from skytether.gym.spaces import Space, idle_of, no_rows, observed, size_of, to_action, to_rows
 from skytether.netem.fate import Fates
+from skytether.netem.impairments.direction import Impairments, impairments
+from skytether.netem.impairments.draws import SLOT_NS
 from skytether.netem.link import QUEUE_BYTES_MAX
 from skytether.shared.base.chance import stream
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.base.units import seconds_to_ns
 from skytether.shared.scenario import reading
-from skytether.shared.scenario.air.draws import SLOT_NS
-from skytether.shared.scenario.air.path import Path, path
 from skytether.shared.scenario.grammar import GrammarError
 
 if TYPE_CHECKING:
@@ -441,20 +441,20 @@ def _whole(key: str, value: Any, low: int, high: int, kind: type[Exception] = Co
     return int(value)
 
 
-def _path(key: str, text: str) -> Path:
+def _path(key: str, text: str) -> Impairments:
     if not isinstance(text, str):
         raise ConfigError(f"{key}: got {text!r}, expected impairments such as 'loss(10%)'")
     try:
-        return path(text, reading.files_of("network.uplink", text, key))
+        return impairments(text, reading.files_of("network.uplink", text, key))
     except GrammarError as error:
         raise ConfigError(f"{key}: {error}") from None
 
 
-def _thinking(given: float | str) -> Path:
+def _thinking(given: float | str) -> Impairments:
     """Delays of answers; raises ConfigError if it loses answers or is no delay."""
     text = given if isinstance(given, str) else f"constant({float(given)!r})"
     delays = _path("thinking", text)
-    if delays.queue or any(each.kind != "delay" for _, each in delays.impairments) or delays.loss:
+    if delays.queue or any(each.kind != "delay" for _, each in delays.parts) or delays.loss:
         expected = "seconds, delays such as 'gamma(20ms, 80ms, 30ms)', or 'measured'"
         raise ConfigError(f"thinking: got {given!r}, expected {expected}")
     return delays

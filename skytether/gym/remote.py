@@ -20,13 +20,13 @@ from numpy.typing import NDArray
 
 from skytether.gym.players import Chunk, Held, Player, Row
 from skytether.netem.fate import Fates
+from skytether.netem.impairments.direction import Impairments
 from skytether.netem.link import QUEUE_BYTES_MAX, Lane, Link
 from skytether.server.schemes.delay_bound import DelayBound, add_sample, delay_bound
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.base.kernel import kernel
 from skytether.shared.base.units import HEADER_BYTES, SECOND_NS
-from skytether.shared.core.endpoint import make_datagram
-from skytether.shared.scenario.air.path import Path
+from skytether.shared.endpoints.endpoint import make_datagram
 from skytether.shared.telemetry.record import DOWNLINK, UPLINK
 
 ROWS_MAX = 1024
@@ -45,9 +45,9 @@ PART_BYTES = 12
 
 
 class Network(NamedTuple):
-    uplink: Path
+    uplink: Impairments
     """From agent to robot."""
-    downlink: Path
+    downlink: Impairments
     """From robot to agent."""
     seed: int
     mtu: int

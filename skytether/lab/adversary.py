@@ -26,7 +26,7 @@ from skytether.lab.lives import CLOCK, STANDBY_FLOWS, Lives, Saved, world_s
 from skytether.shared.base.chance import stream
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS, seconds_to_ns
-from skytether.shared.core.endpoint import STANDBY_SOCKETS, Datagram, Endpoint
+from skytether.shared.endpoints.endpoint import STANDBY_SOCKETS, Datagram, Endpoint
 from skytether.shared.law.terms import Terms
 from skytether.shared.missions import mission
 from skytether.shared.missions.derived import zones

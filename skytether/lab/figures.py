@@ -12,8 +12,8 @@ from skytether.figures.page import blank
 from skytether.lab.crowd import TITLES, CrowdPoint, FlownScheme, Scheme
 from skytether.lab.envelope import WRONG, Envelope, EnvelopePoint, Outcome
 from skytether.lab.sweep import GridAxis
+from skytether.netem.impairments.direction import impairments
 from skytether.shared.law.model import Array, Flags
-from skytether.shared.scenario.air.path import path as path_of
 
 OUTCOMES: Mapping[Outcome, Mapping[str, Any]] = {
     "refused": {"color": "0.82", "marker": "."},
@@ -38,7 +38,9 @@ def envelope(path: Path, title: str, plan: Envelope, points: Sequence[EnvelopePo
         return np.array([each[key] for each in keys])
 
     outcomes = np.array([point.outcome for point in points])
-    ways = [[path_of(each[f"network.{way}"]) for each in keys] for way in ("uplink", "downlink")]
+    ways = [
+        [impairments(each[f"network.{way}"]) for each in keys] for way in ("uplink", "downlink")
+    ]
     up_s, down_s = (np.array([each.mean_s for each in paths]) for paths in ways)
     loss = np.max([[each.loss for each in paths] for paths in ways], axis=0)
     trip_s, covers_s = up_s + down_s, column("control.horizon") * column("control.dt")

@@ -23,7 +23,7 @@ from skytether.client.pilot import LAND_MPS
 from skytether.lab.courses import Course, FollowedCourse, PlannedCourse
 from skytether.server.gate import Gate, GateCall, ReplyPath
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS, seconds_to_ns
-from skytether.shared.core.endpoint import EVENTS_MAX, Datagram
+from skytether.shared.endpoints.endpoint import EVENTS_MAX, Datagram
 from skytether.shared.law.model import ALTITUDE, Array
 from skytether.shared.law.terms import Terms
 from skytether.shared.scenario.gain import regulator

@@ -26,9 +26,9 @@ from skytether.server.missions.mission_planner import MissionPlanner
 from skytether.shared.base.chance import stream
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.base.units import SECOND_NS, seconds_to_ns
-from skytether.shared.core.change import Running, with_values
-from skytether.shared.core.endpoint import Address, Endpoint
-from skytether.shared.core.events import Event
+from skytether.shared.endpoints.change import Running, with_values
+from skytether.shared.endpoints.endpoint import Address, Endpoint
+from skytether.shared.events.flight import Event
 from skytether.shared.missions.mission import Mission
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Recorder, client_columns, parse

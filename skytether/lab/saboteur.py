@@ -13,7 +13,7 @@ import numpy as np
 
 from skytether.lab.faults import FaultKind, ScheduledFault
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS, seconds_to_ns
-from skytether.shared.core.endpoint import Address, Datagram, Endpoint
+from skytether.shared.endpoints.endpoint import Address, Datagram, Endpoint
 from skytether.shared.wire.channel import kind as kind_of
 from skytether.shared.wire.handshake import INITIATION
 

@@ -37,16 +37,16 @@ from skytether.lab.invariants import (
 from skytether.lab.saboteur import NETEM, OBSERVER, SABOTEUR, SERVER, Observer, Saboteur
 from skytether.netem.proxy import Proxy
 from skytether.server import secure as server_secure
-from skytether.server.common.clock import BUCKET_NS, BUCKETS, RECENT
 from skytether.server.endpoint import Server
 from skytether.server.mpc.solver import Solver
+from skytether.server.planning.clock import BUCKET_NS, BUCKETS, RECENT
 from skytether.server.schemes.horizons import HorizonScheme
 from skytether.server.sessions import WELCOME_NS
 from skytether.shared.base.chance import stream
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS, seconds_to_ns
-from skytether.shared.core.endpoint import Address
-from skytether.shared.core.events import Event, ModeChanged
-from skytether.shared.core.steady import JUMP_NS, Steady
+from skytether.shared.endpoints.endpoint import Address
+from skytether.shared.endpoints.steady import JUMP_NS, Steady
+from skytether.shared.events.flight import Event, ModeChanged
 from skytether.shared.law.model import Array, Flags
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.registry import IMPAIRMENTS

@@ -12,13 +12,13 @@ from skytether.netem import relay
 from skytether.netem.proxy import Proxy
 from skytether.netem.relay import Relay
 from skytether.shared.base.errors import ConfigError
-from skytether.shared.core.change import Running
-from skytether.shared.core.endpoint import Address
-from skytether.shared.core.line import Listen
-from skytether.shared.core.ways import FLIGHT, NAMES, RELAY, named
+from skytether.shared.endpoints.change import Running
+from skytether.shared.endpoints.endpoint import Address
+from skytether.shared.endpoints.line import Listen
+from skytether.shared.endpoints.ways import FLIGHT, NAMES, RELAY, named
 from skytether.shared.scenario import reading
-from skytether.shell import plugins
-from skytether.shell.driver import Shell, new_event_loop
+from skytether.shell.commandline import plugins
+from skytether.shell.driving.driver import Shell, new_event_loop
 
 LOG = logging.getLogger("skytether.netem")
 """Says what `skytether netem` prints, such as a server that cannot be reached."""

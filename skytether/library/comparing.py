@@ -15,8 +15,8 @@ from skytether.shared.base import extras, files
 from skytether.shared.base.errors import ConfigError, FlightError
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.dotted import set_keys
-from skytether.shell import plugins
-from skytether.shell.command import CommandError
+from skytether.shell.commandline import plugins
+from skytether.shell.commandline.command import CommandError
 
 
 @extras.named()

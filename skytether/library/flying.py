@@ -12,14 +12,15 @@ import msgspec
 from skytether.library.flight import Flight
 from skytether.shared.base import extras
 from skytether.shared.base.errors import ConfigError, FlightError
-from skytether.shared.core.endpoint import Endpoint
+from skytether.shared.endpoints.endpoint import Endpoint
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.dotted import flat, set_keys
 from skytether.shared.scenario.planners import Planner
 from skytether.shared.scenario.registry import PLANNERS
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Record
-from skytether.shell import plugins, temporary
+from skytether.shell.commandline import plugins
+from skytether.shell.host import temporary
 
 Given = str | PathLike[str] | Scenario
 """Name of a scenario (see `skytether scenarios`), path of a .toml file, or a scenario."""
@@ -161,7 +162,7 @@ def prepare(*scenarios: Scenario) -> None:
     import skytether.sim.flight  # noqa: F401 - its kernels are those of every flight
     from skytether.server.schemes import table
     from skytether.shared.base import kernel
-    from skytether.shell import terminal
+    from skytether.shell.commandline import terminal
 
     if not scenarios:
         table.load_all()
@@ -225,8 +226,8 @@ def _over_udp(scenario: Scenario, *, secure: bool) -> Record:
     loop, as in a notebook.
     """
     from skytether.cli import processes
-    from skytether.shell.command import CommandError
-    from skytether.shell.log import LogLine
+    from skytether.shell.commandline.command import CommandError
+    from skytether.shell.processes.log import LogLine
 
     said: list[LogLine] = []
     stopped = threading.Event()

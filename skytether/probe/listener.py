@@ -30,7 +30,7 @@ from skytether.probe.wire import (
 )
 from skytether.server.gate import Gate, GateCall
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
-from skytether.shared.core.endpoint import Address, Datagram, Endpoint, by_name, host_of
+from skytether.shared.endpoints.endpoint import Address, Datagram, Endpoint, by_name, host_of
 from skytether.shared.wire.channel import OVERHEAD_BYTES
 from skytether.shared.wire.drop import Drop, ProtocolError
 from skytether.shared.wire.protocol import PAYLOAD_BYTES_MAX

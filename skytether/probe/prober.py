@@ -30,7 +30,7 @@ from skytether.probe.wire import (
     encode,
 )
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
-from skytether.shared.core.endpoint import Address, Datagram, Endpoint, by_name
+from skytether.shared.endpoints.endpoint import Address, Datagram, Endpoint, by_name
 from skytether.shared.law.model import Flags
 from skytether.shared.wire.channel import OVERHEAD_BYTES
 from skytether.shared.wire.drop import Drop, ProtocolError

@@ -1,5 +1,5 @@
 """ROS 2 as it is on a Zenoh network: messages in CDR, and the names that rmw_zenoh gives them.
 
 Nothing of ROS is imported, and no module of this package has a socket: rosbags only encodes and
-decodes messages. `skytether.shell.graph` puts a `graph.Node` on a Zenoh network.
+decodes messages. `skytether.shell.driving.graph` puts a `graph.Node` on a Zenoh network.
 """

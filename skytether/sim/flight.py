@@ -33,10 +33,10 @@ from skytether.shared.base.chance import stream
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.base.kernel import compile_all
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS, seconds_to_ns
-from skytether.shared.core.change import Running
-from skytether.shared.core.endpoint import Address, Datagram, Endpoint, by_name
-from skytether.shared.core.events import Event, Fault, VehicleEvent
-from skytether.shared.core.stopwatch import Stopwatch
+from skytether.shared.endpoints.change import Running
+from skytether.shared.endpoints.endpoint import Address, Datagram, Endpoint, by_name
+from skytether.shared.endpoints.stopwatch import Stopwatch
+from skytether.shared.events.flight import Event, Fault, VehicleEvent
 from skytether.shared.scenario.dotted import text_key
 from skytether.shared.scenario.reference import Reference
 from skytether.shared.scenario.registry import load
@@ -116,7 +116,7 @@ def fly(
             own; or an endpoint in its place, which is not recorded.
         beside: endpoints of further hosts by name, such as an autopilot at `vehicle.address`.
         changes: times [s, counted as in `Record.events`], and the keys and values that change then,
-            as in `shared.core.change`; a refused change is an event, and the flight continues.
+            as in `shared.endpoints.change`; a refused change is an event, and the flight continues.
         actions: times [s], and functions that act on the world then, for example stop a host.
         stopwatch: stopwatch for the server's stages; its times differ from flight to flight.
         on_second: called with the time flown [s], once per second of flight.

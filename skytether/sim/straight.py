@@ -13,8 +13,8 @@ from skytether.autopilot.flavours import FlavourName
 from skytether.netem.proxy import Proxy
 from skytether.shared.base.chance import stream
 from skytether.shared.base.units import SECOND_NS, seconds_to_ns
-from skytether.shared.core.change import Running
-from skytether.shared.core.events import Event
+from skytether.shared.endpoints.change import Running
+from skytether.shared.events.flight import Event
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import (
     PACKET_COLUMNS,

@@ -17,8 +17,8 @@ from dataclasses import dataclass
 from heapq import heapify, heappop, heappush
 from typing import Protocol
 
-from skytether.shared.core.endpoint import Address, Datagram, Endpoint
-from skytether.shared.core.events import Event
+from skytether.shared.endpoints.endpoint import Address, Datagram, Endpoint
+from skytether.shared.events.flight import Event
 
 BILLION = 1_000_000_000
 FROZEN_MAX = 6_500

@@ -2,7 +2,7 @@
 
 import sys
 
-from skytether.shell.start import run
+from skytether.shell.commandline.start import run
 
 if __name__ == "__main__":  # called before the slow imports below
     sys.exit(run("skytether.station.__main__:fly", "station"))
@@ -10,10 +10,11 @@ if __name__ == "__main__":  # called before the slow imports below
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from skytether.shell import command, process
-from skytether.shell.command import CommandError, ScenarioName
-from skytether.shell.process import ProcessOptions
-from skytether.shell.udp import is_loopback, look_up
+from skytether.shell.commandline import command
+from skytether.shell.commandline.command import CommandError, ScenarioName
+from skytether.shell.host.udp import is_loopback, look_up
+from skytether.shell.processes import process
+from skytether.shell.processes.process import ProcessOptions
 from skytether.station import laws
 from skytether.station.endpoint import Station
 from skytether.station.joined import station_columns

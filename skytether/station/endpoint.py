@@ -25,9 +25,9 @@ from skytether.mavlink.dialect import dialect
 from skytether.mavlink.frames import turned
 from skytether.mavlink.text import Texts
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS, seconds_to_ns
-from skytether.shared.core.aboard import AutopilotText, NotTakenOff
-from skytether.shared.core.endpoint import Address, Datagram, Endpoint, by_name
-from skytether.shared.core.events import Finished, Flying
+from skytether.shared.endpoints.endpoint import Address, Datagram, Endpoint, by_name
+from skytether.shared.events.aboard import AutopilotText, NotTakenOff
+from skytether.shared.events.flight import Finished, Flying
 from skytether.shared.law.model import Array
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Recorder

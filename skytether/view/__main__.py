@@ -2,7 +2,7 @@
 
 import sys
 
-from skytether.shell.start import run
+from skytether.shell.commandline.start import run
 
 if __name__ == "__main__":  # called before the slow imports below
     sys.exit(run("skytether.view.__main__:show", "page"))
@@ -16,11 +16,12 @@ from typing import Annotated
 
 import tyro
 
-from skytether.shell import command, system
-from skytether.shell.argument import Argument
-from skytether.shell.command import CONFIGURATION, CommandError
-from skytether.shell.log import LogFormat
-from skytether.shell.options import read
+from skytether.shell.commandline import command
+from skytether.shell.commandline.argument import Argument
+from skytether.shell.commandline.command import CONFIGURATION, CommandError
+from skytether.shell.commandline.options import read
+from skytether.shell.host import system
+from skytether.shell.processes.log import LogFormat
 from skytether.view.browser.access import HOST_PORT
 from skytether.view.browser.serve import followed, until_told
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import msgspec
 
-from skytether.shared.core.events import Changed
+from skytether.shared.events.flight import Changed
 from skytether.shared.scenario.dotted import TEXTS
 from skytether.shared.scenario.grammar import GrammarError, calls
 from skytether.view.controls import LOST, THRESHOLDS, WAYS, applied, knobs

@@ -5,7 +5,7 @@ from heapq import merge
 
 import numpy as np
 
-from skytether.shared.core.events import Flying
+from skytether.shared.events.flight import Flying
 from skytether.shared.law.model import Indices
 from skytether.shared.scenario.reading import to_toml
 from skytether.shared.scenario.schema import Scenario

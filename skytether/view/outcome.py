@@ -9,7 +9,7 @@ from itertools import combinations
 import numpy as np
 
 from skytether.shared.base.units import SECOND_NS
-from skytether.shared.core.events import (
+from skytether.shared.events.flight import (
     BegunAnew,
     Changed,
     ChangeRefused,
@@ -26,15 +26,15 @@ from skytether.shared.core.events import (
     StateLeapt,
     SteppedLate,
 )
-from skytether.shared.core.path_events import PathDied, PathHealed, PathMissing
-from skytether.shared.core.process_events import (
+from skytether.shared.events.paths import PathDied, PathHealed, PathMissing
+from skytether.shared.events.processes import (
     HostFound,
     HostMissing,
     NotRecalled,
     Recalled,
     TimeUnknown,
 )
-from skytether.shared.core.standby_events import LeaderChanged
+from skytether.shared.events.standby import LeaderChanged
 from skytether.shared.law.model import Array
 from skytether.shared.missions.events import LeftMotion, LeftTube
 from skytether.shared.telemetry.record import Rows

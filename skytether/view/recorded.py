@@ -17,9 +17,9 @@ import numpy as np
 from skytether.shared.base import toml
 from skytether.shared.base.errors import RecordingError
 from skytether.shared.base.units import SECOND_NS
-from skytether.shared.core.events import Event
-from skytether.shared.core.process_events import Counted
-from skytether.shared.core.ways import FLIGHT, Ways
+from skytether.shared.endpoints.ways import FLIGHT, Ways
+from skytether.shared.events.flight import Event
+from skytether.shared.events.processes import Counted
 from skytether.shared.law.model import Indices
 from skytether.shared.scenario.reading import check
 from skytether.shared.scenario.schema import Scenario

@@ -30,7 +30,7 @@ import msgspec
 import numpy as np
 from mcap.writer import Writer
 
-from skytether.shared.core.events import (
+from skytether.shared.events.flight import (
     ChangeRefused,
     Degraded,
     Event,

@@ -12,7 +12,7 @@ from skytether.figures.flights import draw_packets, draw_reference
 from skytether.figures.page import Picture, Table, as_png, as_text, lettered, rendered
 from skytether.shared.base.errors import RecordingError
 from skytether.shared.base.units import SECOND_NS
-from skytether.shared.core.events import DOES
+from skytether.shared.events.flight import DOES
 from skytether.shared.law.model import Array
 from skytether.shared.scenario.reading import to_toml
 from skytether.shared.scenario.schema import Scenario

@@ -12,14 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skytether.shared.base.units import SECOND_NS
-from skytether.shared.core.ways import FLIGHT, Ways
+from skytether.shared.endpoints.ways import FLIGHT, Ways
 from skytether.shared.law.model import Array
 from skytether.shared.scenario.schema import Scenario
-from skytether.shared.scenario.triggers import Compared
 from skytether.shared.telemetry.record import (
     DOWNLINK,
     PACKET_COLUMNS,
     UPLINK,
+    Compared,
     Reason,
     Rows,
     client_columns,

@@ -21,9 +21,9 @@ from skytether.figures.colours import AMBER, GREEN, GREY, MODE_COLOURS, RED
 from skytether.shared.base import toml
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS, seconds_to_ns
-from skytether.shared.core.events import DOES, Changed, Event
-from skytether.shared.core.process_events import Counted, Listening, Plaintext
-from skytether.shared.core.ways import FLIGHT, Ways
+from skytether.shared.endpoints.ways import FLIGHT, Ways
+from skytether.shared.events.flight import DOES, Changed, Event
+from skytether.shared.events.processes import Counted, Listening, Plaintext
 from skytether.shared.law.model import Array
 from skytether.shared.missions import zone_texts
 from skytether.shared.missions.zones import Zones

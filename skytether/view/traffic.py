@@ -12,7 +12,7 @@ import numpy as np
 
 from skytether.figures.tables import to_csv
 from skytether.shared.base.units import HEADER_BYTES, SECOND_NS
-from skytether.shared.core.ways import FLIGHT, Ways
+from skytether.shared.endpoints.ways import FLIGHT, Ways
 from skytether.shared.telemetry.record import DOWNLINK, UPLINK, Rows
 
 RAW_IP = 101

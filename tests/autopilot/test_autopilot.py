@@ -21,7 +21,7 @@ from skytether.mavlink import parameters
 from skytether.mavlink.codec import Codec
 from skytether.mavlink.dialect import dialect
 from skytether.shared.base.errors import ConfigError
-from skytether.shared.core.endpoint import Datagram
+from skytether.shared.endpoints.endpoint import Datagram
 from skytether.shared.scenario.reading import check
 from skytether.shared.scenario.schema import Scenario
 

@@ -21,12 +21,12 @@ import pytest
 from skytether.cli.processes import Child, started
 from skytether.mavlink.codec import Codec, Message
 from skytether.mavlink.dialect import dialect
-from skytether.shared.core.events import Flying, ModeChanged
-from skytether.shared.core.events import address_text as text
+from skytether.shared.events.flight import Flying, ModeChanged
+from skytether.shared.events.flight import address_text as text
 from skytether.shared.scenario.reading import check, to_toml
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Rows, parse
-from skytether.shell.log import LogLine
+from skytether.shell.processes.log import LogLine
 
 pytestmark = [pytest.mark.autopilot, pytest.mark.timeout(300)]
 

@@ -20,9 +20,9 @@ from skytether.mavlink.codec import Codec
 from skytether.mavlink.dialect import dialect
 from skytether.netem.proxy import Proxy
 from skytether.shared.base.errors import ConfigError
-from skytether.shared.core.aboard import AutopilotText
-from skytether.shared.core.endpoint import Datagram
-from skytether.shared.core.events import Finished, Flying
+from skytether.shared.endpoints.endpoint import Datagram
+from skytether.shared.events.aboard import AutopilotText
+from skytether.shared.events.flight import Finished, Flying
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.reference import figure_eight
 from skytether.shared.scenario.schema import Scenario

@@ -22,7 +22,7 @@ from skytether.client import vehicles
 from skytether.client.endpoint import Client
 from skytether.netem.proxy import Proxy
 from skytether.server.endpoint import Server
-from skytether.shared.core.process_events import Counted
+from skytether.shared.events.processes import Counted
 from skytether.shared.law.model import Array
 from skytether.shared.missions.derived import zones
 from skytether.shared.scenario import reading
@@ -32,7 +32,7 @@ from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry import record
 from skytether.shared.telemetry.record import TRUTH_COLUMNS, Recorder, client_columns, parse
 from skytether.shared.telemetry.summary import least_separation
-from skytether.shell.log import LogLine
+from skytether.shell.processes.log import LogLine
 from skytether.sim.world import Clock, World
 
 NUMBERS = (1, 2, 3)

@@ -17,14 +17,14 @@ import pytest
 
 from helpers import PATIENCE_S, refused, until
 from skytether.__main__ import COMMANDS, main
-from skytether.shared.core.endpoint import Address
-from skytether.shared.core.events import Finished, Flying, ModeChanged, address_text
-from skytether.shared.core.process_events import Counted, Listening, Plaintext
+from skytether.shared.endpoints.endpoint import Address
+from skytether.shared.events.flight import Finished, Flying, ModeChanged, address_text
+from skytether.shared.events.processes import Counted, Listening, Plaintext
 from skytether.shared.scenario import reading
 from skytether.shared.telemetry.record import client_columns
 from skytether.shared.wire.protocol import Hello, encode
-from skytether.shell import command
-from skytether.shell.log import LogLine
+from skytether.shell.commandline import command
+from skytether.shell.processes.log import LogLine
 from warm import Command, Process, skytether
 
 QUICK = [

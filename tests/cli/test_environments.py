@@ -16,7 +16,7 @@ import pytest
 
 from helpers import PATIENCE_S, SKYTETHER, ran, refused, until
 from skytether.__main__ import main
-from skytether.shell import system
+from skytether.shell.host import system
 
 SIGUSR1_IGNORED = 1 << (signal.SIGUSR1 - 1)
 

@@ -22,13 +22,13 @@ from skytether.netem.proxy import Proxy
 from skytether.server.endpoint import Server
 from skytether.shared.base.chance import stream
 from skytether.shared.base.units import SECOND_NS
-from skytether.shared.core.endpoint import VEHICLES_TOLD_MAX, Address, Datagram
-from skytether.shared.core.events import NoAnswer
+from skytether.shared.endpoints.endpoint import VEHICLES_TOLD_MAX, Address, Datagram
+from skytether.shared.events.flight import NoAnswer
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.drops import drops
 from skytether.shared.telemetry.record import Recorder, Rows, client_columns, parse
-from skytether.shell import workers
+from skytether.shell.processes import workers
 from skytether.sim.world import Clock, World
 from warm import skytether
 

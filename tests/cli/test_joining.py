@@ -17,7 +17,7 @@ from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.feed import Frame, Rows
 from skytether.shared.telemetry.record import PACKET_COLUMNS, Record
 from skytether.shared.telemetry.summary import summarise
-from skytether.shell import command
+from skytether.shell.commandline import command
 from skytether.sim import flight
 from skytether.view.frames import of_flight
 from skytether.view.recorded import read

@@ -13,7 +13,7 @@ from skytether.cli import fly, keygen
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.base.meanings import meanings
 from skytether.shared.scenario.schema import LinkConfig
-from skytether.shell import command, help_text, options
+from skytether.shell.commandline import command, help_text, options
 
 CLIENT = client.ClientOptions()
 PLAIN: list[tuple[Any, str]] = [

@@ -22,8 +22,8 @@ from helpers import until
 from skytether.__main__ import COMMANDS, main
 from skytether.shared.base import files, input_files
 from skytether.shared.telemetry.record import PACKET_COLUMNS, read
-from skytether.shell.command import CommandError
-from skytether.shell.process import recorded
+from skytether.shell.commandline.command import CommandError
+from skytether.shell.processes.process import recorded
 
 pytestmark = pytest.mark.usefixtures("plugin_tables")
 

@@ -15,7 +15,7 @@ import pytest
 
 from skytether.cli.fly import _tell
 from skytether.cli.processes import Child, _read, feeds_in, record_of, started
-from skytether.shared.core.events import (
+from skytether.shared.events.flight import (
     Finished,
     FlowOpened,
     Flying,
@@ -23,11 +23,11 @@ from skytether.shared.core.events import (
     RecordIncomplete,
     SessionEnded,
 )
-from skytether.shared.core.process_events import Counted, Listening, Measured, NoFailsafe, Plaintext
+from skytether.shared.events.processes import Counted, Listening, Measured, NoFailsafe, Plaintext
 from skytether.shared.scenario.reading import load
 from skytether.shared.telemetry.record import PACKET_COLUMNS, Recorder, server_columns
-from skytether.shell.command import CommandError, flight_warnings
-from skytether.shell.log import LogLine
+from skytether.shell.commandline.command import CommandError, flight_warnings
+from skytether.shell.processes.log import LogLine
 from warm import Process
 
 

@@ -13,8 +13,8 @@ from helpers import PATIENCE_S, SKYTETHER, refused
 from skytether.cli.ros2 import Bridge, Ros2Options, changed
 from skytether.ros2 import messages
 from skytether.ros2.graph import Node
-from skytether.shared.core.endpoint import Datagram
-from skytether.shared.core.line import parse_line
+from skytether.shared.endpoints.endpoint import Datagram
+from skytether.shared.endpoints.line import parse_line
 
 GOAL = messages.topic("/skytether_1/goal_pose", messages.POSE_STAMPED)
 PLAN = messages.topic("/skytether_1/plan", messages.PATH)

@@ -12,7 +12,7 @@ from helpers import ran
 MODULES = """
 import signal, sys
 from skytether.__main__ import main
-from skytether.shell import log
+from skytether.shell.processes import log
 
 def listens(self, event):
     signal.raise_signal(signal.SIGTERM)
@@ -53,7 +53,7 @@ FLIES = ["client demo --model.tau-s 1 1", "netem demo --bind 127.0.0.1:0"]
 @pytest.mark.parametrize("command", [pytest.param("scenarios", marks=pytest.mark.long), *FLIES])
 def test_what_is_light_imports_nothing_heavy(command: str) -> None:
     modules = imported(*command.split())
-    assert "skytether.shell.command" in modules
+    assert "skytether.shell.commandline.command" in modules
     assert modules & (HEAVY | EXTRAS if command in FLIES else HEAVY) == set()
 
 

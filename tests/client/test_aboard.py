@@ -27,7 +27,8 @@ from skytether.client.mavlink.setpoints import VELOCITY_ALONE
 from skytether.mavlink.codec import Codec, Message
 from skytether.mavlink.dialect import dialect
 from skytether.shared.base.errors import ConfigError
-from skytether.shared.core.aboard import (
+from skytether.shared.endpoints.endpoint import Datagram
+from skytether.shared.events.aboard import (
     AutopilotFound,
     AutopilotMode,
     AutopilotRefused,
@@ -37,8 +38,7 @@ from skytether.shared.core.aboard import (
     ParametersSet,
     ParametersUnsafe,
 )
-from skytether.shared.core.endpoint import Datagram
-from skytether.shared.core.events import Flying
+from skytether.shared.events.flight import Flying
 from skytether.shared.telemetry.record import Reason
 from skytether.shared.wire.protocol import Mode
 

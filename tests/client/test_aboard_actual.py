@@ -9,7 +9,8 @@ from skytether.autopilot.flavours import FlightMode
 from skytether.mavlink.codec import Codec
 from skytether.mavlink.dialect import dialect
 from skytether.netem.proxy import Proxy
-from skytether.shared.core.aboard import (
+from skytether.shared.endpoints.endpoint import Datagram
+from skytether.shared.events.aboard import (
     AutopilotElsewhere,
     AutopilotMoved,
     AutopilotRefused,
@@ -20,8 +21,7 @@ from skytether.shared.core.aboard import (
     PositionsDropped,
     TextsOmitted,
 )
-from skytether.shared.core.endpoint import Datagram
-from skytether.shared.core.events import (
+from skytether.shared.events.flight import (
     AutopilotWaits,
     ServerHeard,
     ServerSilent,

@@ -13,7 +13,7 @@ from skytether.mavlink.codec import Codec
 from skytether.mavlink.dialect import dialect
 from skytether.shared.base import extras
 from skytether.shared.base.extras import ExtraMissing
-from skytether.shared.core.endpoint import Datagram
+from skytether.shared.endpoints.endpoint import Datagram
 
 MS, SECOND = 1_000_000, 1_000_000_000
 SLOW = 2_100_000

@@ -15,14 +15,14 @@ import pytest
 from airborne import FIGURE, SAFE, documented, scenario
 from skytether.autopilot.flavours import FlavourName
 from skytether.cli.processes import Child, started
-from skytether.shared.core.aboard import AutopilotMode, ParametersSet
-from skytether.shared.core.endpoint import Address
-from skytether.shared.core.events import Flying
-from skytether.shared.core.events import address_text as text
+from skytether.shared.endpoints.endpoint import Address
+from skytether.shared.events.aboard import AutopilotMode, ParametersSet
+from skytether.shared.events.flight import Flying
+from skytether.shared.events.flight import address_text as text
 from skytether.shared.scenario.reading import to_toml
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import client_columns, parse
-from skytether.shell.log import LogLine
+from skytether.shell.processes.log import LogLine
 
 pytestmark = [pytest.mark.long, pytest.mark.realtime]
 PAPER = "paper(0.4, 0.02, 2.0) & loss(0.1)"

@@ -11,8 +11,8 @@ from skytether.client.endpoint import Client
 from skytether.client.link import HELLO_NS
 from skytether.client.simulated.vehicle import SimulatedVehicle, simulated
 from skytether.shared.base.units import SECOND_NS
-from skytether.shared.core.endpoint import PATH_SOCKETS, Address, Datagram
-from skytether.shared.core.events import (
+from skytether.shared.endpoints.endpoint import PATH_SOCKETS, Address, Datagram
+from skytether.shared.events.flight import (
     Finished,
     Flying,
     ModeChanged,

@@ -4,7 +4,7 @@ from helpers import packaged
 from skytether.client.endpoint import Client
 from skytether.client.simulated.vehicle import simulated
 from skytether.shared.base.units import SECOND_NS
-from skytether.shared.core.endpoint import Address, Datagram
+from skytether.shared.endpoints.endpoint import Address, Datagram
 from skytether.shared.wire.framing import Report, split
 from skytether.shared.wire.paths import Paths
 from skytether.shared.wire.protocol import Heartbeat, Refusal, Welcome, encode

@@ -26,9 +26,9 @@ from skytether.client.simulated.vehicle import SimulatedVehicle
 from skytether.shared.base.chance import stream
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
-from skytether.shared.core.change import Running
-from skytether.shared.core.endpoint import Datagram
-from skytether.shared.core.events import Event, ModeChanged
+from skytether.shared.endpoints.change import Running
+from skytether.shared.endpoints.endpoint import Datagram
+from skytether.shared.events.flight import Event, ModeChanged
 from skytether.shared.law import rule
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Reason

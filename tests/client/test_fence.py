@@ -10,7 +10,7 @@ from fenced_flights import furthest_m, scenario
 from helpers import packaged
 from skytether.client.fence import Fence
 from skytether.shared.base.errors import ConfigError
-from skytether.shared.core.events import FenceHolds, ModeChanged
+from skytether.shared.events.flight import FenceHolds, ModeChanged
 from skytether.shared.scenario.fence import SLOW_STEPS, inner_bounds
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Record

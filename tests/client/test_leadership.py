@@ -13,8 +13,8 @@ from skytether.client.memory import SavedState, recall
 from skytether.client.simulated.vehicle import SimulatedVehicle, simulated
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.base.units import SECOND_NS, seconds_to_ns
-from skytether.shared.core.endpoint import STANDBY_SOCKETS, Address, Datagram
-from skytether.shared.core.standby_events import LeaderChanged
+from skytether.shared.endpoints.endpoint import STANDBY_SOCKETS, Address, Datagram
+from skytether.shared.events.standby import LeaderChanged
 from skytether.shared.law.terms import Limits
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.wire.drop import Drop

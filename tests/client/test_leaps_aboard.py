@@ -8,7 +8,7 @@ import pytest
 from airborne import Air, flying
 from skytether.autopilot.faults import LEAP
 from skytether.shared.base.errors import ConfigError
-from skytether.shared.core.events import ModeChanged, StateLeapt
+from skytether.shared.events.flight import ModeChanged, StateLeapt
 from skytether.shared.telemetry.record import Reason
 from skytether.shared.wire.protocol import Mode
 

@@ -9,8 +9,8 @@ from airborne import BOTH, SECOND, Air
 from skytether.autopilot.flavours import FlavourName
 from skytether.mavlink.codec import Codec, Message
 from skytether.mavlink.dialect import dialect
-from skytether.shared.core.aboard import AutopilotRefused
-from skytether.shared.core.endpoint import Datagram, Endpoint
+from skytether.shared.endpoints.endpoint import Datagram, Endpoint
+from skytether.shared.events.aboard import AutopilotRefused
 from skytether.shared.wire.protocol import Mode
 
 BEGINS_S, CHECK_S = 10.0, 60.0

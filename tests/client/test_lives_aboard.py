@@ -7,7 +7,7 @@ import pytest
 from airborne import ARM, Air
 from skytether.autopilot.flavours import FlavourName, FlightMode
 from skytether.shared.base.errors import ConfigError
-from skytether.shared.core.aboard import ArmingAwaited, NotTakenOff, OriginAwaited
+from skytether.shared.events.aboard import ArmingAwaited, NotTakenOff, OriginAwaited
 from skytether.shared.wire.protocol import Mode
 
 NORTH_M, EAST_M = 20.0, -12.0

@@ -10,12 +10,12 @@ import pytest
 
 from airborne import scenario
 from skytether.cli.processes import Child, started
-from skytether.shared.core.aboard import ArmingAwaited, AutopilotMode
-from skytether.shared.core.events import Flying
-from skytether.shared.core.events import address_text as text
-from skytether.shared.core.process_events import Recalled
+from skytether.shared.events.aboard import ArmingAwaited, AutopilotMode
+from skytether.shared.events.flight import Flying
+from skytether.shared.events.flight import address_text as text
+from skytether.shared.events.processes import Recalled
 from skytether.shared.scenario.reading import to_toml
-from skytether.shell.control import Caller
+from skytether.shell.driving.control import Caller
 
 pytestmark = [pytest.mark.long, pytest.mark.realtime]
 

@@ -20,7 +20,7 @@ from skytether.client.memory import (
 from skytether.client.vehicle import VehicleMemory
 from skytether.server.missions.mission_state import MissionState
 from skytether.shared.base.units import SECOND_NS
-from skytether.shared.core.events import BegunAnew, CannotResume, ModeChanged
+from skytether.shared.events.flight import BegunAnew, CannotResume, ModeChanged
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Reason

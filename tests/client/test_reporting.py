@@ -10,8 +10,8 @@ import skytether
 from skytether.client import reporting
 from skytether.client.compensator import Compensator
 from skytether.client.reporting import BelievedState, Reporter
+from skytether.client.reports import Unreported, make_report
 from skytether.shared.scenario.grammar import GrammarError
-from skytether.shared.scenario.observing import Unreported, make_report
 from skytether.shared.scenario.reading import load
 from skytether.shared.scenario.registry import REPORTS
 from skytether.shared.telemetry.record import DOWNLINK, Record

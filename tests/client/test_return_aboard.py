@@ -11,8 +11,8 @@ from skytether.autopilot.flavours import FlavourName
 from skytether.autopilot.flight import Result
 from skytether.client import vehicles
 from skytether.shared.base.errors import ConfigError
-from skytether.shared.core.aboard import AutopilotRefused, ParametersUnsafe
-from skytether.shared.core.events import ModeChanged
+from skytether.shared.events.aboard import AutopilotRefused, ParametersUnsafe
+from skytether.shared.events.flight import ModeChanged
 from skytether.shared.telemetry.record import parse
 from skytether.shared.wire.protocol import Mode
 

@@ -14,7 +14,7 @@ from skytether.client.mavlink.obedience import Obedience
 from skytether.client.mavlink.rivals import QUIET_NS, Rivals
 from skytether.mavlink.codec import Codec, Message
 from skytether.mavlink.dialect import dialect
-from skytether.shared.core.aboard import SecondCommander, Strays
+from skytether.shared.events.aboard import SecondCommander, Strays
 from skytether.shared.telemetry.record import Reason, parse
 from skytether.shared.wire.protocol import Mode
 

@@ -23,9 +23,9 @@ from skytether.ros2 import messages
 from skytether.shared.base import extras
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.base.extras import ExtraMissing
-from skytether.shared.core.aboard import OdometryDropped, SecondPublisher
-from skytether.shared.core.endpoint import Datagram
-from skytether.shared.core.events import AutopilotWaits
+from skytether.shared.endpoints.endpoint import Datagram
+from skytether.shared.events.aboard import OdometryDropped, SecondPublisher
+from skytether.shared.events.flight import AutopilotWaits
 from skytether.shared.wire.protocol import Mode
 from skytether.sim.world import Clock, World
 

@@ -36,20 +36,20 @@ from skytether.lab.adversary import (
 from skytether.lab.commands import pool
 from skytether.lab.commands.adversary import Kept
 from skytether.lab.lives import Body, world_s
-from skytether.server.common.clock import ClockMap
 from skytether.server.missions.mission_planner import MissionPlanner
 from skytether.server.missions.mission_state import MissionState
 from skytether.server.missions.vehicle_motions import VehicleMotions
+from skytether.server.planning.clock import ClockMap
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.base.units import SECOND_NS, seconds_to_ns
-from skytether.shared.core.endpoint import Datagram
-from skytether.shared.core.standby_events import LeaderChanged
+from skytether.shared.endpoints.endpoint import Datagram
+from skytether.shared.events.standby import LeaderChanged
 from skytether.shared.law.model import Array, Indices
 from skytether.shared.law.motion import Motion
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import parse
-from skytether.shell import command
+from skytether.shell.commandline import command
 from skytether.sim.flight import SERVER, STANDBY
 from skytether.sim.world import World
 

@@ -9,7 +9,7 @@ import pytest
 from skytether.client.compensator import Compensator
 from skytether.client.followers import Constants, Follower, HorizonFollower, SplineFollower
 from skytether.lab.courses import FollowedCourse, PlannedCourse
-from skytether.server.common.scheme import Foresight
+from skytether.server.planning.scheme import Foresight
 from skytether.server.schemes import trajectory
 from skytether.server.schemes.committed import Replay
 from skytether.server.schemes.trajectory import Guidance

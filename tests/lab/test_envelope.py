@@ -27,16 +27,16 @@ from skytether.lab.envelope import (
     worst_first,
 )
 from skytether.lab.journal import StudyJournal
+from skytether.netem.impairments.direction import impairments
 from skytether.server.controller import Controller
 from skytether.shared.base.chance import stream
 from skytether.shared.law.model import Array, Flags, Indices
 from skytether.shared.scenario import reading
-from skytether.shared.scenario.air.path import path
 from skytether.shared.scenario.dotted import set_keys
 from skytether.shared.scenario.registry import IMPAIRMENTS
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Rows, client_columns
-from skytether.shell import command
+from skytether.shell.commandline import command
 from skytether.sim import flight
 
 DEMO = Envelope("demo-committed", reading.load("demo-committed"))
@@ -55,7 +55,9 @@ def test_points_lie_within_their_bounds_and_fill_them() -> None:
         assert 0.0 <= delays.min() < 0.01
         assert 2.99 < delays.max() <= 3.0
         assert {call.name for call in calls} == {"constant", "paper"}
-    paths = [[path(each) for each in column[f"network.{way}"]] for way in ("uplink", "downlink")]
+    paths = [
+        [impairments(each) for each in column[f"network.{way}"]] for way in ("uplink", "downlink")
+    ]
     up, down = (np.array([each.loss for each in way]) for way in paths)
     assert 0.97 < max(up.max(), down.max()) <= 0.99
     assert np.mean(np.maximum(up, down) <= 0.5) == pytest.approx(

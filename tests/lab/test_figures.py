@@ -21,7 +21,7 @@ from bench.figures import (
     statistic,
 )
 from bench.harness import TextTable, refresh
-from skytether.shell.command import CommandError
+from skytether.shell.commandline.command import CommandError
 
 ROOT = figures.ROOT
 REGISTER = register()

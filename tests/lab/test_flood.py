@@ -14,11 +14,11 @@ from bench.flood import FORGED, FloodCounts
 from bench.link import NOW_NS, PEER, Ends
 from bench.wire import messages
 from skytether.server.secure import FORMS, SecureGate
-from skytether.shared.core.endpoint import Datagram, Form
+from skytether.shared.endpoints.endpoint import Datagram, Form
 from skytether.shared.scenario.reading import load
 from skytether.shared.wire.drop import ProtocolError
 from skytether.shared.wire.protocol import Hello, Observation, Welcome, encode
-from skytether.shell.udp import admit_only, kernel_drops, open_socket
+from skytether.shell.host.udp import admit_only, kernel_drops, open_socket
 from skytether.sim.sealed import make_keys
 
 pytestmark = pytest.mark.long

@@ -23,7 +23,7 @@ from skytether.shared.telemetry import feed
 from skytether.shared.wire import handshake, protocol
 from skytether.shared.wire.drop import Drop
 from skytether.shared.wire.protocol import decode
-from skytether.shell import log
+from skytether.shell.processes import log
 from skytether.view import container
 
 COUNTS = {

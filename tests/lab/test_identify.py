@@ -34,12 +34,12 @@ from skytether.lab.identify.steps import (
     default_speeds,
     fenced,
 )
-from skytether.shared.core.endpoint import Datagram, Endpoint
+from skytether.shared.endpoints.endpoint import Datagram, Endpoint
 from skytether.shared.law.model import Array
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Reason
-from skytether.shell import command
+from skytether.shell.commandline import command
 from skytether.sim import flight
 from skytether.sim.world import Clock, World
 

@@ -22,8 +22,8 @@ from skytether.lab import plates, report, studies
 from skytether.lab.calibration import TABLE_1
 from skytether.lab.studies import EVENT, EVERY, NONE, PERIODIC, MethodFlights, Study
 from skytether.lab.sweep import GridAxis, Sweep
+from skytether.netem.impairments.direction import impairments
 from skytether.shared.scenario import reading
-from skytether.shared.scenario.air.path import path
 from skytether.shared.scenario.registry import IMPAIRMENTS
 from skytether.shared.telemetry.summary import Summary, summarise
 from skytether.sim import flight
@@ -104,7 +104,7 @@ def test_jitter_grows_while_the_mean_delay_stays() -> None:
     for (std_ms, _), task in zip(jitter.first().cells, jitter.first().tasks(), strict=True):
         for way in (task.scenario.network.uplink, task.scenario.network.downlink):
             _, slot_s, slots_mean, _ = IMPAIRMENTS.calls(way)[0].values
-            assert path(way).mean_s == pytest.approx(0.44)
+            assert impairments(way).mean_s == pytest.approx(0.44)
             assert slot_s * math.sqrt(slots_mean) == pytest.approx(std_ms / 1e3)
 
 

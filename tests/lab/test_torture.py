@@ -42,11 +42,11 @@ from skytether.server.reception import Reception
 from skytether.server.sessions import Session
 from skytether.server.tick import Ticker
 from skytether.shared.base.units import SECOND_NS
-from skytether.shared.core.endpoint import Datagram, Endpoint
+from skytether.shared.endpoints.endpoint import Datagram, Endpoint
 from skytether.shared.law import rule, spline
 from skytether.shared.telemetry.record import Reason
 from skytether.shared.wire.protocol import Mode
-from skytether.shell.command import CommandError
+from skytether.shell.commandline.command import CommandError
 
 SEEDS = Path(__file__).parents[1] / "torture_seeds.txt"
 FAILED = [line for line in SEEDS.read_text().splitlines() if not line.startswith("#")]

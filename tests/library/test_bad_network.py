@@ -15,8 +15,8 @@ import pytest
 import skytether
 import skytether.library.bad_network
 from helpers import PATIENCE_S, echo, until
-from skytether.shared.core.line import CONNECTIONS_MAX, Listen
-from skytether.shell.udp import AddressError
+from skytether.shared.endpoints.line import CONNECTIONS_MAX, Listen
+from skytether.shell.host.udp import AddressError
 
 Opened = Callable[..., skytether.bad_network]
 

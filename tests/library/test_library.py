@@ -19,7 +19,7 @@ import skytether
 from helpers import PATIENCE_S
 from skytether import ConfigError, check, fly, fly_batch, load, sweep
 from skytether.cli import processes
-from skytether.shared.core.events import NoAnswer, ReferenceTooFast
+from skytether.shared.events.flight import NoAnswer, ReferenceTooFast
 from skytether.shared.telemetry.summary import Summary, summarise
 from skytether.shared.wire.protocol import (
     Hello,
@@ -31,7 +31,7 @@ from skytether.shared.wire.protocol import (
     encode,
     stamp_us,
 )
-from skytether.shell.command import CommandError
+from skytether.shell.commandline.command import CommandError
 from skytether.sim import flight as virtual
 
 EXPORTS = skytether.__all__

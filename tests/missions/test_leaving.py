@@ -14,7 +14,7 @@ from skytether.client.failsafe import FOLLOWING
 from skytether.lab.adversary import Move, MoveKind, Raid, spare_m
 from skytether.lab.lives import Lives
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS, seconds_to_ns
-from skytether.shared.core.events import Leaving, SteppedLate
+from skytether.shared.events.flight import Leaving, SteppedLate
 from skytether.shared.missions.events import LeftMotion
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Reason, parse

@@ -21,7 +21,6 @@ from skytether.__main__ import main
 from skytether.client.compensator import Compensator
 from skytether.client.reporting import Reporter
 from skytether.server import sessions
-from skytether.server.common.clock import ClockMap
 from skytether.server.endpoint import Server
 from skytether.server.missions import trajectory_qp, vehicle_motions, waypoints, yielding
 from skytether.server.missions.compiled_motion import pieces_of
@@ -35,10 +34,11 @@ from skytether.server.missions.separation import too_near
 from skytether.server.missions.trajectory_qp import TrajectoryQP
 from skytether.server.missions.vehicle_motions import PROMPT_COUNT, SentMotion, VehicleMotions
 from skytether.server.missions.waypoints import Waypoints
+from skytether.server.planning.clock import ClockMap
 from skytether.shared.base.chance import stream
 from skytether.shared.base.units import SECOND_NS
-from skytether.shared.core.endpoint import Datagram
-from skytether.shared.core.events import ChangeRefused, SessionEnded
+from skytether.shared.endpoints.endpoint import Datagram
+from skytether.shared.events.flight import ChangeRefused, SessionEnded
 from skytether.shared.law.model import Array, Indices
 from skytether.shared.law.motion import INTERVALS, SAMPLES, SPACING, Motion, resting
 from skytether.shared.law.spline import spline_at

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from bench.problems import from_python
-from skytether.server.common.clock import EXACT, ClockMap, Contradiction, StepError
 from skytether.server.missions.half_planes import half_planes
 from skytether.server.missions.mission_state import LONGEST
 from skytether.server.missions.possible_motions import (
@@ -19,6 +18,7 @@ from skytether.server.missions.separation import _distance_from_parallelogram, t
 from skytether.server.missions.vehicle_motions import SentMotion, VehicleMotions
 from skytether.server.missions.waypoints import Waypoints
 from skytether.server.missions.zone_clearance import comes_near
+from skytether.server.planning.clock import EXACT, ClockMap, Contradiction, StepError
 from skytether.shared.base.chance import stream
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
 from skytether.shared.law.motion import SAMPLES, SPACING, Motion, bend_m, resting

@@ -12,8 +12,8 @@ from skytether.lab.adversary import AdversaryNetwork, Climb, Move, MoveKind, Rai
 from skytether.lab.lives import Lives
 from skytether.server.missions.led_vehicles import LedVehicles
 from skytether.shared.base.units import SECOND_NS
-from skytether.shared.core.events import SessionRefused
-from skytether.shared.core.standby_events import LimitsDiffer
+from skytether.shared.events.flight import SessionRefused
+from skytether.shared.events.standby import LimitsDiffer
 from skytether.shared.law.motion import SPACING, Motion, resting
 from skytether.shared.missions.mission import Mission
 from skytether.shared.scenario.schema import Scenario

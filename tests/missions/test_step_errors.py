@@ -16,21 +16,21 @@ from hypothesis import strategies as st
 from helpers import packaged
 from skytether.lab.lives import Lives
 from skytether.netem.fate import Fates
+from skytether.netem.impairments.direction import impairments
 from skytether.netem.proxy import Proxy
-from skytether.server.common.clock import EXACT, ClockMap, Contradiction, StepError
 from skytether.server.missions.half_planes import half_planes
 from skytether.server.missions.possible_motions import NEVER, PossibleMotion, PossibleMotions
 from skytether.server.missions.separation import too_near
+from skytether.server.planning.clock import EXACT, ClockMap, Contradiction, StepError
 from skytether.shared.base.units import MILLISECOND_NS as MS
 from skytether.shared.base.units import SECOND_NS as S
-from skytether.shared.core.events import ClockContradicted
-from skytether.shared.core.time_of_day import DRIFT
+from skytether.shared.endpoints.time_of_day import DRIFT
+from skytether.shared.events.flight import ClockContradicted
 from skytether.shared.law.model import Array
 from skytether.shared.law.motion import SPACING, Motion, resting
 from skytether.shared.missions.derived import zones
 from skytether.shared.missions.mission import Mission
 from skytether.shared.scenario import reading
-from skytether.shared.scenario.air.path import path
 from skytether.shared.scenario.schema import Scenario
 from skytether.sim import flight
 from two_vehicles import clear_m, drawn, left_m, separation_m
@@ -388,7 +388,7 @@ def odd(up_s: float, down_s: float) -> Delays:
 def delay(monkeypatch: pytest.MonkeyPatch, delays: Delays) -> None:
     def fates(_: Proxy, name: Literal["uplink", "downlink"], flow: int) -> Fates:
         delay_s = delays(flow)[name == "downlink"]
-        return Fates(path(f"constant({delay_s})"), 1, name, flow)
+        return Fates(impairments(f"constant({delay_s})"), 1, name, flow)
 
     monkeypatch.setattr(Proxy, "fates", fates)
 

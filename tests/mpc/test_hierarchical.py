@@ -14,8 +14,6 @@ from scipy.optimize import lsq_linear
 
 import skytether.server.mpc.hierarchical
 from bench.problems import gradients, listening, solving
-from skytether.server.common.desired import Desired
-from skytether.server.common.scheme import FIGURES, Figures, Foresight, empty_foresight
 from skytether.server.controller import BLOCK
 from skytether.server.mpc.appraisal import GENERATOR, TRACKER
 from skytether.server.mpc.exact import ExactSolver
@@ -23,7 +21,9 @@ from skytether.server.mpc.hierarchical import PlanBatch, Planner
 from skytether.server.mpc.osqp_solver import OsqpSolver
 from skytether.server.mpc.problem import FIRST, LATER, Problem, make_mpc, pose
 from skytether.server.mpc.riccati import RiccatiWorkspace
-from skytether.shared.core.stopwatch import Stopwatch
+from skytether.server.planning.desired import Desired
+from skytether.server.planning.scheme import FIGURES, Figures, Foresight, empty_foresight
+from skytether.shared.endpoints.stopwatch import Stopwatch
 from skytether.shared.law.model import Array, Flags, Indices
 from skytether.shared.scenario.reading import check
 from skytether.shared.scenario.schema import Scenario

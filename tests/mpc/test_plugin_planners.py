@@ -24,7 +24,7 @@ from skytether.shared.base.errors import ConfigError
 from skytether.shared.law.model import Array
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Record
-from skytether.shell import plugins
+from skytether.shell.commandline import plugins
 from skytether.sim.flight import fly, fly_batch
 
 pytestmark = pytest.mark.usefixtures("plugin_tables")

@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from skytether.netem.fate import Fates
+from skytether.netem.impairments.direction import impairments
+from skytether.netem.impairments.draws import SLOT_NS, Fate
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.scenario import reading
-from skytether.shared.scenario.air.draws import SLOT_NS, Fate
-from skytether.shared.scenario.air.path import path
 from skytether.shared.scenario.grammar import Call, GrammarError
 from skytether.shared.scenario.registry import IMPAIRMENTS, TRIGGERS
 
@@ -25,7 +25,7 @@ P_MIN = 0.001
 
 
 def fates(text: str, seed: int = 1, count: int = SAMPLES, every: int = 7) -> list[Fate]:
-    made = Fates(path(text), seed, "uplink", 0)
+    made = Fates(impairments(text), seed, "uplink", 0)
     return [made.at(every * number) for number in range(count)]
 
 
@@ -77,7 +77,7 @@ def test_a_unit_of_something_else_is_refused(text: str) -> None:
 
 @pytest.mark.parametrize("text", LAWS)
 def test_delays_follow_their_law_and_what_it_says_of_itself_is_so(text: str) -> None:
-    made, law = path(text), LAWS[text]
+    made, law = impairments(text), LAWS[text]
     assert stats.kstest(delays_s(text, 1), law.cdf).pvalue > P_MIN
     assert made.mean_s == pytest.approx(law.mean(), rel=1e-6)
     assert made.least_s == pytest.approx(max(0.0, law.ppf(2.0**-54)), abs=0.01)
@@ -120,7 +120,7 @@ def test_shares_are_those_asked_for(
     count = sum(befell(fate) for fate in fates(text))
     assert stats.binomtest(count, SAMPLES, share).pvalue > P_MIN
     if "loss" in text or "gilbert" in text:
-        assert path(text).loss == pytest.approx(share)
+        assert impairments(text).loss == pytest.approx(share)
 
 
 def test_flipped_bits_lie_anywhere() -> None:
@@ -156,7 +156,7 @@ def test_an_outage_keeps_its_schedule() -> None:
 
 def test_delays_add_up() -> None:
     assert {fate.delay_ns for fate in fates("constant(0.1) & constant(0.05)")} == {150_000_000}
-    assert path("constant(0.1) & uniform(0.1, 0.3)").mean_s == pytest.approx(0.3)
+    assert impairments("constant(0.1) & uniform(0.1, 0.3)").mean_s == pytest.approx(0.3)
 
 
 def test_another_impairment_changes_no_draw_of_the_others() -> None:
@@ -192,7 +192,7 @@ def test_another_impairment_changes_no_draw_of_the_others() -> None:
 )
 def test_a_wrong_text_is_told_in_a_line(text: str, said: str) -> None:
     with pytest.raises(GrammarError) as raised:
-        path(text)
+        impairments(text)
     assert said in str(raised.value)
     assert "\n" not in str(raised.value)
 
@@ -200,7 +200,7 @@ def test_a_wrong_text_is_told_in_a_line(text: str, said: str) -> None:
 @given(st.text("()&,=.\"' -0123456789alosrtequnif_\n", max_size=60))
 def test_no_text_does_anything_but_be_refused(text: str) -> None:
     with suppress(GrammarError):
-        path(text)
+        impairments(text)
 
 
 def test_arguments_may_have_names_and_defaults() -> None:

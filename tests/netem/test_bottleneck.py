@@ -10,10 +10,10 @@ from hypothesis import strategies as st
 
 from skytether.netem.bottleneck import INTERVAL_NS, TARGET_NS, Bottleneck, Codel
 from skytether.netem.fate import Fates
+from skytether.netem.impairments.direction import impairments
 from skytether.netem.link import Lane, Link
 from skytether.shared.base.units import HEADER_BYTES, MILLISECOND_NS, SECOND_NS
-from skytether.shared.core.endpoint import Datagram
-from skytether.shared.scenario.air.path import path
+from skytether.shared.endpoints.endpoint import Datagram
 from skytether.shared.scenario.reading import files_of
 from skytether.shared.telemetry.record import UPLINK
 
@@ -22,13 +22,13 @@ Packet = tuple[int, int, int]
 
 
 def linked(text: str) -> tuple[Link, Lane]:
-    direction = path(text)
+    direction = impairments(text)
     return Link(UPLINK, 1472, None, direction), Lane(0, Fates(direction, 1, "uplink", 0), 0)
 
 
 def passed(text: str, packets: Sequence[Packet]) -> tuple[dict[int, int], list[int]]:
     """Times at which packets have passed by number [ns], and the numbers of those dropped."""
-    queue = path(text, files_of("network.uplink", text)).queue
+    queue = impairments(text, files_of("network.uplink", text)).queue
     assert queue is not None
     bottleneck: Bottleneck[int] = Bottleneck(queue)
     out: dict[int, int] = {}
@@ -133,7 +133,7 @@ def test_times_of_mahimahi_are_kept(tmp_path: Path) -> None:
     assert [out[number] // ms for number in range(5)] == [10, 10, 30, 40, 50]
     out, _ = passed(text, [(0, 752, 0)] * 4 + [(35 * ms, 100, 0), (60 * ms, 1504, 0)])
     assert [out[number] // ms for number in range(6)] == [10, 10, 10, 10, 40, 70]
-    queue = path(text, files_of("network.uplink", text)).queue
+    queue = impairments(text, files_of("network.uplink", text)).queue
     assert queue is not None
     assert queue.bytes_per_s == 4 * 1504 / 0.04
 
@@ -189,7 +189,7 @@ def test_a_rate_that_changes_serves_those_who_wait() -> None:
         for _ in range(20):
             link.accept(Datagram(b"x" * 72, ("a", 1)), lane, now_ns=0)
         link.release(now_ns=20 * MILLISECOND_NS)
-        link.change(path(text), now_ns=20 * MILLISECOND_NS)
+        link.change(impairments(text), now_ns=20 * MILLISECOND_NS)
         left = 0
         while (due_ns := link.next_due_ns()) is not None:
             left += len(link.release(now_ns=due_ns))

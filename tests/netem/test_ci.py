@@ -19,7 +19,7 @@ from helpers import PATIENCE_S
 from namespaces import needs_namespaces
 from robot import free_port
 from skytether.__main__ import main
-from skytether.shell import inside
+from skytether.shell.driving import inside
 
 PAGE = (Path(__file__).parents[2] / "docs" / "ci.md").read_text()
 GITHUB, GITLAB = (

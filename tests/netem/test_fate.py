@@ -8,10 +8,10 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from skytether.netem.fate import Fates
+from skytether.netem.impairments import delays
+from skytether.netem.impairments.direction import impairments
+from skytether.netem.impairments.draws import SLOT_NS, Draws, Fate, Stream
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
-from skytether.shared.scenario.air import delays
-from skytether.shared.scenario.air.draws import SLOT_NS, Draws, Fate, Stream
-from skytether.shared.scenario.air.path import path
 
 SAMPLES = 20_000
 TAIL = 8
@@ -29,7 +29,7 @@ def first_fates(
     flow: int = 0,
     count: int = COUNT,
 ) -> list[Fate]:
-    fates = Fates(path(direction), seed, name, flow)
+    fates = Fates(impairments(direction), seed, name, flow)
     return [fates.at(slot) for slot in range(count)]
 
 
@@ -46,7 +46,7 @@ def test_paper_delays_follow_the_corrected_equation_17() -> None:
     shares = [*stats.poisson.pmf(range(TAIL), 2), stats.poisson.sf(TAIL - 1, 2)]
     counts = np.bincount(np.minimum(slots, TAIL), minlength=TAIL + 1)
     assert stats.chisquare(counts, np.multiply(shares, SAMPLES)).pvalue > 0.001
-    assert path(PAPER).mean_s == pytest.approx(0.44)
+    assert impairments(PAPER).mean_s == pytest.approx(0.44)
 
 
 def test_losses_are_independent_of_delays() -> None:
@@ -58,7 +58,7 @@ def test_losses_are_independent_of_delays() -> None:
 
 def test_a_fate_does_not_depend_on_what_was_asked_before() -> None:
     fates, bursty = (
-        Fates(path(text), 1, "uplink", 0)
+        Fates(impairments(text), 1, "uplink", 0)
         for text in (
             LOSSY,
             "gamma(0, 0.1, 0.05, correlation_s=0.3) & gilbert_elliott(0.1, 0.5) & duplicate(0.2)",
@@ -73,7 +73,7 @@ def test_a_fate_does_not_depend_on_what_was_asked_before() -> None:
 
 def test_packets_of_one_slot_have_fates_of_their_own() -> None:
     """CLOSE is sent three times at once, because one may be lost: a binomial test."""
-    fates = Fates(path(LOSSY), 17, "uplink", 0)
+    fates = Fates(impairments(LOSSY), 17, "uplink", 0)
     triples = [[fates.at(slot, rank) for rank in range(3)] for slot in range(SAMPLES)]
     all_lost = sum(all(fate.lost for fate in triple) for triple in triples)
     assert stats.binomtest(all_lost, SAMPLES, 0.1**3).pvalue > 0.001
@@ -120,7 +120,7 @@ def test_no_draw_lies_beyond_the_last_number_of_slots(mean: float) -> None:
 
 
 def test_in_a_burst_everything_is_lost() -> None:
-    fates = Fates(path(f"{PAPER} & gilbert_elliott(0.3, 0.1)"), 1, "uplink", 0)
+    fates = Fates(impairments(f"{PAPER} & gilbert_elliott(0.3, 0.1)"), 1, "uplink", 0)
     slots = [{fates.at(slot, rank).lost for rank in range(4)} for slot in range(2000)]
     assert all(len(fates_of) == 1 for fates_of in slots)
     assert {True} in slots

@@ -10,11 +10,11 @@ from hypothesis import strategies as st
 
 from skytether.netem import link as link_module
 from skytether.netem.fate import Fates
+from skytether.netem.impairments.direction import impairments
+from skytether.netem.impairments.draws import SLOT_NS, Fate
 from skytether.netem.link import QUEUE_BYTES_MAX, SLICE_BITS, Lane, Link, QueuedPacket
 from skytether.shared.base.units import MILLISECOND_NS
-from skytether.shared.core.endpoint import Datagram
-from skytether.shared.scenario.air.draws import SLOT_NS, Fate
-from skytether.shared.scenario.air.path import path
+from skytether.shared.endpoints.endpoint import Datagram
 from skytether.shared.telemetry.record import (
     DOWNLINK,
     PACKET_COLUMNS,
@@ -266,7 +266,7 @@ def test_the_fate_of_every_packet_is_written_down() -> None:
 
 
 def test_a_packet_meets_the_fate_of_when_it_enters() -> None:
-    fates, began_ns = Fates(path("paper(0.4, 0.02, 2.0)"), 1, "uplink", 0), 500
+    fates, began_ns = Fates(impairments("paper(0.4, 0.02, 2.0)"), 1, "uplink", 0), 500
     for before in ([], [0, 1, 2], [59] * 3, [60, 90]):  # the last: a clock set back
         link, lane = make_link(), Lane(0, fates, began_ns)
         for slot in (*before, 60, 60):

@@ -31,19 +31,19 @@ from skytether.netem.__main__ import NetemOptions, _with_directions
 from skytether.netem.proxy import Proxy
 from skytether.netem.relay import Relay
 from skytether.shared.base.units import HEADER_BYTES, MILLISECOND_NS, SECOND_NS
-from skytether.shared.core.change import Answer, Running
-from skytether.shared.core.endpoint import Address, Datagram
-from skytether.shared.core.ways import FLIGHT, NAMES, RELAY, RUN, Ways
+from skytether.shared.endpoints.change import Answer, Running
+from skytether.shared.endpoints.endpoint import Address, Datagram
+from skytether.shared.endpoints.ways import FLIGHT, NAMES, RELAY, RUN, Ways
 from skytether.shared.formats.recorded import recorded_in
 from skytether.shared.scenario.reading import load
 from skytether.shared.scenario.registry import File
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import DOWNLINK, PACKET_COLUMNS, UPLINK
-from skytether.shell.command import parse
-from skytether.shell.control import answer_of
-from skytether.shell.metrics import families
-from skytether.shell.process import Process
-from skytether.shell.udp import leads_back
+from skytether.shell.commandline.command import parse
+from skytether.shell.driving.control import answer_of
+from skytether.shell.host.udp import leads_back
+from skytether.shell.processes.metrics import families
+from skytether.shell.processes.process import Process
 from skytether.view import traffic
 from skytether.view.rows import readable
 
@@ -270,7 +270,7 @@ def test_without_a_scenario_netem_changes_nothing() -> None:
     scenario = directed()
     assert scenario.network.mtu == 65_507
     for path in (scenario.uplink, scenario.downlink):
-        assert [name for name, _ in path.impairments] == ["none"]
+        assert [name for name, _ in path.parts] == ["none"]
         assert path.queue is None
 
 
@@ -463,7 +463,7 @@ def test_changes_of_a_relay_are_asked_for_and_told_by_its_own_names() -> None:
         with pytest.raises(skytether.ConfigError, match="to_client") as refused:
             running_.change(wrong, now_ns=0)
         assert "link" not in str(refused.value)
-    assert relay.downlink.path.loss == 0.3
+    assert relay.downlink.impairments.loss == 0.3
 
 
 def test_set_lists_the_names_of_a_relay(

@@ -10,13 +10,13 @@ from hypothesis import strategies as st
 from skytether.netem import link as link_module
 from skytether.netem import places as places_module
 from skytether.netem.fate import Fates
+from skytether.netem.impairments.direction import impairments
 from skytether.netem.link import Link
 from skytether.netem.places import EARNED_NS, EXCHANGES, HOST_FLOWS, IDLE_NS, Flow
 from skytether.netem.proxy import FLOWS_MAX, LAPS_MAX, Proxy
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
-from skytether.shared.core.endpoint import Datagram, host_of
-from skytether.shared.core.events import FlowOpened, Returned, TooLong, Unreachable
-from skytether.shared.scenario.air.path import path
+from skytether.shared.endpoints.endpoint import Datagram, host_of
+from skytether.shared.events.flight import FlowOpened, Returned, TooLong, Unreachable
 from skytether.shared.scenario.schema import NetworkConfig, Scenario
 
 SERVER = ("192.0.2.9", 47001)
@@ -521,7 +521,7 @@ def test_each_direction_and_flow_meets_its_own_fates() -> None:
             hear(proxy, bytes([number]), SERVER, flow + 1)
         sent = proxy.outbox()
         for name, peer in (("downlink", SERVER), ("uplink", client)):
-            fates = Fates(path(half), 7, name, flow)
+            fates = Fates(impairments(half), 7, name, flow)
             drawn = [fates.at(0, rank).lost for rank in range(40)]
             passed = [datagram.payload[0] for datagram in sent if datagram.peer == peer]
             assert passed == [number for number in range(40) if not drawn[number]]

@@ -30,9 +30,9 @@ from skytether.netem.__main__ import emulate_for
 from skytether.shared.base.packets import GATEWAY, GATEWAY6
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.telemetry.record import DOWNLINK, UPLINK, read
-from skytether.shell import system
-from skytether.shell.command import CommandError
-from skytether.shell.program import GRACE_S
+from skytether.shell.commandline.command import CommandError
+from skytether.shell.driving.program import GRACE_S
+from skytether.shell.host import system
 
 PATIENCE_S = 180.0
 PASSED_ON = set(system.passable()) - {signal.SIGTSTP}
@@ -544,7 +544,11 @@ class TestEnd:
 
     @pytest.mark.parametrize(
         "begins",
-        [r"\S*python\S* -P -m skytether.shell.inside", r"\S*slirp4netns", r"sh -c \nulimit"],
+        [
+            r"\S*python\S* -P -m skytether.shell.driving.inside",
+            r"\S*slirp4netns",
+            r"sh -c \nulimit",
+        ],
     )
     def test_another_process_is_killed(self, begins: str) -> None:
         with self.running() as (run, processes):

@@ -20,12 +20,12 @@ from skytether.netem.relay import Relay
 from skytether.netem.tunnel import Tunnel
 from skytether.shared.base.packets import PROGRAM
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
-from skytether.shared.core.endpoint import Datagram
-from skytether.shared.core.line import CLIENT
-from skytether.shared.core.ways import RELAY
+from skytether.shared.endpoints.endpoint import Datagram
+from skytether.shared.endpoints.line import CLIENT
+from skytether.shared.endpoints.ways import RELAY
 from skytether.shared.scenario.schema import NetworkConfig, Scenario
 from skytether.shared.telemetry.record import DOWNLINK, PACKET_COLUMNS, Recorder, parse
-from skytether.shell.process import Process
+from skytether.shell.processes.process import Process
 
 AIR = "gamma(0.01, 0.1, 0.05) & loss(0.3) & duplicate(0.2) & corrupt(0.2)"
 FAR = ("192.0.2.9", 5000)

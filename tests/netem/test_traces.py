@@ -8,15 +8,14 @@ import numpy as np
 import pytest
 
 from skytether.netem.fate import Fates
+from skytether.netem.impairments.direction import Impairments, impairments
+from skytether.netem.impairments.draws import SLOT_NS
 from skytether.probe.outages import compare
 from skytether.probe.recorded import round_trips
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.formats import recorded
 from skytether.shared.scenario import reading
-from skytether.shared.scenario.air.draws import SLOT_NS
-from skytether.shared.scenario.air.path import Path as AirPath
-from skytether.shared.scenario.air.path import path
 from skytether.shared.scenario.registry import File
 
 PING = """PING example (192.0.2.1) 56(84) bytes of data.
@@ -380,9 +379,9 @@ def test_a_file_is_read_again_where_it_has_changed(tmp_path: Path) -> None:
     assert path_of(f"trace({name})").mean_s == 0.25
 
 
-def path_of(text: str) -> AirPath:
+def path_of(text: str) -> Impairments:
     """Direction of the network, with the files that its text names."""
-    return path(text, reading.files_of("network.uplink", text))
+    return impairments(text, reading.files_of("network.uplink", text))
 
 
 @pytest.mark.parametrize("play", ["loop", "once"])

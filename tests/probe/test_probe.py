@@ -19,6 +19,7 @@ from helpers import SKYTETHER, refused
 from skytether.__main__ import main
 from skytether.client.link import PlainLink
 from skytether.figures.probing import drawn
+from skytether.netem.impairments.direction import impairments
 from skytether.netem.proxy import Proxy
 from skytether.probe import analysis, fits
 from skytether.probe.listener import HOLD_NS, IDLE_NS, SESSIONS_MAX, Listener
@@ -38,9 +39,8 @@ from skytether.probe.wire import (
 )
 from skytether.server.gate import PlainGate
 from skytether.shared.base.units import SECOND_NS
-from skytether.shared.core.endpoint import Datagram
+from skytether.shared.endpoints.endpoint import Datagram
 from skytether.shared.scenario import reading
-from skytether.shared.scenario.air.path import path
 from skytether.shared.telemetry.record import (
     DOWNLINK,
     PACKET_COLUMNS,
@@ -257,7 +257,7 @@ def measure(
 
 
 def models(text: str) -> set[str]:
-    return {name for name, _ in path(text).impairments} - {"rate", "ordered"}
+    return {name for name, _ in impairments(text).parts} - {"rate", "ordered"}
 
 
 def in_order(packets: Rows, direction: int) -> Rows:
@@ -334,7 +334,7 @@ def test_the_models_are_those_of_the_network_and_fly() -> None:
     for way in (told.uplink, told.downlink):
         assert models(way.text) == models(text)
         assert way.rate_bytes_per_s is None
-        made = path(way.text)
+        made = impairments(way.text)
         assert made.mean_s == pytest.approx(0.06, rel=0.03)
         assert made.loss == pytest.approx(way.loss, abs=0.03)
 

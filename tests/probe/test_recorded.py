@@ -11,12 +11,12 @@ import pytest
 
 from helpers import refused
 from skytether.__main__ import main
+from skytether.netem.impairments.direction import impairments
 from skytether.probe import recorded
 from skytether.probe.outcome import outcome
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
 from skytether.shared.formats.recorded import recorded_in
 from skytether.shared.scenario import reading
-from skytether.shared.scenario.air.path import path
 from skytether.shared.scenario.registry import File
 from skytether.shared.telemetry.record import parse
 
@@ -61,7 +61,7 @@ def test_the_documented_command_reads_a_log(
     assert way["quantiles_s"]["1"] == pytest.approx(kept.max(), abs=1e-6)
     assert told["round_trip_mean_s"] == pytest.approx(2.0 * kept.mean(), abs=1e-6)
     assert told["every_s"] == pytest.approx(0.2, abs=1e-6)
-    assert "gilbert_elliott" in path(way["text"]).impairments[1][0]
+    assert "gilbert_elliott" in impairments(way["text"]).parts[1][0]
     for name in ("uplink", "downlink"):
         file = tmp_path / "probed" / f"{name}.csv"
         again = recorded_in(File(name, file.read_bytes()))

@@ -7,11 +7,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from skytether.server.common.clock import ClockMap
-from skytether.server.common.scheme import Foresight, empty_foresight
 from skytether.server.controller import Controller
+from skytether.server.planning.clock import ClockMap
+from skytether.server.planning.scheme import Foresight, empty_foresight
 from skytether.server.schemes.predictive import Estimator
-from skytether.shared.core.stopwatch import Stopwatch
+from skytether.shared.endpoints.stopwatch import Stopwatch
 from skytether.shared.law.model import Array, Indices, discretise
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.gain import feedback_gain

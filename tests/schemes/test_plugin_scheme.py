@@ -17,7 +17,7 @@ from skytether.server.schemes import table
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.wire.protocol import Mode
-from skytether.shell import plugins
+from skytether.shell.commandline import plugins
 from skytether.sim.flight import fly, fly_batch
 
 pytestmark = pytest.mark.usefixtures("plugin_tables")
@@ -157,7 +157,7 @@ def test_a_scheme_calls_no_kernels_of_ours_but_those_that_send(tmp_path: Path) -
     plug(tmp_path, CHASE)
     others = table.others(scenario("chase"))
     assert "skytether.server.schemes.horizons" not in others
-    assert {"skytether.server.mpc.exact", "skytether.server.common.splines"} <= others
+    assert {"skytether.server.mpc.exact", "skytether.server.planning.splines"} <= others
 
 
 # -- checks ----------------------------------------------------------------------------------------

@@ -7,9 +7,9 @@ import pytest
 
 from helpers import packaged
 from skytether.client.compensator import Compensator
-from skytether.server.common.clock import ClockMap
-from skytether.server.common.scheme import Foresight, empty_foresight
 from skytether.server.mpc.hierarchical import Planner
+from skytether.server.planning.clock import ClockMap
+from skytether.server.planning.scheme import Foresight, empty_foresight
 from skytether.server.schemes.committed import Replay
 from skytether.server.schemes.sent import LOSS_WEIGHT
 from skytether.shared.law import rule

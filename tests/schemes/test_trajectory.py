@@ -18,16 +18,16 @@ from bench.problems import from_python
 from skytether.client.compensator import Compensator
 from skytether.client.navigation import Navigation
 from skytether.lab.sweep import summaries
-from skytether.server.common.clock import ClockMap
-from skytether.server.common.desired import Desired, Window
-from skytether.server.common.scheme import Fleet, Foresight, empty_foresight
 from skytether.server.mpc.nominal import make_nominal, plan_nominal
+from skytether.server.planning.clock import ClockMap
+from skytether.server.planning.desired import Desired, Window
+from skytether.server.planning.scheme import Fleet, Foresight, empty_foresight
 from skytether.server.schemes import trajectory
 from skytether.server.schemes.knots import fewest_knots
 from skytether.server.schemes.sent import FIRST_LOSS
 from skytether.server.schemes.trajectory import Guidance
 from skytether.shared.base.errors import ConfigError
-from skytether.shared.core.stopwatch import Stopwatch
+from skytether.shared.endpoints.stopwatch import Stopwatch
 from skytether.shared.law.model import Array, Indices, advance
 from skytether.shared.law.spline import AxisSpline, along, follow, guided_to, regulated, spline_at
 from skytether.shared.scenario import reading

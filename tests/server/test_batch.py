@@ -9,10 +9,10 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from helpers import packaged
-from skytether.server.common.desired import Desired
+from skytether.server.planning.desired import Desired
 from skytether.shared.base import chance
 from skytether.shared.base.units import MILLISECOND_NS
-from skytether.shared.core.events import NoAnswer, SessionEnded
+from skytether.shared.events.flight import NoAnswer, SessionEnded
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Record
 from skytether.shared.wire.protocol import Heartbeat, encode

@@ -13,7 +13,7 @@ from skytether.lab.crowd import judge
 from skytether.server import budget as budgets
 from skytether.server import rate as rates
 from skytether.server.budget import BURST_S, GUESS_BYTES, WAIT_S, SharedBudget
-from skytether.server.common.clock import ClockMap
+from skytether.server.planning.clock import ClockMap
 from skytether.server.rate import RateControl
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
 from skytether.shared.law.model import Array

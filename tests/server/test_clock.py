@@ -8,8 +8,8 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from bench.problems import from_python
-from skytether.server.common import clock as clocks
-from skytether.server.common.clock import ECHOES, ClockMap, shortest_ns
+from skytether.server.planning import clock as clocks
+from skytether.server.planning.clock import ECHOES, ClockMap, shortest_ns
 from skytether.shared.base.units import MILLISECOND_NS as MS
 from skytether.shared.base.units import SECOND_NS as S
 

@@ -9,10 +9,10 @@ from hypothesis import strategies as st
 
 from bench.problems import from_python
 from skytether.netem.fate import Fates
+from skytether.netem.impairments.direction import impairments
 from skytether.server.schemes import delay_bound as delay
 from skytether.server.schemes.delay_bound import DelayBound, delay_bound, forget
 from skytether.shared.base.units import seconds_to_ns
-from skytether.shared.scenario.air.path import path
 
 quick = settings(max_examples=40)
 
@@ -187,7 +187,7 @@ def flown(
     """
     dt_ns, steps = seconds_to_ns(dt_s), round(SECONDS / dt_s)
     parts = [
-        Fates(path(f"paper({least_s}, 0.02, 2.0) & loss(0.1)"), seed, "uplink", 0)
+        Fates(impairments(f"paper({least_s}, 0.02, 2.0) & loss(0.1)"), seed, "uplink", 0)
         for least_s in minima_s
     ]
     arrivals: dict[int, list[int]] = {}

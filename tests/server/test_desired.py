@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 
 from bench.problems import from_python
 from helpers import packaged
-from skytether.server.common.desired import EMPTY, PAGE, PAGES, Desired, _extrapolated
-from skytether.server.common.moving_setpoint import MEMORY_S, REST_S, LivePoint
 from skytether.server.controller import BLOCK
+from skytether.server.planning.desired import EMPTY, PAGE, PAGES, Desired, _extrapolated
+from skytether.server.planning.moving_setpoint import MEMORY_S, REST_S, LivePoint
 from skytether.shared.base.chance import stream
 from skytether.shared.base.units import SECOND_NS, seconds_to_ns
 from skytether.shared.law.model import Array, Indices
@@ -423,7 +423,7 @@ def test_a_mean_of_velocities_bears_moves_that_are_off(monkeypatch: pytest.Monke
 
     assert MEMORY_S == 0.2
     assert spread() < 0.07
-    monkeypatch.setattr("skytether.server.common.moving_setpoint.MEMORY_S", 1e-6)
+    monkeypatch.setattr("skytether.server.planning.moving_setpoint.MEMORY_S", 1e-6)
     assert spread() > 0.5
 
 

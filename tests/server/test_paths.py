@@ -7,7 +7,7 @@ from skytether.server.endpoint import Server
 from skytether.server.paths import FORMER_NS, Place, ServerPaths, SeveralWays
 from skytether.shared.base.chance import stream
 from skytether.shared.base.units import SECOND_NS
-from skytether.shared.core.endpoint import Address, Datagram
+from skytether.shared.endpoints.endpoint import Address, Datagram
 from skytether.shared.wire.drop import Drop
 from skytether.shared.wire.framing import split
 from skytether.shared.wire.paths import Paths

@@ -15,7 +15,7 @@ from skytether.client.simulated.plant import FirstOrderPlant
 from skytether.server.plausibility import REPEATS, Belief, Plausibility
 from skytether.shared.base.units import MILLISECOND_NS as MS
 from skytether.shared.base.units import SECOND_NS as S
-from skytether.shared.core.events import ModeChanged, StateDoubted
+from skytether.shared.events.flight import ModeChanged, StateDoubted
 from skytether.shared.law.heartbeat import NUMBERS
 from skytether.shared.law.model import Array
 from skytether.shared.scenario import reading

@@ -16,7 +16,7 @@ from skytether.server.gate import GateCall
 from skytether.server.secure import COOKIE_NS, FORMS, HANDSHAKES, OUT_MAX, PENDING_MAX
 from skytether.server.secure import SecureGate as Gate
 from skytether.shared.base.units import SECOND_NS, seconds_to_ns
-from skytether.shared.core.endpoint import Address, Datagram
+from skytether.shared.endpoints.endpoint import Address, Datagram
 from skytether.shared.scenario import reading
 from skytether.shared.wire import channel as channels
 from skytether.shared.wire import handshake, noise_nnpsk0

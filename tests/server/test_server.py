@@ -17,8 +17,8 @@ from skytether.server.sessions import WELCOME_NS, Session, Sessions
 from skytether.server.tick import Grid
 from skytether.shared.base.chance import stream
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
-from skytether.shared.core.endpoint import Address, Datagram, Events
-from skytether.shared.core.events import (
+from skytether.shared.endpoints.endpoint import Address, Datagram, Events
+from skytether.shared.events.flight import (
     BegunAnew,
     Degraded,
     NumberTaken,

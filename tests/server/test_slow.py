@@ -17,9 +17,11 @@ import pytest
 import skytether.netem.emulator
 from skytether.client.compensator import Compensator
 from skytether.netem.fate import Fates
-from skytether.server.common.clock import ClockMap, Contradiction
+from skytether.netem.impairments.direction import Impairments
+from skytether.netem.impairments.draws import SLOT_NS, Fate
+from skytether.server.planning.clock import ClockMap, Contradiction
 from skytether.shared.base.units import SECOND_NS
-from skytether.shared.core.events import (
+from skytether.shared.events.flight import (
     Finished,
     ModeChanged,
     NotFlown,
@@ -27,8 +29,6 @@ from skytether.shared.core.events import (
     PlanningStopped,
 )
 from skytether.shared.scenario import reading
-from skytether.shared.scenario.air.draws import SLOT_NS, Fate
-from skytether.shared.scenario.air.path import Path
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Record
 from skytether.shared.telemetry.summary import summarise
@@ -63,7 +63,9 @@ def fly_over(flown: Scenario, delays: Sequence[tuple[Delay, Delay]]) -> list[Rec
     class Clocked(Fates):
         """Fates as functions of the time, by the seed of the flight."""
 
-        def __init__(self, direction: Path, seed: int, name: str, flow: int, **how: bool) -> None:
+        def __init__(
+            self, direction: Impairments, seed: int, name: str, flow: int, **how: bool
+        ) -> None:
             super().__init__(direction, seed, name, flow, **how)
             self._delay = delays[seed][name != "uplink"]
 

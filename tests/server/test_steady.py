@@ -1,4 +1,4 @@
-"""`shared.core.steady`: an endpoint continues when the clock of its host jumps."""
+"""`shared.endpoints.steady`: an endpoint continues when the clock of its host jumps."""
 
 import io
 from collections.abc import Callable, Sequence
@@ -16,9 +16,9 @@ from skytether.netem.proxy import Proxy
 from skytether.server.endpoint import Server
 from skytether.shared.base.chance import stream
 from skytether.shared.base.units import SECOND_NS, seconds_to_ns
-from skytether.shared.core.endpoint import Datagram, Endpoint
-from skytether.shared.core.events import Degraded
-from skytether.shared.core.steady import JUMP_NS, Steady
+from skytether.shared.endpoints.endpoint import Datagram, Endpoint
+from skytether.shared.endpoints.steady import JUMP_NS, Steady
+from skytether.shared.events.flight import Degraded
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Recorder, client_columns, parse

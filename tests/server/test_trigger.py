@@ -11,11 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import skytether
-from skytether.server.common.scheme import FIGURES, Figures
-from skytether.shared.law.model import Flags, Indices, discretise
-from skytether.shared.scenario.registry import TRIGGERS
-from skytether.shared.scenario.schema import ControlConfig
-from skytether.shared.scenario.triggers import (
+from skytether.server.planning.scheme import FIGURES, Figures
+from skytether.server.triggers.trigger import (
     Combined,
     Compared,
     Situation,
@@ -25,6 +22,9 @@ from skytether.shared.scenario.triggers import (
     _column,
     make_trigger,
 )
+from skytether.shared.law.model import Flags, Indices, discretise
+from skytether.shared.scenario.registry import TRIGGERS
+from skytether.shared.scenario.schema import ControlConfig
 
 quick = settings(max_examples=25)
 

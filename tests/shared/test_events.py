@@ -17,11 +17,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import skytether
-from skytether.shared.core.endpoint import EVENTS_MAX, Datagram, Endpoint
-from skytether.shared.core.events import Event, Fault, Flying, Omitted, VehicleEvent, address_text
-from skytether.shared.core.process_events import Counted, Plaintext
+from skytether.shared.endpoints.endpoint import EVENTS_MAX, Datagram, Endpoint
+from skytether.shared.events.flight import Event, Fault, Flying, Omitted, VehicleEvent, address_text
+from skytether.shared.events.processes import Counted, Plaintext
 from skytether.shared.telemetry.every_event import EveryEvent, kinds
-from skytether.shell.log import Log, LogLine, line_of, rendered
+from skytether.shell.processes.log import Log, LogLine, line_of, rendered
 
 # Numbers that msgspec can encode: of 64 bits, and finite.
 st.register_type_strategy(int, st.integers(0, 2**63))
@@ -176,8 +176,8 @@ def test_lines_that_nobody_reads_are_counted_for_whoever_reads_later(
     """The first lines are kept; the number of omitted ones is a line itself."""
     with piped(monkeypatch) as pipe:
         line = b"2026-11-22 22:51:58.123 client: vehicle 1: session open, flying\n"
-        monkeypatch.setattr("skytether.shell.log.ROOM_BYTES", 10 * len(line))
-        monkeypatch.setattr("skytether.shell.log.TOGETHER_BYTES", 1)
+        monkeypatch.setattr("skytether.shell.processes.log.ROOM_BYTES", 10 * len(line))
+        monkeypatch.setattr("skytether.shell.processes.log.TOGETHER_BYTES", 1)
         filled = 0
         os.set_blocking(sys.stdout.fileno(), False)
         with suppress(BlockingIOError):

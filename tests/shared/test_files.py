@@ -20,7 +20,7 @@ from skytether.lab.commands.torture import torture
 from skytether.netem.__main__ import emulate
 from skytether.server.__main__ import serve
 from skytether.shared.base import files
-from skytether.shell import command
+from skytether.shell.commandline import command
 
 SHORT = ("--virtual", "--duration", "6", "--settle", "0")
 CALLS: list[tuple[Any, tuple[str, ...], str]] = [

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 import skytether
 from idle_link import keep
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
-from skytether.shared.core.events import ModeChanged
+from skytether.shared.events.flight import ModeChanged
 from skytether.shared.law.heartbeat import (
     ASSUMED,
     FALSE_PER_H,

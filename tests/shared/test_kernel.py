@@ -17,7 +17,7 @@ from numba import config as numba_config
 from skytether.server.schemes import table
 from skytether.shared.base import files, kernel
 from skytether.shared.scenario import reading
-from skytether.shell.compiling import LOCK
+from skytether.shell.host.compiling import LOCK
 
 HELPER = """
 from typing import NamedTuple
@@ -72,7 +72,7 @@ REFUSED = (
 PREPARED = """
 import caller
 from skytether.shared.base import kernel
-from skytether.shell.terminal import prepare
+from skytether.shell.commandline.terminal import prepare
 prepare(kernel.missing())
 """
 
@@ -81,7 +81,7 @@ SIDE_BY_SIDE = """
 import os, sys, time
 import caller, second
 from skytether.shared.base import kernel
-from skytether.shell.compiling import compile_kernels
+from skytether.shell.host.compiling import compile_kernels
 
 os.sched_getaffinity = lambda _: {0, 1}
 if sys.argv[1:] == ["alone"]:

@@ -14,7 +14,7 @@ import pytest
 from skytether.cli.keygen import keygen as keygen_
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.wire.keys import Keyring, VehicleKey, load, parse, write
-from skytether.shell import command
+from skytether.shell.commandline import command
 
 ROOT = Path(__file__).parents[2]
 A, B, C = (bytes([i]) * 32 for i in (0xA1, 0xB2, 0xC3))

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from scipy.linalg import expm
 
 from bench.problems import from_python
-from skytether.server.common.compiled import advance as shared
+from skytether.server.planning.compiled import advance as shared
 from skytether.shared.base.kernel import part
 from skytether.shared.law.model import advance, discretise, white_acceleration
 

@@ -8,11 +8,11 @@ import pytest
 
 import helpers
 from helpers import packaged
-from skytether.shared.core.endpoint import PATH_SOCKETS
+from skytether.shared.endpoints.endpoint import PATH_SOCKETS
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.schema import PATHS_MAX, PathConfig, Scenario
-from skytether.shell import command
-from skytether.shell.command import ScenarioOptions
+from skytether.shell.commandline import command
+from skytether.shell.commandline.command import ScenarioOptions
 
 NEAR, FAR = "constant(0.02)", "constant(0.3) & loss(0.1)"
 TWO = f"""

@@ -26,7 +26,7 @@ from skytether.shared.scenario.catalogue import differences
 from skytether.shared.scenario.registry import REFERENCES, TABLES, TRIGGERS
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Record
-from skytether.shell import plugins
+from skytether.shell.commandline import plugins
 from skytether.sim.flight import fly, fly_batch
 
 pytestmark = pytest.mark.usefixtures("plugin_tables")
@@ -408,7 +408,7 @@ ADDS = (
     "expected @planner, @trigger, @scheme, @reference, @vehicle or @impairment on a function or "
     "class, see docs"
 )
-OURS = "skytether.shared.scenario.triggers"
+OURS = "skytether.server.triggers.trigger"
 WRONG = {
     "a syntax error": ("def f(:\n", "line 3: SyntaxError: invalid syntax"),
     "an exception": ("\n1 / 0\n", "line 4: ZeroDivisionError: division by zero"),

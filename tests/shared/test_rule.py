@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 
 from bench.problems import from_python
 from skytether.client.compensator import Compensator
-from skytether.server.common import compiled as law
-from skytether.server.common.clock import ClockMap
-from skytether.server.common.scheme import Foresight, empty_foresight
+from skytether.server.planning import compiled as law
+from skytether.server.planning.clock import ClockMap
+from skytether.server.planning.scheme import Foresight, empty_foresight
 from skytether.server.schemes.committed import Replay
 from skytether.shared.base.kernel import part
 from skytether.shared.law import rule

@@ -1,6 +1,6 @@
 """Laps of a stopwatch on a given clock."""
 
-from skytether.shared.core.stopwatch import Stopwatch
+from skytether.shared.endpoints.stopwatch import Stopwatch
 
 
 def test_laps_follow_each_other_and_add_up_by_name() -> None:

@@ -13,8 +13,8 @@ from skytether.client.simulated.vehicle import simulated
 from skytether.server.endpoint import Server
 from skytether.shared.base.chance import stream
 from skytether.shared.base.units import SECOND_NS
-from skytether.shared.core.change import ONCE
-from skytether.shared.core.endpoint import Datagram
+from skytether.shared.endpoints.change import ONCE
+from skytether.shared.endpoints.endpoint import Datagram
 from skytether.shared.law.terms import Difference, Terms
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.catalogue import KEYS, TERMS, differences

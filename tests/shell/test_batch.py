@@ -1,4 +1,4 @@
-"""`shell.batch`: many datagrams in one system call, and the driver with it.
+"""`shell.host.batch`: many datagrams in one system call, and the driver with it.
 
 The driver runs in virtual time; two tests are of the kernel's stamps and the loop of flights.
 """
@@ -15,11 +15,12 @@ import pytest
 
 from helpers import Idle, until
 from skytether.shared.base.units import MILLISECOND_NS
-from skytether.shared.core.endpoint import Address, Datagram, Endpoint
-from skytether.shared.core.events import Event, Fault
-from skytether.shell import batch as batch_module
-from skytether.shell import driver
-from skytether.shell.batch import (
+from skytether.shared.endpoints.endpoint import Address, Datagram, Endpoint
+from skytether.shared.events.flight import Event, Fault
+from skytether.shell.driving import driver
+from skytether.shell.driving.driver import Shell, new_event_loop
+from skytether.shell.host import batch as batch_module
+from skytether.shell.host.batch import (
     BATCH_MAX,
     SEGMENTS_MAX,
     SIZE_MAX,
@@ -28,8 +29,7 @@ from skytether.shell.batch import (
     pack_address,
     unpack_address,
 )
-from skytether.shell.driver import Shell, new_event_loop
-from skytether.shell.udp import ADDRESSES_MAX, Names, open_socket
+from skytether.shell.host.udp import ADDRESSES_MAX, Names, open_socket
 from virtual_loop import run_virtually
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="Linux has these calls alone")

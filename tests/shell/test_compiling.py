@@ -3,7 +3,8 @@
 from pathlib import Path
 
 from skytether.shared.base.kernel import Missing
-from skytether.shell import compiling, terminal
+from skytether.shell.commandline import terminal
+from skytether.shell.host import compiling
 from skytether.view.browser.flight import PageFlight
 
 

@@ -13,19 +13,19 @@ from typing import Any
 
 import pytest
 
-import skytether.shell.control
+import skytether.shell.driving.control
 from helpers import LOOPBACK, HandLoop
 from skytether.cli.set import set_keys
 from skytether.netem.proxy import Proxy
-from skytether.shared.core.change import Running
-from skytether.shared.core.events import Changed, ChangeRefused, Event
+from skytether.shared.endpoints.change import Running
+from skytether.shared.events.flight import Changed, ChangeRefused, Event
 from skytether.shared.scenario import reading, schema
-from skytether.shell import command
-from skytether.shell.control import REST_S, RESTS, Caller, Control, ControlError, controlled
-from skytether.shell.driver import Shell, run
-from skytether.shell.journal import take_up
-from skytether.shell.local import LocalError
-from skytether.shell.options import toml_value
+from skytether.shell.commandline import command
+from skytether.shell.commandline.options import toml_value
+from skytether.shell.driving.control import REST_S, RESTS, Caller, Control, ControlError, controlled
+from skytether.shell.driving.driver import Shell, run
+from skytether.shell.driving.journal import take_up
+from skytether.shell.host.local import LocalError
 from virtual_loop import virtually
 
 DEMO = reading.load("demo")
@@ -123,7 +123,9 @@ def test_a_request_that_takes_long_is_followed_by_a_rest_that_is_longer(
     seconds = iter((10.0, 10.5))
     with closing(Control(tmp_path / "netem", running())) as control:
         loop, _ = heeding(control)
-        monkeypatch.setattr(skytether.shell.control.time, "monotonic", lambda: next(seconds))
+        monkeypatch.setattr(
+            skytether.shell.driving.control.time, "monotonic", lambda: next(seconds)
+        )
         loop.look()
     assert [rest_s for rest_s, _ in loop.later] == [0.5 * RESTS]
 
@@ -348,7 +350,7 @@ def test_one_that_listens_and_does_not_answer_is_not_waited_for_for_ever(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = tmp_path / "netem"
-    monkeypatch.setattr(skytether.shell.control, "PATIENCE_S", 0.05)
+    monkeypatch.setattr(skytether.shell.driving.control, "PATIENCE_S", 0.05)
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as deaf:
         deaf.bind(str(path))
         assert command.main(set_keys, [str(path)], "set") == 1

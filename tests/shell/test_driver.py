@@ -7,9 +7,10 @@ import pytest
 
 from helpers import Idle
 from skytether.shared.base.units import SECOND_NS
-from skytether.shared.core.events import Event, Fault, Flying
-from skytether.shell import driver, timer
-from skytether.shell.driver import Shell, run
+from skytether.shared.events.flight import Event, Fault, Flying
+from skytether.shell.driving import driver
+from skytether.shell.driving.driver import Shell, run
+from skytether.shell.host import timer
 from virtual_loop import VirtualLoop
 
 

@@ -19,13 +19,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-import skytether.shell.feed
+import skytether.shell.driving.feed
 from helpers import HandLoop, ran, until
 from skytether.netem.proxy import Proxy
-from skytether.server.common import splines
+from skytether.server.planning import splines
 from skytether.server.schemes import horizons
-from skytether.shared.core.change import Running
-from skytether.shared.core.events import Changed, Degraded, Event, Finished
+from skytether.shared.endpoints.change import Running
+from skytether.shared.events.flight import Changed, Degraded, Event, Finished
 from skytether.shared.law.spline import along
 from skytether.shared.scenario import reading, schema
 from skytether.shared.telemetry.feed import (
@@ -45,9 +45,9 @@ from skytether.shared.telemetry.feed import (
 )
 from skytether.shared.telemetry.record import PACKET_COLUMNS, Recorder, parse, plan_columns
 from skytether.shared.wire.protocol import Message, Trajectory
-from skytether.shell import command, process
-from skytether.shell.driver import Shell
-from skytether.shell.feed import (
+from skytether.shell.commandline import command
+from skytether.shell.driving.driver import Shell
+from skytether.shell.driving.feed import (
     BACKLOG_BYTES_MAX,
     READERS_MAX,
     ROWS_BYTES_MAX,
@@ -55,7 +55,8 @@ from skytether.shell.feed import (
     Feed,
     Subscriber,
 )
-from skytether.shell.local import LocalError
+from skytether.shell.host.local import LocalError
+from skytether.shell.processes import process
 from skytether.sim import flight
 from skytether.view.browser import serve
 from virtual_loop import virtually
@@ -325,7 +326,7 @@ def test_who_does_not_read_is_dropped_and_all_else_goes_on(driven: Driven) -> No
 def test_without_the_bound_memory_grows_for_who_does_not_read(
     driven: Driven, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(skytether.shell.feed, "WAITING_BYTES_MAX", 1 << 60)
+    monkeypatch.setattr(skytether.shell.driving.feed, "WAITING_BYTES_MAX", 1 << 60)
     dropped, waiting = flooded(driven)
     assert dropped == 0
     assert waiting > 1.5 * WAITING_BYTES_MAX
@@ -401,7 +402,7 @@ def test_at_the_end_readers_get_the_rest(driven: Driven) -> None:
 def test_the_end_does_not_wait_long_for_who_does_not_read(
     driven: Driven, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(skytether.shell.feed, "PATIENCE_S", 0.01)
+    monkeypatch.setattr(skytether.shell.driving.feed, "PATIENCE_S", 0.01)
     for _ in range(READERS_MAX):
         driven.look()
     driven.tell(*range(16), size=65536)
@@ -685,7 +686,7 @@ def test_flights_of_a_batch_keep_no_plans() -> None:
 
 
 def test_events_are_of_the_log_and_limited() -> None:
-    from skytether.shell.log import Log
+    from skytether.shell.processes.log import Log
 
     told: list[Event] = []
     with closing(Log("netem", "json", told.append)) as log:

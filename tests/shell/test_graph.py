@@ -21,9 +21,9 @@ from helpers import PATIENCE_S, Idle
 from robot import CMD_VEL, ODOM, free_port, opened
 from skytether.ros2 import graph, messages
 from skytether.ros2.graph import Node
-from skytether.shared.core.endpoint import Datagram
-from skytether.shell.driver import Shell, new_event_loop
-from skytether.shell.graph import MESSAGE_BYTES_MAX, QUEUE_MAX, GraphSession
+from skytether.shared.endpoints.endpoint import Datagram
+from skytether.shell.driving.driver import Shell, new_event_loop
+from skytether.shell.driving.graph import MESSAGE_BYTES_MAX, QUEUE_MAX, GraphSession
 
 LAST_MPS = 9.0
 """Last command, sent when the process ends."""

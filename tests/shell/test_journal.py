@@ -12,16 +12,16 @@ import pytest
 
 from helpers import HandLoop
 from skytether.netem.proxy import Proxy
-from skytether.shared.core.change import Answer, Running
-from skytether.shared.core.events import Event
-from skytether.shared.core.process_events import NotKept
+from skytether.shared.endpoints.change import Answer, Running
+from skytether.shared.events.flight import Event
+from skytether.shared.events.processes import NotKept
 from skytether.shared.missions.derived import zones
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.schema import Scenario
-from skytether.shell import control, journal
-from skytether.shell.command import CommandError
-from skytether.shell.control import Caller, Control, answer_of, controlled
-from skytether.shell.journal import TakenUp, take_up
+from skytether.shell.commandline.command import CommandError
+from skytether.shell.driving import control, journal
+from skytether.shell.driving.control import Caller, Control, answer_of, controlled
+from skytether.shell.driving.journal import TakenUp, take_up
 from virtual_loop import AtOnce
 
 DEMO, SWAP = reading.load("demo"), reading.load("swap")

@@ -12,10 +12,10 @@ import pytest
 
 from helpers import Idle
 from skytether.shared.base.errors import ConfigError
-from skytether.shared.core.endpoint import Address, Datagram, Endpoint
-from skytether.shared.core.line import LINE, Line, parse_line
-from skytether.shell.driver import Shell
-from skytether.shell.udp import AddressError
+from skytether.shared.endpoints.endpoint import Address, Datagram, Endpoint
+from skytether.shared.endpoints.line import LINE, Line, parse_line
+from skytether.shell.driving.driver import Shell
+from skytether.shell.host.udp import AddressError
 from virtual_loop import run_virtually
 
 

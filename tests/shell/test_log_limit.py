@@ -1,8 +1,8 @@
 """Limit of the log: a few events of a kind per second, and the number of omitted ones."""
 
 from skytether.shared.base.units import SECOND_NS
-from skytether.shared.core.events import Event, Flying, Omitted, SessionEnded
-from skytether.shell.limit import KIND_MAX, Limit
+from skytether.shared.events.flight import Event, Flying, Omitted, SessionEnded
+from skytether.shell.host.limit import KIND_MAX, Limit
 
 
 def told(limit: Limit, events: list[Event], now_ns: int) -> list[Event]:

@@ -11,8 +11,8 @@ import pytest
 
 from helpers import HandLoop, Idle
 from skytether.shared.base import files
-from skytether.shell import memory
-from skytether.shell.memory import MAGIC, MemoryFile, MemoryRefused
+from skytether.shell.driving import memory
+from skytether.shell.driving.memory import MAGIC, MemoryFile, MemoryRefused
 from virtual_loop import AtJoin
 
 IDENTITY = {"vehicle": "1", "key": "2", "autopilot": "udpout:127.0.0.1:14551", "terms": "0a1b"}

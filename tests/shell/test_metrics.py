@@ -21,16 +21,17 @@ from helpers import packaged
 from skytether.client.endpoint import Client
 from skytether.client.fleet import ClientFleet
 from skytether.client.simulated.vehicle import simulated
-from skytether.shared.core.endpoint import VEHICLES_TOLD_MAX
-from skytether.shared.core.process_events import Measured
-from skytether.shared.core.stopwatch import Stopwatch
+from skytether.shared.endpoints.endpoint import VEHICLES_TOLD_MAX
+from skytether.shared.endpoints.stopwatch import Stopwatch
+from skytether.shared.events.processes import Measured
 from skytether.shared.scenario import reading
 from skytether.shared.wire.drop import Drop
 from skytether.shared.wire.protocol import Mode
-from skytether.shell import command, exporter, metrics
-from skytether.shell.exporter import CONNECTIONS_MAX, Collected, Metrics, MetricsError
-from skytether.shell.log import LogLine
-from skytether.shell.metrics import (
+from skytether.shell.commandline import command
+from skytether.shell.processes import exporter, metrics
+from skytether.shell.processes.exporter import CONNECTIONS_MAX, Collected, Metrics, MetricsError
+from skytether.shell.processes.log import LogLine
+from skytether.shell.processes.metrics import (
     HEALTHY,
     LEFT_OUT,
     PREFIX,

@@ -18,11 +18,11 @@ import yaml
 from prometheus_client.parser import text_string_to_metric_families
 
 from skytether.cli.processes import Child, started
-from skytether.shared.core.endpoint import Address
-from skytether.shared.core.events import ModeChanged
-from skytether.shared.core.process_events import Measured
-from skytether.shell.log import LogLine
-from skytether.shell.metrics import TABLES, names
+from skytether.shared.endpoints.endpoint import Address
+from skytether.shared.events.flight import ModeChanged
+from skytether.shared.events.processes import Measured
+from skytether.shell.processes.log import LogLine
+from skytether.shell.processes.metrics import TABLES, names
 
 ROOT = Path(__file__).parents[2]
 OBSERVE = ROOT / "deploy"

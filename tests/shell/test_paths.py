@@ -15,15 +15,16 @@ from types import SimpleNamespace
 import pytest
 
 from helpers import LOOPBACK, Idle, ran
-from skytether.shared.core.endpoint import PATH_SOCKETS, Address, Datagram
-from skytether.shared.core.events import Event
-from skytether.shared.core.path_events import PathFound, PathMissing
-from skytether.shared.core.process_events import HostFound, HostMissing
-from skytether.shell import driver, udp
-from skytether.shell import paths as path_sockets
-from skytether.shell.driver import Shell
-from skytether.shell.paths import NetworkPath, parse_path
-from skytether.shell.udp import AddressError
+from skytether.shared.endpoints.endpoint import PATH_SOCKETS, Address, Datagram
+from skytether.shared.events.flight import Event
+from skytether.shared.events.paths import PathFound, PathMissing
+from skytether.shared.events.processes import HostFound, HostMissing
+from skytether.shell.driving import driver
+from skytether.shell.driving.driver import Shell
+from skytether.shell.host import paths as path_sockets
+from skytether.shell.host import udp
+from skytether.shell.host.paths import NetworkPath, parse_path
+from skytether.shell.host.udp import AddressError
 from virtual_loop import AtOnce, virtually
 
 GROUND = ("ground", 47000)

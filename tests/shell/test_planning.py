@@ -12,8 +12,8 @@ from typing import Any
 
 import pytest
 
-from skytether.shell import planning
-from skytether.shell.planning import HANGING_MAX, Planners
+from skytether.shell.driving import planning
+from skytether.shell.driving.planning import HANGING_MAX, Planners
 
 LIMIT_S = 30.0
 """Never reached by a planner that answers, however busy the machine is."""

@@ -4,7 +4,7 @@ import sys
 
 import pytest
 
-from skytether.shell.terminal import progress
+from skytether.shell.commandline.terminal import progress
 
 
 def test_a_bar_shows_title_amount_unit_and_text(

@@ -8,12 +8,13 @@ import pytest
 
 from helpers import until
 from skytether.shared.base import files
-from skytether.shared.core.events import RecordIncomplete
+from skytether.shared.events.flight import RecordIncomplete
 from skytether.shared.telemetry.record import PACKET_COLUMNS, read
-from skytether.shell import recording, writer
-from skytether.shell.command import CommandError
-from skytether.shell.process import recorded, recorded_meanwhile
-from skytether.shell.recording import RecordFile
+from skytether.shell.commandline.command import CommandError
+from skytether.shell.driving import recording
+from skytether.shell.driving.recording import RecordFile
+from skytether.shell.host import writer
+from skytether.shell.processes.process import recorded, recorded_meanwhile
 from virtual_loop import AtJoin
 
 

@@ -10,12 +10,12 @@ from pathlib import Path
 
 import pytest
 
-from skytether.shell.temporary import MARK, folder
+from skytether.shell.host.temporary import MARK, folder
 from warm import Command, skytether
 
 HOLDING = """
 import sys, time
-from skytether.shell.temporary import folder
+from skytether.shell.host.temporary import folder
 with folder() as made:
     (made / "below").mkdir()
     (made / "below" / "file").write_text("content")

@@ -4,10 +4,10 @@ from unittest.mock import call, create_autospec
 
 import pytest
 
-from skytether.shared.core.endpoint import Endpoint
-from skytether.shared.core.process_events import TimeUnknown
-from skytether.shell import time_of_day
-from skytether.shell.time_of_day import HostTime, TimeTeller, stated
+from skytether.shared.endpoints.endpoint import Endpoint
+from skytether.shared.events.processes import TimeUnknown
+from skytether.shell.host import time_of_day
+from skytether.shell.host.time_of_day import HostTime, TimeTeller, stated
 
 
 def test_a_host_s_clock_counts_where_its_kernel_tells_how_wrong_it_is() -> None:

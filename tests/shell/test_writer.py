@@ -13,8 +13,8 @@ from typing import IO
 import pytest
 
 from helpers import PATIENCE_S
-from skytether.shell import writer as writer_module
-from skytether.shell.writer import Writer
+from skytether.shell.host import writer as writer_module
+from skytether.shell.host.writer import Writer
 from virtual_loop import AtJoin
 
 

@@ -12,7 +12,7 @@ import skytether.sim.flight
 from helpers import packaged
 from skytether.server import reception
 from skytether.shared.base.units import SECOND_NS
-from skytether.shared.core.events import (
+from skytether.shared.events.flight import (
     Finished,
     FlowOpened,
     Flying,
@@ -24,7 +24,7 @@ from skytether.shared.law.model import Array
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import DOWNLINK, UPLINK, Reason, Record, client_columns
 from skytether.shared.telemetry.summary import Summary, position_error, summarise
-from skytether.shell.terminal import summary_rows
+from skytether.shell.commandline.terminal import summary_rows
 from skytether.sim.flight import fly, fly_batch
 
 

@@ -10,15 +10,15 @@ import pytest
 from helpers import packaged
 from skytether.client.endpoint import Client
 from skytether.netem.fate import Fates
+from skytether.netem.impairments.draws import SLOT_NS
 from skytether.shared.base.units import SECOND_NS
-from skytether.shared.core.endpoint import Address
-from skytether.shared.core.events import FlowOpened
-from skytether.shared.core.path_events import PathDied, PathHealed
-from skytether.shared.scenario.air.draws import SLOT_NS
+from skytether.shared.endpoints.endpoint import Address
+from skytether.shared.events.flight import FlowOpened
+from skytether.shared.events.paths import PathDied, PathHealed
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import DOWNLINK, UPLINK, Record
 from skytether.shared.telemetry.summary import summarise
-from skytether.shell.terminal import summary_rows
+from skytether.shell.commandline.terminal import summary_rows
 from skytether.sim import flight
 from skytether.sim.flight import fly, fly_batch
 

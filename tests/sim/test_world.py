@@ -9,8 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from skytether.shared.base.units import SECOND_NS
-from skytether.shared.core.endpoint import Address, Datagram, Endpoint
-from skytether.shared.core.events import Event, Flying
+from skytether.shared.endpoints.endpoint import Address, Datagram, Endpoint
+from skytether.shared.events.flight import Event, Flying
 from skytether.sim import world as world_module
 from skytether.sim.world import Clock, World
 

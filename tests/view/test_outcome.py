@@ -13,11 +13,11 @@ from helpers import packaged
 from skytether.cli import recorder
 from skytether.cli.join import join
 from skytether.cli.report import report
-from skytether.shared.core.path_events import PathDied, PathHealed
+from skytether.shared.events.paths import PathDied, PathHealed
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import FlightEvent, Record
 from skytether.shared.telemetry.summary import summarise
-from skytether.shell import command
+from skytether.shell.commandline import command
 from skytether.sim.flight import SERVER, fly
 from skytether.view.outcome import Outcome, listed
 from skytether.view.recorded import read

@@ -19,12 +19,12 @@ import viser
 from helpers import until
 from skytether.cli import page_process
 from skytether.cli.duel import DuelOptions, titles, together
-from skytether.shared.core.change import Answer, Running
-from skytether.shared.core.events import Changed
+from skytether.shared.endpoints.change import Answer, Running
+from skytether.shared.events.flight import Changed
 from skytether.shared.scenario import reading, registry, schema
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.feed import Opened, Said
-from skytether.shell.command import CommandError
+from skytether.shell.commandline.command import CommandError
 from skytether.sim import flight as virtual
 from skytether.view import plots
 from skytether.view.browser import panel, serve

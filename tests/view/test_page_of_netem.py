@@ -5,8 +5,8 @@ import re
 import pytest
 
 from skytether.shared.base.units import SECOND_NS
-from skytether.shared.core.events import Changed
-from skytether.shared.core.ways import FLIGHT, RELAY, RUN, Ways
+from skytether.shared.endpoints.ways import FLIGHT, RELAY, RUN, Ways
+from skytether.shared.events.flight import Changed
 from skytether.shared.scenario import reading
 from skytether.shared.telemetry.feed import Figures, Opened, Said
 from skytether.view import words

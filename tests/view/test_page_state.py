@@ -13,7 +13,7 @@ import pytest
 
 from skytether.figures.colours import MODE_COLOURS
 from skytether.shared.base.units import SECOND_NS
-from skytether.shared.core.events import Changed, Event, ModeChanged
+from skytether.shared.events.flight import Changed, Event, ModeChanged
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.reading import to_toml
 from skytether.shared.scenario.schema import Scenario

@@ -35,7 +35,7 @@ from skytether.cli.recorder import Live
 from skytether.cli.report import report
 from skytether.figures.tables import to_csv
 from skytether.shared.base.errors import RecordingError
-from skytether.shared.core.aboard import AutopilotText
+from skytether.shared.events.aboard import AutopilotText
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.schema import NetworkConfig, Scenario
 from skytether.shared.telemetry.feed import Figures, Opened, Rows, described, pack
@@ -47,8 +47,8 @@ from skytether.shared.telemetry.record import (
     server_columns,
 )
 from skytether.shared.telemetry.summary import Summary, summarise
-from skytether.shell import command
-from skytether.shell.log import Log
+from skytether.shell.commandline import command
+from skytether.shell.processes.log import Log
 from skytether.sim import flight
 from skytether.view import container, recorded
 from skytether.view import report as view_report

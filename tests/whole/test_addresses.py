@@ -5,7 +5,7 @@ from collections.abc import Callable
 import pytest
 
 import warm
-from skytether.shared.core.events import SessionOpened
+from skytether.shared.events.flight import SessionOpened
 from warm import Process
 
 QUICK = ("--settle", "0", "--duration", "2")

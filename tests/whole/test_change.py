@@ -20,9 +20,9 @@ from skytether.netem.proxy import Proxy
 from skytether.server.endpoint import Server
 from skytether.shared.base.chance import stream
 from skytether.shared.base.errors import ConfigError
-from skytether.shared.core.change import REQUEST_BYTES_MAX, Answer, Running
-from skytether.shared.core.endpoint import Endpoint
-from skytether.shared.core.events import Changed, ChangeRefused, Event, Flying, ModeChanged
+from skytether.shared.endpoints.change import REQUEST_BYTES_MAX, Answer, Running
+from skytether.shared.endpoints.endpoint import Endpoint
+from skytether.shared.events.flight import Changed, ChangeRefused, Event, Flying, ModeChanged
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.schema import Scenario, VehicleConfig
 from skytether.shared.telemetry.record import UPLINK, Reason, Record

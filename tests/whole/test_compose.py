@@ -11,7 +11,7 @@ import yaml
 from helpers import ran
 from skytether.client.__main__ import ClientOptions
 from skytether.shared.scenario import reading
-from skytether.shell import command
+from skytether.shell.commandline import command
 
 ROOT = Path(__file__).parents[2]
 FILE = yaml.safe_load((ROOT / "docker-compose.yml").read_text())

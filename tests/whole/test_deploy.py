@@ -11,7 +11,7 @@ import pytest
 from helpers import ran
 from skytether.client.__main__ import ClientOptions
 from skytether.server.__main__ import ServerOptions
-from skytether.shell import command
+from skytether.shell.commandline import command
 
 UNITS = Path(__file__).parents[2] / "deploy" / "systemd"
 CLIENT, SERVER = UNITS / "skytether-client@.service", UNITS / "skytether-server.service"

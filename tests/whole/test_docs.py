@@ -23,7 +23,7 @@ from skytether import __main__
 from skytether.__main__ import main
 from skytether.cli.set import set_keys
 from skytether.shared.base import files
-from skytether.shell import command, options
+from skytether.shell.commandline import command, options
 
 ROOT = Path(__file__).parents[2]
 DOCUMENTS = [

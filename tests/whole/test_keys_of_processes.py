@@ -7,10 +7,10 @@ from typing import Any
 import pytest
 
 from helpers import refused
-from skytether.shared.core.events import Unauthenticated
-from skytether.shared.core.process_events import Plaintext
-from skytether.shell import process
-from skytether.shell.driver import Shell
+from skytether.shared.events.flight import Unauthenticated
+from skytether.shared.events.processes import Plaintext
+from skytether.shell.driving.driver import Shell
+from skytether.shell.processes import process
 from warm import Process, skytether
 
 QUICK = [

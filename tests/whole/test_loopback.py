@@ -19,8 +19,8 @@ from skytether.netem.proxy import Proxy
 from skytether.server.endpoint import Server
 from skytether.shared.base.chance import stream
 from skytether.shared.base.units import SECOND_NS
-from skytether.shared.core.endpoint import Address, Datagram, Endpoint
-from skytether.shared.core.events import Event, FlowOpened, Unreachable
+from skytether.shared.endpoints.endpoint import Address, Datagram, Endpoint
+from skytether.shared.events.flight import Event, FlowOpened, Unreachable
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import (
@@ -31,10 +31,10 @@ from skytether.shared.telemetry.record import (
     parse,
     server_columns,
 )
-from skytether.shell import timer, udp
-from skytether.shell.driver import Shell, new_event_loop
-from skytether.shell.paths import NetworkPath
-from skytether.shell.udp import AddressError, open_socket
+from skytether.shell.driving.driver import Shell, new_event_loop
+from skytether.shell.host import timer, udp
+from skytether.shell.host.paths import NetworkPath
+from skytether.shell.host.udp import AddressError, open_socket
 from skytether.sim.flight import fly as fly_virtually
 
 LOOPBACK_6: Address = ("::1", 0)
@@ -113,7 +113,7 @@ async def test_datagrams_come_and_go_through_several_sockets(
 async def test_wakes_come_and_never_early(kernel: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     """Both timers, twenty wakes, some of them already in the past."""
     if not kernel:
-        monkeypatch.setattr("skytether.shell.driver.make_timer", timer.LoopTimer)
+        monkeypatch.setattr("skytether.shell.driving.driver.make_timer", timer.LoopTimer)
     now_ns = time.monotonic_ns()
     wakes_ns = [now_ns + step * 2_000_000 for step in range(-5, 15)]
     echo = Echo(wakes_ns, last=20)
@@ -238,7 +238,7 @@ async def test_a_host_with_a_new_address_is_found_again(monkeypatch: pytest.Monk
         return addresses["first" if len(looked_up) == 1 else "then"]
 
     monkeypatch.setattr(udp, "look_up", look_up)
-    monkeypatch.setattr("skytether.shell.driver.RESOLVE_EVERY_S", 0.001)
+    monkeypatch.setattr("skytether.shell.driving.driver.RESOLVE_EVERY_S", 0.001)
     driver = Shell(Echo(), LOOPBACK, [("moving", 1)])
     assert driver._names.name(addresses["first"]) == ("moving", 1)
     async with driven(driver):

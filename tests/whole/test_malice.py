@@ -11,8 +11,8 @@ from skytether.client.simulated.vehicle import simulated
 from skytether.server.endpoint import VEHICLES_MAX, Server
 from skytether.shared.base.chance import stream
 from skytether.shared.base.units import SECOND_NS
-from skytether.shared.core.endpoint import EVENTS_MAX, Address, Datagram, Endpoint
-from skytether.shared.core.events import Omitted
+from skytether.shared.endpoints.endpoint import EVENTS_MAX, Address, Datagram, Endpoint
+from skytether.shared.events.flight import Omitted
 from skytether.shared.scenario import reading
 from skytether.shared.wire.drop import Drop
 from skytether.shared.wire.protocol import (

@@ -15,8 +15,8 @@ from skytether.server.endpoint import Server
 from skytether.server.secure import SecureGate
 from skytether.shared.base.chance import stream
 from skytether.shared.base.units import SECOND_NS
-from skytether.shared.core.endpoint import Address, Datagram
-from skytether.shared.core.events import Event, ModeChanged
+from skytether.shared.endpoints.endpoint import Address, Datagram
+from skytether.shared.events.flight import Event, ModeChanged
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Recorder, client_columns, parse

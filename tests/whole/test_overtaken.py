@@ -18,8 +18,8 @@ from skytether.client.endpoint import Client
 from skytether.server.endpoint import Server
 from skytether.shared.base.chance import stream
 from skytether.shared.base.units import SECOND_NS
-from skytether.shared.core.endpoint import Datagram, Endpoint
-from skytether.shared.core.events import Unauthenticated
+from skytether.shared.endpoints.endpoint import Datagram, Endpoint
+from skytether.shared.events.flight import Unauthenticated
 from skytether.shared.telemetry.record import Record, Rows
 from skytether.shared.wire.drop import Drop
 from skytether.sim.flight import fly

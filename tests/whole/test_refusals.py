@@ -8,7 +8,7 @@ from skytether.client.simulated.vehicle import simulated
 from skytether.server.endpoint import Server
 from skytether.shared.base.chance import stream
 from skytether.shared.base.units import SECOND_NS
-from skytether.shared.core.events import Event
+from skytether.shared.events.flight import Event
 from skytether.sim.world import World
 
 

@@ -18,7 +18,7 @@ ROOMS = {
     "shared/formats": f"{FLIES} --reference.shape csv",
     "shared/missions": f"{FLIES} --reference.shape swap",
     "server/missions": "fleet swap --virtual",
-    "server/triggers.py": f"{FLIES} --control.trigger deviation(0.1)",
+    "server/triggers/further.py": f"{FLIES} --control.trigger deviation(0.1)",
 }
 """Folder or module of each room, and a command that needs it."""
 

@@ -13,10 +13,10 @@ from skytether.client.leadership import Leadership
 from skytether.client.servers import Servers
 from skytether.netem.proxy import Proxy
 from skytether.server.endpoint import Server
-from skytether.shared.core.change import Running
-from skytether.shared.core.endpoint import Address, Datagram, Endpoint
-from skytether.shared.core.events import ModeChanged, SessionEnded
-from skytether.shared.core.standby_events import LeaderChanged
+from skytether.shared.endpoints.change import Running
+from skytether.shared.endpoints.endpoint import Address, Datagram, Endpoint
+from skytether.shared.events.flight import ModeChanged, SessionEnded
+from skytether.shared.events.standby import LeaderChanged
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Record
 from skytether.shared.telemetry.summary import summarise

@@ -10,9 +10,9 @@ import pytest
 
 from helpers import packaged, until
 from skytether.__main__ import main
-from skytether.shared.core.events import Changed, ChangeRefused
-from skytether.shared.core.process_events import HostMissing, Listening
-from skytether.shared.core.standby_events import LeaderChanged
+from skytether.shared.events.flight import Changed, ChangeRefused
+from skytether.shared.events.processes import HostMissing, Listening
+from skytether.shared.events.standby import LeaderChanged
 from skytether.sim.flight import fly
 from warm import Process
 

@@ -8,8 +8,8 @@ import pytest
 from helpers import packaged
 from skytether.server.endpoint import Server
 from skytether.shared.base.units import SECOND_NS
-from skytether.shared.core.endpoint import Datagram
-from skytether.shared.core.events import ModeChanged, Unauthenticated
+from skytether.shared.endpoints.endpoint import Datagram
+from skytether.shared.events.flight import ModeChanged, Unauthenticated
 from skytether.shared.telemetry.record import DOWNLINK, UPLINK, Record
 from skytether.shared.telemetry.summary import summarise
 from skytether.shared.wire.paths import Paths

@@ -10,13 +10,13 @@ HOUSE = Path(__file__).parents[2]
 ROOMS = ("skytether", "server", "client", "netem", "shared", "bench", "fuzz")
 ALLOWED = {
     "shared/base/files.py": "the one place",
-    "skytether/shell/start.py": "/dev/null in place of a closed stream",
-    "skytether/shell/command.py": "/dev/null in place of a closed pipe",
-    "skytether/shell/inside.py": "files of the kernel in a program's own namespaces",
-    "skytether/shell/compiling.py": "an empty lock beside machine code",
-    "skytether/shell/program.py": "what another program says, in a temporary folder",
-    "skytether/shell/stream.py": "the line to an autopilot",
-    "skytether/shell/temporary.py": "marks in folders that it has made",
+    "skytether/shell/commandline/start.py": "/dev/null in place of a closed stream",
+    "skytether/shell/commandline/command.py": "/dev/null in place of a closed pipe",
+    "skytether/shell/driving/inside.py": "files of the kernel in a program's own namespaces",
+    "skytether/shell/host/compiling.py": "an empty lock beside machine code",
+    "skytether/shell/driving/program.py": "what another program says, in a temporary folder",
+    "skytether/shell/driving/stream.py": "the line to an autopilot",
+    "skytether/shell/host/temporary.py": "marks in folders that it has made",
 }
 """Files of code that open something for writing, and what."""
 SCRATCH = "fuzz/"

@@ -34,9 +34,9 @@ from skytether.shared.base.errors import ConfigError
 from skytether.shared.missions.mission import Mission
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.schema import Scenario
-from skytether.shell import command
-from skytether.shell.argument import Argument
-from skytether.shell.command import CommandError, ScenarioFlags, ScenarioName
+from skytether.shell.commandline import command
+from skytether.shell.commandline.argument import Argument
+from skytether.shell.commandline.command import CommandError, ScenarioFlags, ScenarioName
 
 TRIES_MAX = 10**6
 ASSUMES = {

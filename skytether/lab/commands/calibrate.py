@@ -16,9 +16,9 @@ from skytether.lab.search import SIGMA, Free, Search, SearchPoint, Values, best,
 from skytether.shared.base import files
 from skytether.shared.scenario.reading import to_toml
 from skytether.shared.scenario.schema import Scenario
-from skytether.shell import command, terminal
-from skytether.shell.argument import Argument
-from skytether.shell.command import CommandError, ScenarioFlags, ScenarioName
+from skytether.shell.commandline import command, terminal
+from skytether.shell.commandline.argument import Argument
+from skytether.shell.commandline.command import CommandError, ScenarioFlags, ScenarioName
 
 BEST = "best.toml"
 POPULATION_MIN, POPULATION_MAX = 4, 1000

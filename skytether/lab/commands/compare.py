@@ -20,10 +20,10 @@ from skytether.lab.search import Search, best
 from skytether.shared.base import files
 from skytether.shared.scenario import reading
 from skytether.shared.telemetry.summary import Summary
-from skytether.shell import command, terminal
-from skytether.shell.argument import Argument
-from skytether.shell.command import CommandError
-from skytether.shell.options import read
+from skytether.shell.commandline import command, terminal
+from skytether.shell.commandline.argument import Argument
+from skytether.shell.commandline.command import CommandError
+from skytether.shell.commandline.options import read
 
 WEIGHTS = "weights.toml"
 

@@ -17,9 +17,10 @@ from skytether.lab.journal import StudyJournal
 from skytether.shared.base import files
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry import record
-from skytether.shell import command, temporary
-from skytether.shell.argument import Argument
-from skytether.shell.command import CommandError, ScenarioFlags, ScenarioName
+from skytether.shell.commandline import command
+from skytether.shell.commandline.argument import Argument
+from skytether.shell.commandline.command import CommandError, ScenarioFlags, ScenarioName
+from skytether.shell.host import temporary
 from skytether.sim import flight
 
 VEHICLES_MAX = 4096

@@ -10,8 +10,8 @@ import numpy as np
 from skytether.cli.processes import started
 from skytether.shared.base import files
 from skytether.shared.base.units import MILLISECOND_NS
-from skytether.shared.core.endpoint import Address
-from skytether.shared.core.events import address_text
+from skytether.shared.endpoints.endpoint import Address
+from skytether.shared.events.flight import address_text
 from skytether.shared.law.model import Array
 from skytether.shared.scenario.reading import to_toml
 from skytether.shared.scenario.schema import Scenario

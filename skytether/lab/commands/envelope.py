@@ -14,9 +14,9 @@ from skytether.lab.commands.pool import Flags, PoolFlags, study, writing
 from skytether.lab.envelope import BAD, Envelope, EnvelopePoint, Outcome, worst_first
 from skytether.shared.base import files
 from skytether.shared.scenario.schema import Scenario
-from skytether.shell import command, terminal
-from skytether.shell.argument import Argument
-from skytether.shell.command import CommandError, ScenarioFlags, ScenarioName
+from skytether.shell.commandline import command, terminal
+from skytether.shell.commandline.argument import Argument
+from skytether.shell.commandline.command import CommandError, ScenarioFlags, ScenarioName
 
 TOLD_MAX = 10
 

@@ -31,15 +31,16 @@ from skytether.ros2.graph import Node
 from skytether.shared.base import files, kernel
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.base.units import SECOND_NS
-from skytether.shared.core.events import Event
-from skytether.shared.core.line import Line
-from skytether.shared.core.steady import Steady
+from skytether.shared.endpoints.line import Line
+from skytether.shared.endpoints.steady import Steady
+from skytether.shared.events.flight import Event
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.schema import Scenario
-from skytether.shell import command, driver, terminal
-from skytether.shell.argument import Argument
-from skytether.shell.command import CommandError, ScenarioFlags
-from skytether.shell.udp import AddressError
+from skytether.shell.commandline import command, terminal
+from skytether.shell.commandline.argument import Argument
+from skytether.shell.commandline.command import CommandError, ScenarioFlags
+from skytether.shell.driving import driver
+from skytether.shell.host.udp import AddressError
 from skytether.sim.world import World
 
 SCENARIO, PICTURE, MEASURED = "scenario.toml", "steps.png", "measured.csv"

@@ -19,9 +19,9 @@ from skytether.lab.margins import Margin, MarginLimit
 from skytether.shared.base import files
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.schema import Scenario
-from skytether.shell import command
-from skytether.shell.argument import Argument
-from skytether.shell.command import CommandError, ScenarioFlags, ScenarioName
+from skytether.shell.commandline import command
+from skytether.shell.commandline.argument import Argument
+from skytether.shell.commandline.command import CommandError, ScenarioFlags, ScenarioName
 
 POINTS_MAX = 100_000
 

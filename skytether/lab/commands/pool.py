@@ -34,12 +34,13 @@ from skytether.lab.sweep import Results, Runs, Sweep
 from skytether.server.schemes import table
 from skytether.shared.base import kernel
 from skytether.shared.scenario.schema import Scenario
-from skytether.shell import command, plugins, system, terminal
-from skytether.shell.argument import Argument
-from skytether.shell.command import CommandError
-from skytether.shell.plugins import Plugin
-from skytether.shell.pool import processes
-from skytether.shell.terminal import Bar
+from skytether.shell.commandline import command, plugins, terminal
+from skytether.shell.commandline.argument import Argument
+from skytether.shell.commandline.command import CommandError
+from skytether.shell.commandline.plugins import Plugin
+from skytether.shell.commandline.terminal import Bar
+from skytether.shell.host import system
+from skytether.shell.processes.pool import processes
 
 UNDER_WAY_MAX = 256
 """Largest number of tasks submitted at once; more than the cores of any machine."""

@@ -16,7 +16,7 @@ from skytether.lab.commands import machine
 from skytether.lab.report import Drawn
 from skytether.shared.base import files
 from skytether.shared.scenario.schema import Scenario
-from skytether.shell import system
+from skytether.shell.host import system
 
 PAGE = "report.html"
 CALLS = "calls.jsonl"

@@ -27,10 +27,10 @@ from skytether.shared.scenario import reading
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry import record
 from skytether.shared.telemetry.record import Record
-from skytether.shell import command, terminal
-from skytether.shell.argument import Argument
-from skytether.shell.command import CommandError
-from skytether.shell.options import read
+from skytether.shell.commandline import command, terminal
+from skytether.shell.commandline.argument import Argument
+from skytether.shell.commandline.command import CommandError
+from skytether.shell.commandline.options import read
 from skytether.sim.flight import fly_batch
 
 

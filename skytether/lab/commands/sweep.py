@@ -14,9 +14,9 @@ from skytether.lab.commands.pool import Crew, Flags, PoolFlags, crew, writing
 from skytether.lab.sweep import Results, Sweep, estimate, parse_axis
 from skytether.shared.base import files
 from skytether.shared.scenario.schema import Scenario
-from skytether.shell import command, terminal
-from skytether.shell.argument import Argument
-from skytether.shell.command import ScenarioFlags, ScenarioName
+from skytether.shell.commandline import command, terminal
+from skytether.shell.commandline.argument import Argument
+from skytether.shell.commandline.command import ScenarioFlags, ScenarioName
 
 DRAWN = {"rmse_xy": "RMSE xy [m]", "event_ratio": "event ratio"}
 SHOWN = {

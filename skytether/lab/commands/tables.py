@@ -6,7 +6,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from skytether.shell import terminal
+from skytether.shell.commandline import terminal
 
 AROUND = 3
 """Width of the frame and space around a cell."""

@@ -17,10 +17,10 @@ from skytether.lab.faults import Trial, dumps, loads
 from skytether.lab.torture import TrialOutcome, fly, long_trial, short_trial, shrunk
 from skytether.shared.base import input_files
 from skytether.shared.base.errors import ConfigError
-from skytether.shell import command, terminal
-from skytether.shell.argument import Argument
-from skytether.shell.command import CommandError
-from skytether.shell.options import read
+from skytether.shell.commandline import command, terminal
+from skytether.shell.commandline.argument import Argument
+from skytether.shell.commandline.command import CommandError
+from skytether.shell.commandline.options import read
 
 SEEDS = 2**32
 HOURS_MAX = 10_000

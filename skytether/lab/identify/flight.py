@@ -13,8 +13,8 @@ from skytether.client.navigation import Navigation
 from skytether.client.vehicle import Measurement, Vehicle
 from skytether.lab.identify.steps import Experiment
 from skytether.shared.base.units import SECOND_NS
-from skytether.shared.core.endpoint import Datagram, Endpoint
-from skytether.shared.core.events import Failure
+from skytether.shared.endpoints.endpoint import Datagram, Endpoint
+from skytether.shared.events.flight import Failure
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Reason
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from enum import Enum
 from urllib.parse import parse_qs, urlsplit
 
-from skytether.shell.web import host_name, is_ours, numeric
+from skytether.shell.host.web import host_name, is_ours, numeric
 
 HOST_PORT = "127.0.0.1:8080"
 

@@ -8,10 +8,10 @@ from typing import Any
 
 import msgspec
 
-from skytether.shared.core.change import ONCE, Answer
-from skytether.shared.core.events import Changed
+from skytether.shared.endpoints.change import ONCE, Answer
+from skytether.shared.events.flight import Changed
 from skytether.shared.telemetry.feed import Frame, Opened, Said
-from skytether.shell.compiling import told
+from skytether.shell.host.compiling import told
 from skytether.view import controls
 from skytether.view.browser.play import NETEMS, PROCESSES, Operator
 from skytether.view.changes import Mark, mark, together

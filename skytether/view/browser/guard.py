@@ -33,8 +33,8 @@ import websockets.asyncio.server as sockets
 from websockets.frames import CloseCode, Frame, Opcode
 from websockets.http11 import Request, Response
 
-from skytether.shared.core.process_events import BrowserRefused
-from skytether.shell.web import HEADERS
+from skytether.shared.events.processes import BrowserRefused
+from skytether.shell.host.web import HEADERS
 from skytether.view.browser.access import TurnedAway, Visitor, refusal
 
 BROWSERS_MAX = 16

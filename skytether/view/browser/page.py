@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 import viser
 from websockets.asyncio.server import ServerConnection
 
-from skytether.shared.core.process_events import BrowserRefused
+from skytether.shared.events.processes import BrowserRefused
 from skytether.view.browser.access import TurnedAway, knows, may_play
 from skytether.view.browser.flight import PageFlight
 from skytether.view.browser.guard import Guard, visitor

@@ -1,8 +1,8 @@
 """Sender of changes requested on the page to the flight's processes.
 
 A dragged slider makes many requests per second, and processes may answer slowly: of the requests
-waiting for a key only the newest is sent. All go through the control sockets (`shell.control`), and
-so through the checks of a scenario.
+waiting for a key only the newest is sent. All go through the control sockets
+(`shell.driving.control`), and so through the checks of a scenario.
 """
 
 import threading
@@ -10,9 +10,9 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from skytether.shared.core.change import Answer
+from skytether.shared.endpoints.change import Answer
 from skytether.shared.wire.framing import PATHS_MAX
-from skytether.shell.control import Caller, ControlError
+from skytether.shell.driving.control import Caller, ControlError
 
 NETEMS = ("netem", *(f"netem {number}" for number in range(2, PATHS_MAX + 2)))
 """Names of the netems of a session's paths, and of the one to a standby server."""

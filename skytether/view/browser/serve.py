@@ -8,12 +8,12 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from pathlib import Path
 
-from skytether.shared.core.endpoint import Address
-from skytether.shared.core.events import address_text
-from skytether.shared.core.process_events import PageServed
-from skytether.shell.command import RUN, CommandError, interruptible
-from skytether.shell.feed import Subscriber
-from skytether.shell.log import Log, LogFormat
+from skytether.shared.endpoints.endpoint import Address
+from skytether.shared.events.flight import address_text
+from skytether.shared.events.processes import PageServed
+from skytether.shell.commandline.command import RUN, CommandError, interruptible
+from skytether.shell.driving.feed import Subscriber
+from skytether.shell.processes.log import Log, LogFormat
 from skytether.view.browser.access import is_loopback
 from skytether.view.browser.flight import PageFlight
 from skytether.view.browser.page import Page

@@ -1,0 +1,58 @@
+"""Base class of impairments, and types of their arguments.
+
+@impairment
+class Fading(Impairment):
+    '''Loses a share of the packets that rises and falls with this period.'''
+
+    def __init__(self, period_s: Annotated[float, Meta(ge=0.001)]) -> None:
+        self.period_s, self.loss = period_s, 0.5
+
+    def __call__(self, fate: Fate, draws: Draws) -> None:
+        share = 0.5 + 0.5 * sin(2 * pi * fate.time_s / self.period_s)
+        fate.lost |= draws.uniform(fate) < share
+"""
+
+from typing import Annotated, Literal
+
+from msgspec import Meta
+
+from skytether.netem.impairments.draws import Draws, Fate
+from skytether.shared.scenario.registry import IMPAIRMENTS
+
+impairment = IMPAIRMENTS
+"""Decorator of an impairment: a class whose arguments are written in the scenario."""
+
+Time = Annotated[float, Meta(ge=0, le=3600)]
+"""Time from 0 to an hour [s]."""
+Share = Annotated[float, Meta(ge=0, le=1)]
+"""Share from 0 to 1."""
+
+
+class Impairment:
+    """Base class of an effect of the network on packets. It must not store anything between
+    packets.
+    """
+
+    kind: Literal["delay", "loss", "other"] = "other"
+    """Kind of effect. Adding an impairment of another kind does not change the random numbers of
+    delays and losses."""
+    least_s: float = 0.0
+    """Smallest delay that the impairment adds [s]."""
+    mean_s: float = 0.0
+    """Mean delay that the impairment adds [s]."""
+    loss: float = 0.0
+    """Mean share of packets that the impairment loses."""
+    is_ordered: bool = False
+    """Whether packets of a flow stay in order."""
+    is_queue: bool = False
+    """Whether it is a finite rate with a queue, see `queues.Queued`."""
+    only_packets: bool = False
+    """Whether byte streams, such as connections of TCP, cannot have the impairment."""
+
+    def __call__(self, fate: Fate, draws: Draws) -> None:
+        """Change the fate of a packet that enters.
+
+        Args:
+            fate: fate of the packet after the impairments before this one.
+            draws: random numbers of this impairment.
+        """

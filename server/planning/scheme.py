@@ -1,0 +1,331 @@
+"""Interface of a scheme of delay compensation, and the arrays that schemes fill in.
+
+`shared.scenario.schemes` lists the schemes, `server.schemes.table` loads the one of a scenario.
+"""
+
+from abc import ABC, abstractmethod
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+from typing import Annotated, Any, ClassVar, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skytether.server.planning.clock import ClockMap
+from skytether.server.planning.desired import Desired
+from skytether.shared.base.kernel import F2, F3, F4, I1, S3, record, records
+from skytether.shared.endpoints.stopwatch import Stopwatch
+from skytether.shared.events.flight import Event
+from skytether.shared.law.model import Array, Flags, Indices
+from skytether.shared.law.terms import Limits, Terms
+from skytether.shared.scenario.reference import Reference
+from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.schemes import SchemeProperties
+from skytether.shared.wire.protocol import FEEDBACK, KNOTS_MAX, Lead, Observation
+
+
+class Splines(NamedTuple):
+    """Trajectories sent by the scheme "trajectory"; with other schemes `block` is 0."""
+
+    knots: S3
+    """Position [m] and velocity [m/s] of each knot in turn; shape (block, axes, 2 KNOTS_MAX)."""
+    number: I1
+    """Number of knots; shape (block,)."""
+    spacing: I1
+    """Steps from one knot to the next; shape (block,)."""
+    age: I1
+    """Age of the trajectory [steps]: 0 unless an old one is sent again; shape (block,)."""
+
+
+class Foresight(NamedTuple):
+    """Predictions for a block of vehicles, each at its step k, and the horizons planned from them.
+
+    The arrays are reused for every block. A block with fewer vehicles fills the first rows only.
+    """
+
+    estimate: F3
+    """Estimate x̂(k) [m, m/s]; shape (block, axes, 2)."""
+    ahead: I1
+    """Delay bound d: planning starts at k + d; shape (block,)."""
+    start: F3
+    """Estimate x̂(k+d), where planning starts [m, m/s]; shape (block, axes, 2)."""
+    committed: F3
+    """Committed inputs of steps k … k+d-1, in the first d columns [m/s]; shape (block, axes,
+    largest d)."""
+    held: F3
+    """Inputs that the vehicle flies from k+d on if no further packet is sent [m/s]; shape (block,
+    axes, H)."""
+    loss_probability: F2
+    """Probability that exactly the newest 1, 2, … of the horizons in flight are lost; shape (block,
+    loss_cases), with 0 cases if no trigger uses them."""
+    start_if_lost: F4
+    """State at k+d in each loss case [m, m/s]; shape (block, loss_cases, axes, 2)."""
+    inputs_if_lost: F4
+    """Inputs from k+d on in each loss case, if no further packet is sent [m/s]; shape (block,
+    loss_cases, axes, H)."""
+    usable: I1
+    """Number of inputs from k+d on that a vehicle may fly before they reach `link.age_max_s`; shape
+    (block,)."""
+    disturbance: F2
+    """Estimated disturbance ŵ, as an equivalent input [m/s]; shape (block, axes)."""
+    horizons: S3
+    """Horizons to send, from step k on: d committed inputs, then H planned ones [m/s]; shape
+    (block, axes, largest d + H)."""
+    feedback: S3
+    """Feedback columns of a horizon, see `wire.protocol.Horizon`; shape (block, axes, FEEDBACK)."""
+    splines: Splines
+    """Trajectories to send, with the scheme "trajectory"."""
+
+
+class PlanFigures:
+    """Numpy record: figures of one plan, from which triggers decide; costs are those of eq. (9)."""
+
+    row: int
+    step: int
+    start: int
+    """Step k + d, where planning starts."""
+    gap: int
+    """Steps from the start of the previous plan to the start of this one."""
+    state_gap: float
+    """V(k) of eq. (16): (x̂ - x_p)' P (x̂ - x_p)."""
+    cost_gap: float
+    """Cost of flying on with the inputs already sent, minus the cost of the new plan."""
+    expected_gap: float
+    """Expected value of `cost_gap` over the losses of packets in flight."""
+    deviation_m: float
+    """Largest distance between the flight with the inputs already sent and the previous plan [m]; 0
+    if `fresh`."""
+    fresh: bool
+    """Whether no usable previous plan exists: first step, or a gap longer than H."""
+    solved: bool
+    """Whether the solver has found a plan, so that it may be sent."""
+
+
+FIGURES = record(PlanFigures)
+Figures = Annotated[NDArray[np.void], records(FIGURES, 1)]
+"""A `PlanFigures` for each plan; shape (n,)."""
+
+
+LOSS_CASES = 4
+"""Number of loss cases computed: the newest 1, 2, 3, or 4 horizons in flight are lost."""
+
+
+def empty_foresight(
+    block: int, axes: int, H: int, ahead_max: int, loss_cases: int = 0, *, splines: bool = False
+) -> Foresight:
+    states, trajectories = (block, axes, 2), block if splines else 0
+    return Foresight(
+        estimate=np.zeros(states),
+        ahead=np.zeros(block, dtype=np.int64),
+        start=np.zeros(states),
+        committed=np.zeros((block, axes, ahead_max)),
+        held=np.zeros((block, axes, H)),
+        loss_probability=np.zeros((block, loss_cases)),
+        start_if_lost=np.zeros((block, loss_cases, axes, 2)),
+        inputs_if_lost=np.zeros((block, loss_cases, axes, H)),
+        usable=np.full(block, H),
+        disturbance=np.zeros((block, axes)),
+        horizons=np.zeros((block, axes, ahead_max + H), dtype=np.float32),
+        feedback=np.zeros((block, axes, FEEDBACK), dtype=np.float32),
+        splines=Splines(
+            knots=np.zeros((trajectories, axes, 2 * KNOTS_MAX), dtype=np.float32),
+            number=np.ones(trajectories, dtype=np.int64),
+            spacing=np.ones(trajectories, dtype=np.int64),
+            age=np.zeros(trajectories, dtype=np.int64),
+        ),
+    )
+
+
+class Header(NamedTuple):
+    """Header of a packet to a vehicle, the same for horizons and trajectories."""
+
+    vehicle: int
+    session: int
+    sent_us: int
+    """Server's clock when the packet is sent [µs]."""
+    number: int
+    """Number of the packet in the session."""
+    silence: int
+    """Longest time without a packet from the vehicle that the server asks for [half steps]."""
+
+
+make_header: Callable[[tuple[int, int, int, int, int]], Header] = partial(tuple.__new__, Header)
+"""Header from its five values, in half the time of calling `Header`."""
+
+
+class Batch(NamedTuple):
+    """Vehicles planned for together, and which of them are sent their plan."""
+
+    rows: Indices
+    """Rows of the vehicles; shape (n,)."""
+    step: Indices
+    """Step k of each; shape (n,)."""
+    foresight: Foresight
+    """Predictions and plans, in the first n rows of the arrays."""
+    sent: Indices
+    """Indices, from 0 to n - 1, of the vehicles whose plan is sent; shape (m,)."""
+
+
+class SentPlans(NamedTuple):
+    step: Indices
+    """Step k that each plan is made for; shape (m,)."""
+    begins: Indices
+    """First planned step of each plan; shape (m,)."""
+    state: Array
+    """Predicted state at the step `begins` [m, m/s]; shape (m, axes, 2)."""
+    inputs: NDArray[np.floating]
+    """Planned inputs [m/s]; shape (m, axes, H)."""
+
+
+Planning = Callable[[Sequence[tuple[int, Callable[[], Any]]]], list[Any]]
+"""Function that calls planners of plug-ins, each with a number of its own: returns what each has
+returned, or its exception; TimeoutError if it takes too long, `queue.Full` if too many hang."""
+
+
+def in_turn(calls: Sequence[tuple[int, Callable[[], Any]]]) -> list[Any]:
+    """Call planners one after the other, however long they take, as in virtual time."""
+    answers = []
+    for _, call in calls:
+        try:
+            answers.append(call())
+        except Exception as error:
+            answers.append(error)
+    return answers
+
+
+class Fleet(NamedTuple):
+    scenario: Scenario
+    terms: Terms
+    capacity: int
+    block: int
+    """Largest number of vehicles planned for together."""
+    clock: ClockMap
+    desired: Desired
+    references: Callable[[int], Reference] | None
+    """Reference of each vehicle of a mission, by its number; None without a mission."""
+    stopwatch: Stopwatch
+    tell: Callable[[str], None]
+    """Called with the traceback of a plug-in's first error in flight, for the log."""
+    planning: Planning = in_turn
+
+
+class Scheme(ABC):
+    """A scheme of delay compensation: predicts vehicles, plans for them and encodes the plans.
+
+    At each step and for each block of vehicles the server calls `foresee`, `plan`, `remember` and
+    `encode`, in this order.
+    """
+
+    properties: ClassVar[SchemeProperties]
+    """Properties of a plug-in's scheme; built-in ones are in `shared.scenario.schemes`."""
+    solve_ns = -1
+    """Time that planning for the last block took [ns], or -1 if it is not measured."""
+
+    def __init__(self, fleet: Fleet) -> None:
+        self.terms = fleet.terms
+        self.observed_step: Indices = np.full(fleet.capacity, -1, dtype=np.int64)
+        """Step of the newest observation of each vehicle, or -1; shape (capacity,)."""
+        self.counts: Counter[str] = Counter()
+        self.events: list[Event] = []
+        """What the operator is to be told; the caller empties the list."""
+        self.figures: Figures = np.zeros(fleet.block, dtype=FIGURES)
+        """Figures of the newest plans, in the first rows."""
+        self.planned: Array = np.zeros((fleet.block, fleet.terms.axes, 2))
+        """States at which the newest plans start, as predicted by the previous plans [m, m/s];
+        shape (block, axes, 2)."""
+
+    @abstractmethod
+    def forget(self, row: int) -> None:
+        """Forget the vehicle in this row."""
+
+    @abstractmethod
+    def observe(self, row: int, observation: Observation) -> bool:
+        """Store an observation unless a newer one is stored (E11); True if stored."""
+
+    @abstractmethod
+    def foresee(self, rows: Indices, step: Indices, foresight: Foresight) -> None:
+        """Fill in the predictions; the newest observation of each vehicle is young enough.
+
+        Args:
+            rows: rows of the vehicles; shape (n,).
+            step: step k of each; shape (n,).
+            foresight: output: all fields except the plans.
+        """
+
+    @abstractmethod
+    def plan(self, rows: Indices, step: Indices, foresight: Foresight) -> None:
+        """Plan, and fill in `figures` and `planned`.
+
+        Args:
+            rows: rows of the vehicles; shape (n,).
+            step: step k of each; shape (n,).
+            foresight: their predictions; output: `horizons`.
+        """
+
+    def remember(  # noqa: B027 - many schemes ignore what is sent
+        self, rows: Indices, step: Indices, foresight: Foresight, event: Flags
+    ) -> None:
+        """Store the plans, before those that the trigger chose are encoded and sent.
+
+        Args:
+            rows: rows of the vehicles; shape (n,).
+            step: step k of each; shape (n,).
+            foresight: their predictions and plans.
+            event: True for vehicles whose plan is sent; shape (n,).
+        """
+
+    @abstractmethod
+    def encode(self, batch: Batch, header: Callable[[int], Header]) -> Iterator[tuple[int, bytes]]:
+        """Row and encoded message of each vehicle whose plan is sent.
+
+        Args:
+            batch: vehicles and plans.
+            header: makes the header of the next packet to the vehicle in a row, with a new packet
+                number at each call: call once for each packet.
+        """
+
+    @abstractmethod
+    def sent_plans(self, batch: Batch) -> SentPlans:
+        """Plans that are sent, for the record."""
+
+    # -- what a room may add -----------------------------------------------------------------------
+
+    changeable: frozenset[str] = frozenset()
+    """Keys that may be changed in flight, beside the server's own."""
+    is_one_fleet = False
+    """Whether all vehicles follow one server, and keep their rows when they fall silent."""
+    limits: Limits | None = None
+    """Limits of motions, which two servers of a vehicle must have in common."""
+
+    def change(self, scenario: Scenario, keys: frozenset[str]) -> None:  # noqa: B027
+        """Act on changed keys; the caller has asked `objection` first."""
+
+    def objection(self, scenario: Scenario, keys: frozenset[str]) -> str:  # noqa: ARG002
+        """Reason why the keys cannot be changed now; empty if they can."""
+        return ""
+
+    def fleet_figures(self) -> dict[str, Any]:
+        """Figures of all vehicles together, beside the server's own."""
+        return {}
+
+    def vehicle_figures(self, row: int) -> dict[str, Any]:  # noqa: ARG002
+        """Figures of a vehicle that the scheme adds to the server's own."""
+        return {}
+
+    def follow(self, row: int, told: Lead | None) -> None:  # noqa: B027
+        """Note who leads a vehicle, and its motion in force; None if it has no other server."""
+
+    def leave(self) -> int:
+        """Plan nothing further: the server ends. Returns the longest time until all vehicles rest
+        [steps].
+        """
+        return 0
+
+    def rests(self, row: int) -> bool:  # noqa: ARG002
+        """Whether a vehicle needs no further plan to be safe, or another server leads it."""
+        return True
+
+    def restart(self, row: int) -> bool:  # noqa: ARG002
+        """Note that a vehicle's client has restarted; False if this was known already."""
+        return False

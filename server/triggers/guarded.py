@@ -1,0 +1,94 @@
+"""A plug-in's policy with its errors caught."""
+
+import traceback
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skytether.server.triggers.trigger import (
+    Figures,
+    Situation,
+    Trigger,
+    Verdict,
+    all_of,
+    timed,
+)
+from skytether.shared.law.model import Indices
+from skytether.shared.telemetry.record import Compared
+
+
+class Guarded(Trigger):
+    """A plug-in's policy with its errors caught: if it fails, it fires.
+
+    A needless packet costs bytes; a missing one may end the flight. A `budget` joined by & still
+    limits the rate. The policy gets read-only arrays.
+
+    Args:
+        name: name of the policy, for messages.
+        inner: the policy.
+        tell: called at each error, at the first one with its traceback, later with nothing.
+    """
+
+    def __init__(self, name: str, inner: Trigger, tell: Callable[[str], None]) -> None:
+        self.doubts = inner.doubts
+        self._name, self._inner, self._tell = name, inner, tell
+        self._has_failed = False
+
+    def forget(self, row: int) -> None:
+        try:
+            self._inner.forget(row)
+        except Exception as error:
+            self._fail(error)
+
+    def test(self, situation: Situation) -> Verdict:
+        rows, figures, estimate, planned, arrays = situation
+        # Read-only views: an error in a policy must not change what is sent.
+        views = map(_read_only, (rows, figures, estimate, planned))
+        try:
+            verdict = self._inner.test(Situation._make((*views, arrays)))
+            return Verdict(
+                _column(verdict.event, np.bool_, len(rows)),
+                _column(verdict.figure, np.float64, len(rows)),
+                _column(verdict.threshold, np.float64, len(rows)),
+                Compared(verdict.compared),
+            )
+        except Exception as error:
+            self._fail(error)
+            return timed(all_of(len(rows)), figures)
+
+    def sent(self, rows: Indices, figures: Figures) -> None:
+        try:
+            self._inner.sent(rows.copy(), figures.copy())
+        except Exception as error:
+            self._fail(error)
+
+    def _fail(self, error: Exception) -> None:
+        if self._has_failed:
+            self._tell("")
+            return
+        self._has_failed = True
+        what = f"the trigger {self._name}: {type(error).__name__}: {error}"
+        trace = "".join(traceback.format_exception(error))
+        self._tell(f"{trace}{what}; when it fails, a horizon is sent")
+
+
+def _read_only(array: NDArray[Any]) -> NDArray[Any]:
+    view = array.view()
+    view.flags.writeable = False
+    return view
+
+
+def _column(values: Any, kind: type[np.generic], n: int) -> NDArray[Any]:
+    """Values of n vehicles as an array of a type; shape (n,).
+
+    Raises:
+        ValueError: the values have another shape, or cannot be cast to the type.
+    """
+    column = np.asarray(values)
+    if column.shape != (n,) or not np.can_cast(column.dtype, kind):
+        got = f"{column.dtype.name} of shape {column.shape}"
+        raise ValueError(f"got {got}, expected {np.dtype(kind).name} of shape ({n},)")
+    # Kernels do not check types at each call: they need this type, contiguous.
+    return np.ascontiguousarray(column, dtype=kind)

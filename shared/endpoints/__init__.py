@@ -1,0 +1,1 @@
+"""What server, client and netem are: endpoints, driven by datagrams and time only."""

@@ -1,0 +1,118 @@
+"""Events of the process around an endpoint: its addresses, pages, keys, files and figures."""
+
+from typing import Any
+
+from skytether.shared.events.flight import Event, VehicleEvent, address_text
+
+
+class Listening(Event):
+    host: str
+    port: int
+    waiting_for: str
+
+    def __str__(self) -> str:
+        address = address_text(self.host, self.port)
+        return f"listening on {address}, waiting for {self.waiting_for}"
+
+
+class HostMissing(Event):
+    sentence = "cannot find {host}: {reason}; it is looked up again until it is found"
+    host: str
+    reason: str
+
+
+class HostFound(Event):
+    sentence = "found {host}: it is {address}"
+    host: str
+    address: str
+
+
+class PageServed(Event):
+    address: str
+    """Address for a browser; includes a token if the page may change the flight."""
+    taken: str = ""
+    """Requested HOST:PORT if another process uses that address."""
+
+    def __str__(self) -> str:
+        # Only a space may follow the address: it is copied, or clicked.
+        taken = f" ({self.taken} is taken)" if self.taken else ""
+        return f"the page is at {self.address}{taken}"
+
+
+class BrowserRefused(Event):
+    sentence = "refused, {count} so far: {why}"
+    why: str
+    count: int
+
+
+class Measured(Event):
+    host: str
+    port: int
+    local: bool = True
+
+    def __str__(self) -> str:
+        whose = "" if self.local else ", WITHOUT A PASSWORD: anybody on the network can read them"
+        return f"metrics at http://{address_text(self.host, self.port)}/metrics{whose}"
+
+
+class NoFailsafe(Event):
+    sentence = (
+        "NO FAILSAFE: without a packet it holds its last input for ever; "
+        'vehicle.exhausted = "brake" has one'
+    )
+
+
+class Plaintext(Event):
+    """A process has no keys: anybody can read and forge its packets."""
+
+    local: bool
+
+    def __str__(self) -> str:
+        who = "on this machine" if self.local else "on the network"
+        return f"PLAINTEXT, no keys: anybody {who} can fly the vehicle; see skytether keygen"
+
+
+class Counted(Event):
+    sentence = "counted so far:"
+    figures: dict[str, Any]
+
+
+class TimeUnknown(Event):
+    sentence = (
+        'link.time_of_day is "host", and the kernel of this host does not say how wrong its clock '
+        "is: clocks are compared by delays alone (chrony needs `rtcsync` in its configuration; "
+        "systemd-timesyncd states no error)"
+    )
+
+
+class Recalled(VehicleEvent):
+    goes_on: bool
+
+    def __str__(self) -> str:
+        if self.goes_on:
+            return f"vehicle {self.vehicle} goes on with the flight of an earlier run"
+        return f"vehicle {self.vehicle}: the flight of an earlier run is too long ago to go on"
+
+
+class NotRecalled(VehicleEvent):
+    sentence = "vehicle {vehicle}: the state saved by an earlier run is not used: {reason}"
+    reason: str
+
+
+class SettingsRecalled(Event):
+    path: str
+    values: dict[str, Any]
+
+    def __str__(self) -> str:
+        settings = ", ".join(f"{key} = {value!r}" for key, value in self.values.items())
+        return f"set in flight and in force again, from {self.path}: {settings}"
+
+
+class NotKept(Event):
+    reason: str
+    removed: bool = False
+    """Whether the file of an earlier state was removed: the next run would follow it."""
+
+    def __str__(self) -> str:
+        hovers = "; a client that is restarted now hovers where it is" if self.removed else ""
+        return f"the state for the next run of this process cannot be saved: {self.reason}{hovers}"

@@ -1,0 +1,1 @@
+"""What drives an endpoint in real time: datagrams, streams, changes, and files beside it."""

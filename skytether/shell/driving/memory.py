@@ -1,0 +1,259 @@
+"""File in which a client keeps its memory for the next run of the process.
+
+    MAGIC | digest of the rest, with the vehicle's key | host, time and identity | content
+
+A thread writes a new file beside it and renames that, so that no step waits for a disk and the file
+is always whole. Where it cannot be written and the endpoint waits for that, it is removed: the next
+run must not follow what is long past, and the endpoint goes on. A file that can be neither written
+nor removed, on a disk that is read-only, is refused by the next run, as is one that is damaged, or
+of another vehicle, key or flight. The file need not survive a reboot, which outlasts any motion.
+"""
+
+import asyncio
+import contextlib
+import os
+import threading
+import time
+from collections.abc import Mapping
+from errno import EBUSY, EIO, EROFS
+from hashlib import blake2b
+from pathlib import Path
+from typing import BinaryIO
+
+import msgspec
+
+from skytether.shared.base import files, input_files
+from skytether.shared.endpoints.endpoint import Endpoint
+from skytether.shared.events.processes import NotKept
+
+MAGIC = b"skytether memory 1\n"
+DIGEST_BYTES = 32
+FILE_BYTES_MAX = 65_536
+BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
+"""File with the host's boot id, on Linux; the monotonic clock restarts at each boot."""
+DISK_FAILED = {EROFS, EIO}
+"""Errors of a disk that has failed; one that was full has had room for the lock file."""
+AGAIN_S = 1.0
+"""Time after which a failed write is tried again."""
+
+
+class MemoryRefused(ValueError):
+    """The memory file must not be used; the message says why."""
+
+
+class _Envelope(msgspec.Struct, frozen=True, array_like=True):
+    host: str
+    """Boot id of the host; empty if the system has none."""
+    written_ns: int
+    """Time of writing [ns; monotonic clock of the host]."""
+    identity: dict[str, str]
+    """Names and values that must match the reader's: vehicle, flight."""
+    content: bytes
+
+
+def folder(given: str) -> Path:
+    """Folder for the memory file.
+
+    Args:
+        given: key `vehicle.memory`: a path, or "auto" for the state folder of the systemd service,
+            else of the user.
+    """
+    if given != "auto":
+        return Path(given).expanduser()
+    service = os.environ.get("STATE_DIRECTORY", "").partition(":")[0]
+    if service:
+        return Path(service)
+    state = os.environ.get("XDG_STATE_HOME") or "~/.local/state"
+    return Path(state).expanduser() / "skytether"
+
+
+class MemoryFile:
+    """File in which one client keeps its memory.
+
+    Args:
+        path: path of the file; a missing folder is created.
+        identity: names and values that a file must have in order to be used: vehicle, flight.
+        secret: key of the vehicle, which authenticates the file; empty without keys.
+
+    Raises:
+        OSError: the folder cannot be created, or another process uses this file. On a disk that
+            has failed neither is an error: the flight goes on, and `news` says what is not kept.
+    """
+
+    def __init__(self, path: Path, identity: Mapping[str, str], secret: bytes = b"") -> None:
+        self._path, self._identity, self._secret = path, dict(identity), secret
+        self._host = _host()
+        try:
+            self._lock = _locked(path)
+        except OSError as error:
+            if error.errno != EBUSY:
+                raise
+            raise OSError(f"{path}: another process keeps its memory there") from None
+        self._wanted: bytes | None = None
+        self._changed = threading.Condition()
+        self._ends = False
+        self._thread: threading.Thread | None = None
+        self._failure = self._told = ""
+        """Reason why the newest content could not be written, and reason reported last."""
+        self._is_removed = False
+        """Whether the file was removed, because it could not be written."""
+        self._told_nothing = False
+        """Whether the endpoint was told last that the next run finds nothing."""
+
+    @property
+    def path(self) -> Path:
+        return self._path
+
+    def read(self) -> tuple[bytes, int | None] | None:
+        """Content that the previous run has kept, and the time of writing; None without a file.
+
+        The time is of the monotonic clock [ns]; None if the host was rebooted since. The file is
+        written again with the same content: one that cannot be replaced may be older than the
+        flight.
+
+        Raises:
+            MemoryRefused: the file must not be used.
+        """
+        try:
+            content = input_files.read(self._path, FILE_BYTES_MAX, private=True, is_input=False)
+        except FileNotFoundError:
+            return None
+        except OSError as error:
+            raise MemoryRefused(f"{self._path}: {error.strerror or error}") from None
+        envelope = self._opened(content)
+        for name, expected in self._identity.items():
+            written = envelope.identity.get(name, "")
+            if written != expected:
+                mismatch = f"{name}: got {written or 'nothing'}, expected {expected}"
+                raise MemoryRefused(f"{self._path}: it was kept by another flight: {mismatch}")
+        try:
+            self._write(content)
+        except OSError as error:
+            reason = f"it cannot be replaced, so it may be too old: {error.strerror or error}"
+            raise MemoryRefused(f"{self._path}: {reason}") from None
+        is_now = bool(self._host) and envelope.host == self._host
+        return envelope.content, envelope.written_ns if is_now else None
+
+    def _opened(self, held: bytes) -> _Envelope:
+        digest, body = held[len(MAGIC) :][:DIGEST_BYTES], held[len(MAGIC) + DIGEST_BYTES :]
+        if not held.startswith(MAGIC) or digest != self._digest(body):
+            raise MemoryRefused(f"{self._path}: it is damaged, or was kept with another key")
+        try:
+            return msgspec.msgpack.decode(body, type=_Envelope)
+        except (msgspec.DecodeError, RecursionError) as error:
+            raise MemoryRefused(f"{self._path}: it is damaged: {error}") from None
+
+    def _digest(self, body: bytes) -> bytes:
+        return blake2b(body, key=self._secret, digest_size=DIGEST_BYTES, person=b"memory").digest()
+
+    def sealed(self, content: bytes, written_ns: int) -> bytes:
+        envelope = _Envelope(self._host, written_ns, self._identity, content)
+        body = msgspec.msgpack.encode(envelope)
+        return MAGIC + self._digest(body) + body
+
+    def forget(self) -> None:
+        self._path.unlink(missing_ok=True)
+
+    # -- in flight -----------------------------------------------------------------------------
+
+    def begin(self, endpoint: Endpoint, loop: asyncio.AbstractEventLoop) -> None:
+        """Start the thread that writes the endpoint's memory and acknowledges it."""
+        self._endpoint, self._loop = endpoint, loop
+        self._thread = threading.Thread(target=self._work, daemon=True)
+        self._thread.start()
+
+    def look(self) -> None:
+        now_ns = time.monotonic_ns()
+        content = self._endpoint.keep(now_ns=now_ns)
+        if content is not None:
+            with self._changed:
+                self._wanted = self.sealed(content, now_ns)
+                self._changed.notify()
+
+    def news(self) -> NotKept | None:
+        """Event that says why the file cannot be written; None if it can, or that was reported."""
+        failure, reported = self._failure, self._told
+        self._told = failure
+        if not failure or failure == reported:
+            return None
+        return NotKept(reason=failure, removed=self._is_removed)
+
+    def close(self) -> None:
+        """Write the rest, within a bounded time, and release the file's lock."""
+        with self._changed:
+            self._ends = True
+            self._changed.notify()
+        if self._thread is not None:
+            self._thread.join(AGAIN_S)
+        if self._lock:
+            with contextlib.suppress(OSError):
+                self._lock.close()
+
+    def _work(self) -> None:
+        while True:
+            with self._changed:
+                while self._wanted is None and not self._ends:
+                    self._changed.wait()
+                if self._wanted is None:
+                    return
+                content = self._wanted
+            try:
+                self._write(content)
+                self._failure, self._is_removed = "", False
+            except OSError as error:
+                failure = f"{self._path}: {error.strerror or error}"
+                stale = self._endpoint.waits_for_disk or self._told_nothing
+                if stale and not self._is_removed:
+                    self._remove()
+                self._failure = failure
+            with self._changed:
+                is_newest = self._wanted is content
+                if is_newest and not self._failure:
+                    self._wanted = None
+                elif self._failure:
+                    if self._ends:
+                        return
+                    self._changed.wait(AGAIN_S)
+            if is_newest and not self._failure:
+                with contextlib.suppress(RuntimeError):  # the loop has closed meanwhile
+                    self._loop.call_soon_threadsafe(self._tell)
+
+    def _write(self, content: bytes) -> None:
+        with files.replacing(self._path, mode=0o600, is_synced=False) as file:
+            file.write(content)
+
+    def _remove(self) -> None:
+        with contextlib.suppress(OSError):  # of a disk that is read-only
+            self._path.unlink(missing_ok=True)
+            self._is_removed, self._told, self._told_nothing = True, "", True
+            with contextlib.suppress(RuntimeError):  # the loop has closed meanwhile
+                self._loop.call_soon_threadsafe(lambda: self._endpoint.kept(nothing=True))
+
+    def _tell(self) -> None:
+        if self._wanted is None:
+            self._told_nothing = False
+            self._endpoint.kept()
+
+
+def _locked(path: Path) -> BinaryIO | None:
+    """Lock of a memory file; None on a disk that has failed and holds no readable lock file."""
+    lock = path.with_name(path.name + ".lock")
+    try:
+        path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        return files.appending(lock)
+    except OSError as error:
+        if error.errno not in DISK_FAILED:
+            raise
+    try:
+        return files.held(lock)
+    except OSError as error:
+        if error.errno == EBUSY:
+            raise
+    return None
+
+
+def _host() -> str:
+    try:
+        return BOOT_ID.read_text().strip()
+    except OSError:
+        return ""

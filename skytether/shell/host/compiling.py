@@ -1,0 +1,148 @@
+"""Compilation of kernels, by as many processes as there are cores.
+
+Numba compiles one function at a time in a process. So other processes compile beside this one,
+which then reads the machine code that they stored on disk. Each takes the next kernel from a
+queue, because compile times are not known beforehand. A second command waits for the first, which
+compiles what it needs, too.
+"""
+
+import subprocess
+import sys
+import time
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from skytether.shared.base import files, input_files
+from skytether.shell.host import system
+
+# for type checking only: the client aboard is installed without numba
+if TYPE_CHECKING:
+    from skytether.shared.base.kernel import Missing
+
+LOCK = "compiling.lock"
+POLL_S = 0.1
+"""Time between two tries for the lock."""
+
+
+@contextmanager
+def alone(folder: Path | None, on_wait: Callable[[], None]) -> Iterator[None]:
+    """Let no other command that stores machine code in a folder compile during the block.
+
+    Args:
+        folder: None where machine code is not stored.
+        on_wait: called once if another command compiles.
+    """
+    try:
+        lock = folder and (folder / LOCK).open("ab")
+    except OSError:  # read-only
+        lock = None
+    if not lock:
+        yield
+        return
+    with lock:
+        waits = False
+        while not _locked(lock.fileno()):
+            if not waits:
+                waits = True
+                on_wait()
+            time.sleep(POLL_S)
+        yield
+
+
+def _locked(descriptor: int) -> bool:
+    try:
+        files.lock(descriptor)
+    except BlockingIOError:
+        return False
+    except OSError:  # no locks on this system: each command compiles
+        pass
+    return True
+
+
+TOLD = "compiling"
+"""Name of the file in a flight's folder that says how far compiling is, for the page."""
+TOLD_BYTES = 200
+
+
+def tell(folder: Path | None, text: str) -> None:
+    """Leave a text for `told` in a flight's folder, if it has one; without a text, none."""
+    if folder is None:
+        return
+    with suppress(OSError):
+        if text:
+            with files.replacing(folder / TOLD, is_synced=False) as file:
+                file.write(text.encode())
+        else:
+            (folder / TOLD).unlink(missing_ok=True)
+
+
+def told(folder: Path | None) -> str:
+    """What a command has told of its compiling; empty if nothing, or once it is over."""
+    with suppress(OSError, ValueError):
+        return input_files.read(folder / TOLD, TOLD_BYTES).decode() if folder else ""
+    return ""
+
+
+def compile_kernels(kernels: Sequence["Missing"], on_done: Callable[[], None]) -> None:
+    """Compile kernels, in parallel where there are several cores.
+
+    Args:
+        kernels: kernels to compile; those that take longest should come first.
+        on_done: called after each kernel, from any thread.
+    """
+    queue = deque(each for each in kernels if each.is_stored)
+    helpers = min(system.cores(), len(queue)) - 1
+    with ThreadPoolExecutor(max(helpers, 1)) as pool:
+        for _ in range(helpers):
+            pool.submit(_have_compiled, queue, on_done)
+        while each := _next(queue):
+            each.compile()
+            on_done()
+    for each in kernels:
+        # Loads code that other processes have compiled, and compiles kernels for which they failed.
+        each.compile()
+        if not each.is_stored:
+            on_done()
+
+
+def _next(kernels: "deque[Missing]") -> "Missing | None":
+    """Kernel at the front of a queue that several threads empty; None at its end."""
+    try:
+        return kernels.popleft()
+    except IndexError:
+        return None
+
+
+def _have_compiled(kernels: "deque[Missing]", on_done: Callable[[], None]) -> None:
+    """Let another process compile kernels from the front of a queue, until the queue is empty."""
+    with subprocess.Popen(
+        [sys.executable, "-P", "-m", __name__],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        text=True,
+    ) as helper:
+        assert helper.stdin
+        assert helper.stdout
+        while each := _next(kernels):
+            print(each.name, file=helper.stdin, flush=True)
+            if not helper.stdout.readline():  # killed, by the system or by Ctrl-C
+                return
+            on_done()
+
+
+def _help() -> None:
+    """Compile the kernels named on stdin, one a line; answer each with a line on stdout."""
+    from skytether.shared.base.kernel import compile_named
+
+    for line in sys.stdin:
+        compile_named(line.rstrip("\n"))
+        print(flush=True)
+
+
+if __name__ == "__main__":
+    _help()

@@ -1,0 +1,88 @@
+"""Time of day of this host, with the error bound that its kernel reports (`adjtimex`, Linux).
+
+The time daemon sets that bound. chrony and ntpd include half of the round-trip time to their
+source, so it holds whatever the network delay. systemd-timesyncd sets it to 0, which is not an
+estimate: such a clock counts as unknown. So does the clock under chrony without `rtcsync`, which
+leaves it marked as not synchronised.
+"""
+
+import ctypes
+import time
+from functools import cache
+from typing import NamedTuple
+
+from skytether.shared.base.units import MICROSECOND_NS
+from skytether.shared.endpoints.endpoint import Endpoint
+from skytether.shared.events.processes import TimeUnknown
+from skytether.shell.host import system
+
+UNSYNCHRONISED, CLOCK_ERROR = 0x40, 5
+"""Status bit, and return value of `adjtimex`, of a clock that is not synchronised."""
+
+
+class _Timex(ctypes.Structure):
+    """First fields of the kernel's `struct timex`; the rest of it is padding."""
+
+    _fields_ = (
+        ("modes", ctypes.c_uint),
+        ("offset", ctypes.c_long),
+        ("freq", ctypes.c_long),
+        ("maxerror", ctypes.c_long),
+        ("esterror", ctypes.c_long),
+        ("status", ctypes.c_int),
+        ("rest", ctypes.c_byte * 256),
+    )
+
+
+class HostTime(NamedTuple):
+    utc_ns: int
+    """Time since 1970 [ns]."""
+    error_ns: int
+    """Largest error of `utc_ns` [ns]."""
+    now_ns: int
+    """CLOCK_MONOTONIC at the same moment [ns]."""
+
+
+@cache
+def _adjtimex() -> "ctypes._FuncPointer | None":
+    return getattr(system.LIBC, "adjtimex", None)
+
+
+def stated(answer: int, status: int, maxerror_us: int, esterror_us: int) -> int | None:
+    """Largest error of the host's clock by the answer of `adjtimex` [ns]; None if it is unknown."""
+    if answer in (-1, CLOCK_ERROR) or status & UNSYNCHRONISED or esterror_us <= 0:
+        return None
+    return maxerror_us * MICROSECOND_NS if maxerror_us > 0 else None
+
+
+def host_time() -> HostTime | None:
+    """Time of day of this host; None if its error is unknown."""
+    call, timex = _adjtimex(), _Timex()
+    if call is None:
+        return None
+    answer = int(call(ctypes.byref(timex)))
+    error_ns = stated(answer, timex.status, timex.maxerror, timex.esterror)
+    if error_ns is None:
+        return None
+    # The process may be preempted between two clocks: the monotonic one is read before and after,
+    # and the time between counts as an error.
+    before_ns, utc_ns, after_ns = time.monotonic_ns(), time.time_ns(), time.monotonic_ns()
+    return HostTime(utc_ns, error_ns + after_ns - before_ns, after_ns)
+
+
+class TimeTeller:
+    """Gives an endpoint the time of day of this host while its error is known."""
+
+    def __init__(self, endpoint: Endpoint) -> None:
+        self._endpoint = endpoint
+        self._is_known = True
+
+    def news(self) -> TimeUnknown | None:
+        """Give the endpoint the time of day; returns an event when the time has become unknown."""
+        time_of_day, was_known = host_time(), self._is_known
+        self._is_known = time_of_day is not None
+        if time_of_day is None:
+            return TimeUnknown() if was_known else None
+        utc_ns, error_ns, now_ns = time_of_day
+        self._endpoint.learn_time(utc_ns, error_ns, now_ns=now_ns)
+        return None
