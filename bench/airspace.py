@@ -20,7 +20,7 @@ from skytether.shared.endpoints.endpoint import Address, Datagram
 from skytether.shared.endpoints.stopwatch import Stopwatch
 from skytether.shared.law.heartbeat import NUMBERS
 from skytether.shared.law.model import Array, Indices, discretise
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.shared.wire.protocol import (
     NO_HORIZON,
     Hello,

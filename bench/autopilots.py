@@ -27,7 +27,7 @@ from skytether.lab.commands.pool import Flags, study
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.events.flight import Flying
 from skytether.shared.scenario import reading
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import TRUTH_COLUMNS, Record, Recorder, Rows, parse
 from skytether.shared.telemetry.summary import Summary, position_error, summarise
 from skytether.shared.wire.protocol import Mode

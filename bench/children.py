@@ -17,7 +17,7 @@ from skytether.shared.endpoints.endpoint import Address
 from skytether.shared.events.flight import Event, address_text
 from skytether.shared.events.processes import Counted, Listening
 from skytether.shared.scenario.reading import to_toml
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.shared.wire import keys
 from skytether.shell.processes.log import LogLine, line_of
 from skytether.shell.processes.workers import die_with_parent

@@ -27,7 +27,7 @@ from skytether.lab.commands.pool import Flags, study
 from skytether.shared.base.units import SECOND_NS, seconds_to_ns
 from skytether.shared.events.flight import ModeChanged
 from skytether.shared.law.model import Array
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import parse
 from skytether.shared.wire.protocol import Mode
 from skytether.shell.commandline import command

@@ -33,7 +33,7 @@ from skytether.server.secure import FORMS
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
 from skytether.shared.endpoints.endpoint import Datagram
 from skytether.shared.events.flight import Flying
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry import record
 from skytether.shared.telemetry.summary import position_error
 from skytether.shared.wire import channel, handshake

@@ -57,7 +57,8 @@ from skytether.shared.missions.derived import clearances, zones
 from skytether.shared.missions.mission import Mission
 from skytether.shared.missions.zones import Zones
 from skytether.shared.scenario import reading
-from skytether.shared.scenario.schema import NetworkConfig, Scenario
+from skytether.shared.scenario.schema import NetworkConfig
+from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import Record
 from skytether.shared.telemetry.summary import least_separation
 from skytether.shared.wire.protocol import Mode

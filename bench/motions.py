@@ -31,7 +31,7 @@ from skytether.server.missions.trajectory_qp import TrajectoryQP
 from skytether.shared.base import files
 from skytether.shared.law.model import Array
 from skytether.shared.scenario import reading
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.sim import flight
 
 ROWS = 64

@@ -26,7 +26,8 @@ from skytether.server.mpc.problem import (
 from skytether.server.mpc.solver import Solver
 from skytether.shared.law.model import Array, Flags
 from skytether.shared.scenario import reading
-from skytether.shared.scenario.schema import ControlConfig, Scenario
+from skytether.shared.scenario.schema import ControlConfig
+from skytether.shared.scenario.whole import Scenario
 from skytether.sim.flight import fly
 
 

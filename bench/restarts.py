@@ -39,7 +39,7 @@ from bench.problems import derive
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.events.flight import Flying, ModeChanged
 from skytether.shared.law.model import Array
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry import record
 from skytether.shared.telemetry.record import Rows
 from skytether.shared.wire.protocol import Mode

@@ -23,7 +23,7 @@ from bench.harness import (
 from bench.problems import RecordedProblems, derive, record
 from bench.reference import Reference
 from skytether.shared.law.model import Array, Flags
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 
 TARGETS = {"hot": {"p50": 15.0, "p99": 10.0}, "paced": {"p50": 7.0, "p99": 5.0}}
 """Targets: ratio of tuned OSQP's time to the exact solver's, by pace and quantile."""

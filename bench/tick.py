@@ -33,7 +33,7 @@ from bench.problems import ByTurns, derive, listening, record, saturated, solvin
 from skytether.figures.flights import save
 from skytether.server.mpc.exact import ExactSolver
 from skytether.shared.endpoints.stopwatch import Stopwatch
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 
 PERIOD_MS = 20.0
 """Length Δt of a step of all flights here [ms]."""

@@ -20,7 +20,7 @@ from bench.harness import HOT, PACED, machine
 from bench.problems import derive
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.endpoints.stopwatch import Stopwatch
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.sim.flight import fly, fly_batch
 
 PLANNING = {"estimate", "trigger", "plan", "solve"}

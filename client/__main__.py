@@ -29,7 +29,7 @@ from skytether.shared.endpoints.steady import Steady
 from skytether.shared.events.aboard import ParametersUnsafe
 from skytether.shared.events.flight import Event, NoSession, SessionRefused, address_text
 from skytether.shared.events.processes import NotRecalled, Recalled
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import client_columns
 from skytether.shared.telemetry.summary import summarise
 from skytether.shared.wire import keys

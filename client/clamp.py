@@ -7,9 +7,29 @@ bound allows.
 
 import math
 from collections.abc import Sequence
+from typing import Protocol
 
 ROUNDING = 1e-9
 """Excess of speed attributed to rounding [m/s]."""
+
+
+class Guard(Protocol):
+    """A room's limit on inputs, which acts after this bound, such as a fence."""
+
+    holds: bool
+    """Whether it limited the latest requested input."""
+
+    def limited(
+        self, wanted: Sequence[float], state: Sequence[tuple[float, float]], u_max: Sequence[float]
+    ) -> list[float]:
+        """Input that may be flown, of each axis [m/s].
+
+        Args:
+            wanted: chosen input of each axis [m/s].
+            state: state in which the input will take effect, of each axis [m, m/s]; the
+                position of the first call is home.
+            u_max: bound of each axis [m/s].
+        """
 
 
 def clamped(

@@ -26,7 +26,8 @@ which the input leads. The factor 1.25 covers a gain of 0.8; 0.1 s covers an err
 import math
 from collections.abc import Sequence
 
-from skytether.shared.scenario.fence import SLOW_STEPS, inner_bounds
+from skytether.shared.fence.keys import FenceConfig
+from skytether.shared.fence.margins import SLOW_STEPS, inner_bounds
 from skytether.shared.scenario.schema import Scenario
 
 ROUNDING = 1e-9
@@ -35,7 +36,7 @@ ROUNDING = 1e-9
 
 class Fence:
     def __init__(self, scenario: Scenario) -> None:
-        terms, fence, dt = scenario.terms(), scenario.fence, scenario.control.dt
+        terms, fence, dt = scenario.terms(), scenario.section(FenceConfig), scenario.control.dt
         self._tau, self._gain = terms.tau_s, terms.gain
         self._T = [tau + SLOW_STEPS * dt for tau in terms.tau_s]
         self._brake = scenario.vehicle.brake_mps2
@@ -50,14 +51,7 @@ class Fence:
     def limited(
         self, wanted: Sequence[float], state: Sequence[tuple[float, float]], u_max: Sequence[float]
     ) -> list[float]:
-        """Input that may be flown, of each axis [m/s].
-
-        Args:
-            wanted: chosen input of each axis [m/s].
-            state: state in which the input will take effect, of each axis [m, m/s]; the
-                position of the first call is home.
-            u_max: bound of each axis [m/s].
-        """
+        """See `client.clamp.Guard`."""
         # The first known state, not the scenario's start: a real vehicle starts where it stands.
         self._home = self._home or [p for p, _ in state]
         rest = [p + tau * v for (p, v), tau in zip(state, self._tau, strict=True)]

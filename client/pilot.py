@@ -8,11 +8,10 @@ decides what the vehicle may do, `client.compensator` which input of a horizon i
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from skytether.client.clamp import clamped
+from skytether.client.clamp import Guard, clamped
 from skytether.client.compensator import Compensator
 from skytether.client.failsafe import DROPPING, LATE_SHARE, Failsafe
 from skytether.client.navigation import Navigation
@@ -36,9 +35,6 @@ from skytether.shared.wire.protocol import (
     Trajectory,
     stamp_us,
 )
-
-if TYPE_CHECKING:
-    from skytether.client.fence import Fence
 
 LAND_MPS = 0.5
 """Speed of descent when landing [m/s]."""
@@ -76,9 +72,10 @@ class Pilot:
         along = regulator(scenario) if self._terms.splines or self._holds else None
         self.compensator = Compensator(self._terms, along)
         self._reporter = Reporter(self._terms, scenario.vehicle.report, self.compensator)
-        self._fence: Fence | None = None
-        if scenario.fence.is_there:
-            self._fence = load("skytether.client.fence", "fence").Fence(scenario)
+        self._fence: Guard | None = None
+        for section in scenario.sections():
+            if module := section.guard():
+                self._fence = load(module, "fence").Fence(scenario)
         # The paper's vehicle does not bound the change of the input: with `exhausted = "hold"` the
         # clamp only keeps the input finite and bounded.
         self._change_max = (
@@ -326,7 +323,7 @@ class Pilot:
         is_measured = bool(np.isfinite(self._navigation.measured[:, 0]).all())
         return is_measured and (self._is_mission or failsafe.reason not in UNPLACED)
 
-    def _fenced(self, fence: "Fence", flown: list[float]) -> list[float]:
+    def _fenced(self, fence: Guard, flown: list[float]) -> list[float]:
         """Input limited by the fence, which does not stop a landing vehicle from descending."""
         within = fence.limited(flown, self._navigation.predicted.tolist(), self._terms.u_max)
         if self._failsafe.mode is Mode.LAND and self._terms.axes > ALTITUDE:

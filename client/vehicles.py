@@ -1,14 +1,12 @@
 """Table of vehicles: the names that `vehicle.kind` accepts, and how each vehicle is made.
 
-A plug-in adds a vehicle in the same way. Packages that a vehicle needs beside numpy are imported
-when it is made.
+`shared.scenario.rooms` names the modules of ours, which are imported when a scenario names one; a
+plug-in adds a vehicle in the same way.
 """
 
 from typing import TYPE_CHECKING
 
-from skytether.client.simulated import vehicle as computed
 from skytether.client.vehicle import Vehicle
-from skytether.shared.base import extras
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.endpoints.line import Line, parse_line
 from skytether.shared.scenario.grammar import GrammarError
@@ -21,35 +19,6 @@ if TYPE_CHECKING:
 vehicle = VEHICLES
 """Decorator that registers a vehicle: a function of the `Scenario` and its number that makes a
 `Vehicle`."""
-
-
-@vehicle
-def simulated(scenario: Scenario, number: int) -> Vehicle:
-    """Simulated velocity loop of first order in wind: eq. (1), with optional deviations from it."""
-    return computed.simulated(scenario, number)
-
-
-@vehicle
-def quadrotor(scenario: Scenario, number: int) -> Vehicle:
-    """Simulated quadrotor with rotors and control loops, in wind and turbulence."""
-    return computed.quadrotor(scenario, number)
-
-
-@vehicle
-def mavlink(scenario: Scenario, number: int) -> Vehicle:
-    """ArduCopter or PX4 at `vehicle.address`, flown by velocities over MAVLink."""
-    with extras.named():
-        from skytether.client.mavlink.vehicle import MavlinkVehicle
-    return MavlinkVehicle(scenario, number)
-
-
-@vehicle
-def ros2(scenario: Scenario, number: int) -> Vehicle:
-    """Robot that speaks ROS 2 by rmw_zenoh at `vehicle.address`, flown by velocities."""
-    extras.need("ros2")
-    from skytether.client.ros2.vehicle import Ros2Vehicle
-
-    return Ros2Vehicle(scenario, number)
 
 
 def make(scenario: Scenario, number: int) -> Vehicle:

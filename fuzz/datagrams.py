@@ -20,7 +20,7 @@ from skytether.shared.base.chance import stream
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
 from skytether.shared.endpoints.endpoint import EVENTS_MAX, Datagram, Endpoint
 from skytether.shared.scenario import reading
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.shared.wire import protocol
 from skytether.shared.wire.drop import ProtocolError
 from skytether.shared.wire.protocol import decode, encode, kind_of

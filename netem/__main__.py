@@ -26,7 +26,7 @@ from skytether.shared.endpoints.line import CONNECTIONS_MAX, Listen, parse_addre
 from skytether.shared.endpoints.ways import FLIGHT, KEYS, RELAY, RUN, Ways, named
 from skytether.shared.events.flight import address_text
 from skytether.shared.scenario import reading
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import PACKET_COLUMNS
 from skytether.shell.commandline import command
 from skytether.shell.commandline.argument import Argument

@@ -25,7 +25,7 @@ from skytether.shared.endpoints.endpoint import PATH_SOCKETS, Address, Form
 from skytether.shared.endpoints.steady import Steady
 from skytether.shared.endpoints.stopwatch import Stopwatch
 from skytether.shared.events.flight import address_text
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import RECORDING, plan_columns, server_columns
 from skytether.shared.wire import keys
 from skytether.shared.wire.keys import Keyring

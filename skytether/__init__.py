@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from skytether.library.sweeping import Swept, sweep
     from skytether.shared.base.errors import ConfigError, FlightError, RecordingError
     from skytether.shared.endpoints.endpoint import Datagram, Endpoint
-    from skytether.shared.scenario.schema import Scenario
+    from skytether.shared.scenario.whole import Scenario
     from skytether.shared.telemetry.summary import Summary
     from skytether.sim.world import World
 
@@ -54,7 +54,7 @@ _HOMES = {
     "skytether.library.sweeping": ("Swept", "sweep"),
     "skytether.shared.base.errors": ("ConfigError", "FlightError", "RecordingError"),
     "skytether.shared.endpoints.endpoint": ("Datagram", "Endpoint"),
-    "skytether.shared.scenario.schema": ("Scenario",),
+    "skytether.shared.scenario.whole": ("Scenario",),
     "skytether.shared.telemetry.summary": ("Summary",),
     "skytether.sim.world": ("World",),
 }

@@ -12,8 +12,9 @@ from skytether.netem.impairments.impairment import Impairment, Share, Time, impa
 from skytether.server.triggers.trigger import Situation, Trigger, Verdict, above, trigger
 from skytether.shared.scenario.planners import Planner, Problem, planner
 from skytether.shared.scenario.reference import Reference
-from skytether.shared.scenario.schema import ControlConfig, Scenario
+from skytether.shared.scenario.schema import ControlConfig
 from skytether.shared.scenario.trajectories import reference
+from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import Compared
 
 __all__ = [

@@ -22,7 +22,7 @@ from skytether.shared.endpoints.change import Running
 from skytether.shared.endpoints.endpoint import Datagram, Endpoint
 from skytether.shared.events.flight import Event, ModeChanged
 from skytether.shared.scenario.reading import check
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import TRUTH_COLUMNS, Recorder, Rows, client_columns, parse
 from skytether.shared.wire.protocol import Mode
 from skytether.sim.world import Clock, World

@@ -10,7 +10,7 @@ from skytether.client.simulated.vehicle import simulated
 from skytether.client.vehicle import Vehicle
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.endpoints.endpoint import Address, Datagram
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import Recorder, Rows, client_columns, parse
 from skytether.shared.wire.protocol import (
     Horizon,

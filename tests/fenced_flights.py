@@ -18,7 +18,7 @@ from skytether.client.simulated.weather import Weather
 from skytether.client.vehicle import Measurement
 from skytether.shared.base.chance import stream
 from skytether.shared.law.model import Array
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 
 FLIGHT_S = 20.0
 BOX_M = 6.0

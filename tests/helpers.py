@@ -20,7 +20,7 @@ from skytether.shared.endpoints.endpoint import Address, Datagram, Endpoint
 from skytether.shared.events.flight import Fault
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.dotted import set_keys
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import Record
 from skytether.shell.driving.driver import Shell
 

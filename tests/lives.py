@@ -10,7 +10,7 @@ from skytether.lab import lives
 from skytether.lab.lives import world_s
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS, seconds_to_ns
 from skytether.shared.missions.zones import Zones
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.summary import nearest
 
 LOOK_S = 10 * MILLISECOND_NS / SECOND_NS

@@ -27,7 +27,7 @@ from skytether.server.endpoint import Server
 from skytether.shared.endpoints.endpoint import Datagram, Endpoint
 from skytether.shared.events.flight import Event
 from skytether.shared.scenario.reading import check
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import Recorder, Rows, client_columns, parse
 from skytether.shared.wire.protocol import Mode
 from skytether.sim.world import Clock, World

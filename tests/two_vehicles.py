@@ -18,7 +18,7 @@ from skytether.shared.law.motion import SPACING, Motion, resting
 from skytether.shared.missions.mission import Mission, swap
 from skytether.shared.missions.zones import Zones
 from skytether.shared.scenario import reading
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import Record, Rows
 from skytether.shared.telemetry.summary import least_separation
 from skytether.shared.wire.protocol import NO_HORIZON, NO_INPUT, Mode, Observation

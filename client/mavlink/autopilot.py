@@ -11,6 +11,7 @@ from typing import NamedTuple
 from skytether.client.clock import BootClock
 from skytether.client.mavlink.condition import Condition
 from skytether.client.mavlink.flavours import ARDUPILOT, FLAVOURS, Flavour, unfit
+from skytether.client.mavlink.keys import MavlinkConfig
 from skytether.client.mavlink.launch import (
     ACCEPTED,
     IN_PROGRESS,
@@ -62,11 +63,12 @@ class Autopilot:
 
     def __init__(self, scenario: Scenario, vehicle: int, altitude: float, events: Events) -> None:
         self._scenario, self._vehicle, self._altitude = scenario, vehicle, altitude
-        self._patience_ns = seconds_to_ns(scenario.mavlink.patience_s)
+        self._keys = scenario.section(MavlinkConfig)
+        self._patience_ns = seconds_to_ns(self._keys.patience_s)
         self._events = events
         self.clock = BootClock()
         self.timesync = Timesync(self.clock, vehicle, events)
-        self.condition = Condition(scenario.mavlink.battery_min, scenario.mavlink.battery_min_v)
+        self.condition = Condition(self._keys.battery_min, self._keys.battery_min_v)
         self.positions = Positions(
             scenario.model.axes,
             self.clock,
@@ -151,7 +153,7 @@ class Autopilot:
             self._set_up()
 
     def _set_up(self) -> None:
-        keys, flavour = self._scenario.mavlink, self.flavour
+        keys, flavour = self._keys, self.flavour
         self._set_up_ns = None
         setup = Setup(
             self._vehicle,
@@ -251,7 +253,7 @@ class Autopilot:
             self._give_up("its autopilot's clock is not known", f"it waits for {self.waits_for}")
 
     def _give_up(self, doing: str, why: str) -> None:
-        self._fail(f"{doing} in {self._scenario.mavlink.patience_s:g} s", why)
+        self._fail(f"{doing} in {self._keys.patience_s:g} s", why)
 
     def _fail(self, doing: str, why: str) -> None:
         self._unfit = NotTakenOff(vehicle=self._vehicle, doing=doing, why=why)

@@ -9,6 +9,7 @@ from collections import Counter
 from collections.abc import Sequence
 from typing import NamedTuple
 
+from skytether.client.mavlink.keys import MavlinkConfig
 from skytether.mavlink.codec import Codec, Message
 from skytether.mavlink.dialect import dialect
 from skytether.shared.endpoints.endpoint import Address, Datagram, Events
@@ -35,7 +36,7 @@ class Arrivals(NamedTuple):
 
 class Connection:
     def __init__(self, scenario: Scenario, vehicle: int, line: Line, events: Events) -> None:
-        self._keys = keys = scenario.mavlink
+        self._keys = keys = scenario.section(MavlinkConfig)
         self._vehicle, self._events = vehicle, events
         self.line = scenario.vehicle.address
         self._may_move = line.kind == "udp"

@@ -5,6 +5,7 @@ disarmed → another mode → second commander → bad estimate → low battery 
 
 from skytether.client.clock import BootClock
 from skytether.client.mavlink.condition import Condition
+from skytether.client.mavlink.keys import MavlinkConfig
 from skytether.client.mavlink.obedience import Obedience
 from skytether.client.mavlink.rivals import Rivals
 from skytether.client.mavlink.texts import SAME_TEXT_NS
@@ -33,7 +34,7 @@ class Hindrances:
         clock: BootClock,
         events: Events,
     ) -> None:
-        keys = scenario.mavlink
+        keys = scenario.section(MavlinkConfig)
         self._silence_ns = seconds_to_ns(keys.silence_s)
         self._yields_to_others = keys.second_commander == "yield"
         self._vehicle, self._condition, self._positions = vehicle, condition, positions

@@ -25,6 +25,7 @@ from collections import deque
 
 from skytether.client.positions import Vector
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS, seconds_to_ns
+from skytether.shared.fence.keys import FenceConfig
 from skytether.shared.scenario.schema import Scenario
 
 LATER_NS = 300 * MILLISECOND_NS
@@ -56,7 +57,7 @@ class Obedience:
         terms, axes = scenario.terms(), 3 - scenario.model.axes
         self._gain = (*terms.gain, *(1.0,) * axes)
         self._late_ns = seconds_to_ns(max(terms.dead_time_s)) + LATER_NS
-        self._margin = MARGIN_MPS + scenario.fence.wind_mps
+        self._margin = MARGIN_MPS + scenario.section(FenceConfig).wind_mps
         self._commands: deque[tuple[int, Vector]] = deque(maxlen=COMMANDS_MAX)
         self._low = self._high = [0.0, 0.0, 0.0]
         self._stepped_ns: int | None = None

@@ -3,6 +3,7 @@
 from typing import Any
 
 from skytether.client import positions
+from skytether.client.mavlink.keys import MavlinkConfig
 from skytether.client.navigation import Plane, Slides
 from skytether.client.positions import Vector
 from skytether.mavlink.codec import Message
@@ -16,14 +17,14 @@ FRESH_NS = 200 * MILLISECOND_NS
 
 def given_origin(scenario: Scenario) -> Vector | None:
     """Origin given by a scenario, in our axes [m]; None if it is the place of take-off."""
-    match scenario.mavlink.origin:
+    match scenario.section(MavlinkConfig).origin:
         case "takeoff":
             return None
         case "autopilot":
             return 0.0, 0.0, 0.0
         case (x, y, *up):
             return float(x), float(y), float(up[0]) if up else 0.0
-    raise AssertionError(scenario.mavlink.origin)  # `contradictions` has refused all other values
+    raise AssertionError  # `contradictions` has refused all other values
 
 
 class Positions(positions.Positions):

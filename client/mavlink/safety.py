@@ -13,6 +13,7 @@ from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
 from skytether.shared.events.aboard import AutopilotParameter
+from skytether.shared.fence.keys import FenceConfig
 from skytether.shared.law.model import ALTITUDE
 from skytether.shared.scenario.schema import Scenario
 
@@ -30,7 +31,7 @@ def returns_below_m(scenario: Scenario) -> float | None:
     """
     if scenario.vehicle.on_loss != "return":
         return None
-    high = scenario.fence.high_m[ALTITUDE:]
+    high = scenario.section(FenceConfig).high_m[ALTITUDE:]
     return high[0] if high else math.inf
 
 

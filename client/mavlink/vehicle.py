@@ -4,6 +4,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from skytether.client.mavlink import keys
+from skytether.client.mavlink.keys import MavlinkConfig
 from skytether.client.mavlink.port import Port
 from skytether.client.mavlink.positions import given_origin
 from skytether.client.vehicle import Measurement, Vehicle, VehicleMemory
@@ -18,7 +20,7 @@ from skytether.shared.telemetry.record import Reason
 
 PLANE_ALTITUDE_M = 3.0
 """Altitude of a vehicle that is flown in the plane."""
-ORIGIN = keys_of(InFlight.ORIGIN)
+ORIGIN = keys_of(keys.ORIGIN)
 ALTITUDE_MIN_M = 0.5
 
 
@@ -31,7 +33,7 @@ class MavlinkVehicle(Vehicle):
 
     returns = True
     drifts = True
-    changeable = keys_of(InFlight.ARMED, InFlight.ORIGIN)
+    changeable = keys_of(InFlight.ARMED, keys.ORIGIN)
 
     def __init__(self, scenario: Scenario, number: int) -> None:
         line = parse_line("vehicle.address", scenario.vehicle.address)
@@ -117,13 +119,15 @@ class MavlinkVehicle(Vehicle):
         if keys & ORIGIN and self._autopilot.positions.has_origin:
             x, y, z = self._autopilot.positions.origin
             origin_text = f"the origin is known: [{x:.2f}, {y:.2f}, {z:.2f}]"
-            return f"mavlink.origin: got {scenario.mavlink.origin}, but {origin_text}"
+            return (
+                f"mavlink.origin: got {scenario.section(MavlinkConfig).origin}, but {origin_text}"
+            )
         return ""
 
 
 def altitude(scenario: Scenario, number: int = 1) -> float:
     """Take-off altitude of a vehicle [m]; ConfigError if the flight would begin on the ground."""
-    takeoff_m = scenario.mavlink.takeoff_m
+    takeoff_m = scenario.section(MavlinkConfig).takeoff_m
     if takeoff_m != "auto":
         return float(takeoff_m)
     if scenario.model.axes == 2:

@@ -13,6 +13,7 @@ from skytether.client.clock import BootClock
 from skytether.client.navigation import Leaps
 from skytether.client.positions import Positions, take_off_place
 from skytether.client.ros2 import drive
+from skytether.client.ros2.keys import Ros2Config
 from skytether.ros2 import messages
 from skytether.ros2.messages import MessageError
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
@@ -28,7 +29,7 @@ class OdometryFilter:
     """Odometry of one robot, turned into positions and velocities of the point that is flown."""
 
     def __init__(self, scenario: Scenario, vehicle: int) -> None:
-        keys = scenario.ros2
+        keys = scenario.section(Ros2Config)
         self._ahead = keys.ahead_m if keys.drive == "differential" else 0.0
         self.clock = BootClock(SECOND_NS)
         self.positions = Positions(

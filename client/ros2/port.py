@@ -16,6 +16,7 @@ from typing import Any
 
 from skytether.client.positions import Vector
 from skytether.client.ros2 import drive
+from skytether.client.ros2.keys import Ros2Config
 from skytether.client.ros2.odometry import OdometryFilter
 from skytether.ros2 import messages
 from skytether.ros2.graph import PUBLISHER, SUBSCRIBER, TOKENS, Entity, Node, Topic, entity_of
@@ -48,7 +49,7 @@ class Port(Endpoint):
 
     def __init__(self, scenario: Scenario, vehicle: int, line: Line) -> None:
         super().__init__()
-        keys = self._keys = scenario.ros2
+        keys = self._keys = scenario.section(Ros2Config)
         self._vehicle, self._step_ns = vehicle, scenario.dt_ns
         self._silence_ns = seconds_to_ns(keys.silence_s)
         stamped, plain = (

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 
+from skytether.client.ros2.keys import Ros2Config
 from skytether.client.ros2.port import Port
 from skytether.client.vehicle import Measurement, Vehicle, VehicleMemory
 from skytether.shared.base.errors import ConfigError
@@ -25,7 +26,7 @@ class Ros2Vehicle(Vehicle):
         if line.kind != "tcp":
             expected = "tcp:HOST:PORT of a Zenoh router with vehicle.kind = 'ros2'"
             raise ConfigError(f"vehicle.address: got {address!r}, expected {expected}")
-        if scenario.ros2.drive == "differential" and scenario.model.axes != 2:
+        if scenario.section(Ros2Config).drive == "differential" and scenario.model.axes != 2:
             expected = "expected 'holonomic' or 'fixed' with model.axes = 3"
             raise ConfigError(f"ros2.drive: got 'differential', {expected}")
         self._port = self.port = Port(scenario, number, line)

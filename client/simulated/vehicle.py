@@ -13,6 +13,7 @@ from skytether.shared.base.chance import stream
 from skytether.shared.law.model import Array
 from skytether.shared.scenario.catalogue import keys_of
 from skytether.shared.scenario.owners import InFlight
+from skytether.shared.scenario.registry import VEHICLES
 from skytether.shared.scenario.schema import Scenario, VehicleConfig
 
 WIND = keys_of(InFlight.WIND)
@@ -71,7 +72,9 @@ class SimulatedVehicle(Vehicle):
         self.plant.change(scenario.vehicle)
 
 
+@VEHICLES
 def quadrotor(scenario: Scenario, number: int) -> SimulatedVehicle:
+    """Simulated quadrotor with rotors and control loops, in wind and turbulence."""
     from skytether.client.simulated.quadrotor import (
         QuadrotorPlant,
     )  # importing numba takes a second
@@ -81,7 +84,9 @@ def quadrotor(scenario: Scenario, number: int) -> SimulatedVehicle:
     return SimulatedVehicle(scenario.dt_ns, plant, sensor)
 
 
+@VEHICLES
 def simulated(scenario: Scenario, number: int) -> SimulatedVehicle:
+    """Simulated velocity loop of first order in wind: eq. (1), with optional deviations from it."""
     weather = Weather(scenario, stream(scenario.seed, "wind", number))
     sensor = Sensor(scenario, stream(scenario.seed, "sensor", number))
     return SimulatedVehicle(scenario.dt_ns, FirstOrderPlant(scenario, weather, number), sensor)

@@ -51,12 +51,13 @@ from skytether.server.planning.splines import SplineScheme
 from skytether.shared.base.chance import stream
 from skytether.shared.law.model import ALTITUDE, Array, Flags, Indices
 from skytether.shared.law.motion import INTERVALS, SPACING, Motion
+from skytether.shared.missions import keys
 from skytether.shared.missions.derived import clearances, lands, limits, rest_scale, zones
 from skytether.shared.missions.events import InZone
+from skytether.shared.missions.keys import MissionConfig
 from skytether.shared.missions.mission import Guided, parse_goals
 from skytether.shared.missions.zones import Zones
 from skytether.shared.scenario.catalogue import keys_of
-from skytether.shared.scenario.owners import InFlight
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.wire.protocol import KNOTS_MAX, Lead, Observation
 
@@ -81,7 +82,7 @@ CLOCK_POINTS = 33
 BINDS_M = 1e-4
 """Distance from its half-plane within which a constraint counts as limiting a motion [m]."""
 
-ZONES, GOALS = keys_of(InFlight.ZONES), keys_of(InFlight.GOALS)
+ZONES, GOALS = keys_of(keys.ZONES), keys_of(keys.GOALS)
 
 SILENT = np.zeros((), dtype=FIGURES)
 """Figures of a vehicle without a packet to send."""
@@ -101,7 +102,7 @@ class MissionPlanner(SplineScheme):
         self._state = state
         self.counts, self.events = state.counts, state.events
         self.observed_step = state.observed_step
-        mission = scenario.mission
+        mission = scenario.section(MissionConfig)
         self.limits = limits(scenario)
         self._references = fleet.references
         apart = self._clearances = clearances(scenario)
@@ -199,7 +200,8 @@ class MissionPlanner(SplineScheme):
 
     def change(self, scenario: Scenario, keys: frozenset[str]) -> None:
         if keys & GOALS and isinstance(self._references, Guided):
-            self._references.goals = parse_goals(scenario.mission.goals, scenario.model.axes)
+            goals = scenario.section(MissionConfig).goals
+            self._references.goals = parse_goals(goals, scenario.model.axes)
         if keys & ZONES:
             self._zones, self.limits = zones(scenario), limits(scenario)
             self._waypoints.change_zones(self._zones)

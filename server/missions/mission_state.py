@@ -22,6 +22,7 @@ from skytether.shared.law.motion import INTERVALS, JOIN_MAX, SPACING, Motion, re
 from skytether.shared.law.terms import Terms
 from skytether.shared.missions.derived import lands
 from skytether.shared.missions.events import LeftMotion, LeftTube
+from skytether.shared.missions.keys import MissionConfig
 from skytether.shared.missions.mission import Mission
 from skytether.shared.scenario.reference import Reference
 from skytether.shared.scenario.schema import Scenario
@@ -112,7 +113,11 @@ class MissionState:
         """Numbers of the mission's vehicles that have not yet been at rest at their start."""
         self.is_show = isinstance(mission, Mission) and mission.is_show
         """Whether vehicles follow timed paths."""
-        self._tube_m, self._dt_s, self._join = scenario.mission.tube_m, terms.dt_s, terms.join
+        self._tube_m, self._dt_s, self._join = (
+            scenario.section(MissionConfig).tube_m,
+            terms.dt_s,
+            terms.join,
+        )
         self._dead_time_s = terms.dead_time_s
         self.kept_steps = -(-terms.join // SPACING) * SPACING
         """Steps after the first knot up to which a motion equals the one in force."""
@@ -129,7 +134,7 @@ class MissionState:
         """Scratch of `align`: PLAN_DUE and REPEAT_DUE of each vehicle, and the change of its offset
         on the grid."""
         scale = np.ones(terms.axes)
-        scale[ALTITUDE:] = scenario.mission.height_scale
+        scale[ALTITUDE:] = scenario.section(MissionConfig).height_scale
         self.possible = PossibleMotions(scale, terms.dt_s)
         """All motions that may be flown, as of the last `update_possible`."""
         self._is_updated = False

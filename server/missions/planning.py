@@ -7,6 +7,7 @@ from skytether.server.missions.mission_planner import MissionPlanner
 from skytether.server.missions.mission_state import MissionState
 from skytether.server.planning import splines
 from skytether.server.planning.scheme import Fleet, Scheme
+from skytether.shared.missions.keys import MissionConfig
 from skytether.shared.missions.mission import Guided, parse_goals
 from skytether.shared.scenario.reference import Reference
 from skytether.shared.scenario.schema import Scenario
@@ -24,7 +25,7 @@ def references(
         given: references without these goals; None: the scenario's.
         most: largest number of vehicles.
     """
-    goals = parse_goals(scenario.mission.goals, scenario.model.axes)
+    goals = parse_goals(scenario.section(MissionConfig).goals, scenario.model.axes)
     return Guided(given or scenario.measured_reference, goals, most)
 
 

@@ -29,7 +29,7 @@ OF_SOME = tuple(
     for each in (
         "schemes",
         "missions",
-        "common.splines",
+        "planning.splines",
         "mpc.exact",
         "mpc.hierarchical",
         "mpc.riccati",

@@ -23,7 +23,7 @@ from skytether.shared.scenario import reading
 from skytether.shared.scenario.catalogue import keys_of
 from skytether.shared.scenario.dotted import set_keys, text_key, value
 from skytether.shared.scenario.owners import InFlight
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 
 REQUEST_BYTES_MAX = 4096
 ONCE = keys_of(InFlight.LEAP, InFlight.LEADER)

@@ -4,7 +4,7 @@ from skytether.shared.formats import tracks
 from skytether.shared.missions.mission import Mission
 from skytether.shared.scenario.reference import Reference
 from skytether.shared.scenario.registry import REFERENCES
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 
 
 @REFERENCES

@@ -9,12 +9,12 @@ import numpy as np
 from skytether.shared.law.model import Array
 from skytether.shared.law.motion import INTERVALS, JOIN_MAX, SPACING, speed_bounds
 from skytether.shared.missions.derived import clearances, lands, rest_scale, zones
+from skytether.shared.missions.keys import MissionConfig
 from skytether.shared.missions.mission import Mission, format_goals, parse_goals
-from skytether.shared.scenario.contradictions import Contradiction
 from skytether.shared.scenario.grammar import GrammarError
 from skytether.shared.scenario.planners import MPC
 from skytether.shared.scenario.registry import PLANNERS, TRIGGERS, PluginTable
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.schema import Contradiction, Scenario
 
 TINY = 1e-9
 """Rounding tolerance of times and heights."""
@@ -35,7 +35,7 @@ def of_keys(scenario: Scenario) -> Iterator[Contradiction]:
     most_s = JOIN_MAX * SPACING * control.dt
     if not 0.0 < link.join_s <= most_s + TINY:
         yield "link.join_s", link.join_s, f"more than 0, and at most {most_s:g} s, on a mission"
-    mission = scenario.mission
+    mission = scenario.section(MissionConfig)
     if 0.0 < mission.height_m < mission.separation_m - TINY:
         # Heights are scaled by separation_m / height_m: a factor above 1 would make tubes, which
         # are as high as wide, too high.
@@ -65,7 +65,7 @@ def of_changes(scenario: Scenario) -> Iterator[Contradiction]:
 
 
 def _no_zones(scenario: Scenario) -> Iterator[Contradiction]:
-    least_m = scenario.mission.tube_m
+    least_m = scenario.section(MissionConfig).tube_m
     try:
         for zone in zones(scenario).zones:
             long_m = float(np.ptp(zone.corners, axis=0).max())
@@ -80,7 +80,7 @@ def _no_goals(scenario: Scenario) -> Iterator[Contradiction]:
     """Contradictions of `mission.goals`: unknown vehicle, in a zone, or too
     near to another goal.
     """
-    mission = scenario.mission
+    mission = scenario.section(MissionConfig)
     if not mission.goals:
         return
     try:
@@ -119,7 +119,7 @@ def _away_m(scenario: Scenario, off: Array) -> float:
 
 def of_places(scenario: Scenario) -> Iterator[Contradiction]:
     """Contradictions of the goals of a mission's shape: too near to each other, or to zones."""
-    mission, goals = scenario.mission, scenario.unallocated_reference()
+    mission, goals = scenario.section(MissionConfig), scenario.unallocated_reference()
     assert isinstance(goals, Mission)
     if mission.allocate and (goals.is_show or not goals.in_step):
         others = (
@@ -167,7 +167,8 @@ def of_places(scenario: Scenario) -> Iterator[Contradiction]:
 
 def _too_fast(scenario: Scenario, show: Mission) -> Iterator[Contradiction]:
     """Contradictions of a show that is too fast for its vehicles, or too large to be checked."""
-    most_mps = speed_bounds(scenario.u_max, scenario.model_gain, scenario.mission.speed_mps)
+    asked_mps = scenario.section(MissionConfig).speed_mps
+    most_mps = speed_bounds(scenario.u_max, scenario.model_gain, asked_mps)
     if show.is_show and (found := show.too_fast(most_mps)):
         vehicle, at_s, axis, speed_mps = found
         bound = f"{most_mps[axis]:.3g} m/s on an axis, by model.u_max and mission.speed_mps"

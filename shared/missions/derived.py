@@ -5,12 +5,13 @@ import numpy as np
 from skytether.shared.law.motion import Clearances, bend_m
 from skytether.shared.law.terms import Limits
 from skytether.shared.missions import zone_texts
+from skytether.shared.missions.keys import MissionConfig
 from skytether.shared.missions.zones import Zones
 from skytether.shared.scenario.schema import Scenario, digest
 
 
 def clearances(scenario: Scenario) -> Clearances:
-    mission = scenario.mission
+    mission = scenario.section(MissionConfig)
     most_mps2 = float(np.sqrt(scenario.model.axes)) * mission.acceleration_mps2
     return Clearances(
         mission.separation_m + 2.0 * mission.tube_m,
@@ -26,7 +27,7 @@ def lands(scenario: Scenario) -> bool:
 
 def rest_scale(scenario: Scenario) -> float:
     """Factor on distances along the third axis between vehicles at rest: 0 if they may land."""
-    return 0.0 if lands(scenario) else scenario.mission.height_scale
+    return 0.0 if lands(scenario) else scenario.section(MissionConfig).height_scale
 
 
 def zones(scenario: Scenario) -> Zones:
@@ -36,13 +37,14 @@ def zones(scenario: Scenario) -> Zones:
     Raises:
         GrammarError: the text is invalid.
     """
-    parsed = zone_texts.parse(scenario.mission.zones, scenario.model.axes, scenario.files)
+    text = scenario.section(MissionConfig).zones
+    parsed = zone_texts.parse(text, scenario.model.axes, scenario.files)
     return parsed.to_the_sky() if lands(scenario) else parsed
 
 
 def limits(scenario: Scenario) -> Limits:
     """Limits of the motions of a mission."""
-    mission = scenario.mission
+    mission = scenario.section(MissionConfig)
     plain = [(zone.corners.tolist(), *zone[2:]) for zone in zones(scenario).zones]
     return Limits(
         speed_mps=mission.speed_mps,

@@ -11,8 +11,9 @@ import msgspec
 
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.law.terms import Difference, Limits, Terms
-from skytether.shared.scenario.owners import InFlight, Key, Owner
-from skytether.shared.scenario.schema import Scenario, Section
+from skytether.shared.scenario.owners import Key, Owner
+from skytether.shared.scenario.schema import Section
+from skytether.shared.scenario.whole import Scenario
 
 
 def keys(section: type[Section], prefix: str = "") -> Iterator[tuple[str, Key]]:
@@ -50,7 +51,7 @@ LIMITS: Mapping[str, str] = MappingProxyType(
 """Dotted key of each limit of a mission's motions, by the field in `Limits`."""
 
 
-def keys_of(*groups: InFlight) -> frozenset[str]:
+def keys_of(*groups: str) -> frozenset[str]:
     """Dotted names of the keys in these groups, which may change in flight."""
     return frozenset(name for name, key in KEYS.items() if key.in_flight in groups)
 

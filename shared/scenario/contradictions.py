@@ -4,12 +4,8 @@ import math
 from collections.abc import Iterator
 from itertools import pairwise
 
-import numpy as np
-
-from skytether.shared.law.model import Array
 from skytether.shared.scenario import reference as shapes
 from skytether.shared.scenario import rooms, schemes
-from skytether.shared.scenario.fence import inner_bounds, is_home_inside, margins
 from skytether.shared.scenario.grammar import GrammarError, leaves
 from skytether.shared.scenario.planners import MPC
 from skytether.shared.scenario.registry import (
@@ -21,19 +17,15 @@ from skytether.shared.scenario.registry import (
     PluginTable,
 )
 from skytether.shared.scenario.schema import (
-    TABLES,
+    Contradiction,
     ControlConfig,
     Scenario,
 )
 from skytether.shared.wire.protocol import INPUTS_MAX
 
-Contradiction = tuple[str, object, str]
-"""Key, its value, and the expected value in words."""
-
 TINY = 1e-9
 """Rounding tolerance of a product such as 40 · 0.011."""
 
-FENCED_STEPS_MAX = 100_000
 LOSSY = 0.3
 """Share of lost packets to the vehicle above which horizons must be longer."""
 
@@ -61,15 +53,10 @@ def contradictions(
     ):
         if isinstance(values, tuple) and len(values) not in (1, axes):
             yield key, list(values), f"1 or {axes} numbers with model.axes = {axes}"
-    origin = scenario.mavlink.origin
-    if isinstance(origin, tuple) and len(origin) not in (2, 3):
-        yield "mavlink.origin", list(origin), "north and east, or north, east and up"
     for key, values in (
         ("vehicle.start_m", vehicle.start_m),
         ("reference.velocity_mps", scenario.reference.velocity_mps),
         ("vehicle.steady_wind_mps", vehicle.steady_wind_mps),
-        ("fence.low_m", scenario.fence.low_m),
-        ("fence.high_m", scenario.fence.high_m),
         ("sensor.position_bias_m", scenario.sensor.position_bias_m),
         ("sensor.velocity_bias_mps", scenario.sensor.velocity_bias_mps),
     ):
@@ -95,9 +82,9 @@ def contradictions(
     yield from wrong
     if wrong:
         return
-    mission = scenario.is_mission
     yield from _no_planner(scenario)
-    yield from rooms.of_missions().of_keys(scenario) if mission else _no_mission(scenario)
+    for section in scenario.sections():
+        yield from section.contradictions(scenario)
     no_network = list(_no_impairments(scenario))
     yield from no_network
     if not (no_network or any_network):
@@ -107,8 +94,6 @@ def contradictions(
     yield from _no_trigger(control)
     yield from _no_policies("vehicle.report", vehicle.report, REPORTS, control)
     yield from _no_way(scenario, known)
-    if scenario.fence.is_there:
-        yield from list(_no_room(scenario)) or _outside(scenario)
 
 
 def _no_origin(scenario: Scenario) -> Iterator[Contradiction]:
@@ -122,17 +107,14 @@ def _no_origin(scenario: Scenario) -> Iterator[Contradiction]:
 
 
 def _no_way(scenario: Scenario, known: Scenario | None) -> Iterator[Contradiction]:
-    mission = rooms.of_missions() if scenario.is_mission else None
-    wrong: list[Contradiction] = list(mission.of_changes(scenario)) if mission else []
     same = known and (scenario.reference, scenario.model.axes) == (
         known.reference,
         known.model.axes,
     )
-    if not same:
-        wrong += _no_shape(scenario) or _no_reference(scenario)
-        if mission and not wrong:
-            wrong += mission.of_places(scenario)
+    wrong = [] if same else _no_shape(scenario) or list(_no_reference(scenario))
     yield from wrong
+    for section in () if wrong else scenario.sections():
+        yield from section.contradictions_of_way(scenario, is_new=not same)
 
 
 def _no_scheme(scenario: Scenario) -> Iterator[Contradiction]:
@@ -161,16 +143,6 @@ def _no_planner(scenario: Scenario) -> Iterator[Contradiction]:
     if not SCHEMES[schemes.call(control.scheme).name].is_ours:
         expected = f"{MPC!r} with control.scheme = {control.scheme!r}, which plans itself"
         yield "control.planner", repr(control.planner), expected
-
-
-def _no_mission(scenario: Scenario) -> Iterator[Contradiction]:
-    """Contradictions of what only missions have."""
-    if scenario.vehicle.on_loss == "return" and not is_home_inside(scenario.fence):
-        yield "vehicle.on_loss", "'return'", "'land', for home (0, 0) is outside the fence"
-    for key in ("zones", "goals"):
-        if given := getattr(scenario.mission, key):
-            expected = "none without a mission: reference.shape = 'mission', or a swap"
-            yield f"mission.{key}", repr(given), expected
 
 
 def _too_late(scenario: Scenario) -> Iterator[Contradiction]:
@@ -281,71 +253,15 @@ def _no_reference(scenario: Scenario) -> Iterator[Contradiction]:
     route = ref.points_m + ref.points_m[:1] * ref.loop
     if ref.shape == "waypoints" and any(here == there for here, there in pairwise(route)):
         yield "reference.points_m", [list(point) for point in route], "no point twice in a row"
-    elif ref.shape in ("waypoints", *TABLES):
+    elif ref.shape in ("waypoints", *rooms.TABLES):
         try:
             scenario.unallocated_reference()
         except ValueError as error:
-            if ref.shape in TABLES:
+            if ref.shape in rooms.TABLES:
                 yield "reference.file", repr(ref.file), f"a table of the trajectory ({error})"
             else:
                 points = [list(point) for point in route]
                 yield "reference.points_m", points, "points that are further apart"
-
-
-def _no_room(scenario: Scenario) -> Iterator[Contradiction]:
-    fence = scenario.fence
-    low, high, radius = inner_bounds(scenario)
-    drawn = max(margins(scenario))
-    wind = f"fence.wind_mps = {fence.wind_mps:g}"
-    fastest = scenario.u_max * scenario.model_gain
-    slowest = min(*fastest.tolist(), fence.speed_mps or math.inf)
-    if fence.wind_mps >= slowest:
-        yield "fence.wind_mps", fence.wind_mps, f"less than {slowest:g}, the vehicle's speed"
-    if any(least >= most for least, most in zip(low, high, strict=True)):
-        spacing = f"more than {2 * drawn:.2g} m above fence.low_m, with {wind}"
-        yield "fence.high_m", list(fence.high_m), spacing
-    if radius <= 0.0:
-        yield "fence.radius_m", fence.radius_m, f"more than {drawn:.2g} m, with {wind}"
-
-
-def _outside(scenario: Scenario) -> Iterator[Contradiction]:
-    steps = min(scenario.steps, FENCED_STEPS_MAX)
-    reference, times_s = (
-        scenario.unallocated_reference(),
-        np.arange(steps + 1) * scenario.control.dt,
-    )
-    for vehicle in reference.vehicles if isinstance(reference, shapes.OfFleet) else (1,):
-        states = scenario.unallocated_reference(vehicle)(times_s)
-        wrong = list(_over_fence(scenario, scenario.start_m(vehicle), states))
-        yield from wrong
-        if wrong:
-            return
-
-
-def _over_fence(scenario: Scenario, home: Array, states: Array) -> Iterator[Contradiction]:
-    """First contradiction of a trajectory from home that leaves the fence, or is too fast."""
-    fence = scenario.fence
-    position, speed = states[..., 0], np.linalg.norm(states[..., 1], axis=1)
-    low, high, radius = inner_bounds(scenario)
-    far = np.linalg.norm(position - home, axis=1)
-    checks = (
-        ("fence.low_m", list(fence.low_m), (position < low).any(axis=1), "lower"),
-        ("fence.high_m", list(fence.high_m), (position > high).any(axis=1), "higher"),
-        ("fence.radius_m", fence.radius_m, far > radius, "more"),
-        ("fence.speed_mps", fence.speed_mps, speed > (fence.speed_mps or np.inf), "more"),
-    )
-    for key, value, over, more in checks:
-        if over.any():
-            at = int(over.argmax())
-            where = ", ".join(f"{each:.3g}" for each in position[at])
-            demanded = f"at {at * scenario.control.dt:g} s ({where}) m at {speed[at]:.3g} m/s"
-            margin = f"{max(margins(scenario)):.2g} m inside"
-            yield (
-                key,
-                value,
-                f"{more}, for the trajectory asks {demanded}, and the fence keeps {margin}",
-            )
-            return
 
 
 def _no_shape(scenario: Scenario) -> list[Contradiction]:

@@ -7,7 +7,7 @@ msgspec and tyro ignore this metadata. `catalogue.py` collects it, for the keys 
 keys that may change in flight.
 """
 
-from enum import Enum, auto
+from enum import Enum, StrEnum, auto
 from typing import Annotated, TypeVar
 
 import msgspec
@@ -27,29 +27,25 @@ class Owner(Enum):
     """Describes computers and clocks in virtual time; no effect on real ones."""
 
 
-class InFlight(Enum):
-    """Group of keys that change together in flight."""
+class InFlight(StrEnum):
+    """Groups of keys that change together in flight; rooms have further ones."""
 
     TRIGGER = auto()
     POINT = auto()
     """Position and velocity of a live point."""
     ARMED = auto()
-    ORIGIN = auto()
-    """Origin of the scenario's frame, for a vehicle in the air without one."""
     LEAP = auto()
     """Operator's choice after a leap of the position."""
     LEADER = auto()
     """Operator's choice of the server that leads."""
     WIND = auto()
     IMPAIRMENT = auto()
-    ZONES = auto()
-    GOALS = auto()
 
 
 class Key(msgspec.Struct, frozen=True):
     owner: Owner
-    in_flight: InFlight | None = None
-    """Group with which the key may change in flight; None if it may not change."""
+    in_flight: str = ""
+    """Group with which the key may change in flight; empty if it may not change."""
     term: str = ""
     """Field of `Terms` for a key of both ends; empty if it has the key's name."""
 

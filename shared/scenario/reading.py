@@ -22,11 +22,13 @@ from skytether import scenarios
 from skytether.shared.base import input_files, toml
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.base.hint import hint
-from skytether.shared.scenario.contradictions import Contradiction, contradictions
+from skytether.shared.scenario import rooms, schema
+from skytether.shared.scenario.contradictions import contradictions
 from skytether.shared.scenario.dotted import TEXTS, flat, with_argument
 from skytether.shared.scenario.grammar import GrammarError
-from skytether.shared.scenario.registry import IMPAIRMENTS, ZONES, File, Files, PluginTable
-from skytether.shared.scenario.schema import TABLES, NetworkConfig, Scenario, WithFiles
+from skytether.shared.scenario.registry import IMPAIRMENTS, File, Files, PluginTable
+from skytether.shared.scenario.schema import Contradiction, NetworkConfig
+from skytether.shared.scenario.whole import Scenario, WithFiles
 
 SCENARIOS = Path(scenarios.__file__).parent
 EXTENDS_MAX = 20
@@ -37,7 +39,7 @@ FILES: Mapping[str, tuple[PluginTable, int]] = MappingProxyType(
     {
         "network.uplink": (IMPAIRMENTS, 128 * 1024 * 1024),
         "network.downlink": (IMPAIRMENTS, 128 * 1024 * 1024),
-        "mission.zones": (ZONES, 4_000_000),
+        **rooms.FILES,
     }
 )
 """Keys whose text may name files: table of the text's entries, and largest size of a file [B]."""
@@ -92,7 +94,7 @@ def check(
     raw: Mapping[str, Any],
     source: str = "",
     *,
-    known: Scenario | None = None,
+    known: schema.Scenario | None = None,
     any_network: bool = False,
 ) -> Scenario:
     """Make a scenario from a table of plain values, and check it for contradictions.
@@ -129,7 +131,11 @@ def convert(raw: Mapping[str, Any], source: str = "") -> Scenario:
 
 
 def _without_contradictions(
-    scenario: Scenario, source: str, *, known: Scenario | None = None, any_network: bool = False
+    scenario: Scenario,
+    source: str,
+    *,
+    known: schema.Scenario | None = None,
+    any_network: bool = False,
 ) -> Scenario:
     """Scenario with its files, refused if it has contradictions; see `check`."""
     scenario = _with_files(scenario, source, known)
@@ -146,14 +152,14 @@ def _where(source: str) -> str:
     return f"{source}: " if source else ""
 
 
-def to_table(scenario: Scenario) -> dict[str, Any]:
+def to_table(scenario: schema.Scenario) -> dict[str, Any]:
     """Plain values of a scenario, from which `check` makes it again."""
     return {
         name: msgspec.to_builtins(getattr(scenario, name)) for name in Scenario.__struct_fields__
     }
 
 
-def to_toml(scenario: Scenario) -> bytes:
+def to_toml(scenario: schema.Scenario) -> bytes:
     return msgspec.toml.encode(to_table(scenario))
 
 
@@ -212,14 +218,14 @@ def _relative_to(folder: Path, raw: dict[str, Any], prefix: str = "") -> None:
                 raw[name] = FILES[key][0].with_files(value, lambda file: str(folder / file))
 
 
-def _with_files(scenario: Scenario, source: str, known: Scenario | None) -> Scenario:
+def _with_files(scenario: Scenario, source: str, known: schema.Scenario | None) -> Scenario:
     """Scenario with the contents of the files that it names; raises ConfigError if one cannot be
     read.
     """
     before = _naming_files(known) if known else ()
     contents: dict[str, File] = {}
     for key, text in _naming_files(scenario):
-        if key == "reference.file" and scenario.reference.shape not in TABLES:
+        if key == "reference.file" and scenario.reference.shape not in rooms.TABLES:
             continue
         with suppress(GrammarError):  # reported by `contradictions`
             own = known.files if known and (key, text) in before else ()
@@ -230,13 +236,19 @@ def _with_files(scenario: Scenario, source: str, known: Scenario | None) -> Scen
     return WithFiles(**keys, contents=tuple(contents.values()))
 
 
-def _naming_files(scenario: Scenario) -> list[tuple[str, str]]:
+def _naming_files(scenario: schema.Scenario) -> list[tuple[str, str]]:
     """Keys whose values may name files, and these values: those of the network for each path."""
     return [
         ("reference.file", scenario.reference.file),
         *((f"network.{way}", getattr(path, way)) for path in scenario.paths for way in WAYS),
-        ("mission.zones", scenario.mission.zones),
+        *((key, str(_value(scenario, key))) for key in FILES if not key.startswith("network.")),
     ]
+
+
+def _value(scenario: schema.Scenario, key: str) -> Any:
+    """Value of a key of a room's section; empty if the room is not installed."""
+    section, _, name = key.partition(".")
+    return getattr(getattr(scenario, section, None), name, "")
 
 
 def files_of(key: str, text: str, source: str = "", known: Files = ()) -> Files:

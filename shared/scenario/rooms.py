@@ -13,6 +13,7 @@ from skytether.shared.scenario.registry import (
     REFERENCES,
     REPORTS,
     TRIGGERS,
+    VEHICLES,
     ZONES,
     Files,
     load,
@@ -21,13 +22,33 @@ from skytether.shared.scenario.registry import (
 SHARED, NETEM = "skytether.shared.", "skytether.netem."
 TRIGGER, FURTHER = "skytether.server.triggers.policies", "skytether.server.triggers.further"
 
+MISSIONS = ("swap", "sphere", "mission", "show")
+"""Shapes that are missions: goals or paths of several vehicles, which keep apart."""
+TABLES = ("csv", "mission", "show")
+"""Shapes that are read from `reference.file`."""
+
+SECTIONS = {
+    "fence": f"{SHARED}fence.keys",
+    "mission": f"{SHARED}missions.keys",
+    "mavlink": "skytether.client.mavlink.keys",
+    "ros2": "skytether.client.ros2.keys",
+}
+"""Sections of a scenario that rooms bring: the module whose SECTION each is."""
+
+FILES = {"mission.zones": (ZONES, 4_000_000)}
+"""Keys of rooms whose text may name files, see `reading.FILES`."""
+
 EVENTS = (f"{SHARED}missions.events",)
 """Modules with events of rooms, see `shared.telemetry.every_event`."""
 
 
-def of_missions() -> Any:
-    """Module with the contradictions of missions."""
-    return load(f"{SHARED}missions.contradictions", "missions")
+def sections() -> dict[str, Any]:
+    """Sections of the rooms that are installed, by name."""
+    found = {}
+    for name, module in SECTIONS.items():
+        with suppress(ConfigError):
+            found[name] = load(module, name).SECTION
+    return found
 
 
 def trigger(control: Any, capacity: int) -> Any:
@@ -63,6 +84,10 @@ TRIGGERS.offer(
 TRIGGERS.offer(FURTHER, "deviation", "send_on_delta", "self_triggered")
 TRIGGERS.offer(TRIGGER, "silence")
 TRIGGERS.offer(FURTHER, "budget")
+
+VEHICLES.offer("skytether.client.simulated.vehicle", "simulated", "quadrotor")
+VEHICLES.offer("skytether.client.mavlink.kind", "mavlink")
+VEHICLES.offer("skytether.client.ros2.kind", "ros2")
 
 IMPAIRMENTS.offer(
     f"{NETEM}impairments.delays", "constant", "paper", "uniform", "normal", "lognormal", "gamma"

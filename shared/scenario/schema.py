@@ -11,6 +11,7 @@ valid, but not together.
 
 import hashlib
 from collections.abc import Callable, Iterator
+from itertools import chain
 from typing import Annotated, Any, Literal, Self, TypeVar
 
 import msgspec
@@ -23,7 +24,7 @@ from skytether.shared.law.heartbeat import PATIENCE, SESSION_NS
 from skytether.shared.law.model import Array
 from skytether.shared.law.terms import Terms
 from skytether.shared.scenario import reference as shapes
-from skytether.shared.scenario import schemes
+from skytether.shared.scenario import rooms, schemes
 from skytether.shared.scenario.grammar import TEXT_MAX, leaves
 from skytether.shared.scenario.owners import (
     InFlight,
@@ -49,7 +50,6 @@ from skytether.shared.scenario.registry import (
     Files,
     file_of,
 )
-from skytether.shared.scenario.rooms import impairments
 from skytether.shared.scenario.schemes import SchemeProperties
 from skytether.shared.wire.framing import PATHS_MAX
 from skytether.shared.wire.protocol import INPUTS_MAX, PAYLOAD_BYTES_MAX
@@ -78,8 +78,41 @@ SHAPE_CHARS = 15
 """Number of characters of a plug-in's shape in the terms, before its digest."""
 
 
+Contradiction = tuple[str, object, str]
+"""Key, its value, and the expected value in words."""
+
+
 class Section(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Base of every table of a scenario."""
+    """Base of every table of a scenario. Rooms bring their own, see `rooms.SECTIONS`."""
+
+    def shared_terms(self) -> dict[str, Any]:
+        """Fields of `Terms` that a room's section fills in."""
+        return {}
+
+    def guard(self) -> str:
+        """Module with a `Guard`, which limits the inputs aboard; empty: none."""
+        return ""
+
+    def contradictions(self, scenario: "Scenario") -> Iterator[Contradiction]:  # noqa: ARG002
+        """Contradictions of a room's keys with others."""
+        yield from ()
+
+    def contradictions_of_way(
+        self,
+        scenario: "Scenario",  # noqa: ARG002
+        *,
+        is_new: bool,  # noqa: ARG002
+    ) -> Iterator[Contradiction]:
+        """Contradictions of a room's keys with the desired trajectory.
+
+        Args:
+            is_new: whether the trajectory has not been checked before.
+        """
+        yield from ()
+
+    def assigned(self, reference: shapes.Reference, vehicle: int) -> shapes.Reference:  # noqa: ARG002
+        """Desired trajectory of a vehicle, which a room may give to another."""
+        return reference
 
 
 class ModelConfig(Section, frozen=True):
@@ -145,12 +178,6 @@ class ControlConfig(Section, frozen=True):
     def properties(self) -> SchemeProperties:
         """Properties of the scheme; raises GrammarError if there is no such scheme."""
         return schemes.properties(self.scheme)
-
-
-MISSIONS = ("swap", "sphere", "mission", "show")
-"""Shapes that are missions: goals or paths of several vehicles, which keep apart."""
-TABLES = ("csv", "mission", "show")
-"""Shapes that are read from `reference.file`."""
 
 
 class ReferenceConfig(Section, frozen=True):
@@ -252,59 +279,6 @@ class VehicleConfig(Section, frozen=True):
     """Charge of a quadrotor's battery at the start; endless: always full."""
 
 
-class FenceConfig(Section, frozen=True):
-    """Fence that the vehicle does not leave, whatever inputs it receives. The vehicle uses its own
-    scenario's fence; a server with a fence refuses desired trajectories that cross it.
-    """
-
-    low_m: OfEach[tuple[Position, ...]] = ()
-    """Lowest position on each axis [m]; default: no bound."""
-    high_m: OfEach[tuple[Position, ...]] = ()
-    """Highest position on each axis [m]; default: no bound."""
-    radius_m: OfEach[Strength] = 0.0
-    """Largest distance from the start [m]; 0: no bound."""
-    speed_mps: OfEach[Strength] = 0.0
-    """Largest desired speed over all axes [m/s]; 0: only `model.u_max`."""
-    wind_mps: OfEach[Annotated[float, Meta(ge=0, le=100)]] = 1.0
-    """Largest velocity added by wind or a wrong gain for which the fence holds [m/s]; widens the
-    margin."""
-
-    @property
-    def is_there(self) -> bool:
-        return bool(self.low_m or self.high_m or self.radius_m or self.speed_mps)
-
-
-class MissionConfig(Section, frozen=True):
-    """Mission: several vehicles with goals, which keep apart whichever packets are lost; see
-    docs/together.md.
-    """
-
-    separation_m: Term[Annotated[float, Meta(ge=1e-3, le=1e3)]] = 0.5
-    """Smallest distance between two vehicles [m]."""
-    height_m: Term[Annotated[float, Meta(ge=0, le=1e3)]] = 0.0
-    """Smallest distance between two vehicles, one above the other [m]; 0: `separation_m`."""
-    tube_m: Term[Annotated[float, Meta(ge=0, le=1e3)]] = 0.15
-    """Largest distance of a vehicle from its motion, by wind and tracking errors [m]."""
-    speed_mps: OfServer[Strength] = 0.0
-    """Largest speed of a motion over all axes [m/s]; 0: only `model.u_max`."""
-    acceleration_mps2: OfServer[Annotated[float, Meta(ge=1e-3, le=1e3)]] = 0.6
-    """Largest acceleration of a motion on an axis [m/s²]."""
-    allocate: OfServer[bool] = False
-    """Whether goals are assigned to the nearest vehicles; each vehicle then needs a goal at each
-    time."""
-    goals: Annotated[str, Meta(max_length=4000), Key(Owner.SERVER, InFlight.GOALS)] = ""
-    """Goals that replace those of the mission: goal(vehicle, x, y), or goal(vehicle, x, y, z),
-    combined with &."""
-    zones: Annotated[str, Meta(max_length=4000), Key(Owner.SERVER, InFlight.ZONES)] = ""
-    """Zones combined with &: box(x0, x1, y0, y1), cylinder(x, y, radius), polygon(x, y, …),
-    fence(x0, x1, y0, y1), corridor(width, x, y, …), geojson(file)."""
-
-    @property
-    def height_scale(self) -> float:
-        """Factor on distances along the third axis, before comparison with `separation_m`."""
-        return self.separation_m / self.height_m if self.height_m else 1.0
-
-
 class SensorConfig(Section, frozen=True):
     """Sensors of the vehicle, and the filter of their measurements."""
 
@@ -326,64 +300,6 @@ class SensorConfig(Section, frozen=True):
     """Delay of the measurements [s]."""
     process_noise: OfVehicle[Factor] = 0.1
     """Strength of the white acceleration that the filter assumes [m/s per √s]."""
-
-
-class MavlinkConfig(Section, frozen=True):
-    """Autopilot of a vehicle of the kind `mavlink`."""
-
-    system: OfVehicle[Annotated[int, Meta(ge=1, le=255)]] = 245
-    """MAVLink system number of the client; ArduPilot's ground-station failsafe must listen to
-    it."""
-    component: OfVehicle[Annotated[int, Meta(ge=1, le=255)]] = 191
-    """MAVLink component number of the client; 191: onboard computer."""
-    autopilot: OfVehicle[Annotated[int, Meta(ge=0, le=255)]] = 0
-    """MAVLink system number of the autopilot; 0: that of the first heartbeat."""
-    positions_hz: OfVehicle[Annotated[int, Meta(ge=5, le=200)]] = 50
-    """Rate of positions requested from the autopilot [Hz]."""
-    silence_s: OfVehicle[Annotated[float, Meta(ge=0.2, le=5)]] = 0.5
-    """Time without a position after which the vehicle brakes [s]."""
-    battery_min: OfVehicle[Annotated[float, Meta(ge=0, le=1)]] = 0.2
-    """Charge of the battery below which the vehicle lands."""
-    battery_min_v: OfVehicle[Annotated[float, Meta(ge=0, le=100)]] = 0.0
-    """Voltage of the battery below which the vehicle lands [V]; 0: no limit."""
-    takeoff_m: OfVehicle[Annotated[float, Meta(ge=0.5, le=100)] | Literal["auto"]] = "auto"
-    """Take-off altitude [m]; auto: that of the trajectory's start, or 3 m in the plane."""
-    origin: Annotated[
-        Literal["takeoff", "autopilot"] | tuple[Position, ...],
-        Key(Owner.VEHICLE, InFlight.ORIGIN),
-    ] = "takeoff"
-    """Origin of the scenario: the point of arming (on a mission, below the first goal), the
-    autopilot's local origin, or a point in its local frame: north, east (and up) [m]. A client that
-    restarts in the air without a saved origin hovers until this key is set."""
-    second_commander: OfVehicle[Literal["brake", "yield"]] = "brake"
-    """Reaction to a second commander, or to a vehicle that ignores its commands: brake and then
-    land; or yield, as if a pilot had taken over."""
-    patience_s: OfVehicle[Annotated[float, Meta(ge=1, le=600)]] = 60.0
-    """Longest wait for the first heartbeat, and for each step of take-off [s]."""
-
-
-class Ros2Config(Section, frozen=True):
-    """Robot of a vehicle of the kind `ros2`, see docs/ros2.md."""
-
-    domain: OfVehicle[Annotated[int, Meta(ge=0, le=232)]] = 0
-    """Domain of the robot's nodes (ROS_DOMAIN_ID)."""
-    odometry: OfVehicle[TopicName] = "/odom"
-    """Topic of nav_msgs/Odometry."""
-    command: OfVehicle[TopicName] = "/cmd_vel"
-    """Topic on which velocities are commanded."""
-    stamped: OfVehicle[bool | Literal["auto"]] = "auto"
-    """Whether commands are geometry_msgs/TwistStamped; otherwise Twist. auto: what the subscriber
-    of `command` takes."""
-    drive: OfVehicle[Literal["holonomic", "differential", "fixed"]] = "holonomic"
-    """Way in which the robot is commanded: any velocity in its own frame; forwards and a turn; or
-    any velocity in the fixed frame of its odometry."""
-    ahead_m: OfVehicle[Annotated[float, Meta(ge=0.01, le=10)]] = 0.2
-    """Distance before the axle of the point of a differential robot that is flown [m]."""
-    origin: OfVehicle[Literal["start", "odometry"]] = "start"
-    """Origin of the scenario: where the robot stands at the start (on a mission, its start is
-    there), or the origin of its odometry."""
-    silence_s: OfVehicle[Annotated[float, Meta(ge=0.05, le=5)]] = 0.5
-    """Time without odometry after which the robot brakes [s]."""
 
 
 class PathConfig(Section, frozen=True):
@@ -469,10 +385,11 @@ class SimulationConfig(Section, frozen=True):
 
 
 T = TypeVar("T", NetworkConfig, PathConfig)
+S = TypeVar("S", bound=Section)
 
 
 class Scenario(Section, frozen=True):
-    """Scenario: all keys of a flight."""
+    """Scenario: all keys of a flight. `shared.scenario.whole` has it with the sections of rooms."""
 
     title: OfEach[str] = ""
     """Title in one line."""
@@ -488,11 +405,7 @@ class Scenario(Section, frozen=True):
     control: ControlConfig = ControlConfig()
     reference: ReferenceConfig = ReferenceConfig()
     vehicle: VehicleConfig = VehicleConfig()
-    fence: FenceConfig = FenceConfig()
-    mission: MissionConfig = MissionConfig()
     sensor: SensorConfig = SensorConfig()
-    mavlink: MavlinkConfig = MavlinkConfig()
-    ros2: Ros2Config = Ros2Config()
     network: NetworkConfig = NetworkConfig()
     link: LinkConfig = LinkConfig()
     simulation: SimulationConfig = SimulationConfig()
@@ -510,7 +423,17 @@ class Scenario(Section, frozen=True):
             ConfigError: the file was not read with the scenario.
         """
         file = self.reference.file
-        return file_of(self.files, file).content if self.reference.shape in TABLES else b""
+        return file_of(self.files, file).content if self.reference.shape in rooms.TABLES else b""
+
+    def sections(self) -> Iterator[Section]:
+        for name in self.__struct_fields__:
+            section = getattr(self, name)
+            if isinstance(section, Section):
+                yield section
+
+    def section(self, kind: type[S]) -> S:
+        """Section that a room brings."""
+        return next(each for each in self.sections() if isinstance(each, kind))
 
     @property
     def paths(self) -> tuple[PathConfig, ...]:
@@ -549,12 +472,12 @@ class Scenario(Section, frozen=True):
         """`netem.impairments.direction.Impairments` from server to vehicle, of the first path;
         raises GrammarError if the text is invalid.
         """
-        return impairments(self.network.uplink, self.files)
+        return rooms.impairments(self.network.uplink, self.files)
 
     @property
     def downlink(self) -> Any:
         """Impairments from vehicle to server; see `uplink`."""
-        return impairments(self.network.downlink, self.files)
+        return rooms.impairments(self.network.downlink, self.files)
 
     @property
     def dt_ns(self) -> int:
@@ -624,16 +547,14 @@ class Scenario(Section, frozen=True):
             speed_mps=reference.speed_mps,
             loop=reference.loop,
             table=self._tabledigest(),
-            separation_m=self.mission.separation_m,
-            height_m=self.mission.height_m,
-            tube_m=self.mission.tube_m,
+            **dict(chain.from_iterable(each.shared_terms().items() for each in self.sections())),
         )
 
     def make_reference(self, vehicle: int = 1) -> shapes.Reference:
         """Desired trajectory of a vehicle, by its number; with the shape "target" each differs."""
         reference = self.unallocated_reference(vehicle)
-        if isinstance(reference, shapes.OfFleet) and self.mission.allocate:
-            return reference.allocated().of(vehicle)
+        for section in self.sections():
+            reference = section.assigned(reference, vehicle)
         return reference
 
     def measured_reference(self, vehicle: int = 1) -> shapes.Reference:
@@ -667,7 +588,7 @@ class Scenario(Section, frozen=True):
     @property
     def is_mission(self) -> bool:
         """Whether the flight is a mission: several vehicles with goals, which keep apart."""
-        return self.reference.shape.partition("(")[0].strip() in MISSIONS
+        return self.reference.shape.partition("(")[0].strip() in rooms.MISSIONS
 
     def entries(self) -> Iterator[Entry]:
         """Entries of the scheme, the planner, the policies of the trigger, the shape and the
@@ -678,9 +599,7 @@ class Scenario(Section, frozen=True):
         for policy in leaves(TRIGGERS.parse(self.control.trigger)):
             yield TRIGGERS[policy.name]
         yield REFERENCES[REFERENCES.one(self.reference.shape).name]
-        flies = self.vehicle.kind.partition("(")[0].strip()
-        if flies in VEHICLES:  # built-in ones are registered by the client, which may be missing
-            yield VEHICLES[flies]
+        yield VEHICLES[VEHICLES.one(self.vehicle.kind).name]
 
     def _tabledigest(self) -> str:
         """Digest of `reference.file`, and of the origin of its coordinates."""
@@ -694,16 +613,6 @@ class Scenario(Section, frozen=True):
             return shape.name
         states = shapes.sampled(self.unallocated_reference(), self.model.axes)
         return f"{str(shape)[:SHAPE_CHARS]} {digest(f'{shape}'.encode() + states)}"
-
-
-class WithFiles(Scenario, frozen=True):
-    """Scenario with the contents of the files that it names, made by `reading.py`."""
-
-    contents: Files = ()
-
-    @property
-    def files(self) -> Files:
-        return tuple(each._replace(origin=self.reference.origin) for each in self.contents)
 
 
 def digest(content: bytes) -> str:

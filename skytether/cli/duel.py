@@ -15,7 +15,7 @@ from skytether.cli import page_process, processes
 from skytether.server.schemes import table
 from skytether.shared.base import kernel
 from skytether.shared.scenario import reading
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import Record
 from skytether.shared.telemetry.summary import summarise
 from skytether.shell.commandline import command, terminal

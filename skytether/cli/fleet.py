@@ -27,7 +27,7 @@ from skytether.shared.formats import plans, tracks
 from skytether.shared.law.model import Array
 from skytether.shared.missions.mission import Mission
 from skytether.shared.scenario import reading
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.drops import drops
 from skytether.shared.telemetry.record import Record, sent_by
 from skytether.shared.telemetry.summary import plugin_errors, separations, summarise

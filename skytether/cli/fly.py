@@ -31,7 +31,7 @@ from skytether.shared.events.flight import (
 )
 from skytether.shared.events.standby import LeaderChanged
 from skytether.shared.scenario import reading
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import Record
 from skytether.shared.telemetry.summary import Summary, summarise
 from skytether.shared.wire.protocol import Idle, Mode

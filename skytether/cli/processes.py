@@ -27,7 +27,7 @@ from skytether.shared.endpoints.endpoint import Address
 from skytether.shared.events.flight import Failure, Flying, NotFlown, RecordIncomplete, address_text
 from skytether.shared.events.processes import Counted, Listening
 from skytether.shared.scenario.reading import to_toml
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import (
     PACKET_COLUMNS,
     FlightEvent,

@@ -14,7 +14,7 @@ import msgspec
 from skytether.shared.base import files, toml
 from skytether.shared.events.flight import RecordIncomplete
 from skytether.shared.scenario.reading import check as checked
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.feed import Frame, Opened, Rows
 from skytether.shared.telemetry.record import RECORDING, Record
 from skytether.shared.telemetry.summary import Summary

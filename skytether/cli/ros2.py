@@ -28,7 +28,7 @@ from skytether.shared.endpoints.endpoint import VEHICLES_TOLD_MAX, Datagram
 from skytether.shared.endpoints.line import Line, parse_line
 from skytether.shared.events.flight import ChangeRefused
 from skytether.shared.missions.mission import format_goals, parse_goals
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.feed import FeedError, Frame, Opened, Rows, columns_of, table
 from skytether.shell.commandline.argument import Argument
 from skytether.shell.commandline.command import CONFIGURATION, CommandError

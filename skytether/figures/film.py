@@ -12,7 +12,7 @@ from skytether.figures.page import blank
 from skytether.shared.base import files
 from skytether.shared.law.model import Array
 from skytether.shared.missions.derived import zones
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import Rows
 
 if TYPE_CHECKING:

@@ -13,7 +13,7 @@ from skytether.shared.base import files
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.law.model import Array
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import DOWNLINK, UPLINK, Record, Rows
 from skytether.shared.telemetry.summary import desired, position_error, summarise
 

@@ -31,7 +31,7 @@ from skytether.shared.law.model import Indices
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.dotted import set_keys
 from skytether.shared.scenario.reference import Reference
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import Compared, Rows
 from skytether.sim.flight import BOOT_ID, MIDNIGHT_NS, PLAIN, SERVER, Run
 from skytether.sim.world import Clock, World

@@ -32,7 +32,7 @@ from skytether.shared.missions import mission
 from skytether.shared.missions.derived import zones
 from skytether.shared.missions.mission import Mission
 from skytether.shared.missions.zones import Zones
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.summary import Track, nearest
 from skytether.shared.wire.protocol import Lead, Observation, decode, encode
 from skytether.sim.flight import SERVER, STANDBY

@@ -26,7 +26,7 @@ from skytether.lab.contenders import (
 from skytether.lab.sweep import GridAxis, Results, Sweep
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.dotted import value
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 
 BUDGETS = (1.0, 2.0, 5.0, 10.0, 20.0, 40.0)
 """Budgets: largest numbers of packets per second, both directions together, with heartbeats."""

@@ -16,7 +16,7 @@ from skytether.lab.search import Free, Values, plain
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.grammar import leaves
 from skytether.shared.scenario.registry import TRIGGERS
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.summary import Summary
 
 COLUMNS: Mapping[str, Mapping[str, str]] = {

@@ -20,7 +20,7 @@ from skytether.shared.base.hint import hint
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.dotted import flat, set_keys, text_key, value
 from skytether.shared.scenario.grammar import GrammarError
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 
 SEARCH_SEED = 1001
 PACKETS = 0.1

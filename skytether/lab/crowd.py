@@ -18,7 +18,7 @@ from skytether.lab.journal import digests
 from skytether.shared.base.units import HEADER_BYTES
 from skytether.shared.law.model import Array
 from skytether.shared.scenario import reading
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import Rows
 from skytether.shared.telemetry.summary import position_error
 from skytether.shared.wire.protocol import Mode

@@ -35,7 +35,7 @@ from skytether.shared.base.units import SECOND_NS
 from skytether.shared.law.model import Array, Flags
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.dotted import flat, set_keys
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import Rows
 from skytether.shared.telemetry.summary import position_error
 from skytether.sim import flight

@@ -32,7 +32,7 @@ from skytether.lab.journal import digests
 from skytether.shared.law.model import Array, white_acceleration
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.gain import regulator
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import PACKET_COLUMNS, UPLINK, Reason, Rows, client_columns
 from skytether.shared.telemetry.summary import Summary, summarise
 from skytether.shared.wire.protocol import NO_HORIZON, Mode

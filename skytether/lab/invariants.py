@@ -27,7 +27,7 @@ from skytether.shared.endpoints.endpoint import EVENTS_MAX, Datagram
 from skytether.shared.law.model import ALTITUDE, Array
 from skytether.shared.law.terms import Terms
 from skytether.shared.scenario.gain import regulator
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import Recorder, client_columns
 from skytether.shared.wire.framing import split
 from skytether.shared.wire.protocol import (

@@ -20,7 +20,7 @@ import msgspec
 from skytether.shared.base import files, toml
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.scenario.dotted import flat
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 
 SETTINGS, ENTRIES = "settings.toml", "journal.jsonl"
 

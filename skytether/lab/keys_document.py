@@ -12,7 +12,8 @@ import msgspec
 
 from skytether.shared.base.meanings import meanings
 from skytether.shared.scenario.catalogue import KEYS
-from skytether.shared.scenario.schema import Scenario, Section
+from skytether.shared.scenario.schema import Section
+from skytether.shared.scenario.whole import Scenario
 
 HEAD = """# Keys of a scenario
 

@@ -30,7 +30,7 @@ from skytether.shared.endpoints.change import Running, with_values
 from skytether.shared.endpoints.endpoint import Address, Endpoint
 from skytether.shared.events.flight import Event
 from skytether.shared.missions.mission import Mission
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import Recorder, client_columns, parse
 from skytether.shared.telemetry.summary import Track, track
 from skytether.shared.wire.protocol import Mode

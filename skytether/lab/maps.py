@@ -25,7 +25,7 @@ from skytether.lab.margins import Differing, growth_of, hovering, windless
 from skytether.shared.law.model import Array
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.registry import IMPAIRMENTS
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import Rows
 from skytether.shared.telemetry.summary import Summary, position_error, summarise
 from skytether.sim.flight import fly_batch

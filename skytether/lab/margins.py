@@ -28,7 +28,8 @@ from skytether.lab.intervals import interval, jackknife
 from skytether.shared.law.model import Array
 from skytether.shared.scenario.grammar import leaves
 from skytether.shared.scenario.registry import PERIOD_MAX, TRIGGERS
-from skytether.shared.scenario.schema import ReferenceConfig, Scenario, SensorConfig
+from skytether.shared.scenario.schema import ReferenceConfig, SensorConfig
+from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import Record
 from skytether.shared.telemetry.summary import AT_BOUND
 from skytether.sim.flight import fly_batch

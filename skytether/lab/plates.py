@@ -28,7 +28,8 @@ from skytether.lab.studies import (
 from skytether.lab.sweep import by_name, estimate
 from skytether.shared.law.model import Array, Indices
 from skytether.shared.scenario.registry import IMPAIRMENTS, TRIGGERS
-from skytether.shared.scenario.schema import ControlConfig, Scenario
+from skytether.shared.scenario.schema import ControlConfig
+from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import Record, Rows
 from skytether.shared.telemetry.summary import Summary, desired, summarise
 

@@ -29,7 +29,7 @@ from skytether.lab.studies import (
 )
 from skytether.lab.sweep import by_name
 from skytether.shared.law.model import Array
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import Record
 from skytether.shared.telemetry.summary import summarise
 

@@ -15,7 +15,7 @@ from skytether.lab.journal import digests
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.scenario import dotted, reading
 from skytether.shared.scenario.grammar import GrammarError
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 
 SIGMA = 0.1
 

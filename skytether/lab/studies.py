@@ -17,7 +17,7 @@ from skytether.lab.calibration import COLUMNS, TABLE_1, deviations
 from skytether.lab.intervals import Estimate, interval
 from skytether.lab.sweep import GridAxis, Results, Sweep, estimate
 from skytether.shared.scenario.registry import IMPAIRMENTS, TRIGGERS
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.summary import Summary
 
 SCENARIO = "paper"

@@ -22,7 +22,7 @@ from skytether.shared.base import toml
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.dotted import set_keys
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.summary import Summary, summarise
 from skytether.sim.flight import fly_batch
 

@@ -50,7 +50,7 @@ from skytether.shared.events.flight import Event, ModeChanged
 from skytether.shared.law.model import Array, Flags
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.registry import IMPAIRMENTS
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.shared.wire.channel import LIFE_NS
 from skytether.shared.wire.keys import Keyring
 from skytether.shared.wire.protocol import Mode

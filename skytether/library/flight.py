@@ -17,7 +17,7 @@ from skytether.shared.base import extras
 from skytether.shared.base.errors import ConfigError, FlightError, RecordingError
 from skytether.shared.base.hint import hint
 from skytether.shared.events.flight import Event, Failure, RecordIncomplete, VehicleEvent
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.feed import Figures, Said
 from skytether.shared.telemetry.record import (
     PACKET_COLUMNS,

@@ -17,7 +17,7 @@ from skytether.shared.scenario import reading
 from skytether.shared.scenario.dotted import flat, set_keys
 from skytether.shared.scenario.planners import Planner
 from skytether.shared.scenario.registry import PLANNERS
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import Record
 from skytether.shell.commandline import plugins
 from skytether.shell.host import temporary

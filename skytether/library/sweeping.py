@@ -15,7 +15,7 @@ from skytether.library.flying import Given, named, prepare
 from skytether.shared.base import extras
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.base.hint import hint
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.summary import Summary
 
 if TYPE_CHECKING:

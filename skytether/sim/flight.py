@@ -40,7 +40,7 @@ from skytether.shared.events.flight import Event, Fault, VehicleEvent
 from skytether.shared.scenario.dotted import text_key
 from skytether.shared.scenario.reference import Reference
 from skytether.shared.scenario.registry import load
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import (
     PACKET_COLUMNS,
     FlightEvent,

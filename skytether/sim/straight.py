@@ -15,7 +15,7 @@ from skytether.shared.base.chance import stream
 from skytether.shared.base.units import SECOND_NS, seconds_to_ns
 from skytether.shared.endpoints.change import Running
 from skytether.shared.events.flight import Event
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import (
     PACKET_COLUMNS,
     TRUTH_COLUMNS,

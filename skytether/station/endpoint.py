@@ -29,7 +29,7 @@ from skytether.shared.endpoints.endpoint import Address, Datagram, Endpoint, by_
 from skytether.shared.events.aboard import AutopilotText, NotTakenOff
 from skytether.shared.events.flight import Finished, Flying
 from skytether.shared.law.model import Array
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import Recorder
 from skytether.station.laws import Heard, Law, Setpoint, setpoint
 

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from skytether.shared.events.flight import Failure
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import (
     FlightEvent,
     Reason,

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from skytether.figures.tables import to_csv
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
 from skytether.shared.law.model import Array
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import Rows
 from skytether.shared.telemetry.summary import position_error
 from skytether.view.recorded import Recorded

@@ -8,7 +8,7 @@ import numpy as np
 from skytether.shared.events.flight import Flying
 from skytether.shared.law.model import Indices
 from skytether.shared.scenario.reading import to_toml
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.feed import Figures, Frame, Opened, Said, described
 from skytether.shared.telemetry.feed import Rows as RowsFrame
 from skytether.shared.telemetry.record import Record, Rows

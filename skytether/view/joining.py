@@ -21,7 +21,7 @@ from skytether.shared.scenario.catalogue import KEYS, keys_of
 from skytether.shared.scenario.dotted import flat, set_keys
 from skytether.shared.scenario.owners import InFlight, Owner
 from skytether.shared.scenario.reading import check, to_table
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.feed import Frame, Rows
 from skytether.shared.telemetry.record import Rows as Table
 from skytether.view.recorded import Recorded, summary_of

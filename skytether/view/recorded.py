@@ -22,7 +22,7 @@ from skytether.shared.events.flight import Event
 from skytether.shared.events.processes import Counted
 from skytether.shared.law.model import Indices
 from skytether.shared.scenario.reading import check
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry import drops, feed
 from skytether.shared.telemetry.feed import Figures, Frame, Opened, Rows, Said, columns_of
 from skytether.shared.telemetry.record import Rows as Table

@@ -40,7 +40,7 @@ from skytether.shared.events.flight import (
 )
 from skytether.shared.law.model import Array
 from skytether.shared.scenario.reading import to_toml
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry import feed
 from skytether.shared.telemetry.feed import Figures, Frame, Opened, Rows, Said, columns_of
 from skytether.shared.telemetry.record import Rows as Table

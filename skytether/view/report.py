@@ -15,7 +15,7 @@ from skytether.shared.base.units import SECOND_NS
 from skytether.shared.events.flight import DOES
 from skytether.shared.law.model import Array
 from skytether.shared.scenario.reading import to_toml
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import Rows, compared
 from skytether.shared.telemetry.summary import Summary, desired, position_error
 from skytether.shared.wire.protocol import NO_HORIZON, Mode

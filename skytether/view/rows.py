@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.endpoints.ways import FLIGHT, Ways
 from skytether.shared.law.model import Array
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import (
     DOWNLINK,
     PACKET_COLUMNS,

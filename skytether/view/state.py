@@ -29,7 +29,7 @@ from skytether.shared.missions import zone_texts
 from skytether.shared.missions.zones import Zones
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.grammar import GrammarError
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.feed import (
     FeedError,
     Figures,

@@ -23,7 +23,7 @@ from skytether.mavlink.dialect import dialect
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.endpoints.endpoint import Datagram
 from skytether.shared.scenario.reading import check
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 
 Steps = tuple[np.ndarray, np.ndarray]
 BOTH: tuple[FlavourName, ...] = ("ardupilot", "px4")

@@ -24,7 +24,7 @@ from skytether.mavlink.dialect import dialect
 from skytether.shared.events.flight import Flying, ModeChanged
 from skytether.shared.events.flight import address_text as text
 from skytether.shared.scenario.reading import check, to_toml
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import Rows, parse
 from skytether.shell.processes.log import LogLine
 

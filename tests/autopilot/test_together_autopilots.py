@@ -28,7 +28,7 @@ from skytether.shared.missions.derived import zones
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.dotted import set_keys
 from skytether.shared.scenario.reading import check
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry import record
 from skytether.shared.telemetry.record import TRUTH_COLUMNS, Recorder, client_columns, parse
 from skytether.shared.telemetry.summary import least_separation

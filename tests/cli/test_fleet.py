@@ -25,7 +25,7 @@ from skytether.shared.base.units import SECOND_NS
 from skytether.shared.endpoints.endpoint import VEHICLES_TOLD_MAX, Address, Datagram
 from skytether.shared.events.flight import NoAnswer
 from skytether.shared.scenario import reading
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.drops import drops
 from skytether.shared.telemetry.record import Recorder, Rows, client_columns, parse
 from skytether.shell.processes import workers

@@ -13,7 +13,7 @@ from skytether.cli.export import export
 from skytether.cli.join import join
 from skytether.cli.report import report
 from skytether.shared.scenario import reading
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.feed import Frame, Rows
 from skytether.shared.telemetry.record import PACKET_COLUMNS, Record
 from skytether.shared.telemetry.summary import summarise

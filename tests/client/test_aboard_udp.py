@@ -20,7 +20,7 @@ from skytether.shared.events.aboard import AutopilotMode, ParametersSet
 from skytether.shared.events.flight import Flying
 from skytether.shared.events.flight import address_text as text
 from skytether.shared.scenario.reading import to_toml
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import client_columns, parse
 from skytether.shell.processes.log import LogLine
 

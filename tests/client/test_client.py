@@ -22,7 +22,7 @@ from skytether.shared.events.flight import (
     Unanswered,
 )
 from skytether.shared.law.terms import Difference
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import Reason
 from skytether.shared.wire.drop import Drop
 from skytether.shared.wire.paths import Paths

@@ -15,7 +15,7 @@ from skytether.client.simulated.vehicle import simulated
 from skytether.client.simulated.weather import Weather
 from skytether.shared.base.chance import stream
 from skytether.shared.law.dead_time import PendingInputs
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import Record
 from skytether.shared.telemetry.summary import Summary, summarise
 from skytether.sim.flight import fly

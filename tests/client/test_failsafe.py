@@ -30,7 +30,7 @@ from skytether.shared.endpoints.change import Running
 from skytether.shared.endpoints.endpoint import Datagram
 from skytether.shared.events.flight import Event, ModeChanged
 from skytether.shared.law import rule
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import Reason
 from skytether.shared.wire.drop import Drop
 from skytether.shared.wire.protocol import (

@@ -11,8 +11,8 @@ from helpers import packaged
 from skytether.client.fence import Fence
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.events.flight import FenceHolds, ModeChanged
-from skytether.shared.scenario.fence import SLOW_STEPS, inner_bounds
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.fence.margins import SLOW_STEPS, inner_bounds
+from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import Record
 from skytether.shared.wire.protocol import Mode
 from skytether.sim.flight import fly

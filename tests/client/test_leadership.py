@@ -16,7 +16,7 @@ from skytether.shared.base.units import SECOND_NS, seconds_to_ns
 from skytether.shared.endpoints.endpoint import STANDBY_SOCKETS, Address, Datagram
 from skytether.shared.events.standby import LeaderChanged
 from skytether.shared.law.terms import Limits
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.shared.wire.drop import Drop
 from skytether.shared.wire.protocol import (
     Close,

@@ -22,7 +22,7 @@ from skytether.server.missions.mission_state import MissionState
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.events.flight import BegunAnew, CannotResume, ModeChanged
 from skytether.shared.scenario import reading
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import Reason
 from skytether.shared.wire.protocol import KNOTS_MAX, Mode
 from skytether.sim.flight import SERVER

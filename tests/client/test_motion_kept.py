@@ -18,7 +18,7 @@ from skytether.client.failsafe import AT_ONCE, FOLLOWING, TABLE, Failsafe
 from skytether.client.link import PlainLink
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
 from skytether.shared.events.flight import Leaving
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import Reason, Rows
 from skytether.shared.wire.protocol import (
     Close,

@@ -24,7 +24,7 @@ from skytether.server.schemes import committed
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
 from skytether.shared.law.model import Array, white_acceleration
 from skytether.shared.scenario.registry import VEHICLES, Entry
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import Rows
 from skytether.shared.telemetry.summary import summarise
 from skytether.shared.wire.protocol import Message

@@ -13,7 +13,7 @@ from skytether.client.simulated.plant import FirstOrderPlant
 from skytether.client.simulated.weather import Weather
 from skytether.shared.law.model import Array, discretise, white_acceleration
 from skytether.shared.scenario.reading import check
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 
 FLIGHT = {
     "model": {"tau_s": [0.81, 0.3]},

@@ -47,7 +47,7 @@ from skytether.shared.events.standby import LeaderChanged
 from skytether.shared.law.model import Array, Indices
 from skytether.shared.law.motion import Motion
 from skytether.shared.scenario import reading
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import parse
 from skytether.shell.commandline import command
 from skytether.sim.flight import SERVER, STANDBY

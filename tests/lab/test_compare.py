@@ -57,7 +57,7 @@ from skytether.shared.scenario import reading
 from skytether.shared.scenario.dotted import text_key
 from skytether.shared.scenario.reading import COMPARED
 from skytether.shared.scenario.registry import TRIGGERS
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.summary import summarise
 from skytether.sim import flight
 

@@ -17,7 +17,7 @@ from skytether.shared.law.model import Array, Flags, Indices
 from skytether.shared.law.terms import Terms
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.gain import regulator
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.shared.wire.protocol import FEEDBACK, KNOTS_MAX, Horizon, Trajectory
 from skytether.sim.flight import fly
 

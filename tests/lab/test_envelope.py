@@ -34,7 +34,7 @@ from skytether.shared.law.model import Array, Flags, Indices
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.dotted import set_keys
 from skytether.shared.scenario.registry import IMPAIRMENTS
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import Rows, client_columns
 from skytether.shell.commandline import command
 from skytether.sim import flight

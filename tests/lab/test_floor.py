@@ -11,7 +11,7 @@ from skytether.client.simulated.weather import Weather
 from skytether.lab.floor import fly_aboard, summarise_aboard, target_floor_m, wind_floor_m
 from skytether.shared.base.chance import stream
 from skytether.shared.scenario import reference
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import Rows, client_columns
 from skytether.shared.telemetry.summary import summarise
 from skytether.sim.flight import fly

@@ -18,7 +18,7 @@ from fuzz.mutators import corpus, seeds
 from fuzz.target import Target, functions
 from fuzz.targets import TARGETS
 from skytether.server.reception import IMPLAUSIBLE
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry import feed
 from skytether.shared.wire import handshake, protocol
 from skytether.shared.wire.drop import Drop

@@ -37,7 +37,7 @@ from skytether.lab.identify.steps import (
 from skytether.shared.endpoints.endpoint import Datagram, Endpoint
 from skytether.shared.law.model import Array
 from skytether.shared.scenario import reading
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import Reason
 from skytether.shell.commandline import command
 from skytether.sim import flight

@@ -4,7 +4,7 @@ from lives import Death, Lives
 from skytether.shared.missions import zone_texts
 from skytether.shared.missions.events import InZone
 from skytether.shared.scenario import reading
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 
 BOX = "box(-1.5, 1.5, -1.5, 1.5)"
 CENTRE = zone_texts.parse(BOX, 2)

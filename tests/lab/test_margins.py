@@ -23,7 +23,7 @@ from skytether.lab.margins import (
 )
 from skytether.shared.law.model import Array, white_acceleration
 from skytether.shared.scenario.gain import regulator
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import Rows, client_columns
 
 BLIND = {

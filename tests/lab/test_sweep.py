@@ -27,7 +27,7 @@ from skytether.lab.sweep import CHUNK, GridAxis, Runs, Sweep, estimate, fly, par
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.dotted import value
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.summary import summarise
 from skytether.sim import flight
 

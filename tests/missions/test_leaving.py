@@ -16,7 +16,7 @@ from skytether.lab.lives import Lives
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS, seconds_to_ns
 from skytether.shared.events.flight import Leaving, SteppedLate
 from skytether.shared.missions.events import LeftMotion
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import Reason, parse
 
 FOUR = packaged("swap", duration=40.0, reference={"shape": "swap(4)"})

@@ -48,7 +48,7 @@ from skytether.shared.missions.mission import Mission
 from skytether.shared.missions.zones import Zones
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.reading import ConfigError
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import Rows
 from skytether.shared.telemetry.summary import least_separation
 from skytether.shared.wire.drop import Drop, ProtocolError

@@ -11,7 +11,7 @@ from skytether.shared.base.errors import ConfigError
 from skytether.shared.law.model import Array
 from skytether.shared.missions import contradictions, mission
 from skytether.shared.scenario import reading
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import Record
 from skytether.sim import flight
 from two_vehicles import separation_m

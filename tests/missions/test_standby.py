@@ -16,7 +16,7 @@ from skytether.shared.events.flight import SessionRefused
 from skytether.shared.events.standby import LimitsDiffer
 from skytether.shared.law.motion import SPACING, Motion, resting
 from skytether.shared.missions.mission import Mission
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.summary import nearest
 from skytether.shared.wire.protocol import NO_HORIZON, Lead
 from skytether.sim.flight import SERVER, STANDBY

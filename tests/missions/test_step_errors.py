@@ -31,7 +31,7 @@ from skytether.shared.law.motion import SPACING, Motion, resting
 from skytether.shared.missions.derived import zones
 from skytether.shared.missions.mission import Mission
 from skytether.shared.scenario import reading
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.sim import flight
 from two_vehicles import clear_m, drawn, left_m, separation_m
 

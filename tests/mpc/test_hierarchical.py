@@ -26,7 +26,7 @@ from skytether.server.planning.scheme import FIGURES, Figures, Foresight, empty_
 from skytether.shared.endpoints.stopwatch import Stopwatch
 from skytether.shared.law.model import Array, Flags, Indices
 from skytether.shared.scenario.reading import check
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 
 H = 15
 SCENARIO = check(

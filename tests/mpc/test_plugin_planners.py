@@ -22,7 +22,7 @@ from skytether.plugin import Problem, planner
 from skytether.server.endpoint import Server
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.law.model import Array
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import Record
 from skytether.shell.commandline import plugins
 from skytether.sim.flight import fly, fly_batch

@@ -28,7 +28,8 @@ from skytether.server.mpc.problem import (
     simd_memory,
 )
 from skytether.shared.law.model import Array, discretise
-from skytether.shared.scenario.schema import ControlConfig, ModelConfig, Scenario
+from skytether.shared.scenario.schema import ControlConfig, ModelConfig
+from skytether.shared.scenario.whole import Scenario
 
 quick = settings(max_examples=15)
 

@@ -11,7 +11,8 @@ from skytether.server.mpc.osqp_solver import OsqpSolver
 from skytether.server.mpc.problem import LATER, make_mpc, pose
 from skytether.server.mpc.solver import Solver, SolverFailed
 from skytether.shared.law.model import Array
-from skytether.shared.scenario.schema import ControlConfig, ModelConfig, Scenario
+from skytether.shared.scenario.schema import ControlConfig, ModelConfig
+from skytether.shared.scenario.whole import Scenario
 
 quick = settings(max_examples=15)
 

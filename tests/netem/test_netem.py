@@ -37,7 +37,7 @@ from skytether.shared.endpoints.ways import FLIGHT, NAMES, RELAY, RUN, Ways
 from skytether.shared.formats.recorded import recorded_in
 from skytether.shared.scenario.reading import load
 from skytether.shared.scenario.registry import File
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import DOWNLINK, PACKET_COLUMNS, UPLINK
 from skytether.shell.commandline.command import parse
 from skytether.shell.driving.control import answer_of

@@ -17,7 +17,8 @@ from skytether.netem.proxy import FLOWS_MAX, LAPS_MAX, Proxy
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
 from skytether.shared.endpoints.endpoint import Datagram, host_of
 from skytether.shared.events.flight import FlowOpened, Returned, TooLong, Unreachable
-from skytether.shared.scenario.schema import NetworkConfig, Scenario
+from skytether.shared.scenario.schema import NetworkConfig
+from skytether.shared.scenario.whole import Scenario
 
 SERVER = ("192.0.2.9", 47001)
 ALICE, BOB, CAROL = (("192.0.2.1", 5000), ("192.0.2.1", 5001), ("192.0.2.2", 5000))

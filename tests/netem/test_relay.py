@@ -8,7 +8,8 @@ from skytether.shared.base.units import SECOND_NS
 from skytether.shared.endpoints.endpoint import Datagram
 from skytether.shared.endpoints.line import CLIENT, PIECE_BYTES, SERVER
 from skytether.shared.endpoints.ways import RELAY
-from skytether.shared.scenario.schema import NetworkConfig, Scenario
+from skytether.shared.scenario.schema import NetworkConfig
+from skytether.shared.scenario.whole import Scenario
 
 SERVED = ("192.0.2.9", 80)
 NETWORKS = (

@@ -23,7 +23,8 @@ from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
 from skytether.shared.endpoints.endpoint import Datagram
 from skytether.shared.endpoints.line import CLIENT
 from skytether.shared.endpoints.ways import RELAY
-from skytether.shared.scenario.schema import NetworkConfig, Scenario
+from skytether.shared.scenario.schema import NetworkConfig
+from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import DOWNLINK, PACKET_COLUMNS, Recorder, parse
 from skytether.shell.processes.process import Process
 

@@ -12,7 +12,8 @@ from skytether.netem.tunnel import Tunnel
 from skytether.shared.base.packets import OUTSIDE, PROGRAM
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
 from skytether.shared.endpoints.endpoint import Address, Datagram
-from skytether.shared.scenario.schema import NetworkConfig, Scenario
+from skytether.shared.scenario.schema import NetworkConfig
+from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import DOWNLINK, PACKET_COLUMNS, Recorder, parse
 
 UDP = 17

@@ -15,7 +15,7 @@ from skytether.shared.endpoints.stopwatch import Stopwatch
 from skytether.shared.law.model import Array, Indices, discretise
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.gain import feedback_gain
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.summary import summarise
 from skytether.shared.wire.protocol import NO_HORIZON, Mode, Observation
 from skytether.sim.flight import fly

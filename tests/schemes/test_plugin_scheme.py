@@ -15,7 +15,7 @@ from helpers import faults, packaged, refusal
 from skytether.__main__ import main
 from skytether.server.schemes import table
 from skytether.shared.base.errors import ConfigError
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.shared.wire.protocol import Mode
 from skytether.shell.commandline import plugins
 from skytether.sim.flight import fly, fly_batch

@@ -15,7 +15,7 @@ from skytether.server.schemes.sent import LOSS_WEIGHT
 from skytether.shared.law import rule
 from skytether.shared.law.model import Array, Flags, Indices
 from skytether.shared.scenario.gain import feedback_gain
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import UPLINK, Record
 from skytether.shared.telemetry.summary import summarise
 from skytether.shared.wire.protocol import NO_HORIZON, Horizon, Mode, Observation

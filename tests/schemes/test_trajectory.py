@@ -32,7 +32,7 @@ from skytether.shared.law.model import Array, Indices, advance
 from skytether.shared.law.spline import AxisSpline, along, follow, guided_to, regulated, spline_at
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.gain import regulator
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import UPLINK, Record
 from skytether.shared.telemetry.summary import position_error
 from skytether.shared.wire.drop import ProtocolError

@@ -13,7 +13,7 @@ from skytether.server.planning.desired import Desired
 from skytether.shared.base import chance
 from skytether.shared.base.units import MILLISECOND_NS
 from skytether.shared.events.flight import NoAnswer, SessionEnded
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import Record
 from skytether.shared.wire.protocol import Heartbeat, encode
 from skytether.sim import flight

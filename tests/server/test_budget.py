@@ -19,7 +19,7 @@ from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
 from skytether.shared.law.model import Array
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.dotted import set_keys
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.sim.flight import fly, fly_batch
 
 DT_NS = 50 * MILLISECOND_NS

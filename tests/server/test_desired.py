@@ -19,7 +19,7 @@ from skytether.shared.law.model import Array, Indices
 from skytether.shared.scenario import reference as shapes
 from skytether.shared.scenario.reading import check, to_table
 from skytether.shared.scenario.reference import Reference
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import Record
 from skytether.shared.telemetry.summary import desired as desired_positions
 from skytether.shared.telemetry.summary import summarise

@@ -19,7 +19,7 @@ from skytether.shared.events.flight import ModeChanged, StateDoubted
 from skytether.shared.law.heartbeat import NUMBERS
 from skytether.shared.law.model import Array
 from skytether.shared.scenario import reading
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import Reason, Record
 from skytether.shared.telemetry.summary import summarise
 from skytether.shared.wire.drop import Drop

@@ -33,7 +33,7 @@ from skytether.shared.events.flight import (
 )
 from skytether.shared.law.heartbeat import NUMBERS, SESSION_NS, Hearing
 from skytether.shared.law.terms import Difference
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import Recorder, Rows, parse, server_columns
 from skytether.shared.wire.drop import Drop, ProtocolError
 from skytether.shared.wire.keys import Keyring

@@ -29,7 +29,7 @@ from skytether.shared.events.flight import (
     PlanningStopped,
 )
 from skytether.shared.scenario import reading
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import Record
 from skytether.shared.telemetry.summary import summarise
 from skytether.shared.wire.protocol import IDLE_TEXTS, Idle

@@ -20,7 +20,7 @@ from skytether.shared.endpoints.endpoint import Datagram, Endpoint
 from skytether.shared.endpoints.steady import JUMP_NS, Steady
 from skytether.shared.events.flight import Degraded
 from skytether.shared.scenario import reading
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import Recorder, client_columns, parse
 from skytether.shared.telemetry.summary import summarise
 from skytether.sim.world import Clock, World

@@ -7,6 +7,7 @@ from typing import Annotated
 
 import pytest
 
+from skytether.client.mavlink.keys import ORIGIN
 from skytether.client.simulated.vehicle import SimulatedVehicle
 from skytether.lab import keys_document
 from skytether.netem.__main__ import emulate
@@ -17,7 +18,8 @@ from skytether.shared.base.meanings import meanings
 from skytether.shared.endpoints.ways import RELAY, RUN
 from skytether.shared.scenario.catalogue import KEYS, keys, keys_of
 from skytether.shared.scenario.owners import InFlight, Key, OfServer, Owner
-from skytether.shared.scenario.schema import Scenario, Section, Strength
+from skytether.shared.scenario.schema import Section, Strength
+from skytether.shared.scenario.whole import Scenario
 
 DOCS = Path(__file__).parents[2] / "docs"
 
@@ -42,7 +44,7 @@ def test_the_documented_keys_change_in_flight() -> None:
     named = {socket: set(re.findall("`([a-z_.0-9]+)`", keys)) for socket, keys in rows}
     assert named["server"] == TRIGGER | POINT | ZONES | GOALS
     assert named["client"] == SimulatedVehicle.changeable | keys_of(
-        InFlight.ARMED, InFlight.LEAP, InFlight.LEADER, InFlight.ORIGIN
+        InFlight.ARMED, InFlight.LEAP, InFlight.LEADER, ORIGIN
     )
     assert Proxy.changeable == {"network.uplink", "network.downlink"}
     assert named["netem"] == Proxy.changeable | {*RELAY, *RUN}

@@ -11,7 +11,7 @@ import helpers
 from skytether.shared.base import toml
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.scenario import reading
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 
 COMMITTED = 'control.scheme = "committed"\n'
 """First line of scenarios whose plans of inputs have a delay bound."""

@@ -13,7 +13,7 @@ from hypothesis import HealthCheck, assume, given, settings
 
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.scenario import reading
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.sim import flight
 
 TRIGGERS = ["always", "periodic", "state_gap", "cost_gap | silence(1)", "budget(1000000, 1000000)"]

@@ -12,7 +12,8 @@ from helpers import packaged
 from skytether.shared.law.model import Array, discretise, white_acceleration
 from skytether.shared.scenario.gain import feedback_gain, regulator
 from skytether.shared.scenario.gain import stationary_gain as gain_for
-from skytether.shared.scenario.schema import ControlConfig, Scenario
+from skytether.shared.scenario.schema import ControlConfig
+from skytether.shared.scenario.whole import Scenario
 from skytether.sim.flight import fly
 
 TAU_S, DT = 0.84, 0.05

@@ -10,7 +10,8 @@ import helpers
 from helpers import packaged
 from skytether.shared.endpoints.endpoint import PATH_SOCKETS
 from skytether.shared.scenario import reading
-from skytether.shared.scenario.schema import PATHS_MAX, PathConfig, Scenario
+from skytether.shared.scenario.schema import PATHS_MAX, PathConfig
+from skytether.shared.scenario.whole import Scenario
 from skytether.shell.commandline import command
 from skytether.shell.commandline.command import ScenarioOptions
 

@@ -24,7 +24,7 @@ from skytether.lab.commands.pool import _equipped
 from skytether.lab.journal import digests
 from skytether.shared.scenario.catalogue import differences
 from skytether.shared.scenario.registry import REFERENCES, TABLES, TRIGGERS
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import Record
 from skytether.shell.commandline import plugins
 from skytether.sim.flight import fly, fly_batch

@@ -30,7 +30,7 @@ from skytether.shared.law.rule import (
 )
 from skytether.shared.scenario.gain import feedback_gain
 from skytether.shared.scenario.reading import check
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.shared.wire.protocol import NO_HORIZON, Horizon, Mode, Observation
 
 quick = settings(max_examples=200)

@@ -21,7 +21,7 @@ from skytether.shared.scenario.catalogue import KEYS, TERMS, differences
 from skytether.shared.scenario.dotted import flat, set_keys
 from skytether.shared.scenario.owners import Owner
 from skytether.shared.scenario.registry import PLANNERS
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.shared.wire.protocol import PAYLOAD_BYTES_MAX, Hello, encode
 
 pytestmark = pytest.mark.usefixtures("plugin_tables")

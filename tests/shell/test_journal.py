@@ -17,7 +17,7 @@ from skytether.shared.events.flight import Event
 from skytether.shared.events.processes import NotKept
 from skytether.shared.missions.derived import zones
 from skytether.shared.scenario import reading
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.shell.commandline.command import CommandError
 from skytether.shell.driving import control, journal
 from skytether.shell.driving.control import Caller, Control, answer_of, controlled

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from helpers import interpreted, packaged
 from skytether.shared.base.compilable import COMPILABLE
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import Reason, Record
 from skytether.sim.flight import fly, fly_batch
 

@@ -21,7 +21,7 @@ from skytether.shared.events.flight import (
     SessionOpened,
 )
 from skytether.shared.law.model import Array
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import DOWNLINK, UPLINK, Reason, Record, client_columns
 from skytether.shared.telemetry.summary import Summary, position_error, summarise
 from skytether.shell.commandline.terminal import summary_rows

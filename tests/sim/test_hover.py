@@ -9,7 +9,7 @@ from bench.missions import fly_with_deaths
 from helpers import packaged
 from skytether.server.tick import Ticker
 from skytether.shared.events.flight import Finished, ModeChanged, NotFlown
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import Reason, Record
 from skytether.sim.flight import fly
 

@@ -15,7 +15,7 @@ from skytether.shared.base.units import SECOND_NS
 from skytether.shared.endpoints.endpoint import Address
 from skytether.shared.events.flight import FlowOpened
 from skytether.shared.events.paths import PathDied, PathHealed
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import DOWNLINK, UPLINK, Record
 from skytether.shared.telemetry.summary import summarise
 from skytether.shell.commandline.terminal import summary_rows

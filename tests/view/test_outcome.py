@@ -14,7 +14,7 @@ from skytether.cli import recorder
 from skytether.cli.join import join
 from skytether.cli.report import report
 from skytether.shared.events.paths import PathDied, PathHealed
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import FlightEvent, Record
 from skytether.shared.telemetry.summary import summarise
 from skytether.shell.commandline import command

@@ -22,7 +22,7 @@ from skytether.cli.duel import DuelOptions, titles, together
 from skytether.shared.endpoints.change import Answer, Running
 from skytether.shared.events.flight import Changed
 from skytether.shared.scenario import reading, registry, schema
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.feed import Opened, Said
 from skytether.shell.commandline.command import CommandError
 from skytether.sim import flight as virtual

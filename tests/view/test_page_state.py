@@ -16,7 +16,7 @@ from skytether.shared.base.units import SECOND_NS
 from skytether.shared.events.flight import Changed, Event, ModeChanged
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.reading import to_toml
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.feed import FeedError, Figures, Frame, Opened, Rows, Said, described
 from skytether.shared.telemetry.record import (
     DOWNLINK,

@@ -37,7 +37,8 @@ from skytether.figures.tables import to_csv
 from skytether.shared.base.errors import RecordingError
 from skytether.shared.events.aboard import AutopilotText
 from skytether.shared.scenario import reading
-from skytether.shared.scenario.schema import NetworkConfig, Scenario
+from skytether.shared.scenario.schema import NetworkConfig
+from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.feed import Figures, Opened, Rows, described, pack
 from skytether.shared.telemetry.record import (
     PACKET_COLUMNS,

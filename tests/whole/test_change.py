@@ -24,7 +24,8 @@ from skytether.shared.endpoints.change import REQUEST_BYTES_MAX, Answer, Running
 from skytether.shared.endpoints.endpoint import Endpoint
 from skytether.shared.events.flight import Changed, ChangeRefused, Event, Flying, ModeChanged
 from skytether.shared.scenario import reading
-from skytether.shared.scenario.schema import Scenario, VehicleConfig
+from skytether.shared.scenario.schema import VehicleConfig
+from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import UPLINK, Reason, Record
 from skytether.shared.wire.protocol import Mode
 from skytether.sim.flight import fly

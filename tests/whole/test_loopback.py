@@ -22,7 +22,7 @@ from skytether.shared.base.units import SECOND_NS
 from skytether.shared.endpoints.endpoint import Address, Datagram, Endpoint
 from skytether.shared.events.flight import Event, FlowOpened, Unreachable
 from skytether.shared.scenario import reading
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import (
     PACKET_COLUMNS,
     Record,

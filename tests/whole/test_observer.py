@@ -18,7 +18,7 @@ from skytether.shared.base.units import SECOND_NS
 from skytether.shared.endpoints.endpoint import Address, Datagram
 from skytether.shared.events.flight import Event, ModeChanged
 from skytether.shared.scenario import reading
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import Recorder, client_columns, parse
 from skytether.shared.telemetry.summary import summarise
 from skytether.sim.sealed import make_keys

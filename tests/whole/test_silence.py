@@ -17,7 +17,17 @@ CORES = (
     *("sim", "figures", "view", "lab", "gym"),
 )
 WITHOUT_FILES = (
-    *("shared/law", "shared/endpoints", "shared/events", "quadrotor", "mavlink", "ros2", "server", "client", "netem"),
+    *(
+        "shared/law",
+        "shared/endpoints",
+        "shared/events",
+        "quadrotor",
+        "mavlink",
+        "ros2",
+        "server",
+        "client",
+        "netem",
+    ),
     *("autopilot", "station", "probe", "sim"),
 )
 """Rooms whose modules import neither paths nor the operating system."""

@@ -17,7 +17,7 @@ from skytether.shared.endpoints.change import Running
 from skytether.shared.endpoints.endpoint import Address, Datagram, Endpoint
 from skytether.shared.events.flight import ModeChanged, SessionEnded
 from skytether.shared.events.standby import LeaderChanged
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import Record
 from skytether.shared.telemetry.summary import summarise
 from skytether.shared.wire.protocol import Mode

@@ -33,7 +33,7 @@ from skytether.shared.base import input_files
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.missions.mission import Mission
 from skytether.shared.scenario import reading
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.shell.commandline import command
 from skytether.shell.commandline.argument import Argument
 from skytether.shell.commandline.command import CommandError, ScenarioFlags, ScenarioName

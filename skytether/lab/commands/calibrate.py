@@ -15,7 +15,7 @@ from skytether.lab.commands.pool import Flags, Interrupted, PoolFlags, crew, wri
 from skytether.lab.search import SIGMA, Free, Search, SearchPoint, Values, best, check_free
 from skytether.shared.base import files
 from skytether.shared.scenario.reading import to_toml
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.shell.commandline import command, terminal
 from skytether.shell.commandline.argument import Argument
 from skytether.shell.commandline.command import CommandError, ScenarioFlags, ScenarioName

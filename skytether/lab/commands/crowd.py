@@ -15,7 +15,7 @@ from skytether.lab.commands.pool import Flags, Interrupted, crew, writing
 from skytether.lab.crowd import TITLES, Crowd, CrowdPoint, FlownScheme, Scheme, judge, points_csv
 from skytether.lab.journal import StudyJournal
 from skytether.shared.base import files
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry import record
 from skytether.shell.commandline import command
 from skytether.shell.commandline.argument import Argument

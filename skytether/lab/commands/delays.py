@@ -14,7 +14,7 @@ from skytether.shared.endpoints.endpoint import Address
 from skytether.shared.events.flight import address_text
 from skytether.shared.law.model import Array
 from skytether.shared.scenario.reading import to_toml
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import DOWNLINK, UPLINK, read
 
 EVERY_S = 0.002

@@ -13,7 +13,7 @@ from skytether.lab.commands import tables
 from skytether.lab.commands.pool import Flags, PoolFlags, study, writing
 from skytether.lab.envelope import BAD, Envelope, EnvelopePoint, Outcome, worst_first
 from skytether.shared.base import files
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.shell.commandline import command, terminal
 from skytether.shell.commandline.argument import Argument
 from skytether.shell.commandline.command import CommandError, ScenarioFlags, ScenarioName

@@ -35,7 +35,7 @@ from skytether.shared.endpoints.line import Line
 from skytether.shared.endpoints.steady import Steady
 from skytether.shared.events.flight import Event
 from skytether.shared.scenario import reading
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.shell.commandline import command, terminal
 from skytether.shell.commandline.argument import Argument
 from skytether.shell.commandline.command import CommandError, ScenarioFlags

@@ -18,7 +18,7 @@ from skytether.lab.maps import Box, MapPoint
 from skytether.lab.margins import Margin, MarginLimit
 from skytether.shared.base import files
 from skytether.shared.scenario import reading
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.shell.commandline import command
 from skytether.shell.commandline.argument import Argument
 from skytether.shell.commandline.command import CommandError, ScenarioFlags, ScenarioName

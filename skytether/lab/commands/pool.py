@@ -33,7 +33,7 @@ from skytether.lab.search import Point, Search, SearchPoint, Values, best
 from skytether.lab.sweep import Results, Runs, Sweep
 from skytether.server.schemes import table
 from skytether.shared.base import kernel
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.shell.commandline import command, plugins, terminal
 from skytether.shell.commandline.argument import Argument
 from skytether.shell.commandline.command import CommandError

@@ -15,7 +15,7 @@ from skytether.lab import report
 from skytether.lab.commands import machine
 from skytether.lab.report import Drawn
 from skytether.shared.base import files
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.shell.host import system
 
 PAGE = "report.html"

@@ -24,7 +24,7 @@ from skytether.server.schemes.table import others
 from skytether.shared.base import files, kernel
 from skytether.shared.law.model import Array
 from skytether.shared.scenario import reading
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry import record
 from skytether.shared.telemetry.record import Record
 from skytether.shell.commandline import command, terminal

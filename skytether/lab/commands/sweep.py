@@ -13,7 +13,7 @@ from skytether.lab.commands import tables
 from skytether.lab.commands.pool import Crew, Flags, PoolFlags, crew, writing
 from skytether.lab.sweep import Results, Sweep, estimate, parse_axis
 from skytether.shared.base import files
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.shell.commandline import command, terminal
 from skytether.shell.commandline.argument import Argument
 from skytether.shell.commandline.command import ScenarioFlags, ScenarioName

@@ -15,7 +15,7 @@ from skytether.lab.identify.steps import Experiment
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.endpoints.endpoint import Datagram, Endpoint
 from skytether.shared.events.flight import Failure
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import Reason
 
 BLIND_NS = SECOND_NS

@@ -14,7 +14,7 @@ import tomli_w
 from skytether.lab.identify.fit import Fit, Numbers, StepResponse, verdict
 from skytether.lab.identify.steps import STEPS, reference_speeds
 from skytether.shared.scenario import reading
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 
 AXES = "xyz"
 BEYOND = 1.5

@@ -15,8 +15,8 @@ import numpy as np
 
 from skytether.client.fence import Fence
 from skytether.shared.base.units import SECOND_NS, seconds_to_ns
-from skytether.shared.scenario.fence import SLOW_STEPS, margins
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.fence.margins import SLOW_STEPS, margins
+from skytether.shared.scenario.whole import Scenario
 
 ALTITUDE = 2
 STEPS = 4

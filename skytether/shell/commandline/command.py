@@ -27,7 +27,7 @@ from skytether.shared.events.flight import Event, address_text
 from skytether.shared.events.processes import NoFailsafe
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.dotted import set_keys
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.shell.commandline import plugins
 from skytether.shell.commandline.argument import HELP_KEYS, Argument
 from skytether.shell.commandline.options import key_values, read

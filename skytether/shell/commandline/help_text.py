@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal, NamedTuple, get_args, get_origin
 import msgspec
 
 from skytether.shared.base.meanings import meanings
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.shell.commandline.argument import HELP_KEYS, argument_of, hints_of
 
 ARGUMENTS, OPTIONS = "arguments", "options"

@@ -20,7 +20,7 @@ from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 
 from skytether.shared.base import toml
 from skytether.shared.base.errors import ConfigError
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.shell.commandline import plugins
 from skytether.shell.commandline.argument import HELP_KEYS, argument_of, hints_of
 

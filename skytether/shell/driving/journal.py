@@ -21,7 +21,7 @@ from skytether.shared.endpoints.endpoint import Endpoint
 from skytether.shared.events.flight import Event
 from skytether.shared.events.processes import SettingsRecalled
 from skytether.shared.scenario import reading
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.shell.commandline.command import CONFIGURATION, CommandError
 
 SUFFIX = ".set"

@@ -21,7 +21,7 @@ from skytether.shared.endpoints.stopwatch import Stopwatch
 from skytether.shared.events.flight import Event, address_text
 from skytether.shared.events.processes import Counted, Listening, Measured, Plaintext
 from skytether.shared.scenario import reading, rooms
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.feed import Opened
 from skytether.shared.telemetry.record import RECORDING, Recorder
 from skytether.shell.commandline import command

@@ -13,7 +13,7 @@ from pathlib import Path
 import msgspec
 
 from skytether.shared.scenario.reading import to_toml
-from skytether.shared.scenario.schema import Scenario
+from skytether.shared.scenario.whole import Scenario
 from skytether.shell.commandline import plugins
 from skytether.shell.host import temporary
 

@@ -6,8 +6,8 @@ vehicle over the stated ones, see `client.fence`.
 
 import math
 
-from skytether.shared.law.model import ALTITUDE
-from skytether.shared.scenario.schema import FenceConfig, Scenario
+from skytether.shared.fence.keys import FenceConfig
+from skytether.shared.scenario.schema import Scenario
 
 SLOW_STEPS = 2
 """Steps by which the fence's time constant T exceeds the vehicle's."""
@@ -19,15 +19,9 @@ LATER_S = 0.1
 """Largest excess of the vehicle's dead time over the model's."""
 
 
-def is_home_inside(fence: FenceConfig) -> bool:
-    """Whether home (0, 0) is inside the fence, in the horizontal plane."""
-    low = all(each <= 0.0 for each in fence.low_m[:ALTITUDE])
-    return low and all(each >= 0.0 for each in fence.high_m[:ALTITUDE])
-
-
 def margins(scenario: Scenario) -> list[float]:
     """Margin of the bounds on each axis, and as last item that of `fence.radius_m` [m]."""
-    terms, fence, dt = scenario.terms(), scenario.fence, scenario.control.dt
+    terms, fence, dt = scenario.terms(), scenario.section(FenceConfig), scenario.control.dt
     fastest = fence.speed_mps or math.inf
     blown = [
         WEAK * fence.wind_mps * (tau + SLOW_STEPS * dt + late + LATER_S + dt)
@@ -45,7 +39,7 @@ def inner_bounds(scenario: Scenario) -> tuple[list[float], list[float], float]:
 
     A bound that the fence lacks is infinite.
     """
-    fence, (*drawn, around) = scenario.fence, margins(scenario)
+    fence, (*drawn, around) = scenario.section(FenceConfig), margins(scenario)
     axes = len(drawn)
     low = [each + m for each, m in zip(fence.low_m, drawn, strict=False)] or [-math.inf] * axes
     high = [each - m for each, m in zip(fence.high_m, drawn, strict=False)] or [math.inf] * axes

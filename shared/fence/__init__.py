@@ -1,0 +1,1 @@
+"""Fence: bounds that a vehicle does not leave, whatever inputs it receives; see `client.fence`."""

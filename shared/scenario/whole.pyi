@@ -1,0 +1,15 @@
+from skytether.client.mavlink.keys import MavlinkConfig
+from skytether.client.ros2.keys import Ros2Config
+from skytether.shared.fence.keys import FenceConfig
+from skytether.shared.missions.keys import MissionConfig
+from skytether.shared.scenario import schema
+from skytether.shared.scenario.registry import Files
+
+class Scenario(schema.Scenario, frozen=True):
+    fence: FenceConfig = FenceConfig()
+    mission: MissionConfig = MissionConfig()
+    mavlink: MavlinkConfig = MavlinkConfig()
+    ros2: Ros2Config = Ros2Config()
+
+class WithFiles(Scenario, frozen=True):
+    contents: Files = ()
