@@ -89,7 +89,7 @@ format: setup  ## format the code as `check` wants it
 dist: $(UV)  ## the wheel and the source distribution, in dist/
 	$(BIN)/python -m hatchling build
 
-keys: setup  ## docs/keys.md, from the keys in shared/scenario/schema.py
+keys: setup  ## docs/keys.md, from the sections of a scenario
 	$(BIN)/python -m skytether.lab.keys_document > docs/keys.md
 
 # Open site/index.html; its search works only through a server, as of `python -m http.server -d site`.

@@ -1,9 +1,10 @@
 """Keys of a scenario: everything about a flight, typed and frozen.
 
-A key is defined here alone: name, owner (`owners.py`), type with bounds, default, and a description
-with its unit in brackets. The description appears in `--help` and in docs/keys.md, which `make
-keys` writes. A `Term` is used by both ends: it has a field in `shared/law/terms.py: Terms`, which
-`Scenario.terms` fills in.
+A key is defined here, or in the module `keys` of the room that brings its section
+(`rooms.SECTIONS`; `whole.Scenario` has all of them), and nowhere else: name, owner (`owners.py`),
+type with bounds, default, and a description with its unit in brackets. The description appears in
+`--help` and in docs/keys.md, which `make keys` writes. A `Term` is used by both ends: it has a
+field in `shared/law/terms.py: Terms`, which `Scenario.terms` fills in.
 
 `reading.py` reads a scenario from its TOML file, and `contradictions.py` finds values that are each
 valid, but not together.
@@ -311,6 +312,8 @@ class PathConfig(Section, frozen=True):
 
 
 class NetworkConfig(Section, frozen=True):
+    """Network between server and vehicle, as netem emulates it."""
+
     uplink: OfImpairment[Direction] = "paper(0.4, 0.02, 2.0) & loss(0.1)"
     """Impairments from server to vehicle, combined with &, see `skytether impairments`. An argument
     is also a key: `network.uplink.loss = 0.3`."""
@@ -373,6 +376,8 @@ class LinkConfig(Section, frozen=True):
 
 
 class SimulationConfig(Section, frozen=True):
+    """Computers and clocks in virtual time."""
+
     compute_s: OfVirtualTime[Duration] = 0.001
     """Computing time of the server for a step [s]."""
     clock_offset_s: OfVirtualTime[Annotated[float, Meta(ge=-1e9, le=1e9)]] = 0.0
@@ -389,7 +394,7 @@ S = TypeVar("S", bound=Section)
 
 
 class Scenario(Section, frozen=True):
-    """Scenario: all keys of a flight. `shared.scenario.whole` has it with the sections of rooms."""
+    """Scenario: all keys of a flight."""
 
     title: OfEach[str] = ""
     """Title in one line."""

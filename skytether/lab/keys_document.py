@@ -1,4 +1,4 @@
-"""Text of docs/keys.md, made from `shared/scenario/schema.py`; `make keys` writes it.
+"""Text of docs/keys.md, made from the sections of a scenario; `make keys` writes it.
 
 A key's meaning is its docstring there, as in `--help`; its unit stands in the docstring's brackets.
 """
@@ -18,7 +18,8 @@ from skytether.shared.scenario.whole import Scenario
 HEAD = """# Keys of a scenario
 
 Every key that a scenario's file may have; each is also a flag of every command that flies. This
-page is for looking up; `make keys` makes it from `shared/scenario/schema.py`.
+page is for looking up; `make keys` makes it from the sections of `shared/scenario/schema.py` and of
+rooms.
 
 - **Values** are written as in TOML, with the unit in brackets; bounds of a list hold for each of
   its numbers.
