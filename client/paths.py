@@ -8,8 +8,9 @@ from skytether.shared.endpoints.endpoint import Address, Datagram, Events
 from skytether.shared.events.flight import address_text
 from skytether.shared.events.paths import PathDied, PathHealed
 from skytether.shared.wire.framing import Report
+from skytether.shared.wire.path_proof import PathProof
 from skytether.shared.wire.paths import Paths
-from skytether.shared.wire.protocol import Message, PathProof, encode
+from skytether.shared.wire.protocol import Message, encode
 
 
 class SeveralPaths(Way):

@@ -20,7 +20,8 @@ from skytether.shared.law.heartbeat import SESSION_NS
 from skytether.shared.law.terms import Difference
 from skytether.shared.scenario.catalogue import differences
 from skytether.shared.telemetry.record import Reason
-from skytether.shared.wire.protocol import Lead, Message
+from skytether.shared.wire.lead import Lead
+from skytether.shared.wire.protocol import Message
 
 SOON_NS = 200 * MILLISECOND_NS
 """Time after which a server that has to lead is told again that it does [ns]."""

@@ -28,16 +28,16 @@ from skytether.shared.scenario.catalogue import differences
 from skytether.shared.telemetry.record import Reason
 from skytether.shared.wire.drop import Drop, ProtocolError
 from skytether.shared.wire.framing import EVERYWHERE, split
+from skytether.shared.wire.lead import Lead
+from skytether.shared.wire.path_proof import PathProof
 from skytether.shared.wire.protocol import (
     Close,
     Heartbeat,
     Hello,
     Horizon,
     Idle,
-    Lead,
     Message,
     Observation,
-    PathProof,
     Refusal,
     Time,
     Trajectory,

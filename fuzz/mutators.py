@@ -9,6 +9,8 @@ import msgpack
 import numpy as np
 
 from skytether.shared.law.terms import Terms
+from skytether.shared.wire.lead import Lead
+from skytether.shared.wire.path_proof import PathProof
 from skytether.shared.wire.protocol import (
     FEEDBACK,
     NO_INPUT,
@@ -16,10 +18,8 @@ from skytether.shared.wire.protocol import (
     Heartbeat,
     Hello,
     Horizon,
-    Lead,
     Message,
     Observation,
-    PathProof,
     Time,
     Trajectory,
     Welcome,

@@ -40,7 +40,8 @@ from skytether.shared.law.terms import Terms
 from skytether.shared.scenario.reference import Reference
 from skytether.shared.scenario.registry import load
 from skytether.shared.scenario.schema import ControlConfig, Scenario
-from skytether.shared.wire.protocol import Idle, Lead, Observation, committed_max
+from skytether.shared.wire.lead import Lead
+from skytether.shared.wire.protocol import Idle, Observation, committed_max
 
 if TYPE_CHECKING:
     from skytether.server.budget import SharedBudget

@@ -17,8 +17,9 @@ from skytether.shared.events.flight import address_text
 from skytether.shared.events.paths import PathDied, PathHealed
 from skytether.shared.wire.drop import Drop, ProtocolError
 from skytether.shared.wire.framing import Report
+from skytether.shared.wire.path_proof import PathProof
 from skytether.shared.wire.paths import Paths
-from skytether.shared.wire.protocol import Message, PathProof, encode
+from skytether.shared.wire.protocol import Message, encode
 
 PLACES = 2
 """Number of addresses of a path that are in use at once."""

@@ -38,14 +38,14 @@ from skytether.shared.scenario.registry import load
 from skytether.shared.scenario.schema import LinkConfig
 from skytether.shared.wire.drop import Drop, ProtocolError
 from skytether.shared.wire.framing import Report, split
+from skytether.shared.wire.lead import Lead
+from skytether.shared.wire.path_proof import PathProof
 from skytether.shared.wire.protocol import (
     Close,
     Hello,
     Idle,
-    Lead,
     Message,
     Observation,
-    PathProof,
     Refusal,
     Time,
     Welcome,

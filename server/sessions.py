@@ -23,7 +23,9 @@ from skytether.shared.law.heartbeat import NUMBERS, SESSION_NS, Hearing
 from skytether.shared.law.model import Indices
 from skytether.shared.law.terms import Limits
 from skytether.shared.wire.drop import Drop, ProtocolError
-from skytether.shared.wire.protocol import Close, Hello, Lead, Observation, PathProof, Time
+from skytether.shared.wire.lead import Lead
+from skytether.shared.wire.path_proof import PathProof
+from skytether.shared.wire.protocol import Close, Hello, Observation, Time
 
 InSession = Observation | Close | Time | PathProof | Lead
 """Messages of a vehicle in a session."""

@@ -24,7 +24,8 @@ from skytether.shared.events.flight import (
 from skytether.shared.law.model import Array
 from skytether.shared.telemetry.histogram import Histogram
 from skytether.shared.telemetry.record import Compared, Recorder
-from skytether.shared.wire.protocol import Heartbeat, Idle, encode, led, stamp_us
+from skytether.shared.wire.lead import led
+from skytether.shared.wire.protocol import Heartbeat, Idle, encode, stamp_us
 
 MISSES_MAX = 5
 """Number of ticks that may be missed in a second before the server reports itself as degraded."""

@@ -5,7 +5,7 @@ this server leads, and was observed since (docs/together.md, Two servers).
 """
 
 from skytether.shared.law.model import Indices
-from skytether.shared.wire.protocol import Lead
+from skytether.shared.wire.lead import Lead
 
 
 class LedVehicles:

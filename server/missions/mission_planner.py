@@ -59,7 +59,8 @@ from skytether.shared.missions.mission import Guided, parse_goals
 from skytether.shared.missions.zones import Zones
 from skytether.shared.scenario.catalogue import keys_of
 from skytether.shared.scenario.schema import Scenario
-from skytether.shared.wire.protocol import KNOTS_MAX, Lead, Observation
+from skytether.shared.wire.lead import Lead
+from skytether.shared.wire.protocol import KNOTS_MAX, Observation
 
 RESTS_MPS = 0.2
 """Measured speed below which a vehicle counts as at rest [m/s]."""

@@ -26,7 +26,8 @@ from skytether.shared.missions.keys import MissionConfig
 from skytether.shared.missions.mission import Mission
 from skytether.shared.scenario.reference import Reference
 from skytether.shared.scenario.schema import Scenario
-from skytether.shared.wire.protocol import NO_HORIZON, Lead, Mode, Observation
+from skytether.shared.wire.lead import Lead
+from skytether.shared.wire.protocol import NO_HORIZON, Mode, Observation
 
 LONGEST = (INTERVALS + JOIN_MAX) * SPACING
 """Largest duration of a motion [steps]."""

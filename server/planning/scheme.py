@@ -22,7 +22,8 @@ from skytether.shared.law.terms import Limits, Terms
 from skytether.shared.scenario.reference import Reference
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.scenario.schemes import SchemeProperties
-from skytether.shared.wire.protocol import FEEDBACK, KNOTS_MAX, Lead, Observation
+from skytether.shared.wire.lead import Lead
+from skytether.shared.wire.protocol import FEEDBACK, KNOTS_MAX, Observation
 
 
 class Splines(NamedTuple):

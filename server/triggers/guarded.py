@@ -49,9 +49,9 @@ class Guarded(Trigger):
         try:
             verdict = self._inner.test(Situation._make((*views, arrays)))
             return Verdict(
-                _column(verdict.event, np.bool_, len(rows)),
-                _column(verdict.figure, np.float64, len(rows)),
-                _column(verdict.threshold, np.float64, len(rows)),
+                column(verdict.event, np.bool_, len(rows)),
+                column(verdict.figure, np.float64, len(rows)),
+                column(verdict.threshold, np.float64, len(rows)),
                 Compared(verdict.compared),
             )
         except Exception as error:
@@ -80,7 +80,7 @@ def _read_only(array: NDArray[Any]) -> NDArray[Any]:
     return view
 
 
-def _column(values: Any, kind: type[np.generic], n: int) -> NDArray[Any]:
+def column(values: Any, kind: type[np.generic], n: int) -> NDArray[Any]:
     """Values of n vehicles as an array of a type; shape (n,).
 
     Raises:

@@ -82,12 +82,12 @@ class Terms(NamedTuple):
     loop: bool
     table: str
     """Digest of the content of the trajectory's CSV file."""
-    separation_m: float
+    separation_m: float = 0.5
     """Distance that vehicles of a mission keep [m]. Like the next two it is for the servers: two
     servers of one vehicle plan with the same."""
-    height_m: float
+    height_m: float = 0.0
     """Distance that they keep above one another [m]; 0: `separation_m`."""
-    tube_m: float
+    tube_m: float = 0.15
     """Largest distance of a vehicle from its motion [m]."""
 
     @property

@@ -32,8 +32,9 @@ import math
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from enum import IntEnum
+from importlib import import_module
 from struct import Struct
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any, NamedTuple, Protocol
 
 import msgpack
 import msgspec
@@ -44,9 +45,8 @@ from numpy.typing import NDArray
 from skytether.shared.base.units import MICROSECOND_NS
 from skytether.shared.law.heartbeat import NUMBERS
 from skytether.shared.law.model import Array
-from skytether.shared.law.terms import Limits, Terms
+from skytether.shared.law.terms import Terms
 from skytether.shared.wire.drop import Drop, ProtocolError
-from skytether.shared.wire.framing import PATHS_MAX
 
 # Below 0x80, so that msgpack writes it in one byte: `kind_of` and the quick decoder rely on that.
 VERSION = 1
@@ -284,50 +284,6 @@ class Time(NamedTuple):
     """Largest error of `epoch_us` [µs]."""
 
 
-class PathProof(NamedTuple):
-    """PATH: names the path that it takes. The server answers with a proof, and sends on the path
-    once the client has returned the proof on it.
-    """
-
-    vehicle: int
-    session: int
-    path: int
-    """Number of the path, from 0."""
-    proof: int
-    """Number that the server sends only to the address to be proven; 0 from a client that has not
-    received it."""
-    prices: tuple[int, ...]
-    """Price of a packet on each path of the session, in thousandths of the least."""
-
-
-class Lead(NamedTuple):
-    """LEAD: which of its servers leads a vehicle. The server answers with the same number, and with
-    the largest that any vehicle of its mission has told it.
-    """
-
-    vehicle: int
-    session: int
-    number: int
-    """Number of the leadership, which only rises; a plan of another number is not flown."""
-    leads: int
-    """1 if the server of this session leads the vehicle with that number, else 0."""
-    known: int = 0
-    """Largest number that the server has been told; 0 from a vehicle."""
-    step: int = 0
-    """Step k in which the vehicle sends, on its grid; from a server, that of the newest LEAD from
-    the vehicle. The next three fields are empty from a server."""
-    in_force: int | None = None
-    """Step that the motion in force was made for; None without one."""
-    spacing: int = 0
-    """Steps from one knot of that motion to the next."""
-    knots: NDArray[np.float32] | bytes = b""
-    """Position [m] and velocity [m/s] of each knot; shape (axes, knots, 2)."""
-    limits: Limits | None = None
-    """Limits of the server's motions; None from a vehicle, or without a mission."""
-    changes: int = 0
-    """Number of changes of these limits in the server's run."""
-
-
 # With 10 % loss, all three are lost once in a thousand times.
 CLOSES = 3
 
@@ -349,37 +305,38 @@ def stamped_ns(stamp: int, near_ns: int) -> int:
     return (near + (stamp - near + half) % STAMPS - half) * MICROSECOND_NS
 
 
+class RoomMessage(Protocol):
+    """Message that a room brings by `add`: a `NamedTuple` that begins with these."""
+
+    @property
+    def vehicle(self) -> int: ...
+
+    @property
+    def session(self) -> int: ...
+
+
 Message = (
-    Hello
-    | Welcome
-    | Observation
-    | Horizon
-    | Heartbeat
-    | Close
-    | Trajectory
-    | Time
-    | PathProof
-    | Lead
+    Hello | Welcome | Observation | Horizon | Heartbeat | Close | Trajectory | Time | RoomMessage
 )
 
 
-class _OrNone(NamedTuple):
+class OrNone(NamedTuple):
     """Check of a field that is empty or one of these integers."""
 
     integers: range
 
 
-_Check = range | _OrNone | Callable[[object, Terms], object]
+Check = range | OrNone | Callable[[object, Terms], object]
 """Range of an integer field, or a function that converts or refuses the received value."""
 
 
-def _checked(values: list[object], checks: tuple[_Check, ...], terms: Terms) -> list[object]:
+def _checked(values: list[object], checks: tuple[Check, ...], terms: Terms) -> list[object]:
     for i, check in enumerate(checks):
         if type(check) is range:
             # `type`, not `isinstance`: True is not an integer on this wire.
             if type(values[i]) is not int or values[i] not in check:
                 raise ProtocolError(Drop.FIELD)
-        elif isinstance(check, _OrNone):
+        elif isinstance(check, OrNone):
             if values[i] is not None:
                 _checked(values[i : i + 1], (check.integers,), terms)
         else:
@@ -393,22 +350,12 @@ def _terms(value: object, ours: Terms) -> Terms:
         raise ProtocolError(Drop.FIELD)
     for theirs, our in zip(value, ours, strict=True):
         # Exact types: otherwise True would pass for 1, and 1 for 1.0.
-        if type(theirs) is not type(our) or not _is_plain(theirs):
+        if type(theirs) is not type(our) or not is_plain(theirs):
             raise ProtocolError(Drop.FIELD)
     return Terms._make(value)
 
 
-def _limits(value: object, ours: Terms) -> Limits | None:  # noqa: ARG001
-    if value is None:
-        return None
-    if type(value) is not tuple or tuple(map(type, value)) != (float, float, float, str):
-        raise ProtocolError(Drop.FIELD)
-    if not all(map(_is_plain, value)):
-        raise ProtocolError(Drop.FIELD)
-    return Limits._make(value)
-
-
-def _is_plain(value: object) -> bool:
+def is_plain(value: object) -> bool:
     """Whether a term is a finite number, a short text, a flag, or a number per axis."""
     match value:
         case float():
@@ -463,7 +410,7 @@ def _feedback(value: object, ours: Terms) -> NDArray[np.float32]:
     return feedback
 
 
-def _knots(value: object, ours: Terms) -> NDArray[np.float32]:
+def knots_in(value: object, ours: Terms) -> NDArray[np.float32]:
     if not ours.splines:
         raise ProtocolError(Drop.TYPE)
     numbers = _array(value, _FLOAT32, ours.axes, (2, 2 * KNOTS_MAX))
@@ -472,18 +419,6 @@ def _knots(value: object, ours: Terms) -> NDArray[np.float32]:
     if not all(map(math.isfinite, numbers.ravel().tolist())):
         raise ProtocolError(Drop.NOT_FINITE)
     return numbers.reshape(ours.axes, -1, 2)
-
-
-def _knots_or_none(value: object, ours: Terms) -> NDArray[np.float32]:
-    return _knots(value, ours) if value != b"" else np.empty((ours.axes, 0, 2), np.float32)
-
-
-def _prices(value: object, ours: Terms) -> tuple[int, ...]:  # noqa: ARG001
-    if type(value) is not tuple or not 2 <= len(value) <= PATHS_MAX:
-        raise ProtocolError(Drop.FIELD)
-    if not all(type(price) is int and price in PRICE for price in value):
-        raise ProtocolError(Drop.FIELD)
-    return value
 
 
 def committed_max(terms: Terms) -> int:
@@ -504,11 +439,10 @@ def _array(value: object, dtype: np.dtype[Any], axes: int, counts: tuple[int, in
 
 _FLOAT32 = np.dtype("<f4")
 _FLOATS = {count: Struct(f"<{count}f") for count in range(1, 3 * AXES_MAX + 1)}
-_FLAG = range(2)
-_U16 = range(2**16)
-_U31, _U32 = range(2**31), range(2**32)
-_U64 = range(2**64)
-PRICE = range(1, 10**9)
+FLAG = range(2)
+U16 = range(2**16)
+U31, U32 = range(2**31), range(2**32)
+U64 = range(2**64)
 _CLOCK = range(2**63)
 _STAMP = range(STAMPS)
 _NUMBER = range(NUMBERS)
@@ -519,39 +453,33 @@ _SPACING = range(1, 2**16)
 _DOES = 2 * len(Mode)
 """Number of pairs of an observation's mode and `takes`."""
 
-_TYPES: tuple[tuple[type[Message], tuple[_Check, ...]], ...] = (
-    (Hello, (_U16, _U64, _terms)),
-    (Welcome, (_U16, _U32, _U64, _U64, _CLOCK, range(len(Refusal)), _terms)),
-    (
+_TYPES: dict[int, tuple[type[Any], tuple[Check, ...]]] = {
+    1: (Hello, (U16, U64, _terms)),
+    2: (Welcome, (U16, U32, U64, U64, _CLOCK, range(len(Refusal)), _terms)),
+    3: (
         Observation,
         (
-            *(_U16, _U32, _U32, _AGE, _OrNone(_AGE), _STAMP, _NUMBER),
-            *(range(2 * _DOES), _motion, _NUMBER, _U16),
+            *(U16, U32, U32, _AGE, OrNone(_AGE), _STAMP, _NUMBER),
+            *(range(2 * _DOES), _motion, _NUMBER, U16),
         ),
     ),
-    (Horizon, (_U16, _U32, _U32, _STAMP, _AGE, _inputs, _feedback, _NUMBER, _U16, _U32)),
-    (Heartbeat, (_U16, _U32, _STAMP, range(len(Idle)), _FLAG, _NUMBER, _U16)),
-    (Close, (_U16, _U32)),
-    (Trajectory, (_U16, _U32, _U32, _STAMP, _AGE, _SPACING, _knots, _NUMBER, _U16, _U32)),
-    (Time, (_U16, _U32, _U32, _STAMP, _U32)),
-    (PathProof, (_U16, _U32, range(PATHS_MAX), _U64, _prices)),
-    (
-        Lead,
-        (
-            *(_U16, _U32, _U32, _FLAG, _U32, _U31, _OrNone(_U31), range(2**16)),
-            *(_knots_or_none, _limits, _U31),
-        ),
-    ),
-)
+    4: (Horizon, (U16, U32, U32, _STAMP, _AGE, _inputs, _feedback, _NUMBER, U16, U32)),
+    5: (Heartbeat, (U16, U32, _STAMP, range(len(Idle)), FLAG, _NUMBER, U16)),
+    6: (Close, (U16, U32)),
+    7: (Trajectory, (U16, U32, U32, _STAMP, _AGE, _SPACING, knots_in, _NUMBER, U16, U32)),
+    8: (Time, (U16, U32, U32, _STAMP, U32)),
+}
 """Message of each type number (from 1) and the check of each of its fields on the wire."""
+_ROOMS = {9: "skytether.shared.wire.path_proof", 10: "skytether.shared.wire.lead"}
+"""Modules of rooms that add the message of a type number, imported with the first such message."""
 
 _OBSERVATION = 3
 """Type number of the message that a server receives most."""
-_FIELDS = _TYPES[_OBSERVATION - 1][1]
+_FIELDS = _TYPES[_OBSERVATION][1]
 
 
-def _kind(check: _Check) -> Any:
-    if isinstance(check, _OrNone):
+def _kind(check: Check) -> Any:
+    if isinstance(check, OrNone):
         return _kind(check.integers) | None
     return Annotated[int, Meta(ge=check[0], le=check[-1])] if isinstance(check, range) else bytes
 
@@ -564,7 +492,14 @@ _MADE = [(i, check) for i, check in enumerate(_FIELDS) if callable(check)]
 # 0x90 + n is msgpack's header of an array of n < 16 elements.
 _QUICK_START = bytes([0x90 | (2 + len(_FIELDS)), VERSION, _OBSERVATION])
 
-_NUMBERS = {message: number for number, (message, _) in enumerate(_TYPES, start=1)}
+_NUMBERS = {message: number for number, (message, _) in _TYPES.items()}
+
+
+def add(number: int, message: type[Any], checks: tuple[Check, ...]) -> None:
+    """Add the message of a room, and the check of each of its fields on the wire."""
+    _TYPES[number], _NUMBERS[message] = (message, checks), number
+
+
 # One packer for all messages: packb makes one for each, and takes three times as long.
 _PACKER = msgpack.Packer(default=np.ndarray.tobytes)
 
@@ -629,17 +564,11 @@ def encode(message: Message) -> bytes:
     if type(message) is Observation:
         payload: bytes = _PACKER.pack(_observation_fields(message))
     else:
-        fields = message[: -1 if _is_plain_plan(message) else None]
+        values: Any = message
+        fields = values[: -1 if _is_plain_plan(message) else None]
         payload = _PACKER.pack([VERSION, _NUMBERS[type(message)], *fields])
     assert len(payload) <= PAYLOAD_BYTES_MAX
     return payload
-
-
-def led(number: int, plan: bytes) -> bytes:
-    """Encoded plan with the number of its leadership as a last field; 0 is left out."""
-    if not number:
-        return plan
-    return bytes([plan[0] + 1]) + plan[1:] + msgpack.packb(number)  # an array of one element more
 
 
 def encode_horizon(
@@ -698,12 +627,20 @@ def decode(payload: bytes, terms: Terms) -> Message:
     version, number, *body = fields
     if type(version) is not int or version != VERSION:
         raise ProtocolError(Drop.VERSION)
-    if type(number) is not int or not 1 <= number <= len(_TYPES):
+    if type(number) is not int or not (number in _TYPES or _is_of_a_room(number)):
         raise ProtocolError(Drop.TYPE)
-    message, checks = _TYPES[number - 1]
+    message, checks = _TYPES[number]
     if message in (Horizon, Trajectory) and len(body) == len(checks) - 1:
         body.append(0)
     if len(body) != len(checks):
         raise ProtocolError(Drop.NOT_A_MESSAGE)
     fields = _checked(body, checks, terms)
     return _observation(fields) if message is Observation else message._make(fields)
+
+
+def _is_of_a_room(number: int) -> bool:
+    """Whether an installed room has a message of this number, which is loaded then."""
+    if module := _ROOMS.pop(number, ""):
+        with suppress(ModuleNotFoundError):
+            import_module(module)
+    return number in _TYPES

@@ -34,7 +34,8 @@ from skytether.shared.missions.mission import Mission
 from skytether.shared.missions.zones import Zones
 from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.summary import Track, nearest
-from skytether.shared.wire.protocol import Lead, Observation, decode, encode
+from skytether.shared.wire.lead import Lead
+from skytether.shared.wire.protocol import Observation, decode, encode
 from skytether.sim.flight import SERVER, STANDBY
 
 BASE_NS = 50 * MILLISECOND_NS

@@ -30,15 +30,8 @@ from skytether.shared.scenario.gain import regulator
 from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import Recorder, client_columns
 from skytether.shared.wire.framing import split
-from skytether.shared.wire.protocol import (
-    NO_HORIZON,
-    Horizon,
-    Lead,
-    Mode,
-    Trajectory,
-    decode,
-    kind_of,
-)
+from skytether.shared.wire.lead import Lead
+from skytether.shared.wire.protocol import NO_HORIZON, Horizon, Mode, Trajectory, decode, kind_of
 
 WELCOME, OBSERVATION, HORIZON, HEARTBEAT, TRAJECTORY, LEAD = 2, 3, 4, 5, 7, 10
 """Message types on the wire, see `shared.wire.protocol`."""

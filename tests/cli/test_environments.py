@@ -97,7 +97,7 @@ def test_streams_that_were_closed_are_there_for_children_too(tmp_path: Path) -> 
         f"pathlib.Path({str(file)!r}).write_text(' '.join(names))"
     )
     code = (
-        "import subprocess, sys; from skytether.shell import start; start.begin(); "
+        "import subprocess, sys; from skytether.shell.commandline import start; start.begin(); "
         f"subprocess.run([sys.executable, '-c', {child!r}], check=True)"
     )
     line = f"{shlex.join([sys.executable, '-P', '-c', code])} <&- >&- 2>&-"

@@ -34,7 +34,13 @@ HEAVY = {
     "viser",
     "websockets",
 }
-EXTRAS = {"importlib.metadata", "mcap", "prometheus_client", "skytether.server"}
+EXTRAS = {
+    "importlib.metadata",
+    "mcap",
+    "prometheus_client",
+    "skytether.server.endpoint",
+    "skytether.server.planning",
+}
 """Modules that cost memory and time before the first packet, and that only some options need."""
 COMPILER = {"scipy.linalg", "numba.np.linalg"}
 """Modules that numba imports to compile, but not to load compiled code."""

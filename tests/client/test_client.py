@@ -25,6 +25,7 @@ from skytether.shared.law.terms import Difference
 from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import Reason
 from skytether.shared.wire.drop import Drop
+from skytether.shared.wire.path_proof import PathProof
 from skytether.shared.wire.paths import Paths
 from skytether.shared.wire.protocol import (
     NO_HORIZON,
@@ -34,7 +35,6 @@ from skytether.shared.wire.protocol import (
     Idle,
     Message,
     Observation,
-    PathProof,
     Refusal,
     Welcome,
     encode,

@@ -18,11 +18,11 @@ from skytether.shared.events.standby import LeaderChanged
 from skytether.shared.law.terms import Limits
 from skytether.shared.scenario.whole import Scenario
 from skytether.shared.wire.drop import Drop
+from skytether.shared.wire.lead import Lead
 from skytether.shared.wire.protocol import (
     Close,
     Heartbeat,
     Horizon,
-    Lead,
     Message,
     Observation,
     Refusal,

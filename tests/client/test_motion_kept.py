@@ -20,14 +20,14 @@ from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
 from skytether.shared.events.flight import Leaving
 from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import Reason, Rows
+from skytether.shared.wire.lead import Lead
+from skytether.shared.wire.path_proof import PathProof
 from skytether.shared.wire.protocol import (
     Close,
     Heartbeat,
     Idle,
-    Lead,
     Mode,
     Observation,
-    PathProof,
     Refusal,
     Trajectory,
     stamp_us,

@@ -18,7 +18,8 @@ from skytether.shared.law.motion import SPACING, Motion, resting
 from skytether.shared.missions.mission import Mission
 from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.summary import nearest
-from skytether.shared.wire.protocol import NO_HORIZON, Lead
+from skytether.shared.wire.lead import Lead
+from skytether.shared.wire.protocol import NO_HORIZON
 from skytether.sim.flight import SERVER, STANDBY
 from two_vehicles import along, ready
 

@@ -89,9 +89,9 @@ def test_the_impairments_are_parsed_once_not_for_each_flow(monkeypatch: pytest.M
     for client in (ALICE, BOB):
         pass_on(proxy, b"?", client)
     parsed: list[str] = []
-    path_of = Proxy.path
+    impairments_of = Proxy.impairments
     monkeypatch.setattr(
-        Proxy, "path", lambda self, name: parsed.append(name) or path_of(self, name)
+        Proxy, "impairments", lambda self, name: parsed.append(name) or impairments_of(self, name)
     )
     proxy.change(changed._scenario, frozenset({"network.downlink"}), now_ns=0)
     for client in (ALICE, BOB, CAROL):

@@ -10,6 +10,7 @@ from skytether.shared.base.units import SECOND_NS
 from skytether.shared.endpoints.endpoint import Address, Datagram
 from skytether.shared.wire.drop import Drop
 from skytether.shared.wire.framing import split
+from skytether.shared.wire.path_proof import PathProof
 from skytether.shared.wire.paths import Paths
 from skytether.shared.wire.protocol import (
     NO_HORIZON,
@@ -17,7 +18,6 @@ from skytether.shared.wire.protocol import (
     Message,
     Mode,
     Observation,
-    PathProof,
     Welcome,
     decode,
     encode,

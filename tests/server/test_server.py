@@ -37,6 +37,7 @@ from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import Recorder, Rows, parse, server_columns
 from skytether.shared.wire.drop import Drop, ProtocolError
 from skytether.shared.wire.keys import Keyring
+from skytether.shared.wire.lead import Lead
 from skytether.shared.wire.protocol import (
     NO_HORIZON,
     NO_INPUT,
@@ -45,7 +46,6 @@ from skytether.shared.wire.protocol import (
     Hello,
     Horizon,
     Idle,
-    Lead,
     Message,
     Mode,
     Observation,

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 import skytether
 from skytether.server.planning.scheme import FIGURES, Figures
+from skytether.server.triggers.guarded import column
 from skytether.server.triggers.trigger import (
     Combined,
     Compared,
@@ -19,7 +20,6 @@ from skytether.server.triggers.trigger import (
     SituationArrays,
     Trigger,
     Verdict,
-    _column,
     make_trigger,
 )
 from skytether.shared.law.model import Flags, Indices, discretise
@@ -491,7 +491,7 @@ def test_batch_is_judged_as_its_singles(tree: Any, seed: int) -> None:
 
 def test_columns_of_a_plugin_reach_kernels_as_kernels_read_them() -> None:
     for values in (np.arange(3), np.arange(6.0)[::2], np.ones(3, dtype=np.float32), [1, 2, 3]):
-        column = _column(values, np.float64, 3)
-        assert (column.dtype, column.flags.c_contiguous) == (np.dtype(np.float64), True)
-        np.testing.assert_array_equal(column, values)
-    assert _column(np.ones(6, dtype=np.bool_)[::2], np.bool_, 3).flags.c_contiguous
+        made = column(values, np.float64, 3)
+        assert (made.dtype, made.flags.c_contiguous) == (np.dtype(np.float64), True)
+        np.testing.assert_array_equal(made, values)
+    assert column(np.ones(6, dtype=np.bool_)[::2], np.bool_, 3).flags.c_contiguous

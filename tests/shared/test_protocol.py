@@ -11,11 +11,12 @@ from hypothesis.extra.numpy import arrays
 
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
 from skytether.shared.law.heartbeat import NUMBERS, Hearing
-from skytether.shared.law.terms import Difference, Terms
+from skytether.shared.law.terms import Difference, Limits, Terms
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.catalogue import differences
 from skytether.shared.wire import protocol
 from skytether.shared.wire.drop import Drop, ProtocolError
+from skytether.shared.wire.lead import Lead, led
 from skytether.shared.wire.protocol import (
     FEEDBACK,
     INPUTS_MAX,
@@ -31,7 +32,6 @@ from skytether.shared.wire.protocol import (
     Hello,
     Horizon,
     Idle,
-    Lead,
     Message,
     Mode,
     Observation,
@@ -41,7 +41,6 @@ from skytether.shared.wire.protocol import (
     decode,
     encode,
     encode_horizon,
-    led,
     stamp_us,
     stamped_ns,
 )
@@ -115,6 +114,7 @@ def observed(draw: st.DrawFn, *, splines: bool = False) -> Observation:
     )
 
 
+limits = st.none() | st.builds(Limits, finite, finite, finite, text)
 observations = observed()
 messages: st.SearchStrategy[Message] = st.one_of(
     st.builds(Hello, u16, u64, terms),
@@ -148,6 +148,7 @@ messages: st.SearchStrategy[Message] = st.one_of(
         Lead,
         *(u16, u32, u32, st.integers(0, 1), u32, u31, st.none() | u31, u16),
         knots=st.just(np.empty((2, 0, 2))),
+        limits=limits,
         changes=u31,
     ),
 )
@@ -166,7 +167,7 @@ trajectories = st.builds(
     u32,
 )
 leads = st.builds(
-    Lead, u16, u32, u32, st.just(1), u32, u31, st.none() | u31, u16, knots, changes=u31
+    Lead, u16, u32, u32, st.just(1), u32, u31, st.none() | u31, u16, knots, limits, u31
 )
 along_splines = TERMS._replace(scheme="trajectory")
 
@@ -516,7 +517,7 @@ def test_random_bytes_are_refused_or_are_a_message(payload: bytes) -> None:
 
 def test_the_table_of_messages_is_complete() -> None:
     """Every message has as many checks as fields; an observation has three fewer on the wire."""
-    for message, checks in protocol._TYPES:
+    for message, checks in protocol._TYPES.values():
         # Mode, takes and unsaved are one number, and so are state and input.
         fewer = 3 if message is Observation else 0
         assert len(checks) == len(message._fields) - fewer

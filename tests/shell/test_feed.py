@@ -553,7 +553,7 @@ async def test_a_process_tells_its_readers_while_it_is_driven(tmp_path: Path) ->
     for opened, loss in ((before, 0.1), (after, 0.25)):
         assert isinstance(opened, Opened)
         assert (opened.process, opened.name) == ("netem", "demo")
-        scenario = msgspec.toml.decode(opened.scenario, type=schema.Scenario)
+        scenario = msgspec.toml.decode(opened.scenario, type=Scenario)
         assert scenario.uplink.loss == loss
     assert isinstance(before, Opened)
     columns = columns_of(before.parts["netem"])

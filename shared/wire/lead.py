@@ -1,0 +1,70 @@
+"""LEAD, the message that says which of its servers leads a vehicle, and the leadership of plans."""
+
+from typing import NamedTuple
+
+import msgpack
+import numpy as np
+from numpy.typing import NDArray
+
+from skytether.shared.law.terms import Limits, Terms
+from skytether.shared.wire.drop import Drop, ProtocolError
+from skytether.shared.wire.protocol import FLAG, U16, U31, U32, OrNone, add, is_plain, knots_in
+
+
+class Lead(NamedTuple):
+    """LEAD: which of its servers leads a vehicle. The server answers with the same number, and with
+    the largest that any vehicle of its mission has told it.
+    """
+
+    vehicle: int
+    session: int
+    number: int
+    """Number of the leadership, which only rises; a plan of another number is not flown."""
+    leads: int
+    """1 if the server of this session leads the vehicle with that number, else 0."""
+    known: int = 0
+    """Largest number that the server has been told; 0 from a vehicle."""
+    step: int = 0
+    """Step k in which the vehicle sends, on its grid; from a server, that of the newest LEAD from
+    the vehicle. The next three fields are empty from a server."""
+    in_force: int | None = None
+    """Step that the motion in force was made for; None without one."""
+    spacing: int = 0
+    """Steps from one knot of that motion to the next."""
+    knots: NDArray[np.float32] | bytes = b""
+    """Position [m] and velocity [m/s] of each knot; shape (axes, knots, 2)."""
+    limits: Limits | None = None
+    """Limits of the server's motions; None from a vehicle, or without a mission."""
+    changes: int = 0
+    """Number of changes of these limits in the server's run."""
+
+
+def led(number: int, plan: bytes) -> bytes:
+    """Encoded plan with the number of its leadership as a last field; 0 is left out."""
+    if not number:
+        return plan
+    return bytes([plan[0] + 1]) + plan[1:] + msgpack.packb(number)  # an array of one element more
+
+
+def _limits(value: object, ours: Terms) -> Limits | None:  # noqa: ARG001
+    if value is None:
+        return None
+    if type(value) is not tuple or tuple(map(type, value)) != (float, float, float, str):
+        raise ProtocolError(Drop.FIELD)
+    if not all(map(is_plain, value)):
+        raise ProtocolError(Drop.FIELD)
+    return Limits._make(value)
+
+
+def _knots_or_none(value: object, ours: Terms) -> NDArray[np.float32]:
+    return knots_in(value, ours) if value != b"" else np.empty((ours.axes, 0, 2), np.float32)
+
+
+add(
+    10,
+    Lead,
+    (
+        *(U16, U32, U32, FLAG, U32, U31, OrNone(U31), U16),
+        *(_knots_or_none, _limits, U31),
+    ),
+)

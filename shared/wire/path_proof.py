@@ -1,0 +1,37 @@
+"""PATH, the message by which a session's paths are named and proven."""
+
+from typing import NamedTuple
+
+from skytether.shared.law.terms import Terms
+from skytether.shared.wire.drop import Drop, ProtocolError
+from skytether.shared.wire.framing import PATHS_MAX
+from skytether.shared.wire.protocol import U16, U32, U64, add
+
+PRICE = range(1, 10**9)
+
+
+class PathProof(NamedTuple):
+    """PATH: names the path that it takes. The server answers with a proof, and sends on the path
+    once the client has returned the proof on it.
+    """
+
+    vehicle: int
+    session: int
+    path: int
+    """Number of the path, from 0."""
+    proof: int
+    """Number that the server sends only to the address to be proven; 0 from a client that has not
+    received it."""
+    prices: tuple[int, ...]
+    """Price of a packet on each path of the session, in thousandths of the least."""
+
+
+def _prices(value: object, ours: Terms) -> tuple[int, ...]:  # noqa: ARG001
+    if type(value) is not tuple or not 2 <= len(value) <= PATHS_MAX:
+        raise ProtocolError(Drop.FIELD)
+    if not all(type(price) is int and price in PRICE for price in value):
+        raise ProtocolError(Drop.FIELD)
+    return value
+
+
+add(9, PathProof, (U16, U32, range(PATHS_MAX), U64, _prices))
