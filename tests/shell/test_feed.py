@@ -27,7 +27,8 @@ from skytether.server.schemes import horizons
 from skytether.shared.endpoints.change import Running
 from skytether.shared.events.flight import Changed, Degraded, Event, Finished
 from skytether.shared.law.spline import along
-from skytether.shared.scenario import reading, schema
+from skytether.shared.scenario import reading
+from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.feed import (
     FRAME_BYTES_MAX,
     LENGTH_BYTES,
@@ -468,7 +469,7 @@ class Passing(Proxy):
         super().__init__(DEMO, server=("127.0.0.1", 1), recorder=recorder)
         self.recorder = recorder
 
-    def change(self, scenario: schema.Scenario, keys: frozenset[str], *, now_ns: int) -> None:
+    def change(self, scenario: Scenario, keys: frozenset[str], *, now_ns: int) -> None:
         super().change(scenario, keys, now_ns=now_ns)
         self.recorder.append(1, number=round(100 * scenario.uplink.loss))
         self.finished = scenario.uplink.loss == 1.0
