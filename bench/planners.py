@@ -21,7 +21,7 @@ from skytether.lab.intervals import interval
 from skytether.shared.endpoints.stopwatch import Stopwatch
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.dotted import set_keys
-from skytether.shared.scenario.planners import MPC
+from skytether.shared.scenario.registry import MPC
 from skytether.shared.telemetry.summary import summarise
 from skytether.shell.commandline import command, plugins
 from skytether.shell.commandline.plugins import Plugin

@@ -7,7 +7,7 @@ time: it answers a HELLO, and lets a server go on whose clock was set back.
 
 from typing import NamedTuple
 
-from skytether.shared.endpoints.steady import JUMP_NS
+from skytether.shared.base.units import JUMP_NS
 from skytether.shared.law.heartbeat import NUMBERS
 from skytether.shared.wire.drop import Drop, ProtocolError
 from skytether.shared.wire.protocol import stamped_ns

@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING
 
 from skytether.client.vehicle import Vehicle
 from skytether.shared.base.errors import ConfigError
-from skytether.shared.endpoints.line import Line, parse_line
 from skytether.shared.scenario.grammar import GrammarError
 from skytether.shared.scenario.registry import VEHICLES
 from skytether.shared.scenario.schema import Scenario
 
 if TYPE_CHECKING:
     from skytether.ros2.graph import Node
+    from skytether.shared.endpoints.line import Line
 
 vehicle = VEHICLES
 """Decorator that registers a vehicle: a function of the `Scenario` and its number that makes a
@@ -37,4 +37,6 @@ def connection(flies: Vehicle, scenario: Scenario) -> "Line | Node | None":
     """Connection of a vehicle's port, which becomes its process's socket 1; None without a port."""
     if flies.port is None:
         return None
+    from skytether.shared.endpoints.line import parse_line
+
     return flies.node or parse_line("vehicle.address", scenario.vehicle.address)

@@ -10,7 +10,7 @@ from typing import Literal
 
 import numpy as np
 
-from skytether.netem.impairments.delays import interpolated
+from skytether.netem.impairments.distributions import interpolated
 from skytether.netem.impairments.draws import Draws, Fate
 from skytether.netem.impairments.impairment import Impairment, impairment
 from skytether.netem.impairments.queues import (

@@ -15,7 +15,7 @@ from skytether.server.mpc.plugin_planners import InputPlanner
 from skytether.server.planning.scheme import Batch, Fleet, Foresight, Header, Scheme, SentPlans
 from skytether.shared.base.kernel import I1, I2, S1, S3, kernel
 from skytether.shared.law.model import Flags, Indices
-from skytether.shared.scenario.planners import MPC
+from skytether.shared.scenario.registry import MPC
 from skytether.shared.scenario.schemes import SchemeProperties
 from skytether.shared.wire.protocol import FEEDBACK, Observation, committed_max, encode_horizon
 

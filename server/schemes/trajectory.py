@@ -74,8 +74,7 @@ from skytether.shared.base.kernel import (
 from skytether.shared.law import spline
 from skytether.shared.law.model import Flags, Indices
 from skytether.shared.scenario.gain import regulator
-from skytether.shared.scenario.planners import MPC
-from skytether.shared.scenario.registry import load
+from skytether.shared.scenario.registry import MPC, load
 from skytether.shared.wire.protocol import KNOTS_MAX, NO_HORIZON, Observation, committed_max
 
 if TYPE_CHECKING:

@@ -9,3 +9,8 @@ HEADER_BYTES = 28
 
 def seconds_to_ns(seconds: float) -> int:
     return round(seconds * SECOND_NS)
+
+
+JUMP_NS = 60 * SECOND_NS
+"""Largest advance of a clock between two readings, or past a wake that is due; a larger one is a
+jump, see `shared.endpoints.steady`."""

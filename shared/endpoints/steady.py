@@ -13,14 +13,10 @@ If the host stalls, real time passes; a stall is no jump and is passed on unchan
 from collections.abc import Sequence
 from typing import Any
 
-from skytether.shared.base.units import SECOND_NS
+from skytether.shared.base.units import JUMP_NS
 from skytether.shared.endpoints.endpoint import Datagram, Endpoint
 from skytether.shared.events.flight import Event
 from skytether.shared.scenario.schema import Scenario
-
-JUMP_NS = 60 * SECOND_NS
-"""Largest advance of a clock between two readings, or past a wake that is due; a larger one is a
-jump."""
 
 
 class Steady(Endpoint):

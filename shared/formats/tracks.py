@@ -10,7 +10,8 @@ import numpy as np
 from skytether.shared import formats
 from skytether.shared.formats import Tracks
 from skytether.shared.formats.geographic import Origin
-from skytether.shared.scenario.reference import FAR_M, Reference, timed_path
+from skytether.shared.scenario.curves import timed_path
+from skytether.shared.scenario.reference import FAR_M, Reference
 
 
 @lru_cache(maxsize=2)  # each vehicle's reference needs them

@@ -12,8 +12,7 @@ from skytether.shared.missions.derived import clearances, lands, rest_scale, zon
 from skytether.shared.missions.keys import MissionConfig
 from skytether.shared.missions.mission import Mission, format_goals, parse_goals
 from skytether.shared.scenario.grammar import GrammarError
-from skytether.shared.scenario.planners import MPC
-from skytether.shared.scenario.registry import PLANNERS, TRIGGERS, PluginTable
+from skytether.shared.scenario.registry import MPC, PLANNERS, TRIGGERS, PluginTable
 from skytether.shared.scenario.schema import Contradiction, Scenario
 
 TINY = 1e-9

@@ -7,8 +7,8 @@ from itertools import pairwise
 from skytether.shared.scenario import reference as shapes
 from skytether.shared.scenario import rooms, schemes
 from skytether.shared.scenario.grammar import GrammarError, leaves
-from skytether.shared.scenario.planners import MPC
 from skytether.shared.scenario.registry import (
+    MPC,
     PLANNERS,
     REFERENCES,
     REPORTS,
@@ -133,12 +133,12 @@ def _no_scheme(scenario: Scenario) -> Iterator[Contradiction]:
 
 def _no_planner(scenario: Scenario) -> Iterator[Contradiction]:
     control = scenario.control
+    if control.planner == MPC:
+        return
     try:
         PLANNERS.one(control.planner)
     except GrammarError as error:
         yield "control.planner", repr(error.given), error.expected
-        return
-    if control.planner == MPC:
         return
     if not SCHEMES[schemes.call(control.scheme).name].is_ours:
         expected = f"{MPC!r} with control.scheme = {control.scheme!r}, which plans itself"

@@ -15,9 +15,6 @@ planner = PLANNERS
 """Decorator of a planner: a class of a `Problem` and its own numbers with the method `plan`, see
 `Planner`."""
 
-MPC = "mpc"
-"""The planner that the server has itself."""
-
 
 class Problem(NamedTuple):
     """What a planner is made from."""

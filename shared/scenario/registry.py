@@ -496,6 +496,8 @@ plug-in's is the class itself, called with a `server.planning.scheme.Fleet`. See
 PLANNERS = PluginTable("planner", "a planner such as 'mpc', or 'name(1.5)'", given=1, class_=1)
 """Planners of `control.planner`, called with a `planners.Problem`. See
 `shared.scenario.planners`."""
+MPC = "mpc"
+"""The planner that the server has itself."""
 VEHICLES = PluginTable(
     "vehicle", "a vehicle such as 'simulated', or 'name(1.5)'", given=2, class_=2
 )

@@ -10,6 +10,8 @@ from typing import Any
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.scenario.registry import (
     IMPAIRMENTS,
+    MPC,
+    PLANNERS,
     REFERENCES,
     REPORTS,
     TRIGGERS,
@@ -62,11 +64,12 @@ def impairments(text: str, files: Files) -> Any:
     return load(f"{NETEM}impairments.direction", "network.uplink").impairments(text, files)
 
 
-REFERENCES.offer(
-    f"{SHARED}scenario.trajectories", "circle", "figure-eight", "square", "waypoints", "hover"
-)
+REFERENCES.offer(f"{SHARED}scenario.trajectories", "circle")
+REFERENCES.offer(f"{SHARED}scenario.curves", "figure-eight", "square", "waypoints")
+REFERENCES.offer(f"{SHARED}scenario.trajectories", "hover")
 REFERENCES.offer(f"{SHARED}formats.shapes", "csv")
-REFERENCES.offer(f"{SHARED}scenario.trajectories", "target", "live")
+REFERENCES.offer(f"{SHARED}scenario.targets", "target")
+REFERENCES.offer(f"{SHARED}scenario.trajectories", "live")
 REFERENCES.offer(f"{SHARED}missions.shapes", "swap", "sphere")
 REFERENCES.offer(f"{SHARED}formats.shapes", "mission", "show")
 
@@ -89,19 +92,13 @@ VEHICLES.offer("skytether.client.simulated.vehicle", "simulated", "quadrotor")
 VEHICLES.offer("skytether.client.mavlink.kind", "mavlink")
 VEHICLES.offer("skytether.client.ros2.kind", "ros2")
 
-IMPAIRMENTS.offer(
-    f"{NETEM}impairments.delays", "constant", "paper", "uniform", "normal", "lognormal", "gamma"
-)
-IMPAIRMENTS.offer(
-    f"{NETEM}impairments.losses",
-    "none",
-    "loss",
-    "gilbert_elliott",
-    "outage",
-    "outages",
-    "duplicate",
-    "corrupt",
-)
+PLANNERS.offer(f"{SHARED}scenario.planners", MPC)
+
+IMPAIRMENTS.offer(f"{NETEM}impairments.delays", "constant", "paper")
+IMPAIRMENTS.offer(f"{NETEM}impairments.distributions", "uniform", "normal", "lognormal", "gamma")
+IMPAIRMENTS.offer(f"{NETEM}impairments.losses", "none", "loss")
+IMPAIRMENTS.offer(f"{NETEM}impairments.outages", "gilbert_elliott", "outage", "outages")
+IMPAIRMENTS.offer(f"{NETEM}impairments.damage", "duplicate", "corrupt")
 IMPAIRMENTS.offer(f"{NETEM}impairments.traces", "trace")
 IMPAIRMENTS.offer(f"{NETEM}impairments.queues", "ordered", "rate")
 IMPAIRMENTS.offer(f"{NETEM}impairments.traces", "deliveries")

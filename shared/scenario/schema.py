@@ -50,6 +50,7 @@ from skytether.shared.scenario.registry import (
     Entry,
     Files,
     file_of,
+    load,
 )
 from skytether.shared.scenario.schemes import SchemeProperties
 from skytether.shared.wire.framing import PATHS_MAX
@@ -567,13 +568,14 @@ class Scenario(Section, frozen=True):
         reference, config = self.make_reference(vehicle), self.reference
         if config.shape != "target" or not config.noise_m:
             return reference
-        return shapes.Measured(
+        measured: shapes.Reference = load("skytether.shared.scenario.targets", "target").Measured(
             reference,
             stream(self.seed, "target noise", vehicle),
             dt_s=self.control.dt,
             noise_m=config.noise_m,
             agility=config.agility,
         )
+        return measured
 
     def unallocated_reference(self, vehicle: int = 1) -> shapes.Reference:
         """Desired trajectory of a vehicle; on a mission, before goals are allocated."""

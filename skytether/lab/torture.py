@@ -43,9 +43,9 @@ from skytether.server.planning.clock import BUCKET_NS, BUCKETS, RECENT
 from skytether.server.schemes.horizons import HorizonScheme
 from skytether.server.sessions import WELCOME_NS
 from skytether.shared.base.chance import stream
-from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS, seconds_to_ns
+from skytether.shared.base.units import JUMP_NS, MILLISECOND_NS, SECOND_NS, seconds_to_ns
 from skytether.shared.endpoints.endpoint import Address
-from skytether.shared.endpoints.steady import JUMP_NS, Steady
+from skytether.shared.endpoints.steady import Steady
 from skytether.shared.events.flight import Event, ModeChanged
 from skytether.shared.law.model import Array, Flags
 from skytether.shared.scenario import reading

@@ -24,7 +24,7 @@ from skytether.shared.endpoints.endpoint import Datagram
 from skytether.shared.events.aboard import AutopilotText
 from skytether.shared.events.flight import Finished, Flying
 from skytether.shared.scenario import reading
-from skytether.shared.scenario.reference import figure_eight
+from skytether.shared.scenario.curves import figure_eight
 from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import (
     PACKET_COLUMNS,

@@ -10,7 +10,7 @@ from skytether.client.simulated.plant import FirstOrderPlant
 from skytether.client.simulated.weather import Weather
 from skytether.lab.floor import fly_aboard, summarise_aboard, target_floor_m, wind_floor_m
 from skytether.shared.base.chance import stream
-from skytether.shared.scenario import reference
+from skytether.shared.scenario import targets
 from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import Rows, client_columns
 from skytether.shared.telemetry.summary import summarise
@@ -46,7 +46,7 @@ def test_the_targets_floor_is_how_it_leaves_its_own_velocity() -> None:
     """Over the age of the plan and one step; the preview does not count."""
     free = {"shape": "target", "preview": "none", "agility": 0.3}
     flown = packaged("target", duration=10.0, settle=5.0, reference=free)
-    walk = reference.target(stream(1, "test"), 2, agility=0.3, speed_mps=1e3, radius_m=1e6)
+    walk = targets.target(stream(1, "test"), 2, agility=0.3, speed_mps=1e3, radius_m=1e6)
     starts_s = np.arange(0.0, 4000.0, 1.0)
     before, after = walk(starts_s), walk(starts_s + 1.0)
     left = after[..., 0] - before[..., 0] - before[..., 1]

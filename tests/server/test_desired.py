@@ -16,7 +16,7 @@ from skytether.server.planning.moving_setpoint import MEMORY_S, REST_S, LivePoin
 from skytether.shared.base.chance import stream
 from skytether.shared.base.units import SECOND_NS, seconds_to_ns
 from skytether.shared.law.model import Array, Indices
-from skytether.shared.scenario import reference as shapes
+from skytether.shared.scenario import curves, targets
 from skytether.shared.scenario.reading import check, to_table
 from skytether.shared.scenario.reference import Reference
 from skytether.shared.scenario.whole import Scenario
@@ -270,7 +270,7 @@ def test_a_prediction_that_turns_round_at_the_bounds_is_better() -> None:
     errors: dict[str, list[Array]] = {"turns": [], "goes on": [], "accelerates": []}
     for seed in range(1, 41):
         rng = stream(seed, "target")
-        sample = shapes.target(rng, 2, agility=0.3, speed_mps=1.0, radius_m=10.0)
+        sample = targets.target(rng, 2, agility=0.3, speed_mps=1.0, radius_m=10.0)
         now, past, then = (sample(times + shift) for shift in (0.0, -1.0, ahead_s))
         p, v, old = now[..., 0], now[..., 1], past[..., 1]
         error = p + ahead_s * v - then[..., 0]
@@ -307,7 +307,7 @@ def test_a_prediction_goes_to_and_fro_between_walls(
 
 
 def straight(vehicle: int) -> Reference:
-    return shapes.timed_path(np.array([0.0, 1e4]), np.array([[0.0, 0.0], [1e2 * vehicle, -1e3]]))
+    return curves.timed_path(np.array([0.0, 1e4]), np.array([[0.0, 0.0], [1e2 * vehicle, -1e3]]))
 
 
 @pytest.mark.parametrize("preview", ["all", 0.5])

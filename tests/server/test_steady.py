@@ -15,9 +15,9 @@ from skytether.client.simulated.vehicle import simulated
 from skytether.netem.proxy import Proxy
 from skytether.server.endpoint import Server
 from skytether.shared.base.chance import stream
-from skytether.shared.base.units import SECOND_NS, seconds_to_ns
+from skytether.shared.base.units import JUMP_NS, SECOND_NS, seconds_to_ns
 from skytether.shared.endpoints.endpoint import Datagram, Endpoint
-from skytether.shared.endpoints.steady import JUMP_NS, Steady
+from skytether.shared.endpoints.steady import Steady
 from skytether.shared.events.flight import Degraded
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.whole import Scenario

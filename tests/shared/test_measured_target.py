@@ -7,7 +7,8 @@ from numpy.testing import assert_array_equal
 from helpers import packaged
 from skytether.shared.base.chance import stream
 from skytether.shared.scenario import reading
-from skytether.shared.scenario.reference import Measured, Reference
+from skytether.shared.scenario.reference import Reference
+from skytether.shared.scenario.targets import Measured
 from skytether.sim.flight import fly
 
 DT_S, STEPS = 0.05, 1200

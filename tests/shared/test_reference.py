@@ -1,5 +1,6 @@
 """References: positions, velocities, periods, and files."""
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -7,7 +8,7 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from skytether.shared.scenario import reference
+from skytether.shared.scenario import curves, reference, targets
 from skytether.shared.scenario.reading import check
 
 quick = settings(max_examples=30)
@@ -54,24 +55,28 @@ def test_circle_runs_counter_clockwise(
 def test_figure_eight_passes_its_crossing_and_its_ends(
     eighths: int, position: tuple[float, ...]
 ) -> None:
-    p, _ = sample(reference.figure_eight(3.0, 16.0, 2), 2.0 * eighths)
+    p, _ = sample(curves.figure_eight(3.0, 16.0, 2), 2.0 * eighths)
     assert p == pytest.approx(position, abs=1e-12)
 
 
+Closed = Callable[..., reference.Reference]
+CLOSED: list[Closed] = [reference.circle, curves.figure_eight]
+
+
 @quick
-@given(st.floats(0.0, 100.0), st.integers(1, 4), st.sampled_from(["circle", "figure_eight"]))
-def test_closed_curves_repeat_every_period(t: float, rounds: int, shape: str) -> None:
-    desired = getattr(reference, shape)(1.5, 14.2, 2)
+@given(st.floats(0.0, 100.0), st.integers(1, 4), st.sampled_from(CLOSED))
+def test_closed_curves_repeat_every_period(t: float, rounds: int, shape: Closed) -> None:
+    desired = shape(1.5, 14.2, 2)
     np.testing.assert_allclose(
         desired(np.array(t + 14.2 * rounds)), desired(np.array(t)), rtol=0, atol=1e-11
     )
 
 
 @quick
-@given(st.floats(0.0, 60.0), st.sampled_from(["circle", "figure_eight"]), st.sampled_from([2, 3]))
-def test_velocity_is_the_slope_of_a_smooth_curve(t: float, shape: str, axes: int) -> None:
+@given(st.floats(0.0, 60.0), st.sampled_from(CLOSED), st.sampled_from([2, 3]))
+def test_velocity_is_the_slope_of_a_smooth_curve(t: float, shape: Closed, axes: int) -> None:
     """E6: the velocity that the controller uses is the derivative of the position."""
-    desired = getattr(reference, shape)(1.5, 14.2, axes, 0.7)
+    desired = shape(1.5, 14.2, axes, 0.7)
     before, after = desired(np.array([t - SLOPE_S, t + SLOPE_S]))[..., 0]
     slope = (after - before) / (2 * SLOPE_S)
     np.testing.assert_allclose(desired(np.array(t))[:, 1], slope, rtol=0, atol=1e-8)
@@ -80,7 +85,7 @@ def test_velocity_is_the_slope_of_a_smooth_curve(t: float, shape: str, axes: int
 @quick
 @given(st.floats(0.0, 40.0), st.booleans())
 def test_velocity_is_the_slope_between_waypoints(t: float, loop: bool) -> None:
-    desired = reference.waypoints(ROUTE, 2.0, loop=loop)
+    desired = curves.waypoints(ROUTE, 2.0, loop=loop)
     corners = np.cumsum([0.0, 5.0, 2.0, 4.0, np.sqrt(37.0)]) / 2.0
     phase = t % corners[-1] if loop else t
     assume(np.abs(phase - corners).min() > 2 * SLOPE_S)
@@ -92,8 +97,8 @@ def test_velocity_is_the_slope_between_waypoints(t: float, loop: bool) -> None:
 def test_plane_curves_fly_level_in_space() -> None:
     for desired in (
         reference.circle(1.0, 10.0, 3, 2.5),
-        reference.figure_eight(1.0, 10.0, 3, 2.5),
-        reference.square(1.0, 10.0, 3, 2.5),
+        curves.figure_eight(1.0, 10.0, 3, 2.5),
+        curves.square(1.0, 10.0, 3, 2.5),
     ):
         up = desired(np.linspace(0.0, 25.0, 101))[:, 2]
         np.testing.assert_array_equal(up, np.tile([2.5, 0.0], (101, 1)))
@@ -101,7 +106,7 @@ def test_plane_curves_fly_level_in_space() -> None:
 
 def test_square_turns_at_its_corners() -> None:
     """Radius 2 m in 16 s: a corner every 4 s, at 1 m/s, counter-clockwise."""
-    desired = reference.square(2.0, 16.0, 2)
+    desired = curves.square(2.0, 16.0, 2)
     corners = [[2.0, -2.0], [2.0, 2.0], [-2.0, 2.0], [-2.0, -2.0], [2.0, -2.0]]
     ways = [[0.0, 1.0], [-1.0, 0.0], [0.0, -1.0], [1.0, 0.0], [0.0, 1.0]]
     states = desired(4.0 * np.arange(5))
@@ -112,13 +117,13 @@ def test_square_turns_at_its_corners() -> None:
 @quick
 @given(st.floats(0.0, 100.0))
 def test_square_keeps_to_its_edge_at_one_speed(t: float) -> None:
-    p, v = sample(reference.square(1.5, 12.0, 2), t)
+    p, v = sample(curves.square(1.5, 12.0, 2), t)
     assert max(np.abs(p)) == pytest.approx(1.5)
     assert np.linalg.norm(v) == pytest.approx(1.0)
 
 
 def test_waypoints_are_passed_at_constant_speed_from_rest_to_rest() -> None:
-    desired = reference.waypoints(ROUTE, 2.0)
+    desired = curves.waypoints(ROUTE, 2.0)
     assert sample(desired, -1.0) == ([0.0, 0.0], [0.0, 0.0])
     assert sample(desired, 0.0) == ([0.0, 0.0], pytest.approx([1.2, 1.6]))
     assert sample(desired, 1.25) == (pytest.approx([1.5, 2.0]), pytest.approx([1.2, 1.6]))
@@ -129,7 +134,7 @@ def test_waypoints_are_passed_at_constant_speed_from_rest_to_rest() -> None:
 
 
 def test_looped_waypoints_fly_home_and_on() -> None:
-    desired = reference.waypoints(np.array([[0.0, 0.0], [3.0, 0.0], [3.0, 4.0]]), 1.0, loop=True)
+    desired = curves.waypoints(np.array([[0.0, 0.0], [3.0, 0.0], [3.0, 4.0]]), 1.0, loop=True)
     assert sample(desired, 9.5) == (pytest.approx([1.5, 2.0]), pytest.approx([-0.6, -0.8]))
     assert sample(desired, 12.0) == ([0.0, 0.0], [1.0, 0.0])
     assert sample(desired, 13.0) == (pytest.approx([1.0, 0.0]), [1.0, 0.0])
@@ -165,17 +170,17 @@ def test_array_of_times_is_its_single_times(table: dict[str, object], axes: int)
 def test_a_target_stays_within_its_bounds_and_comes_back_the_way_it_went() -> None:
     """At any time in the future; an hour of its motion is random, then it repeats backwards."""
     rng = np.random.default_rng(1)
-    desired = reference.target(rng, 2, agility=0.5, speed_mps=0.8, radius_m=2.0)
+    desired = targets.target(rng, 2, agility=0.5, speed_mps=0.8, radius_m=2.0)
     times = np.arange(0.0, 200.0, 0.01)
     states = desired(times)
     assert np.abs(states[..., 0]).max() == pytest.approx(2.0, abs=0.01)
     assert np.abs(states[..., 1]).max() == pytest.approx(0.8, abs=0.01)
     travelled = np.abs(np.diff(states[..., 0], axis=0)).max() / 0.01
     assert travelled <= 0.8 + 1e-9
-    back = desired(2.0 * reference.TURN_S - times)
+    back = desired(2.0 * targets.TURN_S - times)
     np.testing.assert_allclose(back[..., 0], states[..., 0], atol=1e-6)
     np.testing.assert_allclose(back[1:, :, 1], -states[1:, :, 1], atol=1e-6)
-    again = desired(times + 1e6 * reference.TURN_S)
+    again = desired(times + 1e6 * targets.TURN_S)
     np.testing.assert_allclose(again[..., 0], states[..., 0], atol=1e-5)
     assert desired(np.array(9e9)).shape == (2, 2)  # without allocating memory up to that time
 
@@ -183,8 +188,8 @@ def test_a_target_stays_within_its_bounds_and_comes_back_the_way_it_went() -> No
 def test_a_target_that_turns_now_and_then_flies_straight_in_between() -> None:
     """The mean square change of its velocity equals that of a target that turns all the time."""
     far: dict[str, Any] = {"agility": 0.3, "speed_mps": 1e3, "radius_m": 1e6}
-    desired = reference.target(np.random.default_rng(1), 2, **far, turn_every_s=4.0)
-    grid_s = np.arange(0.0, 3000.0, reference.GRID_S)
+    desired = targets.target(np.random.default_rng(1), 2, **far, turn_every_s=4.0)
+    grid_s = np.arange(0.0, 3000.0, targets.GRID_S)
     changes = np.diff(desired(grid_s)[..., 1], axis=0)
     turned = (changes != 0.0).any(axis=1)
     assert turned.sum() == pytest.approx(3000.0 / 4.0, rel=0.1)

@@ -1,0 +1,64 @@
+"""Losses of packets that last for a time."""
+
+from typing import Annotated
+
+from msgspec import Meta
+
+from skytether.netem.impairments.draws import SLOT_S, Draws, Fate
+from skytether.netem.impairments.impairment import Impairment, Share, Time, impairment
+
+
+@impairment(name="gilbert_elliott")
+class GilbertElliott(Impairment):
+    """Loses packets while a channel is bad: for a share of the time, burst_s at a time (mean)."""
+
+    kind = "loss"
+
+    def __init__(
+        self, share: Share, burst_s: Time, loss_bad: Share = 1.0, loss_good: Share = 0.0
+    ) -> None:
+        self._share, self._bad, self._good = share, loss_bad, loss_good
+        self.loss = share * loss_bad + (1.0 - share) * loss_good
+        # A redrawn state is bad again with the probability `share`, so bursts last burst_s on
+        # average.
+        self._cell_s = burst_s * (1.0 - share)
+
+    def __call__(self, fate: Fate, draws: Draws) -> None:
+        if self._cell_s <= SLOT_S:  # the state is independent for each packet
+            fate.lost |= draws.uniform(fate) < self.loss
+            return
+        bad = draws.lasting(fate, self._cell_s) < self._share
+        loses = self._bad if bad else self._good
+        if loses and (loses == 1.0 or draws.uniform(fate) < loses):
+            fate.lost = True
+
+
+@impairment(name="outage")
+class Outage(Impairment):
+    """Loses everything from at_s on for for_s seconds, and again every every_s (0: only once)."""
+
+    def __init__(self, at_s: Time, for_s: Time, every_s: Time = 0.0) -> None:
+        if every_s and every_s <= for_s:
+            raise ValueError(f"every_s of 0, or of more than for_s = {for_s:g}")
+        self._at_s, self._for_s, self._every_s = at_s, for_s, every_s
+        self.loss = for_s / every_s if every_s else 0.0
+
+    def __call__(self, fate: Fate, draws: Draws) -> None:  # noqa: ARG002
+        since_s = fate.time_s - self._at_s
+        if since_s < 0.0:
+            return
+        if (since_s % self._every_s if self._every_s else since_s) < self._for_s:
+            fate.lost = True
+
+
+@impairment(name="outages")
+class Outages(Impairment):
+    """Loses everything for for_s seconds, then nothing for every_s: random, with these means."""
+
+    def __init__(self, every_s: Annotated[float, Meta(ge=0.001, le=3600)], for_s: Time) -> None:
+        self.loss = for_s / (every_s + for_s)
+        self._cell_s = for_s * (1.0 - self.loss)
+
+    def __call__(self, fate: Fate, draws: Draws) -> None:
+        if draws.lasting(fate, self._cell_s) < self.loss:
+            fate.lost = True
