@@ -5,6 +5,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib import util
 
+from skytether.shared.base.errors import ConfigError
+
 MODULES = {"eclipse-zenoh": "zenoh", "pillow": "PIL"}
 """Import names of packages, where they differ from the names of the packages."""
 
@@ -23,11 +25,14 @@ def named() -> Iterator[None]:
 
     Raises:
         ExtraMissing: instead of a ModuleNotFoundError, if an extra provides the module.
+        ConfigError: instead of it, if the module is one of ours that has been left out.
     """
     try:
         yield
     except ModuleNotFoundError as error:
         module = str(error.name).partition(".")[0]
+        if module == "skytether":
+            raise ConfigError(f"{error.name} is not installed") from None
         extras = _extras()
         having = [extra for extra in extras if module in extras[extra]]
         if isinstance(error, ExtraMissing) or not having:

@@ -417,6 +417,8 @@ def _unknown_key(table: object, section: Any, at: str = "") -> str | None:
         return None
     kinds = typing.get_type_hints(section)
     for key, value in table.items():
+        if key not in kinds and not at and key in rooms.SECTIONS:
+            return f"{key}: {rooms.SECTIONS[key]} is not installed"
         if key not in kinds:
             return (
                 f"{at}{_short(str(key))}: no such key; {hint(str(key), section.__struct_fields__)}"

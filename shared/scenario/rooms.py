@@ -40,7 +40,12 @@ SECTIONS = {
 FILES = {"mission.zones": (ZONES, 4_000_000)}
 """Keys of rooms whose text may name files, see `reading.FILES`."""
 
-EVENTS = (f"{SHARED}missions.events",)
+EVENTS = (
+    f"{SHARED}events.aboard",
+    f"{SHARED}events.paths",
+    f"{SHARED}events.standby",
+    f"{SHARED}missions.events",
+)
 """Modules with events of rooms, see `shared.telemetry.every_event`."""
 
 

@@ -8,12 +8,7 @@ from contextlib import suppress
 from typing import TYPE_CHECKING, Union
 
 from skytether.shared.base.errors import ConfigError
-from skytether.shared.events import (  # noqa: F401 - define events
-    aboard,
-    paths,
-    processes,
-    standby,
-)
+from skytether.shared.events import processes  # noqa: F401 - defines events
 from skytether.shared.events.flight import Event
 from skytether.shared.scenario.registry import load
 from skytether.shared.scenario.rooms import EVENTS
