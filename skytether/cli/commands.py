@@ -76,10 +76,6 @@ COMMANDS_IN_GROUPS = {
             "a search for the paper's numbers, or for the best ones",
             "skytether.lab.commands.calibrate:calibrate",
         ),
-        "envelope [SCENARIO]": (
-            "the networks and settings that a scenario tolerates",
-            "skytether.lab.commands.envelope:envelope",
-        ),
         "margins [SCENARIO]": (
             "whether its loop is stable, and with which vehicles",
             "skytether.lab.commands.margins:margins",

@@ -1,115 +1,16 @@
-"""Pictures of sweeps, envelopes and crowds."""
+"""Pictures of sweeps and crowds."""
 
 from collections.abc import Callable, Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from skytether.figures.flights import save
 from skytether.figures.page import blank
 from skytether.lab.crowd import TITLES, CrowdPoint, FlownScheme, Scheme
-from skytether.lab.envelope import WRONG, Envelope, EnvelopePoint, Outcome
 from skytether.lab.sweep import GridAxis
-from skytether.netem.impairments.direction import impairments
-from skytether.shared.law.model import Array, Flags
-
-OUTCOMES: Mapping[Outcome, Mapping[str, Any]] = {
-    "refused": {"color": "0.82", "marker": "."},
-    "unanswered": {"color": "0.55", "marker": "."},
-    "flown": {"color": "#0072b2", "marker": "o"},
-    "interrupted": {"color": "#56b4e9", "marker": "s"},
-    "hovering": {"color": "#e69f00", "marker": "D"},
-    "astray": {"color": "#cc79a7", "marker": "^"},
-    "flyaway": {"color": "#c1272d", "marker": "X"},
-    "crashed": {"color": "black", "marker": "P"},
-}
-RATIOS = np.geomspace(1 / 16, 16, 17)
-"""Bin edges of `envelope`: length of a horizon in round trips."""
-
-
-def envelope(path: Path, title: str, plan: Envelope, points: Sequence[EnvelopePoint]) -> None:
-    from matplotlib.patches import Patch
-
-    keys = list(map(plan.keys, range(len(points))))
-
-    def column(key: str) -> Array:
-        return np.array([each[key] for each in keys])
-
-    outcomes = np.array([point.outcome for point in points])
-    ways = [
-        [impairments(each[f"network.{way}"]) for each in keys] for way in ("uplink", "downlink")
-    ]
-    up_s, down_s = (np.array([each.mean_s for each in paths]) for paths in ways)
-    loss = np.max([[each.loss for each in paths] for paths in ways], axis=0)
-    trip_s, covers_s = up_s + down_s, column("control.horizon") * column("control.dt")
-    figure = blank(10.0, 9.0)
-    (cover, bars), (delays, losses) = figure.subplots(2, 2)
-    shown = {outcome: outcomes == outcome for outcome in OUTCOMES if outcome in outcomes}
-    for outcome, has_outcome in shown.items():
-        style: Any = {**OUTCOMES[outcome], "s": _size(outcome, len(points)), "linewidths": 0.0}
-        cover.scatter(trip_s[has_outcome], covers_s[has_outcome], **style)
-        long = has_outcome & (covers_s >= trip_s)
-        delays.scatter(up_s[long], down_s[long], **style)
-        losses.scatter(trip_s[long], loss[long], **style)
-    line_s = np.geomspace(0.01, float(trip_s.max()), 100)
-    cover.plot(line_s, line_s, "k-", linewidth=1.0)
-    cover.set_yscale("log")
-    cover.set_ylabel("length of a horizon, H · Δt [s]")
-    cover.set_title("all points; above the line horizons are longer than a round trip", fontsize=10)
-    losses.set_ylabel("loss, the larger of both ways")
-    for plane in (delays, losses):
-        plane.set_title("points with horizons longer than a round trip", fontsize=10)
-    for plane in (cover, losses):
-        plane.set_xlabel("mean round trip [s]")
-    delays.set_xlabel("mean delay to the vehicle [s]")
-    delays.set_ylabel("mean delay to the server [s]")
-    delays.set_aspect("equal", adjustable="box")
-    _stack(bars, covers_s / trip_s, shown)
-    for plane in (cover, delays, losses):
-        plane.grid(alpha=0.3)
-    patches = [
-        Patch(color=OUTCOMES[outcome]["color"], label=f"{outcome} {has_outcome.sum()}")
-        for outcome, has_outcome in shown.items()
-    ]
-    figure.suptitle(title, fontsize=11)
-    figure.legend(
-        handles=patches,
-        loc="outside lower center",
-        ncols=len(patches),
-        fontsize=9,
-        handlelength=1.0,
-    )
-    save(figure, path, dpi=100)
-
-
-def _size(outcome: Outcome, points: int) -> float:
-    """Marker area of an outcome in a picture with `points` points [pt²]; failures stay visible."""
-    area = float(np.clip(20_000.0 / points, 5.0, 30.0))
-    return max(25.0, area) if outcome in WRONG else area
-
-
-def _stack(plane: Any, ratios: Array, shown: Mapping[Outcome, Flags]) -> None:
-    bins = np.digitize(np.clip(ratios, RATIOS[0], RATIOS[-1] * (1.0 - 1e-9)), RATIOS) - 1
-    total = np.maximum(1, np.bincount(bins, minlength=len(RATIOS) - 1))
-    below = np.zeros(len(total))
-    for outcome, has_outcome in shown.items():
-        share = np.bincount(bins[has_outcome], minlength=len(total)) / total
-        style = {"color": OUTCOMES[outcome]["color"], "edgecolor": "white", "linewidth": 0.5}
-        plane.bar(RATIOS[:-1], share, np.diff(RATIOS), bottom=below, align="edge", **style)
-        below += share
-    plane.set_xscale("log", base=2)
-    plane.set_xticks(RATIOS[::4], ["1/16", "1/4", "1", "4", "16"])
-    plane.set_xlim(RATIOS[0], RATIOS[-1])
-    plane.set_ylim(0.0, 1.0)
-    plane.axvline(1.0, color="k", linewidth=1.0)
-    plane.set_xlabel("length of a horizon in round trips; the outer bars include all beyond")
-    plane.set_ylabel("share of points")
-    plane.set_title(
-        "all points; right of the line horizons are longer than a round trip", fontsize=9
-    )
-
+from skytether.shared.law.model import Array
 
 UNITS = {"s": "s", "m": "m", "mps": "m/s", "mps2": "m/s²", "ppm": "ppm"}
 OTHER_UNITS = {

@@ -2,18 +2,16 @@
 from the model.
 
 The loop is flown in virtual time: vehicle, server and network of a scenario, hovering. There are
-three kinds of flights.
+two kinds of flights.
     push   only a weak wind for PUSH_S; h(n): mean over seeds and axes of p² n steps after it
            growth = lim h(n+1) / h(n), of the mean square; below 1 the loop is stable
     wind   only the scenario's white wind and noise: root mean square of p and u
-    rest   no wind, START_M beside the hover point: a vehicle that does not come to rest is in a
-           limit cycle, an oscillation between the bounds of its input (`lab.maps`)
 
 The growth is that of the linear loop, so nonlinear effects are removed. Bounds: only steps before
 an input reaches SMALL of its bound are used. Noise: the flight is repeated without the push, and p
 is the difference. Thresholds: a weak push stays below all of them, so a trigger that uses the state
-would never send; it is replaced by a periodic one with its measured rate. Wind and rest are flown
-with the scenario's own trigger.
+would never send; it is replaced by a periodic one with its measured rate. Wind is flown with the
+scenario's own trigger.
 """
 
 import math
@@ -161,11 +159,18 @@ def clocked_trigger(scenario: Scenario) -> str:
 def hovering(scenario: Scenario, duration: float) -> Scenario:
     """Scenario of a simulated vehicle that hovers at the origin without wind for `duration` [s]."""
     origin = (0.0,) * scenario.model.axes
-    flown = windless(scenario)
+    vehicle = replace(
+        scenario.vehicle,
+        kind="simulated",
+        start_m=(),
+        wind=0.0,
+        steady_wind_mps=(),
+        gust_mps2=0.0,
+    )
     return replace(
-        flown,
+        scenario,
         reference=ReferenceConfig(shape="hover", points_m=(origin,)),
-        vehicle=replace(flown.vehicle, kind="simulated", start_m=()),
+        vehicle=vehicle,
         duration=duration,
         settle=0.0,
     )
@@ -174,11 +179,6 @@ def hovering(scenario: Scenario, duration: float) -> Scenario:
 def settled_s(scenario: Scenario) -> float:
     """Time after which a flight is stationary [s], see SETTLE_S."""
     return SETTLE_S + ROUND_TRIPS * (scenario.uplink.mean_s + scenario.downlink.mean_s)
-
-
-def windless(scenario: Scenario) -> Scenario:
-    calm = replace(scenario.vehicle, wind=0.0, steady_wind_mps=(), gust_mps2=0.0)
-    return replace(scenario, vehicle=calm)
 
 
 def _flown(scenario: Scenario, runs: int, **keys: Any) -> list[Record]:

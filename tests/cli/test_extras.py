@@ -22,7 +22,7 @@ ALL = (
     *("gym", "lab", "ulog"),
 )
 LAB = (
-    *("crowd", "sweep", "envelope", "margins", "identify", "torture", "adversary", "reproduce"),
+    *("crowd", "sweep", "margins", "identify", "torture", "adversary", "reproduce"),
     *("compare", "calibrate"),
 )
 LISTS = (

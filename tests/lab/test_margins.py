@@ -1,6 +1,5 @@
-"""Margins: flights agree with theory, and show which vehicles end in a limit cycle."""
+"""Margins: flights agree with theory."""
 
-import csv
 import json
 from pathlib import Path
 from typing import Any
@@ -10,8 +9,7 @@ import pytest
 
 from helpers import demo_with
 from skytether.__main__ import main
-from skytether.lab import maps, margins
-from skytether.lab.maps import Box, resting
+from skytether.lab import margins
 from skytether.lab.margins import (
     AS_IT_IS,
     Differing,
@@ -24,7 +22,6 @@ from skytether.lab.margins import (
 from skytether.shared.law.model import Array, white_acceleration
 from skytether.shared.scenario.gain import regulator
 from skytether.shared.scenario.whole import Scenario
-from skytether.shared.telemetry.record import Rows, client_columns
 
 BLIND = {
     "control__feedback": False,
@@ -174,58 +171,6 @@ def test_along_trajectories_the_worst_corner_asks_for_a_fifth_more(
     assert (growth_of(corner, clocked_trigger(scenario), 2)[0] < 0.995) == stable
 
 
-# -- maps ------------------------------------------------------------------------------------------
-
-
-def at(name: str, scenario: Scenario, **box: tuple[float, ...]) -> Box:
-    axes = {"tau": (1.0,), "gain": (1.0,), "dead_time_s": (0.0,), "burst_s": (0.0,)}
-    return Box(name, scenario, "periodic(12)", **axes | box)
-
-
-def test_a_loop_that_is_not_stable_ends_in_a_limit_cycle(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Committed inputs at tight weights, where the vehicle is twice as fast as the model."""
-    monkeypatch.setattr(maps, "REST_S", 40.0)
-    monkeypatch.setattr(maps, "RUNS", 1)
-    monkeypatch.setattr(maps, "PUSHES", 1)
-    tight = demo_with(**BLIND | {"control__input_weight": 0.01}, duration=10.0)
-    swings, rests = (
-        at("tight", each, tau=(0.5,)).fly(0) for each in (tight, demo_with(duration=10.0))
-    )
-    assert swings.cycles
-    assert swings.growth > 1.0
-    assert swings.rest_m > 0.2
-    assert swings.saturated is not None
-    assert swings.saturated > 0.5
-    assert not rests.cycles
-    assert rests.growth < 1.0
-    assert rests.rest_m < 0.01
-
-
-def test_a_swing_that_dies_away_is_no_limit_cycle() -> None:
-    scenario = maps.at_rest(demo_with())
-    rows: Rows = np.zeros(400, client_columns(2))
-    rows["step"] = np.arange(400)
-    rows["state"][:, 0, 0] = 0.5 * np.sin(0.1 * rows["step"])
-    before, last = resting(scenario, rows)
-    assert before == pytest.approx(0.354, abs=0.05)
-    assert last > maps.REST_M
-    assert last > maps.SUSTAINED * before
-    rows["state"][:, 0, 0] *= np.exp(-0.01 * rows["step"])
-    before, last = resting(scenario, rows)
-    assert last < maps.SUSTAINED * before
-
-
-def test_a_place_of_the_box_differs_as_it_says() -> None:
-    box = at("demo", demo_with(), tau=(0.5, 2.0), gain=(0.7,), dead_time_s=(0.1,), burst_s=(2.0,))
-    assert [place.tau for place in box.places] == [0.5, 2.0]
-    scenario = box.scenario_of(1)
-    assert scenario.true_tau_s.tolist() == [1.68, 1.68]
-    assert scenario.true_gain.tolist() == [0.7, 0.7]
-    assert scenario.true_dead_time_s.tolist() == [0.1, 0.1]
-    assert (scenario.vehicle.wind, scenario.tau_s.tolist()) == (0.0, [0.84, 0.84])
-    assert scenario.network.uplink == "paper(0.4, 0.02, 2.0) & gilbert_elliott(0.1, 2.0)"
-
-
 # -- the command -----------------------------------------------------------------------------------
 
 
@@ -243,16 +188,11 @@ def test_the_command_says_which_vehicles_are_stable(
     monkeypatch.setattr(margins, "LIMITS", limits)
     monkeypatch.setattr(margins, "HALVINGS", 2)
     monkeypatch.setattr(margins, "WIND_S", 10.0)
-    monkeypatch.setattr(maps, "REST_S", 20.0)
-    monkeypatch.setattr(maps, "PUSHES", 1)
-    monkeypatch.setattr(maps, "RUNS", 1)
-    file, folder = tmp_path / "margins.json", tmp_path / "maps"
-    flags = (
-        "--runs 1 --control.trigger always --box-tau 1 --box-gain 1 --box-dead-time 0 --box-burst 0"
-    )
+    file = tmp_path / "margins.json"
+    flags = "--runs 1 --control.trigger always"
     flags += " --control.dt 0.1 --control.input-weight 0.01 --control.horizon 20"
     argv = ["margins", "demo", *flags.split(), "--duration", "5", "--settle", "1"]
-    assert main([*argv, "--json", str(file), "--maps", str(folder), "--workers", "1"]) == 0
+    assert main([*argv, "--json", str(file), "--workers", "1"]) == 0
     shown = capsys.readouterr().out
     assert late in shown
     content: dict[str, Any] = json.loads(file.read_bytes())
@@ -263,14 +203,3 @@ def test_the_command_says_which_vehicles_are_stable(
     told = {each["quantity"]: each["value"] for each in content["limits"]}
     assert 0.0 < told["dead time, more [s]"] < 0.3
     assert told["delay each way, more [s]"] > 1.5  # until observations are older than age_max_s
-    (point,) = csv.DictReader((folder / "points.csv").read_text().splitlines())
-    assert (point["cycles"], point["tau"]) == ("false", "1.0")
-    assert (folder / "maps.png").stat().st_size > 10_000
-
-
-def test_an_empty_box_is_refused_in_a_line(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    argv = ["margins", "demo", "--maps", str(tmp_path / "maps"), "--box-gain", "0", "1"]
-    assert main(argv) == 2
-    assert "vehicle.gain[0]: got 0.0" in capsys.readouterr().err

@@ -133,15 +133,11 @@ def test_a_documented_flight_flies(
 ) -> None:
     if "sweep" in line:
         line += " --settle 0 --duration 1 --runs 2"
-    if "envelope" in line:
-        line += " --settle 0 --duration 1 --runs 3"
     if "margins" in line:
         line += " --runs 1"
     if "crowd --out" in line:
         line = re.sub(r"--vehicles [\d ]+", "", line)
         line += " --vehicles 2 --settle 0 --duration 4"
-    if "--maps" in line:
-        line += " --box-tau 1 --box-gain 1 --box-dead-time 0 --box-burst 0 --settle 0 --duration 1"
     if "calibrate" in line:
         line += " --settle 0 --duration 1 --runs 2 --generations 1 --population 4"
     if "--show" in line:

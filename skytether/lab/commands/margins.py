@@ -1,6 +1,5 @@
 """`skytether margins`: stability of a scenario's loop, and the vehicles for which it holds."""
 
-from collections import defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -8,22 +7,15 @@ from pathlib import Path
 from typing import Annotated
 
 import msgspec
-import numpy as np
 
-from skytether.lab import maps
 from skytether.lab import margins as lab
 from skytether.lab.commands import tables
-from skytether.lab.commands.pool import Flags, Interrupted, PoolFlags, crew, study, writing
-from skytether.lab.maps import Box, MapPoint
+from skytether.lab.commands.pool import Flags, Interrupted, PoolFlags, crew
 from skytether.lab.margins import Margin, MarginLimit
-from skytether.shared.base import files
-from skytether.shared.scenario import reading
 from skytether.shared.scenario.whole import Scenario
 from skytether.shell.commandline import command
 from skytether.shell.commandline.argument import Argument
 from skytether.shell.commandline.command import CommandError, ScenarioFlags, ScenarioName
-
-POINTS_MAX = 100_000
 
 
 @dataclass(frozen=True)
@@ -36,17 +28,6 @@ class MarginsOptions:
     """Number of seeds that each vehicle is flown with, which count up from the scenario's."""
     json: Path | None = None
     """File for the figures."""
-    maps: Annotated[Path | None, Argument(metavar="FOLDER")] = None
-    """Folder for maps, made by flights: for each vehicle of a box, whether it comes to rest without
-    wind. The same command continues with the folder's results."""
-    box_tau: tuple[float, ...] = (0.5, 1.0, 2.0)
-    """Time constants of the box, relative to the model's."""
-    box_gain: tuple[float, ...] = (0.7, 1.0, 1.3)
-    """Gains of the box, relative to the model's."""
-    box_dead_time: tuple[float, ...] = (0.0, 0.1, 0.2, 0.3)
-    """Dead times of the box, minus the model's [s]."""
-    box_burst: tuple[float, ...] = (0.0, 2.0)
-    """Mean burst lengths of loss in the box, both ways [s]."""
     pool: PoolFlags = Flags()
     config: ScenarioFlags = Scenario()
 
@@ -68,19 +49,11 @@ def margins(argv: Sequence[str]) -> None:
     far one quantity may differ, relative to the model, before the loop is no longer stable. With a
     trigger that uses the state, pushes are flown with a periodic one at the same mean rate, because
     a weak push stays below every threshold.
-
-    With --maps FOLDER every vehicle of a box is flown as well, without wind: FOLDER/points.csv has
-    a row for each, FOLDER/maps.png shows where the flight ends in a limit cycle, and the RMSE. The
-    box of 72 vehicles takes some minutes; --box-tau, --box-gain, --box-dead-time and --box-burst
-    change it.
     """
     options = command.parse(MarginsOptions(), argv, "skytether margins", margins.__doc__)
     command.check_count("--runs", options.runs, 1000)
     options.pool.check()
     scenario = options.config
-    if options.maps is not None:
-        _box(options, scenario.control.trigger)
-        command.claim_folder("--maps", options.maps, "points.csv", "maps.png")
     vehicles = {lab.AS_IT_IS: scenario}
     vehicles |= {
         name: each.of(scenario) for name, each in lab.VEHICLES.items() if each.is_of(scenario)
@@ -109,74 +82,10 @@ def margins(argv: Sequence[str]) -> None:
         command.write(options.json, content)
     _show(options, trigger, flown)
     _show_limits(limits)
-    if options.maps is not None:
-        _map(options, options.maps, trigger)
 
 
 def _fly(part: Callable[[], Margin | MarginLimit]) -> Margin | MarginLimit:
     return part()
-
-
-def _box(options: MarginsOptions, trigger: str) -> Box:
-    """Box of vehicles given by the options.
-
-    Raises:
-        CommandError: the box is empty, or too large.
-        ConfigError: a value is impossible for a vehicle or a network.
-    """
-    box = Box(
-        options.scenario,
-        options.config,
-        trigger,
-        options.box_tau,
-        options.box_gain,
-        options.box_dead_time,
-        options.box_burst,
-    )
-    count = len(box.places)
-    command.check_count(
-        "--box-tau, --box-gain, --box-dead-time and --box-burst, all in all", count, POINTS_MAX
-    )
-    for number in range(count):
-        reading.check(reading.to_table(box.scenario_of(number)), options.scenario)
-    return box
-
-
-def _map(options: MarginsOptions, folder: Path, trigger: str) -> None:
-    box = _box(options, trigger)
-    numbers, title = range(len(box.places)), f"flying vehicles like {options.scenario}'s"
-    points = study(
-        box.fly, numbers, MapPoint, box.settings(), folder, options.pool, title, "points"
-    )
-    title = f"{options.scenario}, without wind, {maps.RUNS} flights a point"
-    with writing(folder):
-        files.write(folder / "points.csv", box.csv(points).encode())
-        maps.draw(folder / "maps.png", title, box, points)
-    _show_points(title, box, points)
-    print(f"{folder}: points.csv, maps.png")
-
-
-def _show_points(title: str, box: Box, points: Sequence[MapPoint]) -> None:
-    groups: dict[tuple[float, float], list[MapPoint]] = defaultdict(list)
-    for place, point in zip(box.places, points, strict=True):
-        groups[place.burst_s, place.dead_time_s].append(point)
-    headings = ("bursts [s]", "dead time [s]", "vehicles", "limit cycles", "not stable")
-    rows = []
-    for (burst_s, dead_time_s), group in groups.items():
-        rmse = np.array([point.rmse_m or np.nan for point in group])
-        saturated = max(point.saturated or 0.0 for point in group)
-        row = (
-            f"{burst_s:g}",
-            f"{dead_time_s:g}",
-            len(group),
-            sum(point.cycles for point in group),
-            sum(point.growth >= 1.0 for point in group),
-            f"{np.nanmedian(rmse):.3f}",
-            f"{np.nanmax(rmse):.3f}",
-            f"{saturated:.1%}",
-        )
-        rows.append(row)
-    tables.show(title, (*headings, "RMSE xy, median [m]", "largest [m]", "saturated"), rows)
 
 
 def _show(options: MarginsOptions, trigger: str, found: Sequence[Margin]) -> None:
