@@ -1,7 +1,6 @@
 """Targets for texts: scenarios, requests for changes in flight, and output of processes."""
 
 import importlib
-import struct
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -15,7 +14,6 @@ from fuzz.mutators import text_changed, words_of
 from fuzz.target import Target, flown
 from skytether.netem.impairments import traces
 from skytether.netem.proxy import Proxy
-from skytether.probe import recorded as captures
 from skytether.shared import formats
 from skytether.shared.base import toml
 from skytether.shared.base.errors import ConfigError
@@ -101,19 +99,8 @@ class ScenarioFile(Text):
         assert np.isfinite(scenario.make_reference()(SAMPLES_S)).all()
 
 
-def capture(later_s: int) -> bytes:
-    """Capture of four packets of a flow each way, with times shifted by up to `later_s`."""
-    parts = [struct.pack("<IHHiIII", 0xA1B2C3D4, 2, 4, 0, 0, 65535, 101)]
-    for number in range(8):
-        udp = struct.pack(">HHHH", 5 + number % 2, 6 - number % 2, 16, 0) + b"packet %d" % number
-        frame = struct.pack(">BBHHHBBH", 0x45, 0, 20 + len(udp), 0, 0, 64, 17, 0) + bytes(8) + udp
-        time_s = number + later_s * (-1) ** number
-        parts.append(struct.pack("<IIII", time_s + 50, 0, len(frame), len(frame)) + frame)
-    return b"".join(parts)
-
-
 class NamedFiles(Text):
-    """Target for files that a scenario names: tables, zones, traces, captures, and keys.
+    """Target for files that a scenario names: tables, zones, traces, and keys.
 
     The first byte of an input chooses the reader, which raises an error for the user, or gives
     values that can be flown.
@@ -122,7 +109,7 @@ class NamedFiles(Text):
     code = (
         *(importlib.import_module(f"{formats.__name__}.{name}") for name, *_ in formats.FORMATS),
         *(bounded, tracks, mission, plans, zone_files, zone_texts),
-        *(recorded, pings, traces, captures, keys),
+        *(recorded, pings, traces, keys),
     )
     largest = 20_000
 
@@ -186,15 +173,14 @@ class NamedFiles(Text):
             "0\n3\n3\n17\n",
             keys.write(1, 1, bytes(32)) + keys.write(2, 1, bytes(32)),
         )
-        kinds = b"\0\1\1\0\0\2\2\2\0\1\1" + 7 * b"\3" + b"\4\6"
+        kinds = b"\0\1\1\0\0\2\2\2\0\1\1" + 7 * b"\3" + b"\4\5"
         known = [bytes([k]) + text.encode() for k, text in zip(kinds, texts, strict=True)]
-        known.append(b"\5" + capture(0) + capture(9))
         super().__init__(known, [b"nan", b"1e308", b"-0", b"inf", b"9" * 5000, b"[" * 500])
 
     def __call__(self, payload: bytes) -> None:
         self._path.write_bytes(payload[1:])
         with suppress(ConfigError, GrammarError, ValueError):
-            match (payload or b"\0")[0] % 7:
+            match (payload or b"\0")[0] % 6:
                 case 0:
                     assert np.isfinite(tracks.path(payload[1:], 2, (47.0, 8.0))(SAMPLES_S)).all()
                 case 1:
@@ -214,10 +200,6 @@ class NamedFiles(Text):
                 case 4:
                     times_s = traces.deliveries_in.__wrapped__(File("it", payload[1:]))
                     assert np.isfinite(times_s).all()
-                case 5:
-                    half = (len(payload) + 1) // 2
-                    measured = captures.of_captures(payload[1:half], payload[half:])
-                    assert len(measured.uplink.sent_ns) > 1
                 case _:
                     keys.parse("it", payload[1:])
 

@@ -33,10 +33,14 @@ CELLS_MAX = 2_000_000
 TIE_S = 1e-6
 """Difference of times up to which two packets count as sent at the same time [s]."""
 
-CAPTURES = (b"\xd4\xc3\xb2\xa1", b"\xa1\xb2\xc3\xd4", b"\x4d\x3c\xb2\xa1", b"\xa1\xb2\x3c\x4d")
-"""First bytes of a pcap file: both byte orders, with times in microseconds and nanoseconds."""
-CAPTURES_NEW = b"\x0a\x0d\x0d\x0a"
-"""First bytes of a pcapng file."""
+CAPTURES = (
+    b"\xd4\xc3\xb2\xa1",
+    b"\xa1\xb2\xc3\xd4",
+    b"\x4d\x3c\xb2\xa1",
+    b"\xa1\xb2\x3c\x4d",
+    b"\x0a\x0d\x0d\x0a",
+)
+"""First bytes of a capture of packets: pcap, in both byte orders, and pcapng."""
 
 Way = Literal["auto", "send", "receive"]
 
@@ -101,8 +105,8 @@ def text_in(file: File) -> str:
             raise ValueError(
                 f"got a cut file, several, or more than {TEXT_BYTES_MAX} bytes unzipped"
             )
-    if content[:4] in {*CAPTURES, CAPTURES_NEW}:
-        raise ValueError("got a capture of packets, expected a log: see skytether probe --from")
+    if content[:4] in CAPTURES:
+        raise ValueError("got a capture of packets, expected a log")
     try:
         if content[:2] in (b"\xff\xfe", b"\xfe\xff"):
             text = content.decode("utf-16")

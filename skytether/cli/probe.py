@@ -77,8 +77,7 @@ class ProbeOptions:
     """Run as the listening end: answer probes at this address until Ctrl-C."""
     files: Annotated[tuple[Path, ...], Argument(name="from", metavar="FILE", append=True)] = ()
     """Read a log instead of measuring: of ping, fping or irtt, or a table; or up to four, of paths
-    at the same time. Or two captures of one UDP flow (pcap), that of the vehicle's end first:
-    --from NEAR --from FAR.
+    at the same time.
     """
     duration: float = 60.0
     """Length of the measurement [s]."""
@@ -113,7 +112,7 @@ def probe(argv: Sequence[str]) -> None:
     One end listens; the other sends numbered packets, which are answered, and prints the results.
     Run it at the vehicle's place, and the listener at the server's: then its packets take the
     downlink, and the answers the uplink. Ctrl-C ends the measurement and prints the results so far.
-    With --from it analyses logs or captures of other programs. Of several paths it also tells how
+    With --from it analyses logs of other programs. Of several paths it also tells how
     often they were out, and how often all at once.
     """
     options = read(ProbeOptions(), argv, "skytether probe", probe.__doc__)
@@ -279,28 +278,17 @@ def _conclude(
 def _read(options: ProbeOptions) -> None:
     _check(options, len(options.files))
     read = [File(str(path), _content(path)) for path in options.files]
-    captures = sum(recorded.is_capture(file.content) for file in read)
-    names = " and ".join(file.name for file in read)
-    if (len(read), captures) not in ((2, 2), *((count, 0) for count in range(1, PATHS_MAX + 1))):
-        message = f"got {len(read)} files, of which {captures} are captures"
-        expected = (
-            "one log, or two captures of one flow, that of the vehicle's end first, or logs of up "
-            f"to {PATHS_MAX} paths"
-        )
-        raise CommandError(f"--from: {message}, expected {expected}", CONFIGURATION)
-    if not captures and len({*options.files}) < len(read):
+    if len(read) > PATHS_MAX:
+        message = f"got {len(read)} files, expected logs of up to {PATHS_MAX} paths"
+        raise CommandError(f"--from: {message}", CONFIGURATION)
+    if len({*options.files}) < len(read):
+        names = " and ".join(file.name for file in read)
         raise CommandError(f"--from: got {names}, expected each file once", CONFIGURATION)
-    trips: list[RoundTrips] = []
     try:
-        if captures:
-            measured = recorded.of_captures(read[0].content, read[1].content)
-            results = [(measured, outcome(measured, names, secure=False))]
-        else:
-            results = [_of_file(file) for file in read]
-            trips = [recorded.round_trips(recorded_in(file)) for file in read]
+        results = [_of_file(file) for file in read]
+        trips = [recorded.round_trips(recorded_in(file)) for file in read]
     except ValueError as error:
-        where = f"{names}: " if captures else ""
-        raise CommandError(f"--from: {where}{error}", CONFIGURATION) from None
+        raise CommandError(f"--from: {error}", CONFIGURATION) from None
     _conclude(options, results, trips)
 
 
@@ -424,7 +412,7 @@ def _tell_accuracy(outcome: ProbeOutcome, of_path: str) -> None:
             "apart. If they were lost, give each a row with its time and no delay."
         )
     if path.unreported:
-        print(f"{path.unreported} packets are left out: forgotten by the other end, or not unique.")
+        print(f"{path.unreported} packets are left out: forgotten by the other end.")
 
 
 def _flights(options: ProbeOptions, outcomes: Sequence[ProbeOutcome]) -> Sequence[str]:

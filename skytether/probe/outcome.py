@@ -92,7 +92,7 @@ class PathFigures(msgspec.Struct, frozen=True, kw_only=True):
     round_trip_least_s: float
     """Sum of both least delays."""
     unreported: int
-    """Arrivals that the listener dropped before reporting them, or captured packets left out."""
+    """Number of arrivals that the listener dropped before reporting them."""
     uplink: DirectionFigures
     """Figures of the packets from the listener to the prober."""
     downlink: DirectionFigures

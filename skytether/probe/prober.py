@@ -83,7 +83,7 @@ class MeasuredPath:
     size: int
     period_ns: int
     unreported: int
-    """Arrivals that the listener dropped before reporting them, or captured packets left out."""
+    """Number of arrivals that the listener dropped before reporting them."""
 
 
 class Prober(Endpoint):

@@ -1,9 +1,8 @@
-"""`probe.recorded`: figures from logs and pairs of captures, as from a measurement."""
+"""`probe.recorded`: figures from logs, as from a measurement."""
 
 import json
 import re
-import struct
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +13,6 @@ from skytether.__main__ import main
 from skytether.netem.impairments.direction import impairments
 from skytether.probe import recorded
 from skytether.probe.outcome import outcome
-from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
 from skytether.shared.formats.recorded import recorded_in
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.registry import File
@@ -118,165 +116,15 @@ def test_logs_of_two_modems_are_compared_at_the_same_times(
     assert np.bincount(packets["path"]).tolist() == [800, 800]
 
 
-# -- captures -------------------------------------------------------------------------------------
-
-VEHICLE, NAT, SERVER = (b"\x0a\0\0\2", 5000), (b"\xc0\0\2\7", 6000), (b"\xc0\0\2\1", 47001)
-Address = tuple[bytes, int]
-Packet = tuple[int, Address, Address, bytes]
-"""Time [ns], sender, receiver and payload."""
-
-
-def ethernet(source: Address, target: Address, payload: bytes) -> bytes:
-    """Frame with a VLAN tag, and the padding of a short frame after the packet."""
-    return b"\0" * 12 + b"\x81\0\0\5\x08\0" + raw(source, target, payload) + b"\0" * 6
-
-
-def raw(source: Address, target: Address, payload: bytes) -> bytes:
-    udp = struct.pack(">HHHH", source[1], target[1], 8 + len(payload), 0) + payload
-    head = struct.pack(">BBHHHBBH", 0x45, 0, 20 + len(udp), 0, 0x4000, 64, 17, 0)
-    return head + source[0] + target[0] + udp
-
-
-def raw6(source: Address, target: Address, payload: bytes) -> bytes:
-    udp = struct.pack(">HHHH", source[1], target[1], 8 + len(payload), 0) + payload
-    addresses = source[0].rjust(16, b"\xfd") + target[0].rjust(16, b"\xfd")
-    return struct.pack(">IHBB", 6 << 28, len(udp), 17, 64) + addresses + udp
-
-
-def pcap(packets: Sequence[Packet], order: str = "<", *, nano: bool = True) -> bytes:
-    magic = 0xA1B23C4D if nano else 0xA1B2C3D4
-    parts = [struct.pack(order + "IHHiIII", magic, 2, 4, 0, 0, 65535, 1)]
-    for time_ns, *packet in packets:
-        frame = ethernet(*packet)
-        seconds, rest = divmod(time_ns, SECOND_NS)
-        rest //= 1 if nano else 1000
-        parts.append(struct.pack(order + "IIII", seconds, rest, len(frame), len(frame)) + frame)
-    return b"".join(parts)
-
-
-def pcapng(packets: Sequence[Packet], make: Callable[..., bytes] = raw) -> bytes:
-    """Sections as Wireshark writes them, with times in nanoseconds."""
-
-    def block(kind: int, body: bytes) -> bytes:
-        body += b"\0" * (-len(body) % 4)
-        size = struct.pack("<I", 12 + len(body))
-        return struct.pack("<I", kind) + size + body + size
-
-    parts = [
-        block(0x0A0D0D0A, struct.pack("<IHHq", 0x1A2B3C4D, 1, 0, -1)),
-        block(1, struct.pack("<HHI", 101, 0, 0) + struct.pack("<HHB3xHH", 9, 1, 9, 0, 0)),
-        block(4, b"names"),
-    ]
-    for time_ns, *packet in packets:
-        frame = make(*packet)
-        times = struct.pack("<IIIII", 0, time_ns >> 32, time_ns % 2**32, len(frame), len(frame))
-        parts.append(block(6, times + frame))
-    return b"".join(parts)
-
-
-def flight(count: int = 200) -> tuple[list[Packet], list[Packet]]:
-    """Packets at both ends: 50 ms down, 90 ms up, each tenth lost, with clocks an hour apart.
-
-    Both ends send at the same rate. Both captures contain a stranger's packets, and a NAT is
-    between.
-    """
-    near: list[Packet] = []
-    far: list[Packet] = []
-    hour_ns, begin_ns = 3600 * SECOND_NS, 1_700_000_000 * SECOND_NS
-    for number in range(count):
-        at_ns = begin_ns + 100 * MILLISECOND_NS * number
-        down, up = (b"%s %06d" % (way, number) for way in (b"down", b"up"))
-        near.append((at_ns, VEHICLE, SERVER, down))
-        far.append((at_ns + hour_ns, SERVER, NAT, up))
-        near.append((at_ns, VEHICLE, NAT, b"of another %d" % number))
-        if number % 10 != 3:
-            far.append((at_ns + hour_ns + 50 * MILLISECOND_NS, NAT, SERVER, down))
-        if number % 10 != 6:
-            near.append((at_ns + 90 * MILLISECOND_NS, SERVER, VEHICLE, up))
-        if number == 20:
-            far.append((at_ns + hour_ns + 55 * MILLISECOND_NS, NAT, SERVER, down))
-    return near, far
-
-
-@pytest.mark.parametrize(
-    "written",
-    [
-        pcap,
-        lambda p: pcap(p, ">"),
-        lambda p: pcap(p, nano=False),
-        lambda p: pcapng(p, raw6),
-    ],
-)
-def test_a_pair_of_captures_is_measured_each_way(
-    written: Callable[[Sequence[Packet]], bytes],
-) -> None:
-    """Loss of each direction; of the delays only the sum, for any clocks."""
-    near, far = flight()
-    measured = recorded.of_captures(written(near), written(far) + b"cut")
-    told = outcome(measured, "it", secure=False).told
-    assert [(way.sent, way.came, way.copies) for way in (told.downlink, told.uplink)] == [
-        (200, 180, 1),
-        (200, 180, 0),
-    ]
-    assert told.round_trip_mean_s == pytest.approx(0.14, abs=1e-5)
-    assert told.offset_s == pytest.approx(3600.0 - 0.02, abs=1e-5)
-    assert (told.bytes, told.every_s, told.unreported) == (11, pytest.approx(0.1), 0)
-    if written is not pcap:
-        return
-    swapped = recorded.of_captures(written(far), written(near))
-    assert swapped.downlink.came.tolist() == measured.uplink.came.tolist()
-
-
-def test_payloads_that_were_sent_twice_are_left_out() -> None:
-    near, far = flight()
-    far += [(time_ns + SECOND_NS, *rest) for time_ns, *rest in far if rest[2].endswith(b"42")]
-    measured = recorded.of_captures(pcap(near), pcap(far))
-    assert measured.unreported == 4
-    assert len(measured.uplink.sent_ns) == 198
-    assert measured.downlink.copies == 3
-
-
-def test_packets_that_a_kernel_sent_as_one_are_cut() -> None:
-    """The sender's capture has them in one piece, so each would count as lost."""
-    near, far = flight()
-    sent = [packet for packet in near if packet[3].startswith(b"down")]
-    joined = [
-        (time_ns, source, target, one + two[3])
-        for (time_ns, source, target, one), two in zip(sent[::2], sent[1::2], strict=True)
-    ]
-    near = [packet for packet in near if not packet[3].startswith(b"down")] + joined
-    measured = recorded.of_captures(pcap(near), pcap(far))
-    assert (len(measured.downlink.sent_ns), measured.downlink.came.sum()) == (200, 180)
-
-
-def one_way(packets: Sequence[Packet]) -> bytes:
-    return pcap([packet for packet in packets if not packet[3].startswith(b"up")])
-
-
-@pytest.mark.parametrize(
-    ("near", "far", "said"),
-    [
-        (pcap([]), pcap(flight()[1]), "no UDP packet is in both"),
-        (pcap(flight()[0]), pcap(flight()[1])[:20], "no UDP packet is in both"),
-        (one_way(flight()[0]), pcap(flight()[1]), "of one direction only"),
-        (pcap(2 * flight()[0]), pcap(flight()[1]), "0 have a unique payload"),
-    ],
-)
-def test_captures_that_share_too_little_are_refused(near: bytes, far: bytes, said: str) -> None:
-    with pytest.raises(ValueError, match=said):
-        recorded.of_captures(near, far)
-
-
 @pytest.mark.parametrize(
     ("line", "said"),
     [
         ("--from nothing", "--from: nothing: cannot be read"),
-        ("--from near.pcap", "got 1 files, of which 1 are captures, expected one log, or two"),
-        ("--from it.log --from near.pcap", "got 2 files, of which 1 are captures"),
+        (5 * "--from it.log ", "got 5 files, expected logs of up to 4 paths"),
+        ("--from near.pcap", "--from: near.pcap: got a capture of packets"),
         ("--from it.log --from it.log", "got it.log and it.log, expected each file once"),
         ("--from it.log --from tomorrow.log", "got paths without a time in common"),
         ("--from bad.log", "--from: bad.log: got no answer to a ping"),
-        ("--from near.pcap --from near.pcap", "the same times in both captures"),
         ("--from it.log --listen 127.0.0.1:1", "got both, expected"),
     ],
 )
@@ -291,5 +139,5 @@ def test_bad_files_are_one_line(
     (tmp_path / "it.log").write_text(log())
     (tmp_path / "tomorrow.log").write_text(log(begin_s=1.7e9 + 86_400.0))
     (tmp_path / "bad.log").write_text("icmp_seq=1")
-    (tmp_path / "near.pcap").write_bytes(pcap(flight()[0]))
+    (tmp_path / "near.pcap").write_bytes(b"\xd4\xc3\xb2\xa1" + bytes(40))
     assert said in refused(["probe", *line.split()], capsys)
