@@ -16,7 +16,7 @@ from skytether.autopilot.faults import Script, ScriptedFault
 from skytether.autopilot.flavours import FLAVOURS, FlavourName, FlightMode
 from skytether.autopilot.flight import TICK_NS, PilotedVehicle, Result
 from skytether.autopilot.px4 import PX4
-from skytether.autopilot.telemetry import ALL, GROUPS, HEARTBEAT, STREAMS, Telemetry
+from skytether.autopilot.telemetry import HEARTBEAT, STREAMS, Telemetry
 from skytether.mavlink import parameters
 from skytether.mavlink.codec import Codec, Message
 from skytether.mavlink.dialect import dialect
@@ -41,8 +41,6 @@ PATIENCE_NS = SECOND_NS
 """Silence after which a peer may be replaced [ns]."""
 BEHIND_MAX_NS = SECOND_NS
 """Longest time that is simulated at once after a late wake [ns]; the flight skips the rest."""
-LISTED_EACH_TICK = 2
-HOME = int(dialect.MAVLINK_MSG_ID_HOME_POSITION)
 FORCE = 21196.0
 """Magic number that forces arming or disarming."""
 
@@ -68,8 +66,6 @@ class Peer:
         self.codec = Codec(SYSTEM, COMPONENT)
         self.heard_ns = now_ns
         self.is_station = False
-        self.listed: int | None = None
-        """Number of parameters sent of a requested list; None without a request."""
         self.streams: dict[int, tuple[int, int]] = {}
         """Interval of each stream [ns] and time of its next message, by message id."""
         for number, rate in {HEARTBEAT: 1.0, **rates}.items():
@@ -143,16 +139,10 @@ class Autopilot(Endpoint):
             "HEARTBEAT": self._on_heartbeat,
             "TIMESYNC": self._on_timesync,
             "PARAM_REQUEST_READ": self._on_parameter_read,
-            "PARAM_REQUEST_LIST": self._on_parameter_list,
             "PARAM_SET": self._on_parameter_set,
             "COMMAND_LONG": self._on_command,
             "COMMAND_INT": self._on_command,
             "SET_MODE": self._on_mode,
-            "REQUEST_DATA_STREAM": self._on_data_stream,
-            "AUTOPILOT_VERSION_REQUEST": self._on_version_request,
-            "MISSION_REQUEST_LIST": self._on_mission_list,
-            "MISSION_CLEAR_ALL": self._on_mission_clear,
-            "MISSION_COUNT": self._on_mission_count,
             "SET_POSITION_TARGET_LOCAL_NED": self._on_setpoint,
         }
 
@@ -220,7 +210,6 @@ class Autopilot(Endpoint):
             for peer in self._peers.values():
                 for number in peer.due(self.flight.now_ns):
                     self._tell(peer, number)
-                self._list(peer)
 
     def _record(self, time_ns: int) -> None:
         if self._recorder is not None:
@@ -264,16 +253,6 @@ class Autopilot(Endpoint):
                         self._send(peer, message)
         self.flight.said.clear()
 
-    def _list(self, peer: Peer) -> None:
-        if peer.listed is None:
-            return
-        names = list(self.flight.parameters)
-        for name in names[peer.listed : peer.listed + LISTED_EACH_TICK]:
-            self._send(peer, self._telemetry.parameter(name))
-        peer.listed += LISTED_EACH_TICK
-        if peer.listed >= len(names):
-            peer.listed = None
-
     # Incoming messages
 
     def _on_heartbeat(self, message: Message, peer: Peer, now_ns: int) -> None:  # noqa: ARG002
@@ -298,9 +277,6 @@ class Autopilot(Endpoint):
         if name in self.flight.parameters:
             self._send(peer, self._telemetry.parameter(name))
 
-    def _on_parameter_list(self, message: Message, peer: Peer, now_ns: int) -> None:  # noqa: ARG002
-        peer.listed = 0
-
     def _on_parameter_set(self, message: Message, peer: Peer, now_ns: int) -> None:  # noqa: ARG002
         name, before = message.param_id, self.flight.parameters.get(message.param_id)
         if before is None:
@@ -311,42 +287,6 @@ class Autopilot(Endpoint):
             self.flight.set(name, round(value) if isinstance(before, int) else float(value))
         for receiver in self._peers.values():
             self._send(receiver, self._telemetry.parameter(name))
-
-    def _on_data_stream(self, message: Message, peer: Peer, now_ns: int) -> None:  # noqa: ARG002
-        """Set the rate of a group of messages, as ground stations still do."""
-        group, rate = message.req_stream_id, message.req_message_rate
-        for number in sum(GROUPS.values(), ()) if group == ALL else GROUPS.get(group, ()):
-            if message.start_stop and rate:
-                peer.every(number, round(SECOND_NS / rate), self.flight.now_ns)
-            else:
-                peer.streams.pop(number, None)
-
-    def _on_version_request(self, message: Message, peer: Peer, now_ns: int) -> None:  # noqa: ARG002
-        self._send(peer, self._telemetry.version())
-
-    def _on_mission_list(self, message: Message, peer: Peer, now_ns: int) -> None:  # noqa: ARG002
-        """Answer that the mission is empty."""
-        whom = message.get_srcSystem(), message.get_srcComponent()
-        self._send(
-            peer,
-            dialect.MAVLink_mission_count_message(*whom, 0, mission_type=message.mission_type),
-        )
-
-    def _on_mission_clear(self, message: Message, peer: Peer, now_ns: int) -> None:  # noqa: ARG002
-        self._answer_mission(message, peer, dialect.MAV_MISSION_ACCEPTED)
-
-    def _on_mission_count(self, message: Message, peer: Peer, now_ns: int) -> None:  # noqa: ARG002
-        """Refuse the upload of a mission; an empty one is accepted."""
-        is_empty = message.count == 0
-        result = dialect.MAV_MISSION_ACCEPTED if is_empty else dialect.MAV_MISSION_UNSUPPORTED
-        self._answer_mission(message, peer, result)
-
-    def _answer_mission(self, message: Message, peer: Peer, result: int) -> None:
-        whom = message.get_srcSystem(), message.get_srcComponent()
-        self._send(
-            peer,
-            dialect.MAVLink_mission_ack_message(*whom, result, mission_type=message.mission_type),
-        )
 
     def _on_mode(self, message: Message, peer: Peer, now_ns: int) -> None:  # noqa: ARG002
         self._acknowledge(
@@ -407,9 +347,6 @@ class Autopilot(Endpoint):
                 result = self._set_interval(_whole(first), second, peer)
             case dialect.MAV_CMD_REQUEST_MESSAGE:
                 result = Result.ACCEPTED if self._tell(peer, _whole(first)) else Result.DENIED
-            case dialect.MAV_CMD_GET_HOME_POSITION:
-                self._tell(peer, HOME)
-                result = Result.ACCEPTED
             case _:
                 result = Result.UNSUPPORTED
         return result

@@ -27,8 +27,6 @@ UNKNOWN_MV = 65535
 """Voltage sent for a missing cell [mV]."""
 CURRENT_MODE_EXTRA = 193
 """Byte that the checksum of CURRENT_MODE includes."""
-UNKNOWN = 65535
-"""Value of a quantity that is not known."""
 
 
 class CurrentMode:
@@ -89,25 +87,6 @@ class Telemetry:
             round(1e3 * (altitude + up)),
         )
 
-    def global_position(self) -> Message | None:
-        if not self._flight.ready:
-            return None
-        latitude, longitude, altitude_mm = self._globe(self._flight.estimate())
-        *_, up = self._flight.estimate()
-        north, east, down = (round(100.0 * each) for each in turned(self._flight.velocity()))
-        heading = round(100.0 * self._heading) % 36000
-        return dialect.MAVLink_global_position_int_message(
-            self._boot_ms,
-            latitude,
-            longitude,
-            altitude_mm,
-            round(1e3 * up),
-            north,
-            east,
-            down,
-            heading,
-        )
-
     def gps(self) -> Message:
         """Fix of the receiver: none before the estimate is ready."""
         flight = self._flight
@@ -128,22 +107,6 @@ class Telemetry:
             10 if has_fix else 0,
             h_acc=300,
         )
-
-    def hud(self) -> Message:
-        north, east, climb = self._flight.velocity()
-        speed = math.hypot(north, east)
-        altitude_m = self._flight.flavour.home[2] + self._flight.estimate()[2]
-        heading, throttle = int(self._heading), 50 if self._flight.armed else 0
-        return dialect.MAVLink_vfr_hud_message(speed, speed, heading, throttle, altitude_m, climb)
-
-    @property
-    def _heading(self) -> float:
-        """Heading clockwise from north [degrees]."""
-        _, _, yaw, _ = self._flight.quadrotor.attitude()
-        return math.degrees(yaw) % 360.0
-
-    def system_time(self) -> Message:
-        return dialect.MAVLink_system_time_message(0, self._boot_ms)
 
     def time_request(self) -> Message:
         return dialect.MAVLink_timesync_message(0, self._flight.now_ns)
@@ -258,10 +221,7 @@ class Telemetry:
 STREAMS: dict[int, Callable[[Telemetry], Message | None]] = {
     HEARTBEAT: Telemetry.heartbeat,
     int(dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED): Telemetry.local_position,
-    int(dialect.MAVLINK_MSG_ID_GLOBAL_POSITION_INT): Telemetry.global_position,
     int(dialect.MAVLINK_MSG_ID_GPS_RAW_INT): Telemetry.gps,
-    int(dialect.MAVLINK_MSG_ID_VFR_HUD): Telemetry.hud,
-    int(dialect.MAVLINK_MSG_ID_SYSTEM_TIME): Telemetry.system_time,
     int(dialect.MAVLINK_MSG_ID_TIMESYNC): Telemetry.time_request,
     CURRENT_MODE: Telemetry.current_mode,
     int(dialect.MAVLINK_MSG_ID_ATTITUDE): Telemetry.attitude,
@@ -274,23 +234,3 @@ STREAMS: dict[int, Callable[[Telemetry], Message | None]] = {
     int(dialect.MAVLINK_MSG_ID_ESTIMATOR_STATUS): Telemetry.estimate,
 }
 """Telemetry messages by id, which can be streamed or requested once."""
-GROUPS: dict[int, tuple[int, ...]] = {
-    int(dialect.MAV_DATA_STREAM_EXTENDED_STATUS): (
-        int(dialect.MAVLINK_MSG_ID_SYS_STATUS),
-        int(dialect.MAVLINK_MSG_ID_GPS_RAW_INT),
-    ),
-    int(dialect.MAV_DATA_STREAM_POSITION): (
-        int(dialect.MAVLINK_MSG_ID_GLOBAL_POSITION_INT),
-        int(dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED),
-    ),
-    int(dialect.MAV_DATA_STREAM_EXTRA1): (int(dialect.MAVLINK_MSG_ID_ATTITUDE),),
-    int(dialect.MAV_DATA_STREAM_EXTRA2): (int(dialect.MAVLINK_MSG_ID_VFR_HUD),),
-    int(dialect.MAV_DATA_STREAM_EXTRA3): (
-        int(dialect.MAVLINK_MSG_ID_BATTERY_STATUS),
-        int(dialect.MAVLINK_MSG_ID_EKF_STATUS_REPORT),
-        int(dialect.MAVLINK_MSG_ID_SYSTEM_TIME),
-    ),
-}
-"""Messages of each group of REQUEST_DATA_STREAM, as ArduCopter groups them."""
-ALL = int(dialect.MAV_DATA_STREAM_ALL)
-"""Number of the group that stands for all groups."""

@@ -415,11 +415,11 @@ def set_parameter(companion: Companion, name: str, value: float) -> None:
 
 
 @pytest.mark.parametrize("flavour", BOTH)
-def test_parameters_are_read_listed_and_set(flavour: FlavourName) -> None:
+def test_parameters_are_read_and_set(flavour: FlavourName) -> None:
     companion = Companion(flavour)
     own, bytewise = FLAVOURS[flavour].parameters, FLAVOURS[flavour].bytewise
-    companion.send(dialect.MAVLink_param_request_list_message(1, 1))
-    companion.run(0.5)
+    for number in range(len(own)):
+        companion.send(dialect.MAVLink_param_request_read_message(1, 1, b"", number))
     told = {
         message.param_id: parameters.from_wire(
             message.param_value, message.param_type, bytewise=bytewise
@@ -676,60 +676,3 @@ def test_another_wind_blows_when_it_is_told() -> None:
     companion.autopilot.change(windy, frozenset({"vehicle.steady_wind_mps"}), now_ns=0)
     companion.run(5.0)
     assert companion.flight.quadrotor.attitude().roll < before - 0.02
-
-
-# Scripts and ground stations that do not know its local frame
-
-
-@pytest.mark.parametrize("flavour", BOTH)
-def test_its_place_on_the_globe_is_that_of_its_local_frame(flavour: FlavourName) -> None:
-    companion = climbed(flavour)
-    ask = dialect.MAV_DATA_STREAM_POSITION
-    companion.send(dialect.MAVLink_request_data_stream_message(1, 1, ask, 10, 1))
-    companion.velocity = (1.0, -2.0, 0.5)
-    companion.run(3.0)
-    place, local = companion.last("GLOBAL_POSITION_INT"), companion.last("LOCAL_POSITION_NED")
-    latitude, longitude, altitude_m = companion.flavour.home
-    north_m = (place.lat * 1e-7 - latitude) * 111_319.49
-    east_m = (place.lon * 1e-7 - longitude) * 111_319.49 * math.cos(math.radians(latitude))
-    assert (north_m, east_m) == pytest.approx((local.x, local.y), abs=0.05)
-    assert place.relative_alt / 1e3 == pytest.approx(-local.z, abs=0.01)
-    assert place.alt / 1e3 == pytest.approx(altitude_m - local.z, abs=0.01)
-    assert (place.vx / 100, place.vz / 100) == pytest.approx((local.vx, local.vz), abs=0.01)
-
-
-def test_streams_are_asked_for_in_groups_and_stopped() -> None:
-    companion = Companion()
-    names = ["GPS_RAW_INT", "GLOBAL_POSITION_INT", "VFR_HUD", "ATTITUDE", "SYSTEM_TIME"]
-    companion.run(2.0)
-    assert not any(companion.all(name) for name in names)
-    for rate, begins in ((4, 1), (4, 0)):
-        group = dialect.MAV_DATA_STREAM_ALL
-        companion.send(dialect.MAVLink_request_data_stream_message(1, 1, group, rate, begins))
-        before = [len(companion.all(name)) for name in names]
-        companion.run(5.0)
-        came = [len(companion.all(name)) - count for name, count in zip(names, before, strict=True)]
-        assert came == pytest.approx([20.0 * begins] * len(names), abs=1)
-    assert companion.last("GPS_RAW_INT").fix_type == dialect.GPS_FIX_TYPE_3D_FIX
-
-
-def test_it_has_no_mission_and_takes_none() -> None:
-    companion = Companion()
-    companion.send(dialect.MAVLink_mission_request_list_message(1, 1))
-    assert companion.last("MISSION_COUNT").count == 0
-    for message, result in (
-        (dialect.MAVLink_mission_clear_all_message(1, 1), dialect.MAV_MISSION_ACCEPTED),
-        (dialect.MAVLink_mission_count_message(1, 1, 0), dialect.MAV_MISSION_ACCEPTED),
-        (dialect.MAVLink_mission_count_message(1, 1, 3), dialect.MAV_MISSION_UNSUPPORTED),
-    ):
-        companion.send(message)
-        assert companion.last("MISSION_ACK").type == result
-
-
-def test_it_tells_version_and_home_to_who_asks() -> None:
-    companion = Companion()
-    companion.run(1.0)
-    companion.send(dialect.MAVLink_autopilot_version_request_message(1, 1))
-    assert companion.last("AUTOPILOT_VERSION").flight_sw_version >> 24 == 4
-    assert companion.command(dialect.MAV_CMD_GET_HOME_POSITION) == Result.ACCEPTED
-    assert companion.last("HOME_POSITION").latitude == round(1e7 * companion.flavour.home[0])
