@@ -30,7 +30,7 @@ from skytether.shared.law.model import Array, Indices
 from skytether.shared.scenario.registry import IMPAIRMENTS, TRIGGERS
 from skytether.shared.scenario.schema import ControlConfig
 from skytether.shared.scenario.whole import Scenario
-from skytether.shared.telemetry.record import Record, Rows
+from skytether.shared.telemetry.record import Record
 from skytether.shared.telemetry.summary import Summary, desired, summarise
 
 if TYPE_CHECKING:
@@ -376,59 +376,3 @@ def _estimate_error(flight: Record) -> Array:
     error = flight.server["estimate"][ours] - flight.client["state"][theirs]
     norms: Array = np.linalg.norm(error, axis=1)
     return norms
-
-
-def intervals(samples: Samples) -> Plate:
-    scenario, flights = samples[EVENT]
-    gaps = np.concatenate(
-        [np.diff(flight.server["step"][flight.server["event"]]) for flight in flights]
-    )
-    steps = np.arange(1, int(gaps.max()) + 1)
-    counts = np.array([np.sum(gaps == step) for step in steps])
-    (regular,) = map(int, TRIGGERS.one(samples[PERIODIC][0].control.trigger).values)
-    with lettered(COLUMN, 2.4, LETTERS) as figure:
-        plane = figure.subplots()
-        dt = scenario.control.dt
-        plane.bar(steps * dt, counts / len(gaps), 0.8 * dt, color="0.4", label="event trigger (16)")
-        plane.axvline(
-            regular * dt, color="#0072b2", linestyle="--", label=f"periodic, every {regular} steps"
-        )
-        plane.set_xlabel("time between two packets [s]")
-        plane.set_ylabel("share")
-        plane.legend()
-    says = (
-        f"{len(gaps)} intervals of {len(flights)} flights: {np.mean(gaps == 1):.0%} are a single "
-        f"step, the median is {np.median(gaps):g} steps, the longest {gaps.max()}."
-    )
-    rows = list(zip(steps.tolist(), (steps * dt).tolist(), counts.tolist(), strict=True))
-    title = "Time between two packets"
-    csv = to_csv(("steps", "seconds", "count"), rows)
-    return picture(figure, "intervals", title, says, csv)
-
-
-def solve_times(servers: Mapping[str, Rows], dt: float) -> Plate:
-    """Distribution of the time per step of both MPCs in the flights over UDP.
-
-    `servers` are the rows of the server's records by method, `dt` the length of a step [s].
-    """
-    solve_ms = {
-        name: rows["solve_ns"][rows["solve_ns"] >= 0] / 1e6 for name, rows in servers.items()
-    }
-    everything = np.concatenate(list(solve_ms.values()))
-    edges = np.geomspace(max(1e-3, everything.min()), everything.max() * 1.01, 40)
-    counts = {name: np.histogram(values, edges)[0] for name, values in solve_ms.items()}
-    with lettered(COLUMN, 2.4, LETTERS) as figure:
-        plane = figure.subplots()
-        for name, values in counts.items():
-            plane.stairs(values, edges, color=STYLES[name]["color"], label=name)
-        plane.set_xscale("log")
-        plane.set_xlabel("both MPCs of a step [ms]")
-        plane.set_ylabel("steps")
-        plane.legend()
-    says = (
-        f"p50 {np.median(everything):.2f} ms, p99 {np.quantile(everything, 0.99):.2f} ms, longest "
-        f"{everything.max():.2f} ms, where a step has {dt * 1e3:g} ms."
-    )
-    rows = np.column_stack([edges[:-1], edges[1:], *counts.values()]).tolist()
-    header = ("from_ms", "to_ms", *counts)
-    return picture(figure, "solve-times", "Solve times over UDP", says, to_csv(header, rows))

@@ -81,7 +81,6 @@ def draw(measured: Reproduction) -> Drawn:
     columns = {method: cell for (value, method), cell in cells.items() if value == study.here}
     entries = table_1(columns)
     samples = measured.samples
-    servers = {method: real.flight.server for method, real in measured.real.items()}
     scenario = study.scenario
     pictures = [
         plates.delay(scenario.network.downlink, measured.delay_ms),
@@ -91,8 +90,6 @@ def draw(measured: Reproduction) -> Drawn:
         plates.pareto(measured.maps, measured.periods),
         *(plates.curve(*curve) for curve in measured.curves),
         plates.estimates(samples),
-        plates.intervals(samples),
-        plates.solve_times(servers, scenario.control.dt),
     ]
     tables = [paper_table(entries, columns), traffic_table(columns), real_table(measured)]
     return Drawn(TITLE, ABOUT, tables, pictures, verdict(entries, columns))

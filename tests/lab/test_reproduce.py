@@ -44,8 +44,6 @@ FIGURES = {
     "fig5",
     "fig5-pareto",
     "estimate-error",
-    "intervals",
-    "solve-times",
     "rmse-loss",
     "rmse-delay",
     "rmse-jitter",
@@ -170,7 +168,7 @@ def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
     command = [sys.executable, "-P", "-m", "skytether", *shlex.split(LINE)[1:]]
     run = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
     assert run.returncode == 0, run.stderr
-    assert "13 figures; 178 runs flown" in run.stdout
+    assert "11 figures; 178 runs flown" in run.stdout
     return folder / shlex.split(LINE)[-1]
 
 
@@ -283,7 +281,7 @@ def test_the_second_time_it_only_draws(
     kept = {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
     monkeypatch.chdir(out.parent)
     assert main(shlex.split(LINE)[1:]) == 0
-    assert "13 figures; 0 runs flown" in capsys.readouterr().out
+    assert "11 figures; 0 runs flown" in capsys.readouterr().out
     changed = {path.name for path, content in kept.items() if path.read_bytes() != content}
     assert changed == {"report.html", "calls.jsonl"}
     calls = [json.loads(line) for line in (out / "calls.jsonl").read_text().splitlines()]
