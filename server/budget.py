@@ -10,19 +10,16 @@ has bytes for, in this order:
 
 It is a token bucket: b ← b + r Δt, within ± r BURST_S, minus the bytes sent, headers included;
 urgent packets may make it negative. So a window of T seconds has at most r (T + BURST_S) bytes
-beside the urgent ones. The rate r is `control.shared_bytes_per_s`, or follows the queueing delay
-(`server.rate`).
+beside the urgent ones. The rate r is `control.shared_bytes_per_s`.
 
 A refused vehicle asks again at the next step. The ranking covers all blocks of vehicles, with the
 latest request of each vehicle, at most one step old.
 """
 
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
-from skytether.server.planning.clock import ClockMap
-from skytether.server.rate import RateControl
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.law.model import Array, Flags, Indices
 
@@ -40,16 +37,12 @@ class SharedBudget:
     """Shares one rate among up to `capacity` vehicles.
 
     Args:
-        bytes_per_s: the rate [B/s]; auto: controlled by the queueing delay.
-        clock: measures delays.
+        bytes_per_s: the rate [B/s].
     """
 
-    def __init__(
-        self, bytes_per_s: float | Literal["auto"], clock: ClockMap, capacity: int
-    ) -> None:
-        self._fixed = None if bytes_per_s == "auto" else bytes_per_s
-        self._control = RateControl(clock, capacity)
-        self._tokens = self.bytes_per_s * BURST_S
+    def __init__(self, bytes_per_s: float, capacity: int) -> None:
+        self.bytes_per_s = bytes_per_s
+        self._tokens = bytes_per_s * BURST_S
         self._filled_ns: int | None = None
         self._spent = 0
         self._bytes = np.full(capacity, GUESS_BYTES, dtype=np.int64)
@@ -64,18 +57,12 @@ class SharedBudget:
         self.deferred = 0
         """Number of refused requests."""
 
-    @property
-    def bytes_per_s(self) -> float:
-        return self._control.bytes_per_s if self._fixed is None else self._fixed
-
     def forget(self, row: int) -> None:
         self._bytes[row], self._asked[row] = GUESS_BYTES, NEVER
 
-    def fill(self, rows: Indices, now_ns: int) -> None:
+    def fill(self, now_ns: int) -> None:
         passed_s = 0.0 if self._filled_ns is None else (now_ns - self._filled_ns) / SECOND_NS
         self._filled_ns = now_ns
-        if self._fixed is None:
-            self._control.update(rows, self._spent, now_ns)
         rate = self.bytes_per_s
         tokens, most = self._tokens - self._spent + rate * passed_s, rate * BURST_S
         # Debts are bounded too, so that urgent packets cannot keep plans waiting for long.
@@ -108,9 +95,7 @@ class SharedBudget:
         goes = ranked[np.cumsum(self._bytes[ranked]) <= left]
         chosen = urgent & event | np.isin(rows, goes) & asks
         late = int(asks.sum() - (chosen & asks).sum())
-        if late:
-            self.deferred += late
-            self._control.needed = True
+        self.deferred += late
         self._asked[rows[chosen]] = NEVER
         return chosen
 
@@ -121,8 +106,4 @@ class SharedBudget:
             self._bytes[row] = size
 
     def figures(self) -> dict[str, Any]:
-        return {
-            "bytes_per_s": self.bytes_per_s,
-            "queueing_ms": self._control.queueing_s * 1e3,
-            "deferred": self.deferred,
-        }
+        return {"bytes_per_s": self.bytes_per_s, "deferred": self.deferred}

@@ -140,7 +140,7 @@ class Controller:
         self.budget: SharedBudget | None = None
         if shared:
             module = load("skytether.server.budget", "control.shared_bytes_per_s")
-            self.budget = module.SharedBudget(shared, clock, capacity)
+            self.budget = module.SharedBudget(shared, capacity)
 
     @property
     def counts(self) -> Counter[str]:

@@ -117,7 +117,7 @@ class Ticker:
         step = self._clock.steps(rows, tick_ns)
         controller.desired.tick(tick_ns)
         if controller.budget:
-            controller.budget.fill(rows, now_ns)
+            controller.budget.fill(now_ns)
         heartbeats = self._sessions.heartbeats_due(now_ns)
         controller.note_heartbeats([each.row for each in heartbeats])
         rows, step = controller.able(rows, step)

@@ -154,10 +154,9 @@ class ControlConfig(Section, frozen=True):
     trigger: OfTrigger[Text] = "expected_gap | heartbeat"
     """Rule for sending a horizon: policies combined with & and |, see `skytether triggers`. An
     argument is also a key: `control.trigger.expected_gap = 0.1`."""
-    shared_bytes_per_s: OfServer[Annotated[float, Meta(ge=0, le=1e9)] | Literal["auto"]] = 0.0
+    shared_bytes_per_s: OfServer[Annotated[float, Meta(ge=0, le=1e9)]] = 0.0
     """Largest data rate to all vehicles together, IP and UDP headers included [B/s]; horizons with
-    the largest gain per byte are sent first. auto: the largest measured rate without queueing; 0:
-    no limit."""
+    the largest gain per byte are sent first. 0: no limit."""
     planner: OfServer[Text] = "mpc"
     """What plans, see `skytether planners`: the MPC of eq. (9), or a planner of your own."""
     solver: OfServer[Literal["exact", "osqp"]] = "exact"

@@ -32,6 +32,8 @@ TITLES: Mapping[Scheme, str] = {
 """Schemes that are compared, and their titles."""
 PAPER = f"{reading.COMPARED}/paper-every-step-target"
 """Scenario with the best weights of the paper's scheme (docs/compare.md)."""
+BUDGET_BYTES_PER_S = 10_000.0
+"""Rate of the budget, four fifths of the link of the scenario `crowd` [B/s]."""
 STEP = 4.0 / 3.0
 EXACT = 0.05
 """Relative accuracy of the largest number of vehicles."""
@@ -93,7 +95,7 @@ class Crowd:
         table["control"]["shared_bytes_per_s"] = 0.0
         if scheme == "budget":
             rate = self.scenario.control.shared_bytes_per_s
-            table["control"]["shared_bytes_per_s"] = rate or "auto"
+            table["control"]["shared_bytes_per_s"] = rate or BUDGET_BYTES_PER_S
         return reading.check(table, self.name)
 
 

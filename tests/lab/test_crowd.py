@@ -98,7 +98,7 @@ def test_schemes_share_the_network_and_the_target() -> None:
     assert paper.reference == threshold.reference == budget.reference
     assert (paper.control.scheme, paper.control.trigger) == ("predictive", "always")
     assert threshold.control == plan.scenario.control
-    assert budget.control == msgspec.structs.replace(threshold.control, shared_bytes_per_s="auto")
+    assert budget.control == msgspec.structs.replace(threshold.control, shared_bytes_per_s=10_000.0)
     given = reading.check(reading.to_table(plan.scenario) | {}, "test")
     given = msgspec.structs.replace(
         given, control=msgspec.structs.replace(given.control, shared_bytes_per_s=900.0)

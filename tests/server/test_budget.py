@@ -1,4 +1,4 @@
-"""Shared budget: priorities, amounts, and the rate estimate of the network."""
+"""Shared budget: priorities and amounts."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -11,10 +11,7 @@ from hypothesis import strategies as st
 from skytether.client.fleet import apart_ns
 from skytether.lab.crowd import judge
 from skytether.server import budget as budgets
-from skytether.server import rate as rates
 from skytether.server.budget import BURST_S, GUESS_BYTES, WAIT_S, SharedBudget
-from skytether.server.planning.clock import ClockMap
-from skytether.server.rate import RateControl
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
 from skytether.shared.law.model import Array
 from skytether.shared.scenario import reading
@@ -32,7 +29,7 @@ class Crowd:
     def __init__(self, bytes_per_s: float, sizes: list[int]) -> None:
         n = len(sizes)
         self.rows, self.sizes = np.arange(n), np.array(sizes)
-        self.budget = SharedBudget(bytes_per_s, ClockMap(n, DT_NS), n)
+        self.budget = SharedBudget(bytes_per_s, n)
         self.since_s = np.zeros(n)
         self.now_ns = 0
 
@@ -40,7 +37,7 @@ class Crowd:
         """Vehicles that are sent a packet at the next tick, if all ask."""
         self.now_ns += DT_NS
         self.since_s += DT_S
-        self.budget.fill(self.rows, self.now_ns)
+        self.budget.fill(self.now_ns)
         must = np.isin(self.rows, owed or [])
         sent: list[int] = []
         for block in np.array_split(self.rows, blocks):
@@ -149,85 +146,6 @@ def test_who_no_longer_asks_holds_nobody_back() -> None:
     assert crowd.tick(np.array([1.0])) == [0]
 
 
-# -- the rate --------------------------------------------------------------------------------
-
-
-class Air:
-    """Queue of finite rate, and echoes that report its delays to a server.
-
-    Args:
-        rate: rate of the queue [B/s].
-        jitter_s: standard deviation of the additional delay [s].
-        loss: share of lost echoes.
-    """
-
-    def __init__(self, rate: float, *, jitter_s: float = 0.0, loss: float = 0.0) -> None:
-        self.vehicles, self.rate, self.jitter_s, self.loss = 10, rate, jitter_s, loss
-        self.clock = ClockMap(self.vehicles, DT_NS)
-        self.control = RateControl(self.clock, self.vehicles)
-        self.rng = np.random.default_rng(3)
-        self.queue_s, self.sent, self.now_ns = 0.0, 0.0, 0
-        self.queues_s: list[float] = []
-        self.rates: list[float] = []
-
-    def run(self, seconds: float, wanted: float = np.inf) -> "Air":
-        """Offer `wanted` [B/s] for some seconds, and send what the rate estimate allows."""
-        rows = np.arange(self.vehicles)
-        for step in range(round(seconds / DT_S)):
-            self.now_ns += DT_NS
-            spent = min(self.control.bytes_per_s, wanted) * DT_S
-            self.control.needed |= wanted > self.control.bytes_per_s
-            self.queue_s = max(self.queue_s + spent / self.rate - DT_S, 0.0)
-            self.queues_s.append(self.queue_s)
-            self.rates.append(spent / DT_S)
-            row = step % self.vehicles  # the echo reports a packet sent half a second ago
-            before_s = self.queues_s[-min(10, len(self.queues_s))]
-            delay_s = 0.4 + before_s + abs(self.rng.normal(0.0, self.jitter_s or 1e-9))
-            if self.rng.random() >= self.loss:
-                backward_ns = round(delay_s * SECOND_NS)
-                self.clock.observe(
-                    row, 400 * MILLISECOND_NS, backward_ns, heard=step % 128, now_ns=self.now_ns
-                )
-            self.control.update(rows, spent, self.now_ns)
-        return self
-
-
-@pytest.mark.parametrize("rate", [2_000.0, 100_000.0])
-def test_the_rate_of_the_air_is_found(rate: float) -> None:
-    air = Air(rate, jitter_s=0.03).run(160.0)
-    late = slice(len(air.rates) // 4, None)
-    assert 0.75 * rate < np.mean(air.rates[late]) <= 1.02 * rate
-    assert np.quantile(air.queues_s[late], 0.95) < 0.35
-
-
-def test_without_following_the_queue_grows(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert max(Air(12_500.0).run(60.0).queues_s) < 1.0
-    monkeypatch.setattr(rates, "TARGET_S", np.inf)
-    assert Air(12_500.0).run(60.0).queues_s[-1] > 10.0
-
-
-@pytest.mark.parametrize(("loss", "jitter_s"), [(0.0, 0.15), (0.7, 0.03)])
-def test_neither_loss_nor_jitter_lowers_the_rate(loss: float, jitter_s: float) -> None:
-    air = Air(1e9, loss=loss, jitter_s=jitter_s).run(120.0, wanted=20_000.0)
-    late = slice(len(air.rates) // 2, None)
-    assert np.mean(air.rates[late]) > 0.9 * 20_000.0
-
-
-def test_an_air_that_slows_down_is_followed() -> None:
-    air = Air(20_000.0).run(60.0)
-    air.rate = 5_000.0
-    air.run(60.0)
-    assert np.mean(air.rates[-600:]) < 5_500.0
-    assert np.quantile(air.queues_s[-600:], 0.9) < 0.5
-    air.rate = 20_000.0
-    assert np.mean(air.run(90.0).rates[-600:]) > 13_000.0
-
-
-def test_a_rate_that_nobody_uses_does_not_rise() -> None:
-    air = Air(12_500.0).run(60.0, wanted=2_000.0)
-    assert air.control.bytes_per_s == rates.START
-
-
 # -- flights ---------------------------------------------------------------------------------
 
 AIR = "paper(0.4, 0.02, 2) & rate(3000, queue=5000)"
@@ -248,7 +166,7 @@ def flown(keys: Mapping[str, Any], vehicles: int, network: str = AIR) -> tuple[b
     return point.flies(1.0), np.inf if point.rmse_m is None else point.rmse_m
 
 
-AUTO = {"control.shared_bytes_per_s": "auto"}
+BUDGET = {"control.shared_bytes_per_s": 2700.0}
 
 
 @pytest.mark.long
@@ -257,23 +175,21 @@ def test_a_budget_flies_where_thresholds_fill_the_queue() -> None:
     vehicles = 19
     flies, _ = flown({}, vehicles)
     assert not flies
-    flies, rmse_m = flown(AUTO, vehicles)
+    flies, rmse_m = flown(BUDGET, vehicles)
     assert flies
     assert rmse_m < 0.8
-    flies, _ = flown({"control.shared_bytes_per_s": 2700.0}, vehicles)
-    assert flies
 
 
 def test_a_run_with_a_budget_equals_the_same_run_alone() -> None:
-    scenario = crowd({**AUTO, "duration": 4.0, "settle": 1.0})
+    scenario = crowd({**BUDGET, "duration": 4.0, "settle": 1.0})
     for seed, together in zip((1, 2), fly_batch(scenario, (1, 2)), strict=True):
-        alone = fly(crowd({**AUTO, "duration": 4.0, "settle": 1.0, "seed": seed}))
+        alone = fly(crowd({**BUDGET, "duration": 4.0, "settle": 1.0, "seed": seed}))
         assert (together.client == alone.client).all()
 
 
 def test_a_budget_is_told_among_the_figures() -> None:
-    record = fly(crowd({**AUTO, "duration": 3.0, "settle": 1.0}), vehicles=2)
-    assert record.figures["server"]["budget"]["bytes_per_s"] >= rates.LEAST
+    record = fly(crowd({**BUDGET, "duration": 3.0, "settle": 1.0}), vehicles=2)
+    assert record.figures["server"]["budget"] == {"bytes_per_s": 2700.0, "deferred": 0}
     record = fly(crowd({"duration": 1.0, "settle": 0.5}))
     assert "budget" not in record.figures["server"]
 
