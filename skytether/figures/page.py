@@ -1,4 +1,4 @@
-"""Page of a report: tables and figures in one file that opens offline; and empty figures."""
+"""Page of a report: tables, figures and facts in one file that opens offline; and empty figures."""
 
 import base64
 import io
@@ -30,13 +30,14 @@ class Table:
     """Rows and columns of cells in bold type."""
     own: Collection[int] = ()
     """Rows of what the reader has brought."""
+    is_grouped: bool = True
 
     @property
     def groups(self) -> dict[str, list[int]]:
         """Rows by the first column, if that repeats itself; else all of them under no name."""
         groups: dict[str, list[int]] = {}
         for at, (first, *_) in enumerate(self.rows):
-            groups.setdefault(first, []).append(at)
+            groups.setdefault(first if self.is_grouped else "", []).append(at)
         return groups if len(groups) < len(self.rows) else {"": [*range(len(self.rows))]}
 
 
@@ -47,6 +48,25 @@ class Picture:
     says: str
     """Caption: one or two sentences."""
     png: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class Facts:
+    title: str
+    facts: Mapping[str, str]
+
+
+@dataclass(frozen=True, slots=True)
+class Folded:
+    """Part of a page that shows its title alone until it is opened."""
+
+    title: str
+    parts: Sequence["Part"] = ()
+    text: str = ""
+    """Preformatted text before the parts."""
+
+
+Part = Table | Picture | Facts | Folded
 
 
 def blank(width: float, height: float) -> "Figure":
@@ -108,23 +128,13 @@ def table_of(
     return Table(name, title, says, rows_csv(rows), list(shown), lines, own=own)
 
 
-def rendered(template: str, **values: Any) -> str:
-    """Page made from a template.
+def rendered(title: str, about: str, parts: Sequence[Part]) -> str:
+    """Page as HTML, with everything in it."""
+    from jinja2 import Environment, StrictUndefined  # takes a tenth of a second to import
 
-    Args:
-        template: path of the template in the package `skytether`.
-    """
-    from jinja2 import (
-        Environment,
-        FunctionLoader,
-        StrictUndefined,
-    )  # imported here, because it takes a tenth of a second
-
-    def source(name: str) -> str:
-        return resources.files("skytether").joinpath(name).read_text(encoding="utf-8")
-
-    environment = Environment(
-        loader=FunctionLoader(source), autoescape=True, undefined=StrictUndefined, trim_blocks=True
-    )
+    environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True)
     environment.filters["base64"] = lambda content: base64.b64encode(content).decode()
-    return environment.get_template(template).render(**values)
+    template = resources.files("skytether").joinpath("figures/report.html.jinja")
+    return environment.from_string(template.read_text(encoding="utf-8")).render(
+        title=title, about=about, parts=parts
+    )

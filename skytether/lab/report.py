@@ -9,7 +9,7 @@ from typing import Any
 
 from msgspec.structs import asdict
 
-from skytether.figures.page import Row, Table, as_text, rendered, table_of
+from skytether.figures.page import Facts, Row, Table, as_text, rendered, table_of
 from skytether.lab import plates
 from skytether.lab.calibration import within
 from skytether.lab.intervals import Estimate
@@ -233,4 +233,20 @@ def html(drawn: Drawn, scenario: Scenario, calls: Sequence[Mapping[str, Any]]) -
 
     `calls` are facts about each call of the command that made the report, in order.
     """
-    return rendered("figures/report.html.jinja", drawn=drawn, scenario=scenario, calls=calls)
+    call = calls[-1]
+    versions = {"Python": call["python"], **call["versions"]}
+    each = [f"{call['date']}, {call['runs']} runs, {call['seconds']} s" for call in calls]
+    made = {
+        "command": call["command"],
+        "seeds": f"from {scenario.seed} on",
+        "flights": f"{scenario.duration} s each, RMSE from {scenario.settle} s on",
+        "date": call["date"],
+        "machine": call["machine"],
+        "commit": call["commit"] or "none: not run from a checkout",
+        "versions": ", ".join(map(" ".join, versions.items())),
+        "duration": f"{sum(call['seconds'] for call in calls):.1f} s in {len(calls)} "
+        f"call{'s' * (len(calls) > 1)} that came to an end: {'; '.join(each)}",
+    }
+    shown = (drawn.tables, drawn.pictures)[:: -1 if drawn.figures_first else 1]
+    parts = [*shown[0], *shown[1], Facts("How it was made", made)]
+    return rendered(drawn.title, f"{drawn.about} {drawn.verdict}", parts)

@@ -9,7 +9,16 @@ from numpy.typing import NDArray
 
 from skytether.figures.colours import MODE_COLOURS, PALETTE, css
 from skytether.figures.flights import draw_packets, draw_reference
-from skytether.figures.page import Picture, Table, as_png, as_text, lettered, rendered
+from skytether.figures.page import (
+    Facts,
+    Folded,
+    Picture,
+    Table,
+    as_png,
+    as_text,
+    lettered,
+    rendered,
+)
 from skytether.shared.base.errors import RecordingError
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.events.flight import DOES
@@ -103,21 +112,27 @@ def page(recorded: Recorded, figures: Sequence[tuple[str, str]]) -> str:
         "with": f"Skytether {about.version}",
         "recording": recorded.path.name,
     }
-    drawn = {
-        "title": f"Flight of {about.scenario}, seed {scenario.seed}",
-        "about": f"{fleet} vehicle{'s' * (fleet != 1)}, {summary.duration_s:g} s {where}.",
-        "verdict": outcome.verdict if scenario.is_mission else _verdict(summary),
-        "tables": _first(outcome),
-        "pictures": [course(outcome)] if fleet > 1 else [timeline(flown)],
-        "whose": whose,
-        "folded_tables": [table],
-        "folded_pictures": [path(flown), *([timeline(flown)] if fleet > 1 else [])],
-        "events": events[:EVENTS_MAX],
-        "untold": max(0, len(events) - EVENTS_MAX),
-        "made": facts,
-        "toml": to_toml(scenario).decode(),
-    }
-    return rendered("view/report.html.jinja", drawn=drawn)
+    heard = "Time is that of the flight, whose first step is 0."
+    if (untold := len(events) - EVENTS_MAX) > 0:
+        heard += f" {untold} more events are in the recording."
+    heading = ("time [s]", "process", "event")
+    happened = Table("events", "", heard, "", heading, events[:EVENTS_MAX], is_grouped=False)
+    return rendered(
+        f"Flight of {about.scenario}, seed {scenario.seed}",
+        f"{fleet} vehicle{'s' * (fleet != 1)}, {summary.duration_s:g} s {where}. "
+        + (outcome.verdict if scenario.is_mission else _verdict(summary)),
+        [
+            *_first(outcome),
+            course(outcome) if fleet > 1 else timeline(flown),
+            Folded(
+                f"Figures{whose}",
+                [table, path(flown), *([timeline(flown)] if fleet > 1 else [])],
+            ),
+            Folded("All that was said", [happened]),
+            Folded("The scenario, whole", text=to_toml(scenario).decode()),
+            Facts("How it was made", facts),
+        ],
+    )
 
 
 def _verdict(summary: Summary) -> str:

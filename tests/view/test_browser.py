@@ -35,7 +35,7 @@ from chromium import (
     status,
     until,
 )
-from skytether.figures.page import Table, rendered
+from skytether.figures.page import Folded, Table, rendered
 
 sync_api = pytest.importorskip("playwright.sync_api", reason="Playwright is not installed")
 
@@ -422,11 +422,9 @@ def test_a_phone_finds_plots_beside_the_words(browser: "sync_api.Browser", fligh
 def test_a_wide_table_of_a_report_fits_the_window(browser: "sync_api.Browser") -> None:
     heading = [f"a long heading {number}" for number in range(9)]
     tables = [Table(name, name, "", "", heading[:count], [["0"] * count]) for name, count in WIDTHS]
-    drawn: dict[str, object] = dict.fromkeys(("title", "about", "verdict", "toml"), "")
-    drawn |= {"tables": tables, "pictures": [], "events": [], "untold": 0, "made": {}}
-    drawn |= {"whose": "", "folded_tables": [], "folded_pictures": []}
+    folded = Folded("folded", [Table("folded", "", "", "", heading[:3], [["0"] * 3])])
     page = browser.new_page(viewport={"width": 1400, "height": 900})
-    page.set_content(rendered("view/report.html.jinja", drawn=drawn))
+    page.set_content(rendered("", "", [*tables, folded]))
     # What is folded has no layout.
     page.locator("details").evaluate_all("all => all.forEach(each => { each.open = true; })")
     boxes = [page.locator(f"#{name}").bounding_box() for name, _ in WIDTHS]
