@@ -46,7 +46,7 @@ class Start(NamedTuple):
 
 STARTS = {
     "--help": Start("--help"),
-    "scenarios": Start("scenarios"),
+    "list scenarios": Start("list scenarios"),
     "server --help": Start("server --help"),
     "server demo": Start("server demo", warm_s=0.5, memory_mb=120, cold_s=8),
     "server paper": Start("server paper", warm_s=0.5, memory_mb=120, cold_s=8),

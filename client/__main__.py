@@ -49,7 +49,7 @@ NONE = "none"
 @dataclass(frozen=True)
 class ClientOptions(ProcessOptions):
     scenario: ScenarioName = "demo"
-    """A scenario's name (see `skytether scenarios`) or a .toml file; the same as the server's."""
+    """A scenario's name (`skytether list scenarios`) or a .toml file; the same as the server's."""
     server: str = "127.0.0.1:47000"
     """HOST:PORT of netem, or of the server itself; an IPv6 host in brackets, as in [::1]:47000."""
     path: Annotated[

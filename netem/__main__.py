@@ -50,7 +50,7 @@ class NetemOptions(ProcessOptions):
     """Options of `skytether netem`."""
 
     scenario: command.ScenarioName = NETWORK
-    """A scenario's name (see `skytether scenarios`) or a .toml file, for its network and seed.
+    """A scenario's name (`skytether list scenarios`) or a .toml file, for its network and seed.
     netem is part of that scenario's flight then: fates follow the time, and not the number of a
     packet in its flow."""
     bind: str = "127.0.0.1:47000"
@@ -61,7 +61,7 @@ class NetemOptions(ProcessOptions):
     """HOST:PORT of the server; its address family may differ from the clients'."""
     to_client: str | None = None
     """Impairments of packets from the server to clients, joined by &, as in "constant(50ms) &
-    loss(10%)", see `skytether impairments`; the key network.uplink of a scenario."""
+    loss(10%)", see `skytether list impairments`; the key network.uplink of a scenario."""
     to_server: str | None = None
     """Impairments of packets from clients to the server; the key network.downlink."""
     path: Annotated[int, Argument(metavar="N")] = 1
@@ -79,10 +79,10 @@ class RunOptions(ProcessOptions):
     """Options of `skytether netem run`."""
 
     scenario: command.ScenarioName = NETWORK
-    """A scenario's name (see `skytether scenarios`) or a .toml file, for its network and seed."""
+    """A scenario's name (`skytether list scenarios`) or a .toml file, for its network and seed."""
     to_program: str | None = None
     """Impairments of packets to the program, joined by &, as in "constant(50ms) & loss(10%)", see
-    `skytether impairments`; the key network.uplink of a scenario."""
+    `skytether list impairments`; the key network.uplink of a scenario."""
     from_program: str | None = None
     """Impairments of packets from the program; the key network.downlink."""
     expose: Annotated[tuple[str, ...], Argument(metavar="PORT", append=True)] = ()

@@ -7,22 +7,6 @@ from skytether.cli.commands import COMMANDS, usage
 from skytether.shell.commandline import start
 
 
-def list_scenarios(argv: Sequence[str]) -> None:
-    from skytether.shared.scenario import reading
-    from skytether.shell.commandline.command import CommandError
-
-    match argv:
-        case ["-h" | "--help", *_]:
-            print("usage: skytether scenarios\n\nPrint the scenarios that come with Skytether.")
-            return
-        case [word, *_]:
-            raise CommandError(f"got {word!r}, expected nothing", 2)
-    names = reading.names()
-    width = max(map(len, names))
-    for name in names:
-        print(f"{name:{width}}  {reading.load(name).title}")
-
-
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit code."""
     argv = sys.argv[1:] if argv is None else argv

@@ -2,7 +2,7 @@
 
 A scenario with `extends = "other"` (name of a built-in scenario, or a file beside it) contains only
 the differences from the other. Every value is checked here, and every file that a scenario names is
-read here, so that endpoints open no files. `skytether scenarios` lists the built-in scenarios.
+read here, so that endpoints open no files. `skytether list scenarios` lists the built-in scenarios.
 """
 
 import io

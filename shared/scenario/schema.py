@@ -142,7 +142,7 @@ class ControlConfig(Section, frozen=True):
     horizon: Term[Annotated[int, Meta(ge=1, le=INPUTS_MAX)]] = 80
     """Number of steps planned ahead, H."""
     scheme: Term[Text] = "trajectory"
-    """Delay compensation, see `skytether schemes`."""
+    """Delay compensation, see `skytether list schemes`."""
     feedback: Term[bool] = True
     """Whether the vehicle corrects deviations from a horizon's states. A vehicle that can only play
     back inputs needs false, and `input_weight` 3, as in the scenario `playback`."""
@@ -152,13 +152,13 @@ class ControlConfig(Section, frozen=True):
     """Time constant of the estimate of steady wind and a wrong gain [s]; longer if observations are
     old. 0, or scheme "none": no estimate."""
     trigger: OfTrigger[Text] = "expected_gap | heartbeat"
-    """Rule for sending a horizon: policies combined with & and |, see `skytether triggers`. An
+    """Rule for sending a horizon: policies combined with & and |, see `skytether list triggers`. An
     argument is also a key: `control.trigger.expected_gap = 0.1`."""
     shared_bytes_per_s: OfServer[Annotated[float, Meta(ge=0, le=1e9)]] = 0.0
     """Largest data rate to all vehicles together, IP and UDP headers included [B/s]; horizons with
     the largest gain per byte are sent first. 0: no limit."""
     planner: OfServer[Text] = "mpc"
-    """What plans, see `skytether planners`: the MPC of eq. (9), or a planner of your own."""
+    """What plans, see `skytether list planners`: the MPC of eq. (9), or a planner of your own."""
     solver: OfServer[Literal["exact", "osqp"]] = "exact"
     """Solver of eq. (9): a Riccati active set (exact and fast), or OSQP for comparison."""
     spline_error_m: OfServer[Annotated[float, Meta(ge=0, le=1e3)]] = 0.01
@@ -185,7 +185,7 @@ class ReferenceConfig(Section, frozen=True):
     """Desired trajectory."""
 
     shape: Term[Text] = "circle"
-    """Shape of the desired trajectory, see `skytether references`."""
+    """Shape of the desired trajectory, see `skytether list references`."""
     preview: OfServer[Duration | Literal["all", "none"]] = "all"
     """Time for which the server knows the desired trajectory ahead [s]; after that, and for a live
     point, it extrapolates."""
@@ -226,7 +226,7 @@ class VehicleConfig(Section, frozen=True):
     """The UAV: its simulation, its observations, and its failsafe."""
 
     kind: OfVehicle[Text] = "simulated"
-    """Vehicle, see `skytether vehicles`."""
+    """Vehicle, see `skytether list vehicles`."""
     address: OfVehicle[str] = "udp:127.0.0.1:14550"
     """Connection to an autopilot: udp:HOST:PORT (listens there), udpout:HOST:PORT, tcp:HOST:PORT or
     serial:PATH:BAUD; to a robot that speaks ROS 2: tcp:HOST:PORT of a Zenoh router."""
@@ -234,7 +234,7 @@ class VehicleConfig(Section, frozen=True):
     """Folder for the state that a restarted client needs; none: not saved; auto: for a vehicle with
     an autopilot, the state folder of its service or user."""
     report: OfVehicle[Text] = "deviation(0.05) | silence(1)"
-    """Rule for sending an observation: policies combined with & and |, see `skytether reports`."""
+    """Rule for sending an observation: policies joined by & and |, see `skytether list reports`."""
     exhausted: Term[Literal["hold", "brake"]] = "brake"
     """Action at the end of a horizon: hold its last input (the paper), or brake and hover."""
     brake_mps2: Term[Factor] = 2.0
@@ -315,8 +315,8 @@ class NetworkConfig(Section, frozen=True):
     """Network between server and vehicle, as netem emulates it."""
 
     uplink: OfImpairment[Direction] = "paper(0.4, 0.02, 2.0) & loss(0.1)"
-    """Impairments from server to vehicle, combined with &, see `skytether impairments`. An argument
-    is also a key: `network.uplink.loss = 0.3`."""
+    """Impairments from server to vehicle, combined with &, see `skytether list impairments`. An
+    argument is also a key: `network.uplink.loss = 0.3`."""
     downlink: OfImpairment[Direction] = "paper(0.4, 0.02, 2.0) & loss(0.1)"
     """Impairments from vehicle to server."""
     mtu: OfNetem[Annotated[int, Meta(ge=PAYLOAD_BYTES_MAX, le=65_507)]] = 1472

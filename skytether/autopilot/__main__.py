@@ -30,8 +30,9 @@ BIND = "127.0.0.1:14550"
 @dataclass(frozen=True)
 class AutopilotOptions(ProcessOptions):
     scenario: ScenarioName = "demo"
-    """A scenario's name (see `skytether scenarios`) or a .toml file, of which only `vehicle.frame`,
-    `vehicle.battery`, `vehicle.steady_wind_mps`, `vehicle.turbulence_mps` and `seed` are used."""
+    """A scenario's name (`skytether list scenarios`) or a .toml file, of which only
+    `vehicle.frame`, `vehicle.battery`, `vehicle.steady_wind_mps`, `vehicle.turbulence_mps` and
+    `seed` are used."""
     flavour: FlavourName = "ardupilot"
     """Autopilot to simulate: ArduCopter 4.5 or PX4 1.17."""
     bind: str | None = None

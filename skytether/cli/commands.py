@@ -117,15 +117,11 @@ COMMANDS_IN_GROUPS = {
             "skytether.station.__main__:fly",
         ),
     },
-    "Lists, a sentence each": {
-        "scenarios": ("scenarios that come with Skytether", "skytether.__main__:list_scenarios"),
-        "triggers": ("policies for control.trigger", "skytether.cli.names:triggers"),
-        "reports": ("policies for vehicle.report", "skytether.cli.names:reports"),
-        "schemes": ("schemes for control.scheme", "skytether.cli.names:schemes"),
-        "planners": ("planners for control.planner", "skytether.cli.names:planners"),
-        "references": ("shapes for reference.shape", "skytether.cli.names:references"),
-        "impairments": ("what a network does to packets", "skytether.cli.names:impairments"),
-        "vehicles": ("vehicle models for vehicle.kind", "skytether.cli.names:vehicles"),
+    "Names and completion": {
+        "list KIND": (
+            "schemes, triggers, scenarios … that can be named",
+            "skytether.cli.names:list_names",
+        ),
         "completion SHELL": (
             "names and options at the Tab key: bash, zsh or fish",
             "skytether.cli.completion:complete",

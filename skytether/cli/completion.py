@@ -18,7 +18,7 @@ OPTIONS = (
     " | grep -oE -e '--[a-z][a-z0-9.-]*[a-z0-9]' | sort -u"
 )
 """What finds the options of a command: its help names them all."""
-SCENARIOS = "skytether scenarios 2>/dev/null | cut -d ' ' -f 1"
+SCENARIOS = "skytether list scenarios 2>/dev/null | cut -d ' ' -f 1"
 BASH = f"""\
 _skytether_asked=
 _skytether_options=

@@ -47,7 +47,7 @@ STAGES = ("receive", "open", "decode", "observe", "estimate", "plan", "trigger",
 @dataclass(frozen=True)
 class FleetOptions(ScenarioOptions):
     scenario: ScenarioName = "fleet"
-    """A scenario's name (see `skytether scenarios`) or a .toml file; every vehicle flies it."""
+    """A scenario's name (`skytether list scenarios`) or a .toml file; every vehicle flies it."""
     mission: Annotated[str | None, Argument(metavar="NAME|FILE")] = None
     """Mission in place of a scenario: swap, sphere, rings, corridor, warehouse, or a file of timed
     goals: CSV with the columns vehicle, t, x, y (and z), or a .plan of QGroundControl."""

@@ -1,46 +1,59 @@
-"""`skytether triggers`, `skytether reports` and so on: list the names for a scenario's keys."""
+"""`skytether list KIND`: the scenarios, or the names that one of their keys accepts."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
+from typing import Annotated
 
 from skytether.client.vehicles import vehicle
-from skytether.shared.scenario import registry
+from skytether.shared.scenario import reading, registry
 from skytether.shared.scenario.planners import planner
 from skytether.shared.scenario.schemes import scheme
 from skytether.shell.commandline import command, options
+from skytether.shell.commandline.argument import Argument
+from skytether.shell.commandline.command import CONFIGURATION, CommandError
+
+TABLES: Mapping[str, registry.PluginTable] = {
+    "triggers": registry.TRIGGERS,
+    "reports": registry.REPORTS,
+    "schemes": scheme,
+    "planners": planner,
+    "references": registry.REFERENCES,
+    "impairments": registry.IMPAIRMENTS,
+    "vehicles": vehicle,
+}
 
 
 @dataclass(frozen=True)
-class ListingOptions:
+class ListOptions:
+    kind: Annotated[str, Argument(metavar="KIND", positional=True)] = ""
+    """What to list."""
     plugin: command.Plugins = ()
 
 
-def names(title: str, table: registry.PluginTable, about: str, argv: Sequence[str]) -> None:
-    """Print each entry of a table: its form, and below it a description and its source."""
-    options.read(ListingOptions(), argv, f"skytether {title}", about)
-    for name, entry in table.items():
-        source = "" if entry.is_ours else f" (from {entry.source})"
-        print(f"{entry.form(name)}\n    {entry.about}{source}")
+def list_names(argv: Sequence[str]) -> None:
+    """List what a scenario can name, a sentence each.
 
+    KIND is one of
 
-triggers = partial(
-    names, "triggers", registry.TRIGGERS, "List the policies for control.trigger, a sentence each."
-)
-reports = partial(
-    names, "reports", registry.REPORTS, "List the policies for vehicle.report, a sentence each."
-)
-schemes = partial(names, "schemes", scheme, "List the values of control.scheme, a sentence each.")
-planners = partial(
-    names, "planners", planner, "List the values of control.planner, a sentence each."
-)
-references = partial(
-    names, "references", registry.REFERENCES, "List the values of reference.shape, a sentence each."
-)
-impairments = partial(
-    names,
-    "impairments",
-    registry.IMPAIRMENTS,
-    "List the impairments for network.uplink and network.downlink, a sentence each.",
-)
-vehicles = partial(names, "vehicles", vehicle, "List the values of vehicle.kind, a sentence each.")
+      scenarios     that come with Skytether
+      triggers      policies for control.trigger
+      reports       policies for vehicle.report
+      schemes       for control.scheme
+      planners      for control.planner
+      references    shapes for reference.shape
+      impairments   for network.uplink and network.downlink
+      vehicles      for vehicle.kind
+    """
+    chosen = options.read(ListOptions(), argv, "skytether list", list_names.__doc__)
+    if chosen.kind == "scenarios":
+        names = reading.names()
+        width = max(map(len, names))
+        for name in names:
+            print(f"{name:{width}}  {reading.load(name).title}")
+    elif chosen.kind in TABLES:
+        for name, entry in TABLES[chosen.kind].items():
+            source = "" if entry.is_ours else f" (from {entry.source})"
+            print(f"{entry.form(name)}\n    {entry.about}{source}")
+    else:
+        kinds = f"scenarios, {', '.join(TABLES)}"
+        raise CommandError(f"got {chosen.kind or 'nothing'}, expected {kinds}", CONFIGURATION)

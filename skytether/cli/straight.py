@@ -29,7 +29,7 @@ TOLD = AutopilotRefused, AutopilotText, Fault
 @dataclass(frozen=True)
 class StraightOptions(LawOptions, ScenarioOptions):
     scenario: ScenarioName = "autopilot"
-    """A scenario's name (see `skytether scenarios`) or a .toml file."""
+    """A scenario's name (`skytether list scenarios`) or a .toml file."""
     flavour: FlavourName = "ardupilot"
     """Autopilot that is simulated, see `skytether autopilot`."""
     udp: bool = False

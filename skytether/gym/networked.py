@@ -61,7 +61,7 @@ class Options(TypedDict, total=False):
     """Options of `Networked` and `NetworkedVector`."""
 
     uplink: str
-    """Impairments from agent to robot (`skytether impairments`)."""
+    """Impairments from agent to robot (`skytether list impairments`)."""
     downlink: str
     """Impairments from robot to agent."""
     thinking: float | str

@@ -23,7 +23,7 @@ from skytether.shell.commandline import plugins
 from skytether.shell.host import temporary
 
 Given = str | PathLike[str] | Scenario
-"""Name of a scenario (see `skytether scenarios`), path of a .toml file, or a scenario."""
+"""Name of a scenario (`skytether list scenarios`), path of a .toml file, or a scenario."""
 
 
 def load(scenario: Given, /, **keys: Any) -> Scenario:

@@ -1,4 +1,4 @@
-"""Models of delay and loss, those of `skytether impairments`, fitted to a measurement.
+"""Models of delay and loss, those of `skytether list impairments`, fitted to a measurement.
 
 Each is fitted by maximum likelihood. They are compared by BIC, k ln n - 2 ln L with k parameters,
 where n is the effective sample size, see `analysis.effective`. Likelihoods are densities, with a

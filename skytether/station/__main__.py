@@ -24,7 +24,7 @@ from skytether.station.laws import LawOptions
 @dataclass(frozen=True)
 class StationOptions(LawOptions, ProcessOptions):
     scenario: ScenarioName = "autopilot"
-    """A scenario's name (see `skytether scenarios`) or a .toml file."""
+    """A scenario's name (`skytether list scenarios`) or a .toml file."""
     bind: str = "127.0.0.1:14550"
     """HOST:PORT to receive MAVLink at; the first autopilot that sends a heartbeat there is
     flown.

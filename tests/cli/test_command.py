@@ -88,7 +88,7 @@ QUICK = [
         ),
         ("client --id -1", "client: --id: got -1, expected 0 to 65535"),
         ("netem --server nobody.invalid:1", "netem: cannot find nobody.invalid: "),
-        ("scenarios paper", "scenarios: got 'paper', expected nothing"),
+        ("list paper", "list: got paper, expected scenarios, triggers, "),
         ("fleet --vehicles 0", "fleet: --vehicles: got 0, expected 1 to 65535"),
         ("fleet --virtual --workers 2", "fleet: --workers: got --virtual as well, expected 1 in"),
         ("fleet --virtual --page 127.0.0.1:0", "fleet: --page: got --virtual as well, expected a"),
@@ -143,7 +143,7 @@ def test_a_port_in_use_is_named(capfd: pytest.CaptureFixture[str]) -> None:
 
 
 def test_a_reader_that_has_seen_enough_is_no_error() -> None:
-    command = f"{sys.executable} -P -m skytether scenarios | head -c 1"
+    command = f"{sys.executable} -P -m skytether list scenarios | head -c 1"
     run = subprocess.run(command, shell=True, capture_output=True, check=False)
     assert run.stderr == b""
 
@@ -160,7 +160,7 @@ def test_the_front_door_names_every_command(capfd: pytest.CaptureFixture[str]) -
 
 
 def test_scenarios_are_listed_with_a_line_each(capfd: pytest.CaptureFixture[str]) -> None:
-    assert main(["scenarios"]) == 0
+    assert main(["list", "scenarios"]) == 0
     lines = capfd.readouterr().out.splitlines()
     assert [line.split()[0] for line in lines] == reading.names()
     assert {"paper", "paper-no-compensation", "paper-every-step", "demo"} <= set(reading.names())

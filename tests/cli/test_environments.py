@@ -72,10 +72,10 @@ def test_a_command_does_the_same_in_any_environment(environment: str, tmp_path: 
         assert fleet.stdout == ""
     else:
         assert "server's plan [" in fleet.stdout
-    mistake = run(["scenarios", "papr"], environment)
+    mistake = run(["list", "papr"], environment)
     assert mistake.returncode == 2
     if "2>&-" not in ENVIRONMENTS[environment][1]:
-        assert mistake.stderr == "scenarios: got 'papr', expected nothing\n"
+        assert mistake.stderr.startswith("list: got papr, expected scenarios, ")
 
 
 @pytest.mark.long
@@ -203,8 +203,8 @@ def test_a_process_that_cannot_write_does_not_start(
 
 @pytest.mark.long
 def test_a_full_disk_is_one_line(tmp_path: Path) -> None:
-    full = run(["scenarios"], line="{} >/dev/full")
-    assert (full.returncode, full.stderr) == (1, "scenarios: No space left on device\n")
+    full = run(["list", "scenarios"], line="{} >/dev/full")
+    assert (full.returncode, full.stderr) == (1, "list: No space left on device\n")
     file = tmp_path / "summary.json"
     flown = run(["fly", "--virtual", *SHORT, "--json", str(file)], line="ulimit -f 0; {}")
     said = f"fly: {file}: cannot be written: File too large\n"

@@ -78,7 +78,7 @@ def test_the_help_is_as_wide_as_the_terminal(
 
 
 def test_every_help_fits_80_columns(capfd: pytest.CaptureFixture[str]) -> None:
-    for argv in [[name, "--help"] for name in COMMANDS.keys() - {"scenarios", "completion"}] + [
+    for argv in [[name, "--help"] for name in COMMANDS.keys() - {"completion"}] + [
         ["netem", "run", "--help"]
     ]:
         assert max(map(len, shown(argv, capfd).splitlines())) <= 80, argv
@@ -86,7 +86,7 @@ def test_every_help_fits_80_columns(capfd: pytest.CaptureFixture[str]) -> None:
 
 def test_a_flag_has_one_group_over_all_commands(capfd: pytest.CaptureFixture[str]) -> None:
     used = set[str]()
-    for name in COMMANDS.keys() - {"scenarios", "completion"}:
+    for name in COMMANDS.keys() - {"completion"}:
         text = shown([name, "--help"], capfd)
         assert "MISSING" not in text, name
         used |= set(re.findall(r"^  --([a-z-]+)", text, re.MULTILINE))

@@ -56,7 +56,9 @@ def imported(*argv: str) -> set[str]:
 FLIES = ["client demo --model.tau-s 1 1", "netem demo --bind 127.0.0.1:0"]
 
 
-@pytest.mark.parametrize("command", [pytest.param("scenarios", marks=pytest.mark.long), *FLIES])
+@pytest.mark.parametrize(
+    "command", [pytest.param("list scenarios", marks=pytest.mark.long), *FLIES]
+)
 def test_what_is_light_imports_nothing_heavy(command: str) -> None:
     modules = imported(*command.split())
     assert "skytether.shell.commandline.command" in modules

@@ -113,7 +113,7 @@ def test_the_documented_scheme_flies_with_the_documented_command(
     assert len(CHASE.splitlines()) <= 40
     with chdir(tmp_path):
         assert main([*shlex.split(line)[1:], "--duration", "20"]) == 0
-        assert main(["schemes", "--plugin", "chase.py"]) == 0
+        assert main(["list", "schemes", "--plugin", "chase.py"]) == 0
     said = capsys.readouterr().out
     assert "RMSE x, y, xy" in said
     assert "chase(gain=0.8)\n    Sends inputs that follow" in said

@@ -139,7 +139,7 @@ def test_triggers_are_listed_with_a_sentence_each(
 ) -> None:
     path, about = tmp_path / "mine.py", '    """Sends nothing.\n\n    More."""\n'
     path.write_text(HEAD + NEVER.replace("    return", f"{about}    return"))
-    assert main(["triggers", "--plugin", str(path)]) == 0
+    assert main(["list", "triggers", "--plugin", str(path)]) == 0
     said = capsys.readouterr().out
     assert f"never\n    Sends nothing. (from {path})\n" in said
     assert "periodic(N=10) with 1 <= N <= 1000000 (whole)\n    Sends N steps" in said
@@ -731,7 +731,7 @@ def test_an_installed_package_adds_entries_that_fly(
     table: str, installed: str, tmp_path: Path
 ) -> None:
     entry, flags = INSTALLED[table]
-    assert f"\n{entry}" in "\n" + run(table, folder=tmp_path, path=installed)
+    assert f"\n{entry}" in "\n" + run(f"list {table}", folder=tmp_path, path=installed)
     line = f"fly demo --virtual --settle 0 --duration 8 {flags}"
     assert "RMSE" in run(line, folder=tmp_path, path=installed)
 
@@ -745,9 +745,9 @@ def test_a_package_whose_entry_point_leads_nowhere_is_named(
     (info / "entry_points.txt").write_text("[skytether.triggers]\nslip = no_such_module:slip\n")
     monkeypatch.syspath_prepend(tmp_path)
     plugins._load_installed.cache_clear()
-    assert main(["triggers"]) == 2
+    assert main(["list", "triggers"]) == 2
     assert capsys.readouterr().err == (
-        "triggers: entry point slip = no_such_module:slip of broken 2.0: "
+        "list: entry point slip = no_such_module:slip of broken 2.0: "
         "ModuleNotFoundError: No module named 'no_such_module'\n"
     )
 

@@ -29,7 +29,7 @@ class CalibrateOptions:
     """Options of `skytether calibrate`."""
 
     scenario: ScenarioName = "paper"
-    """Scenario from which the search starts: a name (see `skytether scenarios`) or a .toml file."""
+    """Scenario that the search starts from: a name (`skytether list scenarios`) or a .toml file."""
     objective: Literal["table1", "rmse"] = "table1"
     """Goal of the search: table1, to reproduce the paper's Table 1, or rmse, the smallest mean RMSE
     xy."""

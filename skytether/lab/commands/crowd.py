@@ -33,7 +33,7 @@ class CrowdOptions:
     out: Path = Path("crowd")
     """Folder for the results; the same command continues there."""
     scenario: ScenarioName = "crowd"
-    """A scenario's name (see `skytether scenarios`) or a .toml file; every vehicle flies it."""
+    """A scenario's name (`skytether list scenarios`) or a .toml file; every vehicle flies it."""
     schemes: Annotated[tuple[Scheme, ...], Argument(metavar="SCHEME")] = get_args(Scheme)
     """Schemes to compare: paper (a packet at every step), threshold (the scenario's trigger for
     each vehicle) and budget (the same trigger, with control.shared_bytes_per_s)."""

@@ -55,11 +55,11 @@ class IdentifyOptions:
     """Options of `skytether identify`."""
 
     kind: Annotated[str, Argument(metavar="KIND", positional=True)] = ""
-    """Vehicle to fly (see `skytether vehicles`), in place of `vehicle.kind`. Kinds with real
+    """Vehicle to fly (`skytether list vehicles`), in place of `vehicle.kind`. Kinds with real
     hardware, such as mavlink, fly in real time; others fly in virtual time."""
     scenario: str = "demo"
-    """Scenario to be flown later: a name (see `skytether scenarios`) or a .toml file. The written
-    scenario extends it."""
+    """Scenario to be flown later: a name (`skytether list scenarios`) or a .toml file. The
+    written scenario extends it."""
     speed: Annotated[tuple[float, ...], Argument(metavar="MPS")] = ()
     """Size of step [m/s], one for all axes or one for each. Unless given, the largest speed of the
     desired trajectory on the axis, but at least half of its largest speed on any axis."""

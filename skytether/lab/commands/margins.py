@@ -23,7 +23,7 @@ class MarginsOptions:
     """Options of `skytether margins`."""
 
     scenario: ScenarioName = "demo"
-    """Name of a scenario (see `skytether scenarios`) or path of a .toml file."""
+    """Name of a scenario (`skytether list scenarios`) or path of a .toml file."""
     runs: Annotated[int, Argument(metavar="N")] = 16
     """Number of seeds that each vehicle is flown with, which count up from the scenario's."""
     json: Path | None = None

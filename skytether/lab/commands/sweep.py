@@ -35,7 +35,7 @@ class SweepOptions:
     out: Path
     """Folder for the results; the same command continues there."""
     scenario: ScenarioName = "paper"
-    """Name of a scenario (see `skytether scenarios`) or path of a .toml file."""
+    """Name of a scenario (`skytether list scenarios`) or path of a .toml file."""
     grid: Annotated[tuple[str, ...], Argument(append=True, metavar="KEY=VALUES")] = ()
     """Key of the scenario and its values: KEY=START:STOP:COUNT, evenly spaced, or KEY=A,B,C.
     Several grids give all combinations of their values."""

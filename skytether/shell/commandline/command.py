@@ -53,7 +53,7 @@ Plugins = Annotated[
         metavar="FILE",
         append=True,
         help="Python file with impairments, triggers, references and others of your own; may be "
-        "repeated. See `skytether impairments`, `triggers`, `references`.",
+        "repeated. See `skytether list impairments`, `triggers`, `references`.",
     ),
 ]
 
@@ -61,7 +61,7 @@ Plugins = Annotated[
 @dataclass(frozen=True)
 class ScenarioOptions:
     scenario: ScenarioName = "demo"
-    """A scenario's name (see `skytether scenarios`) or a .toml file."""
+    """A scenario's name (`skytether list scenarios`) or a .toml file."""
     plugin: Plugins = ()
     config: ScenarioFlags = Scenario()
 
