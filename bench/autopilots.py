@@ -10,20 +10,17 @@ flight is repeated with the network cut for a while.
 import io
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import product
-from pathlib import Path
 from typing import Any, Literal, NamedTuple, get_args
 
 import msgspec
 import numpy as np
-import tyro
 
-from bench.harness import TextTable
+from bench.harness import Study, TextTable
 from skytether.autopilot.endpoint import Autopilot
 from skytether.autopilot.faults import ScriptedFault
 from skytether.autopilot.flavours import FlavourName
-from skytether.lab.commands.pool import Flags, study
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.events.flight import Flying
 from skytether.shared.scenario import reading
@@ -81,18 +78,9 @@ SAFE: dict[FlavourName, dict[str, float]] = {
     "px4": {"COM_OBL_RC_ACT": 4},
 }
 """Autopilot parameters that Skytether demands before it flies."""
-ACTUAL: dict[tuple[str, Air], float] = {
-    ("velocity", CALM): 1.28,
-    ("targets", CALM): 0.64,
-    ("targets, led", CALM): 0.245,
-    ("led, gain 0.3", CALM): 0.075,
-    ("led, gain 0.5", CALM): 0.055,
-    ("targets, led", WIND): 0.262,
-    ("led, gain 0.3", WIND): 0.069,
-}
-"""RMSE xy of ArduCopter 4.5.6 in its own simulator, over the same netem [m]."""
 WINDY = {"steady_wind_mps": [6.0, 0.0, 0.0], "turbulence_mps": 6.0}
 """Keys of the vehicle for flights in a wind of 6 m/s with turbulence."""
+SEEDS = 5
 CUT_S, HEALED_S, WATCHED_S = 15.0, 20.0, 32.0
 """Times of flight at which the network is cut, at which it is restored, and until which the largest
 error is evaluated [s]."""
@@ -237,7 +225,7 @@ OF_AIR = [
 
 
 def tables(flights: Sequence[FlownCell]) -> dict[str, TextTable]:
-    """Tables by name: one for each flavour, and one of measurements elsewhere."""
+    """Tables by flavour."""
     by_name = {}
     for flavour in get_args(FlavourName):
         of_case = [each for each in flights if each.flavour == flavour]
@@ -252,18 +240,7 @@ def tables(flights: Sequence[FlownCell]) -> dict[str, TextTable]:
             headings = [f"{air}: {OF_AIR[0]}" for air in airs]
             columns = [each for heading in headings for each in (heading, *OF_AIR[1:])]
             by_name[flavour] = TextTable(["set-points", *columns], rows)
-    if near := _near(flights):
-        by_name["actual"] = TextTable(["RMSE xy [m]", "actual", "simulated (least to most)"], near)
     return by_name
-
-
-def _near(flights: Sequence[FlownCell]) -> list[list[str]]:
-    rows = []
-    for (name, air), actual_m in ACTUAL.items():
-        simulated, *_ = figures([e for e in flights if e.flavour == "ardupilot"], name, air)
-        if simulated:
-            rows.append([f"{name}, {air}", f"{actual_m:g}", simulated])
-    return rows
 
 
 def figures(flights: Sequence[FlownCell], name: str, air: str) -> list[str]:
@@ -288,41 +265,18 @@ def figures(flights: Sequence[FlownCell], name: str, air: str) -> list[str]:
     ]
 
 
-@dataclass(frozen=True)
-class AutopilotBenchmarkOptions:
-    seeds: int = 5
-    """Number of seeds, from 1 on."""
-    only: tuple[str, ...] = ()
-    """Contenders to fly; all unless given."""
-    flavours: tuple[FlavourName, ...] = get_args(FlavourName)
-    """Flavours of the autopilot."""
-    airs: tuple[Air, ...] = get_args(Air)
-    """Air: calm, or wind of 6 m/s."""
-    jobs: int = 1
-    """Number of flights at once."""
-    out: Path | None = None
-    """Folder for the flights: after Ctrl-C the same command continues."""
-
-
-def main(argv: Sequence[str]) -> None:
-    options = tyro.cli(AutopilotBenchmarkOptions, args=argv, description=__doc__)
-    cells = [
+def cells(seeds: int) -> list[Cell]:
+    kinds = product(get_args(FlavourName), get_args(Air))
+    return [
         Cell(name, flavour, air, seed)
-        for flavour, air in product(options.flavours, options.airs)
+        for flavour, air in kinds
         for name in contenders(flavour)
-        if not options.only or name in options.only
-        for seed in range(1, options.seeds + 1)
+        for seed in range(1, seeds + 1)
     ]
-    flights = study(fly_cell, cells, FlownCell, {}, options.out, Flags(options.jobs))
-    for title, table in tables(flights).items():
-        table.show(title)
 
 
-def document_tables(folder: Path | None, flags: Flags) -> dict[str, TextTable]:
-    kinds = product(get_args(FlavourName), get_args(Air), range(1, 6))
-    cells = [Cell(name, *kind) for kind in kinds for name in contenders(kind[0])]
-    return tables(study(fly_cell, cells, FlownCell, {}, folder, flags))
-
+STUDY = Study(__doc__, cells, fly_cell, FlownCell, tables, SEEDS)
+document_tables = STUDY.document_tables
 
 if __name__ == "__main__":
-    sys.exit(command.main(main, sys.argv[1:], "autopilots"))
+    sys.exit(command.main(STUDY.main, sys.argv[1:], "autopilots"))

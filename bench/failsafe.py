@@ -8,22 +8,18 @@ mission, distances count until then.
 
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from functools import cache
 from itertools import product
-from pathlib import Path
 from typing import Any, Literal, NamedTuple, get_args
 
 import msgspec
 import numpy as np
-import tyro
 
 from bench import autopilots
-from bench.harness import TextTable
+from bench.harness import Study, TextTable
 from skytether.autopilot.faults import FaultName, ScriptedFault
 from skytether.autopilot.flavours import FlavourName, FlightMode
 from skytether.autopilot.flight import PilotedVehicle
-from skytether.lab.commands.pool import Flags, study
 from skytether.shared.base.units import SECOND_NS, seconds_to_ns
 from skytether.shared.events.flight import ModeChanged
 from skytether.shared.law.model import Array
@@ -67,6 +63,8 @@ SCRIPTED: dict[CaseName, FaultName] = {
 }
 """Faults of the autopilot itself."""
 ENDING = frozenset({"link cut for 5 s", "autopilot sends nothing for 5 s"})
+Cell = tuple[CaseName, FlavourName, int]
+"""Fault, flavour of the autopilot, and seed."""
 Ending = Literal["flies on", "hovers", "moves", "has landed", "pilot has it"]
 Changes = tuple[tuple[str, float], ...]
 """Modes in order, and the time at which each began, counted from the fault [s]."""
@@ -83,10 +81,10 @@ class FaultOutcome(NamedTuple):
     """Largest horizontal distance from its position at the fault [m]."""
     off_path_m: float
     """Largest horizontal distance from the nearest point of the desired path [m]."""
-    still_s: float
-    """Time until the horizontal speed was below STILL_MPS [s]; NaN if it never was."""
-    down_s: float
-    """Time until the motors were off [s]; NaN if they never were."""
+    still_s: float | None
+    """Time until the horizontal speed was below STILL_MPS [s]; None if it never was."""
+    down_s: float | None
+    """Time until the motors were off [s]; None if they never were."""
     ending: Ending
 
 
@@ -172,8 +170,8 @@ def fly(case: CaseName, flavour: FlavourName, seed: int) -> FaultOutcome:
         autopilot=tuple(change for change in since_fault(modes_aboard) if change[1] < down_s),
         moved_m=_largest(positions - positions[0]),
         off_path_m=_off_path(scenario, positions),
-        still_s=float(times_s[seen][still[0]]) if len(still) else np.nan,
-        down_s=down_s if np.isfinite(down_s) else np.nan,
+        still_s=float(times_s[seen][still[0]]) if len(still) else None,
+        down_s=down_s if np.isfinite(down_s) else None,
         ending=_ending(aboard, speeds[-1], modes),
     )
 
@@ -245,7 +243,7 @@ def _down(outcomes: Sequence[FaultOutcome]) -> str:
     if they never were.
     """
     times_s = [each.down_s for each in outcomes]
-    return "" if np.isnan(times_s).all() else f", {_span(times_s)}"
+    return f", {_span(times_s)}" if any(each is not None for each in times_s) else ""
 
 
 def _sequences(changes: Sequence[Changes]) -> str:
@@ -262,48 +260,27 @@ def _sequences(changes: Sequence[Changes]) -> str:
     return "; or ".join(texts)
 
 
-def _span(times_s: Sequence[float]) -> str:
-    finite_s = [time_s for time_s in times_s if not np.isnan(time_s)]
-    if not finite_s:
+def _span(times_s: Sequence[float | None]) -> str:
+    came_s = [time_s for time_s in times_s if time_s is not None]
+    if not came_s:
         return "never"
-    least, most = f"{min(finite_s):.1f}", f"{max(finite_s):.1f}"
+    least, most = f"{min(came_s):.1f}", f"{max(came_s):.1f}"
     span = least if least == most else f"{least} to {most}"
-    return span if len(finite_s) == len(times_s) else f"{span}, or never"
+    return span if len(came_s) == len(times_s) else f"{span}, or never"
 
 
-@dataclass(frozen=True)
-class FailsafeBenchmarkOptions:
-    seeds: int = 3
-    """Number of seeds, from 1 on."""
-    only: tuple[CaseName, ...] = get_args(CaseName)
-    """Faults to fly."""
-    flavours: tuple[FlavourName, ...] = get_args(FlavourName)
-    """Flavours of the autopilot."""
-    jobs: int = 1
-    """Number of flights at once."""
-
-
-def _fly(cell: tuple[CaseName, FlavourName, int]) -> FaultOutcome:
+def fly_cell(cell: Cell) -> FaultOutcome:
     return fly(*cell)
 
 
-def main(argv: Sequence[str]) -> None:
-    options = tyro.cli(FailsafeBenchmarkOptions, args=argv, description=__doc__)
-    cells = product(options.only, options.flavours, range(1, options.seeds + 1))
-    outcomes = study(_fly, list(cells), FaultOutcome, {}, None, Flags(options.jobs))
-    for title, table in tables(outcomes).items():
-        table.show(title)
-
-
-def document_tables(_: Path | None, flags: Flags) -> dict[str, TextTable]:
-    """Tables of docs/fly-a-real-one.md by name; flights are not kept: times may be NaN.
-
-    A killed server is left out: its rows are those of a cut link.
-    """
+def cells(seeds: int) -> list[Cell]:
+    """A killed server is left out: its rows are those of a cut link."""
     cases = [each for each in get_args(CaseName) if each != "server killed"]
-    cells = list(product(cases, get_args(FlavourName), range(1, 4)))
-    return tables(study(_fly, cells, FaultOutcome, {}, None, flags))
+    return list(product(cases, get_args(FlavourName), range(1, seeds + 1)))
 
+
+STUDY = Study(__doc__, cells, fly_cell, FaultOutcome, tables, seeds=3)
+document_tables = STUDY.document_tables
 
 if __name__ == "__main__":
-    sys.exit(command.main(main, sys.argv[1:], "failsafe"))
+    sys.exit(command.main(STUDY.main, sys.argv[1:], "failsafe"))

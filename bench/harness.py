@@ -1,4 +1,5 @@
-"""Measuring contestants side by side, and tables of the results; used by every benchmark.
+"""Measuring contestants side by side, studies of many flights, and tables of the results; used by
+every benchmark.
 
 Contestants take turns at the same problems, so that other load on the machine affects all of them
 alike: ratios of figures from one run are reliable even if the figures are not. Time is the CPU time
@@ -16,16 +17,19 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from importlib import metadata
+from pathlib import Path
 from types import MappingProxyType
-from typing import Any, TypeVar
+from typing import Any, Generic, TypeVar
 
 import numpy as np
+import tyro
 from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import track
 
 from skytether.lab.commands import tables
 from skytether.lab.commands.machine import commit, processor
+from skytether.lab.commands.pool import Flags, study
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
 
 Durations = NDArray[np.int64]
@@ -33,6 +37,8 @@ Durations = NDArray[np.int64]
 PACKAGES = ("casadi", "daqp", "numba", "numpy", "osqp", "piqp", "quadprog", "scipy")
 CONSOLE = Console()
 Step = TypeVar("Step")
+C = TypeVar("C")
+R = TypeVar("R")
 
 
 def sleep_until(due_ns: int) -> None:
@@ -171,6 +177,50 @@ class TextTable:
 
     def show(self, title: str) -> None:
         tables.show(title, self.headings, self.rows)
+
+
+@dataclass(frozen=True)
+class StudyOptions:
+    seeds: int
+    """Number of seeds, from 1 on."""
+    jobs: int | None = None
+    """Number of flights at once; one per core unless given."""
+    out: Path | None = None
+    """Folder for the flights: after Ctrl-C, or with more seeds, the same command continues."""
+
+
+@dataclass(frozen=True)
+class Study(Generic[C, R]):
+    """Flights of some cells with several seeds, and the tables of their results."""
+
+    description: str | None
+    cells: Callable[[int], Sequence[C]]
+    """Returns the cells to fly, for a number of seeds from 1 on."""
+    fly: Callable[[C], R]
+    """Flies a cell, and evaluates the flight; called in a worker."""
+    kind: Any
+    """Type of a result."""
+    tables: Callable[[Sequence[R]], Mapping[str, TextTable]]
+    """Returns the tables by name, from the results in the order of the cells."""
+    seeds: int
+    """Number of seeds of the tables in the documents."""
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    """All settings that determine the results, besides the cells."""
+
+    def make(self, seeds: int, out: Path | None, flags: Flags) -> Mapping[str, TextTable]:
+        """Tables, after flying what the folder does not have; see `lab.commands.pool.study`."""
+        return self.tables(study(self.fly, self.cells(seeds), self.kind, self.settings, out, flags))
+
+    def document_tables(self, out: Path | None, flags: Flags) -> Mapping[str, TextTable]:
+        return self.make(self.seeds, out, flags)
+
+    def show(self, options: StudyOptions) -> None:
+        for title, table in self.make(options.seeds, options.out, Flags(options.jobs)).items():
+            table.show(title)
+
+    def main(self, argv: Sequence[str]) -> None:
+        default = StudyOptions(self.seeds)
+        self.show(tyro.cli(StudyOptions, args=argv, default=default, description=self.description))
 
 
 def place_of(name: str) -> re.Pattern[str]:

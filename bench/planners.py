@@ -5,18 +5,15 @@ seeds, and a stopwatch of CPU time.
 import re
 import sys
 import time
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from itertools import product
 from pathlib import Path
 from typing import NamedTuple
 
 import msgspec
 import numpy as np
-import tyro
 
-from bench.harness import TextTable
-from skytether.lab.commands.pool import Flags, study
+from bench.harness import Study, TextTable
 from skytether.lab.intervals import interval
 from skytether.shared.endpoints.stopwatch import Stopwatch
 from skytether.shared.scenario import reading
@@ -83,36 +80,18 @@ def tables(flights: Sequence[FlownCell]) -> dict[str, TextTable]:
     return {"planners": TextTable(headings, rows)}
 
 
-@dataclass(frozen=True)
-class PlannersOptions:
-    seeds: int = SEEDS
-    """Number of seeds, from 1 on."""
-    jobs: int | None = None
-    """Number of flights at once; one per core unless given."""
-    out: Path | None = None
-    """Folder for the flights: after Ctrl-C the same command continues."""
-
-
-def _flown(seeds: int, out: Path | None, flags: Flags) -> dict[str, TextTable]:
+def cells(seeds: int) -> list[Cell]:
+    """Cells; the planners of the page are loaded for them, also in the workers."""
     plugins.use(
         Plugin(str(PAGE.with_name(f"{name}.py")), code.encode())
         for name, code in documented().items()
     )
-    numbers = range(1, seeds + 1)
-    kinds = product(SCENARIOS, PLANNERS, numbers)
-    cells = [Cell(planner, scenario, seed) for scenario, planner, seed in kinds]
-    return tables(study(fly_cell, cells, FlownCell, {}, out, flags))
+    kinds = product(SCENARIOS, PLANNERS, range(1, seeds + 1))
+    return [Cell(planner, scenario, seed) for scenario, planner, seed in kinds]
 
 
-def main(argv: Sequence[str]) -> None:
-    options = tyro.cli(PlannersOptions, args=argv, description=__doc__)
-    for title, table in _flown(options.seeds, options.out, Flags(options.jobs)).items():
-        table.show(title)
-
-
-def document_tables(folder: Path | None, flags: Flags) -> Mapping[str, TextTable]:
-    return _flown(SEEDS, folder, flags)
-
+STUDY = Study(__doc__, cells, fly_cell, FlownCell, tables, SEEDS)
+document_tables = STUDY.document_tables
 
 if __name__ == "__main__":
-    sys.exit(command.main(main, sys.argv[1:], "planners"))
+    sys.exit(command.main(STUDY.main, sys.argv[1:], "planners"))

@@ -1,16 +1,12 @@
 """A standby server: the first server dies at a random time, and the vehicle flies on."""
 
 import sys
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from pathlib import Path
+from collections.abc import Sequence
 
 import msgspec
 import numpy as np
-import tyro
 
-from bench.harness import TextTable
-from skytether.lab.commands.pool import Flags, study
+from bench.harness import Study, TextTable
 from skytether.shared.base.chance import stream
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.events.standby import LeaderChanged
@@ -108,30 +104,12 @@ def _times(times_s: Sequence[float]) -> str:
     return ", ".join(f"{each:.2f}" for each in np.quantile(times_s, (0.5, 0.99)))
 
 
-@dataclass(frozen=True)
-class StandbyOptions:
-    seeds: int = SEEDS
-    """Number of seeds, from 1 on."""
-    jobs: int | None = None
-    """Number of flights at once; one per core unless given."""
-    out: Path | None = None
-    """Folder for the flights: after Ctrl-C the same command continues."""
-
-
 def cells(seeds: int) -> list[Cell]:
     return [Cell(task, seed) for task in TASKS for seed in range(1, seeds + 1)]
 
 
-def main(argv: Sequence[str]) -> None:
-    options = tyro.cli(StandbyOptions, args=argv, description=__doc__)
-    flights = study(fly_cell, cells(options.seeds), FlownCell, {}, options.out, Flags(options.jobs))
-    for title, table in tables(flights).items():
-        table.show(title)
-
-
-def document_tables(folder: Path | None, flags: Flags) -> Mapping[str, TextTable]:
-    return tables(study(fly_cell, cells(SEEDS), FlownCell, {}, folder, flags))
-
+STUDY = Study(__doc__, cells, fly_cell, FlownCell, tables, SEEDS)
+document_tables = STUDY.document_tables
 
 if __name__ == "__main__":
-    sys.exit(command.main(main, sys.argv[1:], "standby"))
+    sys.exit(command.main(STUDY.main, sys.argv[1:], "standby"))

@@ -6,18 +6,14 @@ of them, or all of them, on both links at the same time.
 """
 
 import sys
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
 from itertools import product
-from pathlib import Path
 from typing import Literal, NamedTuple, get_args
 
 import msgspec
 import numpy as np
-import tyro
 
-from bench.harness import TextTable
-from skytether.lab.commands.pool import Flags, study
+from bench.harness import Study, TextTable
 from skytether.shared.base.chance import stream
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.dotted import set_keys
@@ -131,27 +127,8 @@ def _figures(flown: Sequence[FlownCell]) -> str:
     return f"{np.mean(errors):.3f} ({np.median(errors):.3f}), {brakes:.2f}, {packets:.1f}"
 
 
-@dataclass(frozen=True)
-class TwoLinksOptions:
-    seeds: int = SEEDS
-    """Number of seeds, from 1 on."""
-    jobs: int | None = None
-    """Number of flights at once; one per core unless given."""
-    out: Path | None = None
-    """Folder for the flights: after Ctrl-C the same command continues."""
-
-
-def main(argv: Sequence[str]) -> None:
-    options = tyro.cli(TwoLinksOptions, args=argv, description=__doc__)
-    flags = Flags(options.jobs)
-    flights = study(fly_cell, cells(options.seeds), FlownCell, {}, options.out, flags)
-    for title, table in tables(flights).items():
-        table.show(title)
-
-
-def document_tables(folder: Path | None, flags: Flags) -> Mapping[str, TextTable]:
-    return tables(study(fly_cell, cells(SEEDS), FlownCell, {}, folder, flags))
-
+STUDY = Study(__doc__, cells, fly_cell, FlownCell, tables, SEEDS)
+document_tables = STUDY.document_tables
 
 if __name__ == "__main__":
-    sys.exit(command.main(main, sys.argv[1:], "two links"))
+    sys.exit(command.main(STUDY.main, sys.argv[1:], "two links"))

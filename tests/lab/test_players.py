@@ -23,12 +23,11 @@ def flown() -> dict[str, FlownCell]:
     return {player: fly_cell(Cell("pendulum", player, 0.1, 0.1, 1)) for player in PLAYERS}
 
 
-def test_a_chunk_by_the_clock_continues_the_last_and_one_of_a_queue_jumps(
+def test_a_chunk_by_the_clock_scores_more_than_one_of_a_queue(
     flown: dict[str, FlownCell],
 ) -> None:
     scores = {player: each.score for player, each in flown.items()}
     assert scores["newest"] < scores["replace"] < scores["clocked"]
-    assert flown["clocked"].jump < 0.1 * flown["replace"].jump
 
 
 def test_when_needed_takes_fewer_packets_for_nearly_the_same(
@@ -52,7 +51,7 @@ def test_a_chunk_differs_by_a_row_beyond_the_tolerance_or_when_rows_run_out() ->
 
 def test_the_tables_have_a_row_for_each_network(flown: dict[str, FlownCell]) -> None:
     shown = tables(list(flown.values()))
-    assert [len(table.rows) for table in shown.values()] == [1, 1]
+    assert [len(table.rows) for table in shown.values()] == [1]
     assert shown["players pendulum scores"].rows[0][0] == "100 ms, 10%"
 
 
