@@ -1,6 +1,6 @@
 """Benchmark of missions: smallest distances between vehicles and from zones, and arrival times.
 
-    python -m bench.missions random --flights 1000
+    python -m bench.missions random --seeds 1000
     python -m bench.missions swap
     python -m bench.missions published
 
@@ -9,8 +9,8 @@ and a network with losses up to 50 %, bursts up to 2 s and delays up to 0.5 s. E
 reach its goal. With --harsh every link is also cut repeatedly, often for so long that the server
 takes the vehicle as lost, and in half of the missions the server restarts without memory. With
 --space they fly with three axes, some zones end below or begin above the vehicles, and a vehicle
-without packets for 40 s lands. Every fault is printed with its seed: `--first 17 --flights 1` flies
-the mission of seed 17 again.
+without packets for 40 s lands. Every fault is shown with its seed: `--first 17 --seeds 1` flies the
+mission of seed 17 again.
 
 `swap`: vehicles swap places on a circle or a sphere, over several networks; with one of them the
 server is down three times a flight, for 0.5 to 20 s.
@@ -28,29 +28,24 @@ over a good network (20 ms, no loss) and over the paper's with 30 % loss.
 
 import sys
 import tempfile
-import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from itertools import product
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple, TypeVar, cast
+from typing import Annotated, Any, Literal, NamedTuple, cast
 
 import msgspec
 import numpy as np
 import tyro
 
-from bench.harness import TextTable
-from skytether.lab.commands.pool import Flags, study
+from bench.harness import Study, StudyOptions, TextTable
 from skytether.server.endpoint import Server
-from skytether.server.missions.mission_planner import MissionPlanner
 from skytether.server.missions.routes import Routes
-from skytether.server.planning.scheme import Foresight
 from skytether.shared.base import files
 from skytether.shared.base.chance import stream
-from skytether.shared.law.model import Array, Indices
+from skytether.shared.law.model import Array
 from skytether.shared.law.motion import MARGIN_M
 from skytether.shared.missions import zone_texts
 from skytether.shared.missions.derived import clearances, zones
@@ -65,8 +60,6 @@ from skytether.shared.wire.protocol import Mode
 from skytether.shell.commandline import command
 from skytether.sim import flight
 from skytether.sim.world import World
-
-C = TypeVar("C")
 
 GOAL_AT_S = 2.0
 """Time from which the goals of random and published missions hold [s]."""
@@ -94,8 +87,6 @@ SWAP_NETWORKS = {
     MORTAL: "paper(0.4, 0.02, 2) & loss(0.1)",
 }
 """Networks, the same in both directions."""
-TOLD_S = 20.0
-"""Length of a simulation in `sim_params.m` [s]."""
 PUBLISHED_NETWORKS = {
     "20 ms": ("constant(0.02)", 0.5),
     "paper, 30 %": ("paper(0.4, 0.02, 2) & loss(0.3)", 1.0),
@@ -104,30 +95,10 @@ PUBLISHED_NETWORKS = {
 
 
 @dataclass(frozen=True)
-class Amount:
-    """Number of flights, processes and files."""
-
-    flights: int = 10
-    """Number of flights of each row."""
-    workers: int = 2
-    """Number of processes."""
-    out: Path | None = None
-    """Folder for the flights: after Ctrl-C, or with more flights, the same command continues."""
-    markdown: Path | None = None
-    """File for the table as Markdown."""
-
-    def fly(self, fly: "Callable[[C], MissionFlight]", cells: Sequence[C]) -> "list[MissionFlight]":
-        """Results of the flights of some cells, in order; see `lab.commands.pool.study`."""
-        amount = Amount.__dataclass_fields__
-        settings = {key: value for key, value in asdict(self).items() if key not in amount}
-        return study(fly, cells, MissionFlight, settings, self.out, Flags(self.workers))
-
-
-@dataclass(frozen=True)
-class RandomOptions(Amount):
+class RandomOptions(StudyOptions):
     """Random missions."""
 
-    flights: int = 100
+    seeds: int = 100
     first: int = 1
     """Seed of the first mission."""
     duration: float = 120.0
@@ -139,10 +110,10 @@ class RandomOptions(Amount):
 
 
 @dataclass(frozen=True)
-class SwapOptions(Amount):
+class SwapOptions(StudyOptions):
     """Vehicles that swap places."""
 
-    flights: int = 30
+    seeds: int = 30
     shape: Literal["swap", "sphere"] = "swap"
     """Whether vehicles on a circle swap places, or on a sphere."""
     vehicles: int = 16
@@ -151,9 +122,10 @@ class SwapOptions(Amount):
 
 
 @dataclass(frozen=True)
-class PublishedOptions(Amount):
+class PublishedOptions(StudyOptions):
     """Tasks of published planners."""
 
+    seeds: int = 10
     duration: float = 90.0
     """Length of a flight [s]."""
 
@@ -175,8 +147,6 @@ class MissionFlight(NamedTuple):
     landed: int
     packets: float
     """Packets a second, both directions together, per vehicle."""
-    plan_ms: float
-    """Mean planning time of the server for each motion that it sent [ms]."""
 
     @property
     def was_in_zone(self) -> bool:
@@ -199,8 +169,7 @@ def fly_mission(
             vehicles' clocks are aligned.
         arrived_m: distance from its goal at which a vehicle has arrived [m].
     """
-    with timed() as spent:
-        record, lives = fly_with_deaths(scenario, vehicles, deaths)
+    record, lives = fly_with_deaths(scenario, vehicles, deaths)
     goals, dt_s, client = scenario.make_reference(), scenario.control.dt, record.client
     assert isinstance(goals, Mission)
     each = [client[client["vehicle"] == number] for number in np.unique(client["vehicle"])]
@@ -232,24 +201,7 @@ def fly_mission(
         left=counts["left_tube"],
         landed=sum(bool((rows["mode"] == Mode.LAND).any()) for rows in each),
         packets=packets / (vehicles * scenario.duration),
-        plan_ms=1e3 * sum(spent) / max(counts["events"], 1),
     )
-
-
-@contextmanager
-def timed() -> Iterator[list[float]]:
-    real, spent = MissionPlanner.plan, list[float]()
-
-    def plan(self: MissionPlanner, rows: Indices, step: Indices, foresight: Foresight) -> None:
-        began = time.perf_counter()
-        real(self, rows, step, foresight)
-        spent.append(time.perf_counter() - began)
-
-    MissionPlanner.plan = plan  # type: ignore[method-assign]
-    try:
-        yield spent
-    finally:
-        MissionPlanner.plan = real  # type: ignore[method-assign]
 
 
 def fly_with_deaths(
@@ -413,10 +365,12 @@ def _fly_random(options: RandomOptions, seed: int) -> MissionFlight:
         return fly_mission(scenario, len(goals.vehicles), deaths=when)
 
 
-def random_table(options: RandomOptions) -> tuple[TextTable, list[MissionFlight]]:
-    """Fly all missions; returns the table, and the flights with a fault."""
-    seeds = range(options.first, options.first + options.flights)
-    flights = options.fly(partial(fly_random, options), seeds)
+def random_cells(options: RandomOptions, seeds: int) -> Sequence[int]:
+    return range(options.first, options.first + seeds)
+
+
+def random_tables(options: RandomOptions, flights: Sequence[MissionFlight]) -> dict[str, TextTable]:
+    """Table of all missions, and of those with a fault, if there are any."""
     asked_m = reading.load("swap").mission.separation_m
     rows = []
     for low, high in ((2, 8), (9, 16), (17, 24), (25, 32)):
@@ -424,9 +378,7 @@ def random_table(options: RandomOptions) -> tuple[TextTable, list[MissionFlight]
             figures = (
                 len(those),
                 f"{min(each.least_m for each in those):.3f}",
-                sum(each.least_m < asked_m for each in those),
                 f"{min(each.clear_m for each in those if each.clear_m is not None):.3f}",
-                sum(each.was_in_zone for each in those),
                 sum(each.left for each in those),
                 sum(each.landed for each in those),
                 sum(each.late > 0 for each in those),
@@ -437,20 +389,28 @@ def random_table(options: RandomOptions) -> tuple[TextTable, list[MissionFlight]
         "vehicles",
         "missions",
         "least separation\n[m]",
-        "nearer than\nasked",
         "least distance\nfrom a zone [m]",
-        "in a zone",
         "out of a tube",
         "landed",
         "not all\narrived",
         "last arrival\np50, max [s]",
     ]
+    shown = {"random missions": TextTable(headings, rows)}
     faults = [
-        each
+        [
+            f"seed {each.seed}",
+            each.network,
+            f"{each.least_m:.3f}",
+            f"{each.clear_m:.3f}",
+            str(each.late),
+        ]
         for each in flights
         if each.least_m < asked_m or each.was_in_zone or (each.late and not options.harsh)
     ]
-    return TextTable(headings, rows), faults
+    if faults:
+        headings = ["fault", "network", "least separation [m]", "from a zone [m]", "not arrived"]
+        shown["faults"] = TextTable(headings, faults)
+    return shown
 
 
 # -- vehicles that swap places --------------------------------------------------------------
@@ -478,18 +438,18 @@ def fly_swap(options: SwapOptions, cell: tuple[int, str]) -> MissionFlight:
     return fly_mission(scenario, options.vehicles, deaths=when, goal_at_s=0.0)
 
 
-def swap_table(options: SwapOptions) -> TextTable:
+def swap_cells(seeds: int) -> list[tuple[int, str]]:
     # Seeds in the outer loop, so that more flights only add cells at the end.
-    cells = list(product(range(1, options.flights + 1), SWAP_NETWORKS))
-    done = options.fly(partial(fly_swap, options), cells)
-    asked = reading.load(options.shape).mission.separation_m
+    return list(product(range(1, seeds + 1), SWAP_NETWORKS))
+
+
+def swap_tables(flown: Sequence[MissionFlight]) -> dict[str, TextTable]:
     rows = []
     for i, network in enumerate(SWAP_NETWORKS):
-        flights = done[i :: len(SWAP_NETWORKS)]
+        flights = flown[i :: len(SWAP_NETWORKS)]
         figures = (
             f"{min(each.least_m for each in flights):.3f}",
-            f"{sum(each.least_m < asked for each in flights)} of {len(flights)}",
-            sum(not each.late for each in flights),
+            f"{sum(not each.late for each in flights)} of {len(flights)}",
             arrivals(flights),
             f"{np.mean([each.packets for each in flights]):.2f}",
             sum(each.left for each in flights),
@@ -498,13 +458,12 @@ def swap_table(options: SwapOptions) -> TextTable:
     headings = [
         "network",
         "least separation\n[m]",
-        "flights\nnearer than asked",
         "flights\nin which all arrived",
         "last arrival\np50, max [s]",
         "packets/s\na vehicle",
         "out of a tube",
     ]
-    return TextTable(headings, rows)
+    return {"swap": TextTable(headings, rows)}
 
 
 # -- tasks of published planners -------------------------------------------------------------
@@ -586,34 +545,32 @@ def fly_published(options: PublishedOptions, cell: tuple[int, tuple[str, str]]) 
         return fly_mission(scenario, task.vehicles, arrived_m=PUBLISHED_ARRIVED_M)
 
 
-def published_table(options: PublishedOptions) -> TextTable:
-    kinds = list(product(TASKS, PUBLISHED_NETWORKS))
-    cells = list(product(range(1, options.flights + 1), kinds))
-    done = options.fly(partial(fly_published, options), cells)
+PUBLISHED = tuple(product(TASKS, PUBLISHED_NETWORKS))
+
+
+def published_cells(seeds: int) -> list[tuple[int, tuple[str, str]]]:
+    return list(product(range(1, seeds + 1), PUBLISHED))
+
+
+def published_tables(flown: Sequence[MissionFlight]) -> dict[str, TextTable]:
     rows = []
-    for i, (name, network) in enumerate(kinds):
-        flights = done[i :: len(kinds)]
-        arrived = [each.arrived_s for each in flights if each.arrived_s is not None]
-        crashes = sum(each.least_m < TASKS[name].separation_m for each in flights)
-        rows.append(
-            [
-                f"{name}, {network}",
-                f"{min(each.least_m for each in flights):.3f}",
-                f"{crashes} of {len(flights)}",
-                f"{sum(each <= TOLD_S for each in arrived)}, {len(arrived)}",
-                arrivals(flights),
-                f"{np.mean([each.plan_ms for each in flights]):.2f}",
-            ]
+    for i, (name, network) in enumerate(PUBLISHED):
+        flights = flown[i :: len(PUBLISHED)]
+        figures = (
+            f"{TASKS[name].separation_m:g}",
+            f"{min(each.least_m for each in flights):.3f}",
+            f"{sum(not each.late for each in flights)} of {len(flights)}",
+            arrivals(flights),
         )
+        rows.append([f"{name}, {network}", *figures])
     headings = [
         "task, network",
+        "a crash\nbelow [m]",
         "least separation\n[m]",
-        "flights with\na crash",
-        f"all arrived in\n{TOLD_S:g} s, {options.duration:g} s",
+        "flights\nin which all arrived",
         "last arrival\np50, max [s]",
-        "planning\na motion [ms]",
     ]
-    return TextTable(headings, rows)
+    return {"published": TextTable(headings, rows)}
 
 
 Options = (
@@ -623,23 +580,23 @@ Options = (
 )
 
 
+def study_of(options: Any) -> Study[Any, MissionFlight]:
+    """Study of the missions of some options."""
+    parts: tuple[Any, Any, Any] = published_cells, fly_published, published_tables
+    if isinstance(options, RandomOptions):
+        parts = partial(random_cells, options), fly_random, partial(random_tables, options)
+    elif isinstance(options, SwapOptions):
+        parts = swap_cells, fly_swap, swap_tables
+    cells, fly, tables = parts
+    common = StudyOptions.__dataclass_fields__
+    settings = {key: value for key, value in asdict(options).items() if key not in common}
+    flying = partial(fly, options)
+    return Study(__doc__, cells, flying, MissionFlight, tables, options.seeds, settings)
+
+
 def main(argv: Sequence[str]) -> None:
     options = tyro.cli(cast(Any, Options), args=argv, description=__doc__)
-    faults: list[MissionFlight] = []
-    if isinstance(options, RandomOptions):
-        table, faults = random_table(options)
-    elif isinstance(options, SwapOptions):
-        table = swap_table(options)
-    else:
-        table = published_table(options)
-    table.show(f"{options.flights} flights of {options.duration:g} s")
-    for each in faults:
-        print(
-            f"seed {each.seed}: {each.vehicles} vehicles, {each.network}: {each.least_m:.3f} m, "
-            f"zones {each.clear_m:.3f} m, {each.late} not arrived"
-        )
-    if options.markdown:
-        files.write(options.markdown, table.markdown().encode())
+    study_of(options).show(options)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,7 @@
 """Missions as benchmarks: reproducible, also with cut links and restarted servers."""
 
 import math
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
@@ -8,6 +9,7 @@ import numpy as np
 import pytest
 
 from bench import missions
+from bench.harness import Study, TextTable
 from bench.missions import MissionFlight, RandomOptions, SwapOptions
 from skytether.lab.commands.pool import Flags, study
 from skytether.server.missions import yielding
@@ -25,8 +27,9 @@ def test_a_mission_is_drawn_from_its_seed(tmp_path: Path) -> None:
 @pytest.mark.long
 def test_harsh_missions_keep_apart() -> None:
     """Vehicles that have not arrived are no fault there."""
-    table, told = missions.random_table(RandomOptions(flights=6, harsh=True, duration=60.0))
-    assert told == []
+    harsh = missions.study_of(RandomOptions(harsh=True, duration=60.0))
+    ((name, table),) = harsh.make(6, None, Flags(2)).items()
+    assert name == "random missions"
     assert sum(int(row[1]) for row in table.rows) == 6
     assert all(float(row[2]) > 0.5 for row in table.rows)
 
@@ -54,6 +57,15 @@ def test_a_vehicle_in_a_pocket_of_others_is_let_out(monkeypatch: pytest.MonkeyPa
     assert missions.fly_random(RandomOptions(), 31906).late == 1
 
 
+def test_a_mission_with_a_fault_is_shown_with_its_seed() -> None:
+    fine = MissionFlight(17, 2, "constant(0.1)", 0.8, 0.2, 0, 20.0, 0, 0, 1.0)
+    near, late = fine._replace(seed=18, least_m=0.4), fine._replace(seed=19, late=1)
+    shown = missions.random_tables(RandomOptions(), [fine, near, late])
+    assert [row[0] for row in shown["faults"].rows] == ["seed 18", "seed 19"]
+    shown = missions.random_tables(RandomOptions(harsh=True), [fine, late])
+    assert list(shown) == ["random missions"]
+
+
 def test_what_is_kept_is_not_flown_again(tmp_path: Path) -> None:
     out, one = tmp_path / "flights", Flags(0)
     assert study(math.sqrt, [4.0, 9.0], float, {"seed": 1}, out, one) == [2.0, 3.0]
@@ -62,6 +74,22 @@ def test_what_is_kept_is_not_flown_again(tmp_path: Path) -> None:
     assert study(math.fabs, [4.0], float, {"seed": 1}, None, one) == [4.0]
     with pytest.raises(ConfigError, match="seed: got 2, expected 1"):
         study(math.fabs, [4.0], float, {"seed": 2}, out, one)
+
+
+def test_a_study_flies_what_its_folder_lacks_and_makes_its_tables_of_all(tmp_path: Path) -> None:
+    def squares(fly: Callable[[float], float], seeds: int) -> list[list[str]]:
+        study = Study(
+            None,
+            lambda seeds: [float(seed) for seed in range(1, seeds + 1)],
+            fly,
+            float,
+            lambda found: {"found": TextTable(["x"], [[f"{each:g}"] for each in found])},
+            seeds=2,
+        )
+        return study.make(seeds, tmp_path / "flights", Flags(0))["found"].rows
+
+    assert squares(math.sqrt, 2) == [["1"], ["1.41421"]]
+    assert squares(math.fabs, 3) == [["1"], ["1.41421"], ["3"]]
 
 
 def test_a_flight_without_zones_is_kept_as_well(tmp_path: Path) -> None:

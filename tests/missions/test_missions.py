@@ -1209,5 +1209,4 @@ def test_four_cross_as_published() -> None:
     cell = (1, ("Luis 2020: four cross", "20 ms"))
     done = missions.fly_published(PublishedOptions(duration=25.0), cell)
     assert done.least_m > 0.2
-    assert done.arrived_s < missions.TOLD_S
-    assert done.plan_ms > 0.0
+    assert done.arrived_s < 20.0
