@@ -44,15 +44,15 @@ class Start(NamedTuple):
     """Target of a cold start [s]."""
 
 
-STARTS = {
-    "--help": Start("--help"),
-    "list scenarios": Start("list scenarios"),
-    "server --help": Start("server --help"),
-    "server demo": Start("server demo", warm_s=0.5, memory_mb=120, cold_s=8),
-    "server paper": Start("server paper", warm_s=0.5, memory_mb=120, cold_s=8),
-    "client demo": Start("client demo", memory_mb=40),
-    "fly demo, 10 s": Start("fly demo --virtual --duration 10", warm_s=1),
-}
+STARTS = (
+    Start("--help"),
+    Start("list scenarios"),
+    Start("server --help"),
+    Start("server demo", warm_s=0.5, memory_mb=120, cold_s=8),
+    Start("server paper", warm_s=0.5, memory_mb=120, cold_s=8),
+    Start("client demo", memory_mb=40),
+    Start("fly demo --virtual --duration 10", warm_s=1),
+)
 
 
 @dataclass(frozen=True)
@@ -76,21 +76,17 @@ class StartCost(NamedTuple):
 
 def measure(counts: StartingCounts) -> dict[str, Any]:
     """Costs of each start, as medians of the warm starts and of the cold starts."""
-    inherited = {
-        name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"
-    }
     costs_of: dict[tuple[str, str], list[StartCost]] = {}
     # The first warm start fills the caches on disk, and is not measured.
     turns = [("warm", turn) for turn in range(counts.warm + 1)]
     turns += [("cold", turn + 1) for turn in range(counts.cold)]
-    for (kind, turn), name in progress([*product(turns, STARTS)], "starting"):
+    for (kind, turn), (name, *_) in progress([*product(turns, STARTS)], "starting"):
         with tempfile.TemporaryDirectory() as folder:
             nothing = {"NUMBA_CACHE_DIR": f"{folder}/kernels", "PYTHONPYCACHEPREFIX": folder}
-            environment = inherited | (nothing if kind == "cold" else {})
-            cost = started(STARTS[name].command, environment)
+            cost = started(name, nothing if kind == "cold" else {})
         if turn:
             costs_of.setdefault((name, kind), []).append(cost)
-    costs: dict[str, dict[str, Any]] = {name: {} for name in STARTS}
+    costs: dict[str, dict[str, Any]] = {start.command: {} for start in STARTS}
     for (name, kind), kind_costs in costs_of.items():
         costs[name][kind] = StartCost(*map(median, zip(*kind_costs, strict=True)))._asdict()
     return {"starts": costs}
@@ -99,11 +95,15 @@ def measure(counts: StartingCounts) -> dict[str, Any]:
 def started(command: str, environment: Mapping[str, str]) -> StartCost:
     """Start a command, and measure its cost.
 
+    Args:
+        environment: variables besides those of this process.
+
     Raises:
         TimeoutError: the process is not ready in time.
         RuntimeError: the command has failed.
     """
     name, *rest = command.split()
+    inherited = {key: it for key, it in os.environ.items() if key != "PYTHONDONTWRITEBYTECODE"}
     with ExitStack() as stack:
         sink = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
         sink.settimeout(PATIENCE_S)
@@ -117,7 +117,7 @@ def started(command: str, environment: Mapping[str, str]) -> StartCost:
         began_ns = time.monotonic_ns()
         process = subprocess.Popen(
             [sys.executable, "-P", "-m", "skytether", name, *rest, *more],
-            env=environment,
+            env={**inherited, **environment},
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
             preexec_fn=die_with_parent,  # noqa: PLW1509 - one call of the kernel, which takes no lock
@@ -165,8 +165,9 @@ def _peak_bytes(process: subprocess.Popen[bytes]) -> float:
 
 def tables(result: Mapping[str, Any]) -> dict[str, TextTable]:
     rows = []
-    for name, costs in result["starts"].items():
-        start, warm, cold = STARTS[name], costs["warm"], costs.get("cold")
+    for start in STARTS:
+        costs = result["starts"][start.command]
+        warm, cold = costs["warm"], costs.get("cold")
         row = [
             f"`skytether {start.command}`",
             _shown(f"{warm['wall_s']:.2f}", start.warm_s),

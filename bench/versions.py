@@ -5,9 +5,9 @@
 A commit is checked out into a temporary folder, which is removed at the end; the folder of another
 checkout can be given instead.
 
-Each checkout has a process of its own, its `versions_worker.py`. Only one of them works at a time,
-in short turns of random order, so that other load affects both alike. Time is CPU time. Planning is
-also compared with OSQP, in this checkout only.
+Each checkout has a process of its own, its `versions_worker.py`, and starts its own commands. Only
+one of the two works at a time, in short turns of random order, so that other load affects both
+alike. Time is CPU time.
 """
 
 import json
@@ -19,49 +19,33 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 import tyro
 
-from bench import tick
-from bench.harness import HOT, PACED, TextTable, WakeLateness, progress, us
-from skytether.shared.base import files
+from bench.harness import HOT, TextTable, progress, us
+from bench.starting import started
 
 ROOT = Path(__file__).parents[1]
-WORKERS = tuple(
-    f"{folder}/versions_worker.py" for folder in ("bench", "skytether/lab/benchmarks", "benchmarks")
-)
-"""Paths of a checkout's worker: the present path, and those of older commits, newest first."""
-RUN = """
-import importlib, runpy, sys
-worker, harness, pause_s = sys.argv[1:]
-there = importlib.import_module(harness)
-there.PACED = type(there.PACED)(there.PACED.turn, float(pause_s))
-runpy.run_path(worker, run_name="__main__")
-"""
-"""Program that runs a worker with the pauses of this checkout; older checkouts have 5 ms."""
+WORKERS = "bench/versions_worker.py", "skytether/lab/benchmarks/versions_worker.py"
+"""Paths of a checkout's worker: the present one, and that of older commits."""
 SIDES = ("before", "after")
 VALUES_MIN = 20
 """Number of values below which no p99 is given."""
 
 
-@dataclass(frozen=True)
-class Contest:
+class Contest(NamedTuple):
     """Work that both checkouts do in turns; a row of the table."""
 
     title: str
     """Description, with the unit of the figures in brackets."""
     turn: tuple[Any, ...]
-    """Name and arguments of the worker's turn."""
+    """Name and arguments of a worker's turn; or "start", a command, a figure of `StartCost`."""
     turns: int
     """Number of measured turns of each checkout, after one warm-up turn."""
     per_unit: float = 1.0
-    """Number of the worker's units in one unit of the title."""
-    target_ratio: str = ""
-    """Target of the ratio of medians, after / before."""
-    target_p99: str = ""
-    """Target of the p99 after."""
+    """Number of the turn's units in one unit of the title."""
 
 
 @dataclass(frozen=True)
@@ -70,23 +54,45 @@ class VersionsCounts:
     """Number of turns of 50 hot ticks of one vehicle."""
     paced: int = 40
     """Number of turns of 10 paced ticks of one vehicle."""
-    fleets: tuple[int, ...] = (200, 1000)
+    fleets: tuple[int, ...] = (64, 200, 1000)
     """Number of vehicles of each fleet."""
     fleet: int = 30
     """Number of turns of 10 hot ticks of each fleet."""
-    crowd: int = 2500
-    """Number of vehicles of the crowd."""
-    planning: int = 40
-    """Number of turns of 10 paced ticks of the crowd."""
     flights: int = 20
     """Number of flights in virtual time, or of batches of them, of each scenario."""
     seconds: float = 3.0
     """Duration of each flight [s]."""
-    osqp: tick.TickCounts = tick.FULL
+    starts: int = 10
+    """Number of starts of each command."""
 
 
-FULL = VersionsCounts()
-QUICK = VersionsCounts(20, 6, (200, 1000), 4, 2500, 3, 2, 2.0, tick.QUICK)
+FULL, QUICK = VersionsCounts(), VersionsCounts(20, 6, fleet=4, flights=2, seconds=2.0, starts=2)
+
+
+class Side(NamedTuple):
+    """A checkout with its worker."""
+
+    folder: Path
+    worker: subprocess.Popen[str]
+
+    def take(self, turn: Sequence[Any]) -> Any:
+        """Figures of a turn.
+
+        Raises:
+            ValueError: the worker has failed.
+            RuntimeError: the command has failed.
+        """
+        if turn[0] == "start":
+            cost = started(turn[1], {"PYTHONPATH": str(self.folder)})
+            return [getattr(cost, turn[2])]
+        assert self.worker.stdin is not None
+        assert self.worker.stdout is not None
+        self.worker.stdin.write(json.dumps(turn) + "\n")
+        self.worker.stdin.flush()
+        answer = self.worker.stdout.readline()
+        if not answer:
+            raise ValueError(f"turn {turn}: the worker failed, see above")
+        return json.loads(answer)
 
 
 @dataclass(frozen=True)
@@ -94,47 +100,38 @@ class VersionsBenchmarkOptions:
     other: Annotated[str, tyro.conf.Positional]
     """Commit to compare with, or the folder of another checkout."""
     quick: bool = False
-    """Measure with small counts, only to test the benchmark."""
-    json: Path | None = None
-    """File for the figures."""
+    """Measure with small counts."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     options = tyro.cli(VersionsBenchmarkOptions, args=argv, description=__doc__)
     try:
         result = measure(options.other, QUICK if options.quick else FULL)
-    except ValueError as error:
+    except (ValueError, RuntimeError) as error:
         print(error, file=sys.stderr)
         return 1
-    for title, table in tables(result).items():
-        table.show(title)
-    if options.json:
-        files.write(options.json, (json.dumps(result, indent=1) + "\n").encode())
+    commits = " against ".join(f"{result[side]['commit']} ({side})" for side in SIDES[::-1])
+    table(result["contests"]).show(commits)
     return 0
 
 
 def contests(counts: VersionsCounts) -> list[Contest]:
-    rows = []
-    for name in ("smooth", "saturated"):
-        title = f"one vehicle's tick, {name}"
-        hot: tuple[Any, ...] = ("ticks", name, 1, HOT.turn, False)
-        paced: tuple[Any, ...] = ("ticks", name, 1, 10, True)
-        rows += [
-            Contest(f"{title}, hot [µs]", hot, counts.hot, 1e3, target_ratio="≤ 0.5"),
-            Contest(f"{title}, paced [µs]", paced, counts.paced, 1e3, target_ratio="≤ 0.5"),
-        ]
+    one = "saturated", 1
+    rows = [
+        Contest("one vehicle's tick, hot [µs]", ("ticks", *one, HOT.turn, False), counts.hot, 1e3),
+        Contest("one vehicle's tick, paced [µs]", ("ticks", *one, 10, True), counts.paced, 1e3),
+    ]
     for vehicles in counts.fleets:
         title = f"tick of {vehicles} vehicles, per vehicle [µs]"
-        turn: tuple[Any, ...] = ("ticks", "half", vehicles, 11, False)
-        rows.append(Contest(title, turn, counts.fleet, 1e3, target_ratio="≤ 0.7"))
-    title = f"{counts.crowd} vehicles, estimate + trigger + plan + solve [ms]"
-    turn = ("planning", "half", counts.crowd, 10)
-    target_p99 = f"< {tick.TARGET_P99_MS:g}"
-    rows.append(Contest(title, turn, counts.planning, 1e6, target_p99=target_p99))
-    for name, vehicles, seeds in (("fleet", 20, 1), ("paper", 1, 25), ("demo", 1, 25)):
-        title = f"{name}, vehicle-steps per core-second"
+        rows.append(Contest(title, ("ticks", "half", vehicles, 11, False), counts.fleet, 1e3))
+    kinds = ("paper", 1, 25), ("demo", 1, 25), ("target", 1, 25), ("swap", 16, 1), ("fleet", 20, 1)
+    for name, vehicles, seeds in kinds:
         turn = ("flight", name, counts.seconds, vehicles, seeds)
-        rows.append(Contest(title, turn, counts.flights, target_ratio="≥ 1.2"))
+        rows.append(Contest(f"{name}, vehicle-steps per core-second", turn, counts.flights))
+    for command in ("fly demo --virtual --duration 10", "server demo", "client demo"):
+        for figure, title, per_unit in (("cpu_s", "[ms]", 1e-3), ("memory_bytes", "[MB]", 1e6)):
+            name = f"start of {command} {title}"
+            rows.append(Contest(name, ("start", command, figure), counts.starts, per_unit))
     return rows
 
 
@@ -166,22 +163,22 @@ def checkout(other: str) -> Iterator[Path]:
 
 
 def measure(other: str, counts: VersionsCounts) -> dict[str, Any]:
-    """Figures of both checkouts, and of planning against OSQP.
+    """Figures of both checkouts.
 
     Raises:
         ValueError: `other` is no checkout with benchmarks, or the worker fails in one of the two.
+        RuntimeError: a command fails in one of the two.
     """
     rng = np.random.default_rng(1)
     with ExitStack() as stack:
-        before = stack.enter_context(checkout(other))
-        workers = {
-            side: stack.enter_context(_start(folder.resolve()))
-            for side, folder in zip(SIDES, (before, ROOT), strict=True)
+        before = stack.enter_context(checkout(other)).resolve()
+        sides = {
+            name: Side(folder, stack.enter_context(_start(folder)))
+            for name, folder in zip(SIDES, (before, ROOT), strict=True)
         }
-        machines = {side: _ask(worker, "where") for side, worker in workers.items()}
-        figures = {contest.title: _compete(contest, workers, rng) for contest in contests(counts)}
-    tunings = tick.tune(counts.osqp, WakeLateness())
-    return {**machines, "contests": figures, "fleets": tick.fleets(counts.osqp, tunings)}
+        machines = {name: side.take(("where",)) for name, side in sides.items()}
+        figures = {contest.title: _compete(contest, sides, rng) for contest in contests(counts)}
+    return {**machines, "contests": figures}
 
 
 def _start(folder: Path) -> subprocess.Popen[str]:
@@ -189,9 +186,8 @@ def _start(folder: Path) -> subprocess.Popen[str]:
     worker = next((name for name in WORKERS if (folder / name).exists()), None)
     if worker is None:
         raise ValueError(f"{folder}: got a folder without benchmarks, expected a checkout")
-    harness = ".".join(Path(worker).with_name("harness").parts)
     return subprocess.Popen(
-        [sys.executable, "-P", "-c", RUN, worker, harness, str(PACED.pause_s)],
+        [sys.executable, "-P", worker],
         cwd=folder,
         env={**os.environ, "PYTHONPATH": str(folder)},
         stdin=subprocess.PIPE,
@@ -200,19 +196,8 @@ def _start(folder: Path) -> subprocess.Popen[str]:
     )
 
 
-def _ask(worker: subprocess.Popen[str], *turn: Any) -> Any:
-    assert worker.stdin is not None
-    assert worker.stdout is not None
-    worker.stdin.write(json.dumps(turn) + "\n")
-    worker.stdin.flush()
-    answer = worker.stdout.readline()
-    if not answer:
-        raise ValueError(f"turn {turn}: the worker failed, see above")
-    return json.loads(answer)
-
-
 def _compete(
-    contest: Contest, workers: Mapping[str, subprocess.Popen[str]], rng: np.random.Generator
+    contest: Contest, sides: Mapping[str, Side], rng: np.random.Generator
 ) -> dict[str, Any]:
     """Median and p99 of each side in the contest's unit, and the ratios after / before.
 
@@ -222,7 +207,7 @@ def _compete(
     turns: dict[str, list[list[float]]] = {side: [] for side in SIDES}
     for _ in progress(range(contest.turns + 1), contest.title):
         for side in rng.permutation(SIDES):
-            turns[side].append(_ask(workers[side], *contest.turn))
+            turns[side].append(sides[side].take(contest.turn))
     values = {side: np.array(turns[side][1:]) / contest.per_unit for side in SIDES}
     figures: dict[str, Any] = {
         side: {"p50": float(np.median(measured)), "p99": float(np.quantile(measured, 0.99))}
@@ -233,27 +218,19 @@ def _compete(
         "p50": float(np.median(np.divide(*medians))),
         "p99": figures["after"]["p99"] / figures["before"]["p99"],
     }
-    targets = {"ratio": contest.target_ratio, "p99": contest.target_p99}
-    return {**figures, "values": values["after"].size, "targets": targets}
+    return {**figures, "values": values["after"].size}
 
 
-def tables(result: Mapping[str, Any]) -> dict[str, TextTable]:
-    commits = " against ".join(f"{result[side]['commit']} ({side})" for side in SIDES[::-1])
+def table(contests: Mapping[str, Any]) -> TextTable:
     headings = ["", "before p50", "p99", "after p50", "p99", "after / before p50", "p99"]
-    rows = [_row(title, figures) for title, figures in result["contests"].items()]
-    planning = "planning against sequential OSQP, after"
-    return {commits: TextTable(headings, rows), planning: tick.fleet_table(result["fleets"])}
-
-
-def _row(title: str, figures: Mapping[str, Any]) -> list[str]:
-    row = [title]
-    for key in (*SIDES, "ratio"):
-        p50, p99 = (us(figures[key][share]) for share in ("p50", "p99"))
-        row += [p50, p99 if figures["values"] >= VALUES_MIN else ""]
-    for column, key in ((4, "p99"), (5, "ratio")):
-        if target := figures["targets"][key]:
-            row[column] += f" ({target})"
-    return row
+    rows = []
+    for title, figures in contests.items():
+        row = [title]
+        for key in (*SIDES, "ratio"):
+            p50, p99 = (us(figures[key][share]) for share in ("p50", "p99"))
+            row += [p50, p99 if figures["values"] >= VALUES_MIN else ""]
+        rows.append(row)
+    return TextTable(headings, rows)
 
 
 if __name__ == "__main__":

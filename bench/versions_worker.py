@@ -19,12 +19,8 @@ from bench.airspace import Airspace
 from bench.harness import HOT, PACED, machine
 from bench.problems import derive
 from skytether.shared.base.units import SECOND_NS
-from skytether.shared.endpoints.stopwatch import Stopwatch
 from skytether.shared.scenario.whole import Scenario
 from skytether.sim.flight import fly, fly_batch
-
-PLANNING = {"estimate", "trigger", "plan", "solve"}
-"""Laps of the stopwatch between a decoded observation and a horizon; old checkouts lack some."""
 
 
 def where() -> dict[str, Any]:
@@ -35,7 +31,7 @@ def ticks(name: str, vehicles: int, count: int, paced: bool) -> list[float]:
     """CPU time of whole ticks per vehicle [ns]: without pauses, the first tick left out; or each
     tick after a pause.
     """
-    space, spent = _space(name, vehicles, timed=False), []
+    space, spent = _space(name, vehicles), []
     for number in range(count):
         space.prepare()
         if paced or number == 0:
@@ -44,19 +40,6 @@ def ticks(name: str, vehicles: int, count: int, paced: bool) -> list[float]:
         space.wake()
         spent.append((time.process_time_ns() - start_ns) / vehicles)
     return spent if paced else spent[1:]
-
-
-def planning(name: str, vehicles: int, count: int) -> list[float]:
-    """CPU time of the laps in PLANNING [ns], of ticks that each follow a pause."""
-    space, spent = _space(name, vehicles, timed=True), []
-    laps_ns = space.server.stopwatch.spent_ns
-    for _ in range(count):
-        space.prepare()
-        _pause(PACED.pause_s)
-        laps_ns.clear()
-        space.wake()
-        spent.append(float(sum(laps_ns[lap] for lap in PLANNING)))
-    return spent
 
 
 def flight(name: str, seconds: float, vehicles: int, seeds: int) -> list[float]:
@@ -72,10 +55,9 @@ def flight(name: str, seconds: float, vehicles: int, seeds: int) -> list[float]:
 
 
 @cache
-def _space(name: str, vehicles: int, *, timed: bool) -> Airspace:
+def _space(name: str, vehicles: int) -> Airspace:
     """Vehicles after SETTLE ticks, so that they have left the reference where they start."""
-    stopwatch = Stopwatch(time.process_time_ns) if timed else None
-    space = Airspace(_scenarios()[name], vehicles, stopwatch)
+    space = Airspace(_scenarios()[name], vehicles)
     for _ in range(tick.SETTLE):
         space.prepare()
         space.wake()
@@ -92,9 +74,7 @@ def _pause(pause_s: float) -> None:
     time.process_time_ns()  # the first call after a pause is slow
 
 
-TURNS: dict[str, Callable[..., Any]] = {
-    turn.__name__: turn for turn in (where, ticks, planning, flight)
-}
+TURNS: dict[str, Callable[..., Any]] = {turn.__name__: turn for turn in (where, ticks, flight)}
 
 
 def main() -> None:
