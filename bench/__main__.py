@@ -24,7 +24,6 @@ from bench import (
     solvers,
     starting,
     tick,
-    wire,
 )
 from bench.harness import CONSOLE, TextTable, machine, refresh
 from skytether.shared.base import files
@@ -38,7 +37,6 @@ Section = Literal[
     "solvers",
     "tick",
     "motions",
-    "wire",
     "link",
     "flood",
     "restarts",
@@ -51,7 +49,6 @@ SECTIONS: dict[Section, ModuleType] = {
     "solvers": solvers,
     "tick": tick,
     "motions": motions,
-    "wire": wire,
     "link": link,
     "flood": flood,
     "restarts": restarts,
@@ -97,7 +94,7 @@ def write(
 
     Args:
         results: measured figures, by section.
-        document: document with places for some of the tables; the others are only printed.
+        document: document with a place for each table.
         folder: folder for pictures.
     """
     if "tick" in results:
@@ -108,12 +105,10 @@ def write(
     }
     lines = ",\n".join(f"{json.dumps(name)}: {json.dumps(each)}" for name, each in merged.items())
     files.write(file, f"{{{lines}}}\n".encode())
-    tables = {"machine": machines(merged), "packages": packages(merged)}
+    tables = {"machine": machines(merged)}
     for name, figures in merged.items():
         tables |= SECTIONS[name].tables(figures)
-    text = document.read_text()
-    placed = {name: each for name, each in tables.items() if f"<!-- table: {name} -->" in text}
-    files.write(document, refresh(text, placed).encode())
+    files.write(document, refresh(document.read_text(), tables).encode())
 
 
 def machines(results: Mapping[Section, Any]) -> TextTable:
@@ -130,11 +125,6 @@ def machines(results: Mapping[Section, Any]) -> TextTable:
         rows.append([", ".join(names), *place, worst])
     headings = ["measured", "on", "commit", "date", "wakes late, largest p99 [ms]"]
     return TextTable(headings, rows)
-
-
-def packages(results: Mapping[Section, Any]) -> TextTable:
-    versions = results.get("solvers", {"machine": {"packages": {}}})["machine"]["packages"]
-    return TextTable(["package", "version"], [list(pair) for pair in versions.items()])
 
 
 if __name__ == "__main__":

@@ -16,7 +16,6 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from importlib import metadata
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Generic, TypeVar
@@ -34,7 +33,6 @@ from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
 
 Durations = NDArray[np.int64]
 """CPU time of each problem [ns]; shape (count,)."""
-PACKAGES = ("casadi", "daqp", "numba", "numpy", "osqp", "piqp", "quadprog", "scipy")
 CONSOLE = Console()
 Step = TypeVar("Step")
 C = TypeVar("C")
@@ -150,17 +148,9 @@ def machine() -> dict[str, Any]:
         else os.cpu_count(),
         "system": f"{platform.system()} {platform.machine()}",
         "python": platform.python_version(),
-        "packages": {name: version for name in PACKAGES if (version := _version(name))},
         "commit": commit(),
         "date": time.strftime("%Y-%m-%d"),
     }
-
-
-def _version(package: str) -> str | None:
-    try:
-        return metadata.version(package)
-    except metadata.PackageNotFoundError:
-        return None
 
 
 @dataclass(frozen=True)

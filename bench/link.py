@@ -18,7 +18,6 @@ import numpy as np
 
 from bench.harness import HOT, TextTable, WakeLateness, figures_us, interleave, median, progress, us
 from bench.problems import derive
-from bench.wire import NOTHING, messages
 from skytether.client import secure as client
 from skytether.server import secure as server
 from skytether.server.gate import GateCall
@@ -26,17 +25,30 @@ from skytether.shared.base.chance import stream
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.endpoints.endpoint import Address, Datagram
 from skytether.shared.endpoints.stopwatch import Stopwatch
+from skytether.shared.law.terms import Terms
 from skytether.shared.scenario.reading import load
 from skytether.shared.telemetry.summary import summarise
 from skytether.shared.wire import channel
 from skytether.shared.wire.drop import ProtocolError
 from skytether.shared.wire.keys import Keyring
-from skytether.shared.wire.protocol import Hello, Welcome, encode
+from skytether.shared.wire.protocol import (
+    Heartbeat,
+    Hello,
+    Horizon,
+    Idle,
+    Message,
+    Mode,
+    Observation,
+    Welcome,
+    encode,
+    stamp_us,
+)
 from skytether.sim import flight
 from skytether.sim.sealed import make_keys
 
 PEER: Address = ("127.0.0.1", 1024)
 NOW_NS = 86_400 * SECOND_NS
+NOTHING = "nothing"
 LARGER = 1.01
 """Largest allowed ratio of the RMSE of encrypted flights to that of plaintext flights."""
 
@@ -56,6 +68,23 @@ class LinkCounts:
 
 FULL = LinkCounts()
 QUICK = LinkCounts(packets=1000, handshakes=100, vehicles=5, seconds=2.0, turns=1, seeds=2)
+
+
+def messages(terms: Terms) -> list[Message]:
+    """One message of each type, with numbers as large as those of a real flight."""
+    rng = np.random.default_rng(1)
+    now_ns = 86_400 * 10**9 + 123_456_789
+    inputs = rng.uniform(-1.0, 1.0, (terms.axes, terms.horizon)).astype(np.float32)
+    state = rng.normal(0.0, 1.0, (terms.axes, 2))
+    session, step = 2**31, 5000
+    report = step - 20, step - 10, stamp_us(now_ns), 100, Mode.TRACK, 1, state, np.zeros(terms.axes)
+    return [
+        Hello(1, 2**60, terms),
+        Welcome(1, session, 2**60, 2**60, now_ns, 0, terms),
+        Observation(1, session, step, *report),
+        Horizon(1, session, step, stamp_us(now_ns), 9, inputs),
+        Heartbeat(1, session, stamp_us(now_ns), Idle.PLANS, 0),
+    ]
 
 
 class Ends:
@@ -112,7 +141,7 @@ class Ends:
 def measure(counts: LinkCounts) -> dict[str, Any]:
     lateness = WakeLateness()
     return {
-        **_packets(counts, lateness),
+        "packet": _packets(counts, lateness),
         "handshake": _handshakes(counts, lateness),
         "fleet": _fleet(counts),
         "demo": _demo(counts),
@@ -121,7 +150,7 @@ def measure(counts: LinkCounts) -> dict[str, Any]:
 
 
 def _packets(counts: LinkCounts, lateness: WakeLateness) -> dict[str, Any]:
-    """Sizes of the messages, and the cost of a packet to either end."""
+    """Cost of a packet to either end."""
     terms = derive("paper-every-step", control={"dt": 0.02, "horizon": 50}).terms()
     encoded = {type(message).__name__.upper(): encode(message) for message in messages(terms)}
     hello, welcome = encoded["HELLO"], encoded["WELCOME"]
@@ -130,12 +159,6 @@ def _packets(counts: LinkCounts, lateness: WakeLateness) -> dict[str, Any]:
     ends.challenge()
     ends.welcome()
     ends.adopt()
-    sizes = {
-        name: (len(payload), len(ends.link.seal(payload))) for name, payload in encoded.items()
-    }
-    sizes["HELLO"] = len(hello), len(ends.second)
-    sizes["WELCOME"] = len(welcome), len(ends.response)
-
     observation, horizon = encoded["OBSERVATION"], encoded["HORIZON"]
     old = ends.link.seal(observation)
     call = gate.open(Datagram(old, PEER), now_ns=NOW_NS)
@@ -170,7 +193,7 @@ def _packets(counts: LinkCounts, lateness: WakeLateness) -> dict[str, Any]:
         for what, packet in refused.items()
     }
     spent = interleave(contestants, counts.packets, HOT, lateness, "packets")
-    return {"bytes": sizes, "packet": {name: figures_us(each) for name, each in spent.items()}}
+    return {name: figures_us(each) for name, each in spent.items()}
 
 
 def _gate(vehicles: int) -> tuple[server.SecureGate, Keyring]:
@@ -244,13 +267,8 @@ def tables(result: Mapping[str, Any]) -> dict[str, TextTable]:
         [name, *(us(figures[share]) for share in ("p50_us", "p99_us"))]
         for name, figures in (*both.items(), (NOTHING, nothing))
     ]
-    sizes = [
-        [name, str(plain), str(sealed), f"+{sealed - plain}"]
-        for name, (plain, sealed) in result["bytes"].items()
-    ]
     return {
         "link-packets": TextTable(["a packet", "p50 [µs]", "p99"], rows),
-        "link-bytes": TextTable(["message", "plaintext [B]", "sealed [B]", "more"], sizes),
         "link-cost": TextTable(["", *KINDS, "ratio"], _costs(result)),
     }
 

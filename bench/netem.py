@@ -36,7 +36,7 @@ from bench.harness import TextTable, median, progress, quantile_ms, sleep_until
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
 from skytether.shared.events.processes import Counted
 from skytether.shared.telemetry.record import DOWNLINK, read
-from skytether.shell.host.udp import kernel_drops, open_socket
+from skytether.shell.host.udp import open_socket
 
 HEAD = struct.Struct("<qq")
 """Header of a packet: its number and time of sending [ns]; the rest is zeros."""
@@ -83,19 +83,11 @@ FULL, QUICK = (
 class NetemRun:
     sent: int
     received: int
-    dropped_before: int
-    """Number of packets dropped before netem read them, because its receive buffer was full."""
-    dropped_within: int
-    """Number of packets dropped by netem: its queue was full, or the kernel refused to send."""
-    dropped_after: int
-    """Number of packets dropped after netem, because the receiver's buffer was full."""
-    measured: int
-    """Number of packets with a known drawn delay: those before the first that netem never read."""
+    unread: int
+    """Number of packets that netem never read, because its receive buffer was full."""
     error_ms_p50: float
     error_ms_p99: float
     error_ms_max: float
-    netem_ms_p99: float
-    """Error reported by netem itself [ms]: from the due time until handed to the driver."""
     netem_cpu: float
     """Share of a core that netem used."""
     netem_waited: float
@@ -135,8 +127,8 @@ def send(pipe: Connection, options: NetemBenchmarkOptions, port: int) -> int:
     return number
 
 
-def receive(pipe: Connection, options: NetemBenchmarkOptions) -> tuple[bytes, list[int], int]:
-    """Receive packets; returns headers, arrival times [ns], and the kernel's drops."""
+def receive(pipe: Connection, options: NetemBenchmarkOptions) -> tuple[bytes, list[int]]:
+    """Receive packets; returns headers, and arrival times [ns]."""
     sock = open_blocking()
     pipe.send(sock.getsockname()[1])
     sock.sendto(b"", sock.recvfrom(1)[1])
@@ -157,7 +149,7 @@ def receive(pipe: Connection, options: NetemBenchmarkOptions) -> tuple[bytes, li
             wall_to_monotonic_ns = time.monotonic_ns() - time.time_ns()
             arrivals.append(seconds * SECOND_NS + ns + wall_to_monotonic_ns)
             heads += packet[: HEAD.size]
-    return bytes(heads), arrivals, kernel_drops(sock)
+    return bytes(heads), arrivals
 
 
 def sleep(pipe: Connection, options: NetemBenchmarkOptions) -> list[int]:
@@ -191,7 +183,7 @@ def measure_once(options: NetemBenchmarkOptions, seed: int) -> NetemRun:
             pipe.send(start_ns)
         sent = answer(sender)
         used_ns = scheduled_ns(netem.process.pid) - used_ns
-        (heads, arrivals, dropped_after), late_ns = answer(receiver), answer(sleeper)
+        (heads, arrivals), late_ns = answer(receiver), answer(sleeper)
 
         netem.stop()
         drawn_ns = drawn_delays_ns(record, sent, options.flows)
@@ -199,22 +191,17 @@ def measure_once(options: NetemBenchmarkOptions, seed: int) -> NetemRun:
     numbers, stamps = np.frombuffer(heads, "<i8").reshape(-1, 2).T
     counted = netem.all(Counted)[-1].event
     assert isinstance(counted, Counted)
-    downlink = counted.figures["downlink"]
-    read_packets = downlink["packets"] - options.flows
+    read_packets = counted.figures["downlink"]["packets"] - options.flows
     # A packet that netem never read has no row in the record, and shifts the numbers after it.
     counted_until = sent if read_packets == sent else first_missing(numbers)
     error_ns = (np.array(arrivals) - stamps - drawn_ns[numbers])[numbers < counted_until]
     return NetemRun(
         sent=sent,
         received=len(numbers),
-        dropped_before=sent - read_packets,
-        dropped_within=downlink["overflowed"] + counted.figures["send_errors"],
-        dropped_after=dropped_after,
-        measured=len(error_ns),
+        unread=sent - read_packets,
         error_ms_p50=quantile_ms(error_ns, 0.5),
         error_ms_p99=quantile_ms(error_ns, 0.99),
         error_ms_max=quantile_ms(error_ns, 1.0),
-        netem_ms_p99=downlink["error_ms_p99"],
         netem_cpu=used_ns[0] / SECOND_NS / options.seconds,
         netem_waited=used_ns[1] / SECOND_NS / options.seconds,
         wake_ms_p50=quantile_ms(late_ns, 0.5),
@@ -269,24 +256,20 @@ def first_missing(numbers: NDArray[np.int64]) -> int:
 
 
 def measure(options: NetemBenchmarkOptions) -> dict[str, Any]:
-    """Figures of all runs, and the median of each over the runs, also of the other loads."""
-    runs = measure_all(options)
-    loads = [replace(options, rate=rate, flows=flows) for rate, flows in options.loads]
+    """Medians over the runs, at each load."""
+    first = options.rate, options.flows
+    loads, wake = [], list[NetemRun]()
+    for rate, flows in (first, *options.loads):
+        runs = measure_all(replace(options, rate=rate, flows=flows))
+        loads.append({"rate": rate, "flows": flows, **medians(runs)})
+        wake = wake or runs
     return {
         "options": asdict(options),
-        "median": medians(runs),
-        "loads": [
-            {"rate": each.rate, "flows": each.flows, **medians(measured)}
-            for each, measured in [
-                (options, runs),
-                *((each, measure_all(each)) for each in loads),
-            ]
-        ],
-        "runs": [asdict(run) for run in runs],
+        "loads": loads,
         "wake": {
-            "p50_ms": median(run.wake_ms_p50 for run in runs),
-            "p99_ms": median(run.wake_ms_p99 for run in runs),
-            "max_ms": max(run.wake_ms_max for run in runs),
+            "p50_ms": median(run.wake_ms_p50 for run in wake),
+            "p99_ms": median(run.wake_ms_p99 for run in wake),
+            "max_ms": max(run.wake_ms_max for run in wake),
         },
     }
 
@@ -304,28 +287,9 @@ def medians(runs: Sequence[NetemRun]) -> dict[str, float]:
 
 
 def tables(result: Mapping[str, Any]) -> dict[str, TextTable]:
-    headings = ["run", "packets\nsent", "\nreceived", "\nlost", "error [ms]\np50", "\np99", "\nmax"]
-    headings += ["netem\nCPU", "\nwaited", "machine [ms]\np50", "\np99", "\nmax"]
-    rows = [
-        [
-            str(number),
-            str(run.sent),
-            str(run.received),
-            str(lost(run)),
-            f"{run.error_ms_p50:.2f}",
-            f"{run.error_ms_p99:.2f}",
-            f"{run.error_ms_max:.1f}",
-            f"{run.netem_cpu:.0%}",
-            f"{run.netem_waited:.0%}",
-            f"{run.wake_ms_p50:.2f}",
-            f"{run.wake_ms_p99:.2f}",
-            f"{run.wake_ms_max:.1f}",
-        ]
-        for number, run in enumerate(runs_of(result), start=1)
-    ]
     loads = []
-    for load in result.get("loads", []):  # older results have none
-        read_packets = load["sent"] - load["dropped_before"]
+    for load in result["loads"]:
+        read_packets = load["sent"] - load["unread"]
         packet_s = load["netem_cpu"] * result["options"]["seconds"] / read_packets
         loads.append(
             [
@@ -345,12 +309,4 @@ def tables(result: Mapping[str, Any]) -> dict[str, TextTable]:
         )
     titles = ["packets/s", "flows", "CPU a packet [µs]", "error p50 [ms]", "p99", "max"]
     titles += ["machine p50 [ms]", "p99", "max", "netem CPU", "waited", "lost"]
-    return {"netem": TextTable(headings, rows), "netem-loads": TextTable(titles, loads)}
-
-
-def runs_of(result: Mapping[str, Any]) -> list[NetemRun]:
-    return [NetemRun(**run) for run in result["runs"]]
-
-
-def lost(run: NetemRun) -> int:
-    return run.sent - run.received
+    return {"netem-loads": TextTable(titles, loads)}

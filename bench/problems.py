@@ -88,10 +88,6 @@ class RecordedProblems:
     guess: Array
     """Shifted horizon of the previous step [m/s]; shape (2, ticks, axes, H)."""
 
-    @property
-    def ticks(self) -> int:
-        return self.gradient.shape[1]
-
     def active(self) -> float:
         flat = self.gradient.reshape(-1, *self.gradient.shape[2:])
         inputs, _ = ExactSolver(self.problem).solve(flat, np.zeros_like(flat))

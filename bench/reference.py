@@ -1,15 +1,13 @@
-"""Reference solutions of QPs, found by other solvers and then proved to be optimal.
+"""Reference solutions of QPs, found by another solver and then proved to be optimal.
 
-quadprog (or, if it is not installed, bounded least squares of scipy) finds the inputs that are at a
-bound. With these fixed, a dense Cholesky factorisation gives the other inputs, and the optimality
-conditions are checked: every free input within the box, and no multiplier of the wrong sign.
+DAQP finds the inputs that are at a bound. With these fixed, a dense Cholesky factorisation gives
+the other inputs, and the optimality conditions are checked: every free input within the box, and no
+multiplier of the wrong sign.
 """
 
-from importlib.util import find_spec
-
+import daqp
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
-from scipy.optimize import lsq_linear
 
 from skytether.shared.law.model import Array
 
@@ -30,10 +28,10 @@ class Reference:
 
     def __init__(self, hessian: Array, bound: float) -> None:
         self._hessian, self._bound = hessian, bound
-        self._root = np.linalg.cholesky(hessian).T
-        self._factor = np.linalg.inv(self._root)
         H = len(hessian)
-        self._rows, self._limits = np.hstack([np.eye(H), -np.eye(H)]), np.full(2 * H, -bound)
+        box = np.full(H, bound)
+        self._model = daqp.Model()
+        self._model.setup(hessian, np.zeros(H), np.zeros((0, H)), box, -box)
 
     def solve(self, gradient: Array) -> Array:
         """Optimal inputs, exact to rounding [m/s]; gradient of shape (H,).
@@ -41,7 +39,8 @@ class Reference:
         Raises:
             NoReference: no solution could be proved.
         """
-        first = self._first(gradient)
+        self._model.update(f=gradient)
+        first, *_ = self._model.solve()
         near = self._bound - AT_BOUND
         side = np.where(first >= near, 1.0, np.where(first <= -near, -1.0, 0.0))
         for _ in range(ROUNDS_MAX):
@@ -54,15 +53,6 @@ class Reference:
                 return np.clip(inputs, -self._bound, self._bound)
             side = np.where(outside, np.sign(inputs), np.where(inward, 0.0, side))
         raise NoReference
-
-    def _first(self, gradient: Array) -> Array:
-        if find_spec("quadprog"):
-            import quadprog
-
-            arguments = (self._factor, -gradient, self._rows, self._limits, 0, True)
-            return quadprog.solve_qp(*arguments)[0]
-        aim = -np.linalg.solve(self._root.T, gradient)
-        return lsq_linear(self._root, aim, (-self._bound, self._bound), "bvls", tol=1e-15).x
 
     def _polish(self, side: Array, gradient: Array) -> Array:
         """Optimal inputs when the inputs that are at a bound are fixed there; shape (H,)."""

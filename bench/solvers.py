@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from bench.contestants import NOTHING, OURS, TUNED, TUNINGS, Factory, Tuning, by_axis, contestants
+from bench.contestants import NOTHING, OURS, TUNED, Factory, by_axis, contestants
 from bench.harness import (
     HOT,
     PACED,
@@ -34,11 +34,9 @@ PACES = {"hot": HOT, "paced": PACED}
 class SolversCounts:
     hot: int = 1000
     paced: int = 200
-    tuning: int = 100
-    """Number of ticks with which OSQP is tuned."""
 
 
-FULL, QUICK = SolversCounts(), SolversCounts(hot=100, paced=20, tuning=20)
+FULL, QUICK = SolversCounts(), SolversCounts(hot=100, paced=20)
 
 
 def flights() -> dict[str, Scenario]:
@@ -52,20 +50,26 @@ def flights() -> dict[str, Scenario]:
 
 
 def measure(counts: SolversCounts) -> dict[str, Any]:
+    """Figures of all contestants in the saturated flight, and of tuned OSQP alone in the other."""
     lateness = WakeLateness()
-    result: dict[str, Any] = {
-        name: _measure_flight(name, scenario, counts, lateness)
-        for name, scenario in flights().items()
-    }
+    result: dict[str, Any] = {}
+    for name, scenario in flights().items():
+        factories = contestants(name)
+        if name == "smooth":
+            factories = {key: factories[key] for key in (OURS, TUNED)}
+        result[name] = _measure_flight(name, scenario, factories, counts, lateness)
     return result | {"wake": lateness.figures()}
 
 
 def _measure_flight(
-    name: str, scenario: Scenario, counts: SolversCounts, lateness: WakeLateness
+    name: str,
+    scenario: Scenario,
+    factories: Mapping[str, Factory],
+    counts: SolversCounts,
+    lateness: WakeLateness,
 ) -> dict[str, Any]:
-    recorded = record(scenario, max(counts.hot, counts.paced, counts.tuning))
-    tuned, forms = tune(recorded, counts.tuning, lateness)
-    factories, reference = contestants(tuned), _references(recorded)
+    recorded = record(scenario, max(counts.hot, counts.paced))
+    reference = _references(recorded)
     figures: dict[str, Any] = {key: {"error": 0.0, "unsolved": 0} for key in factories}
 
     def compete(pace: str, *names: str) -> dict[str, dict[str, float]]:
@@ -89,13 +93,7 @@ def _measure_flight(
         figures[key]["paced"] = pair[key] | {"ratio": ratios(pair[key], pair[OURS])}
         if key == TUNED:
             figures[OURS]["paced"] = pair[OURS] | {"ratio": ratios(pair[OURS], pair[OURS])}
-    return {
-        "active": recorded.active(),
-        "ticks": {pace: getattr(counts, pace) for pace in PACES},
-        "tuned": str(tuned),
-        "forms": forms,
-        "contestants": figures,
-    }
+    return {"active": recorded.active(), "contestants": figures}
 
 
 class SolverEntry:
@@ -124,21 +122,6 @@ class SolverEntry:
         return sum(not solved[0] for both in self._answers.values() for _, solved in both)
 
 
-def tune(
-    recorded: RecordedProblems, count: int, lateness: WakeLateness
-) -> tuple[Tuning, dict[str, dict[str, float]]]:
-    """Tuning of OSQP with the smallest median time, and the best tuning of each form [µs]."""
-    entries = {str(tuning): SolverEntry(tuning.make, recorded) for tuning in TUNINGS}
-    runs = {name: entry.tick for name, entry in entries.items()}
-    spent = interleave(runs, count, HOT, lateness, "tuning OSQP")
-    figures = {tuning: figures_us(spent[str(tuning)]) for tuning in TUNINGS}
-    figures = dict(sorted(figures.items(), key=lambda item: item[1]["p50_us"]))
-    best: dict[str, Tuning] = {}
-    for tuning in figures:
-        best.setdefault(tuning.form, tuning)
-    return next(iter(figures)), {str(tuning): figures[tuning] for tuning in best.values()}
-
-
 def _references(recorded: RecordedProblems) -> Array:
     """Exact inputs; shape (2, ticks, axes, H)."""
     references = [Reference(hessian, bound) for hessian, bound in by_axis(recorded.problem)]
@@ -153,17 +136,9 @@ def tables(result: Mapping[str, Any]) -> dict[str, TextTable]:
     for pace in PACES:
         headings += [f"{pace}\np50", "\np99", "\nratio", "\nof p99"]
     headings.append("error\n[m/s]")
-    shown: dict[str, TextTable] = {}
-    tunings = []
-    for flight in flights():
-        figures = result[flight]["contestants"]
-        rows = [_row(name, figures[name]) for name in figures]
-        shown[f"solvers-{flight}"] = TextTable(headings, rows)
-        for tuning, spent in result[flight]["forms"].items():
-            tunings.append([tuning, flight, us(spent["p50_us"]), us(spent["p99_us"])])
-    shown["solvers-tunings"] = TextTable(
-        ["OSQP, the best of each form", "flight", "p50", "p99"], tunings
-    )
+    figures = result["saturated"]["contestants"]
+    rows = [_row(name, figures[name]) for name in figures]
+    shown = {"solvers-saturated": TextTable(headings, rows)}
     shown["solvers-targets"] = TextTable(
         ["tuned OSQP against ours", "bounds active", "hot p50", "p99", "paced p50", "p99"],
         [

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 
 from bench import solvers
 from bench.airspace import Airspace, PlannedFleet
-from bench.contestants import Tuning
+from bench.contestants import Factory, tuned
 from bench.harness import (
     HOT,
     PACED,
@@ -29,7 +29,7 @@ from bench.harness import (
     us,
     without_gc,
 )
-from bench.problems import ByTurns, derive, listening, record, saturated, solving
+from bench.problems import ByTurns, derive, listening, saturated, solving
 from skytether.figures.flights import save
 from skytether.server.mpc.exact import ExactSolver
 from skytether.shared.endpoints.stopwatch import Stopwatch
@@ -52,7 +52,6 @@ STAGES = ("estimate", "plan", "trigger")
 class TickCounts:
     hot: int = 1000
     paced: int = 300
-    tuning: int = 60
     fleet: int = 1000
     """Number of vehicles planned for at once."""
     fleet_ticks: int = 100
@@ -65,7 +64,7 @@ class TickCounts:
 
 
 FULL = TickCounts()
-QUICK = TickCounts(100, 20, 10, 200, 10, 5, 500, 20, (1, 2, 5, 10, 20, 50, 100, 200), 10)
+QUICK = TickCounts(100, 20, 200, 10, 5, 500, 20, (1, 2, 5, 10, 20, 50, 100, 200), 10)
 
 
 def mixes() -> dict[str, Scenario]:
@@ -83,45 +82,36 @@ def mixes() -> dict[str, Scenario]:
 
 def measure(counts: TickCounts) -> dict[str, Any]:
     lateness = WakeLateness()
-    tunings = tune(counts, lateness)
     single = {
-        name: _single(name, scenario, tunings[name], counts, lateness)
+        name: _single(name, scenario, counts, lateness)
         for name, scenario in solvers.flights().items()
     }
     half = mixes()["half"]
     return {
         "single": single,
-        "fleets": fleets(counts, tunings),
+        "fleets": fleets(counts),
         "crowd": _crowd(half, counts, lateness),
         "scaling": _scaling(half, counts, lateness),
         "memory": {"bytes_per_vehicle": _bytes_per_vehicle(half)},
-        "tuned": {name: str(tuning) for name, tuning in tunings.items()},
         "counts": {"fleet": counts.fleet, "crowd": counts.crowd},
         "wake": lateness.figures(),
     }
 
 
-def tune(counts: TickCounts, lateness: WakeLateness) -> dict[str, Tuning]:
-    return {
-        name: solvers.tune(record(scenario, counts.tuning), counts.tuning, lateness)[0]
-        for name, scenario in solvers.flights().items()
-    }
-
-
-def fleets(counts: TickCounts, tunings: Mapping[str, Tuning]) -> dict[str, Any]:
+def fleets(counts: TickCounts) -> dict[str, Any]:
     """Figures of planning for a fleet in one batch against tuned OSQP, for each of `mixes`."""
     return {
-        name: _fleet(name, scenario, tunings["saturated" if name == "half" else "smooth"], counts)
+        name: _fleet(name, scenario, tuned("saturated" if name == "half" else "smooth"), counts)
         for name, scenario in mixes().items()
     }
 
 
 def _single(
-    name: str, scenario: Scenario, tuned: Tuning, counts: TickCounts, lateness: WakeLateness
+    name: str, scenario: Scenario, counts: TickCounts, lateness: WakeLateness
 ) -> dict[str, Any]:
     """CPU time from a decoded observation to a packed horizon of one vehicle, on two servers."""
     ours = Airspace(scenario, 1)
-    with solving(lambda problem: ByTurns(tuned.make, problem)):
+    with solving(lambda problem: ByTurns(tuned(name), problem)):
         theirs = Airspace(scenario, 1)
     spaces = {"ours": ours, "osqp": theirs}
     result: dict[str, Any] = {}
@@ -144,7 +134,7 @@ def _single(
     return result
 
 
-def _fleet(name: str, scenario: Scenario, tuned: Tuning, counts: TickCounts) -> dict[str, Any]:
+def _fleet(name: str, scenario: Scenario, make: Factory, counts: TickCounts) -> dict[str, Any]:
     """Figures of planning for all in one batch, then for some of them one by one by OSQP.
 
     The QPs of a second, equal fleet are recorded, and both solvers solve them again.
@@ -158,7 +148,7 @@ def _fleet(name: str, scenario: Scenario, tuned: Tuning, counts: TickCounts) -> 
         range(0, counts.fleet, max(1, counts.fleet // counts.fleet_sample)),
     )
     # Each vehicle has its own solvers, with their own warm starts.
-    others = [[tuned.make(later.problem) for _ in range(2)] for _ in sample]
+    others = [[make(later.problem) for _ in range(2)] for _ in sample]
     plan_ns, solve_ns, theirs_ns, active = [], [], [], []
     with without_gc():
         for tick in progress(range(counts.fleet_ticks + SETTLE), f"fleet, {name}"):
@@ -297,33 +287,25 @@ def draw(result: Mapping[str, Any], file: Path = FIGURE) -> None:
 
 
 def tables(result: Mapping[str, Any]) -> dict[str, TextTable]:
-    shown = {
-        "tick-single": _single_table(result["single"]),
-        "tick-fleet": fleet_table(result["fleets"]),
-    }
+    limits = {" + ".join(STAGES): f" (< {TARGET_P99_MS:g})"}
     rows = [
-        [stage, f"{figures['p50_ms']:.2f}", f"{figures['p99_ms']:.2f}"]
+        [
+            f"{stage} [ms]",
+            f"{figures['p50_ms']:.2f}",
+            f"{figures['p99_ms']:.2f}{limits.get(stage, '')}",
+        ]
         for stage, figures in result["crowd"].items()
     ]
-    for row in rows:
-        if row[0] == " + ".join(STAGES):
-            row[2] += f" (< {TARGET_P99_MS:g})"
-    shown["tick-crowd"] = TextTable(
-        [f"{result['counts']['crowd']} vehicles [ms]", "p50", "p99"], rows
-    )
-    scaling = [
-        [count, f"{ms:.3f}", us(1000.0 * ms / int(count))]
-        for count, ms in result["scaling"].items()
-    ]
-    shown["tick-scaling"] = TextTable(["vehicles", "tick [ms]", "per vehicle [µs]"], scaling)
     kilobytes = result["memory"]["bytes_per_vehicle"] / 1000.0
-    shown["tick-memory"] = TextTable(
-        ["", "kB"], [["a server's memory for each vehicle", f"{kilobytes:.1f}"]]
-    )
-    return shown
+    rows.append(["the server's memory for each vehicle [kB]", f"{kilobytes:.1f}", ""])
+    return {
+        "tick-single": _single_table(result["single"]),
+        "tick-fleet": _fleet_table(result["fleets"]),
+        "tick-crowd": TextTable([f"{result['counts']['crowd']} vehicles", "p50", "p99"], rows),
+    }
 
 
-def fleet_table(fleets: Mapping[str, Any]) -> TextTable:
+def _fleet_table(fleets: Mapping[str, Any]) -> TextTable:
     rows = []
     for name, figures in fleets.items():
         row = [f"{name} ({figures['active']:.0%})"]

@@ -26,11 +26,10 @@ from bench import (
     starting,
     tick,
     versions,
-    wire,
 )
 from bench.__main__ import DOCUMENT, LACKS, ROOT, SECTIONS, machines, write
 from bench.airspace import PlannedFleet
-from bench.contestants import NOTHING, OURS, TUNED, TUNINGS, Tuning, contestants
+from bench.contestants import NOTHING, OURS, TUNED, contestants
 from bench.harness import (
     HOT,
     PACED,
@@ -51,14 +50,13 @@ TINY = MappingProxyType(
     {
         "netem": netem.NetemBenchmarkOptions(runs=1, seconds=1, rate=1000, loads=((1000, 3),)),
         "program": program.ProgramCounts(20, 5, seconds=1, lossy_s=1, losses=(0.02,)),
-        "solvers": solvers.SolversCounts(hot=6, paced=2, tuning=3),
-        "tick": tick.TickCounts(6, 2, 3, 20, 2, 2, 20, 2, (1, 4, 20), 2),
-        "wire": wire.WireCounts(each=10),
+        "solvers": solvers.SolversCounts(hot=6, paced=2),
+        "tick": tick.TickCounts(6, 2, 20, 2, 2, 20, 2, (1, 4, 20), 2),
         "link": link.LinkCounts(
             packets=60, handshakes=60, vehicles=2, seconds=0.5, turns=1, seeds=1
         ),
         "flood": flood.FloodCounts(seconds=1, forged=2000, hellos=200, lead_s=0.5),
-        "motions": motions.MotionsCounts(fleets=(4,), shares=(0.5,), duration=8.0),
+        "motions": motions.MotionsCounts(fleets=(4,), duration=8.0),
         "restarts": restarts.RestartsCounts(kills=1, stops=0, flight_s=0.5, subjects=("netem",)),
         "starting": starting.StartingCounts(warm=1, cold=0),
         "environments": environments.EnvironmentsCounts(turns=1, seconds=0.01, robots=2),
@@ -70,7 +68,6 @@ TINY = MappingProxyType(
 def results() -> Iterator[dict[str, Any]]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(tick, "SETTLE", 2)
-        patch.setattr(solvers, "TUNINGS", TUNINGS[::8])
         # The other kinds are in tests/lab/test_flood.py.
         patch.setattr(flood, "KINDS", (flood.HELLOS,))
         yield _results()
@@ -102,10 +99,10 @@ def test_the_tables_of_the_document_are_written(results: Mapping[str, Any], tmp_
     assert places - set(made) <= LACKS.keys()
     assert all(made[name].markdown() in document.read_text() for name in places & set(made))
     before = json.loads(file.read_text())
-    write({"wire": {**results["wire"], "nothing": {"p50_us": 1.0, "p99_us": 2.0}}}, file, document)
+    write({"motions": {**results["motions"], "fleets": []}}, file, document)
     after = json.loads(file.read_text())
-    assert after["wire"]["nothing"] == {"p50_us": 1.0, "p99_us": 2.0}
-    assert {**after, "wire": 0} == {**before, "wire": 0}
+    assert after["motions"]["fleets"] == []
+    assert {**after, "motions": 0} == {**before, "motions": 0}
 
 
 def test_the_exact_solver_is_found_exact(results: Mapping[str, Any]) -> None:
@@ -138,10 +135,10 @@ def test_a_fleet_that_is_listened_to_flies_the_same() -> None:
     assert gradient.shape == guess.shape == (2, 2 * count, *shape[2:])
 
 
-@pytest.mark.parametrize("name", sorted(contestants(TUNINGS[0]).keys() - {NOTHING}))
+@pytest.mark.parametrize("name", sorted(contestants("saturated").keys() - {NOTHING}))
 def test_contestants_solve_the_same_problems(name: str, saturated: RecordedProblems) -> None:
-    """All forms of the problem have the same solution; OSQP is only close, at its own tolerance."""
-    entry = solvers.SolverEntry(contestants(TUNINGS[0])[name], saturated)
+    """OSQP is only close, at its own tolerance."""
+    entry = solvers.SolverEntry(contestants("saturated")[name], saturated)
     for i in range(20):
         entry.tick(i)
     assert entry.unsolved() == 0
@@ -151,33 +148,18 @@ def test_contestants_solve_the_same_problems(name: str, saturated: RecordedProbl
     np.testing.assert_allclose(entry.inputs(), exact.inputs(), rtol=0, atol=1e-3)
 
 
-@pytest.mark.parametrize("tuning", TUNINGS[::8], ids=str)
-def test_every_form_of_osqp_is_the_same_problem(
-    tuning: Tuning, saturated: RecordedProblems
-) -> None:
-    ours, theirs = (solvers.SolverEntry(make, saturated) for make in (ExactSolver, tuning.make))
-    for i in range(5):
-        ours.tick(i)
-        theirs.tick(i)
-    np.testing.assert_allclose(theirs.inputs(), ours.inputs(), rtol=0, atol=1e-4)
-
-
 def test_what_is_not_installed_does_not_compete() -> None:
-    names = contestants(TUNINGS[0])
+    names = contestants("saturated")
     assert {OURS, TUNED} < names.keys()
     assert ("PIQP" in names) == (find_spec("piqp") is not None)
 
 
-@pytest.mark.skipif(find_spec("quadprog") is None, reason="quadprog is not installed")
-def test_the_reference_is_the_same_whoever_finds_it(
-    monkeypatch: pytest.MonkeyPatch, saturated: RecordedProblems
-) -> None:
+def test_the_reference_is_what_the_exact_solver_finds(saturated: RecordedProblems) -> None:
     reference = Reference(saturated.problem.hessian[0], saturated.problem.mpc.bounds[0])
-    gradients = saturated.gradient[0, ::50, 0]
-    by_quadprog = [reference.solve(gradient) for gradient in gradients]
-    monkeypatch.setattr("bench.reference.find_spec", lambda _: None)
-    by_scipy = [reference.solve(gradient) for gradient in gradients]
-    np.testing.assert_allclose(by_scipy, by_quadprog, rtol=0, atol=1e-14)
+    proved = np.array([reference.solve(gradient) for gradient in saturated.gradient[0, ::50, 0]])
+    every = saturated.gradient[0, ::50].copy()
+    exact, _ = ExactSolver(saturated.problem).solve(every, np.zeros_like(every))
+    np.testing.assert_allclose(proved, exact[:, 0], rtol=0, atol=1e-12)
 
 
 def test_contestants_take_turns_at_the_same_problems() -> None:
@@ -196,27 +178,19 @@ def test_contestants_take_turns_at_the_same_problems() -> None:
 
 
 def test_a_checkout_is_compared_with_itself(
-    results: Mapping[str, Any],
-    monkeypatch: pytest.MonkeyPatch,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    tiny = versions.VersionsCounts(1, 1, (2,), 1, 3, 1, 1, 0.5)
-    monkeypatch.setattr(versions, "QUICK", tiny)
-    monkeypatch.setattr(tick, "tune", lambda *_: {})
-    monkeypatch.setattr(tick, "fleets", lambda *_: results["tick"]["fleets"])
-    file = tmp_path / "versions.json"
-    assert versions.main([str(ROOT), "--quick", "--json", str(file)]) == 0
-    result = json.loads(file.read_text())
+    tiny = versions.VersionsCounts(1, 1, (2,), 1, 1, 0.5, 1)
+    contests = {each.title: each for each in versions.contests(tiny)}
+    result = versions.measure(str(ROOT), tiny)
     assert result["before"] == result["after"]
     assert result["after"]["folder"] == str(ROOT)
-    assert list(result["contests"]) == [contest.title for contest in versions.contests(tiny)]
-    versus, planning = versions.tables(result).values()
-    assert [row[0] for row in versus.rows] == list(result["contests"])
-    assert len(planning.rows) == len(tick.mixes())
+    assert [row[0] for row in versions.table(result["contests"]).rows] == list(contests)
     for figures in result["contests"].values():
         assert min(figures[side]["p50"] for side in versions.SIDES) > 0.0
-    assert "vehicle-steps per core-second" in " ".join(capsys.readouterr().out.split())
+    monkeypatch.setattr(versions, "contests", lambda _: list(contests.values())[:1])
+    assert versions.main([str(ROOT), "--quick"]) == 0
+    assert "one vehicle's tick, hot" in " ".join(capsys.readouterr().out.split())
 
 
 def test_a_folder_that_is_no_checkout_is_not_compared(

@@ -11,8 +11,7 @@ import pytest
 
 from bench import flood
 from bench.flood import FORGED, FloodCounts
-from bench.link import NOW_NS, PEER, Ends
-from bench.wire import messages
+from bench.link import NOW_NS, PEER, Ends, messages
 from skytether.server.secure import FORMS, SecureGate
 from skytether.shared.endpoints.endpoint import Datagram, Form
 from skytether.shared.scenario.reading import load
