@@ -145,7 +145,6 @@ class Client(Endpoint):
             brake_ns=brake_ns(terms),
             land_after_ns=seconds_to_ns(scenario.vehicle.land_after_s),
             returns=scenario.vehicle.on_loss == "return",
-            changed=self._mode_changed,
         )
         self._servers = OneServer(self._failsafe)
         if standby or self._memory.before.leadership:
@@ -281,6 +280,7 @@ class Client(Endpoint):
                 self.horizons += 1
         except ProtocolError as error:
             self.dropped[error.reason] += 1
+        self._note_transitions(now_ns)
 
     def _begin(self, now_ns: int) -> None:
         """Begin the flight once the first session is open and the vehicle can be flown.
@@ -304,11 +304,13 @@ class Client(Endpoint):
         if is_new:
             self._events.append(Flying(vehicle=self.vehicle))
             self._failsafe.meet(Reason.OPENED, now_ns=now_ns)
+            self._note_transitions(now_ns)
             return
         cause = Reason.RESUMED if motion else Reason.LOST
         for session in self._sessions:
             session.heard_ns = before.heard_ns
         self._failsafe.resume(cause, heard_ns=before.heard_ns, now_ns=now_ns)
+        self._note_transitions(now_ns)
 
     # -- saved state -------------------------------------------------------------------------
 
@@ -404,6 +406,7 @@ class Client(Endpoint):
     def _fly(self, now_ns: int) -> None:
         pilot, latest_ns = self._pilot, self._pilot.latest_ns
         pilot.fly(now_ns=now_ns)
+        self._note_transitions(now_ns)
         if self._is_mission and pilot.late_ns > max(STALL_NS, latest_ns):
             self._events.append(SteppedLate(vehicle=self.vehicle, late_s=pilot.late_ns / SECOND_NS))
         if pilot.is_held and now_ns >= self._fence_report_ns:
@@ -449,7 +452,7 @@ class Client(Endpoint):
             finished = Finished(vehicle=vehicle, steps=pilot.steps, missed=pilot.missed)
             self._events.append(finished)
         else:
-            covered, why = pilot.covered, self._why_no_plan(now_ns)
+            covered, why = pilot.covered, self._why_no_plan(self._failsafe.reason, now_ns)
             self._not_flown = NotFlown(vehicle=vehicle, covered=covered, steps=pilot.steps, why=why)
             self._events.append(self._not_flown)
 
@@ -505,6 +508,7 @@ class Client(Endpoint):
         if not self._pilot.is_moving:
             return now_ns
         rests_ns = self._pilot.rest(now_ns=now_ns) + LATEST_NS
+        self._note_transitions(now_ns)
         most_s = (rests_ns - now_ns) / SECOND_NS
         self._events.append(Leaving(vehicles=(self.vehicle,), most_s=most_s))
         return rests_ns
@@ -520,27 +524,30 @@ class Client(Endpoint):
                 for _ in range(CLOSES):
                     session.send(Close(self.vehicle, session.number), now_ns=now_ns)
 
-    def _mode_changed(self, before: Mode, was: Reason, cause: Reason, now_ns: int) -> None:
-        """Act on a change of mode or reason, and report it.
+    def _note_transitions(self, now_ns: int) -> None:
+        """Let the pilot act on the transitions of the failsafe, and report them.
 
         Short coasting is not reported: with event-triggered horizons it is normal.
         """
-        self._pilot.mode_changed(cause)
-        if self._failsafe.mode is Mode.LAND:
-            self._flies.land()
-        elif self._failsafe.mode is Mode.RETURN:
-            self._flies.return_home()
-        if cause in CLOSING:
-            self._session.close()
-        if cause is Reason.OLD or (was, cause) == (Reason.OLD, Reason.HORIZON):
-            return
-        reason, after = self._failsafe.reason, str(self._failsafe.mode)
-        why = self._why_no_plan(now_ns) if reason is Reason.ENDED else str(reason)
-        changed = ModeChanged(vehicle=self.vehicle, before=str(before), after=after, reason=why)
-        self._events.append(changed)
+        self._pilot.obey()
+        for each in self._pilot.transitions:
+            if each.cause in CLOSING:
+                self._session.close()
+            coasts = each.reason_before is Reason.OLD and each.cause is Reason.HORIZON
+            if each.cause is Reason.OLD or coasts:
+                continue
+            ended = each.reason is Reason.ENDED
+            self._events.append(
+                ModeChanged(
+                    vehicle=self.vehicle,
+                    before=str(each.before),
+                    after=str(each.after),
+                    reason=self._why_no_plan(each.reason, now_ns) if ended else str(each.reason),
+                )
+            )
+        self._pilot.transitions.clear()
 
-    def _why_no_plan(self, now_ns: int) -> str:
-        reason = self._failsafe.reason
+    def _why_no_plan(self, reason: Reason, now_ns: int) -> str:
         if reason not in PLANLESS:
             return str(reason)
         return str(Reason.LOST) if self._failsafe.is_lost(now_ns) else self._session.idle

@@ -10,8 +10,9 @@ table without a failsafe, for a vehicle that repeats its last input for ever, li
 
 import math
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from types import MappingProxyType
+from typing import NamedTuple
 
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
 from skytether.shared.law.terms import Terms
@@ -163,6 +164,19 @@ def brake_ns(terms: Terms) -> int:
     return steps * terms.dt_ns + BRAKE_SPARE_NS
 
 
+class Transition(NamedTuple):
+    """Change of the mode, or of the reason for it."""
+
+    before: Mode
+    reason_before: Reason
+    after: Mode
+    reason: Reason
+    cause: Reason
+    """Cause that changed them; it is not the reason if it is one of `KEPT`."""
+    takes: bool
+    """Whether horizons are accepted from now on."""
+
+
 class Failsafe:
     """Mode of one vehicle, and the reason for it.
 
@@ -176,8 +190,6 @@ class Failsafe:
         land_after_ns: time of hovering after which the vehicle lands if, for example, the link
             does not become good again [ns]; 0: never.
         returns: whether the vehicle returns home instead of landing if the server is silent.
-        changed: called when mode or reason have changed, with the previous mode and reason, the
-            cause, and the time.
     """
 
     def __init__(
@@ -189,7 +201,6 @@ class Failsafe:
         brake_ns: int,
         land_after_ns: int,
         returns: bool = False,
-        changed: Callable[[Mode, Reason, Reason, int], None],
     ) -> None:
         self._table = table
         self.armed = armed
@@ -197,7 +208,8 @@ class Failsafe:
         self._land_after_ns = land_after_ns
         self._alone = Reason.HOMEWARD if returns else Reason.ALONE
         """Cause used after a long silence of the server."""
-        self._changed = changed
+        self.transitions: list[Transition] = []
+        """Transitions on which the pilot has not acted yet, oldest first."""
         self.mode = Mode.INIT
         self.reason = Reason.BEGUN
         """Newest cause that changed mode or reason; while hovering, why the vehicle braked."""
@@ -390,7 +402,8 @@ class Failsafe:
         before = self.mode, self.reason
         self.mode, self.reason = after, self.reason if cause in KEPT else cause
         if (self.mode, self.reason) != before:
-            self._changed(*before, cause, now_ns)
+            after_it = self.mode, self.reason, cause, self.takes
+            self.transitions.append(Transition(*before, *after_it))
 
 
 def _full(times_ns: deque[int], now_ns: int) -> bool:

@@ -13,7 +13,7 @@ import numpy as np
 
 from skytether.client.clamp import Guard, clamped
 from skytether.client.compensator import Compensator
-from skytether.client.failsafe import DROPPING, LATE_SHARE, Failsafe
+from skytether.client.failsafe import DROPPING, LATE_SHARE, Failsafe, Transition
 from skytether.client.navigation import Navigation
 from skytether.client.reporting import Reporter
 from skytether.client.session import ServerSession
@@ -104,6 +104,8 @@ class Pilot:
         self.missed = 0
         self.late_ns = self.latest_ns = 0
         """Time by which the present step began late, and the largest so far [ns]."""
+        self.transitions: list[Transition] = []
+        """Transitions of the failsafe on which the pilot has acted, to be reported."""
         self.leap_m: tuple[float, ...] | None = None
         """Leap about which the operator has not decided: displacement on each axis [m], or empty if
         only the velocity has leapt. None without a leap."""
@@ -147,6 +149,7 @@ class Pilot:
         Raises:
             ProtocolError: the horizon is dropped.
         """
+        self.obey()
         terms = self._terms
         # An overtaken horizon is late anyway, and shows no delay of the newest.
         if horizon.step > self.compensator.newest:
@@ -184,11 +187,20 @@ class Pilot:
         last = self.compensator.last_step
         return self.starts_ns(last) if self._goes_on(self.step) else now_ns
 
-    def mode_changed(self, cause: Reason) -> None:
-        if not self._failsafe.takes:
-            self._takes_from = None
-        if cause in DROPPING:
-            self._drop()
+    def obey(self) -> None:
+        """Act on the transitions of the failsafe since the last call."""
+        transitions = self._failsafe.transitions
+        for each in transitions:
+            if not each.takes:
+                self._takes_from = None
+            if each.cause in DROPPING:
+                self._drop()
+            if each.after is Mode.LAND:
+                self._vehicle.land()
+            elif each.after is Mode.RETURN:
+                self._vehicle.return_home()
+        self.transitions += transitions
+        transitions.clear()
 
     def _drop(self) -> None:
         """Drop the horizon, or the place that is held, and brake from the present input."""
@@ -214,11 +226,13 @@ class Pilot:
         hindrance = self._vehicle.hindrance(now_ns=now_ns)
         self._failsafe.motion_goes_on(self._goes_on(present), now_ns=now_ns)
         self._failsafe.step(late_ns=self.late_ns, hindrance=hindrance, now_ns=now_ns)
+        self.obey()
         if present == self.steps - 1 and self._goes_on(present):
             # Where the flight ends on the way, the vehicle would stop off its motion.
             self._failsafe.meet(Reason.OVER, now_ns=now_ns)
             self.steps = self.compensator.last_step + 1
         self._input = self._choose(now_ns)
+        self.obey()
         self._vehicle.fly(self._input)
         if not self._failsafe.takes:
             self._takes_from = None
@@ -248,6 +262,7 @@ class Pilot:
             failsafe.leapt(now_ns=now_ns)
             if compensator.rests:
                 self._drop()
+        self.obey()
         # Before `choose`, which advances the compensator to this step.
         had_plan = compensator.covered
         self._rest()
@@ -289,6 +304,7 @@ class Pilot:
             failsafe.meet(Reason.NOT_FINITE, now_ns=now_ns)
         elif compensator.in_force != NO_HORIZON and not compensator.covered:
             failsafe.meet(Reason.ENDED, now_ns=now_ns)
+        self.obey()
         stops = flown is None or failsafe.mode in STOPPED
         if flown is None or stops:
             flown = without_feedback = [0.0] * self._terms.axes

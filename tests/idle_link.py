@@ -50,7 +50,6 @@ def _session(network: str, link: LinkConfig, seed: int) -> tuple[int, float, int
         timeout_ns=timeout_ns,
         brake_ns=0,
         land_after_ns=end_ns,
-        changed=lambda *_: None,
     )
     nowhere = ("nowhere", 0)
     hearing = Hearing(link.patience_ns, STEP_NS, link.fixed_ns)

@@ -212,7 +212,6 @@ def test_each_cause_takes_effect_at_once_or_at_the_last_knot(cause: Reason) -> N
             timeout_ns=SECOND_NS,
             brake_ns=SECOND_NS,
             land_after_ns=0,
-            changed=lambda *_: None,
         )
         made.mode, made.keeps_motion = Mode.TRACK, keeps
         made.meet(cause, now_ns=SECOND_NS)
