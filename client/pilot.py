@@ -223,16 +223,17 @@ class Pilot:
         self.latest_ns = max(self.latest_ns, self.late_ns)
         self.flown = self.step = present
         self._flown_ns = self._epoch_ns + present * self._dt_ns
-        hindrance = self._vehicle.hindrance(now_ns=now_ns)
-        self._failsafe.motion_goes_on(self._goes_on(present), now_ns=now_ns)
-        self._failsafe.step(late_ns=self.late_ns, hindrance=hindrance, now_ns=now_ns)
+        self._meet_causes(now_ns)
+        self._rest()
+        flown, speed, is_finite = self._compose_input()
+        if not is_finite:
+            self._failsafe.meet(Reason.NOT_FINITE, now_ns=now_ns)
+        elif self.compensator.in_force != NO_HORIZON and not self.compensator.covered:
+            self._failsafe.meet(Reason.ENDED, now_ns=now_ns)
+        if not speed:
+            self._failsafe.meet(Reason.BRAKED, now_ns=now_ns)
         self.obey()
-        if present == self.steps - 1 and self._goes_on(present):
-            # Where the flight ends on the way, the vehicle would stop off its motion.
-            self._failsafe.meet(Reason.OVER, now_ns=now_ns)
-            self.steps = self.compensator.last_step + 1
-        self._input = self._choose(now_ns)
-        self.obey()
+        self._input, self._speed = np.array(flown), speed
         self._vehicle.fly(self._input)
         if not self._failsafe.takes:
             self._takes_from = None
@@ -249,77 +250,72 @@ class Pilot:
         measurements = self._vehicle.measurements(now_ns=now_ns)
         self._navigation.advance(measurements, self._input, now_ns=now_ns)
 
-    def _choose(self, now_ns: int) -> Array:
-        failsafe, compensator = self._failsafe, self.compensator
-        navigation = self._navigation
-        if not self._navigation.is_known:
+    def _meet_causes(self, now_ns: int) -> None:
+        """Let the failsafe act on the causes that hold at the start of the present step."""
+        failsafe, navigation = self._failsafe, self._navigation
+        hindrance = self._vehicle.hindrance(now_ns=now_ns)
+        failsafe.motion_goes_on(self._goes_on(self.step), now_ns=now_ns)
+        failsafe.step(late_ns=self.late_ns, hindrance=hindrance, now_ns=now_ns)
+        self.obey()
+        if self.step == self.steps - 1 and self._goes_on(self.step):
+            # Where the flight ends on the way, the vehicle would stop off its motion.
+            failsafe.meet(Reason.OVER, now_ns=now_ns)
+            self.steps = self.compensator.last_step + 1
+        if not navigation.is_known:
             failsafe.meet(Reason.NOT_FINITE, now_ns=now_ns)
         if self._vehicle.leap_m is not None:
             self.leap_m = self._vehicle.leap_m
             failsafe.leapt(now_ns=now_ns)
-        elif self._navigation.leapt:
-            self.leap_m = tuple(self._navigation.leaps.off_m)
+        elif navigation.leapt:
+            self.leap_m = tuple(navigation.leaps.off_m)
             failsafe.leapt(now_ns=now_ns)
-            if compensator.rests:
+            if self.compensator.rests:
                 self._drop()
         self.obey()
-        # Before `choose`, which advances the compensator to this step.
-        had_plan = compensator.covered
-        self._rest()
+
+    def _compose_input(self) -> tuple[list[float], float, bool]:
+        """Input of the present step: the compensator's, bounded by mode, clamp and fence.
+
+        Returns:
+            input of each axis [m/s]; speed that counts for the braking curve [m/s]; and whether the
+            compensator's input is finite, otherwise the input is zero.
+        """
+        mode, terms, compensator = self._failsafe.mode, self._terms, self.compensator
+        navigation, had_plan = self._navigation, compensator.covered
+        # From here on the compensator is at this step.
         wanted, without_feedback = compensator.choose(
             self.step, navigation.predicted, navigation.disturbance, self._input
         )
-        if failsafe.mode is Mode.LAND:
-            wanted = wanted if compensator.rests else [0.0] * self._terms.axes
-            if self._terms.axes > ALTITUDE and navigation.estimate[ALTITUDE, 0] > 0.0:
+        if mode is Mode.LAND:
+            wanted = wanted if compensator.rests else [0.0] * terms.axes
+            if terms.axes > ALTITUDE and navigation.estimate[ALTITUDE, 0] > 0.0:
                 wanted[ALTITUDE] = -LAND_MPS
-        without_feedback = without_feedback if compensator.follower.feeds_back else wanted
-        speed_max = self._speed_max(had_plan, compensator.covered)
+        feeds_back = compensator.follower.feeds_back
+        if not feeds_back:
+            without_feedback = wanted
+        speed_max = math.inf
+        if not compensator.covered and self._failsafe.brakes and mode is not Mode.LAND:
+            speed_max = braked(self._speed, 0 if had_plan else 1, terms.brake)
         flown = clamped(
             wanted,
             self._input.tolist(),
-            self._terms.u_max,
+            terms.u_max,
             self._change_max,
             without_feedback=without_feedback,
             speed_max=speed_max,
         )
-        return self._final_input(flown, without_feedback, speed_max, now_ns)
-
-    def _final_input(
-        self,
-        flown: list[float] | None,
-        without_feedback: Sequence[float],
-        speed_max: float,
-        now_ns: int,
-    ) -> Array:
-        """Input finally flown, after mode and fence.
-
-        Args:
-            flown: input of each axis that may be flown [m/s]; None if it is not finite.
-            without_feedback: part of it that is not feedback, of each axis [m/s].
-            speed_max: bound of the magnitude of that part [m/s].
-        """
-        failsafe, compensator = self._failsafe, self.compensator
-        if flown is None:
-            failsafe.meet(Reason.NOT_FINITE, now_ns=now_ns)
-        elif compensator.in_force != NO_HORIZON and not compensator.covered:
-            failsafe.meet(Reason.ENDED, now_ns=now_ns)
-        self.obey()
-        stops = flown is None or failsafe.mode in STOPPED
-        if flown is None or stops:
-            flown = without_feedback = [0.0] * self._terms.axes
+        if flown is None or mode in STOPPED:
+            return [0.0] * terms.axes, 0.0, flown is not None
         # The braking curve applies to the input without feedback; feedback is bounded by u_max
         # alone (docs/failsafe.md). The fence's correction does not count either: it may last for
         # ever.
-        if compensator.follower.feeds_back:
-            self._speed = min(math.hypot(*without_feedback), speed_max)
-        else:
-            self._speed = math.hypot(*flown)
-        if not self._speed:
-            failsafe.meet(Reason.BRAKED, now_ns=now_ns)
-        if self._fence is not None and not stops:
-            flown = self._fenced(self._fence, flown)
-        return np.array(flown)
+        speed = min(math.hypot(*without_feedback), speed_max) if feeds_back else math.hypot(*flown)
+        if self._fence is not None:
+            within = self._fence.limited(flown, navigation.predicted.tolist(), terms.u_max)
+            if mode is Mode.LAND and terms.axes > ALTITUDE:
+                within[ALTITUDE] = flown[ALTITUDE]  # the fence stops no descent of a landing
+            flown = within
+        return flown, speed, True
 
     def _rest(self) -> None:
         """Hold the place of a vehicle that hovers without a plan: where it comes to rest."""
@@ -339,13 +335,6 @@ class Pilot:
         is_measured = bool(np.isfinite(self._navigation.measured[:, 0]).all())
         return is_measured and (self._is_mission or failsafe.reason not in UNPLACED)
 
-    def _fenced(self, fence: Guard, flown: list[float]) -> list[float]:
-        """Input limited by the fence, which does not stop a landing vehicle from descending."""
-        within = fence.limited(flown, self._navigation.predicted.tolist(), self._terms.u_max)
-        if self._failsafe.mode is Mode.LAND and self._terms.axes > ALTITUDE:
-            within[ALTITUDE] = flown[ALTITUDE]
-        return within
-
     def decide(self, *, keeps_frame: bool) -> None:
         self._vehicle.decide(keeps_frame=keeps_frame)
         if not keeps_frame:
@@ -360,16 +349,6 @@ class Pilot:
         """Whether the fence limits the vehicle; False while it lands or somebody else flies it."""
         holds = self._fence is not None and self._fence.holds
         return holds and self._failsafe.mode not in (*STOPPED, Mode.LAND, Mode.RETURN)
-
-    def _speed_max(self, had_plan: bool, has_plan: bool) -> float:
-        """Largest speed of the input without feedback [m/s]: without a plan the vehicle brakes.
-
-        `had_plan` is about the previous step, `has_plan` about this one.
-        """
-        brakes = self._failsafe.brakes and self._failsafe.mode is not Mode.LAND
-        if has_plan or not brakes:
-            return math.inf
-        return braked(self._speed, 0 if had_plan else 1, self._terms.brake)
 
     # -- observation and record --------------------------------------------------------------
 
