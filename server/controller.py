@@ -127,12 +127,12 @@ class Controller:
         """Step of the newest observation of each vehicle, or -1; shape (capacity,)."""
         self.idle = np.zeros(capacity, dtype=np.int64)
         """Reason for the missing plan of each vehicle, one of `Idle`; shape (capacity,)."""
-        self._led = np.ones(capacity, dtype=np.bool_)
+        self._leads = np.ones(capacity, dtype=np.bool_)
         """Whether this server leads each vehicle; shape (capacity,)."""
-        self._owed: dict[int, int] = {}
+        self._plans_due: dict[int, int] = {}
         """Number of plans still due after a takeover, whatever the trigger says, by row."""
-        self._known = 0
-        """Largest number of a leadership that a vehicle has told."""
+        self._leadership = 0
+        """Largest number of a leadership that a vehicle has reported."""
         self._takes = np.ones(capacity, dtype=np.bool_)
         """Whether each vehicle accepts horizons, by its newest observation; shape (capacity,)."""
         self._counts: Counter[str] = Counter()
@@ -184,33 +184,42 @@ class Controller:
         self._takes[row] = True
         self.scheme.forget(row)
         self._trigger.forget(row)
-        self._owed.pop(row, None)
+        self._plans_due.pop(row, None)
         if self.budget:
             self.budget.forget(row)
 
-    def follow(self, row: int, told: Lead | None) -> None:
+    def begin(self, row: int, vehicle: int, lead: Lead | None) -> None:
+        """Begin with a vehicle in a row that was forgotten; `lead` as in `follow`."""
+        self.follow(row, lead)
+        self.desired.assign(row, vehicle)
+
+    def restart(self, row: int) -> bool:
+        """Note that the client of a vehicle has restarted without its state; see `Scheme`."""
+        return self.scheme.restart(row)
+
+    def follow(self, row: int, lead: Lead | None) -> None:
         """Note who leads a vehicle; None if it has no other server.
 
         A server that begins to lead sends a plan at once, whatever it sent before. If it takes over
         from another, it sends a second one a step later: the vehicle may be about to brake, and a
         plan may be lost. Vehicles of a mission hold their place instead.
         """
-        self._led[row] = told is None or bool(told.leads)
-        self._known = max(self._known, told.number if told else 0)
-        if self._led[row]:
+        self._leads[row] = lead is None or bool(lead.leads)
+        self._leadership = max(self._leadership, lead.number if lead else 0)
+        if self._leads[row]:
             self._sent_step[row] = -1
             self._trigger.forget(row)
-        if self._led[row] and told and told.number and not self.scheme.is_one_fleet:
-            self._owed[row] = TAKEOVER_PLANS
+        if self._leads[row] and lead and lead.number and not self.scheme.is_one_fleet:
+            self._plans_due[row] = TAKEOVER_PLANS
         else:
-            self._owed.pop(row, None)
-        self.scheme.follow(row, told)
+            self._plans_due.pop(row, None)
+        self.scheme.follow(row, lead)
 
-    def known(self, number: int) -> int:
+    def leadership_of(self, number: int) -> int:
         """Number of the leadership that a vehicle of a leadership `number` should follow: the
         largest, if all follow one server.
         """
-        return self._known if self.scheme.is_one_fleet else number
+        return self._leadership if self.scheme.is_one_fleet else number
 
     def observe(self, row: int, observation: Observation) -> bool:
         """Store an observation unless a newer one is stored (E11); True if stored."""
@@ -237,7 +246,7 @@ class Controller:
             self._age_max,
             self._clock.seen,
             self._uplink_max_ns,
-            self._led,
+            self._leads,
             self.idle,
             able,
         ):
@@ -257,8 +266,8 @@ class Controller:
         situation = Situation(rows, figures, predicted.start[:n], planned, self._trigger_inputs)
         verdict = self._trigger.test(situation)  # eq. (16)
         event = verdict.event.copy()
-        if self._owed:
-            event |= np.isin(rows, list(self._owed))
+        if self._plans_due:
+            event |= np.isin(rows, list(self._plans_due))
         unsolved, events = _withhold(
             rows,
             step,
@@ -290,7 +299,7 @@ class Controller:
             self._trigger.sent(rows[sent], figures[sent])
         else:
             sent = self._none
-        if self._owed:
+        if self._plans_due:
             self._pay(rows[sent])
         counts = self._counts
         counts["steps"] += n
@@ -301,10 +310,10 @@ class Controller:
         return Decisions(batch, figures, planned, verdict, event, self.scheme.solve_ns)
 
     def _pay(self, sent: Indices) -> None:
-        for row in self._owed.keys() & set(sent.tolist()):
-            self._owed[row] -= 1
-            if not self._owed[row]:
-                del self._owed[row]
+        for row in self._plans_due.keys() & set(sent.tolist()):
+            self._plans_due[row] -= 1
+            if not self._plans_due[row]:
+                del self._plans_due[row]
 
 
 @kernel

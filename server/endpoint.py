@@ -169,9 +169,9 @@ class Server(Endpoint):
             number = session.leadership
             if number is None:
                 continue
-            known = self.controller.known(number)
-            if known > number or is_changed:
-                lead = self._reception.lead(session, known)
+            largest = self.controller.leadership_of(number)
+            if largest > number or is_changed:
+                lead = self._reception.lead(session, largest)
                 self._out += session.sealed(encode(lead), now_ns)
 
     def leave(self, *, now_ns: int) -> int:

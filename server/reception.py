@@ -6,8 +6,8 @@ counted by reason.
 """
 
 from collections import Counter, deque
+from typing import Protocol
 
-from skytether.server.controller import Controller
 from skytether.server.gate import Gate, GateCall
 from skytether.server.planning.clock import ClockMap, Contradiction
 from skytether.server.plausibility import ANEW, BELIEVED, Belief, Plausibility
@@ -32,6 +32,7 @@ from skytether.shared.events.flight import (
     Unauthenticated,
     address_text,
 )
+from skytether.shared.law.model import Indices
 from skytether.shared.law.terms import Limits, Terms
 from skytether.shared.scenario.catalogue import differences
 from skytether.shared.scenario.registry import load
@@ -74,6 +75,31 @@ CONTRADICTED = {
 """Contradictions of the clock estimate, in words for the operator."""
 
 
+class Decider(Protocol):
+    """What decides on the plans of the vehicles, as reception knows it; see `Controller`."""
+
+    observed_step: Indices
+    """Step of the newest observation of each vehicle, or -1; shape (capacity,)."""
+
+    def begin(self, row: int, vehicle: int, lead: Lead | None) -> None:
+        """Begin with a vehicle in a row that was forgotten."""
+
+    def forget(self, row: int) -> None:
+        """Forget everything about the vehicle of a row."""
+
+    def restart(self, row: int) -> bool:
+        """Note that a client has restarted without its state; whether that is to be reported."""
+
+    def observe(self, row: int, observation: Observation) -> bool:
+        """Store an observation unless a newer one is stored; True if stored."""
+
+    def follow(self, row: int, lead: Lead | None) -> None:
+        """Note who leads a vehicle."""
+
+    def leadership_of(self, number: int) -> int:
+        """Number of the leadership that a vehicle of a leadership `number` should follow."""
+
+
 class Reception:
     """Receives messages of vehicles; appends answers to `out`, and events to `events`."""
 
@@ -86,7 +112,7 @@ class Reception:
         gate: Gate,
         sessions: Sessions,
         clock: ClockMap,
-        controller: Controller,
+        controller: Decider,
         grid: Grid,
         stopwatch: Stopwatch,
         *,
@@ -246,8 +272,8 @@ class Reception:
                 self._controller.follow(session.row, message)
             else:
                 session.first = message
-        known = self._controller.known(session.leadership)
-        self._answer(self.lead(session, known), call, datagram)
+        largest = self._controller.leadership_of(session.leadership)
+        self._answer(self.lead(session, largest), call, datagram)
 
     def lead(self, session: Session, known: int) -> Lead:
         """LEAD to a vehicle, see `Session.lead`."""
@@ -260,7 +286,7 @@ class Reception:
     def _hello(self, hello: Hello, call: GateCall, datagram: Datagram, now_ns: int) -> None:
         address = datagram.peer
         row = self._sessions.row_of_other_life(hello)
-        if row is not None and self._controller.scheme.restart(row):
+        if row is not None and self._controller.restart(row):
             self._events.append(BegunAnew(vehicle=hello.vehicle))
         refusal, number = self._refusal(hello, address, now_ns), 0
         if refusal is Refusal.ACCEPTED:
@@ -400,8 +426,7 @@ class Reception:
         session.line = call.line
         self._plausibility.forget(session.row)
         self._anew(session.row, (session.vehicle, session.boot_id))
-        self._controller.follow(session.row, session.first)
-        self._controller.desired.assign(session.row, session.vehicle)
+        self._controller.begin(session.row, session.vehicle, session.first)
         host, port = session.address
         self._events.append(SessionOpened(vehicle=session.vehicle, host=host, port=port))
         return session
