@@ -1,28 +1,27 @@
 """The client as an endpoint: one vehicle that flies, reports its state and receives at every step.
 
-It combines `session` (the conversation with the server), `pilot` (which flies the vehicle) and
-`failsafe` (which decides what the vehicle may do). The flight runs on the client's own clock, so
-losing the server does not shift its steps.
+It combines `session` (the conversation with a server, made by `connections`), `pilot` (which flies
+the vehicle) and `failsafe` (which decides what the vehicle may do). `ground` and `flight_log`
+report what happens, and `orders` takes the orders of an operator. The flight runs on the client's
+own clock, so losing the server does not shift its steps.
 """
 
 from collections import Counter
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from skytether.client.alone import LEADER_KEY, NAMES, Fresh, MotionInForce, OneServer
-from skytether.client.failsafe import CLOSING, GOOD_NS, HOLD, STALL_NS, TABLE, Failsafe, brake_ns
-from skytether.client.followers import SplineFollower
+from skytether.client.alone import Fresh
+from skytether.client.connections import Reached, connect
+from skytether.client.failsafe import CLOSING, HOLD, TABLE, Failsafe, brake_ns
+from skytether.client.flight_log import FlightLog
 from skytether.client.ground import GroundReports
-from skytether.client.link import ClientLink, PlainLink
+from skytether.client.link import ClientLink
+from skytether.client.orders import Orders
 from skytether.client.pilot import Pilot
 from skytether.client.session import ServerSession
 from skytether.client.vehicle import Vehicle
-from skytether.client.way import Way
-from skytether.shared.base.errors import ConfigError
-from skytether.shared.base.units import MICROSECOND_NS, MILLISECOND_NS, SECOND_NS, seconds_to_ns
+from skytether.shared.base.units import MICROSECOND_NS, SECOND_NS, seconds_to_ns
 from skytether.shared.endpoints.endpoint import (
-    PATH_SOCKETS,
-    STANDBY_SOCKETS,
     VEHICLES_TOLD_MAX,
     Address,
     Datagram,
@@ -32,26 +31,16 @@ from skytether.shared.endpoints.endpoint import (
 from skytether.shared.endpoints.time_of_day import TimeOfDay
 from skytether.shared.events.flight import (
     Failure,
-    FenceHolds,
-    Finished,
     Flying,
     Leaving,
-    ModeChanged,
-    NotFlown,
-    StateLeapt,
-    SteppedLate,
     address_text,
-    metres,
 )
-from skytether.shared.law.heartbeat import Hearing
 from skytether.shared.law.model import Array
-from skytether.shared.scenario.catalogue import keys_of
-from skytether.shared.scenario.owners import InFlight
 from skytether.shared.scenario.registry import load
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Reason, Recorder
 from skytether.shared.wire.drop import Drop, ProtocolError
-from skytether.shared.wire.protocol import CLOSES, NO_HORIZON, Close, Mode, stamp_us
+from skytether.shared.wire.protocol import CLOSES, Close, Mode, stamp_us
 
 if TYPE_CHECKING:
     from skytether.client.memory import SavedState
@@ -59,22 +48,11 @@ if TYPE_CHECKING:
 NOWHERE: Address = ("", 0)
 VEHICLE_SOCKET = 1
 """Socket used by the vehicle's own port; the server's is 0."""
-ARMED = keys_of(InFlight.ARMED)
-"""Key with which an operator allows plans to be flown."""
 LATEST_NS = SECOND_NS
 """Time after the end of its motion within which a client that is asked to end does so [ns]."""
-HELD_AGAIN_NS = 5 * SECOND_NS
-"""Time after which the log repeats that the fence limits the vehicle."""
-AFTER_LEAP = "vehicle.after_leap"
-LEAP = keys_of(InFlight.LEAP)
-"""Key with which an operator chooses the frame to use after a leap of the position."""
-LEADER = keys_of(InFlight.LEADER)
-"""Key with which an operator lets another server lead."""
 TIME_NS, TIME_ERROR_MAX_US = 2 * SECOND_NS, 2**32 - 1
 """Interval between two reports of the time of day [ns], and the largest error that fits in one
 [µs]."""
-PLANLESS = frozenset({Reason.OPENED, Reason.GOOD, Reason.HORIZON, Reason.OLD, Reason.ENDED})
-"""Reasons for a mode that do not explain why there is no newer horizon."""
 
 
 class Client(Endpoint):
@@ -119,25 +97,11 @@ class Client(Endpoint):
             module = load("skytether.client.memory", "a saved state")
             self._memory = module.Saving(module.ClientMemory(terms, boot_id, before))
         self._is_mission, self._axes = scenario.is_mission, terms.axes
-        if standby and 3 * (scenario.link.fixed_ns or 0) > seconds_to_ns(scenario.link.timeout_s):
-            expected = "expected at most a third of link.timeout_s with a standby server"
-            raise ConfigError(f"link.heartbeat_s: got {scenario.link.heartbeat_s}, {expected}")
-        servers = [paths or (server,), standby] if standby else [paths or (server,)]
         self.vehicle = vehicle
-        self._at: dict[tuple[int, Address], tuple[int, int]] = {}
-        """Numbers of the server and of its path, by the socket and the peer of its datagrams."""
         self._timeout_ns = seconds_to_ns(scenario.link.timeout_s)
         self._flies, self._port = flies, flies.port
         if before is not None:
             flies.recall(before.frame)
-        self.changeable = flies.changeable | ARMED | LEAP | LEADER
-        for key, setting, at_start in (
-            (AFTER_LEAP, scenario.vehicle.after_leap, "ask"),
-            (LEADER_KEY, scenario.link.leader, NAMES[0]),
-        ):
-            if setting != at_start:
-                expected = f"expected {at_start!r}: it is chosen in flight"
-                raise ConfigError(f"{key}: got {setting!r}, {expected}")
         self._failsafe = Failsafe(
             HOLD if terms.exhausted == "hold" else TABLE,
             armed=scenario.armed,
@@ -146,82 +110,37 @@ class Client(Endpoint):
             land_after_ns=seconds_to_ns(scenario.vehicle.land_after_s),
             returns=scenario.vehicle.on_loss == "return",
         )
-        self._servers = OneServer(self._failsafe)
-        if standby or self._memory.before.leadership:
-            self._servers = load("skytether.client.servers", "a standby server").Servers(
-                len(servers),
-                self._memory.before.leadership,
-                self._failsafe,
-                vehicle=vehicle,
-                timeout_ns=self._timeout_ns,
-                dt_ns=terms.dt_ns,
-                motion=self._motion_in_force,
-                may_tell=self._may_tell,
-                events=self._events,
-            )
-        self._sessions: list[ServerSession] = self._servers.sessions
-        for i, (addresses, sockets) in enumerate(
-            zip(servers, (PATH_SOCKETS, STANDBY_SOCKETS), strict=False)
-        ):
-            at = zip(sockets, addresses, strict=False)
-            self._at |= {each: (i, path) for path, each in enumerate(at)}
-            self._sessions.append(
-                ServerSession(
-                    terms,
-                    vehicle=vehicle,
-                    # To the other server it is another client: packets that are led astray must
-                    # not replace the session there.
-                    boot_id=self._memory.boot_id ^ i,
-                    server=i,
-                    servers=self._servers,
-                    way=self._way(scenario, addresses, sockets, () if i else path_names, prices),
-                    timeout_ns=self._timeout_ns,
-                    connect_s=scenario.link.connect_s,
-                    link=(link, standby_link)[i] or PlainLink(),
-                    hearing=Hearing(self._timeout_ns, terms.dt_ns, scenario.link.fixed_ns),
-                    watch=self._servers.watch(i),
-                    events=self._events,
-                )
-            )
         self._pilot = Pilot(scenario, vehicle, flies, self._failsafe, recorder)
-        self._not_flown: NotFlown | None = None
-        self._land_after_s = scenario.vehicle.land_after_s
-        self._reported_leap: tuple[float, ...] | None = None
+        self._servers, self._at = connect(
+            scenario,
+            terms,
+            Reached(paths or (server,), prices, path_names, standby),
+            (link, standby_link),
+            self._failsafe,
+            vehicle=vehicle,
+            boot_id=self._memory.boot_id,
+            leadership=self._memory.before.leadership,
+            motion=self._pilot.motion_in_force,
+            may_tell=self._may_tell,
+            out=self._out,
+            events=self._events,
+        )
+        self._sessions: list[ServerSession] = self._servers.sessions
+        self._orders = Orders(scenario, flies, self._pilot, self._failsafe, self._servers)
+        self.changeable = self._orders.keys
+        self._log = FlightLog(
+            scenario, vehicle, self._pilot, self._failsafe, self._servers, self._events
+        )
         self._ground = [
             GroundReports(vehicle, each.address, self._timeout_ns, self._events)
             for each in self._sessions
         ]
-        self._fence_report_ns = 0
-        """Time before which the fence is not reported again."""
         self._time: TimeOfDay | None = None
         self._time_due_ns = 0
         self.horizons = 0
         self._leaves = False
         """Whether an operator has asked the client to end."""
         self.dropped: Counter[Drop] = Counter()
-
-    def _way(
-        self,
-        scenario: Scenario,
-        addresses: Sequence[Address],
-        sockets: Sequence[int],
-        names: Sequence[str],
-        prices: Sequence[float],
-    ) -> Way:
-        """Way to a server."""
-        if len(addresses) == 1:
-            return Way(addresses, sockets, self._out)
-        way: Way = load("skytether.client.paths", "paths").SeveralPaths(
-            addresses,
-            sockets,
-            self._out,
-            events=self._events,
-            names=names,
-            prices=prices if len(prices) == len(addresses) else (1.0,) * len(addresses),
-            spread=scenario.link.spread,
-            timeout_ns=self._timeout_ns,
-        )
-        return way
 
     @property
     def _session(self) -> ServerSession:
@@ -231,7 +150,7 @@ class Client(Endpoint):
 
     @property
     def failure(self) -> Failure | None:
-        return self._flies.failure or self._session.failure or self._not_flown
+        return self._flies.failure or self._session.failure or self._log.failure
 
     @property
     def finished(self) -> bool:
@@ -322,23 +241,8 @@ class Client(Endpoint):
         return known | {
             "began_ns": pilot.began_ns,
             "heard_ns": self._failsafe.heard_ns or pilot.began_ns,
-            "motion": self._motion_in_force(),
+            "motion": self._pilot.motion_in_force(),
         }
-
-    def _motion_in_force(self) -> MotionInForce | None:
-        """Motion in force; None without one, on the ground, or without a mission."""
-        compensator = self._pilot.compensator
-        flown = compensator.follower
-        if not self._is_mission or compensator.in_force == NO_HORIZON:
-            return None
-        assert isinstance(flown, SplineFollower)
-        return MotionInForce(
-            compensator.in_force,
-            compensator.observed,
-            compensator.flown_since(self._pilot.step),
-            flown.spacing,
-            flown.sent.tobytes(),
-        )
 
     def keep(self, *, now_ns: int) -> bytes | None:
         return self._memory.keep(self._to_keep, now_ns=now_ns)
@@ -404,18 +308,13 @@ class Client(Endpoint):
         ground.wait(waits_for, now_ns=now_ns)
 
     def _fly(self, now_ns: int) -> None:
-        pilot, latest_ns = self._pilot, self._pilot.latest_ns
+        pilot = self._pilot
         pilot.fly(now_ns=now_ns)
         self._note_transitions(now_ns)
-        if self._is_mission and pilot.late_ns > max(STALL_NS, latest_ns):
-            self._events.append(SteppedLate(vehicle=self.vehicle, late_s=pilot.late_ns / SECOND_NS))
-        if pilot.is_held and now_ns >= self._fence_report_ns:
-            self._fence_report_ns = now_ns + HELD_AGAIN_NS
-            self._events.append(FenceHolds(vehicle=self.vehicle))
-        if pilot.leap_m != self._reported_leap:
-            self._tell_leap(pilot.leap_m)
+        self._log.report_step(now_ns)
         if pilot.step >= pilot.steps:
-            self._end(now_ns)
+            self._flies.land()
+            self._log.report_end(now_ns)
         # Nothing is sent before the state is saved, or the disk has failed: otherwise the server
         # would not know which motion the next run flies.
         may_tell = self._may_tell(now_ns)
@@ -438,40 +337,11 @@ class Client(Endpoint):
                 self._tell_time(session, now_ns)
             session.way.watch(session, now_ns)
 
-    def _tell_leap(self, leap_m: tuple[float, ...] | None) -> None:
-        self._reported_leap = leap_m
-        if leap_m is not None and self._failsafe.has_leapt:
-            # One second more than after a lost link: positions have to be good again first.
-            after_s = self._land_after_s + GOOD_NS / SECOND_NS if self._land_after_s else 0.0
-            self._events.append(StateLeapt(vehicle=self.vehicle, by_m=leap_m, land_after_s=after_s))
-
-    def _end(self, now_ns: int) -> None:
-        self._flies.land()
-        pilot, vehicle = self._pilot, self.vehicle
-        if pilot.covered and pilot.without_ns <= self._timeout_ns:
-            finished = Finished(vehicle=vehicle, steps=pilot.steps, missed=pilot.missed)
-            self._events.append(finished)
-        else:
-            covered, why = pilot.covered, self._why_no_plan(self._failsafe.reason, now_ns)
-            self._not_flown = NotFlown(vehicle=vehicle, covered=covered, steps=pilot.steps, why=why)
-            self._events.append(self._not_flown)
-
     def objection(self, scenario: Scenario, keys: frozenset[str]) -> str:
-        """After a leap, arming requires the operator to choose the frame, which says where the
-        vehicle is. A server that is not heard cannot be made the leader.
-        """
-        if keys & LEADER and (objection := self._servers.objection(scenario.link.leader)):
-            return objection
-        leap_m, choice = self._pilot.leap_m, scenario.vehicle.after_leap
-        if leap_m is None and keys & LEAP and choice != "ask":
-            return f"{AFTER_LEAP}: got {choice!r}, expected 'ask' before its position has leapt"
-        if choice == "old" and keys & LEAP and self._flies.leap_m is None:
-            expected = "expected 'new' or 'stay': the vehicle has not subtracted the leap"
-            return f"{AFTER_LEAP}: got 'old', {expected}"
-        if leap_m is not None and "armed" in keys and scenario.armed and not keys & LEAP:
-            expected = f"expected {AFTER_LEAP} = 'old', 'new' or 'stay' with it"
-            return f"armed: got true after its position has leapt by {metres(leap_m)}, {expected}"
-        return self._flies.objection(scenario, keys)
+        return self._orders.objection(scenario, keys)
+
+    def change(self, scenario: Scenario, keys: frozenset[str], *, now_ns: int) -> None:
+        self._orders.obey(scenario, keys, now_ns=now_ns)
 
     def learn_time(self, utc_ns: int, error_ns: int, *, now_ns: int) -> None:
         self._time = TimeOfDay(utc_ns - now_ns, error_ns, now_ns)
@@ -486,21 +356,6 @@ class Client(Endpoint):
         epoch_us = stamp_us(self._pilot.began_ns + self._time.ahead_ns)
         error_us = min(-(-error_ns // MICROSECOND_NS) + 1, TIME_ERROR_MAX_US)
         session.tell_time(self._pilot.flown, epoch_us, error_us, now_ns=now_ns)
-
-    def change(self, scenario: Scenario, keys: frozenset[str], *, now_ns: int) -> None:
-        self._failsafe.armed = scenario.armed
-        if keys & ARMED and scenario.armed:
-            self._flies.arm()
-        if keys & LEAP:
-            match scenario.vehicle.after_leap:
-                case "old" | "new" as frame:
-                    self._pilot.decide(keeps_frame=frame == "old")
-                case choice:
-                    self._failsafe.stays = choice == "stay"
-        if keys & LEADER:
-            self._servers.name(NAMES.index(scenario.link.leader), now_ns=now_ns)
-        if keys & self._flies.changeable:
-            self._flies.change(scenario)
 
     def leave(self, *, now_ns: int) -> int:
         """A vehicle on a mission's motion flies it to its end first."""
@@ -525,55 +380,19 @@ class Client(Endpoint):
                     session.send(Close(self.vehicle, session.number), now_ns=now_ns)
 
     def _note_transitions(self, now_ns: int) -> None:
-        """Let the pilot act on the transitions of the failsafe, and report them.
-
-        Short coasting is not reported: with event-triggered horizons it is normal.
-        """
+        """Let the pilot act on the transitions of the failsafe, and report them."""
         self._pilot.obey()
-        for each in self._pilot.transitions:
-            if each.cause in CLOSING:
-                self._session.close()
-            coasts = each.reason_before is Reason.OLD and each.cause is Reason.HORIZON
-            if each.cause is Reason.OLD or coasts:
-                continue
-            ended = each.reason is Reason.ENDED
-            self._events.append(
-                ModeChanged(
-                    vehicle=self.vehicle,
-                    before=str(each.before),
-                    after=str(each.after),
-                    reason=self._why_no_plan(each.reason, now_ns) if ended else str(each.reason),
-                )
-            )
+        if any(each.cause in CLOSING for each in self._pilot.transitions):
+            self._session.close()
+        self._log.report_transitions(self._pilot.transitions, now_ns)
         self._pilot.transitions.clear()
-
-    def _why_no_plan(self, reason: Reason, now_ns: int) -> str:
-        if reason not in PLANLESS:
-            return str(reason)
-        return str(Reason.LOST) if self._failsafe.is_lost(now_ns) else self._session.idle
 
     def figures(self) -> dict[str, Any]:
         return figures([self])
 
     def vehicle_figures(self) -> dict[str, Any]:
-        pilot = self._pilot
-        vehicle_figures = {
-            "mode": str(self._failsafe.mode),
-            "step": pilot.step,
-            "steps": pilot.steps,
-            "missed": pilot.missed,
-            "late_ms": pilot.latest_ns / MILLISECOND_NS,
-            "began_s": pilot.began_ns / SECOND_NS,
-            "horizons": self.horizons,
-            "dropped": by_name(self.dropped),
-        }
-        compensator = pilot.compensator
-        if compensator.observed >= 0:
-            now_ns = pilot.starts_ns(pilot.flown)
-            planned_ns = pilot.starts_ns(compensator.in_force)
-            observed_ns = pilot.starts_ns(compensator.observed)
-            vehicle_figures["age_ms"] = (now_ns - observed_ns) / MILLISECOND_NS
-            vehicle_figures["plan_age_ms"] = (now_ns - planned_ns) / MILLISECOND_NS
+        pilot, counts = self._pilot, {"horizons": self.horizons, "dropped": by_name(self.dropped)}
+        vehicle_figures = pilot.figures() | counts
         vehicle_figures |= self._servers.figures()
         if pilot.next_ns is not None:
             vehicle_figures |= self._session.way.figures(pilot.starts_ns(pilot.flown))

@@ -402,8 +402,8 @@ class Failsafe:
         before = self.mode, self.reason
         self.mode, self.reason = after, self.reason if cause in KEPT else cause
         if (self.mode, self.reason) != before:
-            after_it = self.mode, self.reason, cause, self.takes
-            self.transitions.append(Transition(*before, *after_it))
+            transition = Transition(*before, self.mode, self.reason, cause, self.takes)
+            self.transitions.append(transition)
 
 
 def _full(times_ns: deque[int], now_ns: int) -> bool:

@@ -8,17 +8,20 @@ decides what the vehicle may do, `client.compensator` which input of a horizon i
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
+from skytether.client.alone import MotionInForce
 from skytether.client.clamp import Guard, clamped
 from skytether.client.compensator import Compensator
 from skytether.client.failsafe import DROPPING, LATE_SHARE, Failsafe, Transition
+from skytether.client.followers import SplineFollower
 from skytether.client.navigation import Navigation
 from skytether.client.reporting import Reporter
 from skytether.client.session import ServerSession
 from skytether.client.vehicle import Vehicle
-from skytether.shared.base.units import MICROSECOND_NS
+from skytether.shared.base.units import MICROSECOND_NS, MILLISECOND_NS, SECOND_NS
 from skytether.shared.law.model import ALTITUDE, Array
 from skytether.shared.law.rule import braked
 from skytether.shared.scenario.gain import regulator
@@ -175,6 +178,21 @@ class Pilot:
     def _goes_on(self, step: int) -> bool:
         """Whether the vehicle follows a mission's motion whose last knot lies after `step`."""
         return self._is_mission and step < self.compensator.last_step
+
+    def motion_in_force(self) -> MotionInForce | None:
+        """Motion of a mission in force; None without one."""
+        compensator = self.compensator
+        flown = compensator.follower
+        if not self._is_mission or compensator.in_force == NO_HORIZON:
+            return None
+        assert isinstance(flown, SplineFollower)
+        return MotionInForce(
+            compensator.in_force,
+            compensator.observed,
+            compensator.flown_since(self.step),
+            flown.spacing,
+            flown.sent.tobytes(),
+        )
 
     @property
     def is_moving(self) -> bool:
@@ -415,3 +433,21 @@ class Pilot:
         states = navigation.estimate if truth is None else truth
         recorded = (states, navigation.measured, navigation.predicted, self._input)
         return [number for array in recorded for number in array.ravel().tolist()]
+
+    def figures(self) -> dict[str, Any]:
+        """Figures of the flight so far; ages only while a horizon is in force."""
+        figures: dict[str, Any] = {
+            "mode": str(self._failsafe.mode),
+            "step": self.step,
+            "steps": self.steps,
+            "missed": self.missed,
+            "late_ms": self.latest_ns / MILLISECOND_NS,
+            "began_s": self.began_ns / SECOND_NS,
+        }
+        compensator = self.compensator
+        if compensator.observed >= 0:
+            age_ns = (self.flown - compensator.observed) * self._dt_ns
+            plan_age_ns = (self.flown - compensator.in_force) * self._dt_ns
+            figures["age_ms"] = age_ns / MILLISECOND_NS
+            figures["plan_age_ms"] = plan_age_ns / MILLISECOND_NS
+        return figures

@@ -1,0 +1,85 @@
+"""Orders of an operator in flight: keys of the scenario that a vehicle takes while it flies.
+
+`armed` allows plans to be flown, `vehicle.after_leap` chooses the frame after a leap of the
+position, and `link.leader` the server that leads. A vehicle may take further keys of its own.
+"""
+
+from skytether.client.alone import LEADER_KEY, NAMES, OneServer
+from skytether.client.failsafe import Failsafe
+from skytether.client.pilot import Pilot
+from skytether.client.vehicle import Vehicle
+from skytether.shared.base.errors import ConfigError
+from skytether.shared.events.flight import metres
+from skytether.shared.scenario.catalogue import keys_of
+from skytether.shared.scenario.owners import InFlight
+from skytether.shared.scenario.schema import Scenario
+
+ARMED = keys_of(InFlight.ARMED)
+"""Key with which an operator allows plans to be flown."""
+AFTER_LEAP = "vehicle.after_leap"
+LEAP = keys_of(InFlight.LEAP)
+"""Key with which an operator chooses the frame to use after a leap of the position."""
+LEADER = keys_of(InFlight.LEADER)
+"""Key with which an operator lets another server lead."""
+
+
+class Orders:
+    """Orders to one vehicle.
+
+    Raises:
+        ConfigError: the scenario has a value that only an order may give.
+    """
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        flies: Vehicle,
+        pilot: Pilot,
+        failsafe: Failsafe,
+        servers: OneServer,
+    ) -> None:
+        for key, setting, at_start in (
+            (AFTER_LEAP, scenario.vehicle.after_leap, "ask"),
+            (LEADER_KEY, scenario.link.leader, NAMES[0]),
+        ):
+            if setting != at_start:
+                expected = f"expected {at_start!r}: it is chosen in flight"
+                raise ConfigError(f"{key}: got {setting!r}, {expected}")
+        self._flies, self._pilot = flies, pilot
+        self._failsafe, self._servers = failsafe, servers
+        self.keys = flies.changeable | ARMED | LEAP | LEADER
+
+    def objection(self, scenario: Scenario, keys: frozenset[str]) -> str:
+        """Why an order is refused at present; empty if it is not.
+
+        After a leap, arming requires the operator to choose the frame, which says where the
+        vehicle is. A server that is not heard cannot be made the leader.
+        """
+        if keys & LEADER and (objection := self._servers.objection(scenario.link.leader)):
+            return objection
+        leap_m, choice = self._pilot.leap_m, scenario.vehicle.after_leap
+        if leap_m is None and keys & LEAP and choice != "ask":
+            return f"{AFTER_LEAP}: got {choice!r}, expected 'ask' before its position has leapt"
+        if choice == "old" and keys & LEAP and self._flies.leap_m is None:
+            expected = "expected 'new' or 'stay': the vehicle has not subtracted the leap"
+            return f"{AFTER_LEAP}: got 'old', {expected}"
+        if leap_m is not None and "armed" in keys and scenario.armed and not keys & LEAP:
+            expected = f"expected {AFTER_LEAP} = 'old', 'new' or 'stay' with it"
+            return f"armed: got true after its position has leapt by {metres(leap_m)}, {expected}"
+        return self._flies.objection(scenario, keys)
+
+    def obey(self, scenario: Scenario, keys: frozenset[str], *, now_ns: int) -> None:
+        """Act on an order: the keys with a new value, and the scenario that has them."""
+        self._failsafe.armed = scenario.armed
+        if keys & ARMED and scenario.armed:
+            self._flies.arm()
+        if keys & LEAP:
+            match scenario.vehicle.after_leap:
+                case "old" | "new" as frame:
+                    self._pilot.decide(keeps_frame=frame == "old")
+                case choice:
+                    self._failsafe.stays = choice == "stay"
+        if keys & LEADER:
+            self._servers.name(NAMES.index(scenario.link.leader), now_ns=now_ns)
+        if keys & self._flies.changeable:
+            self._flies.change(scenario)
