@@ -33,13 +33,7 @@ CELLS_MAX = 2_000_000
 TIE_S = 1e-6
 """Difference of times up to which two packets count as sent at the same time [s]."""
 
-CAPTURES = (
-    b"\xd4\xc3\xb2\xa1",
-    b"\xa1\xb2\xc3\xd4",
-    b"\x4d\x3c\xb2\xa1",
-    b"\xa1\xb2\x3c\x4d",
-    b"\x0a\x0d\x0d\x0a",
-)
+CAPTURES = *map(bytes.fromhex, ("d4c3b2a1", "a1b2c3d4", "4d3cb2a1", "a1b23c4d")), b"\n\r\r\n"
 """First bytes of a capture of packets: pcap, in both byte orders, and pcapng."""
 
 Way = Literal["auto", "send", "receive"]
