@@ -1,1 +1,1 @@
-"""Missions: motions that keep several vehicles apart, and out of zones (docs/together.md)."""
+"""Missions: motions that keep several vehicles apart, and out of zones (docs/together-proof.md)."""

@@ -1,7 +1,7 @@
 """Led vehicles: which vehicles of a mission follow this server, with a standby server or without.
 
 A server plans motions only if every vehicle of the mission has told it the same number, with which
-this server leads, and was observed since (docs/together.md, Two servers).
+this server leads, and was observed since (docs/together-proof.md, Two servers).
 """
 
 from skytether.shared.law.model import Indices

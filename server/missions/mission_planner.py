@@ -18,7 +18,7 @@ from all motions that all other vehicles may fly, at every position that the err
 allow. `tube_m` is the largest distance of a vehicle from its motion (wind, tracking); the others
 keep more distance from a vehicle observed outside its tube. The motions sent earlier were apart
 already. So whichever motions are accepted, and whichever packets are lost or late, vehicles are
-`separation_m` apart as long as each stays in its tube (docs/together.md has the theorem). The
+`separation_m` apart as long as each stays in its tube (docs/together-proof.md has the theorem). The
 distance from zones is `tube_m`. Staying on the motion in force is always possible: it needs no
 packet.
 
@@ -128,8 +128,8 @@ class MissionPlanner(SplineScheme):
         """Factors of the coordinates in distances between vehicles at rest; shape (axes,)."""
 
     def fleet_figures(self) -> dict[str, Any]:
-        """How near vehicles have come to what the theorem of docs/together.md assumes, each as a
-        share: 1 is the bound.
+        """Margins of the theorem's conditions (docs/together-proof.md), each as a share: 1 is the
+        bound.
         """
         return {"margins": dict(self._state.margins)}
 

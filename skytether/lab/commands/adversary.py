@@ -66,8 +66,8 @@ class AdversaryOptions:
     scenario: ScenarioName = "swap"
     """Name of a mission (swap, sphere, rings, corridor, warehouse) or a .toml file."""
     kinds: Annotated[str, Argument(name="with", metavar="KINDS")] = "delays,losses,cuts,copies"
-    """Kinds of moves, with commas, see docs/together.md; `covered` stands for all against which the
-    distances must hold."""
+    """Kinds of moves, with commas, see docs/together-measured.md; `covered` stands for all against
+    which the distances must hold."""
     runs: Annotated[int, Argument(metavar="N")] = 200
     """Number of flights."""
     moves: Annotated[int, Argument(metavar="N")] = MOVES_MAX
