@@ -1,5 +1,5 @@
-"""Tables of docs/compare.md: `skytether compare` in the cases of the page, with fewer flights than
-its default.
+"""Table of docs/compare.md, and that of README: `skytether compare` in the cases of the page, with
+fewer flights than its default.
 """
 
 from collections.abc import Sequence
@@ -10,9 +10,18 @@ from skytether.lab import contenders
 from skytether.lab.commands import compare
 from skytether.lab.commands.pool import Flags
 from skytether.lab.commands.report_folder import CommandCall
-from skytether.lab.comparison import ComparedCase, leading
+from skytether.lab.comparison import ComparedCase, ContenderRuns, leading
 
-CASES = ("target", "turns", "route", "bounds", "loss-0.5", "burst-2", "measured")
+CASES = {
+    "target": "the server alone sees the target, and only where it is now",
+    "turns": "the same, and the target turns suddenly",
+    "route": "the server sees the next 4 s",
+    "bounds": "the target is nearly as fast as the vehicle",
+    "loss-0.5": "half of all packets are lost",
+    "burst-2": "losses come in bursts of 2 s",
+    "measured": "the server measures the target with noise of 20 cm",
+}
+"""Cases of the page by name, and what is special about each."""
 BUDGETS = (1.0, 5.0, 40.0)
 README_CASES = 3
 README = (
@@ -32,7 +41,7 @@ def document_tables(folder: Path | None, flags: Flags) -> dict[str, TextTable]:
     size = contenders.ComparisonSize(
         RUNS,
         generations=1,
-        cases=contenders.cases(CASES),
+        cases=contenders.cases(tuple(CASES)),
         contenders=[each for each in contenders.CONTENDERS if each.name != UNSHOWN],
         scouts=SCOUTS,
         rounds=ROUNDS,
@@ -40,8 +49,26 @@ def document_tables(folder: Path | None, flags: Flags) -> dict[str, TextTable]:
     )
     options = compare.CompareOptions(RUNS, folder or Path("compare/document"), pool=flags)
     results, _, _ = compare.run(options, size, CommandCall.now("compare", []))
-    made = {f"compare {budget:g}": table(results, budget) for budget in BUDGETS}
-    return made | {"readme": readme_table(results)}
+    return {"compare": choice_table(results), "readme": readme_table(results)}
+
+
+def choice_table(results: Sequence[ComparedCase]) -> TextTable:
+    """The paper's scheme at every step, and the best contender within each budget, by case."""
+    rows = []
+    for each in results:
+        paper = each.bought.get(("paper-every-step", BUDGETS[-1]))
+        row = [f"`{each.case.name}`: {CASES[each.case.name]}", estimate(paper) if paper else "–"]
+        rows.append([*row, *(best(each, budget) for budget in BUDGETS)])
+    headings = [f"≤ {budget:g}/s" for budget in BUDGETS]
+    return TextTable(["your case", "paper, every step", *headings], rows)
+
+
+def best(compared: ComparedCase, budget: float) -> str:
+    """Contender with the least mean, and how many others are not significantly worse."""
+    if not (runs := leading(compared, budget)):
+        return "–"
+    alike = f"; {len(runs) - 1} alike" if runs[1:] else ""
+    return f"**{runs[0].what.contender.title}** {estimate(runs[0])}{alike}"
 
 
 def readme_table(results: Sequence[ComparedCase]) -> TextTable:
@@ -57,21 +84,16 @@ def readme_table(results: Sequence[ComparedCase]) -> TextTable:
     return TextTable(["RMSE xy [m]", *headings], rows)
 
 
-def cell(compared: ComparedCase, contender: str, budget: float, *, has_median: bool = False) -> str:
+def cell(compared: ComparedCase, contender: str, budget: float) -> str:
     """Mean with half of its 95 % interval, in bold if no other mean is significantly smaller."""
     runs = compared.bought.get((contender, budget))
     if runs is None or not runs.values("rmse_xy"):
         return "–"
-    mean, half = runs.estimate("rmse_xy")
-    text = f"{mean:.3f} ± {half or 0.0:.3f}" + (f" ({runs.median():.3f})" if has_median else "")
+    text = estimate(runs)
     return f"**{text}**" if runs in leading(compared, budget) else text
 
 
-def table(results: Sequence[ComparedCase], budget: float) -> TextTable:
-    """Mean RMSE xy with half of its 95 % interval, and the median, of each contender and case."""
-    rows = []
-    for contender in contenders.CONTENDERS:
-        cells = [cell(each, contender.name, budget, has_median=True) for each in results]
-        if set(cells) != {"–"}:
-            rows.append([contender.title, *cells])
-    return TextTable(["contender", *(f"`{each.case.name}`" for each in results)], rows)
+def estimate(runs: ContenderRuns) -> str:
+    """Mean RMSE xy with half of its 95 % interval."""
+    mean, half = runs.estimate("rmse_xy")
+    return f"{mean:.3f} ± {half or 0.0:.3f}"

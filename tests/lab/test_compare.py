@@ -21,6 +21,7 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 import skytether
+from bench.contenders import choice_table
 from helpers import refused_before_writing
 from skytether.__main__ import main
 from skytether.figures.page import Picture
@@ -439,6 +440,22 @@ def test_a_contender_that_cannot_be_told_from_the_best_is_marked_as_well() -> No
     assert [*marked.values()] == [False, True, True]
     found = [row["best"] for row in csv.DictReader(table.csv.splitlines())]
     assert found == ["false", "true", "true"]
+
+
+def test_the_page_names_the_best_within_each_budget_and_counts_those_alike() -> None:
+    """The second is as good seed by seed; nothing flew within the other budgets."""
+    best = flew("feedback-gap", [0.2, 0.3, 0.2])
+    alike = flew("trajectory-expected", [0.21, 0.29, 0.21])
+    every = flew("paper-every-step", [0.3, 0.4, 0.35])
+    compared = within(TARGET, (5.0, best), (5.0, alike), (40.0, every))
+    ((case, *cells),) = choice_table([compared]).rows
+    assert case.startswith("`target`: ")
+    assert cells == [
+        "0.350 ± 0.124",
+        "–",
+        "**committed with feedback, cost gap** 0.233 ± 0.143; 1 alike",
+        "**paper, every step** 0.350 ± 0.124",
+    ]
 
 
 def test_where_nearly_all_are_as_good_as_the_best_none_is_marked() -> None:
