@@ -2,7 +2,7 @@
 
 `python -m bench.autopilots` flies a figure eight over the paper's network with both flavours of the
 scripted autopilot, in calm air and in wind, in virtual time. The contenders are Skytether with
-`vehicle.kind = "mavlink"`, and set-points sent directly by each of the laws of `station.laws`. All
+`vehicle.kind = "mavlink"`, and set-points sent directly by each of the laws of `bench.laws`. All
 contenders fly with the same seeds of network and wind, counted from each flight's start. Each
 flight is repeated with the network cut for a while.
 """
@@ -17,7 +17,10 @@ from typing import Any, Literal, NamedTuple, get_args
 import msgspec
 import numpy as np
 
+from bench import straight
 from bench.harness import Study, TextTable
+from bench.laws import Law
+from bench.straight import state_at, summary_of, within
 from skytether.autopilot.endpoint import Autopilot
 from skytether.autopilot.faults import ScriptedFault
 from skytether.autopilot.flavours import FlavourName
@@ -29,9 +32,7 @@ from skytether.shared.telemetry.record import TRUTH_COLUMNS, Record, Recorder, R
 from skytether.shared.telemetry.summary import Summary, position_error, summarise
 from skytether.shared.wire.protocol import Mode
 from skytether.shell.commandline import command
-from skytether.sim import flight, straight
-from skytether.station import laws
-from skytether.station.joined import state_at, summary_of, within
+from skytether.sim import flight
 
 Air = Literal["calm", "wind"]
 INPUTS: dict[str, Any] = {
@@ -110,15 +111,17 @@ class FlownCell(msgspec.Struct, frozen=True, kw_only=True):
     """Largest error in the flight with the cut, from the cut until well after its end [m]."""
 
 
-def contenders(flavour: FlavourName) -> dict[str, laws.Law | None]:
+def contenders(flavour: FlavourName) -> dict[str, Law | None]:
     """Laws of the contenders by name; None for Skytether."""
     targets_s, led_s = LEADS[flavour]
     return {
-        "velocity": laws.make("velocity"),
-        "targets": laws.make("targets"),
-        "targets, led": laws.make("targets", targets_s),
-        "led, gain 0.3": laws.make("led", led_s, 0.3),
-        "led, gain 0.5": laws.make("led", led_s, 0.5),
+        "velocity": Law("velocity", gain=0.3),
+        "targets": Law("targets"),
+        "targets, led": Law("targets", targets_s),
+        "led, gain 0.3": Law("led", led_s, 0.3),
+        "led, gain 0.5": Law("led", led_s, 0.5),
+        "led, gain 0.5, T - 0.1 s": Law("led", led_s - 0.1, 0.5),
+        "led, gain 0.5, T + 0.1 s": Law("led", led_s + 0.1, 0.5),
         **dict.fromkeys(OURS),
     }
 
@@ -145,12 +148,10 @@ def began_ns(flown: Record) -> int:
 Changes = Sequence[tuple[float, Mapping[str, Any]]]
 
 
-def fly(
-    scenario: Scenario, law: laws.Law | None, flavour: FlavourName, changes: Changes = ()
-) -> Record:
+def fly(scenario: Scenario, law: Law | None, flavour: FlavourName, changes: Changes = ()) -> Record:
     """Fly a contender; the record has true states, and packets from the first step to the last."""
     if law is not None:
-        return straight.fly(scenario, law, flavour, changes=changes)
+        return straight.fly(scenario, law, flavour, changes)
     autopilot, truth = autopilot_of(scenario, flavour)
     record = flight.fly(scenario, beside={"autopilot": autopilot}, changes=changes)
     return as_it_was(scenario, record, parse(truth.getvalue()))
@@ -208,7 +209,7 @@ def judged(
     whole_summary, cut_summary = (
         summarise(scenario, "autopilot", record.client, record.server, record.netem, secure=secure)
         if cell.contender in OURS
-        else summary_of(scenario, "autopilot", record)
+        else summary_of(scenario, record)
         for record in (whole, cut)
     )
     return FlownCell(

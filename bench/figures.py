@@ -106,9 +106,7 @@ def register() -> dict[str, Figure]:
 
 def code() -> str:
     """Digest of all code that flies, and of its scenarios: flights of other code are not reused."""
-    ours = (
-        f"skytether/{room}" for room in ("autopilot", "quadrotor", "scenarios", "sim", "station")
-    )
+    ours = (f"skytether/{room}" for room in ("autopilot", "quadrotor", "scenarios", "sim"))
     rooms = ("server", "client", "netem", "shared", *ours)
     sources = (
         file

@@ -14,6 +14,7 @@ import numpy as np
 
 from airborne import Air
 from bench.autopilots import MODELS
+from bench.straight import state_at
 from skytether.autopilot.flavours import FlavourName, FlightMode
 from skytether.mavlink.codec import Codec, Message
 from skytether.mavlink.dialect import dialect
@@ -25,7 +26,6 @@ from skytether.shared.events.flight import Flying
 from skytether.shared.scenario import reading
 from skytether.shared.telemetry.record import parse
 from skytether.shared.wire.protocol import Mode
-from skytether.station.joined import state_at
 
 CLIENT, AUTOPILOT = ("client", 1), ("autopilot", 0)
 LOST, DOUBLED, LATE, CUT, FLIPPED = 0.1, 0.05, 0.05, 0.1, 0.1

@@ -18,10 +18,6 @@ COMMANDS_IN_GROUPS = {
             "scenarios on the same network, side by side on one page",
             "skytether.cli.duel:duel",
         ),
-        "straight [SCENARIO]": (
-            "by set-points sent straight to an autopilot, to compare",
-            "skytether.cli.straight:straight",
-        ),
         "set PATH KEY=VALUE": (
             "change keys in flight, at a process with --control",
             "skytether.cli.set:set_keys",
@@ -80,10 +76,6 @@ COMMANDS_IN_GROUPS = {
             "whether its loop is stable, and with which vehicles",
             "skytether.lab.commands.margins:margins",
         ),
-        "crowd [SCENARIO]": (
-            "how many vehicles can share one radio channel",
-            "skytether.lab.commands.crowd:crowd",
-        ),
         "torture": (
             "flights under faults and attacks: is all of it safe?",
             "skytether.lab.commands.torture:torture",
@@ -111,10 +103,6 @@ COMMANDS_IN_GROUPS = {
         "autopilot [SCENARIO]": (
             "a simulated autopilot that speaks MAVLink",
             "skytether.autopilot.__main__:pilot",
-        ),
-        "station [SCENARIO]": (
-            "a ground station that sends set-points to one",
-            "skytether.station.__main__:fly",
         ),
     },
     "Names and completion": {

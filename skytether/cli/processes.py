@@ -109,8 +109,8 @@ async def started(
     """Start a process that listens; at the end of the block it gets SIGTERM, then SIGKILL.
 
     Args:
-        name: process to run: server, netem, client, station or autopilot; `netem N` is that of
-            path N, and `server 2` the standby server.
+        name: process to run: server, netem or client; `netem N` is that of path N, and `server 2`
+            the standby server.
         arguments: its command line, beside `--log json`.
         on_event: called with each line of its log.
 
@@ -291,55 +291,14 @@ def run(
             shortfalls.append(line.event)
         on_event(line)
 
-    fly_chain(
-        [
-            servers,
-            [
-                [*netem, *ANYWHERE, f"--server={{{server}}}"]
-                for netem, server in zip(paths, leads_to, strict=True)
-            ],
-            [client],
-        ],
-        flies="client",
-        spares=names,
-        timeout_s=timeout_s,
-        on_second=on_second,
-        interrupted=interrupted,
-        on_event=hear,
-    )
-    client_figures = parts / "client.json"  # empty until the client ends
-    if interrupted() and not (client_figures.exists() and client_figures.stat().st_size):
-        raise CommandError("interrupted before the first step", INTERRUPTED)
-    return shortfalls
-
-
-def fly_chain(
-    chain: Chain,
-    *,
-    flies: str,
-    spares: Collection[str] = (),
-    timeout_s: float,
-    on_second: Callable[[float], None],
-    interrupted: Callable[[], bool],
-    on_event: OnEvent,
-) -> None:
-    """Run processes, each connected to those before, until one of them ends, or Ctrl-C.
-
-    Args:
-        chain: see `Chain`.
-        flies: name of the process whose end is the flight's.
-        spares: names of processes of which all but one may end during the flight.
-        timeout_s: longest time that they run [s].
-        on_second, interrupted, on_event: see `run`.
-
-    Raises:
-        CommandError: a process failed, or the time ran out.
-    """
+    relays = [
+        [*netem, *ANYWHERE, f"--server={{{server}}}"]
+        for netem, server in zip(paths, leads_to, strict=True)
+    ]
+    chain = [servers, relays, [client]]
 
     async def main() -> None:
-        flight = asyncio.create_task(
-            _fly(chain, flies, spares, timeout_s=timeout_s, on_second=on_second, on_event=on_event)
-        )
+        flight = asyncio.create_task(_fly(chain, names, timeout_s, on_second, hear))
         while not flight.done() and not interrupted():
             await asyncio.wait((flight,), timeout=POLL_S)
         flight.cancel()
@@ -347,6 +306,10 @@ def fly_chain(
             await flight
 
     asyncio.run(main())
+    client_figures = parts / "client.json"  # empty until the client ends
+    if interrupted() and not (client_figures.exists() and client_figures.stat().st_size):
+        raise CommandError("interrupted before the first step", INTERRUPTED)
+    return shortfalls
 
 
 def flown(scenario: Scenario, fly: Callable[[Scenario, Path], list[Shortfall]]) -> Record:
@@ -414,13 +377,21 @@ def _with_address(argument: str, addresses: Mapping[str, str]) -> str:
 
 async def _fly(
     chain: Chain,
-    flies: str,
     spares: Collection[str],
-    *,
     timeout_s: float,
     on_second: Callable[[float], None],
     on_event: OnEvent,
 ) -> None:
+    """Run processes, each connected to those before, until the flight of the client ends.
+
+    Args:
+        spares: names of processes of which all but one may end during the flight.
+        timeout_s: longest time that they run [s].
+        on_second, on_event: see `run`.
+
+    Raises:
+        CommandError: a process failed, or the time ran out.
+    """
     loop = asyncio.get_running_loop()
     flying_s: float | None = None
 
@@ -459,7 +430,7 @@ async def _fly(
         for child in (each for each in children if each.name in ended):
             code = child.process.returncode
             # Shortfalls are reported at the end, together with the flight's summary.
-            has_flown = child.name == flies and (
+            has_flown = child.name == "client" and (
                 code == 0 or (child.fell_short and not child.failed)
             )
             if code is not None and not has_flown:

@@ -1,6 +1,5 @@
-"""Pictures of sweeps and crowds."""
+"""Pictures of sweeps."""
 
-from collections.abc import Callable, Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
 
@@ -8,7 +7,6 @@ import numpy as np
 
 from skytether.figures.flights import save
 from skytether.figures.page import blank
-from skytether.lab.crowd import TITLES, CrowdPoint, FlownScheme, Scheme
 from skytether.lab.sweep import GridAxis
 from skytether.shared.law.model import Array
 
@@ -82,62 +80,6 @@ def heat_map(
     figure.colorbar(mesh, label=name)
     plane.set_title(title, fontsize=10)
     save(figure, path, dpi=130)
-
-
-SCHEME_COLOURS: Mapping[Scheme, str] = {
-    "paper": "#c1272d",
-    "threshold": "#e69f00",
-    "budget": "#0072b2",
-}
-
-
-def crowd(path: Path, title: str, flown: Mapping[Scheme, FlownScheme], limit_m: float) -> None:
-    """Draw error, queueing delay and loss over the number of vehicles, for each scheme.
-
-    `limit_m` is the RMSE above which vehicles count as failed [m].
-    """
-    figure = blank(7.0, 8.0)
-    panes = figure.subplots(3, 1, sharex=True)
-    values: Sequence[tuple[str, Callable[[CrowdPoint], float | None]]] = (
-        ("RMSE of all vehicles [m]", lambda p: p.rmse_m),
-        ("queueing delay to a vehicle [ms]", lambda p: p.up_queueing_ms_p50),
-        ("share lost on the way to a vehicle", lambda p: p.up_lost),
-    )
-    for pane, (label, value) in zip(panes, values, strict=True):
-        for scheme, each in flown.items():
-            points = [point for point in each.points if value(point) is not None]
-            numbers = [point.vehicles for point in points]
-            colour = SCHEME_COLOURS[scheme]
-            drawn = np.array([value(point) for point in points], dtype=np.float64)
-            if numbers:
-                pane.plot(numbers, drawn, color=colour, linewidth=1.0, label=TITLES[scheme])
-            for flies, marker in ((True, "o"), (False, "X")):
-                has_outcome = [point.flies(limit_m) == flies for point in points]
-                pane.scatter(
-                    np.array(numbers)[has_outcome], drawn[has_outcome], color=colour, marker=marker
-                )
-            if pane is panes[1]:
-                rare = [point.up_queueing_ms_p99 for point in points]
-                pane.plot(numbers, rare, color=colour, linewidth=0.8, linestyle=":")
-        pane.set_ylabel(label)
-        pane.grid(alpha=0.3)
-        pane.set_xscale("log", base=2)
-    panes[0].axhline(limit_m, color="k", linewidth=0.8, linestyle="--")
-    panes[0].set_yscale("log")
-    panes[0].legend(fontsize=8)
-    panes[1].set_title(
-        "median, and dotted the 99 % quantile; × if the vehicles do not fly",
-        fontsize=9,
-    )
-    panes[-1].set_xlabel("number of vehicles")
-    ticks = sorted({2**i for i in range(13)} & set(range(1, _most(flown) + 1)))
-    panes[-1].set_xticks(ticks, list(map(str, ticks)))
-    figure.suptitle(title, fontsize=11)
-    save(figure, path, dpi=110)
-
-
-def _most(flown: Mapping[Scheme, FlownScheme]) -> int:
-    return max(point.vehicles for each in flown.values() for point in each.points)
 
 
 def _is_scale(axis: GridAxis) -> bool:

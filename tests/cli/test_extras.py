@@ -22,7 +22,7 @@ ALL = (
     *("gym", "lab", "ulog"),
 )
 LAB = (
-    *("crowd", "sweep", "margins", "identify", "torture", "adversary", "reproduce"),
+    *("sweep", "margins", "identify", "torture", "adversary", "reproduce"),
     *("compare", "calibrate"),
 )
 BARE = ("client", "netem", "keygen", "set", "probe", "completion", "list")
@@ -30,8 +30,6 @@ NEEDS: dict[str, tuple[str, ...]] = {
     **dict.fromkeys(BARE, ()),
     "server": ("server",),
     "autopilot": ("mavlink", "server"),
-    "station": ("mavlink",),
-    "straight": ("mavlink", "server"),
     "fly": ("server",),
     "fleet": ("server",),
     "duel": ("server", "page"),

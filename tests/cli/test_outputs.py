@@ -33,11 +33,8 @@ LINES = {
     "fly --json": "fly SCENARIO OUT",
     "fly --record": "fly SCENARIO OUT.mcap",
     "fly --figure": "fly SCENARIO OUT.png",
-    "straight --json": "straight SCENARIO OUT",
-    "straight --figure": "straight SCENARIO OUT.png",
     "fleet --json": "fleet --mission MISSION --virtual OUT",
     "fleet --figure": "fleet SCENARIO --virtual --vehicles 1 OUT.png",
-    "crowd --out": "crowd SCENARIO OUT/crowd.csv",
     "sweep --out": "sweep SCENARIO --runs 1 OUT/runs.csv",
     "margins --json": "margins SCENARIO --runs 1 OUT",
     "identify --out": "identify --scenario SCENARIO OUT/scenario.toml",
@@ -67,8 +64,6 @@ LINES = {
     "client --record": "client SCENARIO OUT.mcap",
     "autopilot --json": "autopilot SCENARIO OUT",
     "autopilot --record": "autopilot SCENARIO OUT",
-    "station --json": "station SCENARIO OUT",
-    "station --record": "station SCENARIO OUT",
 }
 """Command line for each option that names an output; OUT is the option's value, and another path of
 the input.

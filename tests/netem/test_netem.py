@@ -153,23 +153,6 @@ def test_connections_of_tcp_are_relayed(tmp_path: Path) -> None:
 
 @pytest.mark.realtime
 @pytest.mark.long
-@pytest.mark.timeout(120)
-def test_a_ground_station_and_an_autopilot(tmp_path: Path) -> None:
-    station, netem, autopilot = block("--law led")
-    with (
-        running(f"{station} --duration 10", tmp_path) as flight,
-        running(netem, tmp_path, "listening") as relay,
-        running(autopilot, tmp_path),
-    ):
-        # The flight begins only once the autopilot has started.
-        flight.communicate(timeout=PATIENCE_S)
-        said = ended(relay)
-    assert min(counted(said, "forwarded")) > 0
-    assert max(counted(said, "lost")) > 0
-
-
-@pytest.mark.realtime
-@pytest.mark.long
 @pytest.mark.skipif(shutil.which("openssl") is None, reason="needs OpenSSL's program")
 def test_dtls_gets_through(tmp_path: Path) -> None:
     server, netem, client = block("openssl")

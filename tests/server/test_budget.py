@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from bench.crowd import judge
 from skytether.client.fleet import apart_ns
-from skytether.lab.crowd import judge
 from skytether.server import budget as budgets
 from skytether.server.budget import BURST_S, GUESS_BYTES, WAIT_S, SharedBudget
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS

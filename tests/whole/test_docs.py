@@ -47,7 +47,7 @@ COMMANDS = [line for document in DOCUMENTS for block in blocks(document) for lin
 ELSEWHERE = {
     *("adversary", "autopilot", "compare", "duel", "export", "keygen", "page", "probe", "replay"),
     *("report", "reproduce", "set", "torture"),
-    *("client", "netem", "server", "station"),
+    *("client", "netem", "server"),
 }
 """Commands with tests of their own; `test_a_documented_flight_flies` runs all others."""
 
@@ -134,9 +134,6 @@ def test_a_documented_flight_flies(
         line += " --settle 0 --duration 1 --runs 2"
     if "margins" in line:
         line += " --runs 1"
-    if "crowd --out" in line:
-        line = re.sub(r"--vehicles [\d ]+", "", line)
-        line += " --vehicles 2 --settle 0 --duration 4"
     if "calibrate" in line:
         line += " --settle 0 --duration 1 --runs 2 --generations 1 --population 4"
     if "--show" in line:

@@ -28,7 +28,7 @@ WITHOUT_FILES = (
         "client",
         "netem",
     ),
-    *("autopilot", "station", "probe", "sim"),
+    *("autopilot", "probe", "sim"),
 )
 """Rooms whose modules import neither paths nor the operating system."""
 DRIVERS = ("lab/commands", "view/browser", "gym/networked.py")

@@ -1,4 +1,4 @@
-"""Ground station as an endpoint: from the first heartbeat of an autopilot to its landing.
+"""Ground station that flies an autopilot by set-points only, as autopilots are usually flown.
 
     heartbeat → streams requested, clock offset known → armed, climbed (`client.mavlink.launch`)
               → a set-point at every step of the flight → landed
@@ -8,11 +8,9 @@ the autopilot itself flies the vehicle, the station sends nothing, and it does n
 afterwards.
 """
 
-from collections import Counter
-from typing import Any
-
 import numpy as np
 
+from bench.laws import Heard, Law, Setpoint, setpoint
 from skytether.client.clock import BootClock
 from skytether.client.mavlink.condition import Condition
 from skytether.client.mavlink.flavours import FLAVOURS, PX4, Flavour, unfit
@@ -25,13 +23,12 @@ from skytether.mavlink.dialect import dialect
 from skytether.mavlink.frames import turned
 from skytether.mavlink.text import Texts
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS, seconds_to_ns
-from skytether.shared.endpoints.endpoint import Address, Datagram, Endpoint, by_name
+from skytether.shared.endpoints.endpoint import Address, Datagram, Endpoint
 from skytether.shared.events.aboard import AutopilotText, NotTakenOff
 from skytether.shared.events.flight import Finished, Flying
 from skytether.shared.law.model import Array
 from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import Recorder
-from skytether.station.laws import Heard, Law, Setpoint, setpoint
 
 SYSTEM, COMPONENT = 255, int(dialect.MAV_COMP_ID_MISSIONPLANNER)
 """System and component id of the ground station; ArduPilot accepts commands of this system id."""
@@ -48,8 +45,6 @@ requests must be longer than that of its messages.
 """
 AGE_MAX_NS = 10 * SECOND_NS
 """Largest usable age of a position, and longest usable round-trip time [ns]."""
-CLOSES = 3
-"""Number of land commands sent to a flying vehicle when the station ends."""
 FRAME = int(dialect.MAV_FRAME_LOCAL_NED)
 VELOCITY_ALONE, POSITION_AND_VELOCITY = 0b110111000111, 0b110111000000
 """Type masks of set-points, with neither acceleration nor yaw."""
@@ -64,12 +59,28 @@ UNASKED = (int(dialect.MAVLINK_MSG_ID_ATTITUDE), int(dialect.MAVLINK_MSG_ID_SYS_
 """Messages that PX4 sends unrequested, and that the station does not use."""
 
 
+def station_columns(axes: int) -> np.dtype[np.void]:
+    """Columns of the ground station's part: one row per step."""
+    return np.dtype(
+        [
+            ("time_ns", "<i8"),
+            ("step", "<i8"),
+            ("input", "<f8", (axes,)),  # velocity of the set-point [m/s]
+            ("measured", "<f8", (axes,)),  # newest position received [m]; NaN before the first
+            ("age_ns", "<i8"),  # age of that position; -1 before the first
+            # whether the station was in control of the autopilot, and so sent a set-point
+            ("obeyed", "?"),
+            ("late", "<i8"),  # number of positions so far that arrived after newer ones
+        ]
+    )
+
+
 class Station(Endpoint):
     """Ground station that flies one vehicle.
 
     Args:
         law: law that chooses set-points.
-        recorder: takes one row per step, see `station.joined`.
+        recorder: takes one row per step, see `station_columns`.
 
     Raises:
         ConfigError: the scenario's flight begins on the ground.
@@ -94,7 +105,8 @@ class Station(Endpoint):
         self._flavour: Flavour | None = None
         self._launch: Launch | None = None
         self._failure: NotTakenOff | None = None
-        self._counts: Counter[str] = Counter()
+        self.setpoints = 0
+        """Number of set-points sent."""
         self._since_ns: int | None = None
         """Start of the wait for the autopilot [ns]: first for a heartbeat, then for its time."""
         self._tick_ns = self._beat_ns = self._clock_ns = self._stream_ns = 0
@@ -103,7 +115,6 @@ class Station(Endpoint):
         self._epoch_ns: int | None = None
         self._step_ns = 0
         self._step = 0
-        self._missed = 0
         self._newest: Measurement | None = None
 
     @property
@@ -129,9 +140,8 @@ class Station(Endpoint):
             if self._peer is None and message.get_type() == "HEARTBEAT":
                 self._meet(message, sender, datagram.peer)
             if sender != self._target or datagram.peer != self._peer:
-                self._counts["foreign"] += 1
-            elif self._launch is not None:
-                self._counts["heard"] += 1
+                continue
+            if self._launch is not None:
                 self._hear(message, self._launch, now_ns)
 
     def _meet(self, message: Message, sender: tuple[int, int], peer: Address) -> None:
@@ -257,8 +267,6 @@ class Station(Endpoint):
         """Send the set-point of the present step, unless a pilot or the autopilot flies."""
         launch = self._launch
         assert launch is not None
-        step = min((now_ns - epoch_ns) // self._dt_ns, self._steps - 1)
-        self._missed += step - self._step
         time_s = (now_ns - epoch_ns) / SECOND_NS
         measured = self._positions.take(now_ns=now_ns)
         self._newest = newest = measured[-1] if measured else self._newest
@@ -270,11 +278,11 @@ class Station(Endpoint):
         obeys = self._obeys
         if obeys:
             self._say_setpoint(chosen)
-        self._record(step, now_ns, chosen.velocity, obeys=obeys)
-        self._step = step + 1
+        self._record(now_ns, chosen.velocity, obeys=obeys)
+        self._step += 1
         self._step_ns = epoch_ns + self._step * self._dt_ns
         if self._is_over:
-            self._events.append(Finished(vehicle=VEHICLE, steps=self._steps, missed=self._missed))
+            self._events.append(Finished(vehicle=VEHICLE, steps=self._steps, missed=0))
             launch.land(now_ns=now_ns)
 
     @property
@@ -283,7 +291,7 @@ class Station(Endpoint):
         assert self._flavour is not None
         return self._condition.armed and self._condition.mode == self._flavour.guided
 
-    def _record(self, step: int, now_ns: int, velocity: Array, *, obeys: bool) -> None:
+    def _record(self, now_ns: int, velocity: Array, *, obeys: bool) -> None:
         if self._recorder is None:
             return
         newest = self._newest
@@ -291,7 +299,7 @@ class Station(Endpoint):
         age_ns = now_ns - newest.stamp_ns if newest else -1
         late = self._positions.dropped["late"]
         numbers = (*velocity.tolist(), *position)
-        self._recorder.append_row(now_ns, step, *numbers, age_ns, obeys, late, self._missed)
+        self._recorder.append_row(now_ns, self._step, *numbers, age_ns, obeys, late)
 
     def _say_setpoint(self, chosen: Setpoint) -> None:
         x, y, *up = chosen.velocity.tolist()
@@ -301,7 +309,7 @@ class Station(Endpoint):
             x, y, *up = chosen.position.tolist()
             place = turned((x, y, up[0] if up else self._altitude))
             mask = POSITION_AND_VELOCITY
-        self._counts["setpoints"] += 1
+        self.setpoints += 1
         unused = (0.0, 0.0, 0.0, 0.0, 0.0)
         self._say(
             dialect.MAVLink_set_position_target_local_ned_message(
@@ -312,20 +320,3 @@ class Station(Endpoint):
     def _say(self, message: Message) -> None:
         assert self._peer is not None
         self.send(self._codec.encode(message), self._peer)
-
-    def close(self, *, now_ns: int) -> None:
-        """Send land commands to a vehicle that the station flies."""
-        if self._launch is not None:
-            for message in self._launch.close(now_ns=now_ns) * CLOSES:
-                self._say(message)
-
-    def figures(self) -> dict[str, Any]:
-        return {
-            "heard": self._counts["heard"],
-            "foreign": self._counts["foreign"],
-            "setpoints": self._counts["setpoints"],
-            "measurements": self._positions.taken,
-            "dropped": by_name(self._positions.dropped),
-            "garbage_bytes": self._codec.garbage_bytes,
-            "round_trip_ms": (self._clock.round_trip_ns or 0) / MILLISECOND_NS,
-        }
