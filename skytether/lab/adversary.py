@@ -14,19 +14,17 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from functools import partial
-from heapq import heappop, heappush
 from itertools import combinations
 from typing import Annotated, Any, NamedTuple
 
 import msgspec
 import numpy as np
 
-from skytether.lab.faults import shrink
+from skytether.lab.engine import HeldPackets, shrink
 from skytether.lab.lives import CLOCK, STANDBY_FLOWS, Lives, Saved, world_s
 from skytether.shared.base.chance import stream
-from skytether.shared.base.errors import ConfigError
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS, seconds_to_ns
-from skytether.shared.endpoints.endpoint import STANDBY_SOCKETS, Datagram, Endpoint
+from skytether.shared.endpoints.endpoint import STANDBY_SOCKETS, Datagram
 from skytether.shared.law.terms import Terms
 from skytether.shared.missions import mission
 from skytether.shared.missions.derived import zones
@@ -219,16 +217,13 @@ class Approach(msgspec.Struct, frozen=True, kw_only=True):
     """How near vehicles came to what the theorem assumes, see `Scheme.fleet_figures`."""
 
 
-class AdversaryNetwork(Endpoint):
+class AdversaryNetwork(HeldPackets):
     def __init__(self, moves: Moves, seed: int, terms: Terms | None = None) -> None:
         super().__init__()
         self._moves = [move for move in moves if move.kind in NETWORK]
         self._terms = terms
         """Terms of the flight, needed for `MoveKind.LEADS`."""
         self._seed, self._chance = seed, dict[tuple[str, int], np.random.Generator]()
-        self._sent = 0
-        self._in_flight: list[tuple[int, int, Datagram]] = []
-        """Heap of the packets in flight: time of arrival, order, and packet."""
         self.packets: list[Packet] = []
 
     def receive(self, datagram: Datagram, *, now_ns: int) -> None:
@@ -266,13 +261,9 @@ class AdversaryNetwork(Endpoint):
                     more.append(onward._replace(payload=lead))
         due_ns = now_ns + BASE_NS + seconds_to_ns(late_s)
         for each in (onward, *more):
-            self._send(due_ns, each)
+            self.hold(due_ns, each)
         for each_s in copies_s:
-            self._send(due_ns + seconds_to_ns(each_s), onward)
-
-    def _send(self, due_ns: int, onward: Datagram) -> None:
-        self._sent += 1
-        heappush(self._in_flight, (due_ns, self._sent, onward))
+            self.hold(due_ns + seconds_to_ns(each_s), onward)
 
     def _forged(self, payload: bytes, number: float, leads: float) -> bytes | None:
         """Claim of leadership in the session of a packet; None if the packet has none."""
@@ -288,13 +279,6 @@ class AdversaryNetwork(Endpoint):
         if (way, vehicle) not in self._chance:
             self._chance[way, vehicle] = stream(self._seed, "adversary", way, vehicle)
         return float(self._chance[way, vehicle].random())
-
-    def wake(self, *, now_ns: int) -> None:
-        while self._in_flight and self._in_flight[0][0] <= now_ns:
-            self._out.append(heappop(self._in_flight)[2])
-
-    def next_wake_ns(self) -> int | None:
-        return self._in_flight[0][0] if self._in_flight else None
 
 
 class Raid:
@@ -729,18 +713,3 @@ def shrunk(scenario: Scenario, found: Approach) -> Approach:
     """Flight of fewer and shorter moves that still violates a required distance."""
     moves = shrink(found.moves, lambda moves: spare_m(scenario, fly(scenario, moves)) < 0.0)
     return fly(scenario, moves)
-
-
-def dumps(moves: Moves) -> str:
-    return msgspec.json.encode(moves).decode()
-
-
-def loads(line: str) -> Moves:
-    """Decode moves from JSON.
-
-    Raises ConfigError if the line is not a list of moves.
-    """
-    try:
-        return msgspec.json.decode(line, type=Moves)
-    except msgspec.DecodeError as error:
-        raise ConfigError(f"moves: {error}") from None

@@ -5,16 +5,17 @@ Equal seeds draw equal schedules. A failing schedule is shrunk to the shortest o
 and kept as a line of JSON with the seed of the flight.
 """
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 from enum import StrEnum
-from typing import Annotated, Any, Protocol, TypeVar, cast
+from typing import Annotated
 
 import msgspec
 import numpy as np
 
+from skytether.lab import engine
 from skytether.shared.base.errors import ConfigError
-from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS, seconds_to_ns
+from skytether.shared.base.units import SECOND_NS, seconds_to_ns
 
 
 class FaultKind(StrEnum):
@@ -106,8 +107,6 @@ RANGES = {
 }
 
 EVERY_NS = 5 * SECOND_NS
-SHORTEST_NS = MILLISECOND_NS
-"""Length below which `shrink` does not shorten a fault any further [ns]."""
 
 
 @dataclass(frozen=True)
@@ -179,43 +178,6 @@ def _between(rng: np.random.Generator, bounds: tuple[float, float]) -> float:
     return low if low == high else float(low * (high / low) ** rng.random())
 
 
-class Timed(Protocol):
-    @property
-    def length_ns(self) -> int:
-        """Duration [ns]."""
-
-
-T = TypeVar("T", bound=Timed)
-
-
-def shrink(faults: Sequence[T], fails: Callable[[tuple[T, ...]], bool]) -> tuple[T, ...]:
-    """Shrink a failing schedule until leaving out any single fault makes it pass.
-
-    Delta debugging: faults are left out, first many at a time and finally one by one; then each is
-    halved in length while the schedule still fails.
-
-    Args:
-        fails: whether a schedule fails; called often, also with the empty one.
-    """
-    shortest = tuple(faults)
-    size, dropped = len(shortest), True
-    while size > 1 or dropped:
-        size, first, dropped = max(1, size // 2), 0, False
-        while first < len(shortest):
-            rest = shortest[:first] + shortest[first + size :]
-            if fails(rest):
-                shortest, dropped = rest, True
-            else:
-                first += size
-    for n in range(len(shortest)):
-        while shortest[n].length_ns >= 2 * SHORTEST_NS:
-            shorter = cast(T, replace(cast(Any, shortest[n]), length_ns=shortest[n].length_ns // 2))
-            if not fails((*shortest[:n], shorter, *shortest[n + 1 :])):
-                break
-            shortest = (*shortest[:n], shorter, *shortest[n + 1 :])
-    return shortest
-
-
 @dataclass(frozen=True)
 class Trial:
     """Flight under torture: its faults, and the seed of all other random numbers."""
@@ -234,21 +196,12 @@ class Trial:
         return max((fault.over_ns for fault in self.faults), default=0)
 
 
-def dumps(trial: Trial) -> str:
-    return msgspec.json.encode(trial).decode()
-
-
 def loads(line: str) -> Trial:
     """Decode a trial from JSON.
 
     Raises ConfigError if the line is not a trial.
     """
-    try:
-        trial = msgspec.json.decode(line, type=Trial)
-    except msgspec.DecodeError as error:
-        raise ConfigError(
-            f"expected a schedule of faults, as torture prints one ({error})"
-        ) from None
+    trial = engine.loads(line, Trial)
     for fault in trial.faults:
         where = RANGES[fault.kind].where
         if fault.where not in where:

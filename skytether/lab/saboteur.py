@@ -7,10 +7,10 @@ packets.
 
 from collections import Counter, deque
 from collections.abc import Sequence
-from heapq import heappop, heappush
 
 import numpy as np
 
+from skytether.lab.engine import HeldPackets
 from skytether.lab.faults import FaultKind, ScheduledFault
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS, seconds_to_ns
 from skytether.shared.endpoints.endpoint import Address, Datagram, Endpoint
@@ -24,7 +24,6 @@ SABOTEUR: Address = ("saboteur", 0)
 
 RECORDED = 2048
 """Number of newest packets of a direction that an attacker keeps for replay."""
-HELD_MAX = 65536
 FLOOD_NS = 10 * MILLISECOND_NS
 OTHER_SOCKET, STRANGERS_SOCKET, STRANGERS = 100, 200, 8
 """First number of the sockets that replay vehicles' packets; first number and count of the sockets
@@ -46,7 +45,7 @@ ASTRAY = 0.2
 """Share of copies and answers that go to a wrong destination."""
 
 
-class Saboteur(Endpoint):
+class Saboteur(HeldPackets):
     """Man in the middle between vehicles and netem: replays and alters packets, but cannot read
     them.
 
@@ -69,9 +68,6 @@ class Saboteur(Endpoint):
         """Newest packets of each direction, and the times at which they passed."""
         self.initiations: deque[bytes] = deque(maxlen=RECORDED)
         """Newest INITIATIONs of the vehicles."""
-        self._held: list[tuple[int, int, Datagram]] = []
-        """Heap of delayed packets: time of release, order, and packet."""
-        self._order = 0
         self._swift: set[ScheduledFault] = set()
         """Attackers whose copies of vehicles' packets reach the server before the originals."""
         self._copied: dict[int, Address] = {}
@@ -124,7 +120,7 @@ class Saboteur(Endpoint):
             self._pass("uplink", Datagram(payload, self._clients[socket]), now_ns)
         elif socket in self._copied:
             self._hand_on(payload, socket, now_ns)
-        self._release(now_ns)
+        super().wake(now_ns=now_ns)
 
     def wake(self, *, now_ns: int) -> None:
         if self._volley_ns is not None and now_ns >= self._volley_ns:
@@ -133,10 +129,10 @@ class Saboteur(Endpoint):
                 for _ in range(self._rng.poisson(fault.amount * FLOOD_NS / SECOND_NS)):
                     self._forge(fault.where)
             self._volley_ns = now_ns + FLOOD_NS if floods else None
-        self._release(now_ns)
+        super().wake(now_ns=now_ns)
 
     def next_wake_ns(self) -> int | None:
-        due_ns = self._held[0][0] if self._held else None
+        due_ns = super().next_wake_ns()
         if due_ns is None or (self._volley_ns is not None and self._volley_ns < due_ns):
             return self._volley_ns
         return due_ns
@@ -183,7 +179,7 @@ class Saboteur(Endpoint):
                     continue
             self.counts[f"packets: {fault.kind}"] += 1
         for _ in range(copies):
-            self._hold(now_ns + delay_ns, datagram)
+            self.hold(now_ns + delay_ns, datagram)
 
     def _replay(
         self, fault: ScheduledFault, datagram: Datagram, passed_ns: int, now_ns: int
@@ -196,7 +192,7 @@ class Saboteur(Endpoint):
             other = datagram.socket + OTHER_SOCKET
             datagram = datagram._replace(socket=other)
         self.counts[f"packets: {fault.kind}"] += 1
-        self._hold(again_ns, datagram)
+        self.hold(again_ns, datagram)
 
     def _copy(self, fault: ScheduledFault, direction: str, datagram: Datagram, now_ns: int) -> None:
         swift = fault in self._swift
@@ -211,7 +207,7 @@ class Saboteur(Endpoint):
         to, later_ns = (SERVER, NETEM)[self._rng.integers(2)], self._later_ns()
         if swift:
             to, later_ns = SERVER, 0
-        self._hold(now_ns + later_ns, Datagram(datagram.payload, to, socket))
+        self.hold(now_ns + later_ns, Datagram(datagram.payload, to, socket))
 
     def _hand_on(self, payload: bytes, socket: int, now_ns: int) -> None:
         """Forward the answer to a copied packet to its vehicle, sometimes twice."""
@@ -226,7 +222,7 @@ class Saboteur(Endpoint):
         if rng.random() < ASTRAY:
             client = list(self._clients.values())[rng.integers(len(self._clients))]
         socket = socket if rng.random() < 0.5 else 0
-        self._hold(now_ns + self._later_ns(), Datagram(payload, client, socket))
+        self.hold(now_ns + self._later_ns(), Datagram(payload, client, socket))
 
     def _later_ns(self) -> int:
         """Delay of a copy [ns]; half of the copies have none."""
@@ -264,15 +260,6 @@ class Saboteur(Endpoint):
         )
         self._out.append(Datagram(payload, to, socket))
         self.counts[f"packets: {FaultKind.FLOOD}"] += 1
-
-    def _hold(self, due_ns: int, datagram: Datagram) -> None:
-        if len(self._held) < HELD_MAX:
-            self._order += 1
-            heappush(self._held, (due_ns, self._order, datagram))
-
-    def _release(self, now_ns: int) -> None:
-        while self._held and self._held[0][0] <= now_ns:
-            self._out.append(heappop(self._held)[2])
 
 
 class Observer(Endpoint):

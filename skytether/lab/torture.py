@@ -25,7 +25,8 @@ from skytether.client.simulated.plant import FirstOrderPlant
 from skytether.client.simulated.sensor import Sensor
 from skytether.client.simulated.vehicle import SimulatedVehicle
 from skytether.client.simulated.weather import Weather
-from skytether.lab.faults import HARMLESS, FaultKind, ScheduledFault, Trial, schedule, shrink
+from skytether.lab.engine import shrink
+from skytether.lab.faults import HARMLESS, FaultKind, ScheduledFault, Trial, schedule
 from skytether.lab.invariants import (
     FLYING,
     Gatekeeper,
@@ -220,8 +221,6 @@ class TorturedVehicle:
     """Simulated vehicle, which persists through all runs of the client."""
     life: WatchedLife
     lives: int = 1
-    down: int = 0
-    """Number of active faults that keep its host down."""
 
 
 class Torture:

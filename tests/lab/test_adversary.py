@@ -22,19 +22,19 @@ from skytether.lab.adversary import (
     Climbed,
     Move,
     MoveKind,
+    Moves,
     MoveSampler,
     Near,
     Packet,
     Raid,
     climb,
-    dumps,
     fly,
-    loads,
     shrunk,
     spare_m,
 )
 from skytether.lab.commands import pool
 from skytether.lab.commands.adversary import Kept
+from skytether.lab.engine import dumps, loads
 from skytether.lab.lives import Body, world_s
 from skytether.server.missions.mission_planner import MissionPlanner
 from skytether.server.missions.mission_state import MissionState
@@ -369,7 +369,7 @@ def test_a_flight_comes_again_to_the_last_bit() -> None:
     )
     found = fly(FOUR, moves)
     assert math.isfinite(found.apart.distance_m)
-    assert fly(FOUR, loads(dumps(moves))) == found
+    assert fly(FOUR, loads(dumps(moves), Moves)) == found
 
 
 def test_the_fewest_moves_are_those_that_matter(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -394,8 +394,8 @@ def test_a_search_begins_elsewhere_with_another_number_and_comes_again() -> None
 
 def test_what_is_no_list_of_moves_is_refused() -> None:
     for line in ("[", '[{"kind":"rain"}]', dumps((replace(DIES, start_ns=-1),))):
-        with pytest.raises(ConfigError, match="moves: "):
-            loads(line)
+        with pytest.raises(ConfigError, match="expected a schedule"):
+            loads(line, Moves)
 
 
 SHORT = ("swap", "--reference.shape", "swap(4)", "--duration", "12")

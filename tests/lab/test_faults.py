@@ -6,16 +6,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from skytether.lab.engine import SHORTEST_NS, dumps, shrink
 from skytether.lab.faults import (
     RANGES,
-    SHORTEST_NS,
     FaultKind,
     ScheduledFault,
     Trial,
-    dumps,
     loads,
     schedule,
-    shrink,
 )
 from skytether.shared.base.chance import stream
 from skytether.shared.base.errors import ConfigError

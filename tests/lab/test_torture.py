@@ -26,7 +26,8 @@ from helpers import interpreted
 from skytether.__main__ import main
 from skytether.client.failsafe import LOCKING, TABLE
 from skytether.lab.commands import pool
-from skytether.lab.faults import RANGES, FaultKind, ScheduledFault, Trial, dumps, loads
+from skytether.lab.engine import dumps
+from skytether.lab.faults import RANGES, FaultKind, ScheduledFault, Trial, loads
 from skytether.lab.invariants import Violation, check_bounds
 from skytether.lab.torture import (
     CLOCK_NS,
@@ -547,7 +548,7 @@ def test_the_command_flies_seeds_in_processes_and_says_what_happened(tmp_path: P
 @pytest.mark.parametrize(
     ("argv", "said"),
     [
-        (["--schedule", "{"], "expected a schedule of faults"),
+        (["--schedule", "{"], "expected a schedule, as printed for a failure"),
         (["--schedule", "{}", "--seed", "1"], "got --seed and --schedule, expected one of them"),
         (["--hours", "-1"], "--hours: got -1, expected more than 0, at most 10000"),
         (["--seed", "-1"], "--seed: got -1, expected 0 to 4294967295"),

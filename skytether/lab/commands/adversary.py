@@ -20,14 +20,13 @@ from skytether.lab.adversary import (
     MoveKind,
     Moves,
     climb,
-    dumps,
     fly,
-    loads,
     shrunk,
     spare_m,
 )
 from skytether.lab.commands import tables
 from skytether.lab.commands.pool import Flags, Interrupted, crew, writing
+from skytether.lab.engine import dumps, loads
 from skytether.lab.journal import ENTRIES, digests
 from skytether.shared.base import input_files
 from skytether.shared.base.errors import ConfigError
@@ -171,7 +170,7 @@ def _moves(text: str) -> Moves:
         ConfigError: text or file has no valid moves.
     """
     if text.startswith("["):
-        return loads(text)
+        return loads(text, Moves)
     try:
         content = input_files.read(Path(text), ATTACK_BYTES_MAX)
         return msgspec.json.decode(content, type=Kept).nearest.moves

@@ -13,7 +13,8 @@ import msgspec
 
 from skytether.lab.commands import tables
 from skytether.lab.commands.pool import Flags, Interrupted, crew
-from skytether.lab.faults import Trial, dumps, loads
+from skytether.lab.engine import dumps
+from skytether.lab.faults import Trial, loads
 from skytether.lab.torture import TrialOutcome, fly, long_trial, short_trial, shrunk
 from skytether.shared.base import input_files
 from skytether.shared.base.errors import ConfigError
