@@ -74,13 +74,13 @@ def appended(path: Path, remark: str, lines: Iterator[str] | list[str]) -> None:
 
 
 def keep_schedules(said: str) -> None:
-    found = re.findall(r"^ +skytether torture --schedule (.+)$", said, re.MULTILINE)
+    found = re.findall(r"^ +python -m fuzz\.torture --schedule (.+)$", said, re.MULTILINE)
     lines = [word for line in found for word in shlex.split(line)]
     appended(TORTURED, f"Found by a night, {TODAY}.", lines)
 
 
 def keep_attacks(said: str) -> None:
-    found = re.findall(r"^ +skytether (adversary .+)$", said, re.MULTILINE)
+    found = re.findall(r"^ +python -m fuzz\.(adversary .+)$", said, re.MULTILINE)
     appended(ATTACKS, f"Found by a night, {TODAY}.", found)
 
 
@@ -114,14 +114,14 @@ def parts(seconds: float) -> list[Part]:
     new = [
         Part(
             "torture",
-            f"{BIN}skytether torture --runs 50 --seed SEED",
+            f"{BIN}python -m fuzz.torture --runs 50 --seed SEED",
             seconds,
             r"│ flights +│ +(\d+)",
             keep_schedules,
         ),
         Part(
             "adversary",
-            f"{BIN}skytether adversary MISSION --seed SEED --runs 20 --with covered",
+            f"{BIN}python -m fuzz.adversary MISSION --seed SEED --runs 20 --with covered",
             seconds,
             r"│ flights +│ +(\d+)",
             keep_attacks,

@@ -6,8 +6,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from skytether.lab import lives
-from skytether.lab.lives import world_s
+from fuzz.adversary import lives
+from fuzz.adversary.lives import world_s
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS, seconds_to_ns
 from skytether.shared.missions.zones import Zones
 from skytether.shared.scenario.whole import Scenario

@@ -76,14 +76,6 @@ COMMANDS_IN_GROUPS = {
             "whether its loop is stable, and with which vehicles",
             "skytether.lab.commands.margins:margins",
         ),
-        "torture": (
-            "flights under faults and attacks: is all of it safe?",
-            "skytether.lab.commands.torture:torture",
-        ),
-        "adversary [MISSION]": (
-            "a search for faults that bring vehicles too close",
-            "skytether.lab.commands.adversary:adversary",
-        ),
         "identify KIND": (
             "a vehicle's gain, time constant and dead time",
             "skytether.lab.commands.identify:identify",

@@ -22,7 +22,7 @@ ALL = (
     *("gym", "lab", "ulog"),
 )
 LAB = (
-    *("sweep", "margins", "identify", "torture", "adversary", "reproduce"),
+    *("sweep", "margins", "identify", "reproduce"),
     *("compare", "calibrate"),
 )
 BARE = ("client", "netem", "keygen", "set", "probe", "completion", "list")

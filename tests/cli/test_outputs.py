@@ -38,11 +38,6 @@ LINES = {
     "sweep --out": "sweep SCENARIO --runs 1 OUT/runs.csv",
     "margins --json": "margins SCENARIO --runs 1 OUT",
     "identify --out": "identify --scenario SCENARIO OUT/scenario.toml",
-    "torture --json": "torture --replay SCHEDULES OUT",
-    "adversary --json": "adversary swap --attack ATTACK OUT",
-    "adversary --out": (
-        "adversary swap --reference.shape mission --reference.file MISSION OUT/journal.jsonl"
-    ),
     "reproduce --out": "reproduce --quick --plugin PLUGIN OUT/report.html",
     "compare --out": "compare --quick --weights WEIGHTS OUT/report.html",
     "calibrate --out": "calibrate SCENARIO --objective rmse OUT/best.toml",
@@ -112,8 +107,6 @@ def inputs(tmp_path: Path, recording: Path) -> dict[str, Path]:
     made = {
         "SCENARIO": folder / "scenario.toml",
         "MISSION": folder / "mission.csv",
-        "SCHEDULES": folder / "schedules.txt",
-        "ATTACK": folder / "attack.json",
         "PLUGIN": folder / "plugin.py",
         "WEIGHTS": folder / "weights.toml",
         "RECORDING": folder / "flight.mcap",
@@ -122,10 +115,6 @@ def inputs(tmp_path: Path, recording: Path) -> dict[str, Path]:
     }
     made["SCENARIO"].write_text(SCENARIO)
     made["MISSION"].write_text("vehicle,t,x,y\n1,0,0,0\n2,0,5,0\n")
-    made["SCHEDULES"].write_text(
-        Path(__file__).parents[1].joinpath("torture_seeds.txt").read_text()
-    )
-    made["ATTACK"].write_text("{}")
     made["PLUGIN"].write_text(
         "from skytether.plugin import reference\nimport numpy as np\n"
         "@reference\ndef still(scenario):\n"

@@ -1,6 +1,7 @@
 """Adversary: effects of its moves, planted faults that it must find, and reproducibility."""
 
 import math
+import re
 import shlex
 import signal
 from collections.abc import Callable
@@ -12,30 +13,25 @@ import msgspec
 import numpy as np
 import pytest
 
-import skytether.lab.commands.adversary as commands
-from skytether.__main__ import main
-from skytether.lab.adversary import (
+from fuzz.adversary import __main__ as commands
+from fuzz.adversary.climb import Climb, Climbed, MoveSampler, climb
+from fuzz.adversary.lives import Body, world_s
+from fuzz.adversary.raid import (
     COVERED,
     HAS_STANDBY,
     AdversaryNetwork,
-    Climb,
-    Climbed,
     Move,
     MoveKind,
     Moves,
-    MoveSampler,
     Near,
     Packet,
     Raid,
-    climb,
     fly,
     shrunk,
     spare_m,
 )
+from fuzz.engine import dumps, loads
 from skytether.lab.commands import pool
-from skytether.lab.commands.adversary import Kept
-from skytether.lab.engine import dumps, loads
-from skytether.lab.lives import Body, world_s
 from skytether.server.missions.mission_planner import MissionPlanner
 from skytether.server.missions.mission_state import MissionState
 from skytether.server.missions.vehicle_motions import VehicleMotions
@@ -50,6 +46,7 @@ from skytether.shared.scenario import reading
 from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import parse
 from skytether.shell.commandline import command
+from skytether.shell.commandline.command import CommandError
 from skytether.sim.flight import SERVER, STANDBY
 from skytether.sim.world import World
 
@@ -347,8 +344,10 @@ def recorded() -> list[str]:
     ],
 )
 def test_attacks_that_succeeded_once_succeed_no_more(line: str) -> None:
-    """The command ends with 1 if a required distance is violated."""
-    assert main(shlex.split(line)) == 0
+    """The command fails if a required distance is violated."""
+    name, *argv = shlex.split(line)
+    assert name == "adversary"
+    commands.main(argv)
 
 
 # -- reproducibility -----------------------------------------------------------------------------
@@ -403,43 +402,39 @@ SHORT = ("swap", "--reference.shape", "swap(4)", "--duration", "12")
 
 @pytest.mark.usefixtures("here")
 def test_the_command_prints_what_flies_it_again(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     heedless(monkeypatch)
     monkeypatch.setattr(commands, "shrunk", lambda _, found: found)
-    kept = tmp_path / "found.json"
-    search = (*SHORT, "--with", "zones", "--runs", "2", "--json", str(kept))
-    assert main(["adversary", *search]) == 1
+    with pytest.raises(CommandError, match="a required distance was violated"):
+        commands.main([*SHORT, "--with", "zones", "--runs", "2"])
     printed = capsys.readouterr().out
-    (again,) = (line for line in printed.splitlines() if line.startswith("    skytether "))
-    nearest = msgspec.json.decode(kept.read_bytes(), type=Kept).nearest
-    assert f"{nearest.apart.distance_m:.3f}" in printed
-    for attack, shown in (
-        (again, "zones"),
-        (
-            f"skytether adversary {shlex.join(SHORT)} --attack {kept}",
-            f"{nearest.apart.distance_m:.3f}",
-        ),
-    ):
-        assert main(shlex.split(attack)[1:]) == 1
-        assert shown in capsys.readouterr().out
+    (again,) = (line for line in printed.splitlines() if line.startswith("    python "))
+    (least_m,) = re.findall(r"fewest moves, (.*) m:", printed)
+    python, module, name, *argv = shlex.split(again)
+    assert (python, module, name) == ("python", "-m", "fuzz.adversary")
+    with pytest.raises(CommandError, match="a required distance was violated"):
+        commands.main(argv)
+    printed = capsys.readouterr().out
+    assert "zones" in printed
+    assert least_m in printed
 
 
 @pytest.mark.usefixtures("here")
 def test_the_command_ends_well_where_all_distances_are_kept(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    assert main(["adversary", *SHORT, "--with", "losses,copies", "--runs", "2", "--random"]) == 0
+    commands.main([*SHORT, "--with", "losses,copies", "--runs", "2", "--random"])
     assert "2, with losses,copies" in capsys.readouterr().out
 
 
 @pytest.mark.usefixtures("here")
 def test_a_search_that_is_interrupted_shows_what_was_flown_and_goes_on(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(commands, "CLIMB", 1)
     monkeypatch.setattr(pool, "UNDER_WAY_MAX", 1)
-    kept, climbed = tmp_path / "found.json", list[int]()
+    climbed = list[int]()
 
     def interrupt(task: Climb) -> Climbed:
         climbed.append(task.number)
@@ -448,15 +443,14 @@ def test_a_search_that_is_interrupted_shows_what_was_flown_and_goes_on(
         return climb(task)
 
     monkeypatch.setattr(commands, "climb", interrupt)
-    search = (*SHORT, "--with", "losses", "--runs", "2", "--json", str(kept))
-    search += ("--out", str(tmp_path / "climbs"))
-    assert main(["adversary", *search]) == command.INTERRUPTED
-    one = msgspec.json.decode(kept.read_bytes(), type=Kept)
-    assert main(["adversary", *search]) == 0
-    both = msgspec.json.decode(kept.read_bytes(), type=Kept)
+    search = (*SHORT, "--with", "losses", "--runs", "2", "--out", str(tmp_path / "climbs"))
+    with pytest.raises(CommandError, match="interrupted with 1 of 2 flights done") as early:
+        commands.main(search)
+    assert early.value.code == command.INTERRUPTED
+    assert "1, with losses" in capsys.readouterr().out
+    commands.main(search)
     assert climbed == [0, 1]
-    assert both.spares_m[:1] == one.spares_m
-    assert main(["adversary", *SHORT, "--attack", str(kept)]) == 0
+    assert "2, with losses" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
@@ -468,14 +462,12 @@ def test_a_search_that_is_interrupted_shows_what_was_flown_and_goes_on(
             "--with: got rain, expected covered, or some of delays,losses",
         ),
         (("swap", "--runs", "0"), "--runs: got 0, expected 1 to"),
-        (("swap", "--attack", "nowhere.json"), "--attack: nowhere.json: No such file"),
     ],
 )
-def test_what_cannot_be_searched_is_refused(
-    options: tuple[str, ...], said: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["adversary", *options]) == 2
-    assert said in capsys.readouterr().err
+def test_what_cannot_be_searched_is_refused(options: tuple[str, ...], said: str) -> None:
+    with pytest.raises(CommandError, match=said) as refused:
+        commands.main(options)
+    assert refused.value.code == command.CONFIGURATION
 
 
 @pytest.mark.long

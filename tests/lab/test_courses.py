@@ -6,9 +6,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from fuzz.torture.courses import FollowedCourse, PlannedCourse
 from skytether.client.compensator import Compensator
 from skytether.client.followers import Constants, Follower, HorizonFollower, SplineFollower
-from skytether.lab.courses import FollowedCourse, PlannedCourse
 from skytether.server.planning.scheme import Foresight
 from skytether.server.schemes import trajectory
 from skytether.server.schemes.committed import Replay

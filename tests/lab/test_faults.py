@@ -1,4 +1,4 @@
-"""`lab.faults`: schedules of faults are drawn, shrunk, written and read."""
+"""`torture.faults`: schedules of faults are drawn, shrunk, written and read."""
 
 from dataclasses import replace
 
@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from skytether.lab.engine import SHORTEST_NS, dumps, shrink
-from skytether.lab.faults import (
+from fuzz.engine import SHORTEST_NS, dumps, shrink
+from fuzz.torture.faults import (
     RANGES,
     FaultKind,
     ScheduledFault,

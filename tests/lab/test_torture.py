@@ -1,9 +1,7 @@
 """Torture: trials, the faults found when a guard is switched off, and reproducibility."""
 
-import json
 import os
-import subprocess
-import sys
+import re
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
@@ -18,18 +16,14 @@ import skytether.client.endpoint
 import skytether.client.failsafe
 import skytether.client.pilot
 import skytether.client.secure
-import skytether.lab.commands.torture
-import skytether.lab.torture
 import skytether.netem.places
 import skytether.shared.wire.channel
-from helpers import interpreted
-from skytether.__main__ import main
-from skytether.client.failsafe import LOCKING, TABLE
-from skytether.lab.commands import pool
-from skytether.lab.engine import dumps
-from skytether.lab.faults import RANGES, FaultKind, ScheduledFault, Trial, loads
-from skytether.lab.invariants import Violation, check_bounds
-from skytether.lab.torture import (
+from fuzz.engine import dumps
+from fuzz.torture import __main__ as commands
+from fuzz.torture import trials
+from fuzz.torture.faults import RANGES, FaultKind, ScheduledFault, Trial, loads
+from fuzz.torture.invariants import Violation, check_bounds
+from fuzz.torture.trials import (
     CLOCK_NS,
     TrialOutcome,
     fly,
@@ -38,10 +32,14 @@ from skytether.lab.torture import (
     short_trial,
     shrunk,
 )
+from helpers import interpreted
+from skytether.client.failsafe import LOCKING, TABLE
+from skytether.lab.commands import pool
 from skytether.netem.proxy import Proxy
 from skytether.server.reception import Reception
 from skytether.server.sessions import Session
 from skytether.server.tick import Ticker
+from skytether.shared.base.errors import ConfigError
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.endpoints.endpoint import Datagram, Endpoint
 from skytether.shared.law import rule, spline
@@ -290,7 +288,7 @@ def no_steady(patch: pytest.MonkeyPatch) -> None:
     def as_it_is(endpoint: Endpoint) -> Endpoint:
         return endpoint
 
-    patch.setattr(skytether.lab.torture, "Steady", as_it_is)
+    patch.setattr(trials, "Steady", as_it_is)
 
 
 def no_latch(patch: pytest.MonkeyPatch) -> None:
@@ -516,50 +514,36 @@ def test_a_container_without_a_bound_is_found() -> None:
 # -- the command -----------------------------------------------------------------------------
 
 
-def run(*argv: str) -> "subprocess.CompletedProcess[str]":
-    line = [sys.executable, "-P", "-m", "skytether", "torture", *argv]
-    return subprocess.run(line, capture_output=True, text=True, check=False)
-
-
+@pytest.mark.parametrize("in_processes", [False, pytest.param(True, marks=[pytest.mark.long])])
+@pytest.mark.usefixtures("here")
 def test_the_command_counts_what_its_flights_met(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    in_processes: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(pool, "_executor", lambda _: pool._thread())
-    path = tmp_path / "counts.json"
-    argv = ["torture", "--seed", "2", "--runs", "1", "--workers", "1", "--json", str(path)]
-    assert main(argv) == 0
-    said = json.loads(path.read_text())
-    assert (said["flights"], said["failed"], said["failures"]) == (1, 0, [])
-    assert said["counts"]["steps"] == fly(short_trial(2)).counts["steps"]
-
-
-@pytest.mark.long
-def test_the_command_flies_seeds_in_processes_and_says_what_happened(tmp_path: Path) -> None:
-    path = tmp_path / "counts.json"
-    done = run("--seed", "1", "--runs", "3", "--workers", "2", "--json", str(path))
-    assert done.returncode == 0, done.stderr
-    assert "torture from seed 1" in done.stdout
-    said = json.loads(path.read_text())
-    outcomes = [fly(short_trial(seed)) for seed in (1, 2, 3)]
-    assert (said["flights"], said["failed"], said["failures"]) == (3, 0, [])
-    assert said["counts"]["steps"] == sum(outcome.counts["steps"] for outcome in outcomes)
+    if not in_processes:
+        monkeypatch.setattr(pool, "_executor", lambda _: pool._thread())
+    commands.main(["--seed", "1", "--runs", "2", "--workers", "2"])
+    printed = capsys.readouterr().out
+    assert "torture from seed 1" in printed
+    counted = re.findall(r"│ (flights|steps) +│ +(\d+)", printed)
+    steps = sum(fly(short_trial(seed)).counts["steps"] for seed in (1, 2))
+    assert counted == [("flights", "2"), ("steps", str(steps))]
 
 
 @pytest.mark.parametrize(
-    ("argv", "said"),
+    ("argv", "error", "said"),
     [
-        (["--schedule", "{"], "expected a schedule, as printed for a failure"),
-        (["--schedule", "{}", "--seed", "1"], "got --seed and --schedule, expected one of them"),
-        (["--hours", "-1"], "--hours: got -1, expected more than 0, at most 10000"),
-        (["--seed", "-1"], "--seed: got -1, expected 0 to 4294967295"),
-        (["--replay", "/nowhere"], "--replay: /nowhere: "),
+        (["--schedule", "{"], ConfigError, "expected a schedule, as printed for a failure"),
+        (["--schedule", "{}", "--seed", "1"], CommandError, "expected neither --seed nor --hours"),
+        (["--hours", "-1"], CommandError, "--hours: got -1, expected more than 0, at most 10000"),
+        (["--seed", "-1"], CommandError, "--seed: got -1, expected 0 to 4294967295"),
+        (["--schedule", "/nowhere"], CommandError, "--schedule: /nowhere: "),
     ],
 )
 def test_what_cannot_be_flown_is_refused(
-    argv: list[str], said: str, capsys: pytest.CaptureFixture[str]
+    argv: list[str], error: type[Exception], said: str
 ) -> None:
-    assert main(["torture", *argv]) == 2
-    assert said in capsys.readouterr().err
+    with pytest.raises(error, match=said):
+        commands.main(argv)
 
 
 @pytest.mark.usefixtures("here")
@@ -570,10 +554,10 @@ def test_a_failure_is_printed_with_its_schedule_and_flies_again(
     file = tmp_path / "seeds.txt"
     frozen = Trial(1, (fault(FaultKind.FREEZE, "client", 5, 0.6),))
     file.write_text(f"# two\n{dumps(Trial(1, ()))}\n{dumps(frozen)}\n")
-    for argv in (["--replay", str(file)], ["--schedule", dumps(frozen)]):
+    for argv in (["--schedule", str(file)], ["--schedule", dumps(frozen)]):
         with pytest.raises(CommandError, match=r"1 of (1 flight|2 flights) failed") as refused:
-            skytether.lab.commands.torture.torture(argv)
+            commands.main(argv)
         assert refused.value.code == 1
         printed = capsys.readouterr().out
         assert "asleep: " in printed
-        assert 'skytether torture --schedule \'{"seed":1,' in printed
+        assert 'python -m fuzz.torture --schedule \'{"seed":1,' in printed

@@ -8,11 +8,11 @@ import msgspec
 import numpy as np
 import pytest
 
+from fuzz.adversary.lives import Lives
+from fuzz.adversary.raid import Move, MoveKind, Raid, spare_m
 from helpers import packaged
 from skytether.client import failsafe
 from skytether.client.failsafe import FOLLOWING
-from skytether.lab.adversary import Move, MoveKind, Raid, spare_m
-from skytether.lab.lives import Lives
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS, seconds_to_ns
 from skytether.shared.events.flight import Leaving, SteppedLate
 from skytether.shared.missions.events import LeftMotion

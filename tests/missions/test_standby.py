@@ -6,10 +6,11 @@ import msgspec
 import numpy as np
 import pytest
 
+from fuzz.adversary.climb import Climb, climb
+from fuzz.adversary.lives import Lives
+from fuzz.adversary.raid import AdversaryNetwork, Move, MoveKind, Raid, spare_m
 from helpers import packaged
 from skytether.client.endpoint import Client
-from skytether.lab.adversary import AdversaryNetwork, Climb, Move, MoveKind, Raid, climb, spare_m
-from skytether.lab.lives import Lives
 from skytether.server.missions.led_vehicles import LedVehicles
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.events.flight import SessionRefused

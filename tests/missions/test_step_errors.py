@@ -13,8 +13,8 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
+from fuzz.adversary.lives import Lives
 from helpers import packaged
-from skytether.lab.lives import Lives
 from skytether.netem.fate import Fates
 from skytether.netem.impairments.direction import impairments
 from skytether.netem.proxy import Proxy

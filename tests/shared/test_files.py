@@ -16,7 +16,6 @@ from skytether.cli.join import join
 from skytether.cli.report import report
 from skytether.client.__main__ import fly as client
 from skytether.lab.commands.margins import margins
-from skytether.lab.commands.torture import torture
 from skytether.netem.__main__ import emulate
 from skytether.server.__main__ import serve
 from skytether.shared.base import files
@@ -29,7 +28,6 @@ CALLS: list[tuple[Any, tuple[str, ...], str]] = [
     (fly, ("demo", *SHORT, "--figure"), ".png"),
     (fleet, ("fleet", "--virtual", "--json"), ""),
     (margins, ("demo", "--json"), ""),
-    (torture, ("--runs", "1", "--json"), ""),
     (client, ("demo", "--record"), ""),
     (client, ("demo", "--json"), ""),
     (serve, ("demo", "--record"), ""),

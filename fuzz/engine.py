@@ -1,12 +1,17 @@
-"""What torture and adversary share: schedules that shrink and are lines of JSON, held packets."""
+"""What torture and adversary share: schedules that shrink and are lines of JSON, packets that a
+network holds back, and flights on all cores.
+"""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Hashable, Mapping, Sequence
 from dataclasses import replace
 from heapq import heappop, heappush
+from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Protocol, TypeVar, cast
 
 import msgspec
 
+from skytether.lab.commands.pool import Flags, Interrupted, crew, writing
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.base.units import MILLISECOND_NS
 from skytether.shared.endpoints.endpoint import Datagram, Endpoint
@@ -26,6 +31,9 @@ class Timed(Protocol):
 
 T = TypeVar("T", bound=Timed)
 S = TypeVar("S")
+K = TypeVar("K", bound=Hashable)
+Item = TypeVar("Item")
+R = TypeVar("R")
 
 
 def shrink(schedule: Sequence[T], fails: Callable[[tuple[T, ...]], bool]) -> tuple[T, ...]:
@@ -92,3 +100,40 @@ class HeldPackets(Endpoint):
 
     def next_wake_ns(self) -> int | None:
         return self._held[0][0] if self._held else None
+
+
+def flown(
+    fly: Callable[[Item], R],
+    items: Mapping[K, Item],
+    kind: type[R],
+    title: str,
+    workers: int | None,
+    *,
+    settings: Mapping[str, Any] = MappingProxyType({}),
+    out: Path | None = None,
+    size: Callable[[Item], float] = lambda _: 1.0,
+    tell: Callable[[Collection[R]], str],
+) -> tuple[list[R], str]:
+    """Results of all items in order, or of those done before Ctrl-C with a sentence that says so.
+
+    Args:
+        fly: flies an item; called in a worker.
+        size: number of flights of an item.
+        kind, settings, out, tell: see `Crew.study`.
+
+    Raises:
+        CommandError: interrupted before any result.
+    """
+    flags, total = Flags(workers), sum(map(size, items.values()))
+    flags.check()
+    try:
+        with writing(out), crew(flags, title, total, "flights") as flyers:
+            results = flyers.study(fly, items, kind, settings, out, size=size, tell=tell)
+            return list(results.values()), ""
+    except Interrupted as early:
+        if not early.results:
+            raise
+        done = [key for key in items if key in early.results]
+        flights = sum(size(items[key]) for key in done)
+        message = f"interrupted with {flights:.0f} of {total:.0f} flights done"
+        return [early.results[key] for key in done], message

@@ -4,7 +4,7 @@
                observer ────┘
 
 The scenario is drawn from a trial's seed, and the faults are part of the trial, so every trial is
-reproducible. A failure is a `Violation` of an invariant (`lab.invariants`), or an exception of an
+reproducible. A failure is a `Violation` of an invariant (`invariants`), or an exception of an
 endpoint. A vehicle that has landed is restarted after a while, as an operator would do.
 """
 
@@ -17,6 +17,17 @@ from typing import Any
 import msgspec
 import numpy as np
 
+from fuzz.engine import shrink
+from fuzz.torture.faults import HARMLESS, FaultKind, ScheduledFault, Trial, schedule
+from fuzz.torture.invariants import (
+    FLYING,
+    Gatekeeper,
+    Ledger,
+    Violation,
+    WatchedLife,
+    check_bounds,
+)
+from fuzz.torture.saboteur import NETEM, OBSERVER, SABOTEUR, SERVER, Observer, Saboteur
 from skytether.client import secure as client_secure
 from skytether.client.endpoint import Client
 from skytether.client.failsafe import GOOD_NS
@@ -25,17 +36,6 @@ from skytether.client.simulated.plant import FirstOrderPlant
 from skytether.client.simulated.sensor import Sensor
 from skytether.client.simulated.vehicle import SimulatedVehicle
 from skytether.client.simulated.weather import Weather
-from skytether.lab.engine import shrink
-from skytether.lab.faults import HARMLESS, FaultKind, ScheduledFault, Trial, schedule
-from skytether.lab.invariants import (
-    FLYING,
-    Gatekeeper,
-    Ledger,
-    Violation,
-    WatchedLife,
-    check_bounds,
-)
-from skytether.lab.saboteur import NETEM, OBSERVER, SABOTEUR, SERVER, Observer, Saboteur
 from skytether.netem.proxy import Proxy
 from skytether.server import secure as server_secure
 from skytether.server.endpoint import Server

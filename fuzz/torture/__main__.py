@@ -1,21 +1,19 @@
-"""`skytether torture`: encrypted flights through faults and attacks, with checked invariants."""
+"""`python -m fuzz.torture`: encrypted flights through faults and attacks, all of them checked."""
 
 import math
 import secrets
 import shlex
+import sys
 from collections import Counter
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-import msgspec
-
+from fuzz.engine import dumps, flown
+from fuzz.torture.faults import Trial, loads
+from fuzz.torture.trials import TrialOutcome, fly, long_trial, short_trial, shrunk
 from skytether.lab.commands import tables
-from skytether.lab.commands.pool import Flags, Interrupted, crew
-from skytether.lab.engine import dumps
-from skytether.lab.faults import Trial, loads
-from skytether.lab.torture import TrialOutcome, fly, long_trial, short_trial, shrunk
 from skytether.shared.base import input_files
 from skytether.shared.base.errors import ConfigError
 from skytether.shell.commandline import command, terminal
@@ -26,13 +24,12 @@ from skytether.shell.commandline.options import read
 SEEDS = 2**32
 HOURS_MAX = 10_000
 SCHEDULES_BYTES_MAX = 64_000_000
-TOLD_MAX = 10
+SHOWN_MAX = 10
+"""Number of failures that are shrunk and printed."""
 
 
 @dataclass(frozen=True)
 class TortureOptions:
-    """Options of `skytether torture`."""
-
     seed: Annotated[int | None, Argument(metavar="N")] = None
     """First seed; random unless given."""
     runs: Annotated[int, Argument(metavar="N")] = 100
@@ -41,15 +38,12 @@ class TortureOptions:
     """Number of hours to fly instead, in flights of an hour with faults throughout."""
     workers: Annotated[int | None, Argument(metavar="N")] = None
     """Number of worker processes; one per core unless given."""
-    replay: Path | None = None
-    """File with one schedule per line, flown instead of random ones."""
-    schedule: str | None = None
-    """Schedule to fly instead of random ones, as printed for a failure."""
-    json: Path | None = None
-    """File for the counters, and for the failures."""
+    schedule: Annotated[str | None, Argument(metavar="JSON|FILE")] = None
+    """Schedule to fly instead of random ones, as printed for a failure, or a file with one a line.
+    """
 
 
-def torture(argv: Sequence[str]) -> None:
+def main(argv: Sequence[str]) -> None:
     """Fly server, netem and clients in virtual time, encrypted, under random faults and attacks.
 
     Packets are lost, duplicated, delayed, altered, recorded and replayed; hosts freeze, restart,
@@ -59,26 +53,22 @@ def torture(argv: Sequence[str]) -> None:
     schedule is shrunk to the shortest that fails in the same way, and printed; --schedule flies it
     again.
     """
-    options = read(TortureOptions(), argv, "skytether torture", torture.__doc__)
+    options = read(TortureOptions(), argv, "python -m fuzz.torture", main.__doc__)
     command.check_count("--runs", options.runs, 10**6)
-    command.claim_output("--json", options.json)
-    pool = Flags(workers=options.workers)
-    pool.check()
     trials, title = _trials(options)
-    done: Collection[TrialOutcome] = ()
-    interrupted = ""
-    try:
-        with crew(pool, title, len(trials), "flights") as flyers:
-            done = flyers.study(fly, dict(enumerate(trials)), tell=_failures).values()
-            failed = [each for each in done if each.failure]
-            failed[:TOLD_MAX] = flyers.map(shrunk, failed[:TOLD_MAX])
-    except Interrupted as early:
-        done = done or early.results.values()
-        interrupted = (
-            f"interrupted with {len(done)} of {terminal.counted(len(trials), 'flight')} done"
-        )
-        failed = [each for each in done if each.failure]
-    _finish(options, title, done, failed)
+    done, interrupted = flown(
+        fly, dict(enumerate(trials)), TrialOutcome, title, options.workers, tell=_failures
+    )
+    counts: Counter[str] = Counter()
+    for outcome in done:
+        counts.update(outcome.counts)
+    flown_h = sum(outcome.flown_s for outcome in done) / 3600.0
+    rows = [("flights", f"{len(done)}, {flown_h:.2f} h in virtual time")]
+    tables.show(title, (), [*rows, *sorted(counts.items())])
+    failed = [each for each in done if each.failure]
+    for outcome in map(shrunk, failed[:SHOWN_MAX]):
+        print(f"seed {outcome.trial.seed}: {outcome.failure}")
+        print(f"    python -m fuzz.torture --schedule {shlex.quote(dumps(outcome.trial))}")
     if failed:
         message = f"{len(failed)} of {terminal.counted(len(done), 'flight')} failed"
         raise CommandError(f"{interrupted}, and {message}" if interrupted else message)
@@ -98,15 +88,13 @@ def _trials(options: TortureOptions) -> tuple[list[Trial], str]:
         CommandError: the options are impossible, or exclude each other.
         ConfigError: a text is not a schedule.
     """
-    asked = ("seed", "hours", "replay", "schedule")
-    given_options = [name for name in asked if getattr(options, name) is not None]
-    if len(given_options) > 1 and given_options != ["seed", "hours"]:
-        together = " and ".join(f"--{name}" for name in given_options)
-        raise CommandError(f"got {together}, expected one of them", command.CONFIGURATION)
     if options.schedule is not None:
-        return [loads(options.schedule)], "torture by a schedule"
-    if options.replay is not None:
-        return _read(options.replay), f"torture by {options.replay}"
+        if options.seed is not None or options.hours is not None:
+            message = "--schedule: expected neither --seed nor --hours beside it"
+            raise CommandError(message, command.CONFIGURATION)
+        if options.schedule.startswith("{"):
+            return [loads(options.schedule)], "torture by a schedule"
+        return _read(Path(options.schedule)), f"torture by {options.schedule}"
     seed = secrets.randbelow(SEEDS) if options.seed is None else options.seed
     if not 0 <= seed < SEEDS:
         expected = f"expected 0 to {SEEDS - 1}"
@@ -127,45 +115,21 @@ def _read(path: Path) -> list[Trial]:
 
     Raises:
         CommandError: the file cannot be read.
-        ConfigError: a line is not a schedule, or the file has none.
+        ConfigError: a line is not a schedule.
     """
     try:
         lines = input_files.read(path, SCHEDULES_BYTES_MAX).decode().splitlines()
     except (OSError, UnicodeDecodeError) as error:
-        raise CommandError(f"--replay: {path}: {error}", command.CONFIGURATION) from None
+        raise CommandError(f"--schedule: {path}: {error}", command.CONFIGURATION) from None
     trials = []
     for number, line in enumerate(lines, 1):
         if line.strip() and not line.startswith("#"):
             try:
                 trials.append(loads(line))
             except ConfigError as error:
-                raise ConfigError(f"--replay: {path}: line {number}: {error}") from None
-    if not trials:
-        raise ConfigError(f"{path}: no schedules, expected one a line")
+                raise ConfigError(f"--schedule: {path}: line {number}: {error}") from None
     return trials
 
 
-def _finish(
-    options: TortureOptions, title: str, done: Collection[TrialOutcome], failed: list[TrialOutcome]
-) -> None:
-    counts: Counter[str] = Counter()
-    for outcome in done:
-        counts.update(outcome.counts)
-    flown_s = sum(outcome.flown_s for outcome in done)
-    if options.json is not None:
-        figures = {
-            "title": title,
-            "flights": len(done),
-            "flown_s": flown_s,
-            "failed": len(failed),
-            "counts": dict(sorted(counts.items())),
-            "failures": failed,
-        }
-        command.write(options.json, msgspec.json.encode(figures))
-    rows = [("flights", f"{len(done)}, {flown_s / 3600:.2f} h in virtual time")]
-    tables.show(title, (), [*rows, *sorted(counts.items())])
-    for outcome in failed[:TOLD_MAX]:
-        print(f"seed {outcome.trial.seed}: {outcome.failure}")
-        print(f"    skytether torture --schedule {shlex.quote(dumps(outcome.trial))}")
-    if len(failed) > TOLD_MAX:
-        print(f"and {len(failed) - TOLD_MAX} more, in the file of --json")
+if __name__ == "__main__":
+    sys.exit(command.main(main, sys.argv[1:], "torture"))

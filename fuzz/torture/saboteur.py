@@ -1,7 +1,7 @@
 """Attackers: a man in the middle between vehicles and netem, and an observer on another host.
 
-Neither can read packets. Without an active fault (`lab.faults`) packets pass unchanged. During a
-fault they are lost, duplicated, delayed, altered or replayed, or an attacker sends additional
+Neither can read packets. Without an active fault (`faults`) packets pass unchanged. During a fault
+they are lost, duplicated, delayed, altered or replayed, or an attacker sends additional
 packets.
 """
 
@@ -10,8 +10,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from skytether.lab.engine import HeldPackets
-from skytether.lab.faults import FaultKind, ScheduledFault
+from fuzz.engine import HeldPackets
+from fuzz.torture.faults import FaultKind, ScheduledFault
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS, seconds_to_ns
 from skytether.shared.endpoints.endpoint import Address, Datagram, Endpoint
 from skytether.shared.wire.channel import kind as kind_of

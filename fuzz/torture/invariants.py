@@ -1,4 +1,4 @@
-"""Checks of the safety invariants at every step of every vehicle in `skytether torture`.
+"""Checks of the safety invariants at every step of every vehicle in `fuzz.torture`.
 
 A `WatchedLife` wraps the link of one run of a client and receives the client's record, so it sees
 every message that the vehicle accepts and every input that it flies. A `Gatekeeper` wraps the gate
@@ -16,11 +16,11 @@ from typing import Any
 import msgpack
 import numpy as np
 
+from fuzz.torture.courses import Course, FollowedCourse, PlannedCourse
 from skytether.client.failsafe import GOOD_NS, STALL_NS, TABLE
 from skytether.client.leadership import ASK_SHARE
 from skytether.client.link import ClientLink
 from skytether.client.pilot import LAND_MPS
-from skytether.lab.courses import Course, FollowedCourse, PlannedCourse
 from skytether.server.gate import Gate, GateCall, ReplyPath
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS, seconds_to_ns
 from skytether.shared.endpoints.endpoint import EVENTS_MAX, Datagram
