@@ -19,6 +19,7 @@ from typing import NamedTuple
 
 import daqp
 import numpy as np
+from numpy.typing import NDArray
 
 from skytether.server.missions.half_planes import HalfPlanes
 from skytether.shared.law.model import Array, Indices
@@ -49,7 +50,7 @@ class MotionProblem(NamedTuple):
     """Rows: rest at the end, inputs at the ends and the beginnings of intervals, half-planes."""
     upper: Array
     lower: Array
-    sense: Indices
+    sense: NDArray[np.int32]
     """Kind of each constraint, as DAQP numbers them."""
 
 
@@ -80,7 +81,8 @@ class TrajectoryQP:
         self._to_gradient = to_position.T * weights
         """Linear term from the distances to the targets [s²]; shape (N, N)."""
         one = self._to_gradient @ to_position
-        self._hessian = np.kron(np.eye(axes), one + ACCELERATION_WEIGHT * np.eye(n))
+        hessian = np.kron(np.eye(axes), one + ACCELERATION_WEIGHT * np.eye(n))
+        self._hessian = hessian.astype(np.float64)
         # Inputs v + τ a at the end and at the beginning of each interval.
         self._to_velocity = T * np.tril(np.ones((n, n)))
         """Sums over intervals, times T [s]; shape (N, N)."""

@@ -76,7 +76,7 @@ def test_seeds_are_messages_of_every_type(scenario: Scenario) -> None:
     terms = scenario.terms()
     found = {type(decode(seed, terms)) for seed in seeds(terms)}
     other = protocol.Horizon if terms.splines else protocol.Trajectory
-    assert found == {message for message, _ in protocol._TYPES} - {other}
+    assert found == {message for message, _ in protocol._TYPES.values()} - {other}
 
 
 @BY_AXES
