@@ -166,7 +166,7 @@ def run(part: Part, result: Result) -> None:
         with log.open("w") as file:
             for command in commands(part):
                 print(f"$ {command}", file=file, flush=True)
-                code, said = told(command, part, file)
+                code, said = executed(command, part, file)
                 count(result, part, said, code)
                 part.keep(said)
     finally:
@@ -175,7 +175,7 @@ def run(part: Part, result: Result) -> None:
         part.after()
 
 
-def told(command: str, part: Part, file: object) -> tuple[int, str]:
+def executed(command: str, part: Part, file: object) -> tuple[int, str]:
     """Exit code and output of a command, which is shown and logged meanwhile."""
     said = []
     with subprocess.Popen(

@@ -82,19 +82,19 @@ class Leadership:
         if raised <= NUMBER_MAX:
             self.number = raised
 
-    def exceed(self, told: int, server: int) -> None:
+    def exceed(self, number: int, server: int) -> None:
         """Let `server` lead, if it may, once it has been told a larger number by an earlier run of
         this vehicle that has not saved it.
         """
-        if self.number < told <= NUMBER_MAX - self._servers:
+        if self.number < number <= NUMBER_MAX - self._servers:
             leads = server if self.may_lead(server) else self.leader
-            self.number = told + 1
+            self.number = number + 1
             self.hand_over(leads)
 
-    def learn(self, known: int, server: int) -> bool:
+    def learn(self, number: int, server: int) -> bool:
         """Take over a larger number that `server` knows, if that server leads with it, and may."""
-        is_larger = self.number < known <= min(NUMBER_MAX, self.number + JUMP_MAX)
-        if not is_larger or known % self._servers != server or not self.may_lead(server):
+        is_larger = self.number < number <= min(NUMBER_MAX, self.number + JUMP_MAX)
+        if not is_larger or number % self._servers != server or not self.may_lead(server):
             return False
-        self.number = known
+        self.number = number
         return True

@@ -50,7 +50,7 @@ class BelievedState:
         """
         return distance_m(self._tau_s, self._states, states)
 
-    def told(self, states: Array, flown: Array) -> None:
+    def advance_from(self, states: Array, flown: Array) -> None:
         """Advance from a step with an observation to the next.
 
         Args:
@@ -120,7 +120,7 @@ class Reporter:
         self._step = step
         if due:
             self._session, self._reported, self._reported_step = session, situation, step
-            self.belief.told(states, flown)
+            self.belief.advance_from(states, flown)
         else:
             self.belief.silent()
         return due

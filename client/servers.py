@@ -75,7 +75,7 @@ class Servers(OneServer):
         number += bool(number and count == 1)
         self.leadership = Leadership(count, number, timeout_ns)
         self.sessions: list[ServerSession] = []
-        self._told = [Told() for _ in range(count)]
+        self._answered = [Told() for _ in range(count)]
         """What each server was told."""
         self._count, self._vehicle, self._events, self._dt_ns = count, vehicle, events, dt_ns
         self._timeout_ns, self._motion, self._may_tell = timeout_ns, motion, may_tell
@@ -100,14 +100,14 @@ class Servers(OneServer):
         return self.leadership.number
 
     def begin(self, server: int) -> None:
-        self._told[server] = Told()
+        self._answered[server] = Told()
         self.leadership.begin(server)
 
     def may_observe(self, server: int) -> bool:
         """See `OneServer`: a server that does not know who leads would take itself for the
         leader.
         """
-        return self._told[server].number is not None
+        return self._answered[server].number is not None
 
     def figures(self) -> dict[str, Any]:
         address = address_text(*self.leading.address)
@@ -190,13 +190,13 @@ class Servers(OneServer):
         if doubts and leader_ns != self._doubted_ns and not self._is_alone(now_ns):
             self._doubted_ns = leader_ns
             self.failsafe.heard(now_ns=now_ns)  # the other server gets a time-out to answer
-        for told, session in zip(self._told, self.sessions, strict=True):
-            if session.number is None or now_ns < told.again_ns:
+        for answered, session in zip(self._answered, self.sessions, strict=True):
+            if session.number is None or now_ns < answered.again_ns:
                 continue
             asks = doubts and not session.leads
-            if asks or (told.number != self.number and not session.is_lost(now_ns)):
+            if asks or (answered.number != self.number and not session.is_lost(now_ns)):
                 again_ns = SOON_NS if asks or session.leads else SECOND_NS
-                told.again_ns, told.asked = now_ns + again_ns, (step, now_ns)
+                answered.again_ns, answered.asked = now_ns + again_ns, (step, now_ns)
                 session.post(self._lead(session, step), now_ns)
 
     def take(self, server: int, message: Message, now_ns: int) -> bool:
@@ -205,12 +205,12 @@ class Servers(OneServer):
         """
         if not isinstance(message, Lead):
             return False
-        told, session = self._told[server], self.sessions[server]
-        told.number = max(told.number or 0, message.number)
+        answered, session = self._answered[server], self.sessions[server]
+        answered.number = max(answered.number or 0, message.number)
         self.leadership.hear_limits(server, message.limits, message.changes)
         self.leadership.exceed(message.number, server)
         self.leadership.learn(message.known, server)
-        step, asked_ns = told.asked
+        step, asked_ns = answered.asked
         age_ns = now_ns - asked_ns + (step - message.step) * self._dt_ns
         if age_ns <= session.hearing.overtaken_ns:
             session.note_heard(now_ns)

@@ -49,7 +49,7 @@ def limited(target: Target, payload: bytes) -> None:
         signal.setitimer(signal.ITIMER_VIRTUAL, 0.0)
 
 
-def told(target: Target, payload: bytes, name: str, seed: int, number: int) -> None:
+def feed_and_print(target: Target, payload: bytes, name: str, seed: int, number: int) -> None:
     """Feed an input as `limited` does; one that finds a fault is printed, to be recorded."""
     try:
         limited(target, payload)
@@ -79,7 +79,7 @@ def attack(name: str, folder: Path, seed: int, count: int, seconds: float) -> st
     begin_s, done, before_mb = time.monotonic(), 0, 0.0
     while done < count and time.monotonic() - begin_s < seconds:
         for _ in range(min(LOOK_EVERY, count - done)):
-            told(target, target.next(rng), name, seed, done)
+            feed_and_print(target, target.next(rng), name, seed, done)
             done += 1
         before_mb = before_mb or memory_mb()  # allocations made once are complete by now
     took_s, grown_mb = time.monotonic() - begin_s, memory_mb() - before_mb
@@ -113,7 +113,7 @@ def _search(name: str, folder: Path, seconds: float, done: c_longlong) -> None:
 
     def one(payload: bytes) -> None:
         done.value += 1
-        told(target, payload, name, GUIDED_SEED, done.value)
+        feed_and_print(target, payload, name, GUIDED_SEED, done.value)
 
     def mutated(payload: bytes, size: int, seed: int) -> bytes:
         rng = Random(seed)

@@ -300,10 +300,10 @@ OUTSIDE = (bomb, misled, scattered)
 """Mutations of bytes."""
 
 
-def hostile(rng: Random, content: bytes, known: list[Any]) -> tuple[str, bytes]:
+def hostile(rng: Random, content: bytes, lines: list[Any]) -> tuple[str, bytes]:
     """Mutated recording, and the name of the mutation; `known` are the records in `content`."""
     if rng.random() < 0.6:
-        how, found = rng.choice(INSIDE), list(known)
+        how, found = rng.choice(INSIDE), list(lines)
         how(rng, found)
         return how.__name__, written(found)
     outside = rng.choice(OUTSIDE)

@@ -50,12 +50,12 @@ class Text(Target):
 
     largest = 8192
 
-    def __init__(self, known: Sequence[bytes], words: Sequence[bytes] = ()) -> None:
-        self._known = known
-        self._words = [*words_of(known), *words]
+    def __init__(self, seeds: Sequence[bytes], words: Sequence[bytes] = ()) -> None:
+        self._seeds = seeds
+        self._words = [*words_of(seeds), *words]
 
     def seeds(self) -> Sequence[bytes]:
-        return self._known
+        return self._seeds
 
     def mutated(self, rng: Random, payload: bytes) -> bytes:
         return text_changed(rng, payload, self._words)
@@ -174,8 +174,8 @@ class NamedFiles(Text):
             keys.write(1, 1, bytes(32)) + keys.write(2, 1, bytes(32)),
         )
         kinds = b"\0\1\1\0\0\2\2\2\0\1\1" + 7 * b"\3" + b"\4\5"
-        known = [bytes([k]) + text.encode() for k, text in zip(kinds, texts, strict=True)]
-        super().__init__(known, [b"nan", b"1e308", b"-0", b"inf", b"9" * 5000, b"[" * 500])
+        seeds = [bytes([k]) + text.encode() for k, text in zip(kinds, texts, strict=True)]
+        super().__init__(seeds, [b"nan", b"1e308", b"-0", b"inf", b"9" * 5000, b"[" * 500])
 
     def __call__(self, payload: bytes) -> None:
         self._path.write_bytes(payload[1:])
@@ -219,8 +219,8 @@ class ControlTarget(Text, EndpointInFlight):
             for running in self._running
             for key in sorted(running.changeable)
         ]
-        known = [msgspec.json.encode(each) for each in ({}, *values)]
-        Text.__init__(self, known, POLICIES)
+        seeds = [msgspec.json.encode(each) for each in ({}, *values)]
+        Text.__init__(self, seeds, POLICIES)
 
     def _begin(self) -> None:
         super()._begin()

@@ -313,7 +313,7 @@ class Reception:
             event = NumberTaken(vehicle=vehicle, host=host, port=port, holder=holder_at)
         elif self._sessions.is_full(hello, now_ns):
             refusal, capacity = Refusal.FULL, len(self._sessions.vehicle)
-            event = ServerFull(vehicle=vehicle, host=host, port=port, room=capacity)
+            event = ServerFull(vehicle=vehicle, host=host, port=port, capacity=capacity)
         else:
             return Refusal.ACCEPTED
         self.refused[refusal] += 1

@@ -111,8 +111,8 @@ class Port(Endpoint):
         return next(taken, None)
 
     def _those(self, kind: str, topic: str) -> list[Entity]:
-        known = self._entities.values()
-        return [each for each in known if (each.kind, each.topic) == (kind, topic)]
+        entities = self._entities.values()
+        return [each for each in entities if (each.kind, each.topic) == (kind, topic)]
 
     @property
     def waits_for(self) -> str:

@@ -538,7 +538,7 @@ LARGE = {
 }
 """Bounds of containers by attribute name, where they differ from BOUND."""
 BOUND = max(EVENTS_MAX, 2048)
-OURS = tuple(f"skytether.{room}." for room in ("server", "client", "netem", "shared"))
+OURS = tuple(f"skytether.{package}." for package in ("server", "client", "netem", "shared"))
 """Packages whose objects are searched for containers."""
 
 

@@ -21,18 +21,18 @@ class LedVehicles:
         self.missing: int | None = None
         """Row because of which no motion may be planned; None if there is none."""
 
-    def follow(self, row: int, told: Lead | None) -> bool:
+    def follow(self, row: int, lead: Lead | None) -> bool:
         """Note who leads a vehicle; returns whether it has told a motion to take over."""
-        if told is None:
+        if lead is None:
             self._alone.add(row)
         else:
             self._alone.discard(row)
-        leads = told is None or bool(told.leads)
-        self._numbers[row] = (told.number if told else 0) if leads else None
-        if told is not None and leads:
-            self._awaited[row] = told.step
+        leads = lead is None or bool(lead.leads)
+        self._numbers[row] = (lead.number if lead else 0) if leads else None
+        if lead is not None and leads:
+            self._awaited[row] = lead.step
         self._look()
-        return told is not None and leads
+        return lead is not None and leads
 
     def leads(self, row: int) -> bool:
         return self._numbers.get(row, 0) is not None

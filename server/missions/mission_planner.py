@@ -139,8 +139,8 @@ class MissionPlanner(SplineScheme):
     def restart(self, row: int) -> bool:
         return self._state.restart(row)
 
-    def follow(self, row: int, told: Lead | None) -> None:
-        self._state.follow(row, told)
+    def follow(self, row: int, lead: Lead | None) -> None:
+        self._state.follow(row, lead)
 
     def observe(self, row: int, observation: Observation) -> bool:
         return self._state.observe(row, observation)
@@ -248,7 +248,7 @@ class MissionPlanner(SplineScheme):
     @property
     def is_standby(self) -> bool:
         """Whether all vehicles that were heard are led by another server."""
-        return self._state.led.is_standby
+        return self._state.led_vehicles.is_standby
 
     def leave(self) -> int:
         self._leaves = True
@@ -302,7 +302,7 @@ class MissionPlanner(SplineScheme):
             return "another server: this one ends"
         if row in self._state.restarted:
             return "its restarted client"
-        if self._state.led.awaits(row):
+        if self._state.led_vehicles.awaits(row):
             return "its first observation"
         if vehicle.sent:
             return "an acknowledgement"  # before it, the motion flown is unknown
@@ -311,7 +311,7 @@ class MissionPlanner(SplineScheme):
 
     def _common_wait(self) -> str:
         """Reason why no motion is planned for any vehicle, in words; empty if there is none."""
-        if (missing := self._state.led.missing) is not None:
+        if (missing := self._state.led_vehicles.missing) is not None:
             return f"vehicle {self._state.number_of(missing)} to follow this server"
         if self._state.absent:
             return f"vehicle {min(self._state.absent)} to begin"

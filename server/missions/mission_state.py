@@ -150,7 +150,7 @@ class MissionState:
         its motions until it is observed after the restart."""
         self.foreign: int | None = None
         """Row of a vehicle that may still fly a motion of another server; None if there is none."""
-        self.led = LedVehicles()
+        self.led_vehicles = LedVehicles()
 
     def forget(self, row: int) -> None:
         """End a session; motions stay, since the vehicle continues on them."""
@@ -170,27 +170,27 @@ class MissionState:
         self._changed.add(row)
         return True
 
-    def follow(self, row: int, told: Lead | None) -> None:
+    def follow(self, row: int, lead: Lead | None) -> None:
         """Note who leads a vehicle.
 
         A vehicle that this server leads has told its motion in force, and flies no plan of an
         earlier leadership any more, so it may fly nothing else.
         """
-        if self.led.follow(row, told):
-            assert told is not None
-            self._take_over(row, told)
+        if self.led_vehicles.follow(row, lead):
+            assert lead is not None
+            self._take_over(row, lead)
 
-    def _take_over(self, row: int, told: Lead) -> None:
+    def _take_over(self, row: int, lead: Lead) -> None:
         vehicle = self.vehicles.setdefault(row, VehicleMotions())
         self.rows.number[row] = self.number_of(row)
         vehicle.sent.clear()
         vehicle.next = None
-        self.observed_step[row] = told.step - 1  # older observations show an earlier motion
-        knots = np.asarray(told.knots, dtype=np.float64)
-        if told.in_force is not None and told.spacing == SPACING and knots.size:
+        self.observed_step[row] = lead.step - 1  # older observations show an earlier motion
+        knots = np.asarray(lead.knots, dtype=np.float64)
+        if lead.in_force is not None and lead.spacing == SPACING and knots.size:
             position, velocity = np.ascontiguousarray(knots.transpose(2, 1, 0))
-            motion = Motion(told.in_force, position, velocity)
-            vehicle.in_force, vehicle.is_foreign = SentMotion(told.in_force, motion), False
+            motion = Motion(lead.in_force, position, velocity)
+            vehicle.in_force, vehicle.is_foreign = SentMotion(lead.in_force, motion), False
             self.rows.unknown_until[row] = -1
         self._mark_changed(row, vehicle)
 
@@ -199,7 +199,7 @@ class MissionState:
         server leads it.
         """
         vehicle = self.vehicles.get(row)
-        if vehicle is None or not self.led.leads(row):
+        if vehicle is None or not self.led_vehicles.leads(row):
             return True
         k = int(self.observed_step[row])
         ends = [motion.last for motion in vehicle.motions()]
@@ -381,7 +381,7 @@ class MissionState:
             self.rows.late[row] = max(self.rows.late[row], stands)
         if moved:
             self._changed.update(rows[self._moved_by[:n] != 0].tolist())
-        self.led.observed(rows, self.observed_step)
+        self.led_vehicles.observed(rows, self.observed_step)
         if self.decided:
             for row in self.decided.intersection(rows.tolist()):
                 self.vehicles[row].next = None

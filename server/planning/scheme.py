@@ -314,7 +314,7 @@ class Scheme(ABC):
         """Figures of a vehicle that the scheme adds to the server's own."""
         return {}
 
-    def follow(self, row: int, told: Lead | None) -> None:  # noqa: B027
+    def follow(self, row: int, lead: Lead | None) -> None:  # noqa: B027
         """Note who leads a vehicle, and its motion in force; None if it has no other server."""
 
     def leave(self) -> int:

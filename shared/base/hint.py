@@ -3,9 +3,9 @@
 from collections.abc import Iterable
 
 
-def hint(given: str, known: Iterable[str]) -> str:
+def hint(given: str, names: Iterable[str]) -> str:
     """Question for the most similar known name; if none is similar, a list of all."""
     import difflib  # imported only after a user's mistake
 
-    close = difflib.get_close_matches(given, known, n=1)
-    return f"did you mean {close[0]}?" if close else f"there are {', '.join(known)}"
+    close = difflib.get_close_matches(given, names, n=1)
+    return f"did you mean {close[0]}?" if close else f"there are {', '.join(names)}"

@@ -167,8 +167,8 @@ class Running:
                 # A request may come from any process that can open the socket: no control
                 # characters in the log.
                 shown_key = shown_key if shown_key.isprintable() else repr(shown_key)
-                known = [self._names.get(each, each) for each in may]
-                raise ConfigError(f"{shown_key}: no such key; {hint(key, known)}") from None
+                names = [self._names.get(each, each) for each in may]
+                raise ConfigError(f"{shown_key}: no such key; {hint(key, names)}") from None
             what = f"expected one of {', '.join(may)}"
             raise ConfigError(f"{key}: cannot be changed in flight; {what}")
         return merged

@@ -207,10 +207,10 @@ class SessionRefused(Failure):
 
 class ServerFull(PeerEvent):
     sentence = (
-        "vehicle {vehicle} from {peer} is refused: the server is full (room for {room}); "
+        "vehicle {vehicle} from {peer} is refused: the server is full (room for {capacity}); "
         "see --vehicles"
     )
-    room: int
+    capacity: int
     """Largest number of vehicles."""
 
 

@@ -201,8 +201,8 @@ def _speed_key(kind: Any) -> str:
         return "hoverSpeed"
     if kind in ROVERS:
         return "cruiseSpeed"
-    known = "that of a vehicle that can stop at each place, as a multicopter or a rover"
-    raise ValueError(f"vehicleType: expected {known}, got MAV_TYPE {str(kind)[:40]}")
+    expected = "that of a vehicle that can stop at each place, as a multicopter or a rover"
+    raise ValueError(f"vehicleType: expected {expected}, got MAV_TYPE {str(kind)[:40]}")
 
 
 def _items(items: list[Any]) -> Iterator[Any]:
@@ -229,9 +229,9 @@ def _check_kind(item: dict[str, Any]) -> None:
 
 def _check_version(part: str, table: dict[str, Any]) -> None:
     """Refuse a part of a plan of an unknown version by a ValueError."""
-    known = VERSIONS[part]
-    if (version := table.get("version", known[0])) not in known:
-        expected = " or ".join(map(str, known))
+    versions = VERSIONS[part]
+    if (version := table.get("version", versions[0])) not in versions:
+        expected = " or ".join(map(str, versions))
         raise ValueError(f"a {part} of version {expected}, got {str(version)[:40]}")
 
 
@@ -263,15 +263,15 @@ def _place(
     if command in (RETURN, DELAY):
         return place
     if command not in (WAYPOINT, LOITER_TIME, LAND, TAKEOFF):
-        known = "a waypoint, take-off, landing, return or speed"
-        raise ValueError(f"expected {known}, got MAV_CMD {command}")
+        expected = "a waypoint, take-off, landing, return or speed"
+        raise ValueError(f"expected {expected}, got MAV_CMD {command}")
     if params[4] or params[5]:
         place[:2] = home.local(params[4], params[5])
     if command != LAND:
         frame = item.get("frame")
         if frame not in FRAMES:
-            known = " or ".join(FRAMES.values())
-            raise ValueError(f"expected an altitude {known}, got one of frame {frame}")
+            expected = " or ".join(FRAMES.values())
+            raise ValueError(f"expected an altitude {expected}, got one of frame {frame}")
         if (belongs := MODE_FRAMES.get(mode := item.get("AltitudeMode"), frame)) != frame:
             raise ValueError(f"expected frame {belongs} with AltitudeMode {mode}, got {frame}")
         if frame == 0 and home.altitude_m is None:

@@ -34,8 +34,8 @@ def tracks(content: bytes, axes: int, _: Origin | None, __: float) -> Tracks:
         except ValueError as error:
             raise ValueError(f"drone {number}: {error}") from None
         except (*WRONG, OverflowError):
-            known = "a trajectory of version 1 with points: time, place, control points"
-            raise ValueError(f"drone {number}: expected {known}") from None
+            expected = "a trajectory of version 1 with points: time, place, control points"
+            raise ValueError(f"drone {number}: expected {expected}") from None
         left -= len(times_s)
         found[number] = times_s, points_m[:, :axes]
     return found

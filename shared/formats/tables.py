@@ -97,8 +97,8 @@ def _table(content: bytes, axes: int, origin: Origin | None) -> Tracks:
     )
     if form is None:
         got = ", ".join(map(repr, header))[:80] or "nothing"
-        known = "; or ".join(", ".join(names) for names in needed)
-        raise ValueError(f"line 1: expected the columns {known}; got {got}")
+        expected = "; or ".join(", ".join(names) for names in needed)
+        raise ValueError(f"line 1: expected the columns {expected}; got {got}")
     names = [*form.columns[: axes + 1], *(["vehicle"] if "vehicle" in header else [])]
     rows, lines = _read(content, names)
     if not len(rows):

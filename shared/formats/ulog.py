@@ -60,8 +60,8 @@ def _global(
 ) -> tuple[Array, NDArray[np.int64]]:
     at = found[GLOBAL]
     places = np.stack([at["lon"], at["lat"], at["alt"]], axis=1).astype(np.float64)
-    known = found.get(HOME, at)
-    home = tuple(float(known[each][0]) for each in ("lat", "lon", "alt"))
+    home_message = found.get(HOME, at)
+    home = tuple(float(home_message[each][0]) for each in ("lat", "lon", "alt"))
     return above_sea(places, axes, origin, home), _times_ns(at)
 
 

@@ -177,7 +177,7 @@ def _features(file: str, collection: Any, origin: Origin) -> Iterator[Zone]:
             raise GrammarError(f"{file}: feature {i + 1}", expected) from None
 
 
-def _frame(collection: dict[str, Any], known: Origin) -> Frame:
+def _frame(collection: dict[str, Any], given: Origin) -> Frame:
     """Function from coordinates to metres north and east of the scenario's origin.
 
     Args:
@@ -195,8 +195,8 @@ def _frame(collection: dict[str, Any], known: Origin) -> Frame:
         raise ValueError('a member "origin" for degrees or "units": "m" for metres, got both')
     if units is not None:
         return lambda points: within(coordinates(points), METRES_MAX)
-    if known or origin is None:
-        return lambda points: local(coordinates(points), known)
+    if given or origin is None:
+        return lambda points: local(coordinates(points), given)
     if not (isinstance(origin, list) and len(origin) == 2):
         raise ValueError('"origin": [longitude, latitude]')
     own = check_origin(origin[1], origin[0], '"origin": [longitude, latitude]')

@@ -75,7 +75,7 @@ class PendingInputs:
             return due, None
         return due, np.array([issued[0] for issued in self._issued]) - due
 
-    def predict(self, known: Array, disturbance: Array) -> Array:
+    def predict(self, states: Array, disturbance: Array) -> Array:
         """State z in which the next input takes effect [m, m/s]; shape (axes, 2).
 
         Args:
@@ -84,7 +84,7 @@ class PendingInputs:
             disturbance: disturbance of each axis meanwhile, as an input [m/s].
         """
         predicted = []
-        axes = zip(self._axes, self._issued, known.tolist(), disturbance.tolist(), strict=True)
+        axes = zip(self._axes, self._issued, states.tolist(), disturbance.tolist(), strict=True)
         for (model, late), issued, (p, v), w in axes:
             # The input of n + 1 steps ago has ceased to act by the end of this step.
             inputs = iter(issued)

@@ -72,5 +72,5 @@ def drops(
         if isinstance(process.refused, int):
             total["refused"] += process.refused
         total["kernel"] += process.kernel_drops
-    known = {end: {why: n for why, n in totals[end].most_common() if n} for end in sorted(totals)}
-    return {end: reasons for end, reasons in known.items() if reasons}
+    ordered = {end: {why: n for why, n in totals[end].most_common() if n} for end in sorted(totals)}
+    return {end: reasons for end, reasons in ordered.items() if reasons}

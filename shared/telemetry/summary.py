@@ -220,10 +220,10 @@ PLUGINS = ("trigger", "planner", "scheme")
 def plugin_errors(figures: Mapping[str, Any]) -> dict[str, int]:
     """Number of failures of a plug-in's code, by its kind; empty if there was none."""
     found = Counter[str]()
-    for process, told in figures.items():
+    for process, reported in figures.items():
         if process.startswith("server"):
             for kind in PLUGINS:
-                found[kind] += told.get("counts", {}).get(f"{kind}_errors", 0)
+                found[kind] += reported.get("counts", {}).get(f"{kind}_errors", 0)
     return dict(+found)
 
 

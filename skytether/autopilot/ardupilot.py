@@ -60,9 +60,9 @@ class ArduPilot(PilotedVehicle):
     def takes_setpoints(self) -> bool:
         return self.mode is FlightMode.GUIDED
 
-    def altitude_of(self, told: float) -> float | None:
+    def altitude_of(self, altitude: float) -> float | None:
         """Altitude above home, as commanded."""
-        return told
+        return altitude
 
     def enter_takeoff(self) -> bool:
         """Enter GUIDED, which climbs by itself."""

@@ -148,7 +148,7 @@ class PilotedVehicle(ABC):
         self._stood_ns = 0
         self._landing = False
         """Whether a return has become a landing."""
-        self._told: set[str] = set()
+        self._announced: set[str] = set()
         """Failsafes that have acted in this flight."""
         quadrotor.on = False
 
@@ -186,7 +186,7 @@ class PilotedVehicle(ABC):
         if why:
             self.say(why, Severity.CRITICAL)
             return self.refusal
-        self.armed, self._told = True, set()
+        self.armed, self._announced = True, set()
         self._stood_ns = self.now_ns
         if self.armed_ns is None:
             self.armed_ns = self.now_ns
@@ -286,7 +286,7 @@ class PilotedVehicle(ABC):
         """Whether set-points are followed in the present mode."""
 
     @abstractmethod
-    def altitude_of(self, told: float) -> float | None:
+    def altitude_of(self, altitude: float) -> float | None:
         """Altitude above home for a commanded altitude [m]; None for an invalid one."""
 
     @abstractmethod
@@ -342,8 +342,8 @@ class PilotedVehicle(ABC):
 
     def once(self, failsafe: str) -> bool:
         """Whether a failsafe acts for the first time in this flight."""
-        new = failsafe not in self._told
-        self._told.add(failsafe)
+        new = failsafe not in self._announced
+        self._announced.add(failsafe)
         return new
 
     def _lift(self, velocity: Vector) -> None:

@@ -104,10 +104,10 @@ class PX4(PilotedVehicle):
     def takes_setpoints(self) -> bool:
         return True
 
-    def altitude_of(self, told: float) -> float | None:
+    def altitude_of(self, altitude: float) -> float | None:
         """Altitude above home; commanded altitudes are above the sea, or missing."""
-        if isfinite(told):
-            return told - self.flavour.home[2]
+        if isfinite(altitude):
+            return altitude - self.flavour.home[2]
         return self.parameters["MIS_TAKEOFF_ALT"]
 
     def enter_takeoff(self) -> bool:

@@ -231,7 +231,7 @@ def _probe(options: ProbeOptions, names: Sequence[str], paths: Sequence[NetworkP
             raise CommandError(f"{where}too little was measured: {error}") from None
     _conclude(options, results, [prober.round_trips() for prober in probers])
     if not all(prober.finished for prober in probers):
-        seconds = min(outcome.told.seconds for _, outcome in results)
+        seconds = min(outcome.figures.seconds for _, outcome in results)
         raise CommandError(
             f"ended early, after {seconds:.3g} s: all figures are of this time", INTERRUPTED
         )
@@ -364,8 +364,8 @@ def _write(
         with _writing(file := options.out / SCENARIO):
             files.write(file, "\n".join([*lines, ""]).encode())
     if options.json:
-        told = [each.told for each in outcomes]
-        figures = PathsFigures(told, common) if common else told[0]
+        each_path = [each.figures for each in outcomes]
+        figures = PathsFigures(each_path, common) if common else each_path[0]
         command.write(options.json, msgspec.json.encode(figures))
     if options.figure:
         from skytether.figures import flights, probing
@@ -387,7 +387,7 @@ def _tell(
 ) -> None:
     """Print tables of both directions, their accuracy, and network texts for a scenario."""
     shown: dict[str, DirectionFigures] = {}
-    for path in (each.told for each in outcomes):
+    for path in (each.figures for each in outcomes):
         ways = {"downlink": path.downlink, "uplink": path.uplink}
         named = {"each way": path.downlink} if path.log else ways
         of_path = f"{path.listener}\n" if common else ""
@@ -395,16 +395,16 @@ def _tell(
     terminal.show(_table(shown))
     terminal.show(_models(shown))
     for each in outcomes:
-        _tell_accuracy(each, f"{each.told.listener}: " if common else "")
+        _tell_accuracy(each, f"{each.figures.listener}: " if common else "")
     if common:
-        terminal.show(_outages([each.told.listener for each in outcomes], common))
+        terminal.show(_outages([each.figures.listener for each in outcomes], common))
     print("To fly over the models, or over what was measured:")
     for line in _flights(options, outcomes):
         print(f"skytether fly {line}")
 
 
 def _tell_accuracy(outcome: ProbeOutcome, of_path: str) -> None:
-    path = outcome.told
+    path = outcome.figures
     print(of_path + (_of_log(path) if path.log else _of_clocks(path)))
     if path.log and not path.uplink.bursts and (missing := _missing(outcome.delays["uplink"])):
         print(
@@ -417,7 +417,9 @@ def _tell_accuracy(outcome: ProbeOutcome, of_path: str) -> None:
 
 def _flights(options: ProbeOptions, outcomes: Sequence[ProbeOutcome]) -> Sequence[str]:
     """Flights over the models, and over the traces."""
-    paths = [{"downlink": each.told.downlink, "uplink": each.told.uplink} for each in outcomes]
+    paths = [
+        {"downlink": each.figures.downlink, "uplink": each.figures.uplink} for each in outcomes
+    ]
     texts = [{name: way.text for name, way in ways.items() if way.text} for ways in paths]
     if len(paths) > 1:
         tables = (", ".join(f'{name} = "{text}"' for name, text in each.items()) for each in texts)

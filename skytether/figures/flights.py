@@ -201,7 +201,7 @@ def _draw_errors(
         for rows in settled
         if len(rows)
     ]
-    known = np.array(errors)[np.isfinite(errors)]
-    spread.hist(known, bins=max(5, round(np.sqrt(len(known)))), color="0.4")
+    finite = np.array(errors)[np.isfinite(errors)]
+    spread.hist(finite, bins=max(5, round(np.sqrt(len(finite)))), color="0.4")
     spread.set_xlabel("RMSE xy of a vehicle [m]")
     spread.set_ylabel("vehicles")

@@ -27,15 +27,15 @@ def drawn(*outcomes: ProbeOutcome) -> "Figure":
     grid = figure.subplots(2 * len(outcomes), 2, width_ratios=(5, 3))
     ways = [(outcome, name) for outcome in outcomes for name in outcome.delays]
     for (outcome, name), (over_time, shares) in zip(ways, grid, strict=True):
-        delays, figures = outcome.delays[name], getattr(outcome.told, name)
-        path_name = f"{outcome.told.listener} " if len(outcomes) > 1 else ""
+        delays, figures = outcome.delays[name], getattr(outcome.figures, name)
+        path_name = f"{outcome.figures.listener} " if len(outcomes) > 1 else ""
         every = max(1, len(delays.time_s) // DOTS_MAX)
         time_s, delay_ms = delays.time_s[::every], 1e3 * delays.delay_s[::every]
         came = np.isfinite(delay_ms)
         over_time.plot(time_s[came], delay_ms[came], ".", markersize=2, color="tab:blue")
         lost_s = time_s[~came]
         over_time.plot(lost_s, np.zeros(len(lost_s)), "|", markersize=8, color="tab:red")
-        ends = np.flatnonzero(np.diff(delays.time_s) > TRAIN_SLOTS / 2 * outcome.told.every_s)
+        ends = np.flatnonzero(np.diff(delays.time_s) > TRAIN_SLOTS / 2 * outcome.figures.every_s)
         for end in ends.tolist():
             over_time.axvspan(*delays.time_s[end : end + 2], color="0.9", linewidth=0)
         over_time.set_title(
@@ -52,7 +52,7 @@ def drawn(*outcomes: ProbeOutcome) -> "Figure":
             _, model = impairments(figures.delay_models[0].text).parts[0]
             assert isinstance(model, Delay)
             passes_s = (
-                (outcome.told.bytes + HEADER_BYTES) / figures.rate_bytes_per_s
+                (outcome.figures.bytes + HEADER_BYTES) / figures.rate_bytes_per_s
                 if figures.rate_bytes_per_s
                 else 0.0
             )

@@ -247,7 +247,7 @@ def budgets_table(results: Sequence[ComparedCase]) -> Table:
     bold, own = [], []
     for each in results:
         best = {budget: leading(each, budget) for budget in BUDGETS}
-        untold = {budget for budget in BUDGETS if not _told(each, budget)}
+        alike = {budget for budget in BUDGETS if not _is_distinct(each, budget)}
         for contender in each.contenders:
             if contender.keys:
                 own.append(len(lines))
@@ -264,14 +264,14 @@ def budgets_table(results: Sequence[ComparedCase]) -> Table:
                 )
                 text = f"{mean} ± {half} ({median}) @ {as_text(runs.mean(PACKETS), '.1f')}"
                 text += "!" if runs.mean(PACKETS) > budget else ""
-                is_marked = runs in best[budget] and budget not in untold
+                is_marked = runs in best[budget] and budget not in alike
                 cells.append(f"{text} *" if is_marked else text)
                 if is_marked and runs is best[budget][0]:
                     bold.append((len(lines), column))
             lines.append((each.case.title, contender.title, *cells))
-        if untold:
-            told = (UNTOLD if budget in untold else "" for budget in BUDGETS)
-            lines.append((each.case.title, "which is best", *told))
+        if alike:
+            notes = (UNTOLD if budget in alike else "" for budget in BUDGETS)
+            lines.append((each.case.title, "which is best", *notes))
     says = (
         "Mean RMSE xy [m] with its 95 % interval, and median, @ packets a second. Within a budget "
         "each contender flies at the threshold and with the reporting policy that had the smallest "
@@ -291,7 +291,7 @@ def budgets_table(results: Sequence[ComparedCase]) -> Table:
     return Table("budgets", title, says, rows_csv(rows), heading, lines, bold, own)
 
 
-def _told(compared: ComparedCase, budget: float) -> bool:
+def _is_distinct(compared: ComparedCase, budget: float) -> bool:
     """Whether the flights tell which contenders are best within a budget."""
     flown = sum(not math.isnan(each.mean(RMSE)) for each in _ranked(compared, budget))
     return flown < 2 or len(leading(compared, budget)) <= SIMILAR * flown

@@ -357,13 +357,13 @@ def of_user(files: Sequence[Path]) -> list[Contender]:
             contender.
     """
     found = {each.name: each for each in (*CONTENDERS, ABOARD)}
-    known = len(found)
+    built_in = len(found)
     for file in files:
         if file.stem in found:
             expected = f"expected another than {', '.join(found)}"
             raise ConfigError(f"--contender: {file}: got the name {file.stem!r}, {expected}")
         found[file.stem] = _of_user(file)
-    return list(found.values())[known:]
+    return list(found.values())[built_in:]
 
 
 def _of_user(file: Path) -> Contender:
@@ -427,7 +427,7 @@ def tuned(contender: Contender, case: Case, weights: str) -> Scenario:
 
 
 def _with_weights(contender: Contender, case: Case, weights: str) -> Scenario:
-    known = {
+    built_in = {
         entry(each, other)
         for other in CASES
         for each in CONTENDERS
@@ -435,9 +435,9 @@ def _with_weights(contender: Contender, case: Case, weights: str) -> Scenario:
     }
     tables = [each.removeprefix(f"{weights}/") for each in reading.names(weights)]
     for table in tables:
-        if table not in known:
+        if table not in built_in:
             expected = "a built-in contender and its case, as --tune writes them (a contender of "
-            expected += f"your own is flown by --contender FILE); {hint(table, sorted(known))}"
+            expected += f"your own is flown by --contender FILE); {hint(table, sorted(built_in))}"
             raise ConfigError(f"{weights}: got the table {table!r}, expected {expected}")
     name = entry(contender, case)
     if name not in tables:

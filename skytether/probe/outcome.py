@@ -110,7 +110,7 @@ class PathsFigures(msgspec.Struct, frozen=True):
 class ProbeOutcome:
     clocks: Clocks
     delays: Mapping[str, Delays]
-    told: PathFigures
+    figures: PathFigures
 
 
 def outcome(

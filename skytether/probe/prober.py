@@ -168,7 +168,7 @@ class Prober(Endpoint):
             self._link.adopt(now_ns=now_ns)
             if not self._session:
                 self._session = message.nonce + message.cookie
-                self.refused = self._done = not message.room
+                self.refused = self._done = not message.is_granted
                 self._zero_ns = self._due_ns = now_ns
         elif isinstance(message, ProbeAnswer):
             if message.session != self._session:
@@ -184,14 +184,14 @@ class Prober(Endpoint):
         if any(number >= len(self._sent_ns) for number, _ in answer.arrivals):
             raise ProtocolError(Drop.FIELD)
         self._total = max(self._total, answer.logged)
-        known = self._logged
+        logged = self._logged
         # the listener's memory was full: the arrivals in between were dropped
-        if answer.first > known:
-            for _ in range(answer.first - known):
+        if answer.first > logged:
+            for _ in range(answer.first - logged):
                 self._logged_number.append(-1)
                 self._logged_ns.append(0)
-            self._logged = known = answer.first
-        for number, came_ns in answer.arrivals[known - answer.first :]:
+            self._logged = logged = answer.first
+        for number, came_ns in answer.arrivals[logged - answer.first :]:
             self._logged_number.append(number)
             self._logged_ns.append(came_ns)
             self._logged += 1
@@ -330,12 +330,12 @@ class Prober(Endpoint):
 
     def _downlink(self, number: Longs, logged_ns: Longs) -> Way:
         sent_ns, train = np.array(self._sent_ns, np.int64), np.array(self._train, np.int64)
-        known = number >= 0
-        first, at = np.unique(number[known], return_index=True)
+        is_numbered = number >= 0
+        first, at = np.unique(number[is_numbered], return_index=True)
         came_ns, came = np.zeros(len(sent_ns), np.int64), np.zeros(len(sent_ns), bool)
-        came_ns[first], came[first] = logged_ns[known][at], True
+        came_ns[first], came[first] = logged_ns[is_numbered][at], True
         end = len(sent_ns) if self._settled else int(first.max(initial=-1)) + 1
-        copies = int(known.sum()) - len(first)
+        copies = int(is_numbered.sum()) - len(first)
         return Way(sent_ns[:end], came_ns[:end], came[:end], train[:end], copies)
 
     def _uplink(self, number: Longs, logged_ns: Longs) -> Way:

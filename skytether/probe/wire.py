@@ -47,7 +47,7 @@ class ProbeWelcome(NamedTuple):
 
     nonce: bytes
     cookie: bytes
-    room: bool
+    is_granted: bool
     """Whether the listener grants the session."""
 
 
@@ -128,10 +128,10 @@ def decode(payload: bytes) -> Message:
     match number, body:
         case 1, [bytes(nonce), bytes()] if len(nonce) == NONCE_BYTES:
             return ProbeHello(nonce)
-        case 2, [bytes(nonce), bytes(cookie), bool(room)] if (
+        case 2, [bytes(nonce), bytes(cookie), bool(is_granted)] if (
             len(nonce) == NONCE_BYTES and len(cookie) == COOKIE_BYTES
         ):
-            return ProbeWelcome(nonce, cookie, room)
+            return ProbeWelcome(nonce, cookie, is_granted)
         case 3, [bytes(session), int(probe), int(train), int(held), bytes()]:
             _check(session, (probe, held))
             if not 0 <= train <= TRAIN_MAX or isinstance(train, bool):
@@ -143,13 +143,13 @@ def decode(payload: bytes) -> Message:
             int(sent_ns),
             int(first),
             int(logged),
-            bytes(told),
+            bytes(arrived),
             bytes(),
         ]:
             _check(session, (answer, first, logged))
-            if not 0 <= sent_ns < 2**63 or len(told) % _ARRIVAL.size:
+            if not 0 <= sent_ns < 2**63 or len(arrived) % _ARRIVAL.size:
                 raise ProtocolError(Drop.FIELD)
-            arrivals = tuple(_ARRIVAL.iter_unpack(told))
+            arrivals = tuple(_ARRIVAL.iter_unpack(arrived))
             if first + len(arrivals) > logged or any(at_ns >= 2**63 for _, at_ns in arrivals):
                 raise ProtocolError(Drop.FIELD)
             return ProbeAnswer(session, answer, sent_ns, first, logged, arrivals)

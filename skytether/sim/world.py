@@ -65,16 +65,16 @@ class _Still(Endpoint):
         armed_ns: time of the world at which the host's timer ends, or None.
     """
 
-    def __init__(self, inner: Endpoint, room: int, armed_ns: int | None = None) -> None:
+    def __init__(self, inner: Endpoint, capacity: int, armed_ns: int | None = None) -> None:
         super().__init__()
         self.armed_ns = armed_ns
         self.inner = inner
-        self.room = room
+        self.capacity = capacity
         self.waiting: deque[Datagram] = deque()
         """Queued datagrams in order of arrival; later ones are dropped when the queue is full."""
 
     def receive(self, datagram: Datagram, *, now_ns: int) -> None:  # noqa: ARG002
-        if len(self.waiting) < self.room:
+        if len(self.waiting) < self.capacity:
             self.waiting.append(datagram)
 
     def wake(self, *, now_ns: int) -> None:
@@ -217,7 +217,7 @@ class World:
         """
         host = self._hosts[name]
         still = host.endpoint
-        if isinstance(still, _Still) and still.room:
+        if isinstance(still, _Still) and still.capacity:
             host.endpoint = still.inner
             for datagram in still.waiting:
                 self._receive(host, datagram)

@@ -117,17 +117,17 @@ def _ways(names: tuple[str, ...], scale: float) -> tuple[Read, Write]:
         scale: factor from the argument to the slider's number.
     """
 
-    def known(values: Values) -> dict[str, float]:
+    def numbers_of(values: Values) -> dict[str, float]:
         keys = [f"{way}.{name}" for way in WAYS for name in names]
         numbers = ((key, _number(values, key)) for key in keys)
         return {key: number for key, number in numbers if number is not None}
 
     def read(values: Values) -> float | None:
-        found = known(values)
+        found = numbers_of(values)
         return scale * max(found.values()) if found else None
 
     def write(values: Values, number: float) -> dict[str, Any]:
-        return dict.fromkeys(known(values), number / scale)
+        return dict.fromkeys(numbers_of(values), number / scale)
 
     return read, write
 

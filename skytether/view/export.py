@@ -67,7 +67,7 @@ def _errors_m(scenario: Scenario, client: Rows, server: Rows | None) -> Array:
 
 
 def csv(columns: Columns) -> str:
-    values = [_known(name, column) for name, column in columns.items()]
+    values = [_values(name, column) for name, column in columns.items()]
     return to_csv(list(columns), zip(*values, strict=True))
 
 
@@ -82,17 +82,17 @@ def parquet() -> Callable[[Columns], bytes]:
 
     def written(columns: Columns) -> bytes:
         file = io.BytesIO()
-        known = {
-            name: _known(name, column) if name in STEPS else column
+        table = {
+            name: _values(name, column) if name in STEPS else column
             for name, column in columns.items()
         }
-        files.write_table(pyarrow.table(known), file, compression="zstd")
+        files.write_table(pyarrow.table(table), file, compression="zstd")
         return file.getvalue()
 
     return written
 
 
-def _known(name: str, column: NDArray[Any]) -> list[Any]:
+def _values(name: str, column: NDArray[Any]) -> list[Any]:
     """Values of a column; None for an unknown one: NaN, or -1 for a step."""
     values: list[Any] = column.tolist()
     if name in STEPS:

@@ -142,7 +142,7 @@ class Outcome:
         found = []
         for number, rows in self.rows.items():
             off_m = np.linalg.norm(position_error(self.scenario, rows, server), axis=1)
-            known = np.isfinite(off_m).any()
+            has_truth = np.isfinite(off_m).any()
             near = [
                 (apart_m, sum(pair) - number)
                 for pair, (apart_m, _) in self.least.items()
@@ -154,7 +154,7 @@ class Outcome:
                     number,
                     Mode(rows["mode"][-1]),
                     float(off_m[-1]) if np.isfinite(off_m[-1]) else None,
-                    float(np.nanmax(off_m)) if known and not self.scenario.is_mission else None,
+                    float(np.nanmax(off_m)) if has_truth and not self.scenario.is_mission else None,
                     float((rows["mode"] == Mode.BRAKE).sum() * self._dt_s),
                     nearest_m,
                     other,
@@ -186,7 +186,7 @@ class Outcome:
         )
 
     @cached_property
-    def told(self) -> list[tuple[float, tuple[int, ...], str]]:
+    def happened(self) -> list[tuple[float, tuple[int, ...], str]]:
         """What failed and took over: time [s], vehicles and sentence, in order of time.
 
         The same event of several vehicles is told once, and outages of a path below BRIEF_S not at

@@ -119,11 +119,13 @@ def _delays(direction: int) -> Values:
         """Mean delays on the grid; NaN in seconds in which no packet arrived."""
         grid_s, seconds = look.curves.time_s, _seconds(look)
         delays_s = look.state.network.delays_s(direction, look.now_ns)
-        known = ~np.isnan(delays_s)
-        if not known.any():
+        is_finite = ~np.isnan(delays_s)
+        if not is_finite.any():
             return np.full(len(grid_s), np.nan)
         nearest = np.clip(np.rint(grid_s - seconds[0]).astype(int), 0, len(seconds) - 1)
-        return np.where(known[nearest], np.interp(grid_s, seconds[known], delays_s[known]), np.nan)
+        return np.where(
+            is_finite[nearest], np.interp(grid_s, seconds[is_finite], delays_s[is_finite]), np.nan
+        )
 
     return values
 
@@ -396,8 +398,8 @@ def on_one_axis(plots: Sequence[Sequence[Array]]) -> list[list[Array]]:
     for time_s, *lines in plots:
         nearest = np.searchsorted((time_s[:-1] + time_s[1:]) / 2, grid_s)
         together.append([grid_s, *(line[nearest] for line in lines)])
-    known = [~np.isnan(line) for _, *lines in together for line in lines]
-    begin = [int(np.argmax(each)) for each in known if each.any() and not each.all()]
+    are_finite = [~np.isnan(line) for _, *lines in together for line in lines]
+    begin = [int(np.argmax(each)) for each in are_finite if each.any() and not each.all()]
     first = min(min(begin, default=0), len(grid_s) - 2)
     return [[line[first:] for line in data] for data in together]
 
@@ -405,8 +407,8 @@ def on_one_axis(plots: Sequence[Sequence[Array]]) -> list[list[Array]]:
 def marked(data: Sequence[Array], marks: Iterable[tuple[float, Mark]]) -> list[Array]:
     """A line for each of MARKS: from the least value of a plot to the largest at each change."""
     time_s, *lines = data
-    known = np.concatenate([line[~np.isnan(line)] for line in lines])
-    low, high = (known.min(), known.max()) if len(known) else (0.0, 1.0)
+    finite = np.concatenate([line[~np.isnan(line)] for line in lines])
+    low, high = (finite.min(), finite.max()) if len(finite) else (0.0, 1.0)
     found = {mark: np.full(len(time_s), np.nan) for mark in MARKS}
     for at_s, mark in marks:
         at = int(np.searchsorted(time_s, at_s))
@@ -418,10 +420,10 @@ def marked(data: Sequence[Array], marks: Iterable[tuple[float, Mark]]) -> list[A
 def spans(plots: Sequence[Sequence[Array]]) -> list[tuple[float, float]]:
     """Ranges of the same width that contain the values of each plot, around their middles."""
     together = [np.concatenate(lines) for lines in plots]
-    known = [values[~np.isnan(values)] for values in together]
-    known = [values if len(values) else np.zeros(1) for values in known]
-    half = max((float(np.ptp(values)) / 2 for values in known), default=0.0)
-    middles = [float(values.min() + values.max()) / 2 for values in known]
+    finite = [values[~np.isnan(values)] for values in together]
+    finite = [values if len(values) else np.zeros(1) for values in finite]
+    half = max((float(np.ptp(values)) / 2 for values in finite), default=0.0)
+    middles = [float(values.min() + values.max()) / 2 for values in finite]
     return [(middle - half, middle + half) for middle in middles]
 
 

@@ -167,14 +167,14 @@ class _Frames:
                     columns = self._columns[process, part] = _columns(described)
                     check_columns(part, columns, self._scenario)
             case Rows():
-                known = self._columns.get((process, frame.part))
-                if known is None:
+                row_type = self._columns.get((process, frame.part))
+                if row_type is None:
                     raise ValueError(f"{process[:20]} has no part {frame.part[:20]!r}")
                 if frame.time_ns < self._begun_ns[process]:
                     raise ValueError(f"rows of {process[:20]} from before it began")
                 rows = self._rows.setdefault(frame.part, [])
-                rows.append((frame.time_ns, feed.table(frame.rows, known)))
-                if rows[0][1].dtype != known:
+                rows.append((frame.time_ns, feed.table(frame.rows, row_type)))
+                if rows[0][1].dtype != row_type:
                     raise ValueError(f"the part {frame.part} has columns of two kinds")
             case Figures():
                 drops.counted(frame.figures)

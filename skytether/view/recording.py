@@ -217,13 +217,13 @@ class Recording:
         self._put(topic, name, foxglove.SCHEMAS[name], message)
 
     def _put(self, topic: str, name: str, schema: Mapping[str, Any], message: Any) -> None:
-        known = 0
+        number = 0
         if topic not in self._channels:
             encoded = msgspec.json.encode({"title": name, **schema})
             if encoded not in self._schemas:
                 self._schemas[encoded] = self._writer.register_schema(name, "jsonschema", encoded)
-            known = self._schemas[encoded]
-        self._add(topic, "json", known, msgspec.json.encode(message))
+            number = self._schemas[encoded]
+        self._add(topic, "json", number, msgspec.json.encode(message))
 
     def _add(self, topic: str, encoding: str, schema: int, content: bytes) -> None:
         """Add a message; its channel is written before the first message of a topic."""

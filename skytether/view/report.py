@@ -166,13 +166,15 @@ def _first(outcome: Outcome) -> list[Table]:
         if len(outcome.numbers) > len(rows):
             says += f" The first {len(rows)} of {len(outcome.numbers)}."
         found.append(Table("vehicles", "Vehicles", says, "", heading, rows))
-    told = [[f"{at_s:.1f}", listed(who) if who else "–", text] for at_s, who, text in outcome.told]
-    says = "" if told else "Nothing failed."
-    if len(told) > TOLD_MAX:
-        says = f"The first {TOLD_MAX} of {len(told)}; all events are below."
-    heading = ["time [s]", "vehicles", "event"] if told else []
-    happened = Table("told", "What failed, and what took over", says, "", heading, told[:TOLD_MAX])
-    return [happened, *found] if told else [*found, happened]
+    events = [
+        [f"{at_s:.1f}", listed(who) if who else "–", text] for at_s, who, text in outcome.happened
+    ]
+    says = "" if events else "Nothing failed."
+    if len(events) > TOLD_MAX:
+        says = f"The first {TOLD_MAX} of {len(events)}; all events are below."
+    heading = ["time [s]", "vehicles", "event"] if events else []
+    table = Table("told", "What failed, and what took over", says, "", heading, events[:TOLD_MAX])
+    return [table, *found] if events else [*found, table]
 
 
 def course(outcome: Outcome) -> Picture:
@@ -193,8 +195,8 @@ def course(outcome: Outcome) -> Picture:
         for lane, dead in enumerate(paths.values(), start=len(numbers)):
             spans_s = [(begin_s, end_s - begin_s) for _, begin_s, end_s in dead]
             above.broken_barh(spans_s, (lane - 0.4, 0.8), color="k", alpha=0.5)
-        led = [each for each in outcome.new_leaders() if each[0] in numbers]
-        above.plot([at_s for _, at_s in led], [numbers.index(each) for each, _ in led], "kv")
+        leads = [each for each in outcome.new_leaders() if each[0] in numbers]
+        above.plot([at_s for _, at_s in leads], [numbers.index(each) for each, _ in leads], "kv")
         names = [f"vehicle {number}" for number in numbers] + [f"path {path}" for path in paths]
         above.set_yticks(range(lanes), names)
         above.invert_yaxis()
@@ -207,7 +209,7 @@ def course(outcome: Outcome) -> Picture:
         [above, *rest][-1].set_xlabel("time [s]")
         _name_modes(figure, modes)
         says = "Modes of the vehicles."
-        says += " Triangles: another server leads." * bool(led)
+        says += " Triangles: another server leads." * bool(leads)
         says += " Black: nothing came over the path." * bool(paths)
         says += " Below: distance between the nearest two, and what is required." * is_apart
         return Picture("course", "What happened", says, as_png(figure, 140))

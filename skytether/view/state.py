@@ -258,9 +258,9 @@ class VehicleTrack:
 
     def goal(self, seconds: float) -> Array | None:
         """Newest desired position of the last seconds [m]; None if there is none."""
-        known = self.goals(seconds)
-        known = known[~np.isnan(known[:, 0])]
-        return known[-1] if len(known) else None
+        goals = self.goals(seconds)
+        goals = goals[~np.isnan(goals[:, 0])]
+        return goals[-1] if len(goals) else None
 
     def ahead(self) -> Array:
         """Positions along the newest plan from the present step on [m]; shape (n, axes).
@@ -350,7 +350,7 @@ def _groups(value: Any) -> list[dict[str, Any]]:
     return [each for each in value if isinstance(each, dict)] if isinstance(value, list) else []
 
 
-def told(figures: dict[str, Any], *names: str) -> float:
+def figure(figures: dict[str, Any], *names: str) -> float:
     """Figure within nested groups; NaN if missing."""
     value = group(figures, *names[:-1]).get(names[-1])
     return float(value) if isinstance(value, int | float) else np.nan
@@ -412,20 +412,20 @@ class State:
         if isinstance(frame, Opened):
             self._open(process, frame)
             return
-        known = self._processes.get(process)
-        if known is None or frame.time_ns <= known.seen_ns:
+        process_state = self._processes.get(process)
+        if process_state is None or frame.time_ns <= process_state.seen_ns:
             return
-        known.newest_ns = max(known.newest_ns, frame.time_ns)
+        process_state.newest_ns = max(process_state.newest_ns, frame.time_ns)
         self.newest_ns = max(self.newest_ns, frame.time_ns)
         if isinstance(frame, Rows):
-            self._rows(process, known, frame)
+            self._rows(process, process_state, frame)
         elif isinstance(frame, Said):
             self._said(process, frame.event, frame.time_ns)
         elif isinstance(frame, Figures):
-            known.figures = frame.figures
-            if known.role == "netem":
+            process_state.figures = frame.figures
+            if process_state.role == "netem":
                 queues = [
-                    [told(each.figures, way, "queue") for way in each.opened.ways]
+                    [figure(each.figures, way, "queue") for way in each.opened.ways]
                     for each in self._processes.values()
                     if each.role == "netem"
                 ]
@@ -436,10 +436,10 @@ class State:
 
     def _open(self, process: str, opened: Opened) -> None:
         self._lost.discard(process)
-        known = self._processes.get(process)
-        if known and known.opened.time_ns == opened.time_ns:
+        process_state = self._processes.get(process)
+        if process_state and process_state.opened.time_ns == opened.time_ns:
             # after a reconnection, the feed repeats the frames that it keeps for new readers
-            known.seen_ns = known.newest_ns
+            process_state.seen_ns = process_state.newest_ns
             return
         try:
             scenario = msgspec.convert(toml.loads(opened.scenario), Scenario)
@@ -448,7 +448,7 @@ class State:
         with suppress(ConfigError):  # a file named in the scenario is on another machine
             scenario = reading.check(reading.to_table(scenario))
         role = re.split("[ .]", opened.process)[0]
-        if known and role == "client" and not self._others_fly(process):
+        if process_state and role == "client" and not self._others_fly(process):
             self._begin()  # a new flight
         if role == "client" or not self.name:
             self.duration_s = scenario.duration
@@ -557,8 +557,8 @@ class State:
     @property
     def ways(self) -> Ways:
         """Names of both directions of the network in netem's figures."""
-        known = (each.opened.ways for each in self._processes.values())
-        return next((ways for ways in known if ways != FLIGHT), FLIGHT)
+        directions = (each.opened.ways for each in self._processes.values())
+        return next((ways for ways in directions if ways != FLIGHT), FLIGHT)
 
     @property
     def directions(self) -> dict[int, str]:
@@ -609,7 +609,7 @@ class State:
         NaN if the server reports neither.
         """
         figures = self.of_vehicle("server", number)
-        return told(figures, "clock_bound_ms"), told(figures, "clock_m")
+        return figure(figures, "clock_bound_ms"), figure(figures, "clock_m")
 
     def paths(self, number: int) -> list[tuple[dict[str, Any], dict[str, Any]]]:
         """Figures of each path of a vehicle's session, of the server and of the vehicle; empty for
@@ -617,8 +617,8 @@ class State:
         """
         nothing: dict[str, Any] = {}
         up, down = (self.of_vehicle(role, number).get("paths") for role in ("server", "client"))
-        known = zip_longest(_groups(up), _groups(down), fillvalue=nothing)
-        return list(known)[:PATHS_MAX]
+        pairs = zip_longest(_groups(up), _groups(down), fillvalue=nothing)
+        return list(pairs)[:PATHS_MAX]
 
     def nearest_m(self, number: int, points: int = 1) -> Array:
         """Distance from a vehicle to the nearest other one in the last minute [m].
@@ -654,13 +654,13 @@ class State:
 
     def role(self, process: str) -> str:
         """What a process is: server, netem or client; empty before its feed has begun."""
-        known = self._processes.get(process)
-        return known.role if known else ""
+        heard = self._processes.get(process)
+        return heard.role if heard else ""
 
     def figures(self, role: str) -> dict[str, Any]:
         """Figures of the first process of a role that tells any; empty without one."""
-        known = (each.figures for each in self._processes.values() if each.role == role)
-        return next(filter(None, known), {})
+        all_figures = (each.figures for each in self._processes.values() if each.role == role)
+        return next(filter(None, all_figures), {})
 
     def of_vehicle(self, role: str, number: int) -> dict[str, Any]:
         """Figures of a vehicle by its client, or by the server that plans for it; or else by any
@@ -690,7 +690,7 @@ class State:
         """Colour of a vehicle's link at each time of its curves, see `link`; empty if unknown."""
         shape = curves.time_s.shape
         cut, degraded = np.zeros(shape, bool), curves.age_s > self.scenario.link.age_max_s / 2
-        known = ~np.isnan(curves.mode) & (curves.mode != Mode.INIT)
+        is_flown = ~np.isnan(curves.mode) & (curves.mode != Mode.INIT)
         ago_ns = (self.time_s(now_ns) - curves.time_s) * SECOND_NS
         at = BINS - 1 - np.clip(np.nan_to_num(ago_ns) // BIN_NS, 0, BINS - 1).astype(int)
         numbers = np.arange(BINS)
@@ -701,14 +701,14 @@ class State:
             recent = np.ones(round(LOSS_S * SECOND_NS / BIN_NS))
             sums = [np.convolve(counts, recent)[:BINS] for counts in (packets, lost)]
             degraded |= (sums[1] > LOSS_HIGH * sums[0])[at]
-        return np.select([~known, cut, degraded], ["", RED, AMBER], GREEN)
+        return np.select([~is_flown, cut, degraded], ["", RED, AMBER], GREEN)
 
     def link(self, number: int, now_ns: int) -> Word:
         """State of a vehicle's link, in words."""
         track = self.vehicles.get(number)
         if track is None or track.row is None or track.mode is Mode.INIT:
-            known = track is not None and track.server and not track.client
-            return Word("UNKNOWN", ONLY_SERVER, GREY) if known else Word("NONE", NO_SESSION, GREY)
+            is_seen = track is not None and track.server and not track.client
+            return Word("UNKNOWN", ONLY_SERVER, GREY) if is_seen else Word("NONE", NO_SESSION, GREY)
         for direction, name in DIRECTIONS.items():
             heard_ns = self.network.heard_ns.get(direction)
             if heard_ns is not None and now_ns - heard_ns > self._silence_ns[direction]:

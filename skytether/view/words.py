@@ -12,7 +12,7 @@ from skytether.shared.base.units import MILLISECOND_NS
 from skytether.shared.telemetry.record import UPLINK
 from skytether.shared.telemetry.summary import PLUGINS
 from skytether.view.scene import FENCE_RGB, FLIGHT_RGB, GOAL_RGB
-from skytether.view.state import LOSS_S, Heard, State, Word, group, told
+from skytether.view.state import LOSS_S, Heard, State, Word, figure, group
 
 CSS = {
     "grey": "var(--mantine-color-gray-6)",
@@ -110,7 +110,7 @@ def figures(state: State, vehicle: int, now_ns: int, title: str = "") -> str:
         p99 = np.quantile(solved, 0.99)
         rows.append(("solving, p99", f"{p99:.2f} of {deadline_ms:g} ms"))
     server = state.figures("server")
-    failed = {kind: told(server, "counts", f"{kind}_errors") for kind in PLUGINS}
+    failed = {kind: figure(server, "counts", f"{kind}_errors") for kind in PLUGINS}
     if errors := ", ".join(f"{kind} {count:.0f}" for kind, count in failed.items() if count > 0):
         rows.append(("errors of plug-ins", errors))
     head = f"<b>{escape(title)}</b>" if title else ""
@@ -123,12 +123,12 @@ def figures(state: State, vehicle: int, now_ns: int, title: str = "") -> str:
 def _carried(state: State, now_ns: int, title: str) -> str:
     """Counters of netem where it carries other programs' packets."""
     counted = state.figures("netem")
-    rows = [("flows", number(told(counted, "flows"), ".0f")), *_rates(state, now_ns)]
+    rows = [("flows", number(figure(counted, "flows"), ".0f")), *_rates(state, now_ns)]
     rows += [(f"lost, last {LOSS_S:.0f} s", _lost(state, now_ns)), _delays(state, now_ns)]
     for way, name in zip(state.ways, state.directions.values(), strict=True):
-        counts = (f"{number(told(counted, way, each), '.0f')} {each}" for each in FATES)
+        counts = (f"{number(figure(counted, way, each), '.0f')} {each}" for each in FATES)
         rows.append((f"{name}, so far", ", ".join(counts)))
-        queue, p99_ms = told(counted, way, "queue"), told(counted, way, "queueing_ms_p99")
+        queue, p99_ms = figure(counted, way, "queue"), figure(counted, way, "queueing_ms_p99")
         queued = f"{number(p99_ms, '.0f')} ms (p99) at the finite rate"
         rows.append((f"{name}, under way", f"{number(queue, '.0f')} packets; {queued}"))
     return (
@@ -179,7 +179,7 @@ def _leader(state: State, vehicle: int) -> list[tuple[str, str]]:
     leadership = group(state.of_vehicle("client", vehicle), "leadership")
     if not leadership:
         return []
-    number_ = number(told(leadership, "number"), ".0f")
+    number_ = number(figure(leadership, "number"), ".0f")
     return [("led by", f"{leadership.get('server', '–')}, leadership {number_}")]
 
 
@@ -209,8 +209,8 @@ def _autopilot(state: State, vehicle: int) -> list[tuple[str, str]]:
     if "mode" not in says:  # a robot has none of these
         return []
     armed = "armed" if says.get("armed") else "disarmed"
-    charge, volts = 100.0 * told(says, "battery"), told(says, "voltage_v")
-    places = (told(says, "home", f"{each}_deg") for each in ("latitude", "longitude"))
+    charge, volts = 100.0 * figure(says, "battery"), figure(says, "voltage_v")
+    places = (figure(says, "home", f"{each}_deg") for each in ("latitude", "longitude"))
     home = (number(place, ".6f", "°") for place in places)
     return [
         ("autopilot", f"{says.get('mode', '–')}, {armed}"),
@@ -227,18 +227,18 @@ def _paths(state: State, vehicle: int) -> list[tuple[str, ...]]:
 
 def _path(path: int, ends: tuple[dict[str, Any], dict[str, Any]]) -> tuple[str, ...]:
     """Texts in the order of PATH, from the figures of the server and of the vehicle."""
-    fails_up, fails_down = (told(end, "failure") for end in ends)
+    fails_up, fails_down = (figure(end, "failure") for end in ends)
     silent = [way for way, fails in (("up", fails_up), ("down", fails_down)) if fails > SILENT]
     is_known = not np.isnan([fails_up, fails_down]).all()
 
     def both(name: str, ends: Iterable[dict[str, Any]] = ends, scale: float = 1.0) -> str:
-        return ", ".join(number(scale * told(end, name), ".0f") for end in ends)
+        return ", ".join(number(scale * figure(end, name), ".0f") for end in ends)
 
     return (
         f"path {path}",
         f"silent {' and '.join(silent)}" if silent else "alive" if is_known else "–",
         both("failure", scale=100.0),
-        number(float(np.fmin.reduce([told(end, "delay_ms") for end in ends])), ".0f"),
+        number(float(np.fmin.reduce([figure(end, "delay_ms") for end in ends])), ".0f"),
         both("loss", scale=100.0),
         both("packets"),
         both("first", ends[::-1]),

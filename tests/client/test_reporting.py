@@ -114,7 +114,7 @@ def test_the_belief_is_the_rule_of_flight() -> None:
     belief, x = BelievedState(terms, compensator), np.array([[0.5, -0.3], [-0.2, 0.4]])
     for step in range(4, 40):
         u = np.array(compensator.choose(step, x, ZERO, ZERO)[0])
-        belief.told(x, u) if step == 4 else belief.silent()
+        belief.advance_from(x, u) if step == 4 else belief.silent()
         x = terms.model.step(x, u + np.float32(0.05))
         assert belief.off_m(x) == pytest.approx(0.0, abs=1e-6)
     aside, faster = [[0.3, 0.0], [0.0, 0.0]], [[0.0, 0.1], [0.0, 0.0]]

@@ -123,13 +123,13 @@ def test_a_motion_that_was_told_is_known_once_all_were_observed() -> None:
     flown = along([4.0, 0.0], [-0.8, 0.0], first=190)
     for row, motion in ((0, flown), (1, resting(200, np.array([-4.0, 0.0])))):
         made.follow(row, told(row, 200, motion=motion))
-        assert made.state.led.missing is not None
+        assert made.state.led_vehicles.missing is not None
     for row, x in ((0, 3.9), (1, -4.0)):
         in_force = made.vehicles[row].in_force
         assert in_force is not None
         made.hear(row, 200, in_force.step, x)
     made.align(201)
-    assert made.state.led.missing is None
+    assert made.state.led_vehicles.missing is None
     (kept, *_) = made.vehicles[0].motions()
     assert np.allclose(kept.position, flown.position, atol=1e-6)
     assert np.allclose(kept.velocity, flown.velocity, atol=1e-6)
@@ -161,13 +161,13 @@ def test_vehicles_of_two_numbers_are_not_planned_for() -> None:
         made.follow(row, told(row, 200, number))
         made.hear(row, 200, NO_HORIZON, 4.0 - 8.0 * row)
     made.align(201)
-    assert made.state.led.missing == 0
+    assert made.state.led_vehicles.missing == 0
     made.follow(0, told(0, 210, 3))
     made.hear(0, 210, NO_HORIZON, 4.0)
     made.align(211)
-    assert made.state.led.missing is None
+    assert made.state.led_vehicles.missing is None
     made.follow(1, Lead(2, 7, 4, 0))
-    assert made.state.led.missing == 1
+    assert made.state.led_vehicles.missing == 1
 
 
 def test_a_vehicle_that_names_another_leader_stops_no_vehicle_that_has_none() -> None:
@@ -176,9 +176,9 @@ def test_a_vehicle_that_names_another_leader_stops_no_vehicle_that_has_none() ->
     made.follow(1, None)
     for number, leads in ((1, 0), (4, 1), (5, 0)):
         made.follow(0, told(0, 200, number)._replace(leads=leads))
-        assert made.state.led.missing is None
+        assert made.state.led_vehicles.missing is None
     made.follow(1, told(1, 200, 0))
-    assert made.state.led.missing is not None
+    assert made.state.led_vehicles.missing is not None
 
 
 def test_a_stolen_vehicle_that_speaks_of_a_standby_costs_the_others_its_room_only() -> None:

@@ -187,8 +187,8 @@ def begin(far: Listener, prober: tuple[str, int], now_ns: int) -> bool:
     assert isinstance(welcome, ProbeWelcome)
     probe = encode(Probe(welcome.nonce + welcome.cookie, 0, 0, 0), 96)
     far.receive(Datagram(probe, prober), now_ns=now_ns)
-    assert len(far.outbox()) == welcome.room
-    return welcome.room
+    assert len(far.outbox()) == welcome.is_granted
+    return welcome.is_granted
 
 
 def test_a_listener_has_room_for_so_many_measurements() -> None:
@@ -281,7 +281,7 @@ def test_every_packet_is_measured_as_it_was() -> None:
         shift = came["delay_ns"] - passed["delay_ns"]
         assert np.ptp(shift) < 200_000
         assert abs(shift.mean()) < found.clocks.doubt_s * SECOND_NS
-    both = found.told
+    both = found.figures
     assert both.round_trip_mean_s == pytest.approx(0.17, rel=0.01)
     assert both.uplink.loss_low < 0.1 < both.uplink.loss_high
     assert both.downlink.loss_low < 0.3 < both.downlink.loss_high
@@ -300,7 +300,7 @@ def test_gaps_of_a_picture_are_the_trains() -> None:
 def test_a_clock_that_drifts_is_found_out() -> None:
     """Offset and drift of the listener's clock are within the stated uncertainty."""
     measured, _ = measure("gamma(0.05, 0.06, 0.005)", "gamma(0.05, 0.06, 0.005)", seconds=200.0)
-    told = outcome(measured, "x", secure=False).told
+    told = outcome(measured, "x", secure=False).figures
     assert told.drift_doubt_ppm < 5.0
     assert told.drift_ppm == pytest.approx(CLOCK.drift_ppb / 1e3, abs=4.0 * told.drift_doubt_ppm)
     assert told.offset_s == pytest.approx(3600.0, abs=told.offset_doubt_s)
@@ -317,7 +317,7 @@ def test_a_clock_that_drifts_is_found_out() -> None:
 def test_a_finite_rate_is_found_where_there_is_one(text: str, rate: float | None) -> None:
     """Within three per cent and the stated uncertainty; none where there is none."""
     measured, _ = measure(text, text, seconds=60.0)
-    told = outcome(measured, "x", secure=False).told
+    told = outcome(measured, "x", secure=False).figures
     for way in (told.uplink, told.downlink):
         assert (way.rate_bytes_per_s is None) == (rate is None)
         if rate and way.rate_bytes_per_s and way.rate_low and way.rate_high:
@@ -330,7 +330,7 @@ def test_a_finite_rate_is_found_where_there_is_one(text: str, rate: float | None
 def test_the_models_are_those_of_the_network_and_fly() -> None:
     text = "gamma(0.02, 0.06, 0.03) & gilbert_elliott(0.2, 0.5)"
     measured, _ = measure(text, text, seconds=60.0)
-    told = outcome(measured, "x", secure=False).told
+    told = outcome(measured, "x", secure=False).figures
     for way in (told.uplink, told.downlink):
         assert models(way.text) == models(text)
         assert way.rate_bytes_per_s is None

@@ -76,7 +76,7 @@ def docs() -> str:
 def test_a_table_of_one_way_is_taken_as_it_is() -> None:
     rows = "".join(f"{n / 10},{0.02 + n / 1e4},0\n" for n in range(100))
     measured = recorded.of_log(recorded_in(File("it", f"time_s,delay_s,lost\n{rows}".encode())))
-    told = outcome(measured, "it", secure=False, log="one way").told
+    told = outcome(measured, "it", secure=False, log="one way").figures
     assert told.uplink.mean_s == pytest.approx(0.02 + 49.5e-4)
     assert told.round_trip_least_s == pytest.approx(0.04)
 

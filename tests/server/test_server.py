@@ -70,7 +70,7 @@ def scenario(**control: Any) -> Scenario:
 
 
 class Vehicles:
-    def __init__(self, flown: Scenario, boot_id: int = 77, room: int = VEHICLES_MAX) -> None:
+    def __init__(self, flown: Scenario, boot_id: int = 77, capacity: int = VEHICLES_MAX) -> None:
         self.terms = flown.terms()
         self.dt_ns = flown.dt_ns
         self.sink = io.BytesIO()
@@ -79,7 +79,7 @@ class Vehicles:
             flown,
             boot_id=boot_id,
             entropy=stream(1, "entropy").bytes,
-            capacity=room,
+            capacity=capacity,
             recorder=recorder,
         )
         # Ticks lie on multiples of 50 ms: the first is 30 ms after the first message.
@@ -411,7 +411,7 @@ def test_a_vehicle_that_was_silent_for_a_while_is_not_taken_over_once_it_is_hear
 
 
 def test_a_new_life_that_comes_when_the_old_one_was_just_forgotten_flies() -> None:
-    vehicles, _ = live(room=1)
+    vehicles, _ = live(capacity=1)
     vehicles.now_ns += SESSION_NS - SECOND_NS
     new = vehicles.open(boot_id=6)
     vehicles.now_ns += 2 * SECOND_NS
@@ -545,7 +545,7 @@ def test_a_vehicle_too_many_is_told_that_the_server_is_full() -> None:
     for _ in range(3):
         refused = vehicles.ask(vehicle=1000)
         assert (refused.refusal, refused.session) == (Refusal.FULL, 0)
-    full = ServerFull(vehicle=1000, host="vehicle", port=1, room=VEHICLES_MAX)
+    full = ServerFull(vehicle=1000, host="vehicle", port=1, capacity=VEHICLES_MAX)
     assert vehicles.server.events() == (full,)
     assert vehicles.server.refused[Refusal.FULL] == 3
     assert vehicles.open(vehicle=7).vehicle == 7
@@ -553,7 +553,7 @@ def test_a_vehicle_too_many_is_told_that_the_server_is_full() -> None:
 
 def test_a_full_server_keeps_the_second_life_of_a_vehicle_from_a_stranger() -> None:
     """The restarted vehicle has its row already, which no stranger can take."""
-    vehicles = Vehicles(scenario(), room=2)
+    vehicles = Vehicles(scenario(), capacity=2)
     for number in (1, 2):
         vehicles.observe(vehicles.open(vehicle=number), 0)
     vehicles.now_ns += SILENCE_NS + 1
@@ -566,7 +566,7 @@ def test_a_full_server_keeps_the_second_life_of_a_vehicle_from_a_stranger() -> N
 
 
 def test_welcomed_vehicles_count_as_present_until_they_are_overdue() -> None:
-    vehicles = Vehicles(scenario(), room=3)
+    vehicles = Vehicles(scenario(), capacity=3)
     welcomes = [vehicles.open(vehicle=number) for number in range(3)]
     assert vehicles.ask(vehicle=1000).refusal == Refusal.FULL
     vehicles.now_ns += WELCOME_NS

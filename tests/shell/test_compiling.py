@@ -18,10 +18,10 @@ def test_a_page_says_how_far_compiling_is_and_nothing_of_it_afterwards(tmp_path:
     flight.close()
     assert said == [f"compiling control loops: {number} of 2" for number in (0, 1)]
     assert flight.waits == heard
-    assert compiling.told(tmp_path) == ""
+    assert compiling.progress(tmp_path) == ""
 
 
 def test_a_folder_that_cannot_be_written_is_no_reason_to_fail(tmp_path: Path) -> None:
     compiling.tell(tmp_path / "none", "text")
     compiling.tell(None, "text")
-    assert compiling.told(tmp_path / "none") == compiling.told(None) == ""
+    assert compiling.progress(tmp_path / "none") == compiling.progress(None) == ""

@@ -38,7 +38,7 @@ def pipe() -> Iterator[tuple[IO[bytes], IO[bytes]]]:
 def test_what_is_written_arrives_in_order(tmp_path: Path) -> None:
     pieces = [b"%d\n" % number for number in range(1000)]
     with (tmp_path / "file").open("wb") as file:
-        writer = Writer(file, room=10**6, together=100, pause_s=0.001)
+        writer = Writer(file, capacity=10**6, together=100, pause_s=0.001)
         assert all(writer.write(piece) for piece in pieces)
         assert writer.close(PATIENCE_S)
     assert (tmp_path / "file").read_bytes() == b"".join(pieces)
@@ -48,7 +48,7 @@ def test_what_is_written_arrives_in_order(tmp_path: Path) -> None:
 
 def test_pieces_share_a_write_but_none_is_torn(pipe: tuple[IO[bytes], IO[bytes]]) -> None:
     reading, writing = pipe
-    writer = Writer(writing, room=10**6, together=100, pause_s=0.1)
+    writer = Writer(writing, capacity=10**6, together=100, pause_s=0.1)
     for _ in range(9):
         writer.write(b"x" * 29 + b"\n")
     assert writer.close(PATIENCE_S)
@@ -57,7 +57,7 @@ def test_pieces_share_a_write_but_none_is_torn(pipe: tuple[IO[bytes], IO[bytes]]
 
 def test_what_waits_is_bounded(tmp_path: Path) -> None:
     with (tmp_path / "file").open("wb") as file:
-        writer = Writer(file, room=100, together=1)
+        writer = Writer(file, capacity=100, together=1)
         taken = [writer.write(b"%09d\n" % number) for number in range(1000)]
         assert taken == [True] * 10 + [False] * 990
         assert (writer.offered, writer.refused, writer.written) == (10_000, 9900, 0)
@@ -75,7 +75,7 @@ def test_nobody_waits_for_a_reader_who_does_not_read(pipe: tuple[IO[bytes], IO[b
     while writing.write(b"before") is not None:
         pages += 1
     os.set_blocking(writing.fileno(), True)
-    writer = Writer(writing, room=100, together=1)
+    writer = Writer(writing, capacity=100, together=1)
     taken = [writer.write(b"%09d\n" % number) for number in range(1000)]
     assert taken == [True] * 10 + [False] * 990
     assert not writer.close(0.01)
@@ -102,7 +102,7 @@ def test_a_pipe_that_does_not_block_loses_nothing(
             read.append(int(reading.read(4096)))
 
     monkeypatch.setattr(writer_module, "select", SimpleNamespace(poll=Poll, POLLOUT=4))
-    writer = Writer(writing, room=10**6, together=10)
+    writer = Writer(writing, capacity=10**6, together=10)
     for number in range(1000):
         writer.write(b"%09d\n" % number)
     assert writer.close(PATIENCE_S)
@@ -114,7 +114,7 @@ def test_a_pipe_that_does_not_block_loses_nothing(
 
 def test_a_full_disk_ends_the_writing_and_nothing_else() -> None:
     with Path("/dev/full").open("wb", buffering=0) as full:
-        writer = Writer(full, room=100, together=100)
+        writer = Writer(full, capacity=100, together=100)
         for _ in range(1000):
             writer.write(b"row")
         assert writer.close(PATIENCE_S)
@@ -127,7 +127,7 @@ def test_a_reader_who_is_gone_ends_the_writing_and_nothing_else() -> None:
     reading, number = os.pipe()
     os.close(reading)
     with os.fdopen(number, "wb", buffering=0) as writing:
-        writer = Writer(writing, room=100, together=100)
+        writer = Writer(writing, capacity=100, together=100)
         writer.write(b"line\n")
         assert writer.close(PATIENCE_S)
         writer.write(b"line\n")
@@ -136,7 +136,7 @@ def test_a_reader_who_is_gone_ends_the_writing_and_nothing_else() -> None:
 
 def test_without_a_file_all_is_left_out() -> None:
     closed = OSError(errno.EBADF, "closed")
-    writer = Writer(closed, room=100, together=100)
+    writer = Writer(closed, capacity=100, together=100)
     for _ in range(1000):
         writer.write(b"row")
     assert writer.close(PATIENCE_S)

@@ -93,7 +93,7 @@ def test_vehicles_that_are_under_way_at_the_end_have_not_arrived(tmp_path: Path)
 
 def test_what_failed_is_told_once_for_all_vehicles(recording: Path) -> None:
     found = outcome(recording)
-    told = {text: (at_s, who) for at_s, who, text in found.told}
+    told = {text: (at_s, who) for at_s, who, text in found.happened}
     (leads,) = (each for each in told if "leads it now" in each)
     assert told[leads][1] == (1, 2, 3, 4)
     (died,) = (each for each in told if "nothing arrives over path 1" in each)

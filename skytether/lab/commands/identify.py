@@ -270,7 +270,7 @@ def _tell(options: IdentifyOptions, scenario: Scenario, flown: Sequence[SizeFlow
 
 
 def _all_told(flown: SizeFlown) -> list[AxisTold]:
-    return [outcome.told(name, axis) for name, axis in zip(AXES, flown.axes, strict=False)]
+    return [outcome.axis_results(name, axis) for name, axis in zip(AXES, flown.axes, strict=False)]
 
 
 def _measured(flight: Identifying, axes: int) -> str:

@@ -72,13 +72,13 @@ def scenario_text(
     fits = [each.fit for each in axes if each.fit is not None]
     if len(fits) < len(axes):
         return None
-    told: dict[str, Any] = {
+    table: dict[str, Any] = {
         "extends": str(Path(extends).absolute()) if ".toml" in extends else extends,
         "title": f"{extends}, with the model of a {flown.vehicle.kind} as identified",
     }
-    told |= differing(reading.to_table(base), reading.to_table(flown))
-    if file := told.get("reference", {}).get("file"):
-        told["reference"]["file"] = str(Path(file).absolute())
+    table |= differing(reading.to_table(base), reading.to_table(flown))
+    if file := table.get("reference", {}).get("file"):
+        table["reference"]["file"] = str(Path(file).absolute())
     # the plant equals the model unless the scenario says otherwise
     if flown.vehicle.kind == "simulated":
         truth = {
@@ -86,11 +86,11 @@ def scenario_text(
             "gain": flown.true_gain,
             "dead_time_s": flown.true_dead_time_s,
         }
-        told["vehicle"] = told.get("vehicle", {}) | {
+        table["vehicle"] = table.get("vehicle", {}) | {
             key: values.tolist() for key, values in truth.items()
         }
     numbers = [fit.numbers for fit in fits]
-    told["model"] = told.get("model", {}) | {
+    table["model"] = table.get("model", {}) | {
         "tau_s": [_rounded(each.tau_s) for each in numbers],
         "u_max": _u_max(flown, axes, numbers),
         "gain": [_rounded(each.gain) for each in numbers],
@@ -103,7 +103,7 @@ def scenario_text(
         f"u_max: {BEYOND:g} times the size of the steps, because larger inputs were not measured;",
         f"more if {FASTER:g} times the desired trajectory's speed or the fence's wind needs more.",
     ]
-    return "".join(f"# {line}\n" for line in lines).encode() + tomli_w.dumps(told).encode()
+    return "".join(f"# {line}\n" for line in lines).encode() + tomli_w.dumps(table).encode()
 
 
 def differing(base: dict[str, Any], table: dict[str, Any]) -> dict[str, Any]:
@@ -156,7 +156,7 @@ class AxisTold(msgspec.Struct, frozen=True):
     largest_at_s: float | None = None
 
 
-def told(name: str, axis: AxisOutcome) -> AxisTold:
+def axis_results(name: str, axis: AxisOutcome) -> AxisTold:
     steps, fit = len(axis.responses), axis.fit
     if fit is None:
         return AxisTold(name, axis.speed, steps, axis.cut, describe(axis))

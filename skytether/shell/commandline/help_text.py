@@ -48,10 +48,14 @@ def help_text(default: Any, prog: str, about: str) -> str:
         metavar = (argument.metavar or _metavar(hint, text)) + "..." * many
         if argument.positional:
             arguments.append(metavar if required else f"[{metavar}]")
-            groups[ARGUMENTS].append(Entry(metavar, text if required else _told(text, value)))
+            groups[ARGUMENTS].append(
+                Entry(metavar, text if required else _with_default(text, value))
+            )
         else:
             flag = name.replace("_", "-")
-            entry = Entry(f"--{flag} {metavar}".rstrip(), _told(text, value, required=required))
+            entry = Entry(
+                f"--{flag} {metavar}".rstrip(), _with_default(text, value, required=required)
+            )
             groups[group_of.get(flag, OPTIONS)].append(entry)
     groups[OPTIONS].append(Entry("-h, --help", "Show this help and exit."))
     parts = [f"usage: {' '.join([prog, *arguments, '[OPTIONS]'])}", *_paragraphs(about)]
@@ -77,7 +81,7 @@ def keys_text(scenario: Scenario, prog: str) -> str:
                 switch = "[no-]" * isinstance(value, bool)
                 form = f"--{prefix}{switch}{flag} {_metavar(hints[name], '')}".rstrip()
                 shown = str(value).lower() if switch else value
-                groups[title].append(Entry(form, _told(texts.get(name, ""), shown)))
+                groups[title].append(Entry(form, _with_default(texts.get(name, ""), shown)))
 
     add(scenario, "", "flight")
     return f"usage: {prog} [SCENARIO] [--KEY VALUE ...]\n\n{_grouped(groups)}"
@@ -118,7 +122,7 @@ def _metavar(hint: Any, text: str) -> str:
     return "HOST:PORT" if hint is str and "HOST:PORT" in text else SHORT.get(hint, "TABLE")
 
 
-def _told(text: str, value: Any, *, required: bool = False) -> str:
+def _with_default(text: str, value: Any, *, required: bool = False) -> str:
     """Text of an option with its default, if it has one that a person would write."""
     if required:
         return f"{text} (required)"

@@ -37,8 +37,8 @@ class HalfConnection:
         self._peer, self._hear = peer, hear
         self.pieces: asyncio.Queue[bytes] = asyncio.Queue()
         """Pieces that have passed the endpoint."""
-        self._held, self._room = 0, asyncio.Event()
-        self._room.set()
+        self._held, self._has_capacity = 0, asyncio.Event()
+        self._has_capacity.set()
         self._has_ended = False
 
     async def read(self) -> None:
@@ -48,8 +48,8 @@ class HalfConnection:
                 self._held += 1
                 self._hear(data[at : at + PIECE_BYTES], self._peer)
             if self._held >= HELD_MAX:
-                self._room.clear()
-                await self._room.wait()
+                self._has_capacity.clear()
+                await self._has_capacity.wait()
         self.end()
 
     async def write(self) -> None:
@@ -58,7 +58,7 @@ class HalfConnection:
             await loop.sock_sendall(self._target, piece)
             self._held -= 1
             if self._held < HELD_MAX:
-                self._room.set()
+                self._has_capacity.set()
         self._target.shutdown(socket.SHUT_WR)
 
     def end(self) -> None:

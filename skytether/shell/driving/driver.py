@@ -162,7 +162,7 @@ class Shell:
             if line is not None:
                 self._add(line)
             failed.pop_all()
-        self._room = memoryview(bytearray(DATAGRAM_BYTES_MAX))
+        self._buffer = memoryview(bytearray(DATAGRAM_BYTES_MAX))
         """One buffer for all datagrams: copying out of it is faster than allocating many."""
         self._batches: dict[int, DatagramBatch | None] = {}
         self._patience_ns = endpoint.patience_ns
@@ -280,7 +280,7 @@ class Shell:
     def _hear(self, number: int) -> None:
         """Hand the datagrams at a socket to the endpoint, one by one, at most BURST_MAX."""
         receive, name = self._sockets[number].recvfrom_into, self._names_at(number).name
-        buffer, hear, clock_ns = self._room, self.endpoint.receive, time.monotonic_ns
+        buffer, hear, clock_ns = self._buffer, self.endpoint.receive, time.monotonic_ns
         stopwatch, is_refused = self._stopwatch, False
         try:
             for count in range(BURST_MAX):

@@ -294,11 +294,11 @@ class Subscriber:
 
     async def _read_all(self, paths: Mapping[str, Path]) -> None:
         async with asyncio.TaskGroup() as readers:
-            known: set[str] = set()
+            followed: set[str] = set()
             found = paths
             while True:
-                for name in list(found.keys() - known)[: FOLLOWED_MAX - len(known)]:
-                    known.add(name)
+                for name in list(found.keys() - followed)[: FOLLOWED_MAX - len(followed)]:
+                    followed.add(name)
                     readers.create_task(self._follow(name, found[name]))
                 if self._further is None:
                     break

@@ -133,9 +133,9 @@ class GraphSession:
         if self._publisher is None:
             return False
         self._sent += 1
-        told = attachment(self._sent, time.time_ns(), self._identity)
+        attached = attachment(self._sent, time.time_ns(), self._identity)
         try:
-            self._publisher.put(payload, attachment=told)
+            self._publisher.put(payload, attachment=attached)
         except self._zenoh.ZError:
             return False
         return True

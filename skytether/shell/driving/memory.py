@@ -93,7 +93,7 @@ class MemoryFile:
         self._changed = threading.Condition()
         self._ends = False
         self._thread: threading.Thread | None = None
-        self._failure = self._told = ""
+        self._failure = self._reported = ""
         """Reason why the newest content could not be written, and reason reported last."""
         self._is_removed = False
         """Whether the file was removed, because it could not be written."""
@@ -172,8 +172,8 @@ class MemoryFile:
 
     def news(self) -> NotKept | None:
         """Event that says why the file cannot be written; None if it can, or that was reported."""
-        failure, reported = self._failure, self._told
-        self._told = failure
+        failure, reported = self._failure, self._reported
+        self._reported = failure
         if not failure or failure == reported:
             return None
         return NotKept(reason=failure, removed=self._is_removed)
@@ -225,7 +225,7 @@ class MemoryFile:
     def _remove(self) -> None:
         with contextlib.suppress(OSError):  # of a disk that is read-only
             self._path.unlink(missing_ok=True)
-            self._is_removed, self._told, self._told_nothing = True, "", True
+            self._is_removed, self._reported, self._told_nothing = True, "", True
             with contextlib.suppress(RuntimeError):  # the loop has closed meanwhile
                 self._loop.call_soon_threadsafe(lambda: self._endpoint.kept(nothing=True))
 

@@ -245,7 +245,7 @@ class ProgramLine:
         self._program, self._hear = program, hear
         self._waiting: deque[bytes] = deque()
         """Frames that slirp4netns cannot take yet."""
-        self._room = memoryview(bytearray(FRAME_BYTES_MAX))
+        self._buffer = memoryview(bytearray(FRAME_BYTES_MAX))
 
     def send(self, payload: bytes, peer: Address) -> bool:
         """Send a packet; False if it is invalid, or too many wait."""
@@ -293,26 +293,26 @@ class ProgramLine:
 
     def _read_device(self) -> int:
         """Hear packets of the program; returns how many."""
-        room, packets = self._room, list[Datagram]()
+        buffer, packets = self._buffer, list[Datagram]()
         with suppress(OSError):
             while len(packets) < BATCH_MAX:
-                size = os.readv(self._program.device, [room])
-                packets.append(Datagram(room[:size].tobytes(), PROGRAM, 1))
+                size = os.readv(self._program.device, [buffer])
+                packets.append(Datagram(buffer[:size].tobytes(), PROGRAM, 1))
         self._hear(*packets)
         return len(packets)
 
     def _read_outside(self) -> None:
-        room, packets = self._room, list[Datagram]()
+        buffer, packets = self._buffer, list[Datagram]()
         with suppress(OSError):
             for _ in range(BATCH_MAX):
                 try:
-                    size = self._program.outside.recv_into(room)
+                    size = self._program.outside.recv_into(buffer)
                 except ConnectionError:
                     size = 0
                 if not size:
                     self._end(f"{SLIRP} has ended: the program has no network any more")
                     return
-                packet = unframed(room[:size].tobytes())
+                packet = unframed(buffer[:size].tobytes())
                 if packet is not None:
                     packets.append(Datagram(packet, OUTSIDE, 1))
         self._hear(*packets)

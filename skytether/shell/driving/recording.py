@@ -35,18 +35,18 @@ class RecordFile:
     def __init__(self, name: str, columns: np.dtype[np.void], file: BinaryIO | OSError) -> None:
         self._name = name.encode(errors="replace").decode()  # a file's name need not be Unicode
         self._file = file
-        self._writer = Writer(file, room=ROOM_BYTES, together=TOGETHER_BYTES, pause_s=PAUSE_S)
+        self._writer = Writer(file, capacity=ROOM_BYTES, together=TOGETHER_BYTES, pause_s=PAUSE_S)
         self.recorder = Recorder(columns, self._writer)
         self._header_bytes = self._writer.offered
         self._ended = False
-        self._told = False
+        self._is_reported = False
 
     def news(self) -> RecordIncomplete | None:
         """Event about lost rows: once, after the first was lost; otherwise None."""
         reason = self._reason()
-        if reason is None or self._told:
+        if reason is None or self._is_reported:
             return None
-        self._told = True
+        self._is_reported = True
         return RecordIncomplete(file=self._name, reason=reason)
 
     def end(self) -> None:

@@ -105,7 +105,7 @@ class _Headers:
         memory = mmap.mmap(-1, stride * BATCH_MAX, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
         with contextlib.suppress(OSError):  # a kernel without huge pages
             memory.madvise(mmap.MADV_NOHUGEPAGE)
-        self.room = memoryview(memory)
+        self.memory = memoryview(memory)
         self.names = bytearray(name_bytes * BATCH_MAX)
         buffers, headers = bytearray(_BUFFER.size * BATCH_MAX), bytearray(_HEADER.size * BATCH_MAX)
         stamps = bytearray(_STAMP.size * BATCH_MAX)
@@ -129,9 +129,9 @@ class _Headers:
         """Arrival times by CLOCK_REALTIME: seconds, and the rest [ns]; shape (BATCH_MAX,)."""
 
 
-def _address(room: bytearray | mmap.mmap) -> int:
+def _address(memory: bytearray | mmap.mmap) -> int:
     """Address of memory; a bytearray can no longer be resized after this."""
-    return ctypes.addressof(ctypes.c_char.from_buffer(room))
+    return ctypes.addressof(ctypes.c_char.from_buffer(memory))
 
 
 class DatagramBatch:
@@ -185,7 +185,7 @@ class DatagramBatch:
         ahead_ns, now_ns = _clocks()
         if count <= 0:
             return [], [], []
-        memory, names, ends = rows.room, bytes(rows.names[: count * size]), size * count
+        memory, names, ends = rows.memory, bytes(rows.names[: count * size]), size * count
         lengths = rows.done[:count].tolist()
         payloads = [
             memory[at : at + length].tobytes() for at, length in zip(_STARTS, lengths, strict=False)
@@ -209,7 +209,7 @@ class DatagramBatch:
         rows, count, at, name_bytes = self._out, len(payloads), 0, self._name_bytes
         if max(map(len, payloads)) > SIZE_MAX or any(len(peer) != name_bytes for peer in peers):
             return 0
-        memory, sizes = rows.room, rows.sizes
+        memory, sizes = rows.memory, rows.sizes
         for i, payload in enumerate(payloads):
             size = sizes[i] = len(payload)
             memory[at : at + size] = payload

@@ -80,7 +80,7 @@ def tell(folder: Path | None, text: str) -> None:
             (folder / TOLD).unlink(missing_ok=True)
 
 
-def told(folder: Path | None) -> str:
+def progress(folder: Path | None) -> str:
     """What a command has told of its compiling; empty if nothing, or once it is over."""
     with suppress(OSError, ValueError):
         return input_files.read(folder / TOLD, TOLD_BYTES).decode() if folder else ""

@@ -23,10 +23,10 @@ class Writer:
     """
 
     def __init__(
-        self, file: IO[Any] | OSError, *, room: int, together: int, pause_s: float = 0.0
+        self, file: IO[Any] | OSError, *, capacity: int, together: int, pause_s: float = 0.0
     ) -> None:
         self._file = file
-        self._room = room
+        self._capacity = capacity
         self._together = together
         self._pause_s = pause_s
         # Each counter is changed by one thread only: `offered` and `refused` by the caller's.
@@ -47,7 +47,7 @@ class Writer:
     def write(self, piece: bytes) -> bool:
         """Queue a piece for writing; False if it was dropped. Never blocks, never raises."""
         self.offered += len(piece)
-        if self.offered - self.refused - self._handled > self._room:
+        if self.offered - self.refused - self._handled > self._capacity:
             self.refused += len(piece)
             return False
         self._pieces.put(piece)

@@ -76,7 +76,7 @@ class Log:
         self._beside = beside
         closed = OSError(errno.EBADF, "the standard output is closed")
         stream = sys.stderr if to_stderr else sys.stdout
-        self._writer = Writer(stream or closed, room=ROOM_BYTES, together=TOGETHER_BYTES)
+        self._writer = Writer(stream or closed, capacity=ROOM_BYTES, together=TOGETHER_BYTES)
         self._limit = Limit()
         self._unread = 0
 

@@ -226,7 +226,7 @@ class Process:
                 if served:
                     served.take(snapshot)
 
-            with _told_once() as told, closing(self._log(line)) as out:
+            with _handling_signals() as ignore_signals, closing(self._log(line)) as out:
                 run(
                     [shell],
                     on_start=start,
@@ -235,7 +235,7 @@ class Process:
                     on_second=each_second,
                     on_signal=line.signal if isinstance(line, Program) else None,
                 )
-                told()
+                ignore_signals()
                 if self.recording:
                     self.recording.end()
                 each_second(last=True)
@@ -361,7 +361,7 @@ def _fed(process: str, options: ProcessOptions, *, secure: bool) -> Iterator[Fee
 
 
 @contextmanager
-def _told_once() -> Iterator[Callable[[], None]]:
+def _handling_signals() -> Iterator[Callable[[], None]]:
     """Handle SIGINT and SIGTERM until the yielded function is called; then ignore them."""
     before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
 

@@ -11,7 +11,7 @@ import msgspec
 from skytether.shared.endpoints.change import ONCE, Answer
 from skytether.shared.events.flight import Changed
 from skytether.shared.telemetry.feed import Frame, Opened, Said
-from skytether.shell.host.compiling import told
+from skytether.shell.host.compiling import progress
 from skytether.view import controls
 from skytether.view.browser.play import NETEMS, PROCESSES, Operator
 from skytether.view.changes import Mark, mark, together
@@ -69,7 +69,7 @@ class PageFlight:
     @property
     def waits(self) -> str:
         """What a flight that has not begun waits for."""
-        return told(self._folder) or f"{self.title} No process of the flight is heard yet."
+        return progress(self._folder) or f"{self.title} No process of the flight is heard yet."
 
     # -- changes -----------------------------------------------------------------------------
 

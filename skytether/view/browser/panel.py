@@ -219,12 +219,12 @@ class Panel:
             figures.content = words.figures(flight.state, vehicle, now_ns, flight.title)
         self._said.content = words.said([(each.title, each.state) for each in self._flights])
         tracks = [each.state.vehicles.get(vehicle, self._nobody) for each in self._flights]
-        known = [track for track in tracks if track]
-        if len(known) == len(tracks):
-            end_s = max(track.time_s for track in known)
+        placed = [track for track in tracks if track]
+        if len(placed) == len(tracks):
+            end_s = max(track.time_s for track in placed)
             looks = [
                 Look(flight.state, track.curves(POINTS, end_s), now_ns, vehicle)
-                for flight, track in zip(self._flights, known, strict=True)
+                for flight, track in zip(self._flights, placed, strict=True)
             ]
             for plots in self._plots:
                 plots.draw(looks)
@@ -282,7 +282,7 @@ class _Slider:
             knob.label, knob.low, knob.high, knob.step, knob.low, hint=knob.hint, visible=False
         )
         self.note = _Note(gui)
-        self._known = knob.low
+        self._shown = knob.low
         self._moved_s = -np.inf
 
         @self._slider.on_update
@@ -295,14 +295,14 @@ class _Slider:
                 self.note.asks(ask(knob, number))
             else:
                 self.note.refuse(knob.with_unit(f"{low:g} to {high:g}"))
-                assign(self._slider, self._known)
+                assign(self._slider, self._shown)
 
     def show(self, values: Values) -> None:
         number = self.knob.read(values)
         self._slider.visible = number is not None
         if number is None or time.monotonic() - self._moved_s < HELD_S:
             return
-        self._known = number
+        self._shown = number
         self._slider.max = max(self._slider.max, number)
         self._slider.min = min(self._slider.min, number)
         if abs(self._slider.value - number) > self.knob.step / 2:
@@ -373,7 +373,7 @@ class _Network:
         flies: bool,
     ) -> None:
         self._number = number
-        self._known: dict[str, str] = {}
+        self._shown: dict[str, str] = {}
         self._folder = gui.add_folder("Network", expand_by_default=not flies, visible=False)
         with self._folder:
             self._texts = {
@@ -391,19 +391,19 @@ class _Network:
         @apply.on_click
         async def _(_: Any) -> None:
             given = {way: text.value for way, text in self._texts.items()}
-            changed = {way: text for way, text in given.items() if text != self._known.get(way)}
+            changed = {way: text for way, text in given.items() if text != self._shown.get(way)}
             self.note.asks(changed)
             if changed:
                 ask(changed)
 
     def show(self, values: Values, *, is_alone: bool) -> None:
-        known = texts(values)
-        self._folder.visible = bool(known)
+        shown = texts(values)
+        self._folder.visible = bool(shown)
         self._folder.label = "Network" if is_alone else f"Network of path {self._number}"
         self._alone.visible = not is_alone
-        if known != self._known:
-            self._known = known
-            for way, text in known.items():
+        if shown != self._shown:
+            self._shown = shown
+            for way, text in shown.items():
                 assign(self._texts[way], text)
 
 
@@ -624,11 +624,11 @@ class _Mission:
         vehicle: Callable[[], int],
     ) -> None:
         self._flight, self._state, self._ask = flights[0], flights[0].state, ask
-        self._known, self._vehicle = self._state.zones, vehicle
+        self._shown, self._vehicle = self._state.zones, vehicle
         self._corners: list[NDArray[Any]] = []
         gui = client.gui
         with gui.add_folder("Mission"):
-            self._text = gui.add_text("Zones", self._known, hint=ZONES)
+            self._text = gui.add_text("Zones", self._shown, hint=ZONES)
             self.note = _Note(gui)
             apply = gui.add_button("Change the zones")
             self._clicks = gui.add_dropdown("A click", CLICKS, hint=CLICKED)
@@ -681,9 +681,9 @@ class _Mission:
 
     def show(self) -> None:
         self._handle.show(self._goal())
-        if self._state.zones != self._known:
-            self._known = self._state.zones
-            assign(self._text, self._known)
+        if self._state.zones != self._shown:
+            self._shown = self._state.zones
+            assign(self._text, self._shown)
 
 
 class _Handle:
