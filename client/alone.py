@@ -85,20 +85,15 @@ class OneServer:
         failsafe: told of the packets and faults of the server that leads.
     """
 
+    leader = 0
+    """Which server leads."""
+    number = 0
+    """Number of its leadership."""
+
     def __init__(self, failsafe: Failsafe) -> None:
         self.failsafe = failsafe
         self.sessions: list[Any] = []
         """Session with each server; the caller appends them."""
-
-    @property
-    def leader(self) -> int:
-        """Which server leads."""
-        return 0
-
-    @property
-    def number(self) -> int:
-        """Number of its leadership."""
-        return 0
 
     @property
     def leading(self) -> Any:

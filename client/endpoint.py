@@ -199,7 +199,8 @@ class Client(Endpoint):
                 self.horizons += 1
         except ProtocolError as error:
             self.dropped[error.reason] += 1
-        self._note_transitions(now_ns)
+        if self._failsafe.transitions or self._pilot.transitions:
+            self._note_transitions(now_ns)
 
     def _begin(self, now_ns: int) -> None:
         """Begin the flight once the first session is open and the vehicle can be flown.
@@ -254,7 +255,11 @@ class Client(Endpoint):
         self._memory.kept(nothing=nothing)
 
     def next_wake_ns(self) -> int | None:
-        due_ns = self._due_ns()
+        pilot, due_ns = self._pilot, None
+        if pilot.next_ns is None:
+            due_ns = self._due_ns()
+        elif pilot.step < pilot.steps:
+            due_ns = pilot.next_ns
         if self._port is None or self.finished:
             return due_ns
         port_ns = self._port.next_wake_ns()
@@ -310,17 +315,19 @@ class Client(Endpoint):
     def _fly(self, now_ns: int) -> None:
         pilot = self._pilot
         pilot.fly(now_ns=now_ns)
-        self._note_transitions(now_ns)
+        if pilot.transitions:
+            self._note_transitions(now_ns)
         self._log.report_step(now_ns)
         if pilot.step >= pilot.steps:
             self._flies.land()
             self._log.report_end(now_ns)
         # Nothing is sent before the state is saved, or the disk has failed: otherwise the server
         # would not know which motion the next run flies.
-        may_tell = self._may_tell(now_ns)
-        self.waits_for_disk = self._memory.is_stale
-        if not may_tell:
-            return
+        if self.keeps:
+            may_tell = self._may_tell(now_ns)
+            self.waits_for_disk = self._memory.is_stale
+            if not may_tell:
+                return
         self._servers.follow(step=pilot.flown, on_ground=False, now_ns=now_ns)
         for server, session in enumerate(self._sessions):
             observation = None

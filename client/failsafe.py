@@ -203,6 +203,8 @@ class Failsafe:
         returns: bool = False,
     ) -> None:
         self._table = table
+        self.brakes = table is TABLE
+        """Whether the vehicle brakes without a plan, rather than repeating its last input."""
         self.armed = armed
         self._timeout_ns, self._brake_ns = timeout_ns, brake_ns
         self._land_after_ns = land_after_ns
@@ -247,11 +249,6 @@ class Failsafe:
         # server that cannot be relied on.
         may = may and self.postponed in (None, Reason.STALLED)
         return may and self.armed and not self.has_leapt and self.reason not in LOCKING
-
-    @property
-    def brakes(self) -> bool:
-        """Whether the vehicle brakes without a plan, rather than repeating its last input."""
-        return self._table is TABLE
 
     def is_lost(self, now_ns: int) -> bool:
         return self._heard_ns is None or now_ns - self._heard_ns > self._timeout_ns

@@ -126,7 +126,7 @@ class HorizonFollower:
     def foresee(self, stage: int, state: Array, flown: Array | None) -> Array:
         if flown is not None:
             return self._model.step(state, flown + self._table[:, rule.DISTURBANCE])
-        ahead = np.empty_like(state)
+        ahead = np.empty(state.shape)
         rule.foresee_horizon(self._table, self._inputs, self.reference, stage, state, ahead)
         return ahead
 
@@ -180,6 +180,6 @@ class SplineFollower:
         return flown
 
     def foresee(self, stage: int, state: Array, flown: Array | None) -> Array:  # noqa: ARG002
-        ahead = np.empty_like(state)
+        ahead = np.empty(state.shape)
         spline.foresee_spline(self._table, self._knots, self.reference, stage, state, ahead)
         return ahead

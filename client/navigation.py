@@ -220,9 +220,8 @@ class Leaps:
         """
         stamp_ns, position, velocity = measured
         p, v = self._position, self._velocity
-        time_p, time_v = (
-            (stamp_ns - last_ns) / SECOND_NS for last_ns in (self._position_ns, self._velocity_ns)
-        )
+        time_p = (stamp_ns - self._position_ns) / SECOND_NS
+        time_v = (stamp_ns - self._velocity_ns) / SECOND_NS
         leaps = has_leapt(p, v, numbers, time_p, time_v, self._noise_m, self._noise_mps)
         self.off_m = []
         if leaps and position is not None:

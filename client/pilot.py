@@ -152,7 +152,8 @@ class Pilot:
         Raises:
             ProtocolError: the horizon is dropped.
         """
-        self.obey()
+        if self._failsafe.transitions:
+            self.obey()
         terms = self._terms
         # An overtaken horizon is late anyway, and shows no delay of the newest.
         if horizon.step > self.compensator.newest:
@@ -173,7 +174,8 @@ class Pilot:
             raise
         if is_held:
             self._failsafe.horizon_taken(now_ns=now_ns)
-            self._failsafe.motion_goes_on(self._goes_on(self.step), now_ns=now_ns)
+            if self._is_mission:
+                self._failsafe.motion_goes_on(self._goes_on(self.step), now_ns=now_ns)
 
     def _goes_on(self, step: int) -> bool:
         """Whether the vehicle follows a mission's motion whose last knot lies after `step`."""
@@ -206,7 +208,7 @@ class Pilot:
         return self.starts_ns(last) if self._goes_on(self.step) else now_ns
 
     def obey(self) -> None:
-        """Act on the transitions of the failsafe since the last call."""
+        """Act on the transitions of the failsafe since the last call; needed only if it has any."""
         transitions = self._failsafe.transitions
         for each in transitions:
             if not each.takes:
@@ -242,7 +244,8 @@ class Pilot:
         self.flown = self.step = present
         self._flown_ns = self._epoch_ns + present * self._dt_ns
         self._meet_causes(now_ns)
-        self._rest()
+        if self._holds and self._failsafe.mode in HOVERING:
+            self._rest()
         flown, speed, is_finite = self._compose_input()
         if not is_finite:
             self._failsafe.meet(Reason.NOT_FINITE, now_ns=now_ns)
@@ -250,7 +253,8 @@ class Pilot:
             self._failsafe.meet(Reason.ENDED, now_ns=now_ns)
         if not speed:
             self._failsafe.meet(Reason.BRAKED, now_ns=now_ns)
-        self.obey()
+        if self._failsafe.transitions:
+            self.obey()
         self._input, self._speed = np.array(flown), speed
         self._vehicle.fly(self._input)
         if not self._failsafe.takes:
@@ -264,7 +268,8 @@ class Pilot:
         self._record()
 
     def _navigate(self, step: int) -> None:
-        now_ns = self.starts_ns(step)
+        assert self._epoch_ns is not None
+        now_ns = self._epoch_ns + step * self._dt_ns
         measurements = self._vehicle.measurements(now_ns=now_ns)
         self._navigation.advance(measurements, self._input, now_ns=now_ns)
 
@@ -272,9 +277,11 @@ class Pilot:
         """Let the failsafe act on the causes that hold at the start of the present step."""
         failsafe, navigation = self._failsafe, self._navigation
         hindrance = self._vehicle.hindrance(now_ns=now_ns)
-        failsafe.motion_goes_on(self._goes_on(self.step), now_ns=now_ns)
+        if self._is_mission:
+            failsafe.motion_goes_on(self._goes_on(self.step), now_ns=now_ns)
         failsafe.step(late_ns=self.late_ns, hindrance=hindrance, now_ns=now_ns)
-        self.obey()
+        if failsafe.transitions:
+            self.obey()
         if self.step == self.steps - 1 and self._goes_on(self.step):
             # Where the flight ends on the way, the vehicle would stop off its motion.
             failsafe.meet(Reason.OVER, now_ns=now_ns)
@@ -289,7 +296,8 @@ class Pilot:
             failsafe.leapt(now_ns=now_ns)
             if self.compensator.rests:
                 self._drop()
-        self.obey()
+        if failsafe.transitions:
+            self.obey()
 
     def _compose_input(self) -> tuple[list[float], float, bool]:
         """Input of the present step: the compensator's, bounded by mode, clamp and fence.
@@ -345,9 +353,8 @@ class Pilot:
 
     def _is_to_rest(self) -> bool:
         failsafe, compensator = self._failsafe, self.compensator
-        hovers = self._holds and failsafe.mode in HOVERING
         is_free = compensator.in_force == NO_HORIZON and not compensator.rests
-        if not (hovers and is_free):
+        if not is_free:
             return False
         # After a change of the frame the estimate is of the old one until a position comes.
         is_measured = bool(np.isfinite(self._navigation.measured[:, 0]).all())

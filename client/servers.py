@@ -92,11 +92,11 @@ class Servers(OneServer):
         """When the leader that is, or was last, doubted had been heard last."""
 
     @property
-    def leader(self) -> int:
+    def leader(self) -> int:  # type: ignore[override] # changes in flight
         return self.leadership.leader
 
     @property
-    def number(self) -> int:
+    def number(self) -> int:  # type: ignore[override] # changes in flight
         return self.leadership.number
 
     def begin(self, server: int) -> None:

@@ -9,7 +9,7 @@ every step, since planning is a small part of the cost of a step.
 """
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -26,6 +26,7 @@ from skytether.server.planning.scheme import (
     in_turn,
 )
 from skytether.server.schemes import table
+from skytether.server.sessions import Session
 from skytether.server.triggers.trigger import (
     Situation,
     SituationArrays,
@@ -228,12 +229,12 @@ class Controller:
             self._takes[row] = bool(observation.takes)
         return is_stored
 
-    def note_heartbeats(self, rows: list[int]) -> None:
+    def note_heartbeats(self, due: Sequence[Session]) -> None:
         """Set the vehicles to which a heartbeat is due at this tick unless a plan is sent."""
-        if rows or self._heartbeats:
+        if due or self._heartbeats:
             self._heartbeat_due[:] = False
-            self._heartbeat_due[rows] = True
-            self._heartbeats = bool(rows)
+            self._heartbeat_due[[each.row for each in due]] = True
+            self._heartbeats = bool(due)
 
     def able(self, rows: Indices, step: Indices) -> tuple[Indices, Indices]:
         """Vehicles with a new step and no reason to be idle, and their steps."""

@@ -154,7 +154,7 @@ class Server(Endpoint):
             for session in self.sessions.expire(now_ns):
                 self._events.append(SessionEnded(vehicle=session.vehicle))
             self._spread_leadership(now_ns)
-        if len(self.sessions):
+        if self.sessions.rows.size:
             self._ticked_ns = now_ns
             self._ticker.tick(tick_ns, now_ns)
         else:

@@ -64,14 +64,13 @@ class Grid:
         # would delay the next tick too.
         late = (now_ns - self.due_ns) // self._dt_ns
         self.missed += late
-        self._note_missed(late, now_ns)
+        if late or self.degraded:
+            self._note_missed(late, now_ns)
         tick_ns = self.due_ns + late * self._dt_ns
         self.due_ns = tick_ns + self._dt_ns
         return tick_ns
 
     def _note_missed(self, count: int, now_ns: int) -> None:
-        if not (count or self.degraded):
-            return
         # After an hour of suspension `count` is large; the deque keeps the newest few only.
         self._missed_ns += [now_ns] * min(count, MISSES_MAX + 1)
         many = len(self._missed_ns) > MISSES_MAX and now_ns - self._missed_ns[0] <= SECOND_NS
@@ -119,7 +118,7 @@ class Ticker:
         if controller.budget:
             controller.budget.fill(now_ns)
         heartbeats = self._sessions.heartbeats_due(now_ns)
-        controller.note_heartbeats([each.row for each in heartbeats])
+        controller.note_heartbeats(heartbeats)
         rows, step = controller.able(rows, step)
         for first in range(0, len(rows), BLOCK):
             block = slice(first, first + BLOCK)

@@ -172,6 +172,10 @@ class Trigger:
         """Note that a horizon is sent to these vehicles at this step: k_i ← k."""
 
 
+COLUMNS = {each: str(each) for each in Compared}
+"""Column of each figure of the plans."""
+
+
 def above(situation: Situation, figure: Array | Compared, threshold: float) -> Verdict:
     """Verdict of a policy that fires if a figure exceeds a threshold; both are recorded.
 
@@ -181,7 +185,7 @@ def above(situation: Situation, figure: Array | Compared, threshold: float) -> V
         threshold: threshold in the figure's unit.
     """
     compared = figure if isinstance(figure, Compared) else Compared.OWN
-    values = situation.figures[str(figure)] if isinstance(figure, Compared) else figure
+    values = situation.figures[COLUMNS[figure]] if isinstance(figure, Compared) else figure
     event = situation.figures["fresh"] | (values > threshold)
     return Verdict(event, values, _constant(len(values), threshold), compared)
 
