@@ -190,7 +190,8 @@ class Compensator:
         """
         if self._new:
             self.since, self._new = step, False
-        self._chosen, self.covered = step, self._covers(step)
+        self._chosen = step
+        self.covered = self.in_force != NO_HORIZON and step - self.begins < self.follower.length
         flown, without_feedback = self.follower.input_at(
             step - self.begins, state, disturbance, before
         ).tolist()
@@ -199,9 +200,6 @@ class Compensator:
     def flown_since(self, step: int) -> int:
         """First step whose input comes from the horizon in force, if `step` is the next one."""
         return step if self._new else self.since
-
-    def _covers(self, step: int) -> bool:
-        return self.in_force != NO_HORIZON and step - self.begins < self.follower.length
 
     def foresee(self, states: Array, flown: Array | None = None) -> Array:
         """State of each axis one step after the latest chosen step, see `Follower.foresee`."""

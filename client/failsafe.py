@@ -337,7 +337,10 @@ class Failsafe:
             self.meet(Reason.OLD, now_ns=now_ns)
         if now_ns - self._began_ns >= self._brake_ns:
             self.meet(Reason.BRAKED, now_ns=now_ns)
-        self._wait(lost=lost, good=good, now_ns=now_ns)
+        if self.mode in HANGING:
+            self._wait(lost=lost, good=good, now_ns=now_ns)
+        else:
+            self._waits_ns = now_ns
 
     def _wait(self, *, lost: bool, good: bool, now_ns: int) -> None:
         """Land if the vehicle has waited too long for a good link, a ready autopilot or an
@@ -348,7 +351,7 @@ class Failsafe:
         waits = lost or (locked and not good) or (self.has_leapt and not self.stays)
         # A link that has just returned gets one second to become good.
         patience_ns = self._land_after_ns + (0 if lost else GOOD_NS)
-        if self.mode not in HANGING or not waits:
+        if not waits:
             self._waits_ns = now_ns
         elif self._land_after_ns and now_ns - self._waits_ns >= patience_ns:
             self.meet(self._alone if lost else Reason.WAITED, now_ns=now_ns)

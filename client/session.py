@@ -144,9 +144,11 @@ class ServerSession:
 
     def is_lost(self, now_ns: int) -> bool:
         timeout_ns = self._timeout_ns
+        if self.heard_ns is None or now_ns - self.heard_ns <= timeout_ns:
+            return self.heard_ns is None
         if not self.leads:  # before the server forgets the session
             timeout_ns = max(timeout_ns, min(STANDBY_TIMES * timeout_ns, SESSION_NS // 2))
-        return self.heard_ns is None or now_ns - self.heard_ns > timeout_ns
+        return now_ns - self.heard_ns > timeout_ns
 
     @property
     def silence(self) -> int:

@@ -100,7 +100,7 @@ def fly(
     actions: Sequence[tuple[float, Callable[[World], None]]] = (),
     stopwatch: Stopwatch | None = None,
     on_second: Callable[[int], None] = lambda _: None,
-    stopped: Callable[[], bool] = lambda: False,
+    stopped: Callable[[], bool] | None = None,
 ) -> Record:
     """Fly a scenario in virtual time.
 
@@ -151,7 +151,7 @@ def fly_batch(
     *,
     changes: Sequence[tuple[float, Mapping[str, Any]]] = (),
     on_second: Callable[[int], None] = lambda _: None,
-    stopped: Callable[[], bool] = lambda: False,
+    stopped: Callable[[], bool] | None = None,
 ) -> list[Record]:
     """Fly a scenario once for each of these seeds, many times faster than one by one.
 
@@ -338,7 +338,7 @@ def _fly(
     scenario: Scenario,
     seeds: Sequence[int],
     on_second: Callable[[int], None],
-    stopped: Callable[[], bool],
+    stopped: Callable[[], bool] | None,
     vehicles: int = 1,
     stopwatch: Stopwatch | None = None,
     ends: Plain = PLAIN,
@@ -441,7 +441,7 @@ def _fly(
             _tell_time(world, {SERVER[0]: server, **runs[0].hosts}, error_ns)
         while flying and not flying[-1].flying:
             flying.pop()
-        return not flying or stopped()
+        return not flying or (stopped is not None and stopped())
 
     longest_s = scenario.link.connect_s + 2.0 * scenario.duration + 10.0
     world.run(over, limit_ns=seconds_to_ns(longest_s))

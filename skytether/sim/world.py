@@ -294,7 +294,8 @@ class World:
         time_ns = max(time_ns, self.now_ns)
         if time_ns != host.armed_ns:
             host.armed_ns = time_ns
-            self._at(time_ns, host.turn, host, None)
+            self._scheduled += 1
+            heappush(self._agenda, (time_ns, host.turn, self._scheduled, host, None))
 
     def _wake(self, host: Host) -> None:
         now_ns = self.now_ns
