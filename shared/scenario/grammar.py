@@ -9,29 +9,28 @@ have any character except a quote. Impairments, zones and goals are calls joined
 tables in `shared.scenario.registry` list the names.
 """
 
+import ast
 import re
-from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Literal
 
 TEXT_MAX = 200
 """Largest number of characters of a trigger, report, shape, scheme or vehicle."""
-TOKENS_MAX, NESTED_MAX = 200, 100
-"""Largest number of tokens (calls, operators and parentheses), and of opening parentheses."""
+CALLS_MAX, NESTED_MAX = 100, 100
+"""Largest number of calls that are combined, and of opening parentheses between them."""
 
 Value = float | str
 
 _QUOTED = r'"[^"]*"'
-_TOKEN = re.compile(
-    rf"\s*(?:([a-z_]\w*(?:-\w+)*)\s*(?:\(((?:{_QUOTED}|[^()\"])*)\))?|([&|()]))\s*",
-    re.IGNORECASE | re.ASCII,
+_CALL = re.compile(
+    rf"([a-z_]\w*(?:-\w+)*)(?:\s*\(((?:{_QUOTED}|[^()\"])*)\))?", re.IGNORECASE | re.ASCII
 )
-"""A call, or an operator or parenthesis between calls."""
 _ARGUMENT = re.compile(
     rf"\s*(?:([a-z_]\w*)\s*=)?\s*((?:{_QUOTED}|[^,\"])*?)\s*,", re.IGNORECASE | re.ASCII
 )
 """An argument and the comma after it."""
+_BETWEEN = re.compile(r"[\s&|()_]*", re.ASCII)
 NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?", re.IGNORECASE | re.ASCII)
 
 
@@ -78,35 +77,27 @@ def parse(text: str, form: str) -> Expression:
     Raises:
         GrammarError: the text is invalid.
     """
-    tokens = deque(_tokens(text, form))
-    if len(tokens) > TOKENS_MAX or tokens.count("(") > NESTED_MAX:
+    found, between = _calls(text, form)
+    if len(found) > CALLS_MAX or between.count("(") > NESTED_MAX:
+        raise GrammarError(text, form)
+    # Python's grammar has the same operators with the same precedence. Nothing of the text but
+    # operators and parentheses is in `between`.
+    rest = iter(found)
+
+    def expression(node: ast.expr) -> Expression:
+        match node:
+            case ast.BinOp(left, ast.BitAnd(), right):
+                return Combination("&", expression(left), expression(right))
+            case ast.BinOp(left, ast.BitOr(), right):
+                return Combination("|", expression(left), expression(right))
+            case ast.Name():
+                return next(rest)
         raise GrammarError(text, form)
 
-    def operand() -> Expression:
-        token = tokens.popleft() if tokens else ""
-        if token == "(":
-            inner = either()
-            if not tokens or tokens.popleft() != ")":
-                raise GrammarError(text, form)
-            return inner
-        if isinstance(token, str):
-            raise GrammarError(text, form)
-        return token
-
-    def joined(operator: Literal["&", "|"], operand: Callable[[], Expression]) -> Expression:
-        left = operand()
-        while tokens and tokens[0] == operator:
-            tokens.popleft()
-            left = Combination(operator, left, operand())
-        return left
-
-    def either() -> Expression:
-        return joined("|", lambda: joined("&", operand))
-
-    expression = either()
-    if tokens:
-        raise GrammarError(text, form)
-    return expression
+    try:
+        return expression(ast.parse(between, mode="eval").body)
+    except SyntaxError:
+        raise GrammarError(text, form) from None
 
 
 def leaves(expression: Expression) -> Iterator[Call]:
@@ -127,31 +118,29 @@ def calls(text: str, form: str) -> list[Call]:
     """
     if not text.strip():
         return []
-    tokens = _tokens(text, form)
-    parsed = [token for token in tokens[::2] if isinstance(token, Call)]
-    if len(tokens) != 2 * len(parsed) - 1 or any(mark != "&" for mark in tokens[1::2]):
+    found, between = _calls(text, form)
+    if between != " & ".join("_" * len(found)):
         raise GrammarError(text, form)
-    return parsed
+    return found
 
 
-def _tokens(text: str, form: str) -> list[Call | str]:
-    tokens: list[Call | str] = []
-    at = 0
-    while at < len(text):
-        token = _TOKEN.match(text, at)
-        if not token:
-            raise GrammarError(text, form)
-        name, arguments, mark = token.groups()
-        tokens.append(mark or _call(name, arguments, text, token.start(1), token.end()))
-        at = token.end()
-    return tokens
+def _calls(text: str, form: str) -> tuple[list[Call], str]:
+    """Calls in a text, and the text with _ in the place of each."""
+    found = []
 
+    def note(match: re.Match[str]) -> str:
+        name, arguments = match.groups()
+        terminated = f"{arguments}," if arguments and arguments.strip() else ""
+        pairs = _ARGUMENT.findall(terminated)
+        values = tuple(_value(word) for _, word in pairs)
+        keys = tuple(key for key, _ in pairs)
+        found.append(Call(name, values, keys, match[0], match.start()))
+        return " _ "
 
-def _call(name: str, arguments: str | None, text: str, begin: int, end: int) -> Call:
-    terminated = f"{arguments}," if arguments and arguments.strip() else ""
-    pairs = _ARGUMENT.findall(terminated)
-    values = tuple(_value(word) for _, word in pairs)
-    return Call(name, values, tuple(key for key, _ in pairs), text[begin:end].rstrip(), begin)
+    between = _CALL.sub(note, text)
+    if not _BETWEEN.fullmatch(between):
+        raise GrammarError(text, form)
+    return found, " ".join(between.split())
 
 
 DIGITS_MAX = 300
