@@ -105,7 +105,7 @@ class Controller:
             self.desired,
             references,
             stopwatch,
-            self.faults.append,
+            self._note_plugin_error,
             planning,
         )
         self.scheme = table.make(fleet)
@@ -149,10 +149,10 @@ class Controller:
 
     def change_trigger(self, control: ControlConfig) -> None:
         """Use the trigger of a scenario from the next step on, see `use_trigger`."""
-        self.use_trigger(make_trigger(control, self._capacity, self._note_trigger_error))
+        self.use_trigger(make_trigger(control, self._capacity, self._note_plugin_error))
 
-    def _note_trigger_error(self, fault: str) -> None:
-        self._counts["trigger_errors"] += 1
+    def _note_plugin_error(self, count: str, fault: str) -> None:
+        self._counts[count] += 1
         self.faults += filter(None, [fault])
 
     def use_trigger(self, trigger: Trigger) -> None:

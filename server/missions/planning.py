@@ -6,14 +6,11 @@ from skytether.server import missions
 from skytether.server.missions.mission_planner import MissionPlanner
 from skytether.server.missions.mission_state import MissionState
 from skytether.server.planning import splines
-from skytether.server.planning.scheme import Fleet, Scheme
+from skytether.server.planning.scheme import Fleet, Scheme, SchemeCode
 from skytether.shared.missions.keys import MissionConfig
 from skytether.shared.missions.mission import Guided, parse_goals
 from skytether.shared.scenario.reference import Reference
 from skytether.shared.scenario.schema import Scenario
-
-KERNELS = (missions, splines)
-"""Package and module whose kernels are called on missions."""
 
 
 def references(
@@ -41,3 +38,6 @@ def make(fleet: Fleet) -> Scheme:
         fleet.clock,
     )
     return MissionPlanner(fleet, state)
+
+
+CODE = SchemeCode(make, lambda _: (missions, splines), references)

@@ -9,12 +9,10 @@ A planner optimises a cost that nobody else knows. So its plan counts as the opt
 of flying on with the inputs already sent is that of their difference from it, ΔUᵀ 𝓗 ΔU of eq. (9).
 """
 
-from collections import Counter
 from dataclasses import dataclass
 from functools import partial
 from itertools import count
 from queue import Full
-from traceback import format_exception
 from typing import Any
 
 import numpy as np
@@ -22,6 +20,7 @@ from numpy.typing import NDArray
 
 from skytether.server.mpc.appraisal import GENERATOR, TRACKER
 from skytether.server.mpc.hierarchical import PlanBatch, Planner, conclude_given, start_plans
+from skytether.server.planning.plugin_errors import NO_PLAN, PluginErrors
 from skytether.server.planning.scheme import Fleet
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.law.model import Array, Flags, Indices
@@ -31,6 +30,8 @@ from skytether.shared.wire.protocol import FLOAT_MAX
 
 ERRORS, LATE, NOT_CALLED = "planner_errors", "planner_late", "planner_not_called"
 """Names of the counts of steps without a plan."""
+EXPECTED = {TimeoutError: LATE, Full: NOT_CALLED}
+"""Counts of what stands for a planner that has not answered."""
 
 
 @dataclass(slots=True)
@@ -58,12 +59,12 @@ class PluginPlanners:
         ConfigError: a planner cannot be made.
     """
 
-    def __init__(self, fleet: Fleet, counts: Counter[str], *, states: bool) -> None:
+    def __init__(self, fleet: Fleet, *, states: bool) -> None:
         self._text = text = fleet.scenario.control.planner
         self._scenario, self._named = fleet.scenario, PLANNERS.one(text)
         self._problem = Problem.of(fleet.scenario)
-        self._states, self._tell, self._planning = states, fleet.tell, fleet.planning
-        self._counts = counts
+        self._states, self._planning = states, fleet.planning
+        self._errors = PluginErrors(f"the planner {text}", NO_PLAN, ERRORS, fleet.tell)
         self._numbers = count()
         self._own: dict[int, VehiclePlanner] = {}
         """Planners by the rows of their vehicles."""
@@ -126,36 +127,26 @@ class PluginPlanners:
             raise RuntimeError(f"got SystemExit: {error}") from error
 
     def _checked(self, own: VehiclePlanner, start: int, answer: Any) -> Array | None:
+        if isinstance(answer, Exception):
+            self._errors.note(answer, EXPECTED.get(type(answer), ""))
+            return None
         problem = self._problem
         shapes: list[tuple[int, ...]] = [(problem.axes, problem.horizon)]
         if self._states:
             shapes.append((problem.horizon + 1, problem.axes, 2))
-        try:
-            if isinstance(answer, Exception):
-                raise answer
+        with self._errors:
             plan = np.array(answer, dtype=np.float64)
             if plan.shape not in shapes:
                 expected = " or ".join(map(str, shapes))
                 raise ValueError(f"got a plan of shape {plan.shape}, expected {expected}")
             if not (np.abs(plan) <= FLOAT_MAX).all():  # NaN fails too
                 raise ValueError("expected a plan of finite numbers")
-        except Exception as error:
-            self._fail(error)
-            return None
-        if plan.ndim == len(shapes[0]):
-            bounds = problem.u_max[:, None]
-            own.inputs, own.start = np.clip(plan, -bounds, bounds), start
-            return own.inputs
-        return plan
-
-    def _fail(self, error: Exception) -> None:
-        kinds = {TimeoutError: LATE, Full: NOT_CALLED}
-        name = kinds.get(type(error), ERRORS)
-        if not self._counts[name]:
-            what = f"the planner {self._text}: {type(error).__name__}: {error}"
-            trace = "".join(format_exception(error)) if name == ERRORS else ""
-            self._tell(f"{trace}{what}; a vehicle for which it fails is sent no plan at that step")
-        self._counts[name] += 1
+            if plan.ndim == len(shapes[0]):
+                bounds = problem.u_max[:, None]
+                own.inputs, own.start = np.clip(plan, -bounds, bounds), start
+                return own.inputs
+            return plan
+        return None
 
 
 class InputPlanner(Planner):
@@ -167,11 +158,11 @@ class InputPlanner(Planner):
     last that was sent.
     """
 
-    def __init__(self, fleet: Fleet, counts: Counter[str]) -> None:
+    def __init__(self, fleet: Fleet) -> None:
         control, terms = fleet.scenario.control, fleet.terms
         desired, capacity, block = fleet.desired, fleet.capacity, fleet.block
         super().__init__(control, terms, desired, capacity, block, fleet.stopwatch)
-        self._planners = PluginPlanners(fleet, counts, states=False)
+        self._planners = PluginPlanners(fleet, states=False)
         self._bounds = np.array(terms.u_max)[:, None]
         self._sent: list[NDArray[Any]] = []
         """Inputs, start and step of the plans sent last to the vehicles of this block."""

@@ -6,7 +6,8 @@
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from functools import partial
+from functools import lru_cache, partial
+from types import ModuleType
 from typing import Annotated, Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 
 from skytether.server.planning.clock import ClockMap
 from skytether.server.planning.desired import Desired
+from skytether.server.planning.plugin_errors import Tell
 from skytether.shared.base.kernel import F2, F3, F4, I1, S3, record, records
 from skytether.shared.endpoints.stopwatch import Stopwatch
 from skytether.shared.events.flight import Event
@@ -206,8 +208,8 @@ class Fleet(NamedTuple):
     references: Callable[[int], Reference] | None
     """Reference of each vehicle of a mission, by its number; None without a mission."""
     stopwatch: Stopwatch
-    tell: Callable[[str], None]
-    """Called with the traceback of a plug-in's first error in flight, for the log."""
+    tell: Tell
+    """Called at each error of a plug-in in flight."""
     planning: Planning = in_turn
 
 
@@ -330,3 +332,26 @@ class Scheme(ABC):
     def restart(self, row: int) -> bool:  # noqa: ARG002
         """Note that a vehicle's client has restarted; False if this was known already."""
         return False
+
+
+Given = Callable[[int], Reference] | None
+"""Desired trajectory of each vehicle by its number; None: all vehicles have the scenario's."""
+
+
+def given_references(scenario: Scenario, given: Given, most: int) -> Given:
+    """Desired trajectories of vehicles that are not on a mission."""
+    if given is None and scenario.reference.shape == "target":
+        return lru_cache(most)(scenario.measured_reference)
+    return given
+
+
+class SchemeCode(NamedTuple):
+    """What the module of a scheme brings, as its CODE."""
+
+    make: Callable[[Fleet], Scheme]
+    kernels: Callable[[str], Sequence[ModuleType]]
+    """Other modules and packages whose kernels the scheme of this text calls, without those that
+    every scheme calls."""
+    references: Callable[[Scenario, Given, int], Given] = given_references
+    """Desired trajectories as the scheme sees them, from those given from outside; the number is
+    the largest of vehicles."""

@@ -31,7 +31,7 @@ import numpy as np
 from skytether.server.mpc import exact, hierarchical, riccati
 from skytether.server.planning.clock import ClockMap, Seen
 from skytether.server.planning.compiled import lasting, laws_of
-from skytether.server.planning.scheme import Fleet, Foresight
+from skytether.server.planning.scheme import Fleet, Foresight, SchemeCode
 from skytether.server.schemes import horizons, sent_horizons
 from skytether.server.schemes import sent as tracker
 from skytether.server.schemes.disturbance import FOLLOW_S, observe_disturbance
@@ -160,8 +160,7 @@ def make(fleet: Fleet) -> HorizonScheme:
     return HorizonScheme(Replay(fleet.terms, control, gain, fleet.capacity, fleet.clock), fleet)
 
 
-KERNELS = (sent_horizons, horizons, hierarchical, exact, riccati)
-"""Other modules and packages whose kernels this scheme calls, see `server.schemes.table`."""
+CODE = SchemeCode(make, lambda _: (sent_horizons, horizons, hierarchical, exact, riccati))
 
 
 @kernel

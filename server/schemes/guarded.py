@@ -4,14 +4,14 @@ If the scheme fails for a vehicle, no plan is sent to it at that step. The vehic
 plan to the end, and then its failsafe acts.
 """
 
-import traceback
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from skytether.server.planning.plugin_errors import NO_PLAN, PluginErrors
 from skytether.server.planning.scheme import (
     Batch,
     Figures,
@@ -37,7 +37,8 @@ class GuardedScheme(Scheme):
 
     def __init__(self, name: str, inner: Scheme, fleet: Fleet) -> None:
         super().__init__(fleet)
-        self._name, self._inner, self._tell = name, inner, fleet.tell
+        self._inner = inner
+        self._errors = PluginErrors(f"the scheme {name}", NO_PLAN, "scheme_errors", fleet.tell)
         self.observed_step = inner.observed_step
         self._ahead_max = committed_max(fleet.terms) if fleet.terms.commits else 0
         self._bounds = INPUT_TOLERANCE * np.array(fleet.terms.u_max)[:, None]
@@ -45,18 +46,14 @@ class GuardedScheme(Scheme):
         """Rows of the vehicles to which no plan is sent at this step."""
 
     def forget(self, row: int) -> None:
-        try:
+        with self._errors:
             self._inner.forget(row)
-        except Exception as error:
-            self._fail(error)
 
     def observe(self, row: int, observation: Observation) -> bool:
         """See `Scheme`; False if the scheme fails."""
-        try:
+        with self._errors:
             return bool(self._inner.observe(row, observation))
-        except Exception as error:
-            self._fail(error)
-            return False
+        return False
 
     def foresee(self, rows: Indices, step: Indices, foresight: Foresight) -> None:
         """Do nothing: `plan` calls the scheme's `foresee` too."""
@@ -93,20 +90,18 @@ class GuardedScheme(Scheme):
     def encode(self, batch: Batch, header: Callable[[int], Header]) -> Iterator[tuple[int, bytes]]:
         for i in batch.sent.tolist():
             if int(batch.rows[i]) not in self._withheld:
-                try:
-                    yield from [*self._inner.encode(batch._replace(sent=np.array([i])), header)]
-                except Exception as error:
-                    self._fail(error)
+                packets: Sequence[tuple[int, bytes]] = ()
+                with self._errors:
+                    packets = [*self._inner.encode(batch._replace(sent=np.array([i])), header)]
+                yield from packets
 
     def sent_plans(self, batch: Batch) -> SentPlans:
         """See `Scheme`; zeros if the scheme fails."""
-        try:
+        with self._errors:
             return self._inner.sent_plans(batch)
-        except Exception as error:
-            self._fail(error)
-            n, step = len(batch.sent), batch.step[batch.sent]
-            axes, H = self.terms.axes, self.terms.horizon
-            return SentPlans(step, step, np.zeros((n, axes, 2)), np.zeros((n, axes, H)))
+        n, step = len(batch.sent), batch.step[batch.sent]
+        axes, H = self.terms.axes, self.terms.horizon
+        return SentPlans(step, step, np.zeros((n, axes, 2)), np.zeros((n, axes, H)))
 
     def _call(self, n: int, call: Callable[[slice], None]) -> list[int]:
         failed = []
@@ -114,11 +109,10 @@ class GuardedScheme(Scheme):
             call(slice(0, n))
         except Exception:
             for i in range(n):
-                try:
+                with self._errors:
                     call(slice(i, i + 1))
-                except Exception as error:
-                    self._fail(error)
-                    failed.append(i)
+                    continue
+                failed.append(i)
         return failed
 
     def _check(self, foresight: Foresight) -> None:
@@ -135,13 +129,6 @@ class GuardedScheme(Scheme):
             raise ValueError(f"expected splines of 1 to {KNOTS_MAX} knots, at least 1 step apart")
         if not (np.isfinite(foresight.estimate).all() and np.isfinite(foresight.start).all()):
             raise ValueError("expected finite numbers in `estimate` and `start`")
-
-    def _fail(self, error: Exception) -> None:
-        if not self.counts["scheme_errors"]:
-            what = f"the scheme {self._name}: {type(error).__name__}: {error}"
-            trace = "".join(traceback.format_exception(error))
-            self._tell(f"{trace}{what}; a vehicle for which it fails is sent no plan at that step")
-        self.counts["scheme_errors"] += 1
 
 
 def _cut(foresight: Foresight, selected: slice) -> Foresight:

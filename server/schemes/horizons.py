@@ -90,7 +90,7 @@ class HorizonScheme(InputScheme):
         self.planner = (
             Planner(control, terms, fleet.desired, fleet.capacity, fleet.block, stopwatch)
             if control.planner == MPC
-            else InputPlanner(fleet, predictor.counts)
+            else InputPlanner(fleet)
         )
         self.observed_step, self.counts = predictor.observed_step, predictor.counts
         self.figures, self.planned = self.planner.figures, self.planner.planned

@@ -2,6 +2,4 @@
 
 from skytether.server.schemes import predictive
 
-make = predictive.make
-KERNELS = (predictive, *predictive.KERNELS)
-"""Other modules and packages whose kernels this scheme calls, see `server.schemes.table`."""
+CODE = predictive.CODE

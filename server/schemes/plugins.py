@@ -3,7 +3,7 @@
 from types import ModuleType
 
 from skytether.server.planning import splines
-from skytether.server.planning.scheme import Fleet, Scheme
+from skytether.server.planning.scheme import Fleet, Scheme, SchemeCode
 from skytether.server.planning.splines import SplineScheme
 from skytether.server.schemes import horizons
 from skytether.server.schemes.guarded import GuardedScheme
@@ -11,11 +11,6 @@ from skytether.server.schemes.horizons import InputScheme
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.scenario import schemes
 from skytether.shared.scenario.registry import SCHEMES
-
-
-def kernels(text: str) -> tuple[ModuleType, ...]:
-    """Module whose kernels send the plans of a plug-in's scheme."""
-    return (splines if schemes.properties(text).splines else horizons,)
 
 
 def make(fleet: Fleet) -> Scheme:
@@ -35,3 +30,10 @@ def make(fleet: Fleet) -> Scheme:
     except Exception as error:
         wrong = f"a scheme that can be made ({type(error).__name__}: {error})"
         raise ConfigError(f"control.scheme: got {text!r}, expected {wrong}") from error
+
+
+def _kernels(text: str) -> tuple[ModuleType, ...]:
+    return (splines if schemes.properties(text).splines else horizons,)
+
+
+CODE = SchemeCode(make, _kernels)

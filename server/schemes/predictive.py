@@ -19,7 +19,7 @@ import numpy as np
 
 from skytether.server.mpc import exact, hierarchical, riccati
 from skytether.server.planning.compiled import Laws, advance, laws_of
-from skytether.server.planning.scheme import Fleet, Foresight
+from skytether.server.planning.scheme import Fleet, Foresight, SchemeCode
 from skytether.server.schemes import horizons
 from skytether.server.schemes.horizons import HorizonScheme
 from skytether.server.schemes.observer import decay_of, updated_disturbance
@@ -151,8 +151,7 @@ def make(fleet: Fleet) -> HorizonScheme:
     return HorizonScheme(Estimator(fleet.terms, control, gain, fleet.capacity), fleet)
 
 
-KERNELS = (horizons, hierarchical, exact, riccati)
-"""Other modules and packages whose kernels this scheme calls, see `server.schemes.table`."""
+CODE = SchemeCode(make, lambda _: (horizons, hierarchical, exact, riccati))
 
 
 @part

@@ -43,7 +43,7 @@ from skytether.server.mpc.nominal import Nominal, make_nominal, plan_nominal
 from skytether.server.planning import splines
 from skytether.server.planning.clock import Seen
 from skytether.server.planning.desired import Window
-from skytether.server.planning.scheme import Figures, Fleet, Foresight, Splines
+from skytether.server.planning.scheme import Figures, Fleet, Foresight, SchemeCode, Splines
 from skytether.server.planning.splines import SplineScheme
 from skytether.server.schemes import knots
 from skytether.server.schemes import sent as tracker
@@ -155,7 +155,7 @@ class Guidance(SplineScheme):
         self._own: PluginPlanners | None = None
         if control.planner != MPC:
             planners = load("skytether.server.mpc.plugin_planners", "control.planner")
-            self._own = planners.PluginPlanners(fleet, self.counts, states=True)
+            self._own = planners.PluginPlanners(fleet, states=True)
         seen = terms.horizon if self._own else desired.seen
         self._desired, self._clock, self._stopwatch = desired, fleet.clock, fleet.stopwatch
         self._loop_gain = np.array(terms.gain)
@@ -251,9 +251,7 @@ class Guidance(SplineScheme):
         _fit_and_store(self._settings, self._memory, intended, rows, step, event, foresight.splines)
 
 
-make = Guidance
-KERNELS = (knots, splines, riccati)
-"""Other modules and packages whose kernels this scheme calls, see `server.schemes.table`."""
+CODE = SchemeCode(Guidance, lambda _: (knots, splines, riccati))
 
 
 @inline

@@ -1,12 +1,11 @@
 """A plug-in's policy with its errors caught."""
 
-import traceback
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from skytether.server.planning.plugin_errors import PluginErrors, Tell
 from skytether.server.triggers.trigger import (
     Figures,
     Situation,
@@ -28,25 +27,23 @@ class Guarded(Trigger):
     Args:
         name: name of the policy, for messages.
         inner: the policy.
-        tell: called at each error, at the first one with its traceback, later with nothing.
     """
 
-    def __init__(self, name: str, inner: Trigger, tell: Callable[[str], None]) -> None:
+    def __init__(self, name: str, inner: Trigger, tell: Tell) -> None:
         self.doubts = inner.doubts
-        self._name, self._inner, self._tell = name, inner, tell
-        self._has_failed = False
+        self._inner = inner
+        then = "when it fails, a horizon is sent"
+        self._errors = PluginErrors(f"the trigger {name}", then, "trigger_errors", tell)
 
     def forget(self, row: int) -> None:
-        try:
+        with self._errors:
             self._inner.forget(row)
-        except Exception as error:
-            self._fail(error)
 
     def test(self, situation: Situation) -> Verdict:
         rows, figures, estimate, planned, arrays = situation
         # Read-only views: an error in a policy must not change what is sent.
         views = map(_read_only, (rows, figures, estimate, planned))
-        try:
+        with self._errors:
             verdict = self._inner.test(Situation._make((*views, arrays)))
             return Verdict(
                 column(verdict.event, np.bool_, len(rows)),
@@ -54,24 +51,11 @@ class Guarded(Trigger):
                 column(verdict.threshold, np.float64, len(rows)),
                 Compared(verdict.compared),
             )
-        except Exception as error:
-            self._fail(error)
-            return timed(all_of(len(rows)), figures)
+        return timed(all_of(len(rows)), figures)
 
     def sent(self, rows: Indices, figures: Figures) -> None:
-        try:
+        with self._errors:
             self._inner.sent(rows.copy(), figures.copy())
-        except Exception as error:
-            self._fail(error)
-
-    def _fail(self, error: Exception) -> None:
-        if self._has_failed:
-            self._tell("")
-            return
-        self._has_failed = True
-        what = f"the trigger {self._name}: {type(error).__name__}: {error}"
-        trace = "".join(traceback.format_exception(error))
-        self._tell(f"{trace}{what}; when it fails, a horizon is sent")
 
 
 def _read_only(array: NDArray[Any]) -> NDArray[Any]:

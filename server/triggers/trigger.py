@@ -16,6 +16,7 @@ import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
 
+from skytether.server.planning.plugin_errors import Tell
 from skytether.shared.law.model import Array, Flags, Indices, Model
 from skytether.shared.scenario.grammar import Combination, Expression, Value
 from skytether.shared.scenario.registry import TRIGGERS, load
@@ -256,14 +257,14 @@ class Combined(Trigger):
 
 
 def make_trigger(
-    control: ControlConfig, capacity: int, tell: Callable[[str], None] = lambda _: None
+    control: ControlConfig, capacity: int, tell: Tell = lambda _count, _text: None
 ) -> Trigger:
     """Make the trigger of a scenario.
 
     Args:
         control: `trigger`, and the keys that policies use.
         capacity: largest number of vehicles.
-        tell: called at each error of a plug-in in flight, see `Guarded`.
+        tell: called at each error of a plug-in in flight.
     """
 
     def make(expression: Expression) -> Trigger:

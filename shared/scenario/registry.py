@@ -193,7 +193,8 @@ class Entry:
 
 
 def load(module: str, what: str) -> Any:
-    """Import a built-in module that a scenario needs; raises ConfigError if it is not installed.
+    """Import a built-in module that a scenario needs; raises ConfigError if it, or another of ours
+    that it imports, is not installed.
 
     Args:
         what: what needs it, for the message.
@@ -201,7 +202,7 @@ def load(module: str, what: str) -> Any:
     try:
         return import_module(module)
     except ModuleNotFoundError as error:
-        if not f"{module}.".startswith(f"{error.name}."):
+        if not f"{error.name}.".startswith("skytether."):
             raise
         raise ConfigError(f"{what}: {error.name} is not installed") from None
 
