@@ -28,8 +28,6 @@ from skytether.shared.scenario.catalogue import differences
 from skytether.shared.telemetry.record import Reason
 from skytether.shared.wire.drop import Drop, ProtocolError
 from skytether.shared.wire.framing import EVERYWHERE, split
-from skytether.shared.wire.lead import Lead
-from skytether.shared.wire.path_proof import PathProof
 from skytether.shared.wire.protocol import (
     Close,
     Heartbeat,
@@ -39,6 +37,7 @@ from skytether.shared.wire.protocol import (
     Message,
     Observation,
     Refusal,
+    RoomMessage,
     Time,
     Trajectory,
     Welcome,
@@ -62,8 +61,9 @@ DEGRADED = "the server misses its deadlines"
 
 Stamped = Horizon | Trajectory | Heartbeat
 """Messages that contain the server's time."""
-FromServer = Stamped | Close | PathProof | Lead
+FromServer = Stamped | Close | RoomMessage
 """Messages of a server in a session."""
+FromVehicle = Hello | Observation | Time
 
 
 class ServerSession:
@@ -182,7 +182,7 @@ class ServerSession:
         if isinstance(message, Welcome):
             self._welcome(message, now_ns)
             return None
-        if not isinstance(message, FromServer):
+        if isinstance(message, FromVehicle):
             raise ProtocolError(Drop.NOT_FOR_A_CLIENT)
         # Nothing of a message is believed before it is found to be of this session, and recent.
         self._check(message)

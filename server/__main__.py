@@ -18,7 +18,7 @@ from typing import Annotated
 
 from skytether.server.endpoint import VEHICLES_MAX, Server
 from skytether.server.gate import Gate, PlainGate
-from skytether.server.reception import PATHS
+from skytether.server.reception import PATHS, STANDBY
 from skytether.server.schemes import table
 from skytether.shared.base import kernel
 from skytether.shared.endpoints.endpoint import PATH_SOCKETS, Address, Form
@@ -108,7 +108,8 @@ def _ready(scenario: Scenario) -> None:
     """Load the compiled planner, and what a vehicle's packet may call for, now: before workers are
     forked, so that they share its memory, and before a tick would have to wait for it.
     """
-    import_module(PATHS)
+    for room in (PATHS, STANDBY):
+        import_module(room)
     others = table.others(scenario)
     terminal.prepare(kernel.missing(without=others))
     kernel.load(without=others)

@@ -9,7 +9,7 @@ every step, since planning is a small part of the cost of a step.
 """
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -26,7 +26,6 @@ from skytether.server.planning.scheme import (
     in_turn,
 )
 from skytether.server.schemes import table
-from skytether.server.sessions import Session
 from skytether.server.triggers.trigger import (
     Situation,
     SituationArrays,
@@ -41,15 +40,12 @@ from skytether.shared.law.terms import Terms
 from skytether.shared.scenario.reference import Reference
 from skytether.shared.scenario.registry import load
 from skytether.shared.scenario.schema import ControlConfig, Scenario
-from skytether.shared.wire.lead import Lead
-from skytether.shared.wire.protocol import Idle, Observation, committed_max
+from skytether.shared.wire.protocol import Idle, Observation, RoomMessage, committed_max
 
 if TYPE_CHECKING:
     from skytether.server.budget import SharedBudget
 
 PLANS, OBSERVATION, DELAY, UNSOLVED, STANDBY = map(int, Idle)
-TAKEOVER_PLANS = 2
-"""Number of plans that a server sends when it takes over, whatever the trigger says."""
 BLOCK = 128
 """Number of vehicles planned for together: their data stay in the cache, and no array is so large
 (128 KiB) that the C library would get new memory from the kernel for it each time."""
@@ -131,9 +127,7 @@ class Controller:
         self._leads = np.ones(capacity, dtype=np.bool_)
         """Whether this server leads each vehicle; shape (capacity,)."""
         self._plans_due: dict[int, int] = {}
-        """Number of plans still due after a takeover, whatever the trigger says, by row."""
-        self._leadership = 0
-        """Largest number of a leadership that a vehicle has reported."""
+        """Number of plans still due, whatever the trigger says, by row."""
         self._takes = np.ones(capacity, dtype=np.bool_)
         """Whether each vehicle accepts horizons, by its newest observation; shape (capacity,)."""
         self._counts: Counter[str] = Counter()
@@ -189,38 +183,34 @@ class Controller:
         if self.budget:
             self.budget.forget(row)
 
-    def begin(self, row: int, vehicle: int, lead: Lead | None) -> None:
-        """Begin with a vehicle in a row that was forgotten; `lead` as in `follow`."""
-        self.follow(row, lead)
+    def begin(self, row: int, vehicle: int) -> None:
+        """Begin with a vehicle in a row that was forgotten."""
         self.desired.assign(row, vehicle)
 
     def restart(self, row: int) -> bool:
         """Note that the client of a vehicle has restarted without its state; see `Scheme`."""
         return self.scheme.restart(row)
 
-    def follow(self, row: int, lead: Lead | None) -> None:
-        """Note who leads a vehicle; None if it has no other server.
+    @property
+    def is_one_fleet(self) -> bool:
+        """Whether all vehicles have to follow one server."""
+        return self.scheme.is_one_fleet
 
-        A server that begins to lead sends a plan at once, whatever it sent before. If it takes over
-        from another, it sends a second one a step later: the vehicle may be about to brake, and a
-        plan may be lost. Vehicles of a mission hold their place instead.
+    def lead(
+        self, row: int, message: RoomMessage | None, *, leads: bool = True, plans: int = 0
+    ) -> None:
+        """Note whether this server leads a vehicle; if it does, it sends a plan at once, whatever
+        it sent before. See `server.leads.Leader`.
         """
-        self._leads[row] = lead is None or bool(lead.leads)
-        self._leadership = max(self._leadership, lead.number if lead else 0)
-        if self._leads[row]:
+        self._leads[row] = leads
+        if leads:
             self._sent_step[row] = -1
             self._trigger.forget(row)
-        if self._leads[row] and lead and lead.number and not self.scheme.is_one_fleet:
-            self._plans_due[row] = TAKEOVER_PLANS
+        if plans:
+            self._plans_due[row] = plans
         else:
             self._plans_due.pop(row, None)
-        self.scheme.follow(row, lead)
-
-    def leadership_of(self, number: int) -> int:
-        """Number of the leadership that a vehicle of a leadership `number` should follow: the
-        largest, if all follow one server.
-        """
-        return self._leadership if self.scheme.is_one_fleet else number
+        self.scheme.follow(row, message)
 
     def observe(self, row: int, observation: Observation) -> bool:
         """Store an observation unless a newer one is stored (E11); True if stored."""
@@ -229,11 +219,11 @@ class Controller:
             self._takes[row] = bool(observation.takes)
         return is_stored
 
-    def note_heartbeats(self, due: Sequence[Session]) -> None:
-        """Set the vehicles to which a heartbeat is due at this tick unless a plan is sent."""
+    def note_heartbeats(self, due: list[int]) -> None:
+        """Set the rows to which a heartbeat is due at this tick unless a plan is sent."""
         if due or self._heartbeats:
             self._heartbeat_due[:] = False
-            self._heartbeat_due[[each.row for each in due]] = True
+            self._heartbeat_due[due] = True
             self._heartbeats = bool(due)
 
     def able(self, rows: Indices, step: Indices) -> tuple[Indices, Indices]:

@@ -13,6 +13,7 @@ import numpy as np
 
 from skytether.server.controller import Controller
 from skytether.server.gate import Gate, PlainGate
+from skytether.server.leads import Leads
 from skytether.server.planning.clock import ClockMap
 from skytether.server.planning.scheme import Planning, in_turn
 from skytether.server.reception import Reception
@@ -40,8 +41,6 @@ VEHICLES_MAX = 64
 LATEST_NS = 2 * SECOND_NS
 """Time after the end of all motions within which a server that is asked to end does so [ns]; a
 vehicle's observation of it takes a round trip."""
-LIMITS_NS = 10 * SECOND_NS
-"""Time for which vehicles are told every second of changed limits [ns]: packets are lost."""
 TICK_EDGES_MS = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0)
 """Bin edges of the histogram of tick durations [ms]."""
 
@@ -99,12 +98,12 @@ class Server(Endpoint):
             entropy,
             silence_ns,
             partial(Hearing, silence_ns, terms.dt_ns, scenario.link.fixed_ns),
+            Leads(self.controller, scheme.limits),
             keeps_rows=scheme.is_one_fleet,
         )
         self._grid = Grid(terms.dt_ns, self._events)
         self._reception = Reception(
             terms,
-            scheme.limits,
             scenario.link,
             boot_id,
             gate or PlainGate(),
@@ -129,8 +128,6 @@ class Server(Endpoint):
         )
         self._leaves = False
         """Whether an operator has asked the server to end."""
-        self._limits_until_ns = 0
-        """Time until which vehicles are told every second of the limits of their motions."""
         self._dt_ns = terms.dt_ns
         self._ticked_ns = 0
         self._expire_ns = 0
@@ -153,26 +150,12 @@ class Server(Endpoint):
             self._expire_ns = (now_ns // SECOND_NS + 1) * SECOND_NS
             for session in self.sessions.expire(now_ns):
                 self._events.append(SessionEnded(vehicle=session.vehicle))
-            self._spread_leadership(now_ns)
+            self._out += self.sessions.leads.spread(self.sessions, now_ns)
         if self.sessions.rows.size:
             self._ticked_ns = now_ns
             self._ticker.tick(tick_ns, now_ns)
         else:
             self._grid.rest()
-
-    def _spread_leadership(self, now_ns: int) -> None:
-        """Tell vehicles of a mission that follow a smaller number of the largest one, and for a
-        while all of changed limits.
-        """
-        is_changed = now_ns < self._limits_until_ns
-        for session in self.sessions:
-            number = session.leadership
-            if number is None:
-                continue
-            largest = self.controller.leadership_of(number)
-            if largest > number or is_changed:
-                lead = self._reception.lead(session, largest)
-                self._out += session.sealed(encode(lead), now_ns)
 
     def leave(self, *, now_ns: int) -> int:
         """On a mission, wait until all vehicles rest, or follow another server."""
@@ -208,10 +191,7 @@ class Server(Endpoint):
             self.controller.change_trigger(scenario.control)
         scheme = self.controller.scheme
         scheme.change(scenario, keys)
-        if scheme.limits is not self._reception.limits:
-            self._reception.limits = scheme.limits
-            self._reception.limits_changes += 1
-            self._limits_until_ns = now_ns + LIMITS_NS
+        self.sessions.leads.change(scheme.limits, now_ns)
         if keys & POINT:
             moved = "reference.points_m" in keys
             position = scenario.make_reference()(np.zeros(()))[:, 0] if moved else None

@@ -9,6 +9,7 @@ from collections import Counter, deque
 from typing import Protocol
 
 from skytether.server.gate import Gate, GateCall
+from skytether.server.leads import Leads
 from skytether.server.planning.clock import ClockMap, Contradiction
 from skytether.server.plausibility import ANEW, BELIEVED, Belief, Plausibility
 from skytether.server.sessions import Session, Sessions
@@ -33,22 +34,24 @@ from skytether.shared.events.flight import (
     address_text,
 )
 from skytether.shared.law.model import Indices
-from skytether.shared.law.terms import Limits, Terms
+from skytether.shared.law.terms import Terms
 from skytether.shared.scenario.catalogue import differences
 from skytether.shared.scenario.registry import load
 from skytether.shared.scenario.schema import LinkConfig
 from skytether.shared.wire.drop import Drop, ProtocolError
 from skytether.shared.wire.framing import Report, split
-from skytether.shared.wire.lead import Lead
-from skytether.shared.wire.path_proof import PathProof
 from skytether.shared.wire.protocol import (
     Close,
+    Heartbeat,
     Hello,
+    Horizon,
     Idle,
     Message,
     Observation,
     Refusal,
+    RoomMessage,
     Time,
+    Trajectory,
     Welcome,
     decode,
     encode,
@@ -57,6 +60,8 @@ from skytether.shared.wire.protocol import (
 
 PATHS = "skytether.server.paths"
 """Room for vehicles with several paths; the first report in front of an observation loads it."""
+LEAD, STANDBY = "skytether.shared.wire.lead", "skytether.server.standby"
+"""Room for vehicles with two servers, which its message loads."""
 REFUSALS_REPORTED = 64
 """Number of stored refusals; a repeated HELLO is not reported again."""
 REPORT_NS = 10 * SECOND_NS
@@ -81,7 +86,7 @@ class Decider(Protocol):
     observed_step: Indices
     """Step of the newest observation of each vehicle, or -1; shape (capacity,)."""
 
-    def begin(self, row: int, vehicle: int, lead: Lead | None) -> None:
+    def begin(self, row: int, vehicle: int) -> None:
         """Begin with a vehicle in a row that was forgotten."""
 
     def forget(self, row: int) -> None:
@@ -93,12 +98,6 @@ class Decider(Protocol):
     def observe(self, row: int, observation: Observation) -> bool:
         """Store an observation unless a newer one is stored; True if stored."""
 
-    def follow(self, row: int, lead: Lead | None) -> None:
-        """Note who leads a vehicle."""
-
-    def leadership_of(self, number: int) -> int:
-        """Number of the leadership that a vehicle of a leadership `number` should follow."""
-
 
 class Reception:
     """Receives messages of vehicles; appends answers to `out`, and events to `events`."""
@@ -106,7 +105,6 @@ class Reception:
     def __init__(
         self,
         terms: Terms,
-        limits: Limits | None,
         link: LinkConfig,
         boot_id: int,
         gate: Gate,
@@ -135,10 +133,6 @@ class Reception:
         """Number of accepted observations, in any order of arrival."""
         self.dropped: Counter[Drop] = Counter()
         self.refused: Counter[Refusal] = Counter()
-        self.limits = limits
-        """Limits of the motions of a mission; None without one."""
-        self.limits_changes = 0
-        """Number of their changes in flight."""
         self.time: TimeOfDay | None = None
         """Time of day; None if the host does not know it."""
         self._reported: deque[tuple[int, int, Refusal]] = deque(maxlen=REFUSALS_REPORTED)
@@ -205,39 +199,46 @@ class Reception:
                 self._observe(message, report, call, datagram, now_ns)
             case Hello():
                 self._hello(message, call, datagram, now_ns)
-            case Close() | Time() | PathProof() | Lead():
-                self._hear_in_session(message, report, call, datagram, now_ns)
-            case _:
+            case Welcome() | Horizon() | Trajectory() | Heartbeat():
                 raise ProtocolError(Drop.NOT_FOR_A_SERVER)
+            case _:
+                self._hear_in_session(message, report, call, datagram, now_ns)
 
     def _hear_in_session(
         self,
-        message: Close | Time | PathProof | Lead,
+        message: Close | Time | RoomMessage,
         report: Report | None,
         call: GateCall,
         datagram: Datagram,
         now_ns: int,
     ) -> None:
         """Process a message; nothing of it is believed before it is found to be recent."""
-        session = self._sessions.find(message)
-        if isinstance(message, Lead):
-            session = self._sessions.welcomed(message)
+        says_leader = type(message).__module__ == LEAD
+        sessions = self._sessions
+        session = sessions.welcomed(message) if says_leader else sessions.find(message)
         if session is None:
             raise ProtocolError(Drop.UNKNOWN_SESSION)
-        if isinstance(message, Time | Lead):
-            self._refuse_overtaken(session, message.step)
+        step = getattr(message, "step", None)
+        if step is not None:
+            self._refuse_overtaken(session, step)
         if report:
-            self._sessions.ways.hear(session, report, message, datagram, now_ns)
+            sessions.ways.hear(session, report, message, datagram, now_ns)
         match message:
             case Close():
-                self._sessions.end(session)
+                sessions.end(session)
                 self._events.append(SessionEnded(vehicle=session.vehicle))
             case Time():
                 self._hear_time(session, message, now_ns)
-            case PathProof():
-                self._prove(session, message, call, datagram, now_ns)
-            case Lead():
-                self._note_leader(session, message, call, datagram, now_ns)
+            case _ if says_leader:
+                if type(sessions.leads) is Leads:
+                    sessions.leads = load(STANDBY, "a standby server").LeadsOfTwo(sessions.leads)
+                session.heard_ns = now_ns
+                self._answer(sessions.leads.take(session, message), call, datagram)
+            case _:
+                answer = sessions.ways.take(session, message, datagram, now_ns)
+                session.heard_ns = now_ns
+                if answer:
+                    self._answer(answer, call, datagram)
 
     def _refuse_overtaken(self, session: Session, step: int) -> None:
         """Refuse a message that a vehicle sent in a step long before its newest observation's."""
@@ -250,34 +251,6 @@ class Reception:
         event = Unauthenticated(count=self._unauthenticated, host=host, port=port, reason=reason)
         self._events.append(event)
         self._report_ns = now_ns + REPORT_NS
-
-    def _prove(
-        self, session: Session, message: PathProof, call: GateCall, datagram: Datagram, now_ns: int
-    ) -> None:
-        """Note the address of a path once it is proven; until then ask for the proof there."""
-        question = self._sessions.ways.take(session, message, datagram, now_ns)
-        session.heard_ns = now_ns
-        if question:
-            self._answer(question, call, datagram)
-
-    def _note_leader(
-        self, session: Session, message: Lead, call: GateCall, datagram: Datagram, now_ns: int
-    ) -> None:
-        """Note who leads a vehicle; a number counts once, for the vehicle repeats it."""
-        session.heard_ns = now_ns
-        session.told_step = max(session.told_step, message.step)
-        if session.leadership is None or message.number > session.leadership:
-            session.leadership, session.leads = message.number, bool(message.leads)
-            if session.row >= 0:
-                self._controller.follow(session.row, message)
-            else:
-                session.first = message
-        largest = self._controller.leadership_of(session.leadership)
-        self._answer(self.lead(session, largest), call, datagram)
-
-    def lead(self, session: Session, known: int) -> Lead:
-        """LEAD to a vehicle, see `Session.lead`."""
-        return session.lead(known, self.limits, self.limits_changes)
 
     def _answer(self, message: Message, call: GateCall, datagram: Datagram) -> None:
         sealed = call.line.seal(encode(message))
@@ -426,7 +399,8 @@ class Reception:
         session.line = call.line
         self._plausibility.forget(session.row)
         self._anew(session.row, (session.vehicle, session.boot_id))
-        self._controller.begin(session.row, session.vehicle, session.first)
+        self._sessions.leads.begin(session)
+        self._controller.begin(session.row, session.vehicle)
         host, port = session.address
         self._events.append(SessionOpened(vehicle=session.vehicle, host=host, port=port))
         return session

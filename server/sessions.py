@@ -12,22 +12,21 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from heapq import heappop, heappush
 from itertools import islice
+from typing import Any
 
 import numpy as np
 
 from skytether.server.gate import ReplyPath
+from skytether.server.leads import Leads
 from skytether.server.ways import Way, Ways
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.endpoints.endpoint import Address, Datagram
 from skytether.shared.law.heartbeat import NUMBERS, SESSION_NS, Hearing
 from skytether.shared.law.model import Indices
-from skytether.shared.law.terms import Limits
 from skytether.shared.wire.drop import Drop, ProtocolError
-from skytether.shared.wire.lead import Lead
-from skytether.shared.wire.path_proof import PathProof
-from skytether.shared.wire.protocol import Close, Hello, Observation, Time
+from skytether.shared.wire.protocol import Close, Hello, Observation, RoomMessage, Time
 
-InSession = Observation | Close | Time | PathProof | Lead
+InSession = Observation | Close | Time | RoomMessage
 """Messages of a vehicle in a session."""
 
 OTHER_NS = 2 * SECOND_NS
@@ -78,24 +77,8 @@ class Session:
     """Number of the server's socket at which the vehicle was heard."""
     way: Way | None = None
     """Way to the vehicle in place of its address; None without one."""
-    leadership: int | None = None
-    """Number of the leadership, as last told by the vehicle; None if it has no other server."""
-    told_step: int = 0
-    """Step of the vehicle in the newest LEAD from it."""
-    leads: bool = True
-    """Whether this server leads the vehicle with that number."""
-    first: Lead | None = None
-    """What the vehicle has told before its first observation."""
-
-    def lead(self, known: int, limits: Limits | None, changes: int) -> Lead:
-        """What the vehicle has told of its leader, the largest number that it should know, and the
-        limits of the server's motions.
-        """
-        number, leads, step = self.leadership, int(self.leads), self.told_step
-        assert number is not None
-        return Lead(
-            self.vehicle, self.number, number, leads, known, step, limits=limits, changes=changes
-        )
+    lead: Any = None
+    """What a room notes of who leads the vehicle; None if it has no other server."""
 
     def number_next(self, now_ns: int) -> int:
         number = self.sent
@@ -140,6 +123,7 @@ class Sessions:
         entropy: returns this many random bytes, for the numbers of sessions.
         silence_ns: time after which a silent vehicle may count as gone [ns].
         hearing: makes a `Hearing` for each session.
+        leads: who leads the vehicles.
         keeps_rows: whether a row stays reserved for its vehicle after its session. On a mission the
             other vehicles keep away from a vehicle that has fallen silent.
     """
@@ -150,6 +134,7 @@ class Sessions:
         entropy: Callable[[int], bytes],
         silence_ns: int,
         hearing: Callable[[], Hearing],
+        leads: Leads,
         *,
         keeps_rows: bool = False,
     ) -> None:
@@ -174,6 +159,8 @@ class Sessions:
         """Number of the vehicle in each row; shape (capacity,)."""
         self.ways = Ways()
         """Ways to the vehicles; another once one of them has several paths."""
+        self.leads = leads
+        """Who leads the vehicles."""
         self.idle = np.zeros(capacity, dtype=np.int64)
         """`Idle` reason of the vehicle in each row, as last reported; shape (capacity,)."""
 
@@ -265,7 +252,7 @@ class Sessions:
     def _is_heard(self, live: Session, now_ns: int) -> bool:
         return now_ns - live.heard_ns <= self._silence_ns
 
-    def welcomed(self, message: Lead) -> Session | None:
+    def welcomed(self, message: RoomMessage) -> Session | None:
         """Session of a message, whether its vehicle has a row yet or not."""
         waiting = self._waiting(message.vehicle).get(message.vehicle)
         for session in (self._live.get(message.vehicle), waiting):

@@ -24,7 +24,6 @@ from skytether.shared.events.flight import (
 from skytether.shared.law.model import Array
 from skytether.shared.telemetry.histogram import Histogram
 from skytether.shared.telemetry.record import Compared, Recorder
-from skytether.shared.wire.lead import led
 from skytether.shared.wire.protocol import Heartbeat, Idle, encode, stamp_us
 
 MISSES_MAX = 5
@@ -118,7 +117,7 @@ class Ticker:
         if controller.budget:
             controller.budget.fill(now_ns)
         heartbeats = self._sessions.heartbeats_due(now_ns)
-        controller.note_heartbeats(heartbeats)
+        controller.note_heartbeats([each.row for each in heartbeats])
         rows, step = controller.able(rows, step)
         for first in range(0, len(rows), BLOCK):
             block = slice(first, first + BLOCK)
@@ -167,7 +166,7 @@ class Ticker:
 
         for row, payload in self._controller.scheme.encode(batch, header):
             session = sessions.at(row)
-            plan = led(session.leadership or 0, payload)
+            plan = sessions.leads.signed(session, payload)
             self._send(session, plan, now_ns, worths.get(row, 0.0), is_plan=True)
 
     def _send_heartbeats(self, due: Sequence[Session], now_ns: int) -> None:

@@ -60,7 +60,7 @@ from skytether.shared.missions.zones import Zones
 from skytether.shared.scenario.catalogue import keys_of
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.wire.lead import Lead
-from skytether.shared.wire.protocol import KNOTS_MAX, Observation
+from skytether.shared.wire.protocol import KNOTS_MAX, Observation, RoomMessage
 
 RESTS_MPS = 0.2
 """Measured speed below which a vehicle counts as at rest [m/s]."""
@@ -139,7 +139,8 @@ class MissionPlanner(SplineScheme):
     def restart(self, row: int) -> bool:
         return self._state.restart(row)
 
-    def follow(self, row: int, lead: Lead | None) -> None:
+    def follow(self, row: int, lead: RoomMessage | None) -> None:
+        assert lead is None or isinstance(lead, Lead)
         self._state.follow(row, lead)
 
     def observe(self, row: int, observation: Observation) -> bool:

@@ -24,8 +24,7 @@ from skytether.shared.law.terms import Limits, Terms
 from skytether.shared.scenario.reference import Reference
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.scenario.schemes import SchemeProperties
-from skytether.shared.wire.lead import Lead
-from skytether.shared.wire.protocol import FEEDBACK, KNOTS_MAX, Observation
+from skytether.shared.wire.protocol import FEEDBACK, KNOTS_MAX, Observation, RoomMessage
 
 
 class Splines(NamedTuple):
@@ -316,7 +315,7 @@ class Scheme(ABC):
         """Figures of a vehicle that the scheme adds to the server's own."""
         return {}
 
-    def follow(self, row: int, lead: Lead | None) -> None:  # noqa: B027
+    def follow(self, row: int, lead: RoomMessage | None) -> None:  # noqa: B027
         """Note who leads a vehicle, and its motion in force; None if it has no other server."""
 
     def leave(self) -> int:

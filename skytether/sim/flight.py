@@ -56,6 +56,8 @@ from skytether.shared.wire.drop import Drop
 from skytether.sim.world import Clock, World
 
 # Aboard the client's code is plain Python; thousands of clients in one process need it compiled.
+# Loaded now, so that its functions are compiled, too, and before anything flies.
+load("skytether.client.simulated.vehicle", "simulated")
 compile_all()
 MIDNIGHT_NS = 86_400 * SECOND_NS
 """Time on the server's clock at the start [ns]; so large that no timestamp is negative."""

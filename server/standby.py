@@ -1,0 +1,98 @@
+"""Leaders of vehicles that have two servers: what each vehicle says of its leader (LEAD), and the
+number of the leadership in every plan, see docs/together-proof.md.
+"""
+
+from collections.abc import Iterable, Iterator
+from typing import Any, NamedTuple
+
+from skytether.server.leads import Leads
+from skytether.shared.base.units import SECOND_NS
+from skytether.shared.endpoints.endpoint import Datagram
+from skytether.shared.wire.lead import Lead, led
+from skytether.shared.wire.protocol import Message, encode
+
+TAKEOVER_PLANS = 2
+"""Number of plans that a server sends when it takes over, whatever the trigger says."""
+LIMITS_NS = 10 * SECOND_NS
+"""Time after a change for which vehicles are told every second of the limits of their motions."""
+
+
+class SessionLead(NamedTuple):
+    """What the vehicle of a session has said of its leader."""
+
+    lead: Lead
+    """Its LEAD with the largest number of a leadership so far."""
+    step: int
+    """Step of the vehicle in its newest LEAD."""
+
+
+class LeadsOfTwo(Leads):
+    """Takes the place of a server's plain `Leads` at the first LEAD."""
+
+    def __init__(self, plain: Leads) -> None:
+        super().__init__(plain.controller, plain.limits)
+        self.changes, self.changed_ns = plain.changes, plain.changed_ns
+        self._largest = 0
+        """Largest number of a leadership that a vehicle has reported."""
+
+    def begin(self, session: Any) -> None:
+        said: SessionLead | None = session.lead
+        self._note(session.row, said.lead if said else None)
+
+    def take(self, session: Any, message: Message) -> Message:
+        """Note who leads a vehicle; a number counts once, for the vehicle repeats it."""
+        assert isinstance(message, Lead)
+        said: SessionLead | None = session.lead
+        if said is None or message.number > said.lead.number:
+            session.lead = SessionLead(message, message.step if said is None else said.step)
+            if session.row >= 0:
+                self._note(session.row, message)
+        session.lead = session.lead._replace(step=max(session.lead.step, message.step))
+        return self._answer(session)
+
+    def signed(self, session: Any, plan: bytes) -> bytes:
+        said: SessionLead | None = session.lead
+        return led(said.lead.number, plan) if said else plan
+
+    def spread(self, sessions: Iterable[Any], now_ns: int) -> Iterator[Datagram]:
+        """Tell vehicles that follow a smaller number of the largest one, and for a while all of
+        changed limits.
+        """
+        is_changed = self.changed_ns is not None and now_ns < self.changed_ns + LIMITS_NS
+        for session in sessions:
+            said: SessionLead | None = session.lead
+            if said and (is_changed or self._number(said) > said.lead.number):
+                yield from session.sealed(encode(self._answer(session)), now_ns)
+
+    def _note(self, row: int, lead: Lead | None) -> None:
+        """Note what a vehicle has said; None: it has no other server.
+
+        A server that takes over from another sends two plans: the vehicle may be about to brake,
+        and a plan may be lost. Vehicles of a mission hold their place instead.
+        """
+        leads = lead is None or bool(lead.leads)
+        self._largest = max(self._largest, lead.number if lead else 0)
+        takes_over = leads and lead and lead.number and not self.controller.is_one_fleet
+        self.controller.lead(row, lead, leads=leads, plans=TAKEOVER_PLANS if takes_over else 0)
+
+    def _number(self, said: SessionLead) -> int:
+        """Number of the leadership that a vehicle should follow: the largest, if all follow one
+        server.
+        """
+        return self._largest if self.controller.is_one_fleet else said.lead.number
+
+    def _answer(self, session: Any) -> Lead:
+        """What the vehicle has said, the largest number that it should follow, and the limits of
+        the server's motions.
+        """
+        said: SessionLead = session.lead
+        return Lead(
+            session.vehicle,
+            session.number,
+            said.lead.number,
+            int(bool(said.lead.leads)),
+            self._number(said),
+            said.step,
+            limits=self.limits,
+            changes=self.changes,
+        )
