@@ -1,5 +1,5 @@
 """The scheme "none": the paper's MPC, which takes the newest observation as the present state."""
 
-from skytether.server.schemes import predictive
+from skytether.server.schemes.predictive import CODE as PREDICTIVE
 
-CODE = predictive.CODE
+CODE = PREDICTIVE
