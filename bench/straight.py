@@ -19,7 +19,6 @@ from skytether.autopilot.flavours import FlavourName
 from skytether.netem.proxy import Proxy
 from skytether.shared.base.chance import stream
 from skytether.shared.base.units import seconds_to_ns
-from skytether.shared.endpoints.change import Running
 from skytether.shared.events.flight import Event, Failure
 from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import (
@@ -36,7 +35,7 @@ from skytether.shared.telemetry.record import (
 )
 from skytether.shared.telemetry.summary import Summary, summarise
 from skytether.shared.wire.protocol import NO_HORIZON, Mode
-from skytether.sim.flight import plan_changes
+from skytether.sim.changes import plan
 from skytether.sim.world import Clock, World
 
 READY_S = 1.0
@@ -82,8 +81,7 @@ def fly(
     start_ns = int(stream(scenario.seed, "phase").integers(scenario.dt_ns))
     world.add("autopilot", autopilot, clock=clock, start_ns=start_ns)
     world.add("station", station)
-    running = {"netem": Running(netem, scenario), "autopilot": Running(autopilot, scenario)}
-    plan_changes(world, running, changes)
+    plan(world, {"netem": (netem, scenario), "autopilot": (autopilot, scenario)}, changes)
     world.run(lambda: station.finished, limit_ns=seconds_to_ns(scenario.duration + AROUND_S))
     parts = [parse(sink.getvalue()) for sink in sinks]
     truth = parts[1].copy()

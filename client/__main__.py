@@ -20,7 +20,7 @@ import msgspec
 
 from skytether.client import vehicles
 from skytether.client.endpoint import Client
-from skytether.client.fleet import ClientFleet, apart_ns
+from skytether.client.fleet import ClientFleet
 from skytether.client.link import ClientLink, PlainLink
 from skytether.client.memory import SavedState, recall
 from skytether.client.vehicle import Vehicle, VehicleMemory
@@ -168,7 +168,9 @@ def fly(argv: Sequence[str]) -> None:
             for number, flies in zip(numbers, flying, strict=True)
         ]
         endpoint = (
-            clients[0] if alone else ClientFleet(clients, apart_ns(len(clients), scenario.dt_ns))
+            clients[0]
+            if alone
+            else ClientFleet(clients, vehicles.apart_ns(len(clients), scenario.dt_ns))
         )
         running.drive(
             Steady(endpoint),

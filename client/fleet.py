@@ -5,21 +5,9 @@ from heapq import heapify, heappop, heappush
 from typing import Any
 
 from skytether.client.endpoint import Client, figures
-from skytether.shared.base.units import SECOND_NS
 from skytether.shared.endpoints.endpoint import Datagram, Endpoint
 from skytether.shared.events.flight import Failure
 from skytether.shared.scenario.schema import Scenario
-
-START_NS = 5 * SECOND_NS
-"""Longest time within which all vehicles of a fleet start."""
-
-
-def apart_ns(vehicles: int, dt_ns: int) -> int:
-    """Time from one vehicle's start to the next's [ns]: one step, less in a large fleet.
-
-    Vehicles that start together would send all their packets together, which then queue.
-    """
-    return min(dt_ns, START_NS // vehicles)
 
 
 class ClientFleet(Endpoint):

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from skytether.client.vehicle import Vehicle
 from skytether.shared.base.errors import ConfigError
+from skytether.shared.base.units import SECOND_NS
 from skytether.shared.scenario.grammar import GrammarError
 from skytether.shared.scenario.registry import VEHICLES
 from skytether.shared.scenario.schema import Scenario
@@ -16,6 +17,8 @@ if TYPE_CHECKING:
     from skytether.ros2.graph import Node
     from skytether.shared.endpoints.line import Line
 
+START_NS = 5 * SECOND_NS
+"""Longest time within which all vehicles of a fleet start."""
 vehicle = VEHICLES
 """Decorator that registers a vehicle: a function of the `Scenario` and its number that makes a
 `Vehicle`."""
@@ -40,3 +43,11 @@ def connection(flies: Vehicle, scenario: Scenario) -> "Line | Node | None":
     from skytether.shared.endpoints.line import parse_line
 
     return flies.node or parse_line("vehicle.address", scenario.vehicle.address)
+
+
+def apart_ns(vehicles: int, dt_ns: int) -> int:
+    """Time from one vehicle's start to the next's [ns]: one step, less in a large fleet.
+
+    Vehicles that start together would send all their packets together, which then queue.
+    """
+    return min(dt_ns, START_NS // vehicles)

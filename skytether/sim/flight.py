@@ -13,7 +13,6 @@ vehicles of each run are numbered from 1.
 import io
 from collections import Counter, defaultdict, deque
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import replace
 from functools import cache, partial
 from types import MappingProxyType
@@ -24,7 +23,6 @@ import numpy as np
 
 from skytether.client import vehicles as kinds
 from skytether.client.endpoint import Client
-from skytether.client.fleet import apart_ns
 from skytether.client.link import ClientLink
 from skytether.netem.proxy import Proxy, of_paths
 from skytether.server.endpoint import Server
@@ -33,11 +31,9 @@ from skytether.shared.base.chance import stream
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.base.kernel import compile_all
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS, seconds_to_ns
-from skytether.shared.endpoints.change import Running
 from skytether.shared.endpoints.endpoint import Address, Datagram, Endpoint, by_name
 from skytether.shared.endpoints.stopwatch import Stopwatch
 from skytether.shared.events.flight import Event, Fault, VehicleEvent
-from skytether.shared.scenario.dotted import text_key
 from skytether.shared.scenario.reference import Reference
 from skytether.shared.scenario.registry import load
 from skytether.shared.scenario.whole import Scenario
@@ -59,6 +55,7 @@ from skytether.sim.world import Clock, World
 # Loaded now, so that its functions are compiled, too, and before anything flies.
 load("skytether.client.simulated.vehicle", "simulated")
 compile_all()
+Flown = tuple[Endpoint, Scenario]
 MIDNIGHT_NS = 86_400 * SECOND_NS
 """Time on the server's clock at the start [ns]; so large that no timestamp is negative."""
 BOOT_ID = 2**63 + 2**31
@@ -234,14 +231,14 @@ class Run:
         self._header_bytes = self._sinks[0].tell()
         packets = Recorder(PACKET_COLUMNS, self._sinks[1])
         self._netems: dict[str, Proxy] = {}
-        self.running: dict[str, Running] = {}
-        """Scenario of each host, and its changes."""
+        self.flown: dict[str, Flown] = {}
+        """Endpoint and scenario of each host."""
         servers = [SERVER] * len(scenario.paths) + [STANDBY] * has_standby
         for i, server in enumerate(servers):
             host = f"netem {scenario.seed}/{i + 1}" if i else f"netem {scenario.seed}"
             own = scenario.on_path(i)
             netem = Proxy(own, server=server, flows=vehicles, recorder=packets, path=i)
-            self._netems[host], self.running[host] = netem, Running(netem, own)
+            self._netems[host], self.flown[host] = netem, (netem, own)
             world.add(host, netem)
         addresses: list[Address] = [(host, 0) for host in self._netems]
         standby = [addresses.pop()] if has_standby else []
@@ -276,11 +273,11 @@ class Run:
                 f"client {scenario.seed}.{vehicle}",
                 client,
                 clock=clock,
-                start_ns=start_ns + (vehicle - 1) * apart_ns(vehicles, scenario.dt_ns),
+                start_ns=start_ns + (vehicle - 1) * kinds.apart_ns(vehicles, scenario.dt_ns),
                 on_finished=self._one_has_finished,
             )
             self.hosts[host] = client
-            self.running[host] = Running(client, scenario)
+            self.flown[host] = client, scenario
         self.flying = vehicles
         self._ends: tuple[int | None, int | None] = None, None
         """Rows of the server and bytes of netem when the last vehicle finished."""
@@ -416,17 +413,17 @@ def _fly(
         )
         for number, run in enumerate(each)
     ]
-    run_of = {host: run for run in runs for host in run.running} | dict.fromkeys(beside, runs[0])
+    run_of = {host: run for run in runs for host in run.flown} | dict.fromkeys(beside, runs[0])
     for name, endpoint in beside.items():
         world.add(name, endpoint)
     # Added last, the server is woken last at an instant, when all datagrams due have arrived.
     compute_ns = seconds_to_ns(scenario.simulation.compute_s)
     for number, (name, endpoint) in enumerate(servers.items(), start=1):
         world.add(name, endpoint, clock=Clock(number * MIDNIGHT_NS), compute_ns=compute_ns)
-    running = {name: Running(endpoint, scenario) for name, endpoint in servers.items()}
-    running |= {host: each for run in runs for host, each in run.running.items()}
-    running |= {host: Running(endpoint, scenario) for host, endpoint in beside.items()}
-    plan_changes(world, running, changes)
+    if changes:
+        own = {host: each for run in runs for host, each in run.flown.items()}
+        others = {name: (each, scenario) for name, each in (servers | {**beside}).items()}
+        load("skytether.sim.changes", "changes in flight").plan(world, others | own, changes)
     for time_s, act in actions:
         world.at(seconds_to_ns(time_s), partial(act, world))
     ask_ns, second_ns, flying = 0, SECOND_NS, runs.copy()
@@ -456,26 +453,3 @@ def _tell_time(world: World, hosts: Mapping[str, Endpoint], error_ns: int) -> No
     for number, (host, each) in enumerate(hosts.items() if error_ns else ()):
         wrong_ns = error_ns if number % 2 else -error_ns
         world.act(host, partial(each.learn_time, world.now_ns + wrong_ns, error_ns))
-
-
-def plan_changes(
-    world: World,
-    running: Mapping[str, Running],
-    changes: Sequence[tuple[float, Mapping[str, Any]]],
-) -> None:
-    """Schedule changes of keys at each host that accepts the key; the first host refuses unknown
-    keys.
-    """
-    changeable = frozenset[str]().union(*(each.changeable for each in running.values()))
-
-    def change(values: Mapping[str, Any]) -> None:
-        for i, (host, each) in enumerate(running.items()):
-            accepted = (
-                each.changeable if i else each.changeable | ({*map(text_key, values)} - changeable)
-            )
-            if own := {key: value for key, value in values.items() if text_key(key) in accepted}:
-                with suppress(ConfigError):  # a refusal is reported as an event
-                    world.act(host, partial(each.change, own))
-
-    for time_s, values in changes:
-        world.at(seconds_to_ns(time_s), partial(change, values))

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bench.crowd import judge
-from skytether.client.fleet import apart_ns
+from skytether.client.vehicles import apart_ns
 from skytether.server import budget as budgets
 from skytether.server.budget import BURST_S, GUESS_BYTES, WAIT_S, SharedBudget
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
