@@ -5,32 +5,12 @@ in `network.uplink`, and `control.trigger.state_gap.decay_rate` is an argument b
 """
 
 from collections.abc import Iterator, Mapping
-from types import MappingProxyType
 from typing import Any
 
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.base.hint import hint
 from skytether.shared.scenario.grammar import GrammarError
-from skytether.shared.scenario.registry import (
-    IMPAIRMENTS,
-    PLANNERS,
-    REFERENCES,
-    REPORTS,
-    TRIGGERS,
-    PluginTable,
-)
-
-TEXTS: Mapping[str, PluginTable] = MappingProxyType(
-    {
-        "control.trigger": TRIGGERS,
-        "control.planner": PLANNERS,
-        "reference.shape": REFERENCES,
-        "vehicle.report": REPORTS,
-        "network.uplink": IMPAIRMENTS,
-        "network.downlink": IMPAIRMENTS,
-    }
-)
-"""Keys whose value is a text with arguments, and the table of the entries it may name."""
+from skytether.shared.scenario.rooms import TEXTS
 
 
 def flat(table: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:

@@ -24,7 +24,6 @@ from skytether.shared.base.errors import ConfigError
 from skytether.shared.base.hint import hint
 from skytether.shared.scenario import rooms, schema
 from skytether.shared.scenario.contradictions import contradictions
-from skytether.shared.scenario.dotted import TEXTS, flat, with_argument
 from skytether.shared.scenario.grammar import GrammarError
 from skytether.shared.scenario.registry import IMPAIRMENTS, File, Files, PluginTable
 from skytether.shared.scenario.schema import Contradiction, NetworkConfig
@@ -302,7 +301,7 @@ def _with_texts(raw: Mapping[str, Any], source: str) -> dict[str, Any]:
     the default texts.
     """
     default = to_table(Scenario())
-    for key in TEXTS:
+    for key in rooms.TEXTS:
         section, name = key.split(".")
         below = raw.get(section)
         if isinstance(below, Mapping) and isinstance(below.get(name), Mapping):
@@ -324,6 +323,8 @@ def _with_paths(raw: dict[str, Any], source: str) -> dict[str, Any]:
 
 
 def _with_arguments(key: str, text: str, arguments: Mapping[str, Any], source: str) -> str:
+    from skytether.shared.scenario.dotted import flat, with_argument
+
     try:
         for path, value in flat(arguments, f"{key}."):
             text = with_argument(key, text, path, value)
@@ -361,7 +362,7 @@ def _overlay(
         key, old = f"{prefix}{name}", merged.get(name)
         if isinstance(old, dict) and isinstance(value, dict):
             merged[name] = _overlay(old, value, source, f"{key}.")
-        elif isinstance(old, str) and isinstance(value, dict) and key in TEXTS:
+        elif isinstance(old, str) and isinstance(value, dict) and key in rooms.TEXTS:
             merged[name] = _with_arguments(key, old, value, source)
         else:
             merged[name] = value

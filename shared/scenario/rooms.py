@@ -3,8 +3,9 @@
 The order is that of help texts and documents. Nothing is imported here.
 """
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from contextlib import suppress
+from types import MappingProxyType
 from typing import Any
 
 from skytether.shared.base.errors import ConfigError
@@ -18,6 +19,7 @@ from skytether.shared.scenario.registry import (
     VEHICLES,
     ZONES,
     Files,
+    PluginTable,
     load,
 )
 
@@ -40,6 +42,17 @@ SECTIONS = {
 FILES = {"mission.zones": (ZONES, 4_000_000)}
 """Keys of rooms whose text may name files, see `reading.FILES`."""
 
+TEXTS: Mapping[str, PluginTable] = MappingProxyType(
+    {
+        "control.trigger": TRIGGERS,
+        "control.planner": PLANNERS,
+        "reference.shape": REFERENCES,
+        "vehicle.report": REPORTS,
+        "network.uplink": IMPAIRMENTS,
+        "network.downlink": IMPAIRMENTS,
+    }
+)
+"""Keys whose value is a text with arguments, and the table of the entries it may name."""
 EVENTS = (
     f"{SHARED}events.aboard",
     f"{SHARED}events.paths",

@@ -11,8 +11,8 @@ from typing import Any
 import msgspec
 
 from skytether.shared.events.flight import Changed
-from skytether.shared.scenario.dotted import TEXTS
 from skytether.shared.scenario.grammar import GrammarError, calls
+from skytether.shared.scenario.rooms import TEXTS
 from skytether.view.controls import LOST, THRESHOLDS, WAYS, applied, knobs
 
 KNOBS = (*knobs(3), *THRESHOLDS)
