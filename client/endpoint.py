@@ -96,7 +96,7 @@ class Client(Endpoint):
         if self.keeps:
             module = load("skytether.client.memory", "a saved state")
             self._memory = module.Saving(module.ClientMemory(terms, boot_id, before))
-        self._is_mission, self._axes = scenario.is_mission, terms.axes
+        self._keeps_apart, self._axes = scenario.keeps_apart, terms.axes
         self.vehicle = vehicle
         self._timeout_ns = seconds_to_ns(scenario.link.timeout_s)
         self._flies, self._port = flies, flies.port
@@ -354,7 +354,7 @@ class Client(Endpoint):
         self._time = TimeOfDay(utc_ns - now_ns, error_ns, now_ns)
 
     def _tell_time(self, session: ServerSession, now_ns: int) -> None:
-        if self._time is None or not self._is_mission or now_ns < self._time_due_ns:
+        if self._time is None or not self._keeps_apart or now_ns < self._time_due_ns:
             return
         error_ns = self._time.error_at(now_ns)
         if error_ns is None:

@@ -41,7 +41,7 @@ class FlightLog:
     ) -> None:
         self._vehicle, self._pilot, self._failsafe = vehicle, pilot, failsafe
         self._servers, self._events = servers, events
-        self._is_mission = scenario.is_mission
+        self._keeps_apart = scenario.keeps_apart
         self._land_after_s = scenario.vehicle.land_after_s
         self._timeout_ns = seconds_to_ns(scenario.link.timeout_s)
         self._fence_report_ns = 0
@@ -80,7 +80,7 @@ class FlightLog:
     def report_step(self, now_ns: int) -> None:
         """Report what the pilot has met in the step that it has just flown."""
         pilot = self._pilot
-        if self._is_mission and pilot.late_ns > max(STALL_NS, self._latest_ns):
+        if self._keeps_apart and pilot.late_ns > max(STALL_NS, self._latest_ns):
             late_s = pilot.late_ns / SECOND_NS
             self._events.append(SteppedLate(vehicle=self._vehicle, late_s=late_s))
         self._latest_ns = pilot.latest_ns

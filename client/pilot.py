@@ -63,13 +63,13 @@ class Pilot:
         recorder: Recorder | None,
     ) -> None:
         self._terms = scenario.terms()
-        self._dt_ns, self._is_mission = self._terms.dt_ns, scenario.is_mission
+        self._dt_ns, self._keeps_apart = self._terms.dt_ns, scenario.keeps_apart
         self.steps = scenario.steps
         self._number, self._vehicle = number, vehicle
         self._navigation = Navigation(scenario)
         self._failsafe = failsafe
         self._recorder = recorder
-        self._holds = scenario.is_mission or (vehicle.drifts and failsafe.brakes)
+        self._holds = scenario.keeps_apart or (vehicle.drifts and failsafe.brakes)
         """Whether a hovering vehicle holds its place: velocities alone let it drift, and other
         vehicles of a mission keep clear of that place."""
         along = regulator(scenario) if self._terms.splines or self._holds else None
@@ -174,18 +174,18 @@ class Pilot:
             raise
         if is_held:
             self._failsafe.horizon_taken(now_ns=now_ns)
-            if self._is_mission:
+            if self._keeps_apart:
                 self._failsafe.motion_goes_on(self._goes_on(self.step), now_ns=now_ns)
 
     def _goes_on(self, step: int) -> bool:
         """Whether the vehicle follows a mission's motion whose last knot lies after `step`."""
-        return self._is_mission and step < self.compensator.last_step
+        return self._keeps_apart and step < self.compensator.last_step
 
     def motion_in_force(self) -> MotionInForce | None:
         """Motion of a mission in force; None without one."""
         compensator = self.compensator
         flown = compensator.follower
-        if not self._is_mission or compensator.in_force == NO_HORIZON:
+        if not self._keeps_apart or compensator.in_force == NO_HORIZON:
             return None
         assert isinstance(flown, SplineFollower)
         return MotionInForce(
@@ -277,7 +277,7 @@ class Pilot:
         """Let the failsafe act on the causes that hold at the start of the present step."""
         failsafe, navigation = self._failsafe, self._navigation
         hindrance = self._vehicle.hindrance(now_ns=now_ns)
-        if self._is_mission:
+        if self._keeps_apart:
             failsafe.motion_goes_on(self._goes_on(self.step), now_ns=now_ns)
         failsafe.step(late_ns=self.late_ns, hindrance=hindrance, now_ns=now_ns)
         if failsafe.transitions:
@@ -347,7 +347,7 @@ class Pilot:
         """Hold the place of a vehicle that hovers without a plan: where it comes to rest."""
         if self._is_to_rest() and self._navigation.is_known:
             place = self._navigation.predicted.copy()
-            if not self._is_mission:
+            if not self._keeps_apart:
                 place[:, 0] += np.array(self._terms.tau_s) * place[:, 1]
             self.compensator.rest(self.step, place)
 
@@ -358,7 +358,7 @@ class Pilot:
             return False
         # After a change of the frame the estimate is of the old one until a position comes.
         is_measured = bool(np.isfinite(self._navigation.measured[:, 0]).all())
-        return is_measured and (self._is_mission or failsafe.reason not in UNPLACED)
+        return is_measured and (self._keeps_apart or failsafe.reason not in UNPLACED)
 
     def decide(self, *, keeps_frame: bool) -> None:
         self._vehicle.decide(keeps_frame=keeps_frame)

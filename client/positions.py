@@ -44,7 +44,7 @@ Vector = tuple[float, float, float]
 
 def take_off_place(scenario: Scenario, vehicle: int) -> Vector:
     """Position of take-off, in our axes [m]; on a mission, below its start position."""
-    if not scenario.is_mission:
+    if not scenario.keeps_apart:
         return 0.0, 0.0, 0.0
     x, y = scenario.start_m(vehicle)[:2].tolist()
     return x, y, 0.0

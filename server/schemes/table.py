@@ -31,7 +31,7 @@ OF_SOME = tuple(
 
 
 def _code(scenario: Scenario, *, missions: bool = True) -> SchemeCode:
-    if missions and scenario.is_mission:
+    if missions and scenario.keeps_apart:
         module = load(MISSIONS, "missions")
     else:
         name = schemes.call(scenario.control.scheme).name

@@ -24,6 +24,8 @@ PLACES_MAX = 100_000_000
 def of_keys(scenario: Scenario) -> Iterator[Contradiction]:
     """Contradictions between keys: vehicles have to keep apart whichever packets are lost."""
     control, link, vehicle = scenario.control, scenario.link, scenario.vehicle
+    if not control.properties.missions:
+        yield "control.scheme", repr(control.scheme), "'trajectory' on a mission"
     if not _is_one(PLANNERS, control.planner, MPC):
         expected = f"{MPC!r} on a mission, whose vehicles keep apart by motions of the server's own"
         yield "control.planner", repr(control.planner), expected

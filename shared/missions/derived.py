@@ -22,7 +22,7 @@ def clearances(scenario: Scenario) -> Clearances:
 
 def lands(scenario: Scenario) -> bool:
     """Whether vehicles of a mission with three axes land if the server is silent."""
-    return scenario.is_mission and scenario.model.axes > 2 and scenario.vehicle.land_after_s > 0.0
+    return scenario.keeps_apart and scenario.model.axes > 2 and scenario.vehicle.land_after_s > 0.0
 
 
 def rest_scale(scenario: Scenario) -> float:

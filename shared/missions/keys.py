@@ -49,7 +49,7 @@ class MissionConfig(Section, frozen=True):
         return {name: getattr(self, name) for name in keys}
 
     def contradictions(self, scenario: Scenario) -> Iterator[Contradiction]:
-        if scenario.is_mission:
+        if scenario.keeps_apart:
             yield from _checks().of_keys(scenario)
             return
         for key in ("zones", "goals"):
@@ -58,7 +58,7 @@ class MissionConfig(Section, frozen=True):
                 yield f"mission.{key}", repr(given), expected
 
     def contradictions_of_way(self, scenario: Scenario, *, is_new: bool) -> Iterator[Contradiction]:
-        if not scenario.is_mission:
+        if not scenario.keeps_apart:
             return
         wrong = list(_checks().of_changes(scenario))
         yield from wrong

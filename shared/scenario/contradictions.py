@@ -127,8 +127,6 @@ def _no_scheme(scenario: Scenario) -> Iterator[Contradiction]:
     if properties.feedback not in (None, control.feedback):
         feedback, needed = (str(each).lower() for each in (control.feedback, properties.feedback))
         yield "control.feedback", feedback, f"{needed} with control.scheme = {control.scheme!r}"
-    if scenario.is_mission and not properties.missions:
-        yield "control.scheme", repr(control.scheme), "'trajectory' on a mission"
 
 
 def _no_planner(scenario: Scenario) -> Iterator[Contradiction]:

@@ -33,7 +33,7 @@ def is_known(scenario: Scenario) -> bool:
     """Whether the desired trajectory is known before the flight: no live
     point, target or mission.
     """
-    return scenario.reference.shape not in ("live", "target") and not scenario.is_mission
+    return scenario.reference.shape not in ("live", "target") and not scenario.keeps_apart
 
 
 def excess(scenario: Scenario, velocity: Array) -> Array:

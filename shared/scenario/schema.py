@@ -592,8 +592,8 @@ class Scenario(Section, frozen=True):
         return self.unallocated_reference(vehicle)(np.zeros(()))[:, 0]
 
     @property
-    def is_mission(self) -> bool:
-        """Whether the flight is a mission: several vehicles with goals, which keep apart."""
+    def keeps_apart(self) -> bool:
+        """Whether vehicles keep apart: each flies its motion to the end, or holds its place."""
         return self.reference.shape.partition("(")[0].strip() in rooms.MISSIONS
 
     def entries(self) -> Iterator[Entry]:

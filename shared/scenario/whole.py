@@ -13,6 +13,7 @@ Scenario = msgspec.defstruct(
     frozen=True,
     forbid_unknown_fields=True,
     kw_only=True,
+    namespace={"is_mission": schema.Scenario.keeps_apart},
 )
 
 

@@ -10,6 +10,9 @@ class Scenario(schema.Scenario, frozen=True):
     mission: MissionConfig = MissionConfig()
     mavlink: MavlinkConfig = MavlinkConfig()
     ros2: Ros2Config = Ros2Config()
+    @property
+    def is_mission(self) -> bool:
+        """Whether the flight is a mission: several vehicles with goals, which keep apart."""
 
 class WithFiles(Scenario, frozen=True):
     contents: Files = ()

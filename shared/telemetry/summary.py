@@ -237,7 +237,7 @@ def desired(scenario: Scenario, client: Rows, server: Rows | None = None) -> Arr
         client: rows of the vehicle.
         server: rows of the server, of any vehicles.
     """
-    if scenario.reference.shape != "live" and not scenario.is_mission:
+    if scenario.reference.shape != "live" and not scenario.keeps_apart:
         times_s, vehicles = client["step"] * scenario.control.dt, client["vehicle"][:1].tolist()
         return scenario.make_reference(*vehicles)(times_s)[..., 0]
     server_rows = (

@@ -168,7 +168,7 @@ def fly_batch(
     """
     in_time = seconds_to_ns(scenario.simulation.compute_s) <= scenario.dt_ns
     # Vehicles of one server share a budget, and on a mission keep clear of each other.
-    alone = not in_time or scenario.is_mission or scenario.control.shared_bytes_per_s
+    alone = not in_time or scenario.keeps_apart or scenario.control.shared_bytes_per_s
     company = 1 if alone else COMPANY_MAX
     groups = [seeds[first : first + company] for first in range(0, len(seeds), company)]
     flights = [
@@ -369,7 +369,7 @@ def _fly(
         run, number = divmod(vehicle - 1, vehicles)
         return each[run].measured_reference(number + 1)
 
-    has_own = scenario.is_mission or scenario.reference.shape == "target"
+    has_own = scenario.keeps_apart or scenario.reference.shape == "target"
     recorder = Recorder(server_columns(scenario.model.axes, scenario.control.scheme), sink)
     header_bytes, row_bytes = sink.tell(), recorder.columns.itemsize
 
