@@ -377,6 +377,7 @@ ALWAYS = {"clock", "controller", "desired", "plausibility"}
 def test_a_server_loads_no_kernel_of_another_scheme(scenario: str) -> None:
     """A module with kernels belongs to named schemes, or to all of them."""
     import_module("skytether.server.endpoint")
+    table.load_all()
     own = table.others(reading.load("paper")) | table.others(reading.load("swap"))
     own -= table.others(reading.load(scenario))
     loaded = {each.__module__ for each in kernel.KERNELS} - table.others(reading.load(scenario))
