@@ -51,7 +51,7 @@ ROOMS: dict[str, tuple[str, str]] = {
     ),
     "traces": ("netem/impairments/traces.py", f"{FLIES} --network.uplink trace('a.csv')"),
     "a shared rate": (
-        "server/rate.py server/budget.py",
+        "server/budget.py",
         f"{FLIES} --control.shared-bytes-per-s 1000",
     ),
     "an autopilot": ("client/mavlink", "client demo --vehicle.kind mavlink"),
