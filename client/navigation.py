@@ -136,9 +136,8 @@ class Navigation:
                 numbers if newest is self._nothing else np.where(np.isnan(numbers), newest, numbers)
             )
             if self._begun:
-                carried = measured
-                if measured.stamp_ns < now_ns - self._delay_ns:
-                    carried = self._carried(measured, now_ns - self._delay_ns, due)
+                carried = self._carried(measured, now_ns - self._delay_ns, due)
+                if carried is not measured:
                     numbers = carried.numbers()
                 self.filter.take(carried, numbers)
             else:
@@ -161,7 +160,7 @@ class Navigation:
         return self.filter.disturbance()
 
     def _carried(self, measured: Measurement, to_ns: int, due: Array) -> Measurement:
-        """Measurement extrapolated by the model to a later time.
+        """Measurement extrapolated by the model to a later time; an earlier time changes nothing.
 
         A real vehicle measures between steps. If an older input than `due` acted during part of the
         extrapolation, the filter has to correct the difference.
@@ -174,6 +173,8 @@ class Navigation:
         Source: eq. (1).
         """
         age = min(to_ns - measured.stamp_ns, CARRIED_NS) / SECOND_NS
+        if age <= 0.0:
+            return measured
         _, position, velocity = measured
         velocity_now = self.filter.estimate()[:, 1] if velocity is None else np.array(velocity)
         # Eq. (1) in closed form: the input is constant over this time.

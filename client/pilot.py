@@ -310,7 +310,7 @@ class Pilot:
         navigation, had_plan = self._navigation, compensator.covered
         # From here on the compensator is at this step.
         wanted, without_feedback = compensator.choose(
-            self.step, navigation.predicted, navigation.filter.disturbance(), self._input
+            self.step, navigation.predicted, navigation.disturbance, self._input
         )
         if mode is Mode.LAND:
             wanted = wanted if compensator.rests else [0.0] * terms.axes

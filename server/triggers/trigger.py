@@ -16,7 +16,6 @@ import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
 
-from skytether.server.planning.plugin_errors import Tell
 from skytether.shared.law.model import Array, Flags, Indices, Model
 from skytether.shared.scenario.grammar import Combination, Expression, Value
 from skytether.shared.scenario.registry import TRIGGERS, load
@@ -257,7 +256,9 @@ class Combined(Trigger):
 
 
 def make_trigger(
-    control: ControlConfig, capacity: int, tell: Tell = lambda _count, _text: None
+    control: ControlConfig,
+    capacity: int,
+    tell: Callable[[str, str], None] = lambda _count, _text: None,
 ) -> Trigger:
     """Make the trigger of a scenario.
 
