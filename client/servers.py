@@ -209,7 +209,7 @@ class Servers(OneServer):
         answered.number = max(answered.number or 0, message.number)
         self.leadership.hear_limits(server, message.limits, message.changes)
         self.leadership.exceed(message.number, server)
-        self.leadership.learn(message.known, server)
+        self.leadership.learn(message.largest, server)
         step, asked_ns = answered.asked
         age_ns = now_ns - asked_ns + (step - message.step) * self._dt_ns
         if age_ns <= session.hearing.overtaken_ns:

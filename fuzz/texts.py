@@ -236,7 +236,7 @@ class ControlTarget(Text, EndpointInFlight):
             assert bool(parsed.changed) == (running.scenario != before), payload.hex()
             assert not (parsed.refused and parsed.changed), payload.hex()
             table = reading.to_table(running.scenario)
-            reading.check(table, known=running.scenario, any_network=True)
+            reading.check(table, checked=running.scenario, any_network=True)
         running.endpoint.events()  # empties the list of netem's events
 
 

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 from skytether.server.leads import Leads
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.endpoints.endpoint import Datagram
-from skytether.shared.wire.lead import Lead, led
+from skytether.shared.wire.lead import Lead, with_leadership
 from skytether.shared.wire.protocol import Message, encode
 
 TAKEOVER_PLANS = 2
@@ -52,7 +52,7 @@ class LeadsOfTwo(Leads):
 
     def signed(self, session: Any, plan: bytes) -> bytes:
         said: SessionLead | None = session.lead
-        return led(said.lead.number, plan) if said else plan
+        return with_leadership(said.lead.number, plan) if said else plan
 
     def spread(self, sessions: Iterable[Any], now_ns: int) -> Iterator[Datagram]:
         """Tell vehicles that follow a smaller number of the largest one, and for a while all of

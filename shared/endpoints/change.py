@@ -184,7 +184,7 @@ def with_values(scenario: Scenario, values: Mapping[str, Any]) -> Scenario:
     table = reading.to_table(scenario)
     set_keys(values, table)
     try:
-        return reading.check(table, known=scenario, any_network=True)
+        return reading.check(table, checked=scenario, any_network=True)
     except RecursionError:
         raise ConfigError("got values that are nested too deeply") from None
 

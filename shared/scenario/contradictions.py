@@ -31,12 +31,12 @@ LOSSY = 0.3
 
 
 def contradictions(
-    scenario: Scenario, known: Scenario | None = None, *, any_network: bool = False
+    scenario: Scenario, checked: Scenario | None = None, *, any_network: bool = False
 ) -> Iterator[Contradiction]:
     """Contradictions of a scenario whose values are each valid.
 
     Args:
-        known: a scenario that was checked before; if the desired trajectory is the same, it is
+        checked: a scenario that was checked before; if the desired trajectory is the same, it is
             not checked again.
         any_network: whether the network may be too slow, or lose too many packets, to fly over.
     """
@@ -93,7 +93,7 @@ def contradictions(
         yield from min(each, key=len)
     yield from _no_trigger(control)
     yield from _no_policies("vehicle.report", vehicle.report, REPORTS, control)
-    yield from _no_way(scenario, known)
+    yield from _no_way(scenario, checked)
 
 
 def _no_origin(scenario: Scenario) -> Iterator[Contradiction]:
@@ -106,10 +106,10 @@ def _no_origin(scenario: Scenario) -> Iterator[Contradiction]:
         yield "reference.origin", list(origin), expected
 
 
-def _no_way(scenario: Scenario, known: Scenario | None) -> Iterator[Contradiction]:
-    same = known and (scenario.reference, scenario.model.axes) == (
-        known.reference,
-        known.model.axes,
+def _no_way(scenario: Scenario, checked: Scenario | None) -> Iterator[Contradiction]:
+    same = checked and (scenario.reference, scenario.model.axes) == (
+        checked.reference,
+        checked.model.axes,
     )
     wrong = [] if same else _no_shape(scenario) or list(_no_reference(scenario))
     yield from wrong

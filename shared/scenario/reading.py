@@ -62,8 +62,8 @@ def names(file: str = "") -> list[str]:
     if file:
         return [f"{file}/{name}" for name in read_toml(_path(file), file)]
     files = (each.name for each in SCENARIOS.iterdir())
-    known = {name.removesuffix(".toml") for name in files if name.endswith(".toml")}
-    return sorted(known - {COMPARED})
+    named = {name.removesuffix(".toml") for name in files if name.endswith(".toml")}
+    return sorted(named - {COMPARED})
 
 
 def load(name: str) -> Scenario:
@@ -93,7 +93,7 @@ def check(
     raw: Mapping[str, Any],
     source: str = "",
     *,
-    known: schema.Scenario | None = None,
+    checked: schema.Scenario | None = None,
     any_network: bool = False,
 ) -> Scenario:
     """Make a scenario from a table of plain values, and check it for contradictions.
@@ -101,7 +101,7 @@ def check(
     Args:
         raw: the table.
         source: file or command line of the values, for messages.
-        known: a scenario that was checked before; if the desired trajectory is the same, its
+        checked: a scenario that was checked before; if the desired trajectory is the same, its
             files are not read again.
         any_network: whether the network may be too slow, or lose too many packets, to fly over.
 
@@ -109,7 +109,7 @@ def check(
         ConfigError: the first error.
     """
     scenario = convert(raw, source)
-    return _without_contradictions(scenario, source, known=known, any_network=any_network)
+    return _without_contradictions(scenario, source, checked=checked, any_network=any_network)
 
 
 def convert(raw: Mapping[str, Any], source: str = "") -> Scenario:
@@ -133,12 +133,12 @@ def _without_contradictions(
     scenario: Scenario,
     source: str,
     *,
-    known: schema.Scenario | None = None,
+    checked: schema.Scenario | None = None,
     any_network: bool = False,
 ) -> Scenario:
     """Scenario with its files, refused if it has contradictions; see `check`."""
-    scenario = _with_files(scenario, source, known)
-    _refuse_first(contradictions(scenario, known, any_network=any_network), source)
+    scenario = _with_files(scenario, source, checked)
+    _refuse_first(contradictions(scenario, checked, any_network=any_network), source)
     return scenario
 
 
@@ -217,17 +217,17 @@ def _relative_to(folder: Path, raw: dict[str, Any], prefix: str = "") -> None:
                 raw[name] = FILES[key][0].with_files(value, lambda file: str(folder / file))
 
 
-def _with_files(scenario: Scenario, source: str, known: schema.Scenario | None) -> Scenario:
+def _with_files(scenario: Scenario, source: str, checked: schema.Scenario | None) -> Scenario:
     """Scenario with the contents of the files that it names; raises ConfigError if one cannot be
     read.
     """
-    before = _naming_files(known) if known else ()
+    before = _naming_files(checked) if checked else ()
     contents: dict[str, File] = {}
     for key, text in _naming_files(scenario):
         if key == "reference.file" and scenario.reference.shape not in rooms.TABLES:
             continue
         with suppress(GrammarError):  # reported by `contradictions`
-            own = known.files if known and (key, text) in before else ()
+            own = checked.files if checked and (key, text) in before else ()
             contents |= {file.name: file for file in files_of(key, text, source, own)}
     if not contents:
         return scenario
@@ -250,14 +250,14 @@ def _value(scenario: schema.Scenario, key: str) -> Any:
     return getattr(getattr(scenario, section, None), name, "")
 
 
-def files_of(key: str, text: str, source: str = "", known: Files = ()) -> Files:
+def files_of(key: str, text: str, source: str = "", have: Files = ()) -> Files:
     """Files that the value of a key names, with their contents.
 
     Args:
         key: `reference.file`, or one of FILES.
         text: value of the key.
         source: file or command line of the value, for messages.
-        known: files that have been read already.
+        have: files that have been read already.
 
     Raises:
         ConfigError: a file cannot be read.
@@ -265,7 +265,7 @@ def files_of(key: str, text: str, source: str = "", known: Files = ()) -> Files:
     """
     is_log = text.lower().endswith(LOGS)
     table, most = FILES.get(key, (None, LOG_BYTES_MAX if is_log else TABLE_BYTES_MAX))
-    read = {file.name: file for file in known}
+    read = {file.name: file for file in have}
     return tuple(
         read.get(name) or File(name, _content(f"{_where(source)}{key}", name, most))
         for name in (table.files(text) if table else [text])

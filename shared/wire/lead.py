@@ -22,7 +22,7 @@ class Lead(NamedTuple):
     """Number of the leadership, which only rises; a plan of another number is not flown."""
     leads: int
     """1 if the server of this session leads the vehicle with that number, else 0."""
-    known: int = 0
+    largest: int = 0
     """Largest number that the server has been told; 0 from a vehicle."""
     step: int = 0
     """Step k in which the vehicle sends, on its grid; from a server, that of the newest LEAD from
@@ -39,7 +39,7 @@ class Lead(NamedTuple):
     """Number of changes of these limits in the server's run."""
 
 
-def led(number: int, plan: bytes) -> bytes:
+def with_leadership(number: int, plan: bytes) -> bytes:
     """Encoded plan with the number of its leadership as a last field; 0 is left out."""
     if not number:
         return plan

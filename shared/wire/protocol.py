@@ -17,7 +17,7 @@
 |      |             |         | silence [, leadership]                                     |
 | 8    | TIME        | client  | session, step, epoch_us, error_us                          |
 | 9    | PATH        | both    | session, path, proof, prices                               |
-| 10   | LEAD        | both    | session, number, leads, known, step, in_force, spacing,    |
+| 10   | LEAD        | both    | session, number, leads, largest, step, in_force, spacing,  |
 |      |             |         | knots, limits                                              |
 
 With the scheme "trajectory", TRAJECTORY replaces HORIZON. `docs/protocol.md` describes the bytes.

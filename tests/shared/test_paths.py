@@ -82,7 +82,7 @@ def test_files_that_paths_name_are_read_from_the_scenarios_folder(tmp_path: Path
     two = read(tmp_path, TWO.replace(FAR, "trace(slow.csv)"))
     assert two.on_path(1).uplink.mean_s == pytest.approx(0.5)
     assert two.on_path(0).uplink.mean_s == pytest.approx(0.02)
-    assert reading.check(reading.to_table(two), known=two) == two
+    assert reading.check(reading.to_table(two), checked=two) == two
 
 
 @pytest.mark.parametrize(

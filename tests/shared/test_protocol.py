@@ -16,7 +16,7 @@ from skytether.shared.scenario import reading
 from skytether.shared.scenario.catalogue import differences
 from skytether.shared.wire import protocol
 from skytether.shared.wire.drop import Drop, ProtocolError
-from skytether.shared.wire.lead import Lead, led
+from skytether.shared.wire.lead import Lead, with_leadership
 from skytether.shared.wire.protocol import (
     FEEDBACK,
     INPUTS_MAX,
@@ -357,8 +357,10 @@ def test_a_horizon_made_of_bytes_is_the_message() -> None:
         plan = encode_horizon(*fields, *bytes_of, number, silence)
         assert plan == encode(horizon)
         for leadership in (1, 127, 128, 2**32 - 1):
-            assert led(leadership, plan) == encode(horizon._replace(leadership=leadership))
-        assert led(0, plan) == plan
+            assert with_leadership(leadership, plan) == encode(
+                horizon._replace(leadership=leadership)
+            )
+        assert with_leadership(0, plan) == plan
 
 
 def body(message: Message) -> list[object]:
