@@ -88,6 +88,9 @@ terms = st.builds(
     feedback=st.booleans(),
     join_s=positive,
     land_after_s=positive,
+    separation_m=positive,
+    height_m=positive,
+    tube_m=positive,
 )
 
 
