@@ -39,7 +39,12 @@ FULL, QUICK = EnvironmentsCounts(), EnvironmentsCounts(turns=2, seconds=0.2)
 
 
 class Stepped:
-    """Environment with what its agent answers; a call of its `step` counts as `each` steps."""
+    """Environment to be measured.
+
+    Args:
+        answer: action that is passed to each call of `step`.
+        each: number of steps that a call counts for.
+    """
 
     def __init__(self, env: Any, answer: Any, each: int = 1) -> None:
         self._env, self._answer, self._each = env, answer, each

@@ -1,4 +1,4 @@
-"""The servers of a vehicle: which one leads, and what each is told of it.
+"""The servers of a vehicle: chooses which one leads, and tells each by LEAD messages.
 
 The vehicle changes the leader by the rules of `client.leadership`; packets and faults of the leader
 alone reach the failsafe.
@@ -24,25 +24,25 @@ from skytether.shared.wire.lead import Lead
 from skytether.shared.wire.protocol import Message
 
 SOON_NS = 200 * MILLISECOND_NS
-"""Time after which a server that has to lead is told again that it does [ns]."""
+"""Time after which a server that has to lead is sent LEAD again if it has not answered [ns]."""
 GROUND_NS = 3 * SECOND_NS
 """Additional time for which the leader of a vehicle on the ground may be silent [ns]: there it
 answers HELLOs only, of which the first need several packets each way."""
 DEPARTURES = frozenset({Reason.CLOSED, Reason.RESTARTED})
-"""Causes after which a server leads no more if another is heard."""
+"""Causes after which a server stops leading if another is heard."""
 NEVER_NS = -(2**63)
 
 
 @dataclass(slots=True)
-class Told:
-    """What a server was told in its present session."""
+class LeadState:
+    """LEAD messages to one server, and its answers, in the present session."""
 
     number: int | None = None
-    """Number of the leadership that the server knows; None before it knows one."""
+    """Largest number of a leadership in its answers; None before the first."""
     again_ns: int = 0
-    """Time before which it is not told again."""
+    """Time before which no further LEAD is sent to it [ns]."""
     asked: tuple[int, int] = 0, -SESSION_NS
-    """Vehicle's step, and time [ns], at which it was last told."""
+    """Vehicle's step, and time [ns], at which the newest LEAD was sent to it."""
 
 
 class Servers(OneServer):
@@ -52,8 +52,9 @@ class Servers(OneServer):
         count: number of servers.
         number: number of the leadership of an earlier run of the client; 0 at first.
         timeout_ns: silence after which the vehicle takes a server for lost [ns].
-        motion: tells the motion in force of a mission; None on the ground, or without one.
-        may_tell: saves the number, if it is to be saved; whether it may be told at a time [ns].
+        motion: returns the motion in force of a mission; None on the ground, or without one.
+        may_tell: saves the number if the vehicle saves its state; returns whether it may be sent
+            at a time [ns].
         events: list to which events for the operator are appended.
     """
 
@@ -75,8 +76,7 @@ class Servers(OneServer):
         number += bool(number and count == 1)
         self.leadership = Leadership(count, number, timeout_ns)
         self.sessions: list[ServerSession] = []
-        self._answered = [Told() for _ in range(count)]
-        """What each server was told."""
+        self._lead_states = [LeadState() for _ in range(count)]
         self._count, self._vehicle, self._events, self._dt_ns = count, vehicle, events, dt_ns
         self._timeout_ns, self._motion, self._may_tell = timeout_ns, motion, may_tell
         self._reported = number
@@ -84,12 +84,13 @@ class Servers(OneServer):
         self._differing: dict[int, tuple[Difference, ...]] = {}
         """Reported differences of the limits of each server that may not lead."""
         self._now_ns = NEVER_NS
-        self._named_ns: int | None = None
-        """Time from which the silence of the leader counts at most: a server that did not lead,
-        or leads a vehicle on the ground, speaks rarely. None before the first wake."""
+        self._counted_from_ns: int | None = None
+        """Time before which the silence of the leader does not count [ns]: a server that does not
+        lead, or leads a vehicle on the ground, sends rarely. None before the first wake."""
         self._was_on_ground = False
-        self._doubted_ns = NEVER_NS
-        """When the leader that is, or was last, doubted had been heard last."""
+        self._silent_since_ns = NEVER_NS
+        """Begin of the leader's silence for which the failsafe last got another time-out [ns]: it
+        gets one for each silence."""
 
     @property
     def leader(self) -> int:  # type: ignore[override] # changes in flight
@@ -100,14 +101,14 @@ class Servers(OneServer):
         return self.leadership.number
 
     def begin(self, server: int) -> None:
-        self._answered[server] = Told()
+        self._lead_states[server] = LeadState()
         self.leadership.begin(server)
 
     def may_observe(self, server: int) -> bool:
         """See `OneServer`: a server that does not know who leads would take itself for the
         leader.
         """
-        return self._answered[server].number is not None
+        return self._lead_states[server].number is not None
 
     def figures(self) -> dict[str, Any]:
         address = address_text(*self.leading.address)
@@ -125,12 +126,12 @@ class Servers(OneServer):
             step: step of the vehicle.
         """
         lead, self._now_ns = self.leadership, now_ns
-        if self._named_ns is None or (self._was_on_ground and not on_ground):
-            self._named_ns = now_ns
+        if self._counted_from_ns is None or (self._was_on_ground and not on_ground):
+            self._counted_from_ns = now_ns
         self._was_on_ground = on_ground
         heard_ns = [NEVER_NS if each.heard_ns is None else each.heard_ns for each in self.sessions]
         useful_ns = self.leading.useful_ns
-        leader_ns = max(NEVER_NS if useful_ns is None else useful_ns, self._named_ns)
+        leader_ns = max(NEVER_NS if useful_ns is None else useful_ns, self._counted_from_ns)
         if on_ground:
             leader_ns += GROUND_NS + self._timeout_ns // 2
         heard_ns[lead.leader] = leader_ns
@@ -139,14 +140,15 @@ class Servers(OneServer):
             lead.hand_over(successor)
         self._report()
         self._report_limits()
-        # The next run must not follow an earlier leadership than the servers have been told.
+        # Only once the number is saved: the next run must not follow an earlier leadership than the
+        # servers do.
         if self._may_tell(now_ns):
             self._tell(lead.doubts(heard_ns, now_ns), heard_ns[lead.leader], step, now_ns)
 
     def name(self, server: int, *, now_ns: int) -> None:
         """Let a server lead, on an operator's order or because the leader has left."""
         self.leadership.hand_over(server)
-        self._named_ns = now_ns
+        self._counted_from_ns = now_ns
         self._report()
 
     def leave(self, server: int, cause: Reason, *, now_ns: int) -> bool:
@@ -182,42 +184,46 @@ class Servers(OneServer):
     # -- telling -----------------------------------------------------------------------------
 
     def _tell(self, doubts: bool, leader_ns: int, step: int, now_ns: int) -> None:
-        """Tell each server that does not know who leads, and ask the others if that is in doubt.
+        """Send LEAD to each server that has not answered with the present leadership.
 
         Args:
-            leader_ns: when the leader was last heard.
+            doubts: whether the leader is silent; then the other servers are sent LEAD too, and an
+                answer shows that they are there.
+            leader_ns: time at which the leader was last heard [ns].
         """
-        if doubts and leader_ns != self._doubted_ns and not self._is_alone(now_ns):
-            self._doubted_ns = leader_ns
+        if doubts and leader_ns != self._silent_since_ns and not self._is_alone(now_ns):
+            self._silent_since_ns = leader_ns
             self.failsafe.heard(now_ns=now_ns)  # the other server gets a time-out to answer
-        for answered, session in zip(self._answered, self.sessions, strict=True):
-            if session.number is None or now_ns < answered.again_ns:
+        for state, session in zip(self._lead_states, self.sessions, strict=True):
+            if session.number is None or now_ns < state.again_ns:
                 continue
             asks = doubts and not session.leads
-            if asks or (answered.number != self.number and not session.is_lost(now_ns)):
+            if asks or (state.number != self.number and not session.is_lost(now_ns)):
                 again_ns = SOON_NS if asks or session.leads else SECOND_NS
-                answered.again_ns, answered.asked = now_ns + again_ns, (step, now_ns)
+                state.again_ns, state.asked = now_ns + again_ns, (step, now_ns)
                 session.post(self._lead(session, step), now_ns)
 
     def take(self, server: int, message: Message, now_ns: int) -> bool:
-        """Note what a server knows of the leadership: its numbers only rise, so that a late answer
-        tells nothing new, and is a sign of life only if the question is recent.
+        """Process a LEAD of a server; False for any other message.
+
+        A late answer does no harm: numbers of leaderships only rise. It counts as a sign of life
+        only if the LEAD that it answers was sent recently.
         """
         if not isinstance(message, Lead):
             return False
-        answered, session = self._answered[server], self.sessions[server]
-        answered.number = max(answered.number or 0, message.number)
+        state, session = self._lead_states[server], self.sessions[server]
+        state.number = max(state.number or 0, message.number)
         self.leadership.hear_limits(server, message.limits, message.changes)
         self.leadership.exceed(message.number, server)
         self.leadership.learn(message.largest, server)
-        step, asked_ns = answered.asked
+        step, asked_ns = state.asked
         age_ns = now_ns - asked_ns + (step - message.step) * self._dt_ns
         if age_ns <= session.hearing.overtaken_ns:
             session.note_heard(now_ns)
         return True
 
     def _is_alone(self, now_ns: int) -> bool:
-        """Whether no server is heard that could lead in place of the leader."""
+        """Whether no other server is heard that may lead."""
         may_lead = filter(self.leadership.may_lead, range(self._count))
         return all(self.sessions[i].leads or self.sessions[i].is_lost(now_ns) for i in may_lead)
 
@@ -250,7 +256,7 @@ class Servers(OneServer):
                 self._events.append(event)
 
     def _report(self) -> None:
-        """Report that another server leads; its packets count as the link's from now on."""
+        """Report that another server leads; the failsafe goes by its packets from now on."""
         if self._reported == self.leadership.number:
             return
         self._reported, session = self.leadership.number, self.leading

@@ -39,8 +39,8 @@ from skytether.shared.wire.protocol import CLOSES, Close, Refusal, encode
 VEHICLES_MAX = 64
 """Default largest number of vehicles at once."""
 LATEST_NS = 2 * SECOND_NS
-"""Time after the end of all motions within which a server that is asked to end does so [ns]; a
-vehicle's observation of it takes a round trip."""
+"""Time after the end of all motions for which a server that is asked to end still waits for the
+vehicles' observations of it [ns]."""
 TICK_EDGES_MS = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0)
 """Bin edges of the histogram of tick durations [ms]."""
 

@@ -76,7 +76,7 @@ class Session:
     socket: int = 0
     """Number of the server's socket at which the vehicle was heard."""
     way: Way | None = None
-    """Way to the vehicle in place of its address; None without one."""
+    """Sends to the vehicle over several paths; None if `address` is the only one."""
     lead: Any = None
     """What a room notes of who leads the vehicle; None if it has no other server."""
 

@@ -14,7 +14,7 @@ from skytether.shared.wire.protocol import Message
 
 
 class Way(Protocol):
-    """Way to one vehicle, in place of its address."""
+    """Sends packets to a vehicle with several paths, see `Session.way`."""
 
     @property
     def is_ready(self) -> bool:
@@ -34,7 +34,7 @@ class Ways:
         return False
 
     def is_repeat(self, session: Any, datagram: Datagram) -> bool:
-        """The same, of a datagram that the channel has refused as a repeat."""
+        """Whether a datagram that the channel refused as a repeat came before over another path."""
         return False
 
     def hear(

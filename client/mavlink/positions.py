@@ -54,7 +54,7 @@ class Positions(positions.Positions):
         is_old = now_ns - self.came_ns > FRESH_NS
         if is_old or self.origin != self._origin_before:
             self._slides.begin()
-        if is_old:  # where newer ones are dropped it stands, while the fixes move on
+        if is_old:  # if newer positions were dropped, the fixes have moved on and this has not
             return
         (north, east, _), (x, y, _) = self.position, self.origin
         slide = self._slides.slid((north - x, east - y), velocity, stamp_ns)

@@ -236,7 +236,7 @@ class Lives:
     def _end(
         self, name: str, endpoint: Endpoint, is_up: Callable[[], bool], stop: Callable[[], None]
     ) -> None:
-        """Let an endpoint end; nothing happens once it is not up any more."""
+        """Let an endpoint end, as an operator asks; nothing is done if it has stopped before."""
         latest_ns = 0
 
         def leave(*, now_ns: int) -> None:

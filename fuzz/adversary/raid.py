@@ -294,7 +294,9 @@ class Raid:
                 self._world.at(time_ns, action)
 
     def _server(self, amounts: Sequence[float]) -> str:
-        """Name of the server that an amount chooses: the standby, if there is one, above 0.5."""
+        """Name of the server that a move acts on: the standby, if there is one and the move's first
+        amount is above 0.5; else the first server.
+        """
         is_standby = self._has_standby and any(each > 0.5 for each in amounts[:1])
         return (STANDBY if is_standby else SERVER)[0]
 

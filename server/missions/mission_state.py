@@ -161,7 +161,7 @@ class MissionState:
             self.vehicles[row].goal = None
 
     def restart(self, row: int) -> bool:
-        """Note that a vehicle's client has restarted; False if this was known already."""
+        """Note that a vehicle's client has restarted; False if this was noted before."""
         vehicle = self.vehicles.get(row)
         if vehicle is None or row in self.restarted:
             return False
@@ -173,8 +173,8 @@ class MissionState:
     def follow(self, row: int, lead: Lead | None) -> None:
         """Note who leads a vehicle.
 
-        A vehicle that this server leads has told its motion in force, and flies no plan of an
-        earlier leadership any more, so it may fly nothing else.
+        If this server begins to lead the vehicle, `lead` contains its motion in force. The vehicle
+        drops all plans of an earlier leadership, so no other motion needs to be expected.
         """
         if self.led_vehicles.follow(row, lead):
             assert lead is not None

@@ -6,7 +6,7 @@ received aboard) of the server's newest packet. Over the last 20 s
 
     offset = (min G - min F) / 2,    bound = (min F + min G) / 2
 
-of the vehicle's clock minus the server's. The asymmetry of the two smallest delays cannot be
+of the vehicle's clock minus the server's. Whether the two smallest delays are equal cannot be
 measured: the offset may be wrong by up to the bound. Step k begins at k Δt of the vehicle.
 
 Independently of this estimate there are two bounds that hold for any delays. A delay is never
@@ -45,8 +45,8 @@ OLD = 8
 STEP_SAMPLES = 5
 """Number of samples needed in both recent and old minima to detect a step of a clock."""
 STEP_NS = 40 * MILLISECOND_NS
-"""Smallest detected step of a clock [ns]: one direction's delay rises, the other's falls as much.
-"""
+"""Smallest step of a clock that is detected [ns]: it raises the estimated delay of one direction,
+and lowers that of the other by as much."""
 
 ECHOES = 4
 """Number of newest echoes kept per vehicle, from which the present delay to it is estimated."""
@@ -57,11 +57,11 @@ UNSEEN = 2**61
 
 
 class Contradiction(IntEnum):
-    """Knowledge of a clock offset that a sample contradicts."""
+    """Which earlier bound of a clock offset a sample contradicts."""
 
     NOTHING = 0
     CLOCK = 1
-    """The bounds from delays: a clock was set, or runs wrong."""
+    """The bounds from delays: a clock was set, or runs at a wrong rate."""
     ASYMMETRY = 2
     """The operator's bound `link.asymmetry_s` on the difference of the delays each way."""
     TIME_OF_DAY = 3
@@ -89,15 +89,14 @@ class VehicleClock:
     bounded: int
     """Server's time at which `low` and `high` hold [ns]; they widen before and after it."""
     sent: int
-    """Earliest server's time at which the newest observation can have been sent [ns]; UNSEEN before
-    the first."""
+    """Earliest time at which the newest observation can have been sent, by the server's clock [ns];
+    UNSEEN before the first."""
     echo: int
-    """`Observation.heard` of the newest observation, of those that came in order; -1 before the
-    first."""
+    """`Observation.heard` of the newest observation that came in order; -1 before the first."""
     echoed: int
-    """Earliest server's time at which that packet can have come aboard [ns]."""
+    """Earliest time at which that packet can have come aboard, by the server's clock [ns]."""
     steps: int
-    """Number of times that a sample contradicted the bounds: a clock was set, or runs wrong."""
+    """Number of times that a sample contradicted the bounds from delays."""
     other_low: int
     """Lower bound of the true offset at `other` from settings and time of day [ns], or -UNSEEN."""
     other_high: int
@@ -211,7 +210,8 @@ class ClockMap:
         return Contradiction(_observe(self.seen, row, *sample))
 
     def tell(self, row: int, offset_ns: int, error_ns: int, *, now_ns: int) -> Contradiction:
-        """Narrow the offset of a vehicle's clock by its time of day; returns what that contradicts.
+        """Narrow the bounds of a vehicle's clock offset by its time of day; returns what that
+        contradicts.
 
         Args:
             offset_ns: the vehicle's clock minus the server's [ns].

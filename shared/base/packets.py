@@ -19,7 +19,7 @@ RESOLVER = IPv4Address("10.0.2.3")
 
 ICMP, ICMP6 = 1, 58
 ECHOES = (0, 8)
-"""ICMP's echo reply and echo: of its messages, these alone get an ICMP error as an answer."""
+"""ICMP's types of echo reply and echo request: no other ICMP message is answered with an error."""
 ERRORS6 = 128
 """Number of ICMPv6's first type that is not an error."""
 DISCOVERY = range(133, 138)

@@ -198,7 +198,7 @@ class SentBy(NamedTuple):
     """The figure that the trigger compares was above its threshold, also if a sign of life was due
     as well."""
     due: int
-    """The others: due as a sign of life, by a schedule, or as the first plan."""
+    """Plans sent below the threshold: as a sign of life, by a schedule, or as the first plan."""
 
 
 def sent_by(rows: Rows) -> SentBy:

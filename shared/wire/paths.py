@@ -17,10 +17,10 @@ A message goes over the set S of paths with the least expected cost,
         p in S           p in S         all p           r_p: that nothing sent on p arrives
 
 where `worth` is what its loss costs, in packets of price 1, and `alive` what it costs if nothing
-arrives since the newest packet that is known to have: a path on which much is under way already
-would lose it all at once, so the next message takes another. q_p follows from the share of packets
-that path p loses, and from the probability that p is down: each packet in a row that has not
-arrived makes that likelier by Bayes' rule, and so does time without news of the path.
+arrives after the newest packet that is known to have arrived. If many packets are under way on one
+path, all of them may be lost at once, so the next message takes another. q_p follows from the share
+of packets that path p loses, and from the probability that p is down: each packet in a row that has
+not arrived makes that likelier by Bayes' rule, and so does time without news of the path.
 """
 
 import math
@@ -63,15 +63,16 @@ WAIT_NS, WAIT_MIN_NS, WAIT_MAX_NS = (
     150 * MILLISECOND_NS,
     5 * SECOND_NS,
 )
-"""Time after which a packet that a report does not name is lost: before the first acknowledgement,
-at least, at most [ns]."""
+"""Time after which a packet that no report names is taken for lost [ns]: WAIT_NS before the first
+acknowledgement; later it follows from the measured delays, between WAIT_MIN_NS and WAIT_MAX_NS."""
 SPARE_NS = 50 * MILLISECOND_NS
-"""Delay beyond those known that is still awaited [ns]."""
+"""Margin added to measured delays before a packet is taken for lost [ns]."""
 LOOK_NS, AGAIN_NS, DEAR_MAX = 2 * SECOND_NS, SECOND_NS, 8.0
-"""Times after which an unused path of the least price is tried, and a doubted one again [ns], and
-the largest factor by which a dearer path is tried more rarely."""
+"""Times after which a path that has not been used is tried, and a doubted path is tried again [ns].
+A dearer path is tried more rarely, in proportion to its price, but at most DEAR_MAX times."""
 TRIES_MAX = 4
-"""Number of tries after which a path that brings packets and takes none is tried no more rarely."""
+"""Largest number of times that the interval between tries is doubled, on a path that brings packets
+of the other end but delivers none of ours."""
 DOUBT = 0.5
 """Probability that a packet does not arrive above which a path is doubted."""
 DEAD, DEAD_NS = 0.9, SECOND_NS
@@ -151,7 +152,7 @@ class PathState:
 
         Args:
             under_way: number of packets that may still arrive.
-            is_sent: whether another one is sent now, for which the path may be well again.
+            is_sent: whether another one is sent now; an outage may have ended since the last one.
         """
         down, loss = self._down(now_ns), self.loss
         if is_sent and self.used_ns is not None:
@@ -265,7 +266,7 @@ class Paths:
         self._awaited: dict[int, int] = {}
         """Times at which packets of the other end were found missing, by sequence number."""
         self._late_ns = 0
-        """Usual time after which such a packet comes all the same [ns]."""
+        """Usual time after which such a packet still comes [ns]."""
         self._sent_ns = 0
         """Time of the newest packet sent [ns]."""
         self._gaps_ns: deque[int] = deque(maxlen=GAPS)
@@ -291,8 +292,8 @@ class Paths:
         return bytes((BIN8, len(head) + len(masks))) + head + masks
 
     def choose(self, worth: float, now_ns: int, among: Sequence[int]) -> tuple[int, ...]:
-        """Paths for the next message; of sets that cost about the same, the one that has rested
-        longest.
+        """Paths for the next message; of sets that cost about the same, the one that has not
+        been used for longest.
 
         Args:
             worth: what its loss costs, in packets on the cheapest path.
@@ -403,8 +404,8 @@ class Paths:
         return newest.datagram, best
 
     def looks(self, now_ns: int) -> list[int]:
-        """Paths on which something is to be sent now: those that have not been used for long, those
-        that may be down or are not known yet, and one to report a packet that has not come.
+        """Paths on which a probe is due: paths not used for long, paths that are doubted or have
+        delivered nothing yet, and one to report that a packet has not come.
         """
         due = []
         for one, path in enumerate(self.each):
@@ -428,9 +429,9 @@ class Paths:
         return due
 
     def turned(self, now_ns: int) -> list[tuple[int, bool]]:
-        """Paths that have died, or are well again, since the last call; and whether each is dead.
+        """Paths that have gone down or come back since the last call; and whether each is down.
 
-        A path over which nothing has arrived yet is neither.
+        A path over which nothing has arrived yet is left out.
         """
         turned = []
         for one, path in enumerate(self.each):
@@ -474,15 +475,15 @@ class Paths:
         *,
         is_recent: bool = True,
     ) -> None:
-        """Note an authentic datagram and its report, and what it says of packets sent.
+        """Note an authentic datagram, and which packets its report acknowledges.
 
         Args:
-            is_recent: whether its message has been found recent; only then the report may be of a
-                run of the other end that has begun its numbers anew.
+            is_recent: whether its message has been found recent; only then the report may come from
+                a new run of the other end, which has begun its numbers anew.
 
         Raises:
-            ProtocolError: it reports other paths than this session has, or is too late to tell
-                anything although its message was not found recent.
+            ProtocolError: it reports another number of paths than this session has, or it is older
+                than WINDOW packets and its message was not found recent.
         """
         if len(report.arrived) != len(self.each):
             raise ProtocolError(Drop.FIELD)
@@ -526,7 +527,7 @@ class Paths:
         elif self._before is not None and abs(_ahead(sequence, self._before)) <= IN_FLIGHT_MAX:
             if ahead >= WINDOW:
                 return -WINDOW
-            if _ahead(sequence, self._before) > 0:  # this run's own numbers have come there
+            if _ahead(sequence, self._before) > 0:  # the new run has reached these numbers itself
                 self._before = None
         return ahead
 

@@ -267,7 +267,7 @@ class PilotedVehicle(ABC):
     refusal: Result
     """Result of a command that cannot be executed now."""
     arming_word: str
-    """Word in the text announced at arming; empty for another sentence."""
+    """Word before "motors" in the text sent at arming; empty if the flavour has another text."""
 
     @abstractmethod
     def why_not_armed(self) -> str:

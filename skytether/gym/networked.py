@@ -70,8 +70,8 @@ class Options(TypedDict, total=False):
     price: float
     """Cost of each datagram with an answer, subtracted from the reward."""
     seed: int
-    """Seed of the network. `reset(seed=…)` starts its random numbers anew, others with another
-    seed; each further `reset` draws those of the next episode."""
+    """Seed of the network. `reset(seed=…)` starts its random numbers anew, from both seeds.
+    Each further `reset` draws those of the next episode."""
     exhausted: Exhausted
     """What the robot plays when rows have run out: "hold" (the last action), "zero" (`idle`), or a
     function."""

@@ -71,7 +71,7 @@ class Ended:
     nearest_m: float | None
     """Smallest distance to another vehicle on the mission [m]."""
     nearest: int | None
-    """Number of the vehicle that came so near."""
+    """Number of the other vehicle at that distance."""
 
 
 class Outcome:

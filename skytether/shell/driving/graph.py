@@ -20,7 +20,7 @@ from skytether.shell.host.udp import AddressError
 QUEUE_MAX = 256
 """Number of messages that wait for the loop; the oldest are dropped."""
 MESSAGE_BYTES_MAX = 65_535
-"""Largest message that is heard, like a datagram."""
+"""Size above which a message is ignored [B]: no datagram is larger."""
 
 
 class GraphSession:
