@@ -64,9 +64,9 @@ class Compensator:
 
         Raises:
             ProtocolError: the horizon is too far in the future; its observation is in the
-                future, or too old for any input; it arrived so long after its committed steps
-                that other inputs were flown instead; or it is a mission's motion whose first
-                knot is in the future.
+                future, or too old for any input; all of its inputs were due before it arrived, or
+                so many after its committed steps that other inputs were flown instead; or it is a
+                mission's motion whose first knot is in the future.
         """
         if horizon.step > step + self._H:
             raise ProtocolError(Drop.FROM_THE_FUTURE)

@@ -65,6 +65,7 @@ class Drop(StrEnum):
     TOO_EARLY = "too early"
     """A mission's motion begins at a step that is in the future of the vehicle."""
     TOO_LATE = "too late"
+    """Its inputs were due before it came: all of them, or so many that others were flown."""
     NOT_TAKEN = "not taken"
     NOT_THE_LEADER = "not the leader"
     """The plan is of a server that does not lead the vehicle, or of an earlier leadership."""
