@@ -79,10 +79,10 @@ class Watch(Protocol):
 
 
 class OneServer:
-    """Servers of a vehicle: one, which leads and is told nothing.
+    """Servers of a vehicle: one, which leads and is sent no LEAD.
 
     Args:
-        failsafe: told of the packets and faults of the server that leads.
+        failsafe: receives the packets and faults of the server that leads.
     """
 
     leader = 0

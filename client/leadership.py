@@ -3,7 +3,7 @@
 The vehicle decides, by a number that only rises: with s servers, number n means that server n mod s
 leads, and what was planned under another number is not flown. The vehicle raises it when the leader
 is silent and another server is heard; when an operator says so; and on a mission when a server that
-it hears has been told a larger number by another vehicle, so that all come to follow one server.
+it hears has received a larger number from another vehicle, so that all then follow one server.
 On a mission it follows no server that plans within other limits than the one that leads.
 """
 
@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from skytether.shared.law.terms import Limits
 
 NUMBER_MAX, JUMP_MAX = 2**32 - 1, 10_000
-"""Largest number, and largest rise at once by what a server knows."""
+"""Largest number, and largest rise at once to a number that a server sends."""
 ASK_SHARE, CHANGE_SHARE = 0.35, 0.75
 """Shares of the time-out for which the leader has to be silent before another server is asked
 whether it is there, and before it leads. The first is just more than the time between heartbeats
@@ -33,10 +33,10 @@ class Leadership:
         self._ask_ns = round(ASK_SHARE * timeout_ns)
         self._change_ns = round(CHANGE_SHARE * timeout_ns)
         self.limits: list[Limits | None] = [None] * servers
-        """Limits of each server's motions, as it told last; None if it has not, or without a
+        """Limits of each server's motions, as it last sent them; None before that, or without a
         mission."""
         self._changes = [0] * servers
-        """Number of changes of these limits in the server's run, as it told last."""
+        """Number of changes of these limits in the server's run, as it last sent it."""
 
     @property
     def leader(self) -> int:
@@ -48,7 +48,7 @@ class Leadership:
         self._changes[server] = 0
 
     def hear_limits(self, server: int, limits: Limits | None, changes: int) -> None:
-        """Note the limits that a server told, unless it has told later ones."""
+        """Note the limits that a server sent, unless later ones have arrived."""
         if changes >= self._changes[server]:
             self._changes[server], self.limits[server] = changes, limits
 
@@ -83,8 +83,8 @@ class Leadership:
             self.number = raised
 
     def exceed(self, number: int, server: int) -> None:
-        """Let `server` lead, if it may, once it has been told a larger number by an earlier run of
-        this vehicle that has not saved it.
+        """Let `server` lead, if it may, with a number above one that it received from an earlier
+        run of this vehicle, which has not saved it.
         """
         if self.number < number <= NUMBER_MAX - self._servers:
             leads = server if self.may_lead(server) else self.leader
@@ -92,7 +92,7 @@ class Leadership:
             self.hand_over(leads)
 
     def learn(self, number: int, server: int) -> bool:
-        """Take over a larger number that `server` knows, if that server leads with it, and may."""
+        """Take over a larger number from a server that leads with it, if it may lead."""
         is_larger = self.number < number <= min(NUMBER_MAX, self.number + JUMP_MAX)
         if not is_larger or number % self._servers != server or not self.may_lead(server):
             return False

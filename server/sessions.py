@@ -61,7 +61,7 @@ class Session:
     doubted: bool = False
     """Whether the newest observation was rejected."""
     unsaved: bool = False
-    """Whether a restart of the client would not continue its flight, as the vehicle last told."""
+    """Whether a restart of the client would not continue its flight, by the newest observation."""
     stale: int = 0
     """Number of observations that arrived after a newer one."""
     asked_ns: int = 0

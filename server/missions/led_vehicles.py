@@ -1,6 +1,6 @@
 """Led vehicles: which vehicles of a mission follow this server, with a standby server or without.
 
-A server plans motions only if every vehicle of the mission has told it the same number, with which
+A server plans motions only if every vehicle of the mission has sent it the same number, with which
 this server leads, and was observed since (docs/together-proof.md, Two servers).
 """
 
@@ -16,13 +16,13 @@ class LedVehicles:
         self._alone: set[int] = set()
         """Rows of vehicles that have no other server."""
         self._awaited: dict[int, int] = {}
-        """Rows that this server has begun to lead, until it has an observation of them from under
-        its lead: the step from which on an observation is one."""
+        """Rows that this server has begun to lead and has not observed since, with the step from
+        which on an observation was made under its lead."""
         self.missing: int | None = None
         """Row because of which no motion may be planned; None if there is none."""
 
     def follow(self, row: int, lead: Lead | None) -> bool:
-        """Note who leads a vehicle; returns whether it has told a motion to take over."""
+        """Note who leads a vehicle; returns whether `lead` may contain a motion to take over."""
         if lead is None:
             self._alone.add(row)
         else:

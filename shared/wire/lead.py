@@ -13,7 +13,7 @@ from skytether.shared.wire.protocol import FLAG, U16, U31, U32, OrNone, add, is_
 
 class Lead(NamedTuple):
     """LEAD: which of its servers leads a vehicle. The server answers with the same number, and with
-    the largest that any vehicle of its mission has told it.
+    the largest that it has received from any vehicle of its mission.
     """
 
     vehicle: int
@@ -23,7 +23,7 @@ class Lead(NamedTuple):
     leads: int
     """1 if the server of this session leads the vehicle with that number, else 0."""
     largest: int = 0
-    """Largest number that the server has been told; 0 from a vehicle."""
+    """Largest number that the server has received; 0 from a vehicle."""
     step: int = 0
     """Step k in which the vehicle sends, on its grid; from a server, that of the newest LEAD from
     the vehicle. The next three fields are empty from a server."""

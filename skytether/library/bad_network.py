@@ -148,7 +148,7 @@ class bad_network:  # noqa: N801 - read as a function, like `contextlib.closing`
         self._task = self._loop.create_task(self._shell.run(lambda event: LOG.info("%s", event)))
 
     def _within(self, work: Callable[[], T]) -> T:
-        """What `work` returns, called where the endpoint is driven."""
+        """Call `work` in the thread that drives the endpoint; returns its result."""
         if self._thread is None or self._loop is None:
             return work()
         done: Future[T] = Future()
