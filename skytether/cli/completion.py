@@ -18,6 +18,8 @@ OPTIONS = (
     " | grep -oE -e '--[a-z][a-z0-9.-]*[a-z0-9]' | sort -u"
 )
 """What finds the options of a command: its help names them all."""
+KINDS = "scenarios triggers reports schemes planners references impairments vehicles"
+"""What `skytether list` lists; written here, since a shell's start is to import no table."""
 SCENARIOS = "skytether list scenarios 2>/dev/null | cut -d ' ' -f 1"
 BASH = f"""\
 _skytether_asked=
@@ -32,6 +34,8 @@ _skytether() {{
             _skytether_asked=$asked
         fi
         words=$_skytether_options
+    elif [ "$COMP_CWORD $asked" = "2 list" ]; then
+        words="{KINDS}"
     elif [ "$COMP_CWORD" -eq 2 ]; then
         words=$({SCENARIOS})
     fi
@@ -48,7 +52,14 @@ function __skytether_options
 end
 complete -c skytether -n 'string match -q -- "-*" (commandline -ct)' -f \\
     -a "(__skytether_options)"
-complete -c skytether -n 'test (count (commandline -opc)) -eq 2' -a "({SCENARIOS})"
+function __skytether_names
+    if test (commandline -opc)[2] = list
+        string split " " "{KINDS}"
+    else
+        {SCENARIOS}
+    end
+end
+complete -c skytether -n 'test (count (commandline -opc)) -eq 2' -a "(__skytether_names)"
 """
 SCRIPTS = {
     "bash": BASH,

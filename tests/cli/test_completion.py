@@ -10,7 +10,8 @@ import pytest
 
 from skytether.__main__ import main
 from skytether.cli.commands import COMMANDS
-from skytether.cli.completion import SCRIPTS
+from skytether.cli.completion import KINDS, SCRIPTS
+from skytether.cli.names import TABLES
 
 BASH = """eval "$(skytether completion bash)"
 COMP_WORDS=({words}) COMP_CWORD=$((${{#COMP_WORDS[@]}} - 1))
@@ -42,6 +43,7 @@ def completed(shell: str, words: str, tmp_path: Path) -> list[str]:
         ("skytether repr", "reproduce"),
         ("skytether fly demo-no", "demo-no-compensation"),
         ("skytether fly demo --control.hor", "--control.horizon"),
+        ("skytether list trig", "triggers"),
     ],
 )
 def test_a_beginning_is_completed(shell: str, words: str, expected: str, tmp_path: Path) -> None:
@@ -54,6 +56,10 @@ def test_a_beginning_is_completed(shell: str, words: str, expected: str, tmp_pat
 def test_each_shell_is_told_every_command(shell: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["completion", shell]) == 0
     assert set(COMMANDS) <= set(capsys.readouterr().out.replace('"', " ").split())
+
+
+def test_every_kind_of_list_is_completed() -> None:
+    assert KINDS.split() == ["scenarios", *TABLES]
 
 
 def test_another_shell_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
