@@ -146,8 +146,13 @@ def test_there_is_a_largest_number_of_connections(
         until(lambda: net.counts["flows"] == 1)
         with pytest.raises(OSError, match=r"reset|closed"):
             fetched(net)
-    until(lambda: net.counts["flows"] == 0)
-    assert fetched(net)
+
+    def is_served() -> bool:
+        with suppress(OSError):  # the place is free a moment after the flow has ended
+            return bool(fetched(net))
+        return False
+
+    until(is_served)
 
 
 @pytest.mark.realtime
