@@ -32,7 +32,7 @@ from skytether.shared.events.processes import NotRecalled, Recalled
 from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import client_columns
 from skytether.shared.telemetry.summary import summarise
-from skytether.shared.wire import keys
+from skytether.shared.wire import keys, protocol
 from skytether.shared.wire.keys import Keyring
 from skytether.shell.commandline import command, terminal
 from skytether.shell.commandline.argument import Argument
@@ -112,6 +112,7 @@ def fly(argv: Sequence[str]) -> None:
         raise CommandError(f"--id: got {numbers_text}, expected 0 to 65535", 2)
     command.check_sockets("--vehicles", len(numbers))
     keyring = keys.load(options.keys) if options.keys else None
+    protocol.preload()
     alone = len(numbers) == 1
 
     def link(number: int) -> ClientLink:

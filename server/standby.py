@@ -90,7 +90,7 @@ class LeadsOfTwo(Leads):
             session.vehicle,
             session.number,
             said.lead.number,
-            int(bool(said.lead.leads)),
+            said.lead.leads,
             self._number(said),
             said.step,
             limits=self.limits,

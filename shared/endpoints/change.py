@@ -39,7 +39,7 @@ class Answer(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     values: dict[str, Any] = {}
     """Keys that may change and their present values, if the request was empty."""
     names: dict[str, str] = {}
-    """What the operator calls some of these keys, see `core.ways`."""
+    """What the operator calls some of these keys, see `endpoints.ways`."""
 
 
 class Running:
@@ -75,7 +75,7 @@ class Running:
 
         Args:
             values: plain values by key, as in a scenario's file; the endpoint's own names of its
-                directions (`core.ways`) are keys, too.
+                directions (`endpoints.ways`) are keys, too.
             now_ns: time on the endpoint's clock [ns].
 
         Returns:

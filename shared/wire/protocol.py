@@ -644,3 +644,9 @@ def _is_of_a_room(number: int) -> bool:
         with suppress(ModuleNotFoundError):
             import_module(module)
     return number in _TYPES
+
+
+def preload() -> None:
+    """Load the messages of rooms now, so that no stranger's packet makes a process import them."""
+    for number in tuple(_ROOMS):
+        _is_of_a_room(number)

@@ -145,6 +145,30 @@ def test_a_change_in_flight_imports_nothing() -> None:
     assert (changed.stdout, changed.stderr) == ("\n", "")
 
 
+MESSAGES = """
+import sys
+import msgpack
+from skytether.shared.scenario import reading
+from skytether.shared.wire import protocol
+from skytether.shared.wire.drop import ProtocolError
+
+terms = reading.load("demo").terms()
+protocol.preload()
+before = {*sys.modules}
+for number in range(256):
+    try:
+        protocol.decode(msgpack.packb([protocol.VERSION, number, 1]), terms)
+    except ProtocolError:
+        pass
+print(*sorted({*sys.modules} - before))
+"""
+
+
+def test_a_strangers_message_imports_nothing() -> None:
+    heard = ran(sys.executable, "-P", "-c", MESSAGES)
+    assert (heard.stdout, heard.stderr) == ("\n", "")
+
+
 @pytest.mark.long
 @pytest.mark.parametrize("room", ROOMS)
 def test_the_kernel_flies_without_a_room(room: str, tmp_path: Path) -> None:
