@@ -191,11 +191,6 @@ class Controller:
         """Note that the client of a vehicle has restarted without its state; see `Scheme`."""
         return self.scheme.restart(row)
 
-    @property
-    def is_one_fleet(self) -> bool:
-        """Whether all vehicles have to follow one server."""
-        return self.scheme.is_one_fleet
-
     def lead(
         self, row: int, message: RoomMessage | None, *, leads: bool = True, plans: int = 0
     ) -> None:

@@ -99,7 +99,7 @@ class Server(Endpoint):
             silence_ns,
             partial(Hearing, silence_ns, terms.dt_ns, scenario.link.fixed_ns),
             Leads(self.controller, scheme.limits),
-            keeps_rows=scheme.is_one_fleet,
+            keeps_rows=scheme.keeps_rows,
         )
         self._grid = Grid(terms.dt_ns, self._events)
         self._reception = Reception(

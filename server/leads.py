@@ -25,17 +25,13 @@ class Leader(Protocol):
             plans: number of plans to send next, whatever the trigger says.
         """
 
-    @property
-    def is_one_fleet(self) -> bool:
-        """Whether all vehicles have to follow one server."""
-
 
 class Leads:
     """Leaders of all vehicles of a server; a session is a `sessions.Session`."""
 
     def __init__(self, controller: Leader, limits: Limits | None) -> None:
         self.controller, self.limits = controller, limits
-        """Limits of the motions of a mission; None without one."""
+        """Limits of motions, see `Scheme.limits`; None if vehicles may follow different servers."""
         self.changes = 0
         """Number of their changes in flight."""
         self.changed_ns: int | None = None

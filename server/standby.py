@@ -72,14 +72,14 @@ class LeadsOfTwo(Leads):
         """
         leads = lead is None or bool(lead.leads)
         self._largest = max(self._largest, lead.number if lead else 0)
-        takes_over = leads and lead and lead.number and not self.controller.is_one_fleet
+        takes_over = leads and lead and lead.number and self.limits is None
         self.controller.lead(row, lead, leads=leads, plans=TAKEOVER_PLANS if takes_over else 0)
 
     def _number(self, said: SessionLead) -> int:
         """Number of the leadership that a vehicle should follow: the largest, if all follow one
         server.
         """
-        return self._largest if self.controller.is_one_fleet else said.lead.number
+        return self._largest if self.limits else said.lead.number
 
     def _answer(self, session: Any) -> Lead:
         """What the vehicle has said, the largest number that it should follow, and the limits of

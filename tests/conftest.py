@@ -18,7 +18,7 @@ import hypothesis
 import pytest
 
 from skytether.shared.base import kernel
-from skytether.shared.scenario.registry import TABLES
+from skytether.shared.scenario.registry import PLUGIN_TABLES
 from skytether.shell.commandline import plugins
 
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
@@ -148,9 +148,9 @@ def plugin_tables() -> Iterator[None]:
     # Each fills a table when it is first imported, which must not be within a test.
     for name in ("client.vehicles", "server.schemes.table", "server.mpc.plugin_planners"):
         import_module(f"skytether.{name}")
-    before = [dict(table) for table in TABLES]
+    before = [dict(table) for table in PLUGIN_TABLES]
     yield
     plugins._loaded.clear()
-    for table, entries in zip(TABLES, before, strict=True):
+    for table, entries in zip(PLUGIN_TABLES, before, strict=True):
         table.clear()
         table.update(entries)

@@ -94,7 +94,7 @@ class MissionPlanner(SplineScheme):
     """Scheme "trajectory" for missions: motions that keep apart."""
 
     changeable = ZONES | GOALS
-    is_one_fleet = True
+    keeps_rows = True
 
     def __init__(self, fleet: Fleet, state: MissionState) -> None:
         super().__init__(fleet)

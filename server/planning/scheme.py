@@ -295,10 +295,11 @@ class Scheme(ABC):
 
     changeable: frozenset[str] = frozenset()
     """Keys that may be changed in flight, beside the server's own."""
-    is_one_fleet = False
-    """Whether all vehicles follow one server, and keep their rows when they fall silent."""
+    keeps_rows = False
+    """Whether vehicles keep their rows when they fall silent."""
     limits: Limits | None = None
-    """Limits of motions, which two servers of a vehicle must have in common."""
+    """Limits of motions of vehicles that all have to follow one server, which its standby must have
+    too; None if each vehicle may follow another."""
 
     def change(self, scenario: Scenario, keys: frozenset[str]) -> None:  # noqa: B027
         """Act on changed keys; the caller has asked `objection` first."""

@@ -12,9 +12,9 @@ from skytether.shared.base.errors import ConfigError
 from skytether.shared.base.kernel import KERNELS
 from skytether.shared.scenario import schemes
 from skytether.shared.scenario.registry import SCHEMES, load
+from skytether.shared.scenario.rooms import SCHEME_APART
 from skytether.shared.scenario.schema import Scenario
 
-MISSIONS = "skytether.server.missions.planning"
 PLUGINS = f"{__package__}.plugins"
 OF_SOME = tuple(
     f"skytether.server.{each}."
@@ -30,9 +30,9 @@ OF_SOME = tuple(
 """Beginnings of the names of modules whose kernels only some schemes call."""
 
 
-def _code(scenario: Scenario, *, missions: bool = True) -> SchemeCode:
-    if missions and scenario.keeps_apart:
-        module = load(MISSIONS, "missions")
+def _code(scenario: Scenario, *, apart: bool = True) -> SchemeCode:
+    if apart and scenario.keeps_apart:
+        module = load(SCHEME_APART, "missions")
     else:
         name = schemes.call(scenario.control.scheme).name
         at = f"{__package__}.{name}" if SCHEMES[name].is_ours else PLUGINS
@@ -46,7 +46,7 @@ def load_all() -> None:
     known yet.
     """
     ours = [f"{__package__}.{name}" for name, entry in SCHEMES.items() if entry.is_ours]
-    for module in (*ours, MISSIONS):
+    for module in (*ours, SCHEME_APART):
         with suppress(ConfigError):
             load(module, module)
 
@@ -57,7 +57,7 @@ def make(fleet: Fleet) -> Scheme:
     Raises:
         ConfigError: a plug-in's scheme cannot be made.
     """
-    return _code(fleet.scenario, missions=fleet.references is not None).make(fleet)
+    return _code(fleet.scenario, apart=fleet.references is not None).make(fleet)
 
 
 def references(scenario: Scenario, given: Given, most: int) -> Given:

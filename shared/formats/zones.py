@@ -4,7 +4,8 @@ from typing import Literal
 
 from skytether.shared.formats import plans, zone_files
 from skytether.shared.missions.zones import Zone
-from skytether.shared.scenario.registry import ZONES, File
+from skytether.shared.scenario.registry import File
+from skytether.shared.scenario.rooms import ZONES
 
 
 @ZONES

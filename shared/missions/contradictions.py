@@ -12,7 +12,7 @@ from skytether.shared.missions.derived import clearances, lands, rest_scale, zon
 from skytether.shared.missions.keys import MissionConfig
 from skytether.shared.missions.mission import Mission, format_goals, parse_goals
 from skytether.shared.scenario.grammar import GrammarError
-from skytether.shared.scenario.registry import MPC, PLANNERS, TRIGGERS, PluginTable
+from skytether.shared.scenario.registry import MPC, PLANNERS, SCHEMES, TRIGGERS, PluginTable
 from skytether.shared.scenario.schema import Contradiction, Scenario
 
 TINY = 1e-9
@@ -24,7 +24,7 @@ PLACES_MAX = 100_000_000
 def of_keys(scenario: Scenario) -> Iterator[Contradiction]:
     """Contradictions between keys: vehicles have to keep apart whichever packets are lost."""
     control, link, vehicle = scenario.control, scenario.link, scenario.vehicle
-    if not control.properties.missions:
+    if not _is_one(SCHEMES, control.scheme, "trajectory"):
         yield "control.scheme", repr(control.scheme), "'trajectory' on a mission"
     if not _is_one(PLANNERS, control.planner, MPC):
         expected = f"{MPC!r} on a mission, whose vehicles keep apart by motions of the server's own"

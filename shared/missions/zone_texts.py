@@ -19,7 +19,8 @@ from skytether.shared.law.model import Array
 from skytether.shared.missions.zones import CORNERS_MAX, Zone, Zones, around, ring
 from skytether.shared.scenario.grammar import GrammarError
 from skytether.shared.scenario.reference import FAR_M
-from skytether.shared.scenario.registry import ZONES, Files
+from skytether.shared.scenario.registry import Files
+from skytether.shared.scenario.rooms import ZONES
 
 
 def parse(text: str, axes: int, files: Files = ()) -> Zones:

@@ -251,11 +251,11 @@ def _no_reference(scenario: Scenario) -> Iterator[Contradiction]:
     route = ref.points_m + ref.points_m[:1] * ref.loop
     if ref.shape == "waypoints" and any(here == there for here, there in pairwise(route)):
         yield "reference.points_m", [list(point) for point in route], "no point twice in a row"
-    elif ref.shape in ("waypoints", *rooms.TABLES):
+    elif ref.shape in ("waypoints", *rooms.FROM_FILE):
         try:
             scenario.unallocated_reference()
         except ValueError as error:
-            if ref.shape in rooms.TABLES:
+            if ref.shape in rooms.FROM_FILE:
                 yield "reference.file", repr(ref.file), f"a table of the trajectory ({error})"
             else:
                 points = [list(point) for point in route]

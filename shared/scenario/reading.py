@@ -224,7 +224,7 @@ def _with_files(scenario: Scenario, source: str, checked: schema.Scenario | None
     before = _naming_files(checked) if checked else ()
     contents: dict[str, File] = {}
     for key, text in _naming_files(scenario):
-        if key == "reference.file" and scenario.reference.shape not in rooms.TABLES:
+        if key == "reference.file" and scenario.reference.shape not in rooms.FROM_FILE:
             continue
         with suppress(GrammarError):  # reported by `contradictions`
             own = checked.files if checked and (key, text) in before else ()

@@ -504,11 +504,6 @@ VEHICLES = PluginTable(
 )
 """Vehicles of `vehicle.kind`, called with the `Scenario` and the vehicle's number. See
 `client.vehicles`."""
-ZONES = PluginTable(
-    "zone", "zones such as 'box(1, 2, -1, 1) & fence(-6, 6, -6, 6)'", given=0, class_=0, texts=True
-)
-"""Zones of `mission.zones`: functions that return a list of zones. See `shared.missions.zones`;
-plug-ins cannot add any."""
 IMPAIRMENTS = PluginTable(
     "impairment",
     "impairments such as 'constant(0.05) & loss(0.1)'",
@@ -517,5 +512,5 @@ IMPAIRMENTS = PluginTable(
     texts=True,
 )
 """Impairments of a direction of the network: classes. See `netem.impairments`."""
-TABLES = (SCHEMES, PLANNERS, TRIGGERS, REFERENCES, VEHICLES, IMPAIRMENTS)
+PLUGIN_TABLES = (SCHEMES, PLANNERS, TRIGGERS, REFERENCES, VEHICLES, IMPAIRMENTS)
 """Tables to which plug-ins can add entries."""

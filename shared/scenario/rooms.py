@@ -17,7 +17,6 @@ from skytether.shared.scenario.registry import (
     REPORTS,
     TRIGGERS,
     VEHICLES,
-    ZONES,
     Files,
     PluginTable,
     load,
@@ -26,10 +25,17 @@ from skytether.shared.scenario.registry import (
 SHARED, NETEM = "skytether.shared.", "skytether.netem."
 TRIGGER, FURTHER = "skytether.server.triggers.policies", "skytether.server.triggers.further"
 
-MISSIONS = ("swap", "sphere", "mission", "show")
-"""Shapes that are missions: goals or paths of several vehicles, which keep apart."""
-TABLES = ("csv", "mission", "show")
+APART = ("swap", "sphere", "mission", "show")
+"""Shapes with goals or paths of several vehicles, which keep apart."""
+SCHEME_APART = "skytether.server.missions.planning"
+"""Module of the scheme that flies these shapes, in place of `control.scheme`."""
+FROM_FILE = ("csv", "mission", "show")
 """Shapes that are read from `reference.file`."""
+ZONES = PluginTable(
+    "zone", "zones such as 'box(1, 2, -1, 1) & fence(-6, 6, -6, 6)'", given=0, class_=0, texts=True
+)
+"""Zones of `mission.zones`: functions that return a list of zones. See `shared.missions.zones`;
+plug-ins cannot add any."""
 
 SECTIONS = {
     "fence": f"{SHARED}fence.keys",

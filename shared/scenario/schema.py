@@ -428,7 +428,7 @@ class Scenario(Section, frozen=True):
             ConfigError: the file was not read with the scenario.
         """
         file = self.reference.file
-        return file_of(self.files, file).content if self.reference.shape in rooms.TABLES else b""
+        return file_of(self.files, file).content if self.reference.shape in rooms.FROM_FILE else b""
 
     def sections(self) -> Iterator[Section]:
         for name in self.__struct_fields__:
@@ -594,7 +594,7 @@ class Scenario(Section, frozen=True):
     @property
     def keeps_apart(self) -> bool:
         """Whether vehicles keep apart: each flies its motion to the end, or holds its place."""
-        return self.reference.shape.partition("(")[0].strip() in rooms.MISSIONS
+        return self.reference.shape.partition("(")[0].strip() in rooms.APART
 
     def entries(self) -> Iterator[Entry]:
         """Entries of the scheme, the planner, the policies of the trigger, the shape and the

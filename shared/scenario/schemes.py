@@ -31,8 +31,6 @@ class SchemeProperties(NamedTuple):
     """Value of `control.feedback` that the scheme needs; None if both are possible."""
     observes: bool = False
     """Whether the scheme estimates a disturbance, with the time constant `control.observer_s`."""
-    missions: bool = False
-    """Whether the scheme can fly missions, whose motions are sent as splines."""
 
     @property
     def indexed(self) -> bool:
@@ -69,7 +67,7 @@ def predictive() -> SchemeProperties:
 @scheme
 def trajectory() -> SchemeProperties:
     """Desired trajectory as a spline, which a regulator aboard follows."""
-    return SchemeProperties("trajectory", FIGURES[1:], feedback=True, missions=True)
+    return SchemeProperties("trajectory", FIGURES[1:], feedback=True)
 
 
 @scheme

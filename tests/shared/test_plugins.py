@@ -23,7 +23,7 @@ from skytether.__main__ import main
 from skytether.lab.commands.pool import _equipped
 from skytether.lab.journal import digests
 from skytether.shared.scenario.catalogue import differences
-from skytether.shared.scenario.registry import REFERENCES, TABLES, TRIGGERS
+from skytether.shared.scenario.registry import PLUGIN_TABLES, REFERENCES, TRIGGERS
 from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import Record
 from skytether.shell.commandline import plugins
@@ -143,7 +143,7 @@ def test_triggers_are_listed_with_a_sentence_each(
     said = capsys.readouterr().out
     assert f"never\n    Sends nothing. (from {path})\n" in said
     assert "periodic(N=10) with 1 <= N <= 1000000 (whole)\n    Sends N steps" in said
-    assert all(entry.about.endswith(".") for table in TABLES for entry in table.values())
+    assert all(entry.about.endswith(".") for table in PLUGIN_TABLES for entry in table.values())
 
 
 # -- situation of a policy -------------------------------------------------------------------------

@@ -23,7 +23,13 @@ PAGES = {
     "IMPAIRMENTS": "network",
 }
 """Page of each table's entries."""
-DOORS = [(table, name) for table in PAGES for name in getattr(registry, table)]
+TABLES = {
+    name: each
+    for module in (registry, rooms)
+    for name, each in vars(module).items()
+    if isinstance(each, PluginTable)
+}
+DOORS = [(table, name) for table in PAGES for name in TABLES[table]]
 
 
 @cache
@@ -36,8 +42,7 @@ def named(name: str) -> re.Pattern[str]:
 
 
 def test_every_table_has_a_page() -> None:
-    tables = {name for name, each in vars(registry).items() if isinstance(each, PluginTable)}
-    assert tables == {*PAGES}
+    assert {*TABLES} == {*PAGES}
 
 
 @pytest.mark.parametrize(("table", "name"), DOORS)
@@ -45,7 +50,7 @@ def test_every_entry_is_tested_and_documented(table: str, name: str) -> None:
     assert named(name).search(all_tests())
     page = (ROOT / "docs" / f"{PAGES[table]}.md").read_text()
     assert re.search(rf"`{re.escape(name)}[`(]|{re.escape(name)}\(", page)
-    assert getattr(registry, table)[name].about
+    assert TABLES[table][name].about
 
 
 @pytest.mark.parametrize("section", rooms.SECTIONS)

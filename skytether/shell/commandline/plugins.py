@@ -22,9 +22,9 @@ from skytether.shared.base.errors import ConfigError
 from skytether.shared.scenario.registry import (
     IMPAIRMENTS,
     PLANNERS,
+    PLUGIN_TABLES,
     REFERENCES,
     SCHEMES,
-    TABLES,
     TRIGGERS,
     VEHICLES,
 )
@@ -115,12 +115,12 @@ def _import(plugin: Plugin) -> None:
         exec(compile(code, path, "exec"), module.__dict__)
 
     with _tables(f"{FLAG}: {path}"):
-        for table in TABLES:  # remove entries of an older version of the file
+        for table in PLUGIN_TABLES:  # remove entries of an older version of the file
             for name in [name for name, entry in table.items() if entry.source == path]:
                 del table[name]
         _guarded(run, f"{FLAG}: {path}", path)
         version, added = hashlib.blake2b(code, digest_size=8).hexdigest(), 0
-        for table in TABLES:
+        for table in PLUGIN_TABLES:
             for name, entry in table.items():
                 if entry.source == path:
                     table[name], added = replace(entry, version=version), added + 1
@@ -162,11 +162,11 @@ def _mention_groups(folder: Path) -> bool:
 @contextmanager
 def _tables(where: str) -> Iterator[None]:
     """Restore all tables if the block fails, and name the plug-in in the error."""
-    before = [dict(table) for table in TABLES]
+    before = [dict(table) for table in PLUGIN_TABLES]
     try:
         yield
     except BaseException as error:
-        for table, entries in zip(TABLES, before, strict=True):
+        for table, entries in zip(PLUGIN_TABLES, before, strict=True):
             table.clear()
             table.update(entries)
         if isinstance(error, ConfigError) and not str(error).startswith(where):
