@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from skytether.client.alone import Fresh
 from skytether.client.connections import Reached, connect
-from skytether.client.failsafe import CLOSING, HOLD, TABLE, Failsafe, brake_ns
+from skytether.client.failsafe import CLOSING, HOLD, TRANSITIONS, Failsafe, brake_ns
 from skytether.client.flight_log import FlightLog
 from skytether.client.ground import GroundReports
 from skytether.client.link import ClientLink
@@ -103,7 +103,7 @@ class Client(Endpoint):
         if before is not None:
             flies.recall(before.frame)
         self._failsafe = Failsafe(
-            HOLD if terms.exhausted == "hold" else TABLE,
+            HOLD if terms.exhausted == "hold" else TRANSITIONS,
             armed=scenario.armed,
             timeout_ns=self._timeout_ns,
             brake_ns=brake_ns(terms),

@@ -2,8 +2,9 @@
 
     INIT → SYNC → READY → TRACK ⇄ COAST → BRAKE → HOVER → LAND            and FAULT, which is final
 
-`TABLE` maps mode and cause to the next mode; a pair that is missing changes nothing. `HOLD` is the
-table without a failsafe, for a vehicle that repeats its last input for ever, like the paper's.
+`TRANSITIONS` maps mode and cause to the next mode; a pair that is missing changes nothing. `HOLD`
+is the table without a failsafe, for a vehicle that repeats its last input for ever, like the
+paper's.
 `Failsafe` detects the causes that take time: a good link, silence, late horizons, repeated errors.
 `client.pilot` chooses the input in each mode.
 """
@@ -98,7 +99,7 @@ _YIELDS = {
     for cause in YIELDING
 }
 
-TABLE: Table = MappingProxyType(
+TRANSITIONS: Table = MappingProxyType(
     {
         (Mode.INIT, Reason.OPENED): Mode.SYNC,
         (Mode.INIT, Reason.RESUMED): Mode.TRACK,
@@ -181,7 +182,7 @@ class Failsafe:
     """Mode of one vehicle, and the reason for it.
 
     Args:
-        table: `TABLE` or `HOLD`.
+        table: `TRANSITIONS` or `HOLD`.
         armed: whether horizons may be flown at all.
         timeout_ns: time of silence after which the link counts as lost, and time without a
             newer horizon after which the vehicle coasts [ns].
@@ -203,7 +204,7 @@ class Failsafe:
         returns: bool = False,
     ) -> None:
         self._table = table
-        self.brakes = table is TABLE
+        self.brakes = table is TRANSITIONS
         """Whether the vehicle brakes without a plan, rather than repeating its last input."""
         self.armed = armed
         self._timeout_ns, self._brake_ns = timeout_ns, brake_ns

@@ -7,7 +7,7 @@ of steps, and netem's loss and delay. There is no vehicle and no plan, so only h
 from heapq import heappop, heappush
 from typing import NamedTuple
 
-from skytether.client.failsafe import TABLE, Failsafe
+from skytether.client.failsafe import TRANSITIONS, Failsafe
 from skytether.netem.fate import Fates
 from skytether.netem.impairments.direction import impairments
 from skytether.netem.impairments.draws import SLOT_NS
@@ -45,7 +45,7 @@ def _session(network: str, link: LinkConfig, seed: int) -> tuple[int, float, int
     up, down = (Fates(impairments(network), seed, name, 0) for name in ("uplink", "downlink"))
     ear = Hearing(timeout_ns, STEP_NS, link.fixed_ns)
     failsafe = Failsafe(
-        TABLE,
+        TRANSITIONS,
         armed=True,
         timeout_ns=timeout_ns,
         brake_ns=0,

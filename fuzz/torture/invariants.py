@@ -17,7 +17,7 @@ import msgpack
 import numpy as np
 
 from fuzz.torture.courses import Course, FollowedCourse, PlannedCourse
-from skytether.client.failsafe import GOOD_NS, STALL_NS, TABLE
+from skytether.client.failsafe import GOOD_NS, STALL_NS, TRANSITIONS
 from skytether.client.leadership import ASK_SHARE
 from skytether.client.link import ClientLink
 from skytether.client.pilot import LAND_MPS
@@ -489,7 +489,7 @@ class WatchedLife(Recorder):
 
 
 MOVES = frozenset(
-    {(str(mode), str(after)) for (mode, _), after in TABLE.items()}
+    {(str(mode), str(after)) for (mode, _), after in TRANSITIONS.items()}
     | {(str(mode), str(mode)) for mode in Mode}
 )
 """Pairs of mode names that the table connects by one transition, or that are equal."""
@@ -499,7 +499,7 @@ def _reached(mode: Mode) -> frozenset[Mode]:
     """Modes that the table reaches from a mode, in any number of transitions."""
     reached = {mode}
     while True:
-        more = {after for (before, _), after in TABLE.items() if before in reached} - reached
+        more = {after for (before, _), after in TRANSITIONS.items() if before in reached} - reached
         if not more:
             return frozenset(reached)
         reached |= more

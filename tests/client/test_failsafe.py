@@ -19,7 +19,7 @@ from helpers import packaged
 from skytether.client import failsafe
 from skytether.client.clamp import clamped
 from skytether.client.compensator import Compensator
-from skytether.client.failsafe import HOLD, TABLE, Failsafe
+from skytether.client.failsafe import HOLD, TRANSITIONS, Failsafe
 from skytether.client.link import AGAIN_NS, PlainLink
 from skytether.client.server_clock import SLEPT_NS
 from skytether.client.simulated.vehicle import SimulatedVehicle
@@ -137,7 +137,7 @@ def aboard(**times_s: float) -> Failsafe:
     """Failsafe without a client; times are a second each, unless given."""
     times = {"timeout": 1.0, "brake": 1.0, "land_after": 1.0} | times_s
     times_ns = {f"{name}_ns": round(s * SECOND_NS) for name, s in times.items()}
-    return Failsafe(TABLE, armed=True, **times_ns)
+    return Failsafe(TRANSITIONS, armed=True, **times_ns)
 
 
 def scenario(**sections: Any) -> Scenario:
@@ -828,7 +828,7 @@ def test_a_slew_that_would_not_let_it_brake_is_refused() -> None:
 # -- the table -------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("table", [TABLE, HOLD])
+@pytest.mark.parametrize("table", [TRANSITIONS, HOLD])
 def test_nothing_leads_out_of_fault_and_only_fault_out_of_land(table: failsafe.Table) -> None:
     out = [(before, after) for (before, _), after in table.items()]
     assert {after for before, after in out if before is Mode.LAND} <= {Mode.FAULT}
@@ -1068,8 +1068,8 @@ ROWS[Reason.RETURNED] = ROWS[Reason.TAKEN]
 def test_without_the_rows_of_a_cause_its_scenario_goes_wrong(
     cause: Reason, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    rows = {key: after for key, after in TABLE.items() if key[1] is not cause}
-    monkeypatch.setattr(skytether.client.endpoint, "TABLE", rows)
+    rows = {key: after for key, after in TRANSITIONS.items() if key[1] is not cause}
+    monkeypatch.setattr(skytether.client.endpoint, "TRANSITIONS", rows)
     with pytest.raises(AssertionError):
         ROWS[cause]()
 

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from by_hand import ByHand
 from helpers import packaged
 from skytether.client import failsafe
-from skytether.client.failsafe import AT_ONCE, FOLLOWING, TABLE, Failsafe
+from skytether.client.failsafe import AT_ONCE, FOLLOWING, TRANSITIONS, Failsafe
 from skytether.client.link import PlainLink
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
 from skytether.shared.events.flight import Leaving
@@ -194,7 +194,7 @@ def test_only_the_vehicle_itself_or_a_person_takes_it_off_its_motion_at_once() -
     """Network, server and clock wait for the last knot, and so does a battery that runs low."""
     off = {
         cause
-        for (mode, cause), after in TABLE.items()
+        for (mode, cause), after in TRANSITIONS.items()
         if mode in FOLLOWING and after not in FOLLOWING
     }
     assert off - AT_ONCE == {
@@ -207,7 +207,7 @@ def test_only_the_vehicle_itself_or_a_person_takes_it_off_its_motion_at_once() -
 def test_each_cause_takes_effect_at_once_or_at_the_last_knot(cause: Reason) -> None:
     def made(keeps: bool) -> Failsafe:
         made = Failsafe(
-            TABLE,
+            TRANSITIONS,
             armed=True,
             timeout_ns=SECOND_NS,
             brake_ns=SECOND_NS,

@@ -33,7 +33,7 @@ from fuzz.torture.trials import (
     shrunk,
 )
 from helpers import interpreted
-from skytether.client.failsafe import LOCKING, TABLE
+from skytether.client.failsafe import LOCKING, TRANSITIONS
 from skytether.lab.commands import pool
 from skytether.netem.proxy import Proxy
 from skytether.server.reception import Reception
@@ -261,8 +261,10 @@ def no_age(patch: pytest.MonkeyPatch) -> None:
 
 
 def no_brake_without_link(patch: pytest.MonkeyPatch) -> None:
-    table = {(mode, cause): after for (mode, cause), after in TABLE.items() if cause != Reason.LOST}
-    patch.setattr(skytether.client.endpoint, "TABLE", table)
+    table = {
+        (mode, cause): after for (mode, cause), after in TRANSITIONS.items() if cause != Reason.LOST
+    }
+    patch.setattr(skytether.client.endpoint, "TRANSITIONS", table)
 
 
 def no_lock_at_restart(patch: pytest.MonkeyPatch) -> None:
@@ -293,7 +295,9 @@ def no_steady(patch: pytest.MonkeyPatch) -> None:
 
 def no_latch(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(
-        skytether.client.endpoint, "TABLE", {**TABLE, (Mode.LAND, Reason.HORIZON): Mode.TRACK}
+        skytether.client.endpoint,
+        "TRANSITIONS",
+        {**TRANSITIONS, (Mode.LAND, Reason.HORIZON): Mode.TRACK},
     )
 
 

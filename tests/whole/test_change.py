@@ -11,7 +11,7 @@ import pytest
 
 from helpers import Idle, packaged
 from skytether.client.endpoint import Client
-from skytether.client.failsafe import TABLE
+from skytether.client.failsafe import TRANSITIONS
 from skytether.client.fleet import ClientFleet
 from skytether.client.simulated.plant import FirstOrderPlant
 from skytether.client.simulated.vehicle import simulated
@@ -357,8 +357,8 @@ def test_without_its_rows_in_the_table_a_disarmed_vehicle_would_fly_on(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Ablation for the test above: it would fly its plan to the end."""
-    rows = {key: mode for key, mode in TABLE.items() if key[1] is not Reason.UNARMED}
-    monkeypatch.setattr("skytether.client.endpoint.TABLE", rows)
+    rows = {key: mode for key, mode in TRANSITIONS.items() if key[1] is not Reason.UNARMED}
+    monkeypatch.setattr("skytether.client.endpoint.TRANSITIONS", rows)
     flight = arming((5.0, False))
     modes = [(event.after, event.reason) for *_, event in told(flight, ModeChanged)]
     assert ("brake", str(Reason.UNARMED)) not in modes
