@@ -164,7 +164,7 @@ def _work(
             gate=gate,
             capacity=options.vehicles,
             recorder=running.recorder,
-            plans=running.fed("plan", plan_columns(axes, control.horizon)),
+            plan_recorder=running.fed("plan", plan_columns(axes, control.horizon)),
             stopwatch=stopwatch,
             planning=Planners(SHARE * control.dt),
         )

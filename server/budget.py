@@ -16,11 +16,13 @@ A refused vehicle asks again at the next step. The ranking covers all blocks of 
 latest request of each vehicle, at most one step old.
 """
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
-from skytether.shared.base.units import SECOND_NS
+from skytether.shared.base.units import HEADER_BYTES, SECOND_NS
+from skytether.shared.endpoints.endpoint import Datagram
 from skytether.shared.law.model import Array, Flags, Indices
 
 BURST_S = 0.1
@@ -99,8 +101,10 @@ class SharedBudget:
         self._asked[rows[chosen]] = NEVER
         return chosen
 
-    def charge(self, row: int, size: int, *, is_plan: bool) -> None:
-        """Subtract a packet of `size` bytes, headers included; `is_plan`: not a heartbeat."""
+    def charge(self, row: int, packet: Sequence[Datagram], *, is_plan: bool) -> None:
+        """Subtract the bytes of a packet, on all its paths; `is_plan`: it is not a heartbeat."""
+        # The network also carries headers of IP and UDP: 28 bytes, more than a whole heartbeat.
+        size = sum(len(each.payload) + HEADER_BYTES for each in packet)
         self._spent += size
         if is_plan:
             self._bytes[row] = size

@@ -10,7 +10,7 @@ every step, since planning is a small part of the cost of a step.
 
 from collections import Counter
 from collections.abc import Callable
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -132,10 +132,14 @@ class Controller:
         """Whether each vehicle accepts horizons, by its newest observation; shape (capacity,)."""
         self._counts: Counter[str] = Counter()
         shared = control.shared_bytes_per_s
-        self.budget: SharedBudget | None = None
+        self._budget: SharedBudget | None = None
+        self.charge: Callable[..., None] | None = None
+        """Called with the row and the datagrams of each packet, if all vehicles share a rate; see
+        `SharedBudget.charge`."""
         if shared:
             module = load("skytether.server.budget", "control.shared_bytes_per_s")
-            self.budget = module.SharedBudget(shared, capacity)
+            self._budget = module.SharedBudget(shared, capacity)
+            self.charge = self._budget.charge
 
     @property
     def counts(self) -> Counter[str]:
@@ -180,8 +184,8 @@ class Controller:
         self.scheme.forget(row)
         self._trigger.forget(row)
         self._plans_due.pop(row, None)
-        if self.budget:
-            self.budget.forget(row)
+        if self._budget:
+            self._budget.forget(row)
 
     def begin(self, row: int, vehicle: int) -> None:
         """Begin with a vehicle in a row that was forgotten."""
@@ -207,6 +211,11 @@ class Controller:
             self._plans_due.pop(row, None)
         self.scheme.follow(row, message)
 
+    def figures(self) -> dict[str, Any]:
+        """Figures of all vehicles together, beside the server's own."""
+        figures = self.scheme.fleet_figures()
+        return figures | {"budget": self._budget.figures()} if self._budget else figures
+
     def observe(self, row: int, observation: Observation) -> bool:
         """Store an observation unless a newer one is stored (E11); True if stored."""
         is_stored = self.scheme.observe(row, observation)
@@ -214,8 +223,13 @@ class Controller:
             self._takes[row] = bool(observation.takes)
         return is_stored
 
-    def note_heartbeats(self, due: list[int]) -> None:
-        """Set the rows to which a heartbeat is due at this tick unless a plan is sent."""
+    def begin_tick(self, tick_ns: int, now_ns: int, due: list[int]) -> None:
+        """Begin the tick of the time `tick_ns`; `due` are the rows to which a heartbeat is due
+        unless a plan is sent.
+        """
+        self.desired.tick(tick_ns)
+        if self._budget:
+            self._budget.fill(now_ns)
         if due or self._heartbeats:
             self._heartbeat_due[:] = False
             self._heartbeat_due[due] = True
@@ -266,13 +280,13 @@ class Controller:
             self.idle,
             event,
         )
-        if self.budget:
+        if self._budget:
             # A trigger that compares nothing, as `periodic`, gives no figure to rank its vehicles
             # by.
             worth = verdict.figure if verdict.compares else figures["cost_gap"]
             # A vehicle without a plan cannot wait for bytes.
             urgent = self._heartbeat_due[rows] | figures["fresh"] | (self._sent_step[rows] < 0)
-            event = self.budget.choose(rows, event, urgent, worth, situation.since_sent_s)
+            event = self._budget.choose(rows, event, urgent, worth, situation.since_sent_s)
             events = int(np.count_nonzero(event))
         # After the budget: the committed scheme may only replay horizons that are really sent.
         self.scheme.remember(rows, step, predicted, event)  # eq. (12)

@@ -55,7 +55,7 @@ class Server(Endpoint):
         boot_id: number unique to this run of the server.
         entropy: returns this many random bytes.
         recorder: receives one row per tick and vehicle.
-        plans: receives one row per horizon sent, see `shared.telemetry.record.plan_columns`.
+        plan_recorder: receives one row per horizon sent, see `record.plan_columns`.
         stopwatch: measures the parts of a tick; the core has no clock of its own.
         references: desired trajectory of each vehicle, by its number, if they differ; default: the
             scenario's.
@@ -71,7 +71,7 @@ class Server(Endpoint):
         gate: Gate | None = None,
         capacity: int = VEHICLES_MAX,
         recorder: Recorder | None = None,
-        plans: Recorder | None = None,
+        plan_recorder: Recorder | None = None,
         stopwatch: Stopwatch | None = None,
         references: Callable[[int], Reference] | None = None,
         planning: Planning = in_turn,
@@ -124,7 +124,7 @@ class Server(Endpoint):
             out=self._out,
             events=self._events,
             recorder=recorder,
-            plans=plans,
+            plan_recorder=plan_recorder,
         )
         self._leaves = False
         """Whether an operator has asked the server to end."""
@@ -241,6 +241,5 @@ class Server(Endpoint):
             "dropped": by_name(self.dropped),
             "refused": by_name(self.refused),
             "by_vehicle": vehicle_figures,
-            **self.controller.scheme.fleet_figures(),
-            **({"budget": self.controller.budget.figures()} if self.controller.budget else {}),
+            **self.controller.figures(),
         }

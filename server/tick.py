@@ -12,7 +12,7 @@ from skytether.server.controller import BLOCK, Controller, Decisions
 from skytether.server.planning.clock import ClockMap
 from skytether.server.planning.scheme import Batch, Header, make_header
 from skytether.server.sessions import Session, Sessions
-from skytether.shared.base.units import HEADER_BYTES, MILLISECOND_NS, SECOND_NS
+from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
 from skytether.shared.endpoints.endpoint import Datagram, Events
 from skytether.shared.endpoints.stopwatch import Stopwatch
 from skytether.shared.events.flight import (
@@ -92,7 +92,7 @@ class Ticker:
         out: list[Datagram],
         events: Events,
         recorder: Recorder | None,
-        plans: Recorder | None,
+        plan_recorder: Recorder | None,
     ) -> None:
         self._sessions = sessions
         self._clock = clock
@@ -101,8 +101,8 @@ class Ticker:
         self._stopwatch = stopwatch
         self._out = out
         self._events = events
-        self._recorder, self._plans = recorder, plans
-        self._records = recorder is not None or plans is not None
+        self._recorder, self._plan_recorder = recorder, plan_recorder
+        self._records = recorder is not None or plan_recorder is not None
         self.durations = Histogram(TICK_BIN_NS)
         """Duration of each tick, while the stopwatch runs."""
 
@@ -113,11 +113,8 @@ class Ticker:
         before_ns = self._stopwatch.total_ns
         rows = self._sessions.rows
         step = self._clock.steps(rows, tick_ns)
-        controller.desired.tick(tick_ns)
-        if controller.budget:
-            controller.budget.fill(now_ns)
         heartbeats = self._sessions.heartbeats_due(now_ns)
-        controller.note_heartbeats([each.row for each in heartbeats])
+        controller.begin_tick(tick_ns, now_ns, [each.row for each in heartbeats])
         rows, step = controller.able(rows, step)
         for first in range(0, len(rows), BLOCK):
             block = slice(first, first + BLOCK)
@@ -197,15 +194,13 @@ class Ticker:
 
     def _put(self, row: int, datagrams: Sequence[Datagram], *, is_plan: bool = False) -> None:
         self._out += datagrams
-        if budget := self._controller.budget:
-            # The network also carries headers of IP and UDP: 28 bytes, more than a whole heartbeat.
-            size = sum(len(each.payload) + HEADER_BYTES for each in datagrams)
-            budget.charge(row, size, is_plan=is_plan)
+        if charge := self._controller.charge:
+            charge(row, datagrams, is_plan=is_plan)
 
     def _record(self, decisions: Decisions) -> None:
         batch, figures = decisions.batch, decisions.figures
-        if self._plans is not None and len(batch.sent):
-            self._record_plans(self._plans, batch)
+        if self._plan_recorder is not None and len(batch.sent):
+            self._record_plans(self._plan_recorder, batch)
         if self._recorder is None:
             return
         rows, predicted = batch.rows, batch.foresight
@@ -244,9 +239,9 @@ class Ticker:
         columns[OWN] = verdict.figure if verdict.compared is Compared.OWN else missing
         return columns
 
-    def _record_plans(self, plans: Recorder, batch: Batch) -> None:
+    def _record_plans(self, recorder: Recorder, batch: Batch) -> None:
         sent_plans = self._controller.scheme.sent_plans(batch)
-        plans.append(
+        recorder.append(
             len(batch.sent),
             vehicle=self._sessions.vehicle[batch.rows[batch.sent]],
             **sent_plans._asdict(),

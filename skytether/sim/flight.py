@@ -125,7 +125,7 @@ def fly(
     if secure:
         ends = load("skytether.sim.sealed", "keys").Sealed(scenario.seed, vehicles)
     columns, sink = plan_columns(scenario.model.axes, scenario.control.horizon), io.BytesIO()
-    plans = Recorder(columns, sink)
+    plan_recorder = Recorder(columns, sink)
     (flight,) = _fly(
         scenario,
         (scenario.seed,),
@@ -135,7 +135,7 @@ def fly(
         stopwatch,
         ends,
         changes,
-        plans,
+        plan_recorder,
         server,
         beside,
         actions,
@@ -342,7 +342,7 @@ def _fly(
     stopwatch: Stopwatch | None = None,
     ends: Plain = PLAIN,
     changes: Sequence[tuple[float, Mapping[str, Any]]] = (),
-    plans: Recorder | None = None,
+    plan_recorder: Recorder | None = None,
     own_server: Endpoint | None = None,
     beside: Mapping[str, Endpoint] = MappingProxyType({}),
     actions: Sequence[tuple[float, Callable[[World], None]]] = (),
@@ -381,7 +381,7 @@ def _fly(
             gate=ends.gate(entropy),
             capacity=len(seeds) * vehicles,
             recorder=recorder,
-            plans=plans,
+            plan_recorder=plan_recorder,
             stopwatch=stopwatch,
             references=target if has_own else None,
         )

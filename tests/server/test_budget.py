@@ -12,7 +12,8 @@ from bench.crowd import judge
 from skytether.client.vehicles import apart_ns
 from skytether.server import budget as budgets
 from skytether.server.budget import BURST_S, GUESS_BYTES, WAIT_S, SharedBudget
-from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
+from skytether.shared.base.units import HEADER_BYTES, MILLISECOND_NS, SECOND_NS
+from skytether.shared.endpoints.endpoint import Datagram
 from skytether.shared.law.model import Array
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.dotted import set_keys
@@ -45,7 +46,8 @@ class Crowd:
             of_block = worth[block], self.since_s[block]
             goes = block[self.budget.choose(block, asks, must[block], *of_block)]
             for row in goes.tolist():
-                self.budget.charge(row, int(self.sizes[row]), is_plan=True)
+                packet = Datagram(bytes(self.sizes[row] - HEADER_BYTES), ("vehicle", 0))
+                self.budget.charge(row, [packet], is_plan=True)
             sent += goes.tolist()
         self.since_s[sent] = 0.0
         return sent
