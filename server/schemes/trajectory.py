@@ -150,7 +150,7 @@ class Guidance(SplineScheme):
         gain = regulator(fleet.scenario)
         lead_s = (1.0 + gain[:, 1]) / np.maximum(gain[:, 0], TINY)
         # A plan shorter than h ends before the vehicle has come near the trajectory, and after its
-        # end the spline is a straight line: measured errors reached 12 m (docs/studies.md).
+        # end the spline is a straight line: measured errors reached 12 m.
         plans = desired.seen > 0 and terms.horizon * terms.dt_s >= lead_s.max()
         self._own: PluginPlanners | None = None
         if control.planner != MPC:
