@@ -698,7 +698,8 @@ SHORT = "--settle 0 --duration 4 --reference.shape slope(0.4)"
 
 def run(line: str, *more: str, folder: Path, path: str = "", code: int = 0) -> str:
     argv = [sys.executable, "-P", "-m", "skytether", *line.split(), *more]
-    env = os.environ | {"PYTHONPATH": path}
+    # With ROOT, for another checkout may be the installed one.
+    env = os.environ | {"PYTHONPATH": f"{ROOT}:{path}"}
     done = subprocess.run(argv, cwd=folder, env=env, capture_output=True, text=True, check=False)
     assert done.returncode == code, done.stderr
     return done.stdout + done.stderr
