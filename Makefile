@@ -90,7 +90,7 @@ dist: $(UV)  ## the wheel and the source distribution, in dist/
 	$(BIN)/python -m hatchling build
 
 keys: setup  ## docs/keys.md, from the sections of a scenario
-	$(BIN)/python -m skytether.lab.keys_document > docs/keys.md
+	$(BIN)/python -m skytether.lab.pages.keys_document > docs/keys.md
 
 # Open site/index.html; its search works only through a server, as of `python -m http.server -d site`.
 docs: $(DOCS_STAMP)  ## a site of docs/ in site/, offline; a link that leads nowhere fails

@@ -6,11 +6,11 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from bench.harness import TextTable
-from skytether.lab import contenders
 from skytether.lab.commands import compare
 from skytether.lab.commands.pool import Flags
 from skytether.lab.commands.report_folder import CommandCall
-from skytether.lab.comparison import ComparedCase, ContenderRuns, leading
+from skytether.lab.engine import contenders
+from skytether.lab.engine.comparison import ComparedCase, ContenderRuns, leading
 
 CASES = {
     "target": "the server alone sees the target, and only where it is now",

@@ -28,11 +28,11 @@ import tyro
 
 from bench.harness import TextTable, place_of, refresh
 from skytether.cli.fly import FlyOptions
-from skytether.lab import sweep
 from skytether.lab.commands import tables
 from skytether.lab.commands.machine import commit
 from skytether.lab.commands.pool import Flags, crew
-from skytether.lab.intervals import interval
+from skytether.lab.engine import sweep
+from skytether.lab.engine.intervals import interval
 from skytether.shared.base import files, toml
 from skytether.shell.commandline import command
 

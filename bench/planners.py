@@ -14,7 +14,7 @@ import msgspec
 import numpy as np
 
 from bench.harness import Study, TextTable
-from skytether.lab.intervals import interval
+from skytether.lab.engine.intervals import interval
 from skytether.shared.endpoints.stopwatch import Stopwatch
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.dotted import set_keys

@@ -31,7 +31,7 @@ from skytether.gym import (
     Queue,
 )
 from skytether.gym.networked import Options
-from skytether.lab.intervals import interval
+from skytether.lab.engine.intervals import interval
 from skytether.shell.commandline import command
 
 Rows = NDArray[np.float64]

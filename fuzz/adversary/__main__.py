@@ -12,7 +12,7 @@ from fuzz.adversary.climb import CLIMB, MOVES_MAX, PATIENCE, Climb, Climbed, cli
 from fuzz.adversary.raid import COVERED, MoveKind, Moves, fly, shrunk, spare_m
 from fuzz.engine import dumps, flown, loads
 from skytether.lab.commands import tables
-from skytether.lab.journal import ENTRIES, digests
+from skytether.lab.engine.journal import ENTRIES, digests
 from skytether.shared.missions.mission import Mission
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.whole import Scenario

@@ -5,11 +5,11 @@ from itertools import product
 from os import PathLike
 from pathlib import Path
 
-from skytether.lab.budgets import BUDGETS
 from skytether.lab.commands.compare import CompareOptions, run, size
 from skytether.lab.commands.pool import Flags, writing
 from skytether.lab.commands.report_folder import CommandCall
-from skytether.lab.contenders import ABOARD
+from skytether.lab.engine.budgets import BUDGETS
+from skytether.lab.engine.contenders import ABOARD
 from skytether.library.sweeping import Swept
 from skytether.shared.base import extras, files
 from skytether.shared.base.errors import ConfigError, FlightError

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
-from skytether.lab import sweep as lab
-from skytether.lab.intervals import Estimate
+from skytether.lab.engine import sweep as lab
+from skytether.lab.engine.intervals import Estimate
 from skytether.library.flight import values
 from skytether.library.flying import Given, named, prepare
 from skytether.shared.base import extras

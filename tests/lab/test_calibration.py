@@ -10,11 +10,27 @@ from msgspec.structs import replace
 
 from helpers import refusal, refused_before_writing
 from skytether.__main__ import main
-from skytether.lab import calibration
-from skytether.lab.calibration import COLUMNS, ONLY, TABLE_1, UNFLYABLE, Rmse, SearchLimits, Table1
-from skytether.lab.intervals import interval
-from skytether.lab.search import Free, Objective, Optimiser, SearchPoint, Values, check_free, put
-from skytether.lab.sweep import summaries
+from skytether.lab.engine import calibration
+from skytether.lab.engine.calibration import (
+    COLUMNS,
+    ONLY,
+    TABLE_1,
+    UNFLYABLE,
+    Rmse,
+    SearchLimits,
+    Table1,
+)
+from skytether.lab.engine.intervals import interval
+from skytether.lab.engine.search import (
+    Free,
+    Objective,
+    Optimiser,
+    SearchPoint,
+    Values,
+    check_free,
+    put,
+)
+from skytether.lab.engine.sweep import summaries
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.dotted import value
 

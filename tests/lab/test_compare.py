@@ -25,24 +25,13 @@ from bench.contenders import choice_table
 from helpers import refused_before_writing
 from skytether.__main__ import main
 from skytether.figures.page import Picture
-from skytether.lab import budgets, contenders
-from skytether.lab.budgets import BUDGETS, REPORTS, SOUGHT, FlownContender, Plan
-from skytether.lab.calibration import Rmse, SearchLimits
 from skytether.lab.commands import pool
 from skytether.lab.commands.report_folder import CommandCall
-from skytether.lab.comparison import (
-    CLAIMS,
-    FLIGHTS_MIN,
-    UNTOLD,
-    Claim,
-    ComparedCase,
-    ContenderRuns,
-    budgets_table,
-    judge,
-    leaders_table,
-    ratio,
-)
-from skytether.lab.contenders import (
+from skytether.lab.engine import budgets, contenders
+from skytether.lab.engine.budgets import BUDGETS, REPORTS, SOUGHT, FlownContender, Plan
+from skytether.lab.engine.calibration import Rmse, SearchLimits
+from skytether.lab.engine.comparison import CLAIMS, Claim, ComparedCase, ContenderRuns, judge, ratio
+from skytether.lab.engine.contenders import (
     ABOARD,
     BESIDE,
     CASES,
@@ -52,7 +41,8 @@ from skytether.lab.contenders import (
     Contender,
     TunedWeights,
 )
-from skytether.lab.report import Drawn, html
+from skytether.lab.pages.comparison import FLIGHTS_MIN, UNTOLD, budgets_table, leaders_table
+from skytether.lab.pages.report import Drawn, html
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.dotted import text_key

@@ -1,4 +1,4 @@
-"""`lab.floor`: lower bounds of the error, and flights without a network."""
+"""`lab.engine.floor`: lower bounds of the error, and flights without a network."""
 
 import math
 
@@ -8,7 +8,7 @@ import pytest
 from helpers import packaged
 from skytether.client.simulated.plant import FirstOrderPlant
 from skytether.client.simulated.weather import Weather
-from skytether.lab.floor import fly_aboard, summarise_aboard, target_floor_m, wind_floor_m
+from skytether.lab.engine.floor import fly_aboard, summarise_aboard, target_floor_m, wind_floor_m
 from skytether.shared.base.chance import stream
 from skytether.shared.scenario import targets
 from skytether.shared.scenario.whole import Scenario

@@ -9,8 +9,8 @@ import pytest
 
 from helpers import demo_with
 from skytether.__main__ import main
-from skytether.lab import margins
-from skytether.lab.margins import (
+from skytether.lab.engine import margins
+from skytether.lab.engine.margins import (
     AS_IT_IS,
     Differing,
     clocked_trigger,

@@ -18,10 +18,11 @@ from msgspec.structs import replace
 
 from helpers import refused_before_writing
 from skytether.__main__ import main
-from skytether.lab import plates, report, studies
-from skytether.lab.calibration import TABLE_1
-from skytether.lab.studies import EVENT, EVERY, NONE, PERIODIC, MethodFlights, Study
-from skytether.lab.sweep import GridAxis, Sweep
+from skytether.lab.engine import studies
+from skytether.lab.engine.calibration import TABLE_1
+from skytether.lab.engine.studies import EVENT, EVERY, NONE, PERIODIC, MethodFlights, Study
+from skytether.lab.engine.sweep import GridAxis, Sweep
+from skytether.lab.pages import plates, report
 from skytether.netem.impairments.direction import impairments
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.registry import IMPAIRMENTS

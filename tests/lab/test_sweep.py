@@ -20,10 +20,10 @@ from msgspec.structs import replace
 
 from helpers import PATIENCE_S, refusal, refused_before_writing, until
 from skytether.__main__ import main
-from skytether.lab import figures
 from skytether.lab.commands import pool
-from skytether.lab.journal import StudyJournal, sealed
-from skytether.lab.sweep import CHUNK, GridAxis, Runs, Sweep, estimate, fly, parse_axis
+from skytether.lab.engine.journal import StudyJournal, sealed
+from skytether.lab.engine.sweep import CHUNK, GridAxis, Runs, Sweep, estimate, fly, parse_axis
+from skytether.lab.pages import figures
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.dotted import value

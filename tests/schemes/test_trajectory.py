@@ -17,7 +17,7 @@ import skytether
 from bench.problems import from_python
 from skytether.client.compensator import Compensator
 from skytether.client.navigation import Navigation
-from skytether.lab.sweep import summaries
+from skytether.lab.engine.sweep import summaries
 from skytether.server.mpc.nominal import make_nominal, plan_nominal
 from skytether.server.planning.clock import ClockMap
 from skytether.server.planning.desired import Desired, Window

@@ -9,7 +9,7 @@ import pytest
 
 from skytether.client.mavlink.keys import ORIGIN
 from skytether.client.simulated.vehicle import SimulatedVehicle
-from skytether.lab import keys_document
+from skytether.lab.pages import keys_document
 from skytether.netem.__main__ import emulate
 from skytether.netem.proxy import Proxy
 from skytether.server.endpoint import POINT, TRIGGER

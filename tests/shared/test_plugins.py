@@ -21,7 +21,7 @@ from hatchling.build import build_wheel
 from helpers import faults, packaged, refusal
 from skytether.__main__ import main
 from skytether.lab.commands.pool import _equipped
-from skytether.lab.journal import digests
+from skytether.lab.engine.journal import digests
 from skytether.shared.scenario.catalogue import differences
 from skytether.shared.scenario.registry import PLUGIN_TABLES, REFERENCES, TRIGGERS
 from skytether.shared.scenario.whole import Scenario

@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 from skytether.figures.page import as_text
-from skytether.lab import calibration
-from skytether.lab.calibration import ONLY, Rmse, SearchLimits, Table1
 from skytether.lab.commands import tables
 from skytether.lab.commands.pool import Flags, Interrupted, PoolFlags, crew, writing
-from skytether.lab.search import SIGMA, Free, Search, SearchPoint, Values, best, check_free
+from skytether.lab.engine import calibration
+from skytether.lab.engine.calibration import ONLY, Rmse, SearchLimits, Table1
+from skytether.lab.engine.search import SIGMA, Free, Search, SearchPoint, Values, best, check_free
 from skytether.shared.base import files
 from skytether.shared.scenario.reading import to_toml
 from skytether.shared.scenario.whole import Scenario

@@ -6,17 +6,18 @@ from pathlib import Path
 from typing import Annotated
 
 from skytether.figures.page import as_text
-from skytether.lab import comparison, contenders
-from skytether.lab.budgets import Plan
-from skytether.lab.calibration import ONLY, Rmse, SearchLimits
 from skytether.lab.commands import report_folder, tables
 from skytether.lab.commands.pool import Crew, Flags, PoolFlags, crew, writing
 from skytether.lab.commands.report_folder import CommandCall
-from skytether.lab.comparison import ComparedCase
-from skytether.lab.contenders import CASES, PACKETS, ComparisonSize, TunedWeights
-from skytether.lab.floor import Baselines, Floor, Work, floor_of, summarise_aboard
-from skytether.lab.report import Drawn
-from skytether.lab.search import Search, best
+from skytether.lab.engine import contenders
+from skytether.lab.engine.budgets import Plan
+from skytether.lab.engine.calibration import ONLY, Rmse, SearchLimits
+from skytether.lab.engine.comparison import ComparedCase, compared
+from skytether.lab.engine.contenders import CASES, PACKETS, ComparisonSize, TunedWeights
+from skytether.lab.engine.floor import Baselines, Floor, Work, floor_of, summarise_aboard
+from skytether.lab.engine.search import Search, best
+from skytether.lab.pages import comparison
+from skytether.lab.pages.report import Drawn
 from skytether.shared.base import files
 from skytether.shared.scenario import reading
 from skytether.shared.telemetry.summary import Summary
@@ -102,7 +103,7 @@ def run(
         for plan, points, sweep in zip(plans, chosen, sweeps, strict=True):
             done = flyers.sweep(sweep, options.out / "sweeps" / plan.case.name, plan.case.title)
             beside = _beside(flyers, plan, options.out / "beside" / plan.case.name)
-            results.append(comparison.compared(plan, points, sweep, done, beside))
+            results.append(compared(plan, points, sweep, done, beside))
         runs += flyers.runs
     drawn = comparison.draw(results)
     report_folder.write(options.out, drawn, reading.load(CASES[0].plant), call, runs)

@@ -8,10 +8,10 @@ from typing import Annotated
 
 import msgspec
 
-from skytether.lab import margins as lab
 from skytether.lab.commands import tables
 from skytether.lab.commands.pool import Flags, Interrupted, PoolFlags, crew
-from skytether.lab.margins import Margin, MarginLimit
+from skytether.lab.engine import margins as lab
+from skytether.lab.engine.margins import Margin, MarginLimit
 from skytether.shared.scenario.whole import Scenario
 from skytether.shell.commandline import command
 from skytether.shell.commandline.argument import Argument

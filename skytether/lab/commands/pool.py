@@ -27,10 +27,10 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Annotated, Any, TypeVar
 
-import skytether.lab.sweep
-from skytether.lab.journal import StudyJournal, name_of
-from skytether.lab.search import Point, Search, SearchPoint, Values, best
-from skytether.lab.sweep import Results, Runs, Sweep
+import skytether.lab.engine.sweep
+from skytether.lab.engine.journal import StudyJournal, name_of
+from skytether.lab.engine.search import Point, Search, SearchPoint, Values, best
+from skytether.lab.engine.sweep import Results, Runs, Sweep
 from skytether.server.schemes import table
 from skytether.shared.base import kernel
 from skytether.shared.scenario.whole import Scenario
@@ -160,7 +160,7 @@ class Crew:
         """Results of all tasks of a sweep; stored and raised as in `study`."""
         tasks, before = {(task.cell, task.chunk): task for task in plan.tasks()}, len(self.fresh)
         results = self.study(
-            skytether.lab.sweep.fly,
+            skytether.lab.engine.sweep.fly,
             tasks,
             Runs,
             plan.settings(),

@@ -11,9 +11,9 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from skytether.lab import report
 from skytether.lab.commands import machine
-from skytether.lab.report import Drawn
+from skytether.lab.pages import report
+from skytether.lab.pages.report import Drawn
 from skytether.shared.base import files
 from skytether.shared.scenario.whole import Scenario
 from skytether.shell.host import system

@@ -11,15 +11,16 @@ import msgspec
 import numpy as np
 
 from skytether.cli import processes
-from skytether.lab import report, studies
 from skytether.lab.commands import delays, report_folder, tables
 from skytether.lab.commands.pool import Crew, Flags, PoolFlags, crew, writing
 from skytether.lab.commands.report_folder import CommandCall
-from skytether.lab.journal import StudyJournal
-from skytether.lab.plates import Samples
-from skytether.lab.report import Reproduction
-from skytether.lab.studies import EVENT, EVERY, PERIODIC, Cells, ReproductionSize, Study
-from skytether.lab.sweep import Runs
+from skytether.lab.engine import studies
+from skytether.lab.engine.journal import StudyJournal
+from skytether.lab.engine.studies import EVENT, EVERY, PERIODIC, Cells, ReproductionSize, Study
+from skytether.lab.engine.sweep import Runs
+from skytether.lab.pages import report
+from skytether.lab.pages.plates import Samples
+from skytether.lab.pages.report import Reproduction
 from skytether.server.schemes.table import others
 from skytether.shared.base import files, kernel
 from skytether.shared.law.model import Array

@@ -8,10 +8,10 @@ from typing import Annotated
 import numpy as np
 import tyro
 
-from skytether.lab import figures
 from skytether.lab.commands import tables
 from skytether.lab.commands.pool import Crew, Flags, PoolFlags, crew, writing
-from skytether.lab.sweep import Results, Sweep, estimate, parse_axis
+from skytether.lab.engine.sweep import Results, Sweep, estimate, parse_axis
+from skytether.lab.pages import figures
 from skytether.shared.base import files
 from skytether.shared.scenario.whole import Scenario
 from skytether.shell.commandline import command, terminal

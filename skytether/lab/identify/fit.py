@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy import optimize
 
-from skytether.lab.intervals import students
+from skytether.lab.engine.intervals import students
 from skytether.shared.law.model import Array
 
 STEPS_MIN = 2

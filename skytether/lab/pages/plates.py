@@ -15,7 +15,7 @@ import numpy as np
 from skytether.figures.flights import draw_reference
 from skytether.figures.page import Picture, as_png, lettered
 from skytether.figures.tables import rows_csv, to_csv
-from skytether.lab.studies import (
+from skytether.lab.engine.studies import (
     EVENT,
     EVERY,
     NONE,
@@ -25,7 +25,7 @@ from skytether.lab.studies import (
     Study,
     periodic_wins,
 )
-from skytether.lab.sweep import by_name, estimate
+from skytether.lab.engine.sweep import by_name, estimate
 from skytether.shared.law.model import Array, Indices
 from skytether.shared.scenario.registry import IMPAIRMENTS, TRIGGERS
 from skytether.shared.scenario.schema import ControlConfig

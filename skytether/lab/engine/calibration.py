@@ -1,6 +1,6 @@
 """Objectives of searches: reproduction of the paper's Table 1, or the smallest error within limits.
 
-An objective (`lab.search.Objective`) flies every point of a search, which is a scenario, with the
+An objective (`search.Objective`) flies every point of a search, which is a scenario, with the
 same seeds, and scores the flights. A smaller score is better.
 """
 
@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from skytether.lab import sweep
-from skytether.lab.search import Free, Values, plain
+from skytether.lab.engine import sweep
+from skytether.lab.engine.search import Free, Values, plain
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.grammar import leaves
 from skytether.shared.scenario.registry import TRIGGERS

@@ -1,9 +1,9 @@
 """Contenders and cases of `skytether compare`, and the file of each contender's weights.
 
 The best weights of each contender in each case stand in that file. A search finds them
-(`search_start`, `lab.calibration.Rmse`), on seeds that the comparison does not fly. `lab.budgets`
-then chooses a threshold for each budget of packets. Some cases are flown with the weights of
-another case, to show how well weights transfer.
+(`search_start`, `calibration.Rmse`), on seeds that the comparison does not fly. `budgets` then
+chooses a threshold for each budget of packets. Some cases are flown with the weights of another
+case, to show how well weights transfer.
 """
 
 import json

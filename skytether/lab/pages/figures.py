@@ -7,7 +7,7 @@ import numpy as np
 
 from skytether.figures.flights import save
 from skytether.figures.page import blank
-from skytether.lab.sweep import GridAxis
+from skytether.lab.engine.sweep import GridAxis
 from skytether.shared.law.model import Array
 
 UNITS = {"s": "s", "m": "m", "mps": "m/s", "mps2": "m/s²", "ppm": "ppm"}

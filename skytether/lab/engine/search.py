@@ -11,7 +11,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from skytether.lab.journal import digests
+from skytether.lab.engine.journal import digests
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.scenario import dotted, reading
 from skytether.shared.scenario.grammar import GrammarError

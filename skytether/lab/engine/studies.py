@@ -13,9 +13,9 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from skytether.lab.calibration import COLUMNS, TABLE_1, deviations
-from skytether.lab.intervals import Estimate, interval
-from skytether.lab.sweep import GridAxis, Results, Sweep, estimate
+from skytether.lab.engine.calibration import COLUMNS, TABLE_1, deviations
+from skytether.lab.engine.intervals import Estimate, interval
+from skytether.lab.engine.sweep import GridAxis, Results, Sweep, estimate
 from skytether.shared.scenario.registry import IMPAIRMENTS, TRIGGERS
 from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.summary import Summary

@@ -1,200 +1,35 @@
-"""Results of a comparison of contenders: tables, claimed ratios, curves."""
+"""Tables, verdict and curves of a comparison of contenders."""
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from skytether.figures.page import Cell, Row, Table, as_text, lettered, table_of
 from skytether.figures.tables import rows_csv, to_csv
-from skytether.lab import plates
-from skytether.lab.budgets import BUDGETS, EVERY, ITS_OWN, SOUGHT, Chosen, FlownContender, Plan
-from skytether.lab.contenders import ABOARD, CASES, CONTENDERS, Case, Contender
-from skytether.lab.floor import Baselines, Floor
-from skytether.lab.intervals import Estimate, interval, jackknife
-from skytether.lab.plates import Plate
-from skytether.lab.report import Drawn
-from skytether.lab.sweep import Results, Sweep, by_name
-from skytether.shared.telemetry.summary import Summary
-
-RMSE, SHARE, EFFORT = "rmse_xy", "event_ratio", "effort_mps"
-PACKETS, BYTES = "packets_per_s", "bytes_per_s"
-FIGURES = (
-    RMSE,
-    PACKETS,
+from skytether.lab.engine.budgets import BUDGETS
+from skytether.lab.engine.comparison import (
     BYTES,
-    "uplink_packets_per_s",
-    "uplink_bytes_per_s",
-    "downlink_packets_per_s",
-    "downlink_bytes_per_s",
-    SHARE,
-    "uplink_above",
-    "uplink_due",
+    CLAIMS,
     EFFORT,
-    "saturated",
-    "aoi_s_mean",
-    "aoi_s_peak",
-    "plan_age_s_mean",
+    FIGURES,
+    OURS,
+    PACKETS,
+    RMSE,
+    ComparedCase,
+    ContenderRuns,
+    Judged,
+    judge,
+    leading,
+    ranked,
+    ratio,
 )
-
-
-@dataclass(frozen=True, slots=True)
-class Claim:
-    """Claim that one contender's RMSE xy is at most a given multiple of another's."""
-
-    ours: str
-    theirs: str
-    share: float = 1.0
-    """Largest share of the other contender's packets in both directions that ours may send."""
-    at_most: Mapping[str, float] = field(default_factory=dict)
-    """Largest ratio by case; in other cases the ratio is only reported."""
-
-
-OURS = "trajectory-expected"
-"""Contender for which most ratios are claimed."""
-CLAIMS = (
-    Claim(OURS, "paper-every-step", 0.12, {"target": 0.95, "turns": 0.8}),
-    Claim(OURS, "feedback-gap", 0.5),
-    Claim("feedback-gap", "paper-every-step", 0.25),
-)
-
-
-@dataclass(frozen=True, slots=True)
-class ContenderRuns:
-    """Runs of a contender in a case, at one threshold and with one reporting policy."""
-
-    what: FlownContender
-    runs: Sequence[Summary]
-
-    def estimate(self, figure: str) -> Estimate:
-        """Mean of one of FIGURES, and half the width of its 95 % interval."""
-        return interval(self.values(figure))
-
-    def values(self, figure: str) -> list[float]:
-        """Values of one of FIGURES, without runs that failed or have no value."""
-        flew = (run for run in self.runs if run.rmse_xy is not None)
-        values = (getattr(run, figure) for run in flew)
-        return [value for value in values if value is not None]
-
-    def mean(self, figure: str) -> float:
-        """Mean of one of FIGURES; NaN if no run has it."""
-        mean, _ = self.estimate(figure)
-        return math.nan if mean is None else mean
-
-    def median(self) -> float | None:
-        """Median RMSE xy [m], robust against a few failed runs; None without runs."""
-        values = self.values(RMSE)
-        return float(np.median(values)) if values else None
-
-
-@dataclass(frozen=True, slots=True)
-class ComparedCase:
-    case: Case
-    bought: Mapping[tuple[str, float], ContenderRuns]
-    """Runs of each contender's chosen point within each budget, by the contender's name and the
-    budget [1/s].
-    """
-    tuned: Sequence[FlownContender] = ()
-    """Each contender at the threshold that the search found."""
-    floor: Sequence[Floor] = ()
-
-    @property
-    def contenders(self) -> list[Contender]:
-        points = (*self.tuned, *(runs.what for runs in self.bought.values()))
-        found = {point.contender.name: point.contender for point in points}
-        first = [each.name for each in CONTENDERS if each.name in found]
-        return [found[name] for name in dict.fromkeys([*first, *found])]
-
-    def curve(self, contender: str) -> list[ContenderRuns]:
-        """Chosen points of a contender with rising budget; each point once."""
-        points = (self.bought.get((contender, budget)) for budget in SOUGHT)
-        return list({id(each): each for each in points if each is not None}.values())
-
-
-def compared(
-    plan: Plan,
-    chosen: Chosen,
-    sweep: Sweep,
-    done: Results,
-    beside: Baselines,
-) -> ComparedCase:
-    """Results of a case: flights of the chosen points, and the baselines."""
-    cells = {name: cell for cell, (name,) in enumerate(sweep.cells)}
-    flown = {
-        point.name: ContenderRuns(point, sweep.of_cell(done, cells[point.name]))
-        for point in chosen.values()
-    }
-    bought = {key: flown[point.name] for key, point in chosen.items()}
-    if beside.aboard:
-        alone = ContenderRuns(FlownContender(ABOARD, None, "", tuned=True, keys={}), beside.aboard)
-        bought |= {(ABOARD.name, budget): alone for budget in BUDGETS}
-    tuned = [each for each in plan.points if each.tuned and each.report in (EVERY, ITS_OWN)]
-    return ComparedCase(plan.case, bought, tuned, beside.floor)
-
-
-def ratio(ours: ContenderRuns, theirs: ContenderRuns) -> tuple[float, float, float] | None:
-    """Ratio of the mean RMSE xy of our contender to that of the other, and its 95 % interval, see
-    `jackknife`; computed for the logarithm, because a ratio is positive.
-
-    None if fewer than two seeds have flown in both.
-    """
-    errors = [
-        (one.rmse_xy, other.rmse_xy)
-        for one, other in zip(ours.runs, theirs.runs, strict=True)
-        if one.rmse_xy is not None and other.rmse_xy is not None
-    ]
-    if len(errors) < 2:
-        return None
-    value, half = jackknife(
-        lambda pairs: float(np.log(np.divide(*pairs.mean(axis=0)))), np.array(errors)
-    )
-    return math.exp(value), math.exp(value - half), math.exp(value + half)
-
-
-@dataclass(frozen=True, slots=True)
-class Judged:
-    claim: Claim
-    case: Case
-    ours: ContenderRuns
-    """Runs within the largest budget in which our contender sends no more than the claim allows."""
-    theirs: ContenderRuns
-    """Runs of the other contender within the largest budget."""
-    ratio: tuple[float, float, float] | None
-    """Ratio of the two mean RMSE xy, with its interval; None if too few flights succeeded."""
-    sparse: bool
-    """Whether our contender sends no more than the claim allows."""
-
-    @property
-    def medians(self) -> float | None:
-        """Ratio of the two median RMSE xy; None if one has no runs."""
-        ours, theirs = self.ours.median(), self.theirs.median()
-        return ours / theirs if ours and theirs else None
-
-    @property
-    def at_most(self) -> float | None:
-        """Largest claimed ratio; None if the claim says nothing about the case."""
-        return self.claim.at_most.get(self.case.name)
-
-    @property
-    def holds(self) -> bool | None:
-        """Whether the whole interval is below the claimed ratio; None without a claimed ratio."""
-        if self.at_most is None:
-            return None
-        return self.sparse and self.ratio is not None and self.ratio[2] <= self.at_most
-
-
-def judge(claim: Claim, compared: ComparedCase) -> Judged | None:
-    ours, theirs = compared.curve(claim.ours), compared.curve(claim.theirs)
-    if not (ours and theirs):
-        return None
-    most = claim.share * theirs[-1].mean(PACKETS)
-    within = [each for each in ours if each.mean(PACKETS) <= most]
-    chosen = within[-1] if within else ours[0]
-    return Judged(
-        claim, compared.case, chosen, theirs[-1], ratio(chosen, theirs[-1]), sparse=bool(within)
-    )
+from skytether.lab.engine.contenders import ABOARD, CASES, CONTENDERS, Contender
+from skytether.lab.engine.sweep import by_name
+from skytether.lab.pages import plates
+from skytether.lab.pages.plates import Plate
+from skytether.lab.pages.report import Drawn
 
 
 def draw(results: Sequence[ComparedCase]) -> Drawn:
@@ -293,27 +128,8 @@ def budgets_table(results: Sequence[ComparedCase]) -> Table:
 
 def _is_distinct(compared: ComparedCase, budget: float) -> bool:
     """Whether the flights tell which contenders are best within a budget."""
-    flown = sum(not math.isnan(each.mean(RMSE)) for each in _ranked(compared, budget))
+    flown = sum(not math.isnan(each.mean(RMSE)) for each in ranked(compared, budget))
     return flown < 2 or len(leading(compared, budget)) <= SIMILAR * flown
-
-
-def _ranked(compared: ComparedCase, budget: float) -> list[ContenderRuns]:
-    """Runs within a budget by mean RMSE xy; failed ones come last."""
-    flown = [runs for (_, within), runs in compared.bought.items() if within == budget]
-    return sorted(flown, key=lambda each: (math.isnan(each.mean(RMSE)), each.mean(RMSE)))
-
-
-def leading(compared: ComparedCase, budget: float) -> list[ContenderRuns]:
-    """Runs within a budget with the least mean RMSE xy, and those without a significant difference
-    from it.
-    """
-    ranked = _ranked(compared, budget)
-    return [
-        each
-        for each in ranked
-        if not math.isnan(each.mean(RMSE))
-        and (each is ranked[0] or ((of := ratio(each, ranked[0])) and of[1] <= 1.0))
-    ]
 
 
 def leaders_table(results: Sequence[ComparedCase]) -> Table:
@@ -325,7 +141,7 @@ def leaders_table(results: Sequence[ComparedCase]) -> Table:
                 ours = each.bought.get((name, budget))
                 others = [
                     runs
-                    for runs in _ranked(each, budget)
+                    for runs in ranked(each, budget)
                     if runs is not ours and runs.what.contender is not ABOARD
                 ]
                 if ours is not None and others:

@@ -16,8 +16,8 @@ import msgspec
 from msgspec.structs import astuple, replace
 
 from skytether.figures.tables import rows_csv, to_csv
-from skytether.lab.intervals import Estimate, interval
-from skytether.lab.journal import digests
+from skytether.lab.engine.intervals import Estimate, interval
+from skytether.lab.engine.journal import digests
 from skytether.shared.base import toml
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.scenario import reading

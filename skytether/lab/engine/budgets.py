@@ -1,7 +1,7 @@
 """Choice of thresholds and reporting policies for contenders, within budgets of packets.
 
 Each contender first flies scouting flights at several thresholds and reporting policies, with its
-weights (`lab.contenders`), on the seeds of the search. Near each budget of packets more thresholds
+weights (`contenders`), on the seeds of the search. Near each budget of packets more thresholds
 are tried, until the budget is almost used up. The choice with the smallest error within each budget
 then flies in the comparison.
 """
@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from msgspec.structs import replace
 
-from skytether.lab.contenders import (
+from skytether.lab.engine.contenders import (
     SEARCH_SEED,
     Case,
     ComparisonSize,
@@ -23,7 +23,7 @@ from skytether.lab.contenders import (
     differences,
     tuned,
 )
-from skytether.lab.sweep import GridAxis, Results, Sweep
+from skytether.lab.engine.sweep import GridAxis, Results, Sweep
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.dotted import value
 from skytether.shared.scenario.whole import Scenario

@@ -10,11 +10,9 @@ from typing import Any
 from msgspec.structs import asdict
 
 from skytether.figures.page import Facts, Row, Table, as_text, rendered, table_of
-from skytether.lab import plates
-from skytether.lab.calibration import within
-from skytether.lab.intervals import Estimate
-from skytether.lab.plates import Plate, Samples
-from skytether.lab.studies import (
+from skytether.lab.engine.calibration import within
+from skytether.lab.engine.intervals import Estimate
+from skytether.lab.engine.studies import (
     EVENT,
     EVERY,
     PERIODIC,
@@ -27,7 +25,9 @@ from skytether.lab.studies import (
     periodic_wins,
     table_1,
 )
-from skytether.lab.sweep import by_name
+from skytether.lab.engine.sweep import by_name
+from skytether.lab.pages import plates
+from skytether.lab.pages.plates import Plate, Samples
 from skytether.shared.law.model import Array
 from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import Record

@@ -26,9 +26,9 @@ from skytether.client.clamp import clamped
 from skytether.client.followers import Constants, SplineFollower
 from skytether.client.navigation import Navigation
 from skytether.client.simulated.vehicle import simulated
-from skytether.lab.budgets import Plan
-from skytether.lab.contenders import BESIDE, REGULATED
-from skytether.lab.journal import digests
+from skytether.lab.engine.budgets import Plan
+from skytether.lab.engine.contenders import BESIDE, REGULATED
+from skytether.lab.engine.journal import digests
 from skytether.shared.law.model import Array, white_acceleration
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.gain import regulator

@@ -22,7 +22,7 @@ import msgspec
 import numpy as np
 from msgspec.structs import replace
 
-from skytether.lab.intervals import interval, jackknife
+from skytether.lab.engine.intervals import interval, jackknife
 from skytether.shared.law.model import Array
 from skytether.shared.scenario.grammar import leaves
 from skytether.shared.scenario.registry import PERIOD_MAX, TRIGGERS
