@@ -12,10 +12,12 @@ from fuzz.texts import Text
 from skytether.shared.telemetry import feed
 from skytether.shared.telemetry.feed import FeedError, Frame, Opened, Reader
 from skytether.shared.telemetry.record import DOWNLINK, UPLINK
-from skytether.view import recording, rows, state
+from skytether.view import rows
 from skytether.view.frames import of_flight
-from skytether.view.recording import About, Recording
-from skytether.view.state import State
+from skytether.view.page import state
+from skytether.view.page.state import State
+from skytether.view.recordings import recording
+from skytether.view.recordings.recording import About, Recording
 
 PIECES = 3
 """Number of pieces into which a feed is split."""

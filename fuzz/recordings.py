@@ -30,11 +30,12 @@ from skytether.shared.base.errors import RecordingError
 from skytether.shared.telemetry import feed
 from skytether.shared.telemetry import summary as summaries
 from skytether.shared.telemetry.summary import summarise
-from skytether.view import container, export, recorded, rows
-from skytether.view.joining import join
-from skytether.view.recorded import read
-from skytether.view.recording import BEGUN, FEED
-from skytether.view.report import page
+from skytether.view import rows
+from skytether.view.recordings import container, export, recorded
+from skytether.view.recordings.joining import join
+from skytether.view.recordings.recorded import read
+from skytether.view.recordings.recording import BEGUN, FEED
+from skytether.view.recordings.report import page
 
 REPORTED = 50
 """One in REPORTED readable recordings is also drawn, because drawing is slow."""

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from helpers import PATIENCE_S
-from skytether.view.words import FLOWN_S
+from skytether.view.page.words import FLOWN_S
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Locator, Page

@@ -86,7 +86,7 @@ COMMANDS_IN_GROUPS = {
         "client [SCENARIO]": ("a vehicle", "skytether.client.__main__:fly"),
         "page FOLDER...": (
             "the page of flights of other commands",
-            "skytether.view.__main__:show",
+            "skytether.view.browser.__main__:show",
         ),
         "keygen FILE": (
             "keys for vehicles, so that nobody else can fly them",

@@ -14,9 +14,9 @@ from skytether.shell.commandline import command
 from skytether.shell.commandline.argument import Argument
 from skytether.shell.commandline.command import CONFIGURATION, CommandError
 from skytether.shell.commandline.options import read
-from skytether.view import export as view
-from skytether.view import traffic
-from skytether.view.recorded import Recorded
+from skytether.view.recordings import export as view
+from skytether.view.recordings import traffic
+from skytether.view.recordings.recorded import Recorded
 
 
 @dataclass(frozen=True)

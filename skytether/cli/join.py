@@ -12,7 +12,7 @@ from skytether.shared.base import files
 from skytether.shell.commandline import command
 from skytether.shell.commandline.argument import Argument
 from skytether.shell.commandline.options import read
-from skytether.view.joining import join as joined
+from skytether.view.recordings.joining import join as joined
 
 
 @dataclass(frozen=True)

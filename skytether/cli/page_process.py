@@ -43,7 +43,7 @@ def beside(folders: Sequence[Path], at: str) -> Iterator[None]:
     """Serve a page of flights at HOST:PORT during the block; print its address or why it failed."""
     arguments = [*map(str, folders), "--page", at, "--log", "json", *plugins.flags()]
     child = subprocess.Popen(
-        [sys.executable, "-P", "-m", "skytether.view", *arguments],
+        [sys.executable, "-P", "-m", "skytether.view.browser", *arguments],
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         stdin=subprocess.DEVNULL,

@@ -23,7 +23,7 @@ from skytether.shell.commandline.command import CommandError
 from skytether.shell.driving.feed import Subscriber
 from skytether.shell.processes.recorder_process import RecorderOrder
 from skytether.view.frames import of_flight
-from skytether.view.recording import About, Recording
+from skytether.view.recordings.recording import About, Recording
 
 FLUSH_S = 0.25
 """Interval at which new frames are written [s]; a killed process loses at most this much."""

@@ -4,7 +4,7 @@ from pathlib import Path
 
 from skytether.cli.page_process import say
 from skytether.shell.commandline.command import CONFIGURATION, CommandError
-from skytether.view.recorded import Recorded, read
+from skytether.view.recordings.recorded import Recorded, read
 
 
 def opened(path: Path) -> Recorded:

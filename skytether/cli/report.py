@@ -13,7 +13,7 @@ from skytether.shell.commandline import command, terminal
 from skytether.shell.commandline.argument import Argument
 from skytether.shell.commandline.command import CommandError
 from skytether.shell.commandline.options import read
-from skytether.view.report import page
+from skytether.view.recordings.report import page
 
 
 @dataclass(frozen=True)

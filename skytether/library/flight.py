@@ -194,7 +194,7 @@ class Flight:
             OSError: the file cannot be read.
             RecordingError: the file is not a recording, or damaged.
         """
-        from skytether.view.recorded import read
+        from skytether.view.recordings.recorded import read
 
         events: list[FlightEvent] = []
         figures: dict[str, Any] = {}

@@ -20,8 +20,8 @@ from skytether.shared.telemetry.summary import summarise
 from skytether.shell.commandline import command
 from skytether.sim import flight
 from skytether.view.frames import of_flight
-from skytether.view.recorded import read
-from skytether.view.recording import Recording
+from skytether.view.recordings.recorded import read
+from skytether.view.recordings.recording import Recording
 from warm import Process
 
 SCENARIO = msgspec.structs.replace(reading.load("demo"), duration=5.0, settle=3.0)

@@ -24,7 +24,7 @@ from skytether.shared.wire import handshake, protocol
 from skytether.shared.wire.drop import Drop
 from skytether.shared.wire.protocol import decode
 from skytether.shell.processes import log
-from skytether.view import container
+from skytether.view.recordings import container
 
 COUNTS = {
     "decoder": 4_000,

@@ -44,7 +44,7 @@ from skytether.shell.driving.control import answer_of
 from skytether.shell.host.udp import leads_back
 from skytether.shell.processes.metrics import families
 from skytether.shell.processes.process import Process
-from skytether.view import traffic
+from skytether.view.recordings import traffic
 from skytether.view.rows import readable
 
 ROOT = Path(__file__).parents[2]

@@ -19,8 +19,8 @@ from skytether.shared.telemetry.record import FlightEvent, Record
 from skytether.shared.telemetry.summary import summarise
 from skytether.shell.commandline import command
 from skytether.sim.flight import SERVER, fly
-from skytether.view.outcome import Outcome, listed
-from skytether.view.recorded import read
+from skytether.view.recordings.outcome import Outcome, listed
+from skytether.view.recordings.recorded import read
 
 DIED_S, HEALED_S, STOPPED_S = 20.0, 35.0, 9.0
 

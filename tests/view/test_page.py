@@ -26,13 +26,14 @@ from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.feed import Opened, Said
 from skytether.shell.commandline.command import CommandError
 from skytether.sim import flight as virtual
-from skytether.view import plots
 from skytether.view.browser import panel, serve
 from skytether.view.browser.access import Visitor, is_loopback, may_play
 from skytether.view.browser.flight import PageFlight
 from skytether.view.browser.page import stop
 from skytether.view.browser.replay import Player
-from skytether.view.controls import (
+from skytether.view.frames import of_flight
+from skytether.view.page import plots
+from skytether.view.page.controls import (
     THRESHOLDS,
     TRIGGERS,
     applied,
@@ -42,10 +43,9 @@ from skytether.view.controls import (
     knobs,
     triggers,
 )
-from skytether.view.frames import of_flight
-from skytether.view.report import with_gaps
-from skytether.view.scene import extent, fence, grid, home, quadrotor, segments
-from skytether.view.state import Curves, State, VehicleTrack
+from skytether.view.page.scene import extent, fence, grid, home, quadrotor, segments
+from skytether.view.page.state import Curves, State, VehicleTrack
+from skytether.view.recordings.report import with_gaps
 
 HERE = {"Host": "127.0.0.1:8080", "Origin": "http://127.0.0.1:8080"}
 

@@ -9,9 +9,9 @@ from skytether.shared.endpoints.ways import FLIGHT, RELAY, RUN, Ways
 from skytether.shared.events.flight import Changed
 from skytether.shared.scenario import reading
 from skytether.shared.telemetry.feed import Figures, Opened, Said
-from skytether.view import words
-from skytether.view.plots import of_link
-from skytether.view.state import State
+from skytether.view.page import words
+from skytether.view.page.plots import of_link
+from skytether.view.page.state import State
 
 
 @pytest.mark.parametrize("ways", [RELAY, RUN, FLIGHT])

@@ -29,12 +29,12 @@ from skytether.shared.telemetry.record import (
 from skytether.shared.telemetry.summary import summarise
 from skytether.shared.wire.protocol import Mode
 from skytether.sim import flight
-from skytether.view import changes, plots, scene, words
-from skytether.view.changes import Mark
 from skytether.view.frames import of_flight
-from skytether.view.network import BINS, DELAY_BINS, SPAN_S
+from skytether.view.page import changes, plots, scene, words
+from skytether.view.page.changes import Mark
+from skytether.view.page.network import BINS, DELAY_BINS, SPAN_S
+from skytether.view.page.state import SAID_MAX, SLOTS_MAX, VEHICLES_MAX, State
 from skytether.view.rows import planned
-from skytether.view.state import SAID_MAX, SLOTS_MAX, VEHICLES_MAX, State
 
 
 @dataclass(frozen=True)

@@ -51,11 +51,11 @@ from skytether.shared.telemetry.summary import Summary, summarise
 from skytether.shell.commandline import command
 from skytether.shell.processes.log import Log
 from skytether.sim import flight
-from skytether.view import container, recorded
-from skytether.view import report as view_report
 from skytether.view.frames import Timed, of_flight
-from skytether.view.recorded import read
-from skytether.view.recording import VEHICLES_MAX, Recording
+from skytether.view.recordings import container, recorded
+from skytether.view.recordings import report as view_report
+from skytether.view.recordings.recorded import read
+from skytether.view.recordings.recording import VEHICLES_MAX, Recording
 from skytether.view.rows import RowTable, planned
 from virtual_loop import AtJoin
 
@@ -518,7 +518,8 @@ def test_without_its_checksum_a_changed_number_would_be_believed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(
-        "skytether.view.recording.Writer", partial(Writer, compression=CompressionType.NONE)
+        "skytether.view.recordings.recording.Writer",
+        partial(Writer, compression=CompressionType.NONE),
     )
     path = record(tmp_path / "it.mcap")
     row = flown().client[7].tobytes()

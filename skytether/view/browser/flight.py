@@ -12,10 +12,10 @@ from skytether.shared.endpoints.change import ONCE, Answer
 from skytether.shared.events.flight import Changed
 from skytether.shared.telemetry.feed import Frame, Opened, Said
 from skytether.shell.host.compiling import progress
-from skytether.view import controls
 from skytether.view.browser.play import NETEMS, PROCESSES, Operator
-from skytether.view.changes import Mark, mark, together
-from skytether.view.state import LED, State
+from skytether.view.page import controls
+from skytether.view.page.changes import Mark, mark, together
+from skytether.view.page.state import LED, State
 
 FINAL = {*ONCE, "armed"}
 """Keys whose changes are not taken back: decisions for once, and what may end a flight."""

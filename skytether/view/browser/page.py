@@ -18,7 +18,7 @@ from skytether.view.browser.access import TurnedAway, knows, may_play
 from skytether.view.browser.flight import PageFlight
 from skytether.view.browser.guard import Guard, visitor
 from skytether.view.browser.panel import More, Panel
-from skytether.view.scene import Scene
+from skytether.view.page.scene import Scene
 
 MOVES_HZ = 25
 MOVES_TO_A_DRAWING = 5

@@ -14,11 +14,11 @@ import viser
 from numpy.typing import NDArray
 
 from skytether.shared.missions.mission import format_goals, parse_goals
-from skytether.view import words
 from skytether.view.browser.flight import PageFlight
 from skytether.view.browser.play import NETEMS
-from skytether.view.changes import together
-from skytether.view.controls import (
+from skytether.view.page import words
+from skytether.view.page.changes import together
+from skytether.view.page.controls import (
     THRESHOLDS,
     WAYS,
     Knob,
@@ -29,9 +29,9 @@ from skytether.view.controls import (
     texts,
     triggers,
 )
-from skytether.view.plots import POINTS, Look, Plots, more, of_flight, of_link
-from skytether.view.scene import GROUND_RGB, WIDE, Scene, in_space
-from skytether.view.state import GUIDED, LED, ZONED, VehicleTrack
+from skytether.view.page.plots import POINTS, Look, Plots, more, of_flight, of_link
+from skytether.view.page.scene import GROUND_RGB, WIDE, Scene, in_space
+from skytether.view.page.state import GUIDED, LED, ZONED, VehicleTrack
 
 HELD_S = 1.5
 """Time for which a slider stays where the user has put it [s]."""

@@ -14,8 +14,8 @@ from skytether.shared.telemetry.feed import Frame, Opened
 from skytether.view.browser.flight import PageFlight
 from skytether.view.browser.panel import assign
 from skytether.view.frames import Timed
-from skytether.view.network import SPAN_S
-from skytether.view.state import State
+from skytether.view.page.network import SPAN_S
+from skytether.view.page.state import State
 
 TICK_S = 0.04
 """Time between two batches of frames."""

@@ -1,7 +1,7 @@
 """Recordings: a flight as an MCAP file, for Skytether and for other programs.
 
 The frames of the flight's processes are written as they come from their feeds, encoded as msgpack
-(`shared.telemetry.feed`); only they are read back, by `view.recorded`:
+(`shared.telemetry.feed`); only they are read back, by `recorded`:
 
     /recording           facts about the recording, a `Begun`; the first message
     /feed/PROCESS        frames of a process
@@ -45,8 +45,9 @@ from skytether.shared.telemetry import feed
 from skytether.shared.telemetry.feed import Figures, Frame, Opened, Rows, Said, columns_of
 from skytether.shared.telemetry.record import Rows as Table
 from skytether.shared.telemetry.summary import Summary
-from skytether.view import foxglove, rows
-from skytether.view.container import COPY, COPY_OF, ENCODING
+from skytether.view import rows
+from skytether.view.recordings import foxglove
+from skytether.view.recordings.container import COPY, COPY_OF, ENCODING
 
 BEGUN, FEED = "/recording", "/feed/"
 """Topic of the first message, and the prefix of the topics of frames."""

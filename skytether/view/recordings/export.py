@@ -19,7 +19,7 @@ from skytether.shared.law.model import Array
 from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import Rows
 from skytether.shared.telemetry.summary import position_error
-from skytether.view.recorded import Recorded
+from skytether.view.recordings.recorded import Recorded
 from skytether.view.rows import Columns, readable
 
 PASSES_NS = ("age_ns", "solve_ns", "delay_ns")

@@ -44,9 +44,9 @@ from skytether.shared.telemetry.record import DOWNLINK, UPLINK, Reason, SentBy, 
 from skytether.shared.telemetry.record import Rows as Table
 from skytether.shared.wire.framing import PATHS_MAX
 from skytether.shared.wire.protocol import Mode
-from skytether.view.changes import Mark, mark, together
-from skytether.view.controls import WAYS
-from skytether.view.network import BIN_NS, BINS, DIRECTIONS, SPAN_S, Network
+from skytether.view.page.changes import Mark, mark, together
+from skytether.view.page.controls import WAYS
+from skytether.view.page.network import BIN_NS, BINS, DIRECTIONS, SPAN_S, Network
 from skytether.view.rows import check_columns, check_values, planned
 
 SLOTS_MAX = 1200

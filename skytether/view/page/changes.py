@@ -13,7 +13,7 @@ import msgspec
 from skytether.shared.events.flight import Changed
 from skytether.shared.scenario.grammar import GrammarError, calls
 from skytether.shared.scenario.rooms import TEXTS
-from skytether.view.controls import LOST, THRESHOLDS, WAYS, applied, knobs
+from skytether.view.page.controls import LOST, THRESHOLDS, WAYS, applied, knobs
 
 KNOBS = (*knobs(3), *THRESHOLDS)
 DIRECTIONS = dict(zip(WAYS, ("up", "down"), strict=True))

@@ -15,7 +15,7 @@ from skytether.shared.law.model import Array
 from skytether.shared.missions.mission import Mission
 from skytether.shared.missions.zones import Zones
 from skytether.shared.scenario.whole import Scenario
-from skytether.view.state import State, VehicleTrack
+from skytether.view.page.state import State, VehicleTrack
 
 FLIGHT_RGB: tuple[Rgb, ...] = ((56, 132, 255), (255, 140, 40), (160, 90, 220), (20, 170, 150))
 """Colours of flights, by their place on the page."""

@@ -28,8 +28,8 @@ from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import Rows, compared
 from skytether.shared.telemetry.summary import Summary, desired, position_error
 from skytether.shared.wire.protocol import NO_HORIZON, Mode
-from skytether.view.outcome import Outcome, listed, spans
-from skytether.view.recorded import Recorded
+from skytether.view.recordings.outcome import Outcome, listed, spans
+from skytether.view.recordings.recorded import Recorded
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

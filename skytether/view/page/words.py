@@ -11,8 +11,8 @@ from skytether.figures.colours import css
 from skytether.shared.base.units import MILLISECOND_NS
 from skytether.shared.telemetry.record import UPLINK
 from skytether.shared.telemetry.summary import PLUGINS
-from skytether.view.scene import FENCE_RGB, FLIGHT_RGB, GOAL_RGB
-from skytether.view.state import LOSS_S, Heard, State, Word, figure, group
+from skytether.view.page.scene import FENCE_RGB, FLIGHT_RGB, GOAL_RGB
+from skytether.view.page.state import LOSS_S, Heard, State, Word, figure, group
 
 CSS = {
     "grey": "var(--mantine-color-gray-6)",

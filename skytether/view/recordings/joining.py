@@ -24,8 +24,8 @@ from skytether.shared.scenario.reading import check, to_table
 from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.feed import Frame, Rows
 from skytether.shared.telemetry.record import Rows as Table
-from skytether.view.recorded import Recorded, summary_of
-from skytether.view.recording import Recording
+from skytether.view.recordings.recorded import Recorded, summary_of
+from skytether.view.recordings.recording import Recording
 
 OWNERS = {"client": Owner.VEHICLE, "server": Owner.SERVER, "netem": Owner.NETEM}
 """Owner of keys by part of the record: a key's value is taken from the recording with that part."""

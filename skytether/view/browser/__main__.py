@@ -1,11 +1,11 @@
-"""`python -m skytether.view`: the page as a process."""
+"""`python -m skytether.view.browser`: the page as a process."""
 
 import sys
 
 from skytether.shell.commandline.start import run
 
 if __name__ == "__main__":  # called before the slow imports below
-    sys.exit(run("skytether.view.__main__:show", "page"))
+    sys.exit(run("skytether.view.browser.__main__:show", "page"))
 
 from collections.abc import Sequence
 from contextlib import ExitStack

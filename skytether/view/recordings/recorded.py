@@ -1,7 +1,7 @@
 """Reader of recordings: a flight's frames, and their rows, bit for bit.
 
-A file is not trusted: `view.container` bounds time and memory, and frames that no flight of the
-scenario can have are refused.
+A file is not trusted: `container` bounds time and memory, and frames that no flight of the scenario
+can have are refused.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -27,9 +27,9 @@ from skytether.shared.telemetry import drops, feed
 from skytether.shared.telemetry.feed import Figures, Frame, Opened, Rows, Said, columns_of
 from skytether.shared.telemetry.record import Rows as Table
 from skytether.shared.telemetry.summary import Summary, summarise
-from skytether.view.container import Container, reading
 from skytether.view.frames import Timed
-from skytether.view.recording import BEGUN, FEED, About, Begun
+from skytether.view.recordings.container import Container, reading
+from skytether.view.recordings.recording import BEGUN, FEED, About, Begun
 from skytether.view.rows import check_columns, check_values
 
 SPAN_NS_MAX = 40 * 86_400 * SECOND_NS

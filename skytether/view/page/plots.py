@@ -13,10 +13,10 @@ from skytether.figures.colours import AMBER, BLUE, GREEN, MODE_COLOURS, PALETTE,
 from skytether.shared.base.units import MILLISECOND_NS
 from skytether.shared.law.model import Array
 from skytether.shared.telemetry.record import DOWNLINK, UPLINK
-from skytether.view.changes import Mark
-from skytether.view.network import DELAY_BIN_NS, DELAY_BINS, SPAN_S, Network
-from skytether.view.scene import FLIGHT_RGB
-from skytether.view.state import Curves, State
+from skytether.view.page.changes import Mark
+from skytether.view.page.network import DELAY_BIN_NS, DELAY_BINS, SPAN_S, Network
+from skytether.view.page.scene import FLIGHT_RGB
+from skytether.view.page.state import Curves, State
 
 POINTS = 400
 SEEN = 4.0

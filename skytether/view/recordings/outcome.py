@@ -40,7 +40,7 @@ from skytether.shared.missions.events import LeftMotion, LeftTube
 from skytether.shared.telemetry.record import Rows
 from skytether.shared.telemetry.summary import Track, nearest, position_error, track
 from skytether.shared.wire.protocol import Mode
-from skytether.view.recorded import Recorded
+from skytether.view.recordings.recorded import Recorded
 
 TOLD = (
     *(HostMissing, HostFound, PathMissing, PathDied, PathHealed, LeaderChanged, ModeChanged),
