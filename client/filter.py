@@ -26,6 +26,7 @@ import numpy as np
 from skytether.client.vehicle import Measurement
 from skytether.shared.base.compilable import Numbers, Table, compilable
 from skytether.shared.law.model import Array, Axis, advance, white_acceleration
+from skytether.shared.scenario import rooms
 from skytether.shared.scenario.schema import Scenario
 
 DRIFT = 0.3
@@ -171,7 +172,9 @@ class Kalman:
             [(np.zeros(axes), None)] * delay, delay + 1
         )
         """Inputs of the steps from there to the present, see `advance` [m/s]."""
-        self._late = np.array([dead_time.late for dead_time in terms.dead_times])
+        self._late = np.zeros((axes, 2))
+        if any(terms.dead_time_s):
+            self._late[:] = [each.late for each in rooms.dead_time().dead_times(terms)]
 
     def begin(self, measured: Measurement, numbers: Array) -> None:
         """Start from the first measurement, which has a position; the vehicle is at rest.

@@ -4,8 +4,8 @@ from typing import Any
 
 from skytether.client import positions
 from skytether.client.mavlink.keys import MavlinkConfig
-from skytether.client.navigation import Plane, Slides
 from skytether.client.positions import Vector
+from skytether.client.slides import Plane, Slides
 from skytether.mavlink.codec import Message
 from skytether.mavlink.frames import turned
 from skytether.shared.base.units import MILLISECOND_NS

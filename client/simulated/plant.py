@@ -6,12 +6,14 @@
 Every part is discretised exactly, including the dead time (`shared.law.dead_time`).
 """
 
+from typing import Any
+
 import numpy as np
 
 from skytether.client.simulated.weather import Weather
 from skytether.shared.base.compilable import Numbers, Table, compilable
-from skytether.shared.law.dead_time import PendingInputs, dead_time
 from skytether.shared.law.model import Array, Axis, advance, discretise
+from skytether.shared.scenario import rooms
 from skytether.shared.scenario.schema import Scenario, VehicleConfig
 
 
@@ -39,13 +41,16 @@ class FirstOrderPlant:
         tau, late_s = scenario.true_tau_s, scenario.true_dead_time_s.tolist()
         model = discretise(tau, scenario.control.dt)
         self._model, self._gain = np.stack(model, -1), scenario.true_gain
-        late = [
-            dead_time(*theta_s, scenario.dt_ns)
-            for theta_s in zip(tau.tolist(), late_s, strict=True)
-        ]
-        self._late = np.array([each.late for each in late])
-        self._inputs = PendingInputs(model.axes(), late) if any(late_s) else None
-        """Inputs that do not act yet; None without a dead time."""
+        self._inputs: Any = None
+        """`PendingInputs` that do not act yet; None without a dead time."""
+        if any(late_s):
+            dead_time = rooms.dead_time()
+            late = [
+                dead_time.dead_time(*theta_s, scenario.dt_ns)
+                for theta_s in zip(tau.tolist(), late_s, strict=True)
+            ]
+            self._late = np.array([each.late for each in late])
+            self._inputs = dead_time.PendingInputs(model.axes(), late)
         self.weather = weather
         self.x = np.zeros((len(tau), 2))
         """Present position [m] and velocity [m/s], in the world frame; shape (axes, 2)."""

@@ -23,6 +23,7 @@ import numpy as np
 
 from skytether.shared.base.units import SECOND_NS, seconds_to_ns
 from skytether.shared.law.model import Array, Axis, advance, discretise
+from skytether.shared.law.terms import Terms
 
 
 class DeadTime(NamedTuple):
@@ -42,6 +43,11 @@ def dead_time(tau_s: float, dead_time_s: float, dt_ns: int, gain: float = 1.0) -
     times_s = (dt_ns / SECOND_NS, (dt_ns - rest_ns) / SECOND_NS, rest_ns / SECOND_NS)
     whole, after, rest = (discretise([tau_s], time_s, gain).axes()[0] for time_s in times_s)
     return DeadTime(steps, rest, (whole.b0 - after.b0, whole.b1 - after.b1))
+
+
+def dead_times(terms: Terms) -> list[DeadTime]:
+    axes = zip(terms.tau_s, terms.dead_time_s, terms.gain, strict=True)
+    return [dead_time(tau_s, late_s, terms.dt_ns, gain) for tau_s, late_s, gain in axes]
 
 
 class PendingInputs:

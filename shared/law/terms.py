@@ -10,7 +10,6 @@ from typing import NamedTuple
 import msgspec
 
 from skytether.shared.base.units import SECOND_NS, seconds_to_ns
-from skytether.shared.law.dead_time import DeadTime, dead_time
 from skytether.shared.law.model import Model, discretise
 
 
@@ -97,11 +96,6 @@ class Terms(NamedTuple):
     @property
     def model(self) -> Model:
         return discretise(self.tau_s, self.dt_s, self.gain)
-
-    @property
-    def dead_times(self) -> list[DeadTime]:
-        axes = zip(self.tau_s, self.dead_time_s, self.gain, strict=True)
-        return [dead_time(tau_s, late_s, self.dt_ns, gain) for tau_s, late_s, gain in axes]
 
     @property
     def indexed(self) -> bool:

@@ -77,6 +77,11 @@ def sections() -> dict[str, Any]:
     return found
 
 
+def dead_time() -> Any:
+    """Module of what a model with a dead time needs."""
+    return load(f"{SHARED}law.dead_time", "model.dead_time_s")
+
+
 def trigger(control: Any, capacity: int) -> Any:
     """See `server.triggers.trigger.make_trigger`."""
     made = load("skytether.server.triggers.trigger", "control.trigger")

@@ -35,75 +35,47 @@ RECORDING = ".mcap"
 class Reason(IntEnum):
     """Why a vehicle is in its mode, see `client.failsafe`."""
 
-    BEGUN = 0
-    OPENED = 1
-    GOOD = 2
-    UNARMED = 3
-    HORIZON = 4
-    OLD = 5
-    ENDED = 6
-    LOST = 7
-    CLOSED = 8
-    RESTARTED = 9
-    LATE = 10
-    MALFORMED = 11
-    RESYNC = 12
-    STALLED = 13
-    BRAKED = 14
-    ALONE = 15
-    NOT_FINITE = 16
-    LEAPT = 17
-    TAKEN = 18
-    DISARMED = 19
-    RETURNED = 20
-    BATTERY = 21
-    ASTRAY = 22
-    MUTE = 23
-    WAITED = 24
-    RESUMED = 25
-    HOMEWARD = 26
-    RIVAL = 27
-    STRAYED = 28
-    UNUSABLE = 29
-    OVER = 30
+    def __new__(cls, number: int, text: str = "") -> "Reason":
+        made = int.__new__(cls, number)
+        made._value_, made.text = number, text
+        return made
+
+    text: str
+
+    BEGUN = 0, "it has just begun"
+    OPENED = 1, "its session is open"
+    GOOD = 2, "the link has been good for a second"
+    UNARMED = 3, "it is not armed"
+    HORIZON = 4, "a horizon has come"
+    OLD = 5, "no newer horizon has arrived"
+    ENDED = 6, "its plan has ended"
+    LOST = 7, "the server is silent"
+    CLOSED = 8, "the server has closed the session"
+    RESTARTED = 9, "the server has restarted"
+    LATE = 10, "horizons arrive too late"
+    MALFORMED = 11, "the server sends malformed messages"
+    RESYNC = 12, "the server sends horizons from the future"
+    STALLED = 13, "its own computer woke it too late"
+    BRAKED = 14, "it has braked"
+    ALONE = 15, "the server has been silent for long"
+    NOT_FINITE = 16, "its state or its input is not finite"
+    LEAPT = 17, "its state has jumped further than a vehicle can move"
+    TAKEN = 18, "a pilot, or its autopilot, has taken over"
+    DISARMED = 19, "its motors are disarmed"
+    RETURNED = 20, "its autopilot follows commands again"
+    BATTERY = 21, "its battery is low"
+    ASTRAY = 22, "its autopilot has no position estimate"
+    MUTE = 23, "its autopilot or robot is silent"
+    WAITED = 24, "it has waited too long"
+    RESUMED = 25, "its process has restarted, and it continues its motion"
+    HOMEWARD = 26, "the server has been silent for long"
+    RIVAL = 27, "somebody else commands it too"
+    STRAYED = 28, "it does not follow its commands"
+    UNUSABLE = 29, "its measured positions cannot be used"
+    OVER = 30, "its flight is over"
 
     def __str__(self) -> str:
-        return REASON_TEXTS[self]
-
-
-REASON_TEXTS = {
-    Reason.BEGUN: "it has just begun",
-    Reason.OPENED: "its session is open",
-    Reason.GOOD: "the link has been good for a second",
-    Reason.UNARMED: "it is not armed",
-    Reason.HORIZON: "a horizon has come",
-    Reason.OLD: "no newer horizon has arrived",
-    Reason.ENDED: "its plan has ended",
-    Reason.LOST: "the server is silent",
-    Reason.CLOSED: "the server has closed the session",
-    Reason.RESTARTED: "the server has restarted",
-    Reason.LATE: "horizons arrive too late",
-    Reason.MALFORMED: "the server sends malformed messages",
-    Reason.RESYNC: "the server sends horizons from the future",
-    Reason.STALLED: "its own computer woke it too late",
-    Reason.BRAKED: "it has braked",
-    Reason.ALONE: "the server has been silent for long",
-    Reason.NOT_FINITE: "its state or its input is not finite",
-    Reason.LEAPT: "its state has jumped further than a vehicle can move",
-    Reason.TAKEN: "a pilot, or its autopilot, has taken over",
-    Reason.DISARMED: "its motors are disarmed",
-    Reason.RETURNED: "its autopilot follows commands again",
-    Reason.BATTERY: "its battery is low",
-    Reason.ASTRAY: "its autopilot has no position estimate",
-    Reason.MUTE: "its autopilot or robot is silent",
-    Reason.HOMEWARD: "the server has been silent for long",
-    Reason.RIVAL: "somebody else commands it too",
-    Reason.STRAYED: "it does not follow its commands",
-    Reason.WAITED: "it has waited too long",
-    Reason.RESUMED: "its process has restarted, and it continues its motion",
-    Reason.UNUSABLE: "its measured positions cannot be used",
-    Reason.OVER: "its flight is over",
-}
+        return self.text
 
 
 class Compared(IntEnum):

@@ -14,7 +14,7 @@ from skytether.client.simulated.plant import FirstOrderPlant
 from skytether.client.simulated.vehicle import simulated
 from skytether.client.simulated.weather import Weather
 from skytether.shared.base.chance import stream
-from skytether.shared.law.dead_time import PendingInputs
+from skytether.shared.law.dead_time import PendingInputs, dead_times
 from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import Record
 from skytether.shared.telemetry.summary import Summary, summarise
@@ -73,7 +73,7 @@ def test_what_the_next_input_meets_obeys_eq_4_without_dead_time(
     )
     terms = known.terms()
     plant = FirstOrderPlant(known, Weather(known, stream(0, "wind")))
-    on_their_way = PendingInputs(terms.model.axes(), terms.dead_times)
+    on_their_way = PendingInputs(terms.model.axes(), dead_times(terms))
     wind = np.array(wind_mps)
     met, states = on_their_way.predict(plant.state(), wind), []
     for u in np.random.default_rng(seed).uniform(-3.0, 3.0, (40, 2)):

@@ -11,7 +11,7 @@ from bench.autopilots import MODELS
 from skytether.autopilot.faults import SHIFT
 from skytether.autopilot.flavours import FlavourName
 from skytether.client.mavlink.receiver import LOST_NS
-from skytether.client.navigation import LAG_S, SLID_M, Slides
+from skytether.client.slides import LAG_S, SLID_M, Slides
 from skytether.shared.events.flight import StateLeapt
 from skytether.shared.telemetry.record import Reason
 from skytether.shared.wire.protocol import Mode

@@ -1,0 +1,110 @@
+"""Slides: the position moves, and the receiver's velocity says that it does not.
+
+Where the receiver's position shifts by some metres, as when a correction arrives, the
+autopilot's estimate slides there within 2 to 5 s, and its velocity bends so that both agree.
+The receiver measures its own velocity by other means, which does not follow. With that g
+
+    o(t) = position(t) - ∫ g dt      slides if |o(t) - o(t - SLIDE_NS)| > SLID_M + LAG_S |Δg|
+
+where Δg is the change of g in that time: a fix is reported late. Once a slide is found it is
+measured for FOLLOWED_NS more, from where it began.
+"""
+
+import math
+from collections import deque
+from typing import NamedTuple
+
+from skytether.shared.base.units import SECOND_NS
+
+SLIDE_NS, SLID_M = 5 * SECOND_NS, 1.5
+"""Time within which a slide is noticed, and the least one [m]."""
+LAG_S = 0.3
+"""Largest delay of a fix of the receiver behind the autopilot's estimate."""
+FOLLOWED_NS = 5 * SECOND_NS
+"""Time for which a slide is measured after it was noticed."""
+STEP_NS, STEP_M = SECOND_NS, 0.3
+"""Least time, and least displacement [m], between two results of that."""
+FIX_GAP_NS = SECOND_NS
+"""Longest time between two fixes over which the receiver's velocity is integrated."""
+OFFSETS_MAX = 128
+
+Plane = tuple[float, float]
+"""North and east."""
+
+
+class Offset(NamedTuple):
+    """Position minus the distance travelled, at one fix."""
+
+    stamp_ns: int
+    velocity: Plane
+    offset_m: Plane
+
+
+class Slide(NamedTuple):
+    by_m: Plane
+    """Displacement of the position since the last one that was returned [m]."""
+    begins: bool
+
+
+class Slides:
+    """Detector of the slides of one vehicle."""
+
+    def __init__(self) -> None:
+        self._past: deque[Offset] = deque(maxlen=OFFSETS_MAX)
+        """Offsets of the last SLIDE_NS, or that from which a slide is measured."""
+        self._travelled: Plane = (0.0, 0.0)
+        self._velocity: Plane = (0.0, 0.0)
+        self._stamp_ns = -FIX_GAP_NS
+        self._until_ns: int | None = None
+        """Time until which a slide is measured; None without one."""
+        self._next_ns = 0
+
+    def begin(self) -> None:
+        """Start again: the origin has changed, or fixes were missing."""
+        self._past.clear()
+        self._until_ns = None
+
+    def slid(self, place: Plane, velocity: Plane, stamp_ns: int) -> Slide | None:
+        """Slide that is to be subtracted from the position from now on; None without one.
+
+        Args:
+            place: position in the plane, without earlier slides [m].
+            velocity: velocity of a fix of the receiver [m/s].
+            stamp_ns: time of the fix [ns].
+        """
+        self._travel(velocity, stamp_ns)
+        offset = _minus(place, self._travelled)
+        if self._until_ns is None:
+            while self._past and stamp_ns - self._past[0].stamp_ns > SLIDE_NS:
+                self._past.popleft()
+            self._past.append(Offset(stamp_ns, velocity, offset))
+        before = self._past[0]
+        by_m, begins = _minus(offset, before.offset_m), self._until_ns is None
+        if self._until_ns is None:
+            change = math.hypot(*_minus(velocity, before.velocity))
+            if math.hypot(*by_m) <= SLID_M + LAG_S * change:
+                return None
+            self._until_ns = stamp_ns + FOLLOWED_NS
+        elif stamp_ns >= self._until_ns:
+            self.begin()
+            return None
+        elif stamp_ns < self._next_ns or math.hypot(*by_m) < STEP_M:
+            return None
+        self._next_ns = stamp_ns + STEP_NS
+        self._past.clear()
+        self._past.append(before)
+        return Slide(by_m, begins)
+
+    def _travel(self, velocity: Plane, stamp_ns: int) -> None:
+        time_ns = stamp_ns - self._stamp_ns
+        if 0 < time_ns <= FIX_GAP_NS:
+            half_s = 0.5 * time_ns / SECOND_NS
+            (x, y), (vx, vy) = self._travelled, self._velocity
+            self._travelled = x + half_s * (vx + velocity[0]), y + half_s * (vy + velocity[1])
+        else:
+            self.begin()
+        self._velocity, self._stamp_ns = velocity, stamp_ns
+
+
+def _minus(a: Plane, b: Plane) -> Plane:
+    return a[0] - b[0], a[1] - b[1]
