@@ -21,9 +21,9 @@ from skytether.netem.proxy import FLOWS_MAX, Proxy
 from skytether.netem.relay import Relay
 from skytether.netem.tunnel import Tunnel
 from skytether.shared.base.errors import ConfigError
+from skytether.shared.endpoints.directions import FLIGHT, KEYS, RELAY, RUN, Directions, named
 from skytether.shared.endpoints.endpoint import Address
 from skytether.shared.endpoints.line import CONNECTIONS_MAX, Listen, parse_address
-from skytether.shared.endpoints.ways import FLIGHT, KEYS, RELAY, RUN, Ways, named
 from skytether.shared.events.flight import address_text
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.whole import Scenario
@@ -134,7 +134,7 @@ def emulate(argv: Sequence[str]) -> None:
             running.scenario,
             server=server,
             flows=flows,
-            ways=RELAY if options.scenario == NETWORK else FLIGHT,
+            directions=RELAY if options.scenario == NETWORK else FLIGHT,
             recorder=recorder,
             path=path,
         )
@@ -228,7 +228,9 @@ def _with_directions(options: NetemOptions) -> NetemOptions:
     return replace(options, config=_impaired(alone, RELAY, tcp=options.tcp))
 
 
-def _impaired(options: NetemOptions | RunOptions, names: Ways, *, tcp: bool = False) -> Scenario:
+def _impaired(
+    options: NetemOptions | RunOptions, names: Directions, *, tcp: bool = False
+) -> Scenario:
     """Scenario of the options with the texts of its two directions, where they are given.
 
     Args:

@@ -2,7 +2,7 @@
 `relay` for byte streams and `tunnel` for packets of IP.
 
 As in the paper, uplink is to the vehicle, or to whoever takes its place: a proxy's client, a
-tunnel's program. Users of other programs read names of their own (`shared.endpoints.ways`).
+tunnel's program. Users of other programs read names of their own (`shared.endpoints.directions`).
 """
 
 from abc import abstractmethod
@@ -13,8 +13,8 @@ from skytether.netem.fate import Fates
 from skytether.netem.impairments.direction import Impairments
 from skytether.netem.link import Lane, Link
 from skytether.shared.base.units import HEADER_BYTES
+from skytether.shared.endpoints.directions import FLIGHT, Directions
 from skytether.shared.endpoints.endpoint import Datagram, Endpoint
-from skytether.shared.endpoints.ways import FLIGHT, Ways
 from skytether.shared.events.flight import Fault
 from skytether.shared.scenario.catalogue import keys_of
 from skytether.shared.scenario.owners import InFlight
@@ -29,8 +29,8 @@ class Emulator(Endpoint):
 
     Args:
         mtu: largest payload that passes [B].
-        ways: names of both directions. Packets of a flight have fates by their time, since two
-            controllers send at times of their own; those of other programs by their number.
+        directions: names of both directions. Packets of a flight have fates by their time, since
+            two controllers send at times of their own; those of other programs by their number.
         path: number of the session's path, from 0, in the record.
         header_bytes: see `Link`.
     """
@@ -42,13 +42,13 @@ class Emulator(Endpoint):
         scenario: Scenario,
         *,
         mtu: int,
-        ways: Ways,
+        directions: Directions,
         recorder: Recorder | None,
         path: int = 0,
         header_bytes: int = HEADER_BYTES,
     ) -> None:
         super().__init__()
-        self._scenario, self.ways = scenario, ways
+        self._scenario, self.directions = scenario, directions
 
         def make(direction: int, name: Direction) -> Link:
             of = self.impairments(name)
@@ -74,7 +74,7 @@ class Emulator(Endpoint):
     def fates(self, name: Direction, flow: int) -> Fates:
         """What the packets of one flow meet in a direction."""
         at = self._scenario.seed, name, flow
-        return Fates(self.link(name).impairments, *at, by_number=self.ways != FLIGHT)
+        return Fates(self.link(name).impairments, *at, by_number=self.directions != FLIGHT)
 
     def _open_lanes(self, began_ns: int) -> tuple[Lane, Lane]:
         """Uplink and downlink of a new flow, whose fates count from `began_ns`."""
@@ -121,5 +121,5 @@ class Emulator(Endpoint):
             self._events.append(Fault(traceback=fault))
 
     def figures(self) -> dict[str, Any]:
-        up, down = self.ways
+        up, down = self.directions
         return {up: self.uplink.figures(), down: self.downlink.figures()}

@@ -18,13 +18,13 @@ from skytether.netem.emulator import Emulator
 from skytether.netem.link import QUEUE_MAX, Lane
 from skytether.netem.places import Flow, Places
 from skytether.shared.base.units import MILLISECOND_NS
+from skytether.shared.endpoints.directions import FLIGHT, Directions
 from skytether.shared.endpoints.endpoint import (
     Address,
     Datagram,
     host_of,
     make_datagram,
 )
-from skytether.shared.endpoints.ways import FLIGHT, Ways
 from skytether.shared.events.flight import FlowOpened, Returned, TooLong, Unreachable
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Recorder
@@ -39,7 +39,7 @@ class Proxy(Emulator):
     """Delays, reorders and loses datagrams between one server and at most `flows` clients.
 
     Args:
-        ways, recorder, path: see `Emulator`.
+        directions, recorder, path: see `Emulator`.
     """
 
     patience_ns = MILLISECOND_NS // 4
@@ -50,12 +50,12 @@ class Proxy(Emulator):
         *,
         server: Address,
         flows: int = FLOWS_MAX,
-        ways: Ways = FLIGHT,
+        directions: Directions = FLIGHT,
         recorder: Recorder | None = None,
         path: int = 0,
     ) -> None:
         self._mtu = mtu = scenario.network.mtu
-        super().__init__(scenario, mtu=mtu, ways=ways, recorder=recorder, path=path)
+        super().__init__(scenario, mtu=mtu, directions=directions, recorder=recorder, path=path)
         self._flows_max = flows
         self._server = server
         self._places = Places(flows)

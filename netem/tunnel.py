@@ -12,8 +12,8 @@ from skytether.netem.emulator import Direction, Emulator
 from skytether.netem.fate import Fates
 from skytether.netem.link import Lane
 from skytether.shared.base.packets import OUTSIDE, PROGRAM, flow_of, too_long
+from skytether.shared.endpoints.directions import RUN
 from skytether.shared.endpoints.endpoint import Datagram
-from skytether.shared.endpoints.ways import RUN
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Recorder
 
@@ -32,7 +32,7 @@ class Tunnel(Emulator):
     """
 
     def __init__(self, scenario: Scenario, *, mtu: int, recorder: Recorder | None = None) -> None:
-        super().__init__(scenario, mtu=mtu, ways=RUN, recorder=recorder, header_bytes=0)
+        super().__init__(scenario, mtu=mtu, directions=RUN, recorder=recorder, header_bytes=0)
         self._mtu = mtu
         self._flows: OrderedDict[bytes, tuple[Lane, Lane]] = OrderedDict()
         """Uplink and downlink of each flow by its key, that which was silent longest first.

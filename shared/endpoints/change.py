@@ -16,7 +16,7 @@ import msgspec
 
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.base.hint import hint
-from skytether.shared.endpoints import ways
+from skytether.shared.endpoints import directions
 from skytether.shared.endpoints.endpoint import Endpoint
 from skytether.shared.events.flight import Changed, ChangeRefused, Event
 from skytether.shared.scenario import reading
@@ -39,7 +39,7 @@ class Answer(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     values: dict[str, Any] = {}
     """Keys that may change and their present values, if the request was empty."""
     names: dict[str, str] = {}
-    """What the operator calls some of these keys, see `endpoints.ways`."""
+    """What the operator calls some of these keys, see `endpoints.directions`."""
 
 
 class Running:
@@ -57,7 +57,7 @@ class Running:
         settings: Mapping[str, Any] = MappingProxyType({}),
     ) -> None:
         self.endpoint = endpoint
-        self._names = ways.NAMES.get(endpoint.ways, {})
+        self._names = directions.NAMES.get(endpoint.directions, {})
         self._scenario = scenario
         self.settings = settings
         """All values that were set in flight, by key; replaced by a new object at each change."""
@@ -75,7 +75,7 @@ class Running:
 
         Args:
             values: plain values by key, as in a scenario's file; the endpoint's own names of its
-                directions (`endpoints.ways`) are keys, too.
+                directions (`endpoints.directions`) are keys, too.
             now_ns: time on the endpoint's clock [ns].
 
         Returns:
@@ -91,7 +91,7 @@ class Running:
             if objection := self.endpoint.objection(scenario, frozenset(values)):
                 raise ConfigError(objection)
         except ConfigError as error:
-            reason = ways.named(str(error), self._names)
+            reason = directions.named(str(error), self._names)
             self.refuse(reason)
             raise ConfigError(reason) from None
         # Only after checking the whole scenario: a change is made completely, or not at all.

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from typing import Any, NamedTuple, Self
 
-from skytether.shared.endpoints.ways import FLIGHT, Ways
+from skytether.shared.endpoints.directions import FLIGHT, Directions
 from skytether.shared.events.flight import Event, Omitted
 from skytether.shared.scenario.schema import Scenario
 
@@ -104,7 +104,7 @@ class Endpoint(ABC):
 
     changeable: frozenset[str] = frozenset()
     """Keys of the scenario that may change in flight, see `shared.endpoints.change`."""
-    ways: Ways = FLIGHT
+    directions: Directions = FLIGHT
     """Names of both directions of its network."""
     keeps = False
     """Whether the endpoint has state for the next run of the process, see `keep`."""

@@ -30,7 +30,7 @@ class Steady(Endpoint):
         super().__init__()
         self._inner = inner
         self.changeable, self.patience_ns = inner.changeable, inner.patience_ns
-        self.keeps, self.ways = inner.keeps, inner.ways
+        self.keeps, self.directions = inner.keeps, inner.directions
         self._seen_ns: int | None = None
         self._jumps_ns = 0
 

@@ -146,7 +146,7 @@ class Changed(Event, omit_defaults=True):
     before: str
     after: str
     name: str = ""
-    """What the operator calls the key, if not by itself, see `endpoints.ways`."""
+    """What the operator calls the key, if not by itself, see `endpoints.directions`."""
 
     def __str__(self) -> str:
         return f"{self.name or self.key} is {self.after} from now on, it was {self.before}"

@@ -12,7 +12,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from skytether.shared.endpoints.ways import FLIGHT, Ways
+from skytether.shared.endpoints.directions import FLIGHT, Directions
 from skytether.shared.telemetry import record
 from skytether.shared.telemetry.every_event import EveryEvent
 from skytether.shared.telemetry.record import Rows as Table
@@ -38,7 +38,7 @@ class Opened(msgspec.Struct, frozen=True, tag=True, kw_only=True, omit_defaults=
     parts: dict[str, str]
     """Parts of the record in this feed: columns by name of the part, as numpy's description in
     JSON."""
-    ways: Ways = FLIGHT
+    directions: Directions = msgspec.field(name="ways", default=FLIGHT)
     """Names of both directions of the process's network."""
     wall_ns: int
     """Time of day corresponding to `time_ns` [ns since 1970]."""

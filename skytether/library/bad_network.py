@@ -13,9 +13,9 @@ from skytether.netem.proxy import Proxy
 from skytether.netem.relay import Relay
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.endpoints.change import Running
+from skytether.shared.endpoints.directions import FLIGHT, NAMES, RELAY, named
 from skytether.shared.endpoints.endpoint import Address
 from skytether.shared.endpoints.line import Listen
-from skytether.shared.endpoints.ways import FLIGHT, NAMES, RELAY, named
 from skytether.shared.scenario import reading
 from skytether.shell.commandline import plugins
 from skytether.shell.driving.driver import Shell, new_event_loop
@@ -74,7 +74,7 @@ class bad_network:  # noqa: N801 - read as a function, like `contextlib.closing`
         except ConfigError as error:
             raise ConfigError(f"bad_network: {named(str(error), NAMES[RELAY])}") from None
         self._endpoint = (
-            Relay(scenario, server=to) if tcp else Proxy(scenario, server=to, ways=RELAY)
+            Relay(scenario, server=to) if tcp else Proxy(scenario, server=to, directions=RELAY)
         )
         self._running = Running(self._endpoint, scenario)
         if tcp:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skytether.shared.base.units import SECOND_NS
-from skytether.shared.endpoints.ways import FLIGHT, Ways
+from skytether.shared.endpoints.directions import FLIGHT, Directions
 from skytether.shared.law.model import Array
 from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import (
@@ -179,7 +179,7 @@ def check_values(part: str, rows: Rows, scenario: Scenario) -> None:
             )
 
 
-def readable(rows: Rows, ways: Ways = FLIGHT) -> Columns:
+def readable(rows: Rows, ways: Directions = FLIGHT) -> Columns:
     """Plain columns of rows, with words for codes, and one column per input of a plan.
 
     Args:

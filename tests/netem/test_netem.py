@@ -32,8 +32,8 @@ from skytether.netem.proxy import Proxy
 from skytether.netem.relay import Relay
 from skytether.shared.base.units import HEADER_BYTES, MILLISECOND_NS, SECOND_NS
 from skytether.shared.endpoints.change import Answer, Running
+from skytether.shared.endpoints.directions import FLIGHT, NAMES, RELAY, RUN, Directions
 from skytether.shared.endpoints.endpoint import Address, Datagram
-from skytether.shared.endpoints.ways import FLIGHT, NAMES, RELAY, RUN, Ways
 from skytether.shared.formats.recorded import recorded_in
 from skytether.shared.scenario.reading import load
 from skytether.shared.scenario.registry import File
@@ -425,7 +425,7 @@ WAYS = [("transparent", RELAY), ("demo", FLIGHT)]
 
 @pytest.mark.parametrize(("scenario", "ways"), WAYS)
 def test_a_relay_names_its_directions_by_their_ends_and_a_flight_as_modems_do(
-    scenario: str, ways: Ways, monkeypatch: pytest.MonkeyPatch
+    scenario: str, ways: Directions, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     driven: list[Any] = []
     monkeypatch.setattr(Process, "drive", lambda _, endpoint, **__: driven.append(endpoint))
@@ -436,7 +436,7 @@ def test_a_relay_names_its_directions_by_their_ends_and_a_flight_as_modems_do(
 
 def test_changes_of_a_relay_are_asked_for_and_told_by_its_own_names() -> None:
     scenario = directed(to_server="loss(0.1)")
-    relay = Proxy(scenario, server=("server", 1), ways=RELAY)
+    relay = Proxy(scenario, server=("server", 1), directions=RELAY)
     running_ = Running(relay, scenario)
     assert json.loads(running_.answer(b"{}", now_ns=0))["names"] == NAMES[RELAY]
     (changed,) = running_.change({"to_server.loss": 0.3}, now_ns=0)
@@ -453,7 +453,7 @@ def test_set_lists_the_names_of_a_relay(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     scenario = directed()
-    running_ = Running(Proxy(scenario, server=("server", 1), ways=RELAY), scenario)
+    running_ = Running(Proxy(scenario, server=("server", 1), directions=RELAY), scenario)
 
     class Caller:
         def __init__(self, _: Path) -> None:
@@ -473,7 +473,7 @@ def test_set_lists_the_names_of_a_relay(
 
 
 def test_metrics_and_tables_have_the_names_of_a_relay() -> None:
-    relay = Proxy(directed(), server=("server", 1), ways=RELAY)
+    relay = Proxy(directed(), server=("server", 1), directions=RELAY)
     exposed, unknown = families("netem", relay.figures())
     labels = {each.labels.get("direction") for family in exposed for each in family.samples}
     assert labels >= {*RELAY}
@@ -487,7 +487,7 @@ def test_metrics_and_tables_have_the_names_of_a_relay() -> None:
 
 @pytest.mark.parametrize(("command", "ways"), [([], RELAY), (["run"], RUN)])
 def test_options_are_named_by_the_ends(
-    command: list[str], ways: Ways, capsys: pytest.CaptureFixture[str]
+    command: list[str], ways: Directions, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with pytest.raises(SystemExit):
         main(["netem", *command, "--help"])

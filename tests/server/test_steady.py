@@ -67,7 +67,7 @@ def test_nothing_of_an_endpoint_is_answered_in_its_place() -> None:
         "keeps",
         "patience_ns",
         "send",
-        "ways",
+        "directions",
     }  # set with the endpoint, or called on itself
     assert asked - own <= set(vars(Steady))
 

@@ -5,7 +5,7 @@ import re
 import pytest
 
 from skytether.shared.base.units import SECOND_NS
-from skytether.shared.endpoints.ways import FLIGHT, RELAY, RUN, Ways
+from skytether.shared.endpoints.directions import FLIGHT, RELAY, RUN, Directions
 from skytether.shared.events.flight import Changed
 from skytether.shared.scenario import reading
 from skytether.shared.telemetry.feed import Figures, Opened, Said
@@ -15,14 +15,14 @@ from skytether.view.page.state import State
 
 
 @pytest.mark.parametrize("ways", [RELAY, RUN, FLIGHT])
-def test_words_plots_and_events_have_the_names_of_the_directions(ways: Ways) -> None:
+def test_words_plots_and_events_have_the_names_of_the_directions(ways: Directions) -> None:
     state, toml = State(), reading.to_toml(reading.load_base("transparent")).decode()
     opened = Opened(
         process="netem",
         name="transparent",
         scenario=toml,
         parts={},
-        ways=ways,
+        directions=ways,
         wall_ns=1,
         time_ns=1,
     )

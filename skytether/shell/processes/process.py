@@ -325,7 +325,7 @@ def opened(process: str, name: str, running: Running, feed: Feed) -> Callable[[]
         name=name,
         scenario=reading.to_toml(running.scenario).decode(),
         parts=feed.parts,
-        ways=running.endpoint.ways,
+        directions=running.endpoint.directions,
         wall_ns=wall_ns,
         time_ns=time_ns,
     )

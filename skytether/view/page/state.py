@@ -21,7 +21,7 @@ from skytether.figures.colours import AMBER, GREEN, GREY, MODE_COLOURS, RED
 from skytether.shared.base import toml
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS, seconds_to_ns
-from skytether.shared.endpoints.ways import FLIGHT, Ways
+from skytether.shared.endpoints.directions import FLIGHT, Directions
 from skytether.shared.events.flight import DOES, Changed, Event
 from skytether.shared.events.processes import Counted, Listening, Plaintext
 from skytether.shared.law.model import Array
@@ -425,7 +425,7 @@ class State:
             process_state.figures = frame.figures
             if process_state.role == "netem":
                 queues = [
-                    [figure(each.figures, way, "queue") for way in each.opened.ways]
+                    [figure(each.figures, way, "queue") for way in each.opened.directions]
                     for each in self._processes.values()
                     if each.role == "netem"
                 ]
@@ -555,9 +555,9 @@ class State:
         return any(each.role != "netem" for each in self._processes.values())
 
     @property
-    def ways(self) -> Ways:
+    def ways(self) -> Directions:
         """Names of both directions of the network in netem's figures."""
-        directions = (each.opened.ways for each in self._processes.values())
+        directions = (each.opened.directions for each in self._processes.values())
         return next((ways for ways in directions if ways != FLIGHT), FLIGHT)
 
     @property

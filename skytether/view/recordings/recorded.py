@@ -17,7 +17,7 @@ import numpy as np
 from skytether.shared.base import toml
 from skytether.shared.base.errors import RecordingError
 from skytether.shared.base.units import SECOND_NS
-from skytether.shared.endpoints.ways import FLIGHT, Ways
+from skytether.shared.endpoints.directions import FLIGHT, Directions
 from skytether.shared.events.flight import Event
 from skytether.shared.events.processes import Counted
 from skytether.shared.law.model import Indices
@@ -69,10 +69,10 @@ class Recorded:
         }
 
     @property
-    def ways(self) -> Ways:
+    def ways(self) -> Directions:
         """Names of both directions of the recorded network."""
         opened = (frame for *_, frame in self.frames if isinstance(frame, Opened))
-        return next((each.ways for each in opened if each.ways != FLIGHT), FLIGHT)
+        return next((each.directions for each in opened if each.directions != FLIGHT), FLIGHT)
 
     @property
     def begin_ns(self) -> int:

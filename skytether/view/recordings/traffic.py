@@ -12,7 +12,7 @@ import numpy as np
 
 from skytether.figures.tables import to_csv
 from skytether.shared.base.units import HEADER_BYTES, SECOND_NS
-from skytether.shared.endpoints.ways import FLIGHT, Ways
+from skytether.shared.endpoints.directions import FLIGHT, Directions
 from skytether.shared.telemetry.record import DOWNLINK, UPLINK, Rows
 
 RAW_IP = 101
@@ -22,7 +22,7 @@ CLIENT_PORT, SERVER_PORT = 47000, 47001
 _UDP = 17
 
 
-def traces(packets: Rows, ways: Ways = FLIGHT) -> Mapping[str, str]:
+def traces(packets: Rows, ways: Directions = FLIGHT) -> Mapping[str, str]:
     """Delay traces that the impairment `trace` replays, as CSV, by direction, flow and path."""
     csv = {}
     for way, direction in zip(ways, (UPLINK, DOWNLINK), strict=True):

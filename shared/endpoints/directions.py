@@ -6,18 +6,18 @@ and the other way round, so netem names their directions by the ends.
 
 from collections.abc import Mapping
 
-Ways = tuple[str, str]
+Directions = tuple[str, str]
 """Names of the direction to the vehicle, or to what takes its place, and of that from it."""
-FLIGHT: Ways = ("uplink", "downlink")
-RELAY: Ways = ("to_client", "to_server")
+FLIGHT: Directions = ("uplink", "downlink")
+RELAY: Directions = ("to_client", "to_server")
 """Packets between clients and a server that are no part of Skytether."""
-RUN: Ways = ("to_program", "from_program")
+RUN: Directions = ("to_program", "from_program")
 """Packets of one program."""
 KEYS = ("network.uplink", "network.downlink")
 """Keys of a scenario with the impairments of both directions."""
 
 
-NAMES = {ways: dict(zip(KEYS, ways, strict=True)) for ways in (RELAY, RUN)}
+NAMES = {directions: dict(zip(KEYS, directions, strict=True)) for directions in (RELAY, RUN)}
 """What operators call these keys, by key, where it is not a flight."""
 
 
