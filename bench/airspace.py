@@ -27,7 +27,7 @@ from skytether.shared.wire.protocol import (
     Mode,
     Observation,
     Welcome,
-    committed_max,
+    ahead_max,
     decode,
     encode,
     stamp_us,
@@ -69,7 +69,7 @@ class PlannedFleet:
         terms = scenario.terms()
         desired = Desired(scenario, terms, count, BLOCK)
         self._planner = Planner(scenario.control, terms, desired, count, BLOCK, Stopwatch())
-        self._found = empty_foresight(BLOCK, terms.axes, terms.horizon, committed_max(terms))
+        self._found = empty_foresight(BLOCK, terms.axes, terms.horizon, ahead_max(terms))
         self._vehicles = Vehicles(scenario, count)
         self._blocks = [
             np.arange(first, min(first + BLOCK, count)) for first in range(0, count, BLOCK)

@@ -14,15 +14,13 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from skytether.server.planning.clock import UNSEEN, ClockMap, Seen, shortest_ns
+from skytether.server.planning.clock import ClockMap, Seen, shortest_ns
 from skytether.server.planning.desired import Desired
 from skytether.server.planning.scheme import (
-    LOSS_CASES,
     Batch,
     Figures,
     Fleet,
     Planning,
-    empty_foresight,
     in_turn,
 )
 from skytether.server.schemes import table
@@ -40,7 +38,7 @@ from skytether.shared.law.terms import Terms
 from skytether.shared.scenario.reference import Reference
 from skytether.shared.scenario.registry import load
 from skytether.shared.scenario.schema import ControlConfig, Scenario
-from skytether.shared.wire.protocol import Idle, Observation, RoomMessage, committed_max
+from skytether.shared.wire.protocol import Idle, Observation, RoomMessage
 
 if TYPE_CHECKING:
     from skytether.server.budget import SharedBudget
@@ -84,11 +82,6 @@ class Controller:
         block = min(capacity, BLOCK)
         self._age_max = terms.age_max
         self._clock = clock
-        most = committed_max(terms)
-        self._uplink_max_ns = (most if terms.commits else terms.horizon) * terms.dt_ns
-        """Longest uplink delay at which a horizon can still be flown [ns]."""
-        if not terms.indexed:
-            self._uplink_max_ns = UNSEEN  # the first input is flown whenever the horizon arrives
         self.desired = Desired(scenario, terms, capacity, block, references)
         self.faults: list[str] = []
         """Tracebacks of the first error of each plug-in, to be reported."""
@@ -107,7 +100,8 @@ class Controller:
         self.scheme = table.make(fleet)
         self.columns = control.properties.figures
         """Names of the recorded figures of plans."""
-        self._terms, self._capacity, self._block = terms, capacity, block
+        self._computes = control.properties.computes
+        self._terms, self._capacity = terms, capacity
         self._sent_step = np.full(capacity, -1, dtype=np.int64)
         """Step of the newest horizon sent to each vehicle, or -1; shape (capacity,)."""
         self._heartbeat_due: Flags = np.zeros(capacity, dtype=np.bool_)
@@ -156,22 +150,15 @@ class Controller:
     def use_trigger(self, trigger: Trigger) -> None:
         """Use another trigger from the next step on; it starts without a memory of sent plans."""
         terms, self._trigger = self._terms, trigger
-        doubts = LOSS_CASES if self._trigger.doubts else 0
-        self._foresight = arrays = empty_foresight(
-            self._block,
-            terms.axes,
-            terms.planned,
-            committed_max(terms),
-            doubts,
-            splines=terms.splines,
-        )
+        self.doubts = trigger.doubts
+        """Whether the trigger compares plans also for the case that horizons are lost."""
+        self._foresight = self.scheme.make_foresight(doubts=trigger.doubts)
         self._trigger_inputs = SituationArrays(
             model=terms.model,
             dt_s=terms.dt_s,
             planned=terms.planned,
-            ahead=arrays.ahead,
-            horizons=arrays.horizons,
-            held=arrays.held if terms.commits else None,
+            foresight=self._foresight,
+            computes=self._computes,
             sent_step=self._sent_step,
             heartbeat_due=self._heartbeat_due,
             desired=self.desired.states,
@@ -245,7 +232,7 @@ class Controller:
             self.observed_step,
             self._age_max,
             self._clock.seen,
-            self._uplink_max_ns,
+            self.scheme.uplink_max_ns,
             self._leads,
             self.idle,
             able,

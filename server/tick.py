@@ -234,7 +234,7 @@ class Ticker:
         solved = figures["solved"]
         if not solved.all():
             columns = {name: np.where(solved, figure, missing) for name, figure in columns.items()}
-        if EXPECTED_GAP in columns and not decisions.batch.foresight.loss_probability.size:
+        if EXPECTED_GAP in columns and not self._controller.doubts:
             columns[EXPECTED_GAP] = missing
         columns[OWN] = verdict.figure if verdict.compared is Compared.OWN else missing
         return columns

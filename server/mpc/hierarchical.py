@@ -262,7 +262,7 @@ def _keep(batch: PlanBatch, simd: SimdBatch, indices: I1, tier: int, axis: int) 
     """Store the solutions of generator or tracker on one axis, rounded as sent."""
     for lane in range(len(indices)):
         i = indices[lane]
-        batch.memory.bounded[batch.figures[i].row] |= simd.held[lane] > 0.0
+        batch.memory.bounded[batch.figures[i].row] |= simd.active[lane] > 0.0
         column(simd.inputs, lane, batch.draft.inputs[tier, i, axis])
 
 

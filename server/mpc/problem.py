@@ -146,7 +146,7 @@ class SimdBatch(NamedTuple):
     """Sum of the gradient, which is not finite if one of its numbers is not; shape (L,)."""
     changed: F1
     """Number of inputs that entered or left the active set in the last iteration; shape (L,)."""
-    held: F1
+    active: F1
     """Number of inputs in the active set; shape (L,)."""
     worst: F1
     """Largest violation by an input that must enter or leave the active set; shape (L,)."""
@@ -201,7 +201,7 @@ def simd_batch(memory: F3) -> SimdBatch:
         p11=memory[7, 0],
         total=memory[8, 0],
         changed=memory[9, 0],
-        held=memory[10, 0],
+        active=memory[10, 0],
         worst=memory[11, 0],
         worst_at=memory[12, 0],
         target_p=memory[13],

@@ -84,16 +84,16 @@ def own_input(model: Axis, q0: float, q1: float, g: float, inverse: float) -> fl
 def _first_set(bound: float, simd: SimdBatch) -> None:
     """Fill in the first active set from the previous plan, and the sum of the gradient."""
     near, L = NEAR * bound, len(simd.p)
-    side, held, total = simd.side, simd.held, simd.total
+    side, active, total = simd.side, simd.active, simd.total
     g, previous = simd.gradient, simd.previous
     for lane in range(L):
-        held[lane], total[lane] = 0.0, 0.0
+        active[lane], total[lane] = 0.0, 0.0
     for i in range(len(g)):
         for lane in range(L):
             before = previous[i, lane]
             at = 1.0 if before >= near else -1.0 if before <= -near else 0.0
             side[i, lane] = at
-            held[lane] += abs(at)
+            active[lane] += abs(at)
             total[lane] += g[i, lane]
 
 
@@ -104,10 +104,10 @@ def _round_free(mpc: MPC, axis: int, simd: SimdBatch, stages: F2) -> None:
     b0, b1 = model.b0, model.b1
     q0, q1, x0, x1 = simd.p, simd.v, simd.leader_p, simd.leader_v
     g, u, side, own = simd.gradient, simd.inputs, simd.side, simd.own
-    changed, held = simd.changed, simd.held
+    changed, active = simd.changed, simd.active
     for lane in range(L):
         q0[lane], q1[lane], x0[lane], x1[lane] = 0.0, 0.0, 0.0, 0.0
-        changed[lane], held[lane] = 0.0, 0.0
+        changed[lane], active[lane] = 0.0, 0.0
     for i in range(len(g) - 1, -1, -1):
         k0, k1, inverse = stages[i, K0], stages[i, K1], stages[i, INVERSE]
         f00, f01, f10, f11 = stages[i, F00], stages[i, F01], stages[i, F10], stages[i, F11]
@@ -130,7 +130,7 @@ def _round_free(mpc: MPC, axis: int, simd: SimdBatch, stages: F2) -> None:
             x1[lane] = f10 * p_ + f11 * v_ + b1 * own_ if free else then_v
             u[i, lane], side[i, lane] = value, verdict
             changed[lane] += abs(verdict)
-            held[lane] += abs(verdict)
+            active[lane] += abs(verdict)
 
 
 @lanes
@@ -174,11 +174,11 @@ def _forward(mpc: MPC, axis: int, simd: SimdBatch, singly: bool) -> None:
     """Forward pass: unconstrained choices decide on the active set; `singly`: on one input only."""
     model, bound, L = axis_at(mpc.model, axis), mpc.bounds[axis], len(simd.p)
     b0, b1, x0, x1 = model.b0, model.b1, simd.leader_p, simd.leader_v
-    u, side, own, changed, held = simd.inputs, simd.side, simd.own, simd.changed, simd.held
+    u, side, own, changed, active = simd.inputs, simd.side, simd.own, simd.changed, simd.active
     k0, k1, f00, f01, f10, f11 = simd.k0, simd.k1, simd.f00, simd.f01, simd.f10, simd.f11
     worst, worst_at = simd.worst, simd.worst_at
     for lane in range(L):
-        x0[lane], x1[lane], changed[lane], held[lane] = 0.0, 0.0, 0.0, 0.0
+        x0[lane], x1[lane], changed[lane], active[lane] = 0.0, 0.0, 0.0, 0.0
         worst[lane], worst_at[lane] = 0.0, -1.0
     for i in range(len(u)):
         for lane in range(L):
@@ -202,7 +202,7 @@ def _forward(mpc: MPC, axis: int, simd: SimdBatch, singly: bool) -> None:
                     worst[lane], worst_at[lane] = wrong, i
             else:
                 side[i, lane] = verdict
-                held[lane] += abs(verdict)
+                active[lane] += abs(verdict)
 
 
 @lanes
@@ -242,7 +242,7 @@ def active_sets(mpc: MPC, axis: int, which: int, simd: SimdBatch, free: F4, sett
         singly = rounds >= ROUNDS_MAX
         rounds += 1
         # If no vehicle has an input at its bound, one table of stages serves all of them.
-        if singly or _any(simd.held):
+        if singly or _any(simd.active):
             _backward(mpc, axis, which, simd)
             _forward(mpc, axis, simd, singly)
         else:

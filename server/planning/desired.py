@@ -25,7 +25,7 @@ from skytether.shared.law.terms import Terms
 from skytether.shared.scenario import reference
 from skytether.shared.scenario.reference import Reference
 from skytether.shared.scenario.schema import Scenario
-from skytether.shared.wire.protocol import committed_max
+from skytether.shared.wire.protocol import ahead_max
 
 PAGE = 128
 """Number of steps of a desired trajectory in a page."""
@@ -80,7 +80,7 @@ class Desired:
         references: Callable[[int], Reference] | None = None,
     ) -> None:
         axes, H, wanted = terms.axes, terms.horizon, scenario.reference
-        longest = committed_max(terms) + H
+        longest = ahead_max(terms) + H
         late_s = np.array(terms.dead_time_s)
         self._point = _live(scenario) if wanted.shape == "live" else None
         self._all = wanted.preview == "all" and self._point is None

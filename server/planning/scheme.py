@@ -13,7 +13,7 @@ from typing import Annotated, Any, ClassVar, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from skytether.server.planning.clock import ClockMap
+from skytether.server.planning.clock import UNSEEN, ClockMap
 from skytether.server.planning.desired import Desired
 from skytether.server.planning.plugin_errors import Tell
 from skytether.shared.base.kernel import F2, F3, F4, I1, S3, record, records
@@ -24,7 +24,7 @@ from skytether.shared.law.terms import Limits, Terms
 from skytether.shared.scenario.reference import Reference
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.scenario.schemes import SchemeProperties
-from skytether.shared.wire.protocol import FEEDBACK, KNOTS_MAX, Observation, RoomMessage
+from skytether.shared.wire.protocol import FEEDBACK, KNOTS_MAX, Observation, RoomMessage, ahead_max
 
 
 class Splines(NamedTuple):
@@ -223,6 +223,8 @@ class Scheme(ABC):
     """Properties of a plug-in's scheme; built-in ones are in `shared.scenario.schemes`."""
     solve_ns = -1
     """Time that planning for the last block took [ns], or -1 if it is not measured."""
+    uplink_max_ns = UNSEEN
+    """Longest uplink delay at which a plan can still be flown [ns]."""
 
     def __init__(self, fleet: Fleet) -> None:
         self.terms = fleet.terms
@@ -236,6 +238,22 @@ class Scheme(ABC):
         self.planned: Array = np.zeros((fleet.block, fleet.terms.axes, 2))
         """States at which the newest plans start, as predicted by the previous plans [m, m/s];
         shape (block, axes, 2)."""
+
+    def make_foresight(self, *, doubts: bool) -> Foresight:
+        """Arrays for a block of vehicles.
+
+        Args:
+            doubts: whether the trigger also asks for the cases in which horizons are lost.
+        """
+        terms, cases = self.terms, LOSS_CASES if doubts else 0
+        return empty_foresight(
+            len(self.figures),
+            terms.axes,
+            terms.planned,
+            ahead_max(terms),
+            cases,
+            splines=terms.splines,
+        )
 
     @abstractmethod
     def forget(self, row: int) -> None:

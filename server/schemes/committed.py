@@ -70,7 +70,7 @@ from skytether.shared.wire.protocol import (
     REFERENCE_P,
     REFERENCE_V,
     Observation,
-    committed_max,
+    ahead_max,
 )
 
 
@@ -85,7 +85,7 @@ class Replay:
     def __init__(
         self, terms: Terms, control: ControlConfig, gain: Array, capacity: int, clock: ClockMap
     ) -> None:
-        axes, H, most = terms.axes, terms.horizon, committed_max(terms)
+        axes, H, most = terms.axes, terms.horizon, ahead_max(terms)
         self.counts: Counter[str] = Counter()
         self._settings = ReplaySettings(
             laws=laws_of(terms, gain),

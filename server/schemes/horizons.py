@@ -12,15 +12,24 @@ import numpy as np
 
 from skytether.server.mpc.hierarchical import Planner
 from skytether.server.mpc.plugin_planners import InputPlanner
+from skytether.server.planning.clock import UNSEEN
 from skytether.server.planning.scheme import Batch, Fleet, Foresight, Header, Scheme, SentPlans
 from skytether.shared.base.kernel import I1, I2, S1, S3, kernel
 from skytether.shared.law.model import Flags, Indices
+from skytether.shared.law.terms import Terms
 from skytether.shared.scenario.registry import MPC
 from skytether.shared.scenario.schemes import SchemeProperties
-from skytether.shared.wire.protocol import FEEDBACK, Observation, committed_max, encode_horizon
+from skytether.shared.wire.protocol import FEEDBACK, Observation, ahead_max, encode_horizon
 
 NO_FEEDBACK = memoryview(b"")
 """Encoded feedback of a horizon without feedback aboard."""
+
+
+def uplink_max_ns(terms: Terms) -> int:
+    """Longest uplink delay at which a horizon can still be flown [ns]."""
+    if not terms.indexed:
+        return UNSEEN  # the first input is flown whenever the horizon arrives
+    return (ahead_max(terms) if terms.commits else terms.horizon) * terms.dt_ns
 
 
 class Predictor(Protocol):
@@ -50,7 +59,8 @@ class InputScheme(Scheme):
     def __init__(self, fleet: Fleet) -> None:
         super().__init__(fleet)
         terms = fleet.terms
-        self._packing = Packing(terms.axes, committed_max(terms) + terms.planned, terms.planned)
+        self.uplink_max_ns = uplink_max_ns(terms)
+        self._packing = Packing(terms.axes, ahead_max(terms) + terms.planned, terms.planned)
 
     def encode(self, batch: Batch, header: Callable[[int], Header]) -> Iterator[tuple[int, bytes]]:
         # Bytes of one input on all axes.

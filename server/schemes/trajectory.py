@@ -75,7 +75,7 @@ from skytether.shared.law import spline
 from skytether.shared.law.model import Flags, Indices
 from skytether.shared.scenario.gain import regulator
 from skytether.shared.scenario.registry import MPC, load
-from skytether.shared.wire.protocol import KNOTS_MAX, NO_HORIZON, Observation, committed_max
+from skytether.shared.wire.protocol import KNOTS_MAX, NO_HORIZON, Observation, ahead_max
 
 if TYPE_CHECKING:
     from skytether.server.mpc.plugin_planners import PluginPlanners
@@ -170,7 +170,7 @@ class Guidance(SplineScheme):
             plans=bool(plans),
         )
         self._memory = Memory(
-            sent=nothing_sent(capacity, RING, terms, control, committed_max(terms)),
+            sent=nothing_sent(capacity, RING, terms, control, ahead_max(terms)),
             state=np.zeros((capacity, axes, 2)),
             trajectories=np.zeros((capacity, RING), dtype=TRAJECTORY),
             knots=np.zeros((capacity, RING, axes, 2 * KNOTS_MAX)),

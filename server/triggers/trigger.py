@@ -10,7 +10,7 @@ plan (`fresh`: first step, or a gap longer than H) fires in every policy but `bu
 
 from collections.abc import Callable, Sequence
 from functools import lru_cache
-from typing import Annotated, NamedTuple
+from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 import numpy as np
 from msgspec import Meta
@@ -22,6 +22,9 @@ from skytether.shared.scenario.registry import TRIGGERS, load
 from skytether.shared.scenario.schema import ControlConfig
 from skytether.shared.scenario.schemes import HELD, that_compute
 from skytether.shared.telemetry.record import Compared
+
+if TYPE_CHECKING:
+    from skytether.server.planning.scheme import Foresight
 
 trigger = TRIGGERS
 """Decorator of a policy: a function of a `Situation` and its numbers, or a subclass of
@@ -44,14 +47,10 @@ class SituationArrays(NamedTuple):
     """Length of a step [s]."""
     planned: int
     """Number of inputs of a plan, H; 1 without a plan."""
-    ahead: Indices
-    """Delay bound d [steps]; shape (block,)."""
-    horizons: NDArray[np.float32]
-    """Horizons from k on, d committed inputs, then H planned ones [m/s]; shape (block, axes,
-    largest d + H)."""
-    held: Array | None
-    """Inputs that are flown from k+d on if nothing is sent [m/s]; shape (block, axes, H). None if
-    the scheme does not compute them."""
+    foresight: "Foresight"
+    """Predictions and plans of the block."""
+    computes: tuple[str, ...]
+    """What the scheme provides, see `SchemeProperties.computes`."""
     sent_step: Indices
     """Step at which a horizon was last sent to each vehicle, or -1; shape (capacity,)."""
     heartbeat_due: Flags
@@ -84,9 +83,9 @@ class Situation(NamedTuple):
         """New plan: inputs from k+d on [m/s]; shape (n, axes, H); H = 1 with a scheme that sends
         trajectories.
         """
-        n, arrays = len(self.rows), self.arrays
-        stages = arrays.ahead[:n, None] + np.arange(arrays.planned)
-        inputs = np.take_along_axis(arrays.horizons[:n], stages[:, None], axis=2)
+        n, foresight = len(self.rows), self.arrays.foresight
+        stages = foresight.ahead[:n, None] + np.arange(self.arrays.planned)
+        inputs = np.take_along_axis(foresight.horizons[:n], stages[:, None], axis=2)
         return inputs.astype(np.float64)
 
     @property
@@ -96,10 +95,10 @@ class Situation(NamedTuple):
         Raises:
             ValueError: the scheme does not compute them.
         """
-        if self.arrays.held is None:
+        if HELD not in self.arrays.computes:
             able = " or ".join(map(repr, that_compute(HELD)))
             raise ValueError(f"held: expected control.scheme = {able}")
-        return self.arrays.held[: len(self.rows)].copy()
+        return self.arrays.foresight.held[: len(self.rows)].copy()
 
     @property
     def desired(self) -> Array:
@@ -107,7 +106,7 @@ class Situation(NamedTuple):
         (n, axes, H + 1, 2).
         """
         rows, step = np.array(self.rows), np.array(self.figures["step"])
-        return self.arrays.desired(rows, step, self.arrays.ahead)
+        return self.arrays.desired(rows, step, self.arrays.foresight.ahead)
 
     @property
     def since_sent_s(self) -> Array:

@@ -193,7 +193,7 @@ class Horizon(NamedTuple):
     age: int
     """Steps from the server's newest observation to `step`."""
     inputs: NDArray[np.float32]
-    """Desired velocity [m/s]; shape (axes, d + H), d committed ones first, 0 … `committed_max`."""
+    """Desired velocity [m/s]; shape (axes, d + H), d committed ones first, 0 … `ahead_max`."""
     feedback: NDArray[np.float32] = NO_FEEDBACK
     """Parameters of the feedback aboard, in the columns REFERENCE_P … GAIN_V; shape (axes,
     FEEDBACK), or (axes, 0) without feedback."""
@@ -390,7 +390,7 @@ def _motion(value: object, ours: Terms) -> tuple[Array, Array]:
 def _inputs(value: object, ours: Terms) -> NDArray[np.float32]:
     if ours.splines:
         raise ProtocolError(Drop.TYPE)
-    most = ours.horizon + committed_max(ours)
+    most = ours.horizon + ahead_max(ours)
     inputs = _array(value, _FLOAT32, ours.axes, (ours.horizon, most))
     largest = np.abs(inputs).max(axis=1).tolist()  # NaN if the row has one
     if not all(map(math.isfinite, largest)):
@@ -421,8 +421,8 @@ def knots_in(value: object, ours: Terms) -> NDArray[np.float32]:
     return numbers.reshape(ours.axes, -1, 2)
 
 
-def committed_max(terms: Terms) -> int:
-    """Largest number of committed steps that fit in a horizon beside its plan; 1 or more."""
+def ahead_max(terms: Terms) -> int:
+    """Largest delay bound d [steps]: d inputs fit in a horizon beside its plan; 1 or more."""
     return max(1, min(INPUTS_MAX // terms.axes - terms.horizon, terms.age_max))
 
 

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import skytether
-from skytether.server.planning.scheme import FIGURES, Figures
+from skytether.server.planning.scheme import FIGURES, Figures, empty_foresight
 from skytether.server.triggers.guarded import column
 from skytether.server.triggers.trigger import (
     Combined,
@@ -25,6 +25,7 @@ from skytether.server.triggers.trigger import (
 from skytether.shared.law.model import Flags, Indices, discretise
 from skytether.shared.scenario.registry import TRIGGERS
 from skytether.shared.scenario.schema import ControlConfig
+from skytether.shared.scenario.schemes import HELD
 
 quick = settings(max_examples=25)
 
@@ -57,9 +58,12 @@ KNOWN = SituationArrays(
     model=discretise((0.84, 0.84), 0.1),
     dt_s=0.1,
     planned=3,
-    ahead=np.array([2, 0]),
-    horizons=np.arange(20, dtype=np.float32).reshape(2, 2, 5),
-    held=np.arange(12.0).reshape(2, 2, 3),
+    foresight=empty_foresight(2, 2, 3, 2)._replace(
+        ahead=np.array([2, 0]),
+        horizons=np.arange(20, dtype=np.float32).reshape(2, 2, 5),
+        held=np.arange(12.0).reshape(2, 2, 3),
+    ),
+    computes=(HELD,),
     sent_step=np.array([40, -1]),
     heartbeat_due=np.array([False, True]),
     desired=lambda rows, *_: np.zeros((len(rows), 2, 4, 2)),
