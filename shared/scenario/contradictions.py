@@ -1,6 +1,5 @@
 """Contradictions: values of a scenario that are each valid, but not together."""
 
-import math
 from collections.abc import Iterator
 from itertools import pairwise
 
@@ -15,6 +14,7 @@ from skytether.shared.scenario.registry import (
     SCHEMES,
     TRIGGERS,
     PluginTable,
+    load,
 )
 from skytether.shared.scenario.schema import (
     Contradiction,
@@ -25,9 +25,6 @@ from skytether.shared.wire.protocol import INPUTS_MAX
 
 TINY = 1e-9
 """Rounding tolerance of a product such as 40 · 0.011."""
-
-LOSSY = 0.3
-"""Share of lost packets to the vehicle above which horizons must be longer."""
 
 
 def contradictions(
@@ -144,52 +141,15 @@ def _no_planner(scenario: Scenario) -> Iterator[Contradiction]:
 
 
 def _too_late(scenario: Scenario) -> Iterator[Contradiction]:
-    yield from _too_slow(scenario)
-    yield from _too_short(scenario)
-
-
-def _too_slow(scenario: Scenario) -> Iterator[Contradiction]:
     """Contradictions of limits that are shorter than the network's delays."""
-    control, link, axes = scenario.control, scenario.link, scenario.model.axes
-    up, down = scenario.uplink, scenario.downlink
-    # Delay as the server estimates it: its clock map knows only half of the smallest round trip.
-    delay_s = up.mean_s - up.least_s + (up.least_s + down.least_s) / 2
-    seen = f"the delay of {delay_s:g} s (half of the smallest round trip, and the uplink's jitter)"
-    H, dt, bound_s = control.horizon, control.dt, control.delay_bound
-    properties = control.properties
-    if properties.indexed and not properties.commits and H * dt < delay_s - TINY:
-        yield "control.horizon", H, f"horizon · dt (now {H * dt:g} s) to cover {seen}"
-    if properties.commits:
-        if bound_s != "auto" and bound_s < delay_s - TINY:
-            yield "control.delay_bound", bound_s, f"at least {seen}"
-        steps = max(1, math.ceil((delay_s if bound_s == "auto" else bound_s) / dt - TINY))
-        most = INPUTS_MAX // axes - steps
-        if most < 1:
-            yield "control.dt", dt, f"more, for {seen} to take fewer than {steps} steps"
-        if most < H:
-            fit = f"at most {most} beside {steps} committed steps with {axes} axes"
-            yield "control.horizon", H, f"{fit}, to fit one datagram"
-    ahead_s = bound_s if properties.commits and bound_s != "auto" else up.mean_s
-    trip_s = max(ahead_s, up.mean_s) + down.mean_s + 2 * dt
-    if link.age_max_s < trip_s - TINY:
-        yield "link.age_max_s", link.age_max_s, f"at least {trip_s:g} s, a round trip and two steps"
-
-
-def _too_short(scenario: Scenario) -> Iterator[Contradiction]:
-    """Contradiction of a horizon that is too short for the vehicle to brake."""
-    control, vehicle, u_max = scenario.control, scenario.vehicle, max(scenario.model.u_max)
-    covered_s, lossy = control.horizon * control.dt, scenario.uplink.loss > LOSSY
-    least_s = u_max / vehicle.brake_mps2 * (1.0 if lossy else 0.5)
-    plans = control.properties.indexed
-    if vehicle.exhausted == "brake" and plans and covered_s < least_s - TINY:
-        what = "what" if lossy else "half of what"
-        lost = f", with over {LOSSY:.0%} of the packets to the vehicle lost" if lossy else ""
-        least = f"at least {least_s:g} s, {what} braking from u_max takes{lost}"
-        yield (
-            "control.horizon",
-            control.horizon,
-            f"horizon · dt (now {covered_s:g} s) to be {least}",
-        )
+    control, ahead_s = scenario.control, scenario.uplink.mean_s
+    if not control.properties.splines:
+        horizons = load(rooms.HORIZONS, f"control.scheme {control.scheme}")
+        yield from horizons.too_late(scenario)
+        ahead_s = horizons.ahead_s(scenario)
+    trip_s, age_max_s = ahead_s + scenario.downlink.mean_s + 2 * control.dt, scenario.link.age_max_s
+    if age_max_s < trip_s - TINY:
+        yield "link.age_max_s", age_max_s, f"at least {trip_s:g} s, a round trip and two steps"
 
 
 def _no_impairments(scenario: Scenario) -> Iterator[Contradiction]:

@@ -29,6 +29,8 @@ APART = ("swap", "sphere", "mission", "show")
 """Shapes with goals or paths of several vehicles, which keep apart."""
 SCHEME_APART = "skytether.server.missions.planning"
 """Module of the scheme that flies these shapes, in place of `control.scheme`."""
+HORIZONS = f"{SHARED}scenario.horizons"
+"""Module with the contradictions of schemes that send horizons of inputs."""
 FROM_FILE = ("csv", "mission", "show")
 """Shapes that are read from `reference.file`."""
 ZONES = PluginTable(

@@ -6,7 +6,7 @@ class that extends one of `skytether.plugin_scheme` and has `properties`.
 
 from typing import NamedTuple
 
-from skytether.shared.law.terms import ALONG_SPLINES, COMMITTING, FLOWN_AS, INDEXED
+from skytether.shared.law.terms import ALONG_SPLINES, COMMITTING, FLOWN_AS
 from skytether.shared.scenario.grammar import Call, GrammarError
 from skytether.shared.scenario.registry import SCHEMES, Entry
 
@@ -31,10 +31,6 @@ class SchemeProperties(NamedTuple):
     """Value of `control.feedback` that the scheme needs; None if both are possible."""
     observes: bool = False
     """Whether the scheme estimates a disturbance, with the time constant `control.observer_s`."""
-
-    @property
-    def indexed(self) -> bool:
-        return self.flown_as in INDEXED
 
     @property
     def commits(self) -> bool:

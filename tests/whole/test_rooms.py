@@ -45,6 +45,13 @@ ROOMS: dict[str, tuple[str, str]] = {
     ),
     "committed": ("server/schemes/committed.py", f"{FLIES} --control.scheme committed"),
     "predictive": ("server/schemes/predictive.py", "fly paper --virtual"),
+    "horizons of inputs": (
+        (
+            "shared/scenario/horizons.py server/schemes/horizons.py server/schemes/predictive.py "
+            "server/schemes/committed.py server/mpc/hierarchical.py server/mpc/appraisal.py"
+        ),
+        "fly paper --virtual",
+    ),
     "queues": (
         "netem/bottleneck.py netem/impairments/queues.py",
         f"{FLIES} --network.uplink rate(9000)",
