@@ -95,8 +95,10 @@ class Compensator:
             self.go_on_along(horizon.step, observed, horizon.spacing, horizon.knots)
             return True
         self._put_in_force(horizon.step, observed)
-        feedback = horizon.feedback if horizon.feedback.size else None
-        self.follower = HorizonFollower(self._constants, horizon.inputs, length, feedback)
+        inputs, feedback = horizon.inputs, horizon.feedback if horizon.feedback.size else None
+        if not self._terms.indexed:  # the first input is flown at every stage (E21)
+            inputs = inputs[:, :1].repeat(length, axis=1)
+        self.follower = HorizonFollower(self._constants, inputs, length, feedback)
         return True
 
     def go_on_along(
@@ -167,16 +169,16 @@ class Compensator:
     def rests(self) -> bool:
         return self.in_force == NO_HORIZON and isinstance(self.follower, SplineFollower)
 
-    def _comes_too_late(self, stage: int, committed: int, length: int) -> bool:
+    def _comes_too_late(self, stage: int, ahead: int, length: int) -> bool:
         """Whether a horizon arrives too late to be flown.
 
         Args:
             stage: stage of the horizon at the present step.
-            committed: number of committed inputs in the horizon, d.
+            ahead: delay bound d of the horizon: its inputs before the planned ones.
             length: number of its inputs that may be flown.
         """
         ended = bool(self._brake) and stage >= length  # braking is not started again
-        return ended or (self._terms.commits and stage > committed + self._late_max)
+        return ended or (self._terms.commits and stage > ahead + self._late_max)
 
     def choose(
         self, step: int, state: Array, disturbance: Array, before: Array

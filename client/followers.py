@@ -54,7 +54,7 @@ class Follower(Protocol):
 class Constants(NamedTuple):
     terms: Terms
     model: Model
-    held: Array
+    horizon: Array
     """Parameters of flight along a horizon that do not depend on it, in the columns of
     `shared.law.rule`; shape (axes, n)."""
     guide: Array
@@ -64,16 +64,15 @@ class Constants(NamedTuple):
     @classmethod
     def of(cls, terms: Terms, regulator: Array) -> Self:
         model = terms.model
-        held = np.zeros((terms.axes, rule.DISTURBANCE + 1))
-        held[:, : rule.MODEL] = np.stack(model, -1)
-        held[:, rule.INDEXED], held[:, rule.BRAKE] = terms.indexed, terms.brake
-        held[:, rule.BOUND] = terms.u_max
+        horizon = np.zeros((terms.axes, rule.DISTURBANCE + 1))
+        horizon[:, : rule.MODEL] = np.stack(model, -1)
+        horizon[:, rule.BRAKE], horizon[:, rule.BOUND] = terms.brake, terms.u_max
         guide = np.zeros((terms.axes, spline.LAG + 1))
         guide[:, : rule.MODEL] = np.stack(model, -1)
         guide[:, spline.DT_S], guide[:, spline.BRAKE] = terms.dt_s, terms.brake
         guide[:, spline.BOUND] = terms.u_max
         guide[:, [spline.GAIN_P, spline.GAIN_V, spline.LAG]] = regulator
-        return cls(terms, model, held, guide)
+        return cls(terms, model, horizon, guide)
 
 
 class HorizonFollower:
@@ -95,8 +94,8 @@ class HorizonFollower:
         terms, self._model = constants.terms, constants.model
         self.length, self.feeds_back = length, feedback is not None
         self._inputs = np.array(inputs, np.float64, order="C")
-        self._table = constants.held.copy()
-        last = self._inputs[:, length - 1 if terms.indexed else 0].tolist()
+        self._table = constants.horizon.copy()
+        last = self._inputs[:, length - 1].tolist()
         within = [bounded(u, bound) for u, bound in zip(last, terms.u_max, strict=True)]
         self._table[:, rule.LENGTH], self._table[:, rule.FEEDS_BACK] = length, self.feeds_back
         # Not math.hypot: its rounding differs in 17 % of cases from the square root in the server's

@@ -98,7 +98,7 @@ def fly_schedule(
             # Horizon unknown: assume that the observed input is held.
             brake = settings.brake if number == HOVERS else 0.0
             one_input = AxisHorizon(
-                model, (first_input,), 1, True, first_speed, brake, bound, False, 0.0, 0.0, 0.0
+                model, (first_input,), 1, first_speed, brake, bound, False, 0.0, 0.0, 0.0
             )
             p, v = _fly(one_input, begin, 0.0, 0.0, p, v, w, first, last, begin, first_input, track)
             continue
@@ -109,7 +109,6 @@ def fly_schedule(
             model,
             memory.inputs[row, slot, axis],
             sent.length,
-            True,
             sent.speed,
             settings.brake,
             bound,

@@ -6,7 +6,7 @@
 
 No input is flown for longer than `link.age_max_s` after the observation that it was planned from: a
 longer horizon ends there. After its last input the vehicle repeats it for ever, or brakes from it.
-Without compensation the first input is flown at all stages until then.
+Without compensation the first input is flown at all stages until then: aboard it is repeated.
 
 With feedback aboard the vehicle is controlled towards the reference state x̄ of these inputs, also
 after the last one:
@@ -35,8 +35,6 @@ class AxisHorizon(NamedTuple):
     """Inputs of the horizon, from k_h on [m/s]."""
     length: int
     """Number of inputs that may be flown."""
-    indexed: bool
-    """Whether each stage has its own input; otherwise the first is flown at every stage."""
     speed: float
     """Magnitude of the last input over all axes [m/s]."""
     brake: float
@@ -153,9 +151,7 @@ def flown(stage: int, without_feedback: float, back: float, bound: float) -> flo
 def planned_input(horizon: AxisHorizon, stage: int) -> tuple[float, float]:
     """Input of a horizon at a stage without feedback [m/s], and its braking factor `remaining`."""
     share = remaining(stage, horizon.length, horizon.speed, horizon.brake)
-    # Without compensation the first input is flown at every stage (E21).
-    index = entry(stage, horizon.length) if horizon.indexed else 0
-    return share * bounded(horizon.inputs[index], horizon.bound), share
+    return share * bounded(horizon.inputs[entry(stage, horizon.length)], horizon.bound), share
 
 
 def next_reference(
@@ -214,7 +210,7 @@ def step(
 
 MODEL = len(Axis._fields)
 """Number of columns of the model, which come first in a table with one row per axis."""
-LENGTH, INDEXED, SPEED, BRAKE, BOUND, FEEDS_BACK, GAIN_P, GAIN_V, DISTURBANCE = range(
+LENGTH, SPEED, BRAKE, BOUND, FEEDS_BACK, GAIN_P, GAIN_V, DISTURBANCE = range(
     MODEL, MODEL + len(AxisHorizon._fields) - 2
 )
 """Columns of a table of horizons: the fields of `AxisHorizon` except model and inputs."""
@@ -225,7 +221,6 @@ def horizon_of(table: Table, inputs: Table, axis: int) -> AxisHorizon:
         model=Axis(table[axis, 0], table[axis, 1], table[axis, 2], table[axis, 3]),
         inputs=inputs[axis],
         length=int(table[axis, LENGTH]),
-        indexed=table[axis, INDEXED] > 0.0,
         speed=table[axis, SPEED],
         brake=table[axis, BRAKE],
         bound=table[axis, BOUND],

@@ -102,7 +102,7 @@ def held(inputs: Sequence[float], *, feeds_back: bool = True, **changed: Any) ->
     axis = Axis(a01=0.09, a11=0.88, b0=0.01, b1=0.12)
     numbers = {"speed": abs(inputs[-1]), "brake": 0.125, "bound": 1.8, "disturbance": 0.25}
     gain = {"gain_p": 3.0, "gain_v": 1.5}
-    given = {"length": len(inputs), "indexed": True, **numbers, **gain, **changed}
+    given = {"length": len(inputs), **numbers, **gain, **changed}
     return AxisHorizon(model=axis, inputs=inputs, feeds_back=feeds_back, **given)
 
 
@@ -123,11 +123,6 @@ def test_a_step_without_feedback_or_before_the_first_stage_leads_nowhere() -> No
     state = (1.0, 0.5, 0.0, 0.0)
     assert rule.step(held([0.25, 0.5], feeds_back=False), 1, *state) == (0.5, 0.5, 1.0, 0.5)
     assert rule.step(held([0.25, 0.5]), -1, *state) == (0.25, 0.25, 1.0, 0.5)
-
-
-def test_a_horizon_that_is_not_indexed_tells_its_first_input_at_every_stage() -> None:
-    first = held([0.25, 0.5], indexed=False, length=10, feeds_back=False)
-    assert {rule.step(first, stage, 0.0, 0.0, 0.0, 0.0)[0] for stage in range(-1, 10)} == {0.25}
 
 
 def test_where_a_horizon_leads_is_that_step_by_step() -> None:
