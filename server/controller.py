@@ -183,7 +183,7 @@ class Controller:
         return self.scheme.restart(row)
 
     def lead(
-        self, row: int, message: RoomMessage | None, *, leads: bool = True, plans: int = 0
+        self, row: int, message: RoomMessage | None, *, leads: bool = True, plans_due: int = 0
     ) -> None:
         """Note whether this server leads a vehicle; if it does, it sends a plan at once, whatever
         it sent before. See `server.leads.Leader`.
@@ -192,8 +192,8 @@ class Controller:
         if leads:
             self._sent_step[row] = -1
             self._trigger.forget(row)
-        if plans:
-            self._plans_due[row] = plans
+        if plans_due:
+            self._plans_due[row] = plans_due
         else:
             self._plans_due.pop(row, None)
         self.scheme.follow(row, message)

@@ -16,13 +16,13 @@ class Leader(Protocol):
     """The server's planning, as far as it depends on who leads; see `Controller`."""
 
     def lead(
-        self, row: int, message: RoomMessage | None, *, leads: bool = True, plans: int = 0
+        self, row: int, message: RoomMessage | None, *, leads: bool = True, plans_due: int = 0
     ) -> None:
         """Note whether this server leads a vehicle.
 
         Args:
             message: what the vehicle has said of it; None if it has no other server.
-            plans: number of plans to send next, whatever the trigger says.
+            plans_due: number of plans to send next, whatever the trigger says.
         """
 
 

@@ -73,7 +73,7 @@ class LeadsOfTwo(Leads):
         leads = lead is None or bool(lead.leads)
         self._largest = max(self._largest, lead.number if lead else 0)
         takes_over = leads and lead and lead.number and self.limits is None
-        self.controller.lead(row, lead, leads=leads, plans=TAKEOVER_PLANS if takes_over else 0)
+        self.controller.lead(row, lead, leads=leads, plans_due=TAKEOVER_PLANS if takes_over else 0)
 
     def _number(self, said: SessionLead) -> int:
         """Number of the leadership that a vehicle should follow: the largest, if all follow one
