@@ -23,8 +23,8 @@ from skytether.shell.commandline.argument import Argument
 from skytether.shell.commandline.command import CommandError
 from skytether.shell.commandline.options import read
 from skytether.shell.host import temporary
+from skytether.shell.host.web import HOST_PORT
 from skytether.sim import flight
-from skytether.view.browser.access import HOST_PORT
 from skytether.view.browser.flight import PageFlight
 from skytether.view.browser.replay import Player
 from skytether.view.browser.serve import until_told

@@ -40,9 +40,9 @@ from skytether.shell.commandline.argument import Argument
 from skytether.shell.commandline.command import CommandError, ScenarioOptions
 from skytether.shell.commandline.plugins import Plugin
 from skytether.shell.host import system, temporary
+from skytether.shell.host.web import HOST_PORT
 from skytether.shell.processes import pool
 from skytether.sim import flight
-from skytether.view.browser.access import HOST_PORT
 
 UNSEEN = Fault, ReferenceTooFast
 """Events of a flight in virtual time that are printed after it."""

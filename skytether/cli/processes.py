@@ -40,10 +40,10 @@ from skytether.shared.telemetry.record import (
 )
 from skytether.shell.commandline import plugins
 from skytether.shell.commandline.command import INTERRUPTED, CommandError
+from skytether.shell.driving.control import NETEMS
 from skytether.shell.host import system, temporary
 from skytether.shell.processes.log import LogLine, line_of
 from skytether.shell.processes.workers import die_with_parent
-from skytether.view.browser.play import NETEMS
 
 ANYWHERE = ("--bind", "127.0.0.1:0")
 NAMES = ("client", "server", "netem")

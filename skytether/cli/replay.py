@@ -12,7 +12,7 @@ from skytether.cli import recordings
 from skytether.shell.commandline import command
 from skytether.shell.commandline.argument import Argument
 from skytether.shell.commandline.options import read
-from skytether.view.browser.access import HOST_PORT
+from skytether.shell.host.web import HOST_PORT
 from skytether.view.browser.flight import PageFlight
 from skytether.view.browser.replay import Player
 from skytether.view.browser.serve import until_told

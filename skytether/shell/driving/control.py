@@ -19,9 +19,15 @@ import msgspec
 
 from skytether.shared.endpoints.change import REQUEST_BYTES_MAX, Answer, Running
 from skytether.shared.events.processes import NotKept
+from skytether.shared.wire.framing import PATHS_MAX
 from skytether.shell.driving.journal import Journal
 from skytether.shell.host import system
 from skytether.shell.host.local import Local
+
+NETEMS = ("netem", *(f"netem {number}" for number in range(2, PATHS_MAX + 2)))
+"""Names of the netems of a session's paths, and of the one to a standby server."""
+PROCESSES = ("server", "server 2", *NETEMS, "client")
+"""Names of the processes, and of their sockets in a flight's folder."""
 
 REST_S = 0.01
 """Shortest pause after a request."""

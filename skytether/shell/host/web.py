@@ -8,6 +8,8 @@ Host header is checked.
 import ipaddress
 from urllib.parse import urlsplit
 
+HOST_PORT = "127.0.0.1:8080"
+"""Address of a page, unless another is requested."""
 HEADERS = {
     "Content-Security-Policy": "frame-ancestors 'none'",
     "X-Frame-Options": "DENY",

@@ -21,8 +21,8 @@ from skytether.shell.commandline.argument import Argument
 from skytether.shell.commandline.command import CONFIGURATION, CommandError
 from skytether.shell.commandline.options import read
 from skytether.shell.host import system
+from skytether.shell.host.web import HOST_PORT
 from skytether.shell.processes.log import LogFormat
-from skytether.view.browser.access import HOST_PORT
 from skytether.view.browser.serve import followed, until_told
 
 NICE = 5

@@ -14,8 +14,6 @@ from urllib.parse import parse_qs, urlsplit
 
 from skytether.shell.host.web import host_name, is_ours, numeric
 
-HOST_PORT = "127.0.0.1:8080"
-
 
 class TurnedAway(Enum):
     """Reason why a browser is refused, or why its message is dropped."""

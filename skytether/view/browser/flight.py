@@ -11,8 +11,9 @@ import msgspec
 from skytether.shared.endpoints.change import ONCE, Answer
 from skytether.shared.events.flight import Changed
 from skytether.shared.telemetry.feed import Frame, Opened, Said
+from skytether.shell.driving.control import NETEMS, PROCESSES
 from skytether.shell.host.compiling import progress
-from skytether.view.browser.play import NETEMS, PROCESSES, Operator
+from skytether.view.browser.play import Operator
 from skytether.view.page import controls
 from skytether.view.page.changes import Mark, mark, together
 from skytether.view.page.state import LED, State

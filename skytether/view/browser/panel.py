@@ -14,8 +14,8 @@ import viser
 from numpy.typing import NDArray
 
 from skytether.shared.missions.mission import format_goals, parse_goals
+from skytether.shell.driving.control import NETEMS
 from skytether.view.browser.flight import PageFlight
-from skytether.view.browser.play import NETEMS
 from skytether.view.page import words
 from skytether.view.page.changes import together
 from skytether.view.page.controls import (

@@ -11,13 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from skytether.shared.endpoints.change import Answer
-from skytether.shared.wire.framing import PATHS_MAX
 from skytether.shell.driving.control import Caller, ControlError
-
-NETEMS = ("netem", *(f"netem {number}" for number in range(2, PATHS_MAX + 2)))
-"""Names of the netems of a session's paths, and of the one to a standby server."""
-PROCESSES = ("server", "server 2", *NETEMS, "client")
-"""Names of the processes, and of their sockets in a flight's folder."""
 
 Answered = Callable[[str, Mapping[str, Any], Answer | None], None]
 

@@ -12,13 +12,13 @@ from skytether.shared.endpoints.endpoint import Address
 from skytether.shared.events.flight import address_text
 from skytether.shared.events.processes import PageServed
 from skytether.shell.commandline.command import RUN, CommandError, interruptible
+from skytether.shell.driving.control import PROCESSES
 from skytether.shell.driving.feed import Subscriber
 from skytether.shell.processes.log import Log, LogFormat
 from skytether.view.browser.access import is_loopback
 from skytether.view.browser.flight import PageFlight
 from skytether.view.browser.page import Page
 from skytether.view.browser.panel import More
-from skytether.view.browser.play import PROCESSES
 
 TOKEN_BYTES = 16
 POLL_S = 0.1
