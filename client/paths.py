@@ -1,4 +1,8 @@
-"""The way from a vehicle to a server over several paths, each an address with a socket."""
+"""The way from a vehicle to a server over several paths, each an address with a socket.
+
+It takes the place of `client.way.Way`; `client.connections` loads it for a server with several
+addresses. `shared.wire.paths` chooses the paths of each message.
+"""
 
 from collections.abc import Callable, Sequence
 from typing import Any

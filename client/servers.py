@@ -2,6 +2,9 @@
 
 The vehicle changes the leader by the rules of `client.leadership`; packets and faults of the leader
 alone reach the failsafe.
+
+It takes the place of `client.alone.OneServer`; `client.connections` loads it if there is a standby
+server.
 """
 
 from collections.abc import Callable

@@ -2,6 +2,8 @@
 
 An idle bottleneck serves a packet at once; otherwise the packet waits in a queue of limited bytes.
 Sizes include the headers of IP and UDP.
+
+`netem.link` loads it for a direction with a `rate` or with `deliveries`.
 """
 
 from bisect import bisect_left

@@ -1,14 +1,18 @@
 """A vehicle with an autopilot that speaks MAVLink: ArduCopter or PX4.
 
+    keys        section `mavlink` of a scenario (`scenario.rooms.SECTIONS`)
+    kind        `vehicle.kind = "mavlink"`, in the table VEHICLES
+    vehicle     the pilot's interface: velocities in, measurements out
     port        messages from and to the autopilot
     connection  the autopilot's address, and the sender of each message
     autopilot   from the first heartbeat to a vehicle that can be flown
-    setup       which autopilot it is, and whether its parameters are safe if set-points stop
+    setup       which autopilot it is, and whether its parameters are safe (`safety`)
     launch      mode, arming, take-off and landing, all done by the autopilot
     setpoints   when a desired velocity is sent, and repeated
-    hindrances  reasons that forbid following a plan, such as a second commander
-    vehicle     the pilot's interface: velocities in, measurements out
+    hindrances  reasons that forbid following a plan, such as a second commander (`rivals`)
 
-`condition` has the autopilot's newest status, `positions` its measurements, and `clock` converts
-its time stamps by the answers to `timesync`. Axes, frames and encoding are in `skytether.mavlink`.
+`condition` has the autopilot's newest status, `positions` and `receiver` its measurements, and
+`timesync` asks for its clock. Axes, frames and encoding are in `skytether.mavlink`. The package
+imports that, `shared`, and of the client the interface of a vehicle, its clock, positions and
+filter. `keys` and `kind` load without the extra `mavlink`.
 """

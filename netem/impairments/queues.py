@@ -1,4 +1,7 @@
-"""Impairments that depend on other packets: finite rates with queues, and order."""
+"""Impairments that depend on other packets: finite rates with queues, and order.
+
+They only describe the queue: `netem.bottleneck` is it.
+"""
 
 from typing import Annotated, Literal
 

@@ -1,1 +1,15 @@
-"""Missions: motions that keep several vehicles apart, and out of zones (docs/together-proof.md)."""
+"""Missions: motions that keep several vehicles apart, and out of zones (docs/together-proof.md).
+
+    planning         entry: `schemes.table` imports it if the scenario is a mission
+    mission_planner  the planner at each tick
+    mission_state    motions that each vehicle may fly (`vehicle_motions`), in arrays for
+                     kernels (`possible_motions`, `compiled_motion`)
+    led_vehicles     vehicles that follow this server, with a standby server or without
+    waypoints        the next point of a vehicle: its goal, or a point on the way (`routes`)
+    yielding         vehicles at rest make way
+    trajectory_qp    the QP for a new motion; its constraints: `half_planes`, `separation`,
+                     `zone_clearance`
+
+The package registers nothing. It imports `shared.missions`, which has the keys and events, and of
+the server only `planning`; never another scheme or a trigger.
+"""

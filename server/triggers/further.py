@@ -1,4 +1,4 @@
-"""Further policies, loaded with a scenario that names one."""
+"""Further policies, in the table TRIGGERS: loaded with a scenario that names one."""
 
 from typing import Annotated
 

@@ -1,7 +1,15 @@
-"""Files of other programs with the tracks of vehicles: a module a format.
+"""Files of other programs: tracks, zones and recorded links.
 
-Each is a `Format`, and is imported when a file of its format is read: a flight without such a file
-loads none of them.
+    skyc, kml, tables, plan, waypoints, ulog, dataflash, gpx  tracks of vehicles, a module a format
+    tracks, timing         tracks for a scenario: one clock, or a speed where a file has no times
+    shapes                 `csv`, `mission` and `show`, in the table REFERENCES
+    zones                  `geojson`, `kml` and `plan`, in the table ZONES; `zone_files`, `plans`
+    recorded, pings        recorded links, for `trace` of netem and for the probe
+    bounded, geographic    files read within bounds; coordinates of the globe
+
+Each of the first is a `Format`, and is imported when a file of its format is read: a flight without
+such a file loads none of them. The package imports `shared.missions`, `shared.scenario`,
+`shared.law` and `shared.base`; ULog needs the extra `ulog`.
 """
 
 from collections.abc import Callable

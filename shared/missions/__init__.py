@@ -1,5 +1,14 @@
-"""Missions, as a scenario describes them: goals of several vehicles, zones, and their
-contradictions. `server.missions` plans them.
+"""Missions, as a scenario describes them: goals of several vehicles that keep apart, and zones.
 
-Loaded with a scenario that is a mission. It fills the tables of shapes and zones.
+    keys            section `mission` of a scenario (`scenario.rooms.SECTIONS`)
+    mission         timed goals or paths of several vehicles; goals that change in flight
+    shapes          the missions `swap` and `sphere`; missions of files are in `shared.formats`
+    zones           polygons that vehicles keep out of, or stay within
+    zone_texts      zones written in a scenario, in the table ZONES
+    derived         what follows from the keys, such as clearances
+    contradictions  values that are each valid, but not together
+    events          events of a mission's vehicles (`scenario.rooms.EVENTS`)
+
+Keys are read with every scenario, the other modules with a mission. `server.missions` plans it. The
+package imports `shared.law`, `shared.scenario`, `shared.events` and `shared.base`.
 """

@@ -1,4 +1,7 @@
-"""LEAD, the message that says which of its servers leads a vehicle, and the leadership of plans."""
+"""LEAD, the message that says which of its servers leads a vehicle, and the leadership of plans.
+
+The protocol imports this module as it does `path_proof`.
+"""
 
 from typing import NamedTuple
 

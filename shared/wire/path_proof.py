@@ -1,4 +1,8 @@
-"""PATH, the message by which a session's paths are named and proven."""
+"""PATH, the message by which a session's paths are named and proven.
+
+The protocol knows its number, and imports this module when such a message is sent or comes;
+processes in real time do so before the first packet (`protocol.preload`).
+"""
 
 from typing import NamedTuple
 

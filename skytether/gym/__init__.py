@@ -1,8 +1,16 @@
 """Gymnasium environments behind a bad network, with the price of every packet; see docs/gym.md.
 
-from skytether.gym import Networked
+    from skytether.gym import Networked
 
-env = Networked(gymnasium.make("Pendulum-v1"), uplink="constant(50ms) & loss(10%)")
+    env = Networked(gymnasium.make("Pendulum-v1"), uplink="constant(50ms) & loss(10%)")
+
+    networked  `Networked`, and `NetworkedVector` for many; `remote` is the network between
+    players    what the robot does with chunks of actions that are late
+    spaces     actions as rows, and the size of observations, for any of Gymnasium's spaces
+    flights    Skytether's own flights, in which the agent is the trigger
+
+Importing `flights` registers `skytether/Target-v0` with Gymnasium. The package imports `sim`,
+`netem`, `server` and `shared`; nothing imports it. It needs the extra `gym`.
 """
 
 from skytether.shared.base import extras

@@ -1,4 +1,5 @@
 """MAVLink for both ends, autopilot and companion: bytes, axes, parameters.
 
-No module of this package has a socket: pymavlink only encodes and decodes messages.
+`client.mavlink` and the simulated autopilot import it. It imports nothing of ours, and no module
+has a socket: pymavlink only encodes and decodes messages.
 """

@@ -1,5 +1,11 @@
 """Measurement of a real path: probes both ways, and their analysis.
 
-Two endpoints exchange numbered packets (`prober`, `listener`); `analysis` and `fits` are functions
-of arrays. The command is `skytether.cli.probe`.
+    prober, listener  the two endpoints, which exchange the numbered packets of `wire`
+    analysis, fits    functions of arrays: figures, and models of delay and loss
+    outages           outages that several paths have in common
+    recorded          measurements from logs of ping and similar programs
+    outcome           results as figures and as text for a scenario
+
+The command is `skytether.cli.probe`; nothing is registered. The package imports `shared`, the
+client's address of a link, and the server's gate, which answers only proven addresses.
 """
