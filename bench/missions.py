@@ -29,7 +29,7 @@ over a good network (20 ms, no loss) and over the paper's with 30 % loss.
 import sys
 import tempfile
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from itertools import product
@@ -59,7 +59,7 @@ from skytether.shared.telemetry.summary import least_separation
 from skytether.shared.wire.protocol import Mode
 from skytether.shell.commandline import command
 from skytether.sim import flight
-from skytether.sim.world import World
+from skytether.sim.process import Process
 
 GOAL_AT_S = 2.0
 """Time from which the goals of random and published missions hold [s]."""
@@ -210,16 +210,13 @@ def fly_with_deaths(
     """Flight in which the server stops and restarts at `deaths` [s]; and all runs of the server."""
     lives: list[Server] = []
 
-    def live(world: World | None = None) -> None:
-        entropy = stream(scenario.seed, "mortal", len(lives)).bytes
-        lives.append(Server(scenario, boot_id=1 + len(lives), entropy=entropy, capacity=vehicles))
-        if world is not None:
-            world.restart(flight.SERVER[0], lives[-1])
+    def live(number: int) -> Server:
+        entropy = stream(scenario.seed, "mortal", number).bytes
+        lives.append(Server(scenario, boot_id=1 + number, entropy=entropy, capacity=vehicles))
+        return lives[-1]
 
-    live()
-    actions: list[tuple[float, Callable[[World], None]]] = []
-    for from_s, to_s in deaths:
-        actions += [(from_s, lambda world: world.stop(flight.SERVER[0])), (to_s, live)]
+    server = Process(flight.SERVER[0], live)
+    actions = [each for down, up in deaths for each in ((down, server.kill), (up, server.start))]
     return flight.fly(scenario, vehicles=vehicles, server=lives[0], actions=actions), lives
 
 

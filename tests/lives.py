@@ -12,6 +12,7 @@ from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS, seconds_to_ns
 from skytether.shared.missions.zones import Zones
 from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.summary import nearest
+from skytether.sim.flight import SERVER
 
 LOOK_S = 10 * MILLISECOND_NS / SECOND_NS
 """Sampling time of the vehicles' positions [s]."""
@@ -57,11 +58,11 @@ class Lives(lives.Lives):
         super().__init__(scenario)
         for each in restarts:
             begin = partial(self.start_client, each.vehicle, remembers=each.remembers)
-            self._at(each.at_s, partial(self.stop_client, each.vehicle))
+            self._at(each.at_s, partial(self.clients[each.vehicle].kill, self.world))
             self._at(each.at_s + each.down_s, begin)
         for death in deaths:
             others = {"mission.zones": death.zones} if death.zones else {}
-            self._at(death.at_s, self.stop_server)
+            self._at(death.at_s, partial(self.servers[SERVER[0]].kill, self.world))
             self._at(
                 death.at_s + death.down_s,
                 partial(self.start_server, others, remembers=death.remembers),

@@ -6,9 +6,10 @@ autopilot. Keys set by the operator survive a restart of the server.
 """
 
 import io
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -35,6 +36,7 @@ from skytether.shared.telemetry.record import Recorder, client_columns, parse
 from skytether.shared.telemetry.summary import Track, track
 from skytether.shared.wire.protocol import Mode
 from skytether.sim.flight import SERVER, STANDBY
+from skytether.sim.process import Process
 from skytether.sim.world import Clock, World
 
 Saved = tuple[bytes, int]
@@ -116,48 +118,54 @@ class Lives:
         self._standby = [(NETWORK[0], STANDBY_FLOWS)] if has_standby else []
         self._lives: dict[int, list[Life]] = {number: [] for number in mission.vehicles}
         self.bodies = {number: Body(scenario, number) for number in mission.vehicles}
-        for number in mission.vehicles:
+        self.clients = {
+            number: Process(f"client {number}", partial(self._client, number))
+            for number in mission.vehicles
+        }
+        for number, client in self.clients.items():
             start_ns = int(stream(scenario.seed, "phase", number).integers(scenario.dt_ns))
-            client = self._client(number)
-            self.world.add(f"client {number}", client, clock=CLOCK, start_ns=start_ns)
-        self.servers: list[Server] = []
+            self.world.add(client.host, client.endpoint, clock=CLOCK, start_ns=start_ns)
+        self.server_runs: list[Server] = []
         """All runs of all servers."""
         self._running: dict[str, Running] = {}
-        """Each server that is up, and its scenario."""
-        self._settings: dict[str, Mapping[str, Any]] = {}
-        """Keys set in flight, as the journal of each server stores them."""
-        for name, _ in (SERVER, STANDBY)[: 1 + has_standby]:
-            self.world.add(name, self._server(scenario, name), clock=CLOCK)
+        """Newest run of each server, and its scenario."""
+        self.servers = {
+            name: Process(name, partial(self._server, name))
+            for name, _ in (SERVER, STANDBY)[: 1 + has_standby]
+        }
+        for name, server in self.servers.items():
+            self.world.add(name, server.endpoint, clock=CLOCK)
 
     def _on_event(self, time_ns: int, host: str, event: Event) -> None:
         self.events.append((time_ns / SECOND_NS, host, event))
 
     @property
-    def server(self) -> Server:
-        """Newest run of a server."""
-        return self.servers[-1]
-
-    @property
-    def running(self) -> Running | None:
-        """A server that is up, the first if both are, and its scenario; None if none is."""
-        return self._running.get(SERVER[0]) or self._running.get(STANDBY[0])
+    def running(self) -> list[Running]:
+        """Servers that are up, and their scenarios, with the keys set in flight."""
+        return [self._running[name] for name, server in self.servers.items() if server.is_up]
 
     @property
     def scenarios(self) -> list[Scenario]:
-        """Scenario of each server that leads, with the keys set in flight."""
-        return [each.scenario for each in self._running.values() if _leads(each)]
+        """Scenario of each server that leads."""
+        return [each.scenario for each in self.running if _leads(each)]
 
-    def _server(self, scenario: Scenario, name: str) -> Server:
-        number = len(self.servers) + 1
+    def _server(
+        self,
+        name: str,
+        _: int,
+        scenario: Scenario | None = None,
+        settings: Mapping[str, Any] = MappingProxyType({}),
+    ) -> Server:
+        scenario, number = scenario or self.scenario, len(self.server_runs) + 1
         entropy = stream(scenario.seed, "entropy", number).bytes
         count = len(self.mission.vehicles)
         server = Server(scenario, boot_id=number, entropy=entropy, capacity=count)
-        self.servers.append(server)
-        self._running[name] = Running(server, scenario, self._settings.get(name, {}))
+        self.server_runs.append(server)
+        self._running[name] = Running(server, scenario, settings)
         return server
 
-    def _client(self, number: int, kept: Saved | None = None) -> Client:
-        lives, before, sink = self._lives[number], None, io.BytesIO()
+    def _client(self, number: int, runs: int, kept: Saved | None = None) -> Client:
+        before, sink = None, io.BytesIO()
         if kept is not None:
             before = recall(*kept, CLOCK.local(self.world.now_ns), self.scenario.terms())
         client = Client(
@@ -166,21 +174,18 @@ class Lives:
             server=NETWORK,
             standby=self._standby,
             vehicle=number,
-            boot_id=number * 1000 + len(lives),
+            boot_id=number * 1000 + runs,
             recorder=Recorder(client_columns(self.scenario.model.axes), sink),
             keeps=self._keeps(number),
             before=before,
         )
-        lives.append(Life(client, sink))
+        self._lives[number].append(Life(client, sink))
         return client
 
     def _keeps(self, number: int) -> bool:
         return number in self._mortal and self.scenario.vehicle.memory != "none"
 
     # -- stops and restarts ------------------------------------------------------------------------
-
-    def stop_client(self, number: int) -> None:
-        self.world.stop(f"client {number}")
 
     def start_client(
         self, number: int, *, remembers: bool = True, saved: Sequence[Saved] | None = None
@@ -194,13 +199,14 @@ class Lives:
         body, remembers = self.bodies[number], remembers and self._keeps(number)
         body.fly_alone(CLOCK.local(self.world.now_ns))
         found = (self.saved(number) if saved is None else saved) if remembers else ()
+        client = self.clients[number]
         if not found:
-            body.reset(_sensor(self.scenario, number, len(self._lives[number])))
-        self.world.restart(f"client {number}", self._client(number, *found))
+            body.reset(_sensor(self.scenario, number, client.runs))
+        client.start(self.world, *found)
 
     def join_client(self, number: int) -> None:
         """Start a vehicle's client, unless one has flown already."""
-        if not self._lives[number][-1].client.began_ns:
+        if not self.clients[number].endpoint.began_ns:
             self.start_client(number, remembers=False)
 
     def saved(self, number: int) -> Sequence[Saved]:
@@ -208,63 +214,17 @@ class Lives:
         saved = self.world.memory(f"client {number}")
         return () if saved is None else (saved,)
 
-    def stop_server(self, name: str = SERVER[0]) -> None:
-        if running := self._running.pop(name, None):
-            self._settings[name] = running.settings
-        self.world.stop(name)
+    def end_client(self, number: int) -> None:
+        """Let a client end in order; its vehicle then holds its place."""
+        hold = partial(setattr, self.bodies[number], "holds", True)
+        self.clients[number].end(self.world, self.scenario.dt_ns, hold)
 
     def end_server(self, name: str = SERVER[0]) -> None:
-        """Ask a server to end, as SIGTERM does."""
-        if running := self._running.get(name):
-            stop = partial(self.stop_server, name)
-            self._end(name, running.endpoint, lambda: self._running.get(name) is running, stop)
-
-    def end_client(self, number: int) -> None:
-        """Ask a client to end, as SIGTERM does."""
-        client, lives, body = (
-            self._lives[number][-1].client,
-            self._lives[number],
-            self.bodies[number],
-        )
-
-        def stop() -> None:
-            body.holds = True
-            self.stop_client(number)
-
-        self._end(f"client {number}", client, lambda: lives[-1].client is client, stop)
-
-    def _end(
-        self, name: str, endpoint: Endpoint, is_up: Callable[[], bool], stop: Callable[[], None]
-    ) -> None:
-        """Let an endpoint end, as an operator asks; nothing is done if it has stopped before."""
-        latest_ns = 0
-
-        def leave(*, now_ns: int) -> None:
-            nonlocal latest_ns
-            latest_ns = endpoint.leave(now_ns=now_ns)
-
-        def look() -> None:
-            if not is_up():
-                return
-            if endpoint.finished or CLOCK.local(self.world.now_ns) >= latest_ns:
-                self.world.act(name, endpoint.close)
-                stop()
-            else:
-                self.world.at(self.world.now_ns + self.scenario.dt_ns, look)
-
-        self.world.act(name, leave)
-        look()
-
-    def close_server(self, name: str = SERVER[0]) -> None:
-        """Let a server close its sessions and end at once, as a second SIGTERM does."""
-        if running := self._running.get(name):
-            self.world.act(name, running.endpoint.close)
-        self.stop_server(name)
+        self.servers[name].end(self.world, self.scenario.dt_ns)
 
     def settings(self, name: str) -> Mapping[str, Any]:
         """Keys set in flight, as the journal of a server has them."""
-        running = self._running.get(name)
-        return running.settings if running else self._settings.get(name, {})
+        return self._running[name].settings
 
     def start_server(
         self,
@@ -281,18 +241,17 @@ class Lives:
             remembers: whether keys that were set in flight are kept.
             settings: the keys that it finds in place of those.
         """
-        if not remembers:
-            self._settings.pop(name, None)
-        if settings is not None:
-            self._settings[name] = settings
-        scenario = with_values(with_values(self.scenario, changes), self._settings.get(name, {}))
-        self.world.restart(name, self._server(scenario, name))
+        if settings is None:
+            settings = self.settings(name) if remembers else {}
+        scenario = with_values(with_values(self.scenario, changes), settings)
+        self.servers[name].start(self.world, scenario, settings)
 
     def set(self, values: Mapping[str, Any]) -> None:
         """Set keys at each server, as an operator; it may refuse them."""
-        for name, running in self._running.items():
-            with suppress(ConfigError):  # a refusal is logged as an event
-                self.world.act(name, partial(running.change, values))
+        for name, server in self.servers.items():
+            if server.is_up:
+                with suppress(ConfigError):  # a refusal is logged as an event
+                    self.world.act(name, partial(self._running[name].change, values))
 
     # -- the flight --------------------------------------------------------------------------------
 

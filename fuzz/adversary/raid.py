@@ -254,26 +254,26 @@ class Raid:
         match move.kind:
             case MoveKind.SERVER | MoveKind.STANDBY:
                 name, _ = SERVER if move.kind is MoveKind.SERVER else STANDBY
-                begin = [partial(lives.stop_server, name)]
+                begin = [partial(lives.servers[name].kill, self._world)]
                 end = [partial(lives.start_server, {}, name=name), self._note_zones]
             case MoveKind.FREEZES:
                 name = self._server(move.amounts)
                 begin, end = [partial(self._world.freeze, name)], [partial(self._world.thaw, name)]
             case MoveKind.STOPS:
                 name = self._server(move.amounts[1:])
-                stop = lives.end_server if round(move.amounts[0]) else lives.close_server
-                begin = [partial(stop, name)]
+                close = partial(lives.servers[name].close, self._world)
+                begin = [partial(lives.end_server, name) if round(move.amounts[0]) else close]
                 end = [partial(lives.start_server, {}, name=name), self._note_zones]
             case MoveKind.RESTORES if move.vehicle == 0:
                 name, settings = self._server(move.amounts[1:]), dict[str, Any]()
                 self._before(move, lambda: settings.update(lives.settings(name)))
-                begin = [partial(lives.stop_server, name)]
+                begin = [partial(lives.servers[name].kill, self._world)]
                 start = partial(lives.start_server, {}, settings=settings, name=name)
                 end = [start, self._note_zones]
             case MoveKind.RESTORES:
                 saved = list[Saved]()
                 self._before(move, lambda: saved.extend(lives.saved(move.vehicle)))
-                begin = [partial(lives.stop_client, move.vehicle)]
+                begin = [partial(lives.clients[move.vehicle].kill, self._world)]
                 end = [partial(lives.start_client, move.vehicle, saved=saved)]
             case MoveKind.ENDS:
                 begin = [partial(lives.end_client, number) for number in hit]
@@ -283,11 +283,11 @@ class Raid:
                 end = [partial(self._world.thaw, f"client {number}") for number in hit]
             case MoveKind.JOINS:
                 for number in hit:
-                    lives.stop_client(number)
+                    lives.clients[number].kill(self._world)
                 begin = []
                 end = [partial(lives.join_client, number) for number in hit]
             case MoveKind.CLIENT:
-                begin = [partial(lives.stop_client, number) for number in hit]
+                begin = [partial(lives.clients[number].kill, self._world) for number in hit]
                 end = [partial(lives.start_client, number) for number in hit]
         for time_ns, actions in ((move.start_ns, begin), (move.end_ns, end)):
             for action in actions:
@@ -308,7 +308,7 @@ class Raid:
     def _set(self) -> None:
         """Set goals and zones of the active moves; the server may refuse them."""
         lives, now_ns, own = self._lives, self._world.now_ns, self._scenario.mission
-        if lives.running is None:
+        if not lives.running:
             return
         now = [move for move in self._moves if move.is_on(now_ns)]
         goals = {
@@ -353,7 +353,7 @@ class Raid:
         self._world.run(over, limit_ns=limit_ns)
         tracks = self._lives.tracks()
         counts, margins = Counter[str](), dict.fromkeys(ASSUMED, 0.0)
-        for server in self._lives.servers:
+        for server in self._lives.server_runs:
             told = server.figures()
             counts.update(told["counts"])
             margins = {each: max(near, told["margins"][each]) for each, near in margins.items()}

@@ -11,7 +11,8 @@ endpoint. A vehicle that has landed is restarted after a while, as an operator w
 import traceback
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import msgspec
@@ -56,6 +57,7 @@ from skytether.shared.wire.channel import LIFE_NS
 from skytether.shared.wire.keys import Keyring
 from skytether.shared.wire.protocol import Mode
 from skytether.sim.flight import STANDBY
+from skytether.sim.process import Process
 from skytether.sim.sealed import make_keys
 from skytether.sim.world import Clock, World
 
@@ -212,17 +214,6 @@ class Failing:
         return inputs, solved & ~failed
 
 
-@dataclass(slots=True)
-class TorturedVehicle:
-    """Vehicle through all runs of its client."""
-
-    name: str
-    plant: FirstOrderPlant
-    """Simulated vehicle, which persists through all runs of the client."""
-    life: WatchedLife
-    lives: int = 1
-
-
 class Torture:
     def __init__(self, trial: Trial) -> None:
         self.trial = trial
@@ -250,7 +241,8 @@ class Torture:
         self._recovery_ns = recovery_ns(self.scenario, restarts=restarts) + self._step_ns
         """Time within which a vehicle must fly again after the last fault [ns]."""
         self.counts: Counter[str] = Counter()
-        self._servers = self._netems = 0
+        self._servers = 0
+        self._processes: dict[str, Process[Steady]] = {}
         names = [f"client {number}" for number in range(1, count + 1)]
         self.saboteur = Saboteur(
             stream(trial.seed, "torture", "saboteur"), [(name, 0) for name in names]
@@ -258,23 +250,21 @@ class Torture:
         self.world.add(SABOTEUR[0], self.saboteur)
         self.observer = Observer(stream(trial.seed, "torture", "observer"), self.saboteur)
         self.world.add(OBSERVER, self.observer)
-        self.world.add(NETEM[0], self._new_netem(), clock=Clock(CLOCK_NS))
+        self._add(NETEM[0], self._new_netem)
         if trial.two_paths:
             self._add_netem(SECOND_PATH, SERVER, trial.seed + 2**31)
         if trial.standby:
             self._add_netem(STANDBY_PATH, STANDBY, trial.seed + 2**30)
-        self.vehicles: list[TorturedVehicle] = []
+        self._lives: dict[str, WatchedLife] = {}
+        """Newest run of each client."""
         for number, name in enumerate(names, start=1):
             weather = Weather(self.scenario, stream(trial.seed, "wind", number))
             plant = FirstOrderPlant(self.scenario, weather)
-            life, client = self._new_client(number, 1, plant)
-            self.vehicles.append(TorturedVehicle(name, plant, life))
-            start_ns = int(self._chance.integers(self.scenario.dt_ns))
-            self.world.add(name, client, clock=Clock(CLOCK_NS), start_ns=start_ns)
-        self.world.add(SERVER[0], self._new_server(), clock=Clock(CLOCK_NS), compute_ns=COMPUTE_NS)
+            client = partial(self._new_client, name, number, plant)
+            self._add(name, client, within_ns=self.scenario.dt_ns)
+        self._add(SERVER[0], self._new_server, compute_ns=COMPUTE_NS)
         if trial.standby:
-            standby = Steady(self._made_server(self._keyring)[0])
-            self.world.add(STANDBY[0], standby, clock=Clock(CLOCK_NS), compute_ns=COMPUTE_NS)
+            self._add(STANDBY[0], self._new_standby, compute_ns=COMPUTE_NS)
         self._down_hosts: Counter[str] = Counter()
         """Number of active faults that keep each host down."""
         for fault in trial.faults:
@@ -293,8 +283,8 @@ class Torture:
             where = traceback.extract_tb(error.__traceback__)[-1]
             message = f"{type(error).__name__} {error} ({where.filename}:{where.lineno})"
             failure, invariant = f"raises: {message}", "raises"
-        for vehicle in self.vehicles:
-            self._count(vehicle.life)
+        for life in self._lives.values():
+            self._count(life)
         self.counts += self.saboteur.counts
         return TrialOutcome(
             trial=self.trial,
@@ -302,6 +292,21 @@ class Torture:
             invariant=invariant,
             flown_s=self.world.now_ns / SECOND_NS,
             counts=dict(self.counts),
+        )
+
+    def _add(
+        self,
+        name: str,
+        make: Callable[[int], Steady],
+        *,
+        within_ns: int = 1,
+        compute_ns: int = 0,
+    ) -> None:
+        """Add a host and its process, which starts at a random time before `within_ns`."""
+        self._processes[name] = process = Process(name, make)
+        start_ns, clock = int(self._chance.integers(within_ns)), Clock(CLOCK_NS)
+        self.world.add(
+            name, process.endpoint, clock=clock, start_ns=start_ns, compute_ns=compute_ns
         )
 
     def _add_netem(self, at: Address, server: Address, seed: int) -> None:
@@ -314,11 +319,14 @@ class Torture:
     def _boot_id(self) -> int:
         return int(self._chance.integers(2**63)) | 2**62
 
-    def _new_server(self) -> Steady:
+    def _new_server(self, _: int) -> Steady:
         wrong = make_keys(self.trial.seed + 1, len(self._keyring))
         keyring = wrong if self._wrong_keys else self._keyring
         self._server, self._gate = self._made_server(keyring)
         return Steady(self._server)
+
+    def _new_standby(self, _: int) -> Steady:
+        return Steady(self._made_server(self._keyring)[0])
 
     def _made_server(self, keyring: Keyring) -> tuple[Server, Gatekeeper]:
         self._servers += 1
@@ -334,16 +342,16 @@ class Torture:
         )
         return server, watched
 
-    def _new_netem(self) -> Steady:
-        scenario = msgspec.structs.replace(self.scenario, seed=self.trial.seed + self._netems)
-        self._netems += 1
+    def _new_netem(self, number: int) -> Steady:
+        scenario = msgspec.structs.replace(self.scenario, seed=self.trial.seed + number)
         self._netem = Proxy(scenario, server=SERVER, flows=FLOWS)
         return Steady(self._netem)
 
-    def _new_client(
-        self, vehicle: int, number: int, plant: FirstOrderPlant, drifted_m: float = 0.0
-    ) -> tuple[WatchedLife, Steady]:
+    def _new_client(self, name: str, vehicle: int, plant: FirstOrderPlant, earlier: int) -> Steady:
+        """Next run of a client; its simulated vehicle persists through all of them."""
         key, world = self._keyring.of(vehicle), self.world
+        if before := self._lives.get(name):
+            self._count(before)
         links = [
             client_secure.SecureLink(key, entropy=self._chance.bytes)
             for _ in range(1 + self.trial.standby)
@@ -352,15 +360,15 @@ class Torture:
             links,
             self.scenario,
             vehicle=vehicle,
-            number=number,
+            number=earlier + 1,
             up=self._up,
             down=self._down,
             clock=lambda: world.now_ns,
             overdue=self._overdue,
             rekey_ns=self._rekey_ns,
-            drifted_m=drifted_m,
+            drifted_m=before.drifted_m if before else 0.0,
         )
-        sensor = Sensor(self.scenario, stream(self.trial.seed, "sensor", vehicle, number))
+        sensor = Sensor(self.scenario, stream(self.trial.seed, "sensor", vehicle, earlier + 1))
         client = Client(
             self.scenario,
             SimulatedVehicle(self.scenario.dt_ns, plant, sensor),
@@ -373,24 +381,12 @@ class Torture:
             recorder=life,
         )
         life.disturbance = lambda: tuple(client.disturbance.tolist())
-        return life, Steady(client)
+        self._lives[name] = life
+        return Steady(client)
 
     def _renew(self, name: str) -> None:
         self.counts[f"lives of {name.partition(' ')[0]}"] += 1
-        if name == SERVER[0]:
-            self.world.restart(name, self._new_server())
-        elif name == STANDBY[0]:
-            self.world.restart(name, Steady(self._made_server(self._keyring)[0]))
-        elif name == NETEM[0]:
-            self.world.restart(name, self._new_netem())
-        else:
-            vehicle = next(each for each in self.vehicles if each.name == name)
-            self._count(vehicle.life)
-            vehicle.lives += 1
-            number = vehicle.life.vehicle
-            drifted_m = vehicle.life.drifted_m
-            vehicle.life, client = self._new_client(number, vehicle.lives, vehicle.plant, drifted_m)
-            self.world.restart(name, client)
+        self._processes[name].start(self.world)
 
     def _count(self, life: WatchedLife) -> None:
         self.counts["steps"] += life.steps
@@ -430,13 +426,13 @@ class Torture:
     def hosts(self, fault: ScheduledFault) -> list[str]:
         if fault.where == SERVER[0] and self.trial.standby and fault.start_ns % 2:
             return [STANDBY[0]]
-        return [each.name for each in self.vehicles] if fault.where == "client" else [fault.where]
+        return [*self._lives] if fault.where == "client" else [fault.where]
 
     def set_down(self, name: str, *, down: bool) -> None:
         """Take a host down, or start its process again once no fault keeps it down."""
         self._down_hosts[name] += 1 if down else -1
         if down:
-            self.world.stop(name)
+            self._processes[name].kill(self.world)
         elif not self._down_hosts[name]:
             self._renew(name)
 
@@ -462,15 +458,16 @@ class Torture:
         """Check a change of mode; restart a vehicle that has landed."""
         if not isinstance(event, ModeChanged):
             return
-        vehicle = self.vehicles[event.vehicle - 1]
-        vehicle.life.check_change(event.before, event.after)
+        name = f"client {event.vehicle}"
+        life = self._lives[name]
+        life.check_change(event.before, event.after)
         self.counts[f"{event.after}: {event.reason}"] += event.before != event.after
-        landed, due_ns = vehicle.life, time_ns + LANDED_NS
+        due_ns = time_ns + LANDED_NS
         recovery_after_ns = recovery_ns(self.scenario, restarts=True) + self._step_ns
 
         def renew() -> None:
-            if vehicle.life is landed and not self._down_hosts[vehicle.name]:
-                self._renew(vehicle.name)
+            if self._lives[name] is life and not self._down_hosts[name]:
+                self._renew(name)
                 self._calm_ns, self._recovery_ns = due_ns, recovery_after_ns
 
         landing = event.after == str(Mode.LAND) and event.before != event.after
@@ -479,8 +476,7 @@ class Torture:
 
     def _check_end(self) -> None:
         """Check that every vehicle flies, and that no container exceeds its bound."""
-        for vehicle in self.vehicles:
-            life = vehicle.life
+        for life in self._lives.values():
             silent_ns = self.end_ns - life.row_ns
             if life.row_ns < 0 or silent_ns > 3 * self.scenario.dt_ns:
                 raise Violation("recovers", f"vehicle {life.vehicle} does not fly at the end")

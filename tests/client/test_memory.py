@@ -233,12 +233,12 @@ def test_to_a_server_that_was_told_a_restart_with_an_old_file_is_one_without(
     with monkeypatch.context() as disk:
         disk.setattr(ClientMemory, "keep", lambda *_, **__: None)
         flight.run(7.5)
-        flight.stop_client(7)
+        flight.clients[7].kill(flight.world)
         flight.run(7.7)
         flight.start_client(7)
     flight.run(9.5)
     assert [host for _, host, event in flight.events if event == begun] == [SERVER[0]]
-    flight.stop_client(7)  # its state is saved again
+    flight.clients[7].kill(flight.world)  # its state is saved again
     flight.run(9.7)
     flight.start_client(7)
     flight.run(12.0)

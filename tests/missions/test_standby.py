@@ -209,7 +209,7 @@ def test_a_standby_that_would_keep_another_distance_is_refused_with_both() -> No
     (differs,) = refused[0].differences
     assert differs.key == "mission.separation_m"
     assert {differs.here, differs.there} == {"0.1", "0.5"}
-    assert lives.running is not None
+    assert lives.running
 
 
 def with_standby(**others: object) -> Lives:
@@ -244,7 +244,7 @@ def test_a_standby_that_plans_within_other_limits_is_not_followed(
 ) -> None:
     lives = with_standby(**others)
     lives.run(6.0)
-    lives.stop_server()
+    lives.servers[SERVER[0]].kill(lives.world)
     lives.run(15.0)
     assert leaderships(lives) == [int(not others)] * 4
     refused = [each for _, _, each in lives.events if isinstance(each, LimitsDiffer)]
@@ -266,7 +266,7 @@ def test_zones_that_are_set_at_both_servers_are_followed_by_the_standby() -> Non
         differs = name == SERVER[0]
         may_lead = [client._servers.leadership.may_lead(1) for client in clients(lives)]
         assert may_lead == [not differs] * 4
-    lives.stop_server()
+    lives.servers[SERVER[0]].kill(lives.world)
     lives.run(17.0)
     assert leaderships(lives) == [1] * 4
 

@@ -1,0 +1,72 @@
+"""Processes in virtual time: they stop, end in order, and start again on their host.
+
+Each run of a process is an endpoint of its own. The host keeps its address, its clock and what a
+run has saved (`World.memory`).
+"""
+
+from collections.abc import Callable
+from typing import Any, Generic, TypeVar
+
+from skytether.shared.endpoints.endpoint import Endpoint
+from skytether.sim.world import World
+
+Run = TypeVar("Run", bound=Endpoint)
+
+
+class Process(Generic[Run]):
+    """Process of a host, whose first run is to be added to the world.
+
+    Its methods take the world first, so that they can be `actions` of `sim.flight.fly`.
+
+    Args:
+        host: name of the host.
+        make: makes a run, from the number of runs before it and the arguments of `start`.
+    """
+
+    def __init__(self, host: str, make: Callable[..., Run]) -> None:
+        self.host, self._make = host, make
+        self.endpoint = make(0)
+        """Newest run."""
+        self.runs, self.is_up = 1, True
+
+    def start(self, world: World, *args: Any) -> None:
+        """Start the next run, in place of one that is up."""
+        self.endpoint = self._make(self.runs, *args)
+        self.runs, self.is_up = self.runs + 1, True
+        world.restart(self.host, self.endpoint)
+
+    def kill(self, world: World) -> None:
+        self.is_up = False
+        world.stop(self.host)
+
+    def close(self, world: World) -> None:
+        """End a run that is up at once, with its last datagrams, as a second SIGTERM does."""
+        if self.is_up:
+            world.act(self.host, self.endpoint.close)
+        self.kill(world)
+
+    def end(self, world: World, look_ns: int, ended: Callable[[], None] = lambda: None) -> None:
+        """Let a run that is up end in order, as SIGTERM does.
+
+        Args:
+            look_ns: time between two looks at whether it has finished [ns].
+            ended: called at the end, unless the run is stopped before.
+        """
+        run, latest_ns = self.endpoint, 0
+
+        def leave(*, now_ns: int) -> None:
+            nonlocal latest_ns
+            latest_ns = world.now_ns + run.leave(now_ns=now_ns) - now_ns
+
+        def look() -> None:
+            if not self.is_up or self.endpoint is not run:
+                return
+            if run.finished or world.now_ns >= latest_ns:
+                self.close(world)
+                ended()
+            else:
+                world.at(world.now_ns + look_ns, look)
+
+        if self.is_up:
+            world.act(self.host, leave)
+            look()
