@@ -10,10 +10,10 @@ from skytether.client.vehicles import vehicle
 from skytether.netem.impairments.draws import Draws, Fate
 from skytether.netem.impairments.impairment import Impairment, Share, Time, impairment
 from skytether.server.triggers.trigger import Situation, Trigger, Verdict, above, trigger
+from skytether.shared.scenario.curves import reference
 from skytether.shared.scenario.planners import Planner, Problem, planner
 from skytether.shared.scenario.reference import Reference
 from skytether.shared.scenario.schema import ControlConfig
-from skytether.shared.scenario.trajectories import reference
 from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import Compared
 

@@ -14,16 +14,16 @@ trajectories of their own have pages of their own.
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from skytether.server.planning.moving_setpoint import LivePoint
 from skytether.shared.base.kernel import F1, F4, I1, inline, kernel, plain, shared
 from skytether.shared.law.model import Array, Indices
 from skytether.shared.law.terms import Terms
 from skytether.shared.scenario import reference
 from skytether.shared.scenario.reference import Reference
+from skytether.shared.scenario.registry import load
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.wire.protocol import ahead_max
 
@@ -82,7 +82,11 @@ class Desired:
         axes, H, wanted = terms.axes, terms.horizon, scenario.reference
         longest = ahead_max(terms) + H
         late_s = np.array(terms.dead_time_s)
-        self._point = _live(scenario) if wanted.shape == "live" else None
+        self._point: Any = None
+        """`LivePoint` that all vehicles follow; None with any other shape."""
+        if wanted.shape == "live":
+            module = load("skytether.server.planning.moving_setpoint", "reference.shape live")
+            self._point = module.live_point(scenario)
         self._all = wanted.preview == "all" and self._point is None
         self._reach = H
         """Steps that a page covers beyond its first PAGE steps: H, or with a limited preview the
@@ -195,12 +199,6 @@ class Desired:
                 self._pages[at, axis] = sample(times_s + self._ahead_s[axis])[:, axis]
             keys[at] = number * TRAJECTORY + page
         return self._found
-
-
-def _live(scenario: Scenario) -> LivePoint:
-    velocity = scenario.reference.velocity_mps
-    start = scenario.unallocated_reference()(np.zeros(()))[:, 0]
-    return LivePoint(start, np.array(velocity) if velocity else None, scenario.u_max)
 
 
 @inline

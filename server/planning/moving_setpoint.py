@@ -11,6 +11,7 @@ import numpy as np
 
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.law.model import Array
+from skytether.shared.scenario.schema import Scenario
 
 MEMORY_S = 0.2
 """Time constant of the mean velocity [s]; the smallest that tolerates errors of 2 cm in moves."""
@@ -58,3 +59,9 @@ class LivePoint:
         # Two moves a moment apart could give a velocity that no vehicle can follow.
         velocity: Array = np.clip(before, -self._fastest, self._fastest)
         return velocity
+
+
+def live_point(scenario: Scenario) -> LivePoint:
+    velocity = scenario.reference.velocity_mps
+    start = scenario.unallocated_reference()(np.zeros(()))[:, 0]
+    return LivePoint(start, np.array(velocity) if velocity else None, scenario.u_max)

@@ -1,8 +1,9 @@
 """Triggers, which decide when a horizon is sent: small policies combined with & and |.
 
 A scenario writes `cost_gap & budget(5, 2) | silence(1)` (`shared.scenario.grammar`). Policies are
-entries of the table `TRIGGERS` (`shared.scenario.registry`): ours in `policies` and `further`, and
-those of plug-ins. docs/triggers.md says when to use each, and how to write one.
+entries of the table `TRIGGERS` (`shared.scenario.registry`): ours in `policies`, `gaps`,
+`schedules` and `further`, and those of plug-ins. docs/triggers.md says when to use each, and how to
+write one.
 
 The server evaluates the trigger once per step, after planning. A vehicle without a usable previous
 plan (`fresh`: first step, or a gap longer than H) fires in every policy but `budget` (E18).

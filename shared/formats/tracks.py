@@ -10,7 +10,7 @@ import numpy as np
 from skytether.shared import formats
 from skytether.shared.formats import Tracks
 from skytether.shared.formats.geographic import Origin
-from skytether.shared.scenario.curves import timed_path
+from skytether.shared.scenario.points import timed_path
 from skytether.shared.scenario.reference import FAR_M, Reference
 
 

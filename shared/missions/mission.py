@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skytether.shared.law.model import Array
-from skytether.shared.scenario.curves import timed_path
 from skytether.shared.scenario.grammar import GrammarError, calls
+from skytether.shared.scenario.points import timed_path
 from skytether.shared.scenario.reference import FAR_M, OfFleet, Reference
 
 SWAP_AT_S = 2.0

@@ -69,29 +69,6 @@ def planar(
     return sample
 
 
-def circle(radius_m: float, period_s: float, axes: int, altitude_m: float = 0.0) -> Reference:
-    """Circle around the origin, counter-clockwise, from (radius, 0)."""
-    w = 2.0 * np.pi / period_s
-    return planar(
-        lambda t: (radius_m * np.cos(w * t), -radius_m * w * np.sin(w * t)),
-        lambda t: (radius_m * np.sin(w * t), radius_m * w * np.cos(w * t)),
-        axes,
-        altitude_m,
-    )
-
-
-def hover(point_m: Array) -> Reference:
-    point = np.asarray(point_m, dtype=np.float64)
-
-    def sample(t: Array) -> Array:
-        t = np.asarray(t, dtype=np.float64)
-        state = np.zeros((*t.shape, len(point), 2))
-        state[..., 0] = point
-        return state
-
-    return sample
-
-
 def reflected(free: Any, bound: float) -> tuple[Any, Any]:
     """Coordinate reflected at walls at ±bound, and its direction: 1, or -1 if reversed.
 

@@ -489,7 +489,7 @@ REPORTS = PluginTable("report", "reports such as 'deviation(0.05) | silence(1)'"
 """Policies of `vehicle.report`, called with a `reports.Unreported` at each step. See
 `client.reports`; plug-ins cannot add any."""
 REFERENCES = PluginTable("shape", "a shape such as 'circle', or 'name(1.5)'", given=1, class_=1)
-"""Shapes of `reference.shape`, called with the `Scenario`. See `shared.scenario.trajectories`."""
+"""Shapes of `reference.shape`, called with the `Scenario`. See `shared.scenario.curves`."""
 SCHEMES = PluginTable("scheme", "a scheme such as 'trajectory', or 'name(1.5)'", given=0, class_=1)
 """Schemes of `control.scheme`. A built-in one is a function that returns its properties; a
 plug-in's is the class itself, called with a `server.planning.scheme.Fleet`. See

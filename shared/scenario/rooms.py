@@ -23,7 +23,7 @@ from skytether.shared.scenario.registry import (
 )
 
 SHARED, NETEM = "skytether.shared.", "skytether.netem."
-TRIGGER, FURTHER = "skytether.server.triggers.policies", "skytether.server.triggers.further"
+TRIGGER = "skytether.server.triggers."
 
 APART = ("swap", "sphere", "mission", "show")
 """Shapes with goals or paths of several vehicles, which keep apart."""
@@ -95,29 +95,24 @@ def impairments(text: str, files: Files) -> Any:
     return load(f"{NETEM}impairments.direction", "network.uplink").impairments(text, files)
 
 
-REFERENCES.offer(f"{SHARED}scenario.trajectories", "circle")
-REFERENCES.offer(f"{SHARED}scenario.curves", "figure-eight", "square", "waypoints")
-REFERENCES.offer(f"{SHARED}scenario.trajectories", "hover")
+REFERENCES.offer(f"{SHARED}scenario.curves", "circle", "figure-eight")
+REFERENCES.offer(f"{SHARED}scenario.points", "square", "waypoints", "hover")
 REFERENCES.offer(f"{SHARED}formats.shapes", "csv")
 REFERENCES.offer(f"{SHARED}scenario.targets", "target")
-REFERENCES.offer(f"{SHARED}scenario.trajectories", "live")
+REFERENCES.offer(f"{SHARED}scenario.points", "live")
 REFERENCES.offer(f"{SHARED}missions.shapes", "swap", "sphere")
 REFERENCES.offer(f"{SHARED}formats.shapes", "mission", "show")
 
 REPORTS.offer("skytether.client.reports", "always", "periodic", "deviation", "silence")
 
-TRIGGERS.offer(
-    TRIGGER,
-    "always",
-    "heartbeat",
-    "periodic",
-    "state_gap",
-    "cost_gap",
-    "expected_gap",
-)
-TRIGGERS.offer(FURTHER, "deviation", "send_on_delta", "self_triggered")
-TRIGGERS.offer(TRIGGER, "silence")
-TRIGGERS.offer(FURTHER, "budget")
+TRIGGERS.offer(f"{TRIGGER}schedules", "always")
+TRIGGERS.offer(f"{TRIGGER}policies", "heartbeat")
+TRIGGERS.offer(f"{TRIGGER}schedules", "periodic")
+TRIGGERS.offer(f"{TRIGGER}gaps", "state_gap", "cost_gap")
+TRIGGERS.offer(f"{TRIGGER}policies", "expected_gap")
+TRIGGERS.offer(f"{TRIGGER}further", "deviation", "send_on_delta", "self_triggered")
+TRIGGERS.offer(f"{TRIGGER}schedules", "silence")
+TRIGGERS.offer(f"{TRIGGER}further", "budget")
 
 VEHICLES.offer("skytether.client.simulated.vehicle", "simulated", "quadrotor")
 VEHICLES.offer("skytether.client.mavlink.kind", "mavlink")

@@ -16,7 +16,7 @@ from skytether.server.planning.moving_setpoint import MEMORY_S, REST_S, LivePoin
 from skytether.shared.base.chance import stream
 from skytether.shared.base.units import SECOND_NS, seconds_to_ns
 from skytether.shared.law.model import Array, Indices
-from skytether.shared.scenario import curves, targets
+from skytether.shared.scenario import points, targets
 from skytether.shared.scenario.reading import check, to_table
 from skytether.shared.scenario.reference import Reference
 from skytether.shared.scenario.whole import Scenario
@@ -307,7 +307,7 @@ def test_a_prediction_goes_to_and_fro_between_walls(
 
 
 def straight(vehicle: int) -> Reference:
-    return curves.timed_path(np.array([0.0, 1e4]), np.array([[0.0, 0.0], [1e2 * vehicle, -1e3]]))
+    return points.timed_path(np.array([0.0, 1e4]), np.array([[0.0, 0.0], [1e2 * vehicle, -1e3]]))
 
 
 @pytest.mark.parametrize("preview", ["all", 0.5])

@@ -408,7 +408,7 @@ ADDS = (
     "expected @planner, @trigger, @scheme, @reference, @vehicle or @impairment on a function or "
     "class, see docs"
 )
-OURS = "skytether.server.triggers.policies"
+OURS = "skytether.server.triggers.schedules"
 WRONG = {
     "a syntax error": ("def f(:\n", "line 3: SyntaxError: invalid syntax"),
     "an exception": ("\n1 / 0\n", "line 4: ZeroDivisionError: division by zero"),

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from skytether.shared.scenario import curves, reference, targets
+from skytether.shared.scenario import curves, points, reference, targets
 from skytether.shared.scenario.reading import check
 
 quick = settings(max_examples=30)
@@ -36,7 +36,7 @@ def sample(desired: reference.Reference, t: float) -> tuple[list[float], list[fl
 def test_circle_runs_counter_clockwise(
     t: float, position: tuple[float, ...], velocity: tuple[float, ...]
 ) -> None:
-    p, v = sample(reference.circle(2.0, 4 * np.pi, 2), t)
+    p, v = sample(curves.circle(2.0, 4 * np.pi, 2), t)
     assert p == pytest.approx(position, abs=1e-12)
     assert v == pytest.approx(velocity, abs=1e-12)
 
@@ -60,7 +60,7 @@ def test_figure_eight_passes_its_crossing_and_its_ends(
 
 
 Closed = Callable[..., reference.Reference]
-CLOSED: list[Closed] = [reference.circle, curves.figure_eight]
+CLOSED: list[Closed] = [curves.circle, curves.figure_eight]
 
 
 @quick
@@ -85,7 +85,7 @@ def test_velocity_is_the_slope_of_a_smooth_curve(t: float, shape: Closed, axes: 
 @quick
 @given(st.floats(0.0, 40.0), st.booleans())
 def test_velocity_is_the_slope_between_waypoints(t: float, loop: bool) -> None:
-    desired = curves.waypoints(ROUTE, 2.0, loop=loop)
+    desired = points.waypoints(ROUTE, 2.0, loop=loop)
     corners = np.cumsum([0.0, 5.0, 2.0, 4.0, np.sqrt(37.0)]) / 2.0
     phase = t % corners[-1] if loop else t
     assume(np.abs(phase - corners).min() > 2 * SLOPE_S)
@@ -96,9 +96,9 @@ def test_velocity_is_the_slope_between_waypoints(t: float, loop: bool) -> None:
 
 def test_plane_curves_fly_level_in_space() -> None:
     for desired in (
-        reference.circle(1.0, 10.0, 3, 2.5),
+        curves.circle(1.0, 10.0, 3, 2.5),
         curves.figure_eight(1.0, 10.0, 3, 2.5),
-        curves.square(1.0, 10.0, 3, 2.5),
+        points.square(1.0, 10.0, 3, 2.5),
     ):
         up = desired(np.linspace(0.0, 25.0, 101))[:, 2]
         np.testing.assert_array_equal(up, np.tile([2.5, 0.0], (101, 1)))
@@ -106,7 +106,7 @@ def test_plane_curves_fly_level_in_space() -> None:
 
 def test_square_turns_at_its_corners() -> None:
     """Radius 2 m in 16 s: a corner every 4 s, at 1 m/s, counter-clockwise."""
-    desired = curves.square(2.0, 16.0, 2)
+    desired = points.square(2.0, 16.0, 2)
     corners = [[2.0, -2.0], [2.0, 2.0], [-2.0, 2.0], [-2.0, -2.0], [2.0, -2.0]]
     ways = [[0.0, 1.0], [-1.0, 0.0], [0.0, -1.0], [1.0, 0.0], [0.0, 1.0]]
     states = desired(4.0 * np.arange(5))
@@ -117,13 +117,13 @@ def test_square_turns_at_its_corners() -> None:
 @quick
 @given(st.floats(0.0, 100.0))
 def test_square_keeps_to_its_edge_at_one_speed(t: float) -> None:
-    p, v = sample(curves.square(1.5, 12.0, 2), t)
+    p, v = sample(points.square(1.5, 12.0, 2), t)
     assert max(np.abs(p)) == pytest.approx(1.5)
     assert np.linalg.norm(v) == pytest.approx(1.0)
 
 
 def test_waypoints_are_passed_at_constant_speed_from_rest_to_rest() -> None:
-    desired = curves.waypoints(ROUTE, 2.0)
+    desired = points.waypoints(ROUTE, 2.0)
     assert sample(desired, -1.0) == ([0.0, 0.0], [0.0, 0.0])
     assert sample(desired, 0.0) == ([0.0, 0.0], pytest.approx([1.2, 1.6]))
     assert sample(desired, 1.25) == (pytest.approx([1.5, 2.0]), pytest.approx([1.2, 1.6]))
@@ -134,14 +134,14 @@ def test_waypoints_are_passed_at_constant_speed_from_rest_to_rest() -> None:
 
 
 def test_looped_waypoints_fly_home_and_on() -> None:
-    desired = curves.waypoints(np.array([[0.0, 0.0], [3.0, 0.0], [3.0, 4.0]]), 1.0, loop=True)
+    desired = points.waypoints(np.array([[0.0, 0.0], [3.0, 0.0], [3.0, 4.0]]), 1.0, loop=True)
     assert sample(desired, 9.5) == (pytest.approx([1.5, 2.0]), pytest.approx([-0.6, -0.8]))
     assert sample(desired, 12.0) == ([0.0, 0.0], [1.0, 0.0])
     assert sample(desired, 13.0) == (pytest.approx([1.0, 0.0]), [1.0, 0.0])
 
 
 def test_hover_stays_where_it_is() -> None:
-    states = reference.hover(np.array([1.0, -2.0, 3.0]))(np.array([0.0, 1.0, 1e6]))
+    states = points.hover(np.array([1.0, -2.0, 3.0]))(np.array([0.0, 1.0, 1e6]))
     np.testing.assert_array_equal(states[..., 0], [[1.0, -2.0, 3.0]] * 3)
     np.testing.assert_array_equal(states[..., 1], np.zeros((3, 3)))
 
