@@ -5,15 +5,21 @@ computes the input from it. Without a horizon the vehicle brakes from the last i
 it stands still.
 """
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 from numpy.typing import NDArray
 
 from skytether.client.followers import Constants, Follower, HorizonFollower, SplineFollower
 from skytether.shared.law.model import Array
-from skytether.shared.law.rule import lasting, late_max
+from skytether.shared.law.rule import lasting
 from skytether.shared.law.terms import Terms
+from skytether.shared.scenario.registry import load
 from skytether.shared.wire.drop import Drop, ProtocolError
 from skytether.shared.wire.protocol import NO_HORIZON, Horizon, Trajectory
+
+if TYPE_CHECKING:
+    from skytether.client.horizons import Horizons
 
 UNENDING = 2**30
 """Number of stages for which a position is held: practically infinite."""
@@ -28,11 +34,15 @@ class Compensator:
     """
 
     def __init__(self, terms: Terms, regulator: Array | None = None) -> None:
-        self._terms = terms
         regulator = np.zeros((terms.axes, 3)) if regulator is None else regulator
         self._constants = Constants.of(terms, regulator)
         self._H, self._age_max, self._join = terms.horizon, terms.age_max, terms.join
-        self._late_max, self._brake = late_max(terms.horizon), terms.brake
+        self._brake = terms.brake
+        self._horizons: Horizons | None = None
+        """Horizons of inputs; None with a scheme that sends trajectories."""
+        if not terms.splines:
+            horizons = load("skytether.client.horizons", f"control.scheme {terms.scheme}")
+            self._horizons = horizons.Horizons(self._constants)
         self.begins = 0
         """Step of stage 0: the step that the horizon was made for, or the step of its drop."""
         self.follower: Follower = self._braking(np.zeros(terms.axes))
@@ -75,11 +85,10 @@ class Compensator:
             self.stale += 1
             self.repeated += horizon.step == self.in_force
             return False
-        # Without compensation the one input is used until its observation is too old.
-        input_count = self._age_max + self._H
-        if self._terms.indexed and isinstance(horizon, Horizon):
-            input_count = horizon.inputs.shape[1]
-        length = lasting(input_count, horizon.step, observed, self._age_max)
+        count = self._age_max + self._H
+        if self._horizons and isinstance(horizon, Horizon):
+            count = self._horizons.inputs(horizon).shape[1]
+        length = lasting(count, horizon.step, observed, self._age_max)
         if not 0 <= observed < step:
             raise ProtocolError(Drop.OBSERVATION)
         if length < 1:
@@ -89,16 +98,14 @@ class Compensator:
             # is not yet in force, and flying it now would be a leap.
             raise ProtocolError(Drop.TOO_EARLY)
         is_late = bool(self._join) and step - horizon.step > self._join
-        if is_late or self._comes_too_late(step - horizon.step, input_count - self._H, length):
+        if is_late or self._comes_too_late(horizon, step - horizon.step, length):
             raise ProtocolError(Drop.TOO_LATE)
         if isinstance(horizon, Trajectory):
             self.go_on_along(horizon.step, observed, horizon.spacing, horizon.knots)
             return True
         self._put_in_force(horizon.step, observed)
-        inputs, feedback = horizon.inputs, horizon.feedback if horizon.feedback.size else None
-        if not self._terms.indexed:  # the first input is flown at every stage (E21)
-            inputs = inputs[:, :1].repeat(length, axis=1)
-        self.follower = HorizonFollower(self._constants, inputs, length, feedback)
+        assert self._horizons
+        self.follower = self._horizons.follower(horizon, length)
         return True
 
     def go_on_along(
@@ -169,16 +176,18 @@ class Compensator:
     def rests(self) -> bool:
         return self.in_force == NO_HORIZON and isinstance(self.follower, SplineFollower)
 
-    def _comes_too_late(self, stage: int, ahead: int, length: int) -> bool:
+    def _comes_too_late(self, horizon: Horizon | Trajectory, stage: int, length: int) -> bool:
         """Whether a horizon arrives too late to be flown.
 
         Args:
             stage: stage of the horizon at the present step.
-            ahead: delay bound d of the horizon: its inputs before the planned ones.
-            length: number of its inputs that may be flown.
+            length: number of its stages that may be flown.
         """
-        ended = bool(self._brake) and stage >= length  # braking is not started again
-        return ended or (self._terms.commits and stage > ahead + self._late_max)
+        if self._brake and stage >= length:  # braking is not started again
+            return True
+        if self._horizons is None or isinstance(horizon, Trajectory):
+            return False
+        return self._horizons.is_late(horizon, stage)
 
     def choose(
         self, step: int, state: Array, disturbance: Array, before: Array

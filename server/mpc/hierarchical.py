@@ -51,7 +51,7 @@ from skytether.server.planning.scheme import FIGURES, Figures, Foresight
 from skytether.shared.base.kernel import B1, F1, F3, I1, kernel, part
 from skytether.shared.endpoints.stopwatch import Stopwatch
 from skytether.shared.law.model import Flags, Indices
-from skytether.shared.law.terms import Terms
+from skytether.shared.law.terms import COMMITTING, Terms
 from skytether.shared.scenario.schema import ControlConfig
 
 
@@ -105,7 +105,7 @@ class Planner:
         mpc = make_mpc(terms, control)
         self._mpc = mpc
         self._terminal_weight = np.array(control.terminal_weight)
-        self._compares = terms.commits
+        self._compares = terms.scheme in COMMITTING
         self.solvers = [
             make_solver(control, pose(terms.model, mpc, which)) for which in (FIRST, LATER)
         ]

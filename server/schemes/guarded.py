@@ -24,6 +24,7 @@ from skytether.server.planning.scheme import (
 )
 from skytether.server.schemes.horizons import uplink_max_ns
 from skytether.shared.law.model import Flags, Indices
+from skytether.shared.law.terms import COMMITTING
 from skytether.shared.wire.protocol import (
     FLOAT_MAX,
     INPUT_TOLERANCE,
@@ -42,7 +43,7 @@ class GuardedScheme(Scheme):
         self._errors = PluginErrors(f"the scheme {name}", NO_PLAN, "scheme_errors", fleet.tell)
         self.observed_step = inner.observed_step
         self.uplink_max_ns = uplink_max_ns(fleet.terms)
-        self._ahead_max = ahead_max(fleet.terms) if fleet.terms.commits else 0
+        self._ahead_max = ahead_max(fleet.terms) if fleet.terms.scheme in COMMITTING else 0
         self._bounds = INPUT_TOLERANCE * np.array(fleet.terms.u_max)[:, None]
         self._withheld: set[int] = set()
         """Rows of the vehicles to which no plan is sent at this step."""

@@ -16,7 +16,7 @@ from skytether.server.planning.clock import UNSEEN
 from skytether.server.planning.scheme import Batch, Fleet, Foresight, Header, Scheme, SentPlans
 from skytether.shared.base.kernel import I1, I2, S1, S3, kernel
 from skytether.shared.law.model import Flags, Indices
-from skytether.shared.law.terms import Terms
+from skytether.shared.law.terms import COMMITTING, INDEXED, Terms
 from skytether.shared.scenario.registry import MPC
 from skytether.shared.scenario.schemes import SchemeProperties
 from skytether.shared.wire.protocol import FEEDBACK, Observation, ahead_max, encode_horizon
@@ -27,9 +27,9 @@ NO_FEEDBACK = memoryview(b"")
 
 def uplink_max_ns(terms: Terms) -> int:
     """Longest uplink delay at which a horizon can still be flown [ns]."""
-    if not terms.indexed:
+    if terms.scheme not in INDEXED:
         return UNSEEN  # the first input is flown whenever the horizon arrives
-    return (ahead_max(terms) if terms.commits else terms.horizon) * terms.dt_ns
+    return (ahead_max(terms) if terms.scheme in COMMITTING else terms.horizon) * terms.dt_ns
 
 
 class Predictor(Protocol):

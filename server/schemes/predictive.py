@@ -25,7 +25,7 @@ from skytether.server.schemes.horizons import HorizonScheme
 from skytether.server.schemes.observer import decay_of, updated_disturbance
 from skytether.shared.base.kernel import F2, F3, I1, S3, kernel, part
 from skytether.shared.law.model import Array, Flags, Indices
-from skytether.shared.law.terms import Terms
+from skytether.shared.law.terms import INDEXED, Terms
 from skytether.shared.scenario.gain import feedback_gain
 from skytether.shared.scenario.schema import ControlConfig
 from skytether.shared.wire.protocol import (
@@ -87,13 +87,13 @@ class Estimator:
     """
 
     def __init__(self, terms: Terms, control: ControlConfig, gain: Array, capacity: int) -> None:
-        n = terms.axes
+        n, compensate = terms.axes, terms.scheme in INDEXED
         self.counts: Counter[str] = Counter()
         self._settings = EstimatorSettings(
             laws=laws_of(terms, gain),
-            compensate=terms.indexed,
+            compensate=compensate,
             dt_ns=terms.dt_ns,
-            decay=decay_of(terms, control) if terms.indexed else 1.0,
+            decay=decay_of(terms, control) if compensate else 1.0,
             feeds_back=terms.feedback,
         )
         self._memory = EstimatorMemory(

@@ -62,17 +62,6 @@ def lasting(length: int, made_for: int, observed: int, age_max: int) -> int:
     return min(length, observed + age_max - made_for + 1)
 
 
-def late_max(horizon: int) -> int:
-    """Number of steps after its committed ones at which a horizon may still come into force.
-
-    By then the vehicle has flown other inputs than its plan begins with. The next plan corrects a
-    few; many would make the server's estimate and its plans oscillate.
-    """
-    # A longer allowance let the estimate oscillate until the vehicle flew away
-    # (tests/server/test_slow.py).
-    return max(2, horizon // 4)
-
-
 def entry(stage: int, length: int) -> int:
     """Index of the input at a stage of a horizon with `length` inputs.
 

@@ -98,14 +98,6 @@ class Terms(NamedTuple):
         return discretise(self.tau_s, self.dt_s, self.gain)
 
     @property
-    def indexed(self) -> bool:
-        return self.scheme in INDEXED
-
-    @property
-    def commits(self) -> bool:
-        return self.scheme in COMMITTING
-
-    @property
     def splines(self) -> bool:
         return self.scheme in ALONG_SPLINES
 

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Iterator
 
-from skytether.shared.law.terms import INDEXED
+from skytether.shared.law.terms import COMMITTING, INDEXED
 from skytether.shared.scenario.schema import Contradiction, Scenario
 from skytether.shared.wire.protocol import INPUTS_MAX
 
@@ -16,7 +16,7 @@ LOSSY = 0.3
 def ahead_s(scenario: Scenario) -> float:
     """Time after which a plan is in force at the latest, if no packet is late [s]."""
     control, mean_s = scenario.control, scenario.uplink.mean_s
-    if control.properties.commits and control.delay_bound != "auto":
+    if control.properties.flown_as in COMMITTING and control.delay_bound != "auto":
         return max(control.delay_bound, mean_s)
     return mean_s
 
@@ -35,7 +35,7 @@ def _too_slow(scenario: Scenario) -> Iterator[Contradiction]:
     delay_s = up.mean_s - up.least_s + (up.least_s + down.least_s) / 2
     seen = f"the delay of {delay_s:g} s (half of the smallest round trip, and the uplink's jitter)"
     H, dt, bound_s = control.horizon, control.dt, control.delay_bound
-    if control.properties.commits:
+    if control.properties.flown_as in COMMITTING:
         if bound_s != "auto" and bound_s < delay_s - TINY:
             yield "control.delay_bound", bound_s, f"at least {seen}"
         steps = max(1, math.ceil((delay_s if bound_s == "auto" else bound_s) / dt - TINY))

@@ -33,10 +33,6 @@ class SchemeProperties(NamedTuple):
     """Whether the scheme estimates a disturbance, with the time constant `control.observer_s`."""
 
     @property
-    def commits(self) -> bool:
-        return self.flown_as in COMMITTING
-
-    @property
     def splines(self) -> bool:
         return self.flown_as in ALONG_SPLINES
 
@@ -45,7 +41,7 @@ class SchemeProperties(NamedTuple):
         """Figures that the scheme provides to triggers, and HELD if it computes the inputs that are
         flown if nothing is sent.
         """
-        return (*self.figures, HELD) if self.commits else self.figures
+        return (*self.figures, HELD) if self.flown_as in COMMITTING else self.figures
 
 
 @scheme

@@ -59,7 +59,7 @@ def test_what_is_no_report_is_refused(text: str, said: str) -> None:
 
 
 def reporter(text: str = "deviation(0.05)") -> tuple[Reporter, Compensator]:
-    terms = load("demo").terms()
+    terms = load("demo").terms()._replace(scheme="predictive")
     compensator = Compensator(terms)
     return Reporter(terms, text, compensator), compensator
 
@@ -107,7 +107,7 @@ def test_a_vehicle_that_waits_for_a_horizon_reports_again() -> None:
 
 def test_the_belief_is_the_rule_of_flight() -> None:
     """From the reported state, along the horizon in force, with its feedback and disturbance."""
-    terms = load("demo").terms()
+    terms = load("demo").terms()._replace(scheme="predictive")
     compensator = Compensator(terms)
     feedback = np.array([[0.2, 0.1, 0.05, 1.5, 0.5]] * 2, np.float32)
     compensator.offer(horizon(3)._replace(feedback=feedback), 4, 2)

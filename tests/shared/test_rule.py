@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from bench.problems import from_python
 from skytether.client.compensator import Compensator
+from skytether.client.horizons import late_max
 from skytether.server.planning import compiled as law
 from skytether.server.planning.clock import ClockMap
 from skytether.server.planning.scheme import Foresight, empty_foresight
@@ -24,7 +25,6 @@ from skytether.shared.law.rule import (
     feedback,
     flown,
     lasting,
-    late_max,
     reference_input,
     remaining,
 )

@@ -237,16 +237,16 @@ def test_the_documents_name_every_term_in_its_place() -> None:
 
 
 @pytest.mark.parametrize(
-    ("scheme", "indexed", "commits", "splines", "planned", "reach"),
+    ("scheme", "splines", "planned", "reach"),
     [
-        ("none", False, False, False, 40, 40),
-        ("predictive", True, False, False, 40, 40),
-        ("committed", True, True, False, 40, 40),
-        ("trajectory", False, False, True, 1, 60),
+        ("none", False, 40, 40),
+        ("predictive", False, 40, 40),
+        ("committed", False, 40, 40),
+        ("trajectory", True, 1, 60),
     ],
 )
 def test_what_follows_from_the_terms_of_a_scheme(
-    scheme: str, indexed: bool, commits: bool, splines: bool, planned: int, reach: int
+    scheme: str, splines: bool, planned: int, reach: int
 ) -> None:
     """Steps of 50 ms, H = 40, an age bound of 3 s, 60 steps, and braking at 2 m/s²."""
     agreed = (
@@ -254,8 +254,8 @@ def test_what_follows_from_the_terms_of_a_scheme(
         .terms()
         ._replace(scheme=scheme, dt_ns=50_000_000, horizon=40, age_max_s=3.0, brake_mps2=2.0)
     )
-    assert (agreed.indexed, agreed.commits, agreed.splines) == (indexed, commits, splines)
-    assert (agreed.planned, agreed.reach, agreed.age_max) == (planned, reach, 60)
+    assert (agreed.splines, agreed.planned, agreed.reach) == (splines, planned, reach)
+    assert agreed.age_max == 60
     assert agreed.dt_s == 0.05
     assert agreed._replace(exhausted="brake").brake == pytest.approx(0.1)
     assert agreed._replace(exhausted="hold").brake == 0.0

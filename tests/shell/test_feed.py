@@ -664,7 +664,7 @@ def test_the_plans_told_are_those_that_are_sent(
         assert (plan["vehicle"], plan["step"], plan["begins"]) == (vehicle, step, step + d)
         np.testing.assert_array_equal(plan["inputs"], inputs[:, d:].astype(np.float32))
     ahead = plans["begins"] - plans["step"]
-    assert (ahead.max() > 0) == terms.commits
+    assert (ahead.max() > 0) == (terms.scheme == "committed")
     assert not plans["disturbance"].any()
     one = plans[plans["vehicle"] == 1]
     own = flight_.server[flight_.server["vehicle"] == 1]

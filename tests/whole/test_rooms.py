@@ -47,7 +47,8 @@ ROOMS: dict[str, tuple[str, str]] = {
     "predictive": ("server/schemes/predictive.py", "fly paper --virtual"),
     "horizons of inputs": (
         (
-            "shared/scenario/horizons.py server/schemes/horizons.py server/schemes/predictive.py "
+            "client/horizons.py shared/scenario/horizons.py "
+            "server/schemes/horizons.py server/schemes/predictive.py "
             "server/schemes/committed.py server/mpc/hierarchical.py server/mpc/appraisal.py"
         ),
         "fly paper --virtual",

@@ -1,0 +1,46 @@
+"""Horizons of inputs, as they come into force aboard; loaded with a scheme that sends them."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skytether.client.followers import Constants, HorizonFollower
+from skytether.shared.law.terms import COMMITTING, INDEXED
+from skytether.shared.wire.protocol import Horizon
+
+
+def late_max(horizon: int) -> int:
+    """Number of steps after its committed ones at which a horizon may still come into force.
+
+    By then the vehicle has flown other inputs than its plan begins with. The next plan corrects a
+    few; many would make the server's estimate and its plans oscillate.
+    """
+    # A longer allowance let the estimate oscillate until the vehicle flew away
+    # (tests/server/test_slow.py).
+    return max(2, horizon // 4)
+
+
+class Horizons:
+    """What differs between horizons of inputs and trajectories when they arrive."""
+
+    def __init__(self, constants: Constants) -> None:
+        terms, self._constants = constants.terms, constants
+        self._H, self._lasts = terms.horizon, terms.age_max + terms.horizon
+        self._indexed, self._commits = terms.scheme in INDEXED, terms.scheme in COMMITTING
+
+    def inputs(self, horizon: Horizon) -> NDArray[np.float32]:
+        """Inputs at the stages of a horizon [m/s]; shape (axes, n)."""
+        if self._indexed:
+            return horizon.inputs
+        # Without compensation the first input is flown at every stage (E21).
+        return horizon.inputs[:, :1].repeat(self._lasts, axis=1)
+
+    def is_late(self, horizon: Horizon, stage: int) -> bool:
+        """Whether a horizon with committed inputs arrives at a stage so long after them that other
+        inputs were flown instead.
+        """
+        return self._commits and stage > horizon.inputs.shape[1] - self._H + late_max(self._H)
+
+    def follower(self, horizon: Horizon, length: int) -> HorizonFollower:
+        """Follower of a horizon of which `length` inputs may be flown."""
+        feedback = horizon.feedback if horizon.feedback.size else None
+        return HorizonFollower(self._constants, self.inputs(horizon), length, feedback)
