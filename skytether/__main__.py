@@ -3,7 +3,7 @@
 import sys
 from collections.abc import Sequence
 
-from skytether.cli.commands import COMMANDS, usage
+from skytether.cli.commands import COMMANDS, ELSEWHERE, usage
 from skytether.shell.commandline import start
 
 
@@ -28,7 +28,8 @@ def introduce(argv: Sequence[str]) -> None:
         case ["--version", *_]:
             print(f"skytether {metadata.version('skytether')}")
         case [name, *_]:
-            raise CommandError(f"no command {name!r}; {hint(name, COMMANDS)}", CONFIGURATION)
+            instead = f"it is {ELSEWHERE[name]}" if name in ELSEWHERE else hint(name, COMMANDS)
+            raise CommandError(f"no command {name!r}; {instead}", CONFIGURATION)
 
 
 if __name__ == "__main__":

@@ -117,6 +117,21 @@ COMMANDS = {
     for usage, (_, place) in group.items()
 }
 
+KINDS = (
+    *("scenarios", "triggers", "reports", "schemes"),
+    *("planners", "references", "impairments", "vehicles"),
+)
+"""What `skytether list` lists; written here, since a shell's start is to import no table."""
+ELSEWHERE = {
+    **{kind: f"skytether list {kind}" for kind in KINDS},
+    "torture": "python -m fuzz.torture, in a checkout",
+    "adversary": "python -m fuzz.adversary, in a checkout",
+    "straight": "python -m bench.autopilots, in a checkout",
+    "crowd": "python -m bench.crowd, in a checkout",
+    "envelope": "skytether sweep",
+}
+"""What does it now, by a word that was a command."""
+
 
 def usage() -> str:
     lines = [ABOUT]

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from skytether.cli.commands import COMMANDS
+from skytether.cli.commands import COMMANDS, KINDS
 from skytether.shell.commandline.command import CONFIGURATION, CommandError
 
 HELP = """usage: skytether completion bash|zsh|fish
@@ -18,8 +18,6 @@ OPTIONS = (
     " | grep -oE -e '--[a-z][a-z0-9.-]*[a-z0-9]' | sort -u"
 )
 """What finds the options of a command: its help names them all."""
-KINDS = "scenarios triggers reports schemes planners references impairments vehicles"
-"""What `skytether list` lists; written here, since a shell's start is to import no table."""
 SCENARIOS = "skytether list scenarios 2>/dev/null | cut -d ' ' -f 1"
 BASH = f"""\
 _skytether_asked=
@@ -35,7 +33,7 @@ _skytether() {{
         fi
         words=$_skytether_options
     elif [ "$COMP_CWORD $asked" = "2 list" ]; then
-        words="{KINDS}"
+        words="{" ".join(KINDS)}"
     elif [ "$COMP_CWORD" -eq 2 ]; then
         words=$({SCENARIOS})
     fi
@@ -54,7 +52,7 @@ complete -c skytether -n 'string match -q -- "-*" (commandline -ct)' -f \\
     -a "(__skytether_options)"
 function __skytether_names
     if test (commandline -opc)[2] = list
-        string split " " "{KINDS}"
+        string split " " "{" ".join(KINDS)}"
     else
         {SCENARIOS}
     end

@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated
 
+from skytether.cli.commands import KINDS
 from skytether.client.vehicles import vehicle
 from skytether.shared.scenario import reading, registry
 from skytether.shared.scenario.planners import planner
@@ -25,15 +26,15 @@ TABLES: Mapping[str, registry.PluginTable] = {
 
 @dataclass(frozen=True)
 class ListOptions:
-    kind: Annotated[str, Argument(metavar="KIND", positional=True)] = ""
-    """What to list."""
+    kind: Annotated[str, Argument(metavar="|".join(KINDS), positional=True)] = ""
+    """What to list; without it, this help."""
     plugin: command.Plugins = ()
 
 
 def list_names(argv: Sequence[str]) -> None:
     """List what a scenario can name, a sentence each.
 
-    KIND is one of
+    The kinds are
 
       scenarios     that come with Skytether
       triggers      policies for control.trigger
@@ -44,7 +45,7 @@ def list_names(argv: Sequence[str]) -> None:
       impairments   for network.uplink and network.downlink
       vehicles      for vehicle.kind
     """
-    chosen = options.read(ListOptions(), argv, "skytether list", list_names.__doc__)
+    chosen = options.read(ListOptions(), argv or ["--help"], "skytether list", list_names.__doc__)
     if chosen.kind == "scenarios":
         names = reading.names()
         width = max(map(len, names))
@@ -55,5 +56,4 @@ def list_names(argv: Sequence[str]) -> None:
             source = "" if entry.is_ours else f" (from {entry.source})"
             print(f"{entry.form(name)}\n    {entry.about}{source}")
     else:
-        kinds = f"scenarios, {', '.join(TABLES)}"
-        raise CommandError(f"got {chosen.kind or 'nothing'}, expected {kinds}", CONFIGURATION)
+        raise CommandError(f"got {chosen.kind}, expected {', '.join(KINDS)}", CONFIGURATION)

@@ -43,6 +43,7 @@ QUICK = [
     [
         ("fly papr", "fly: papr: no such scenario; did you mean paper?"),
         ("flyy", "skytether: no command 'flyy'; did you mean fly?"),
+        ("triggers", "skytether: no command 'triggers'; it is skytether list triggers"),
         ("fly demo --virtual --control sockets", "fly: --control: got --virtual"),
         ("fly demo --virtual --page 127.0.0.1:0", "fly: --page: got --virtual"),
         ("fly demo --virtual --linger", "fly: --linger: got --virtual"),

@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from skytether.__main__ import main
-from skytether.cli.commands import COMMANDS
-from skytether.cli.completion import KINDS, SCRIPTS
+from skytether.cli.commands import COMMANDS, KINDS
+from skytether.cli.completion import SCRIPTS
 from skytether.cli.names import TABLES
 
 BASH = """eval "$(skytether completion bash)"
@@ -59,7 +59,14 @@ def test_each_shell_is_told_every_command(shell: str, capsys: pytest.CaptureFixt
 
 
 def test_every_kind_of_list_is_completed() -> None:
-    assert KINDS.split() == ["scenarios", *TABLES]
+    assert ("scenarios", *TABLES) == KINDS
+
+
+def test_list_without_a_kind_explains_the_kinds(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit, match="0"):
+        main(["list"])
+    usage, *_ = capsys.readouterr().out.split("\n\n")
+    assert "|".join(KINDS) in usage
 
 
 def test_another_shell_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
