@@ -849,6 +849,11 @@ def nest(found: list[Any]) -> None:
     found[at] = replace(found[at], data=b"\x91" * 100_000)
 
 
+def rename_in_event(found: list[Any]) -> None:
+    at, frame = next(iter(frames_of(found, "Said").items()))
+    put(found, at, frame | {"event": {"type": "ServerFull", "room": 2}})
+
+
 def flown_rows(found: list[Any]) -> list[tuple[int, dict[str, Any]]]:
     return [(i, each) for i, each in frames_of(found, "Rows").items() if each["part"] == "client"]
 
@@ -887,6 +892,7 @@ def date(found: list[Any], time_ns: int) -> None:
     ("change", "why"),
     [
         (nest, "got no frame"),
+        (rename_in_event, "it is of another version, or damaged: got no frame: Object missing"),
         (widen, "expected at most 4096 B"),
         (cut_row, "got 9 B, expected rows of"),
         (forget, "client has no part 'client'"),
@@ -899,7 +905,16 @@ def date(found: list[Any], time_ns: int) -> None:
         (partial(write_in, column="state", value=1e308), "client: state: got 1e+308"),
     ],
     ids=[
-        *("nested", "wide", "half", "not begun", "late", "2**63", "early"),
+        *(
+            "nested",
+            "event of another version",
+            "wide",
+            "half",
+            "not begun",
+            "late",
+            "2**63",
+            "early",
+        ),
         *("step 6e8", "step 2**40", "mode", "speed"),
     ],
 )

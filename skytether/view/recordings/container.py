@@ -36,6 +36,7 @@ from mcap.stream_reader import CRCValidationError, breakup_chunk
 
 from skytether.shared.base import input_files
 from skytether.shared.base.errors import ConfigError, RecordingError
+from skytether.shared.telemetry.feed import FeedError
 from skytether.shared.telemetry.record import RECORDING
 
 MAGIC = b"\x89MCAP0\r\n"
@@ -99,6 +100,8 @@ def reading(path: Path) -> Iterator[None]:
         raise
     except ConfigError as error:  # of another version, or its trajectory's file is missing here
         raise RecordingError(f"{path}: {error}") from None
+    except FeedError as error:  # the checksum of its chunk was right
+        raise RecordingError(f"{path}: it is of another version, or damaged: {error}") from None
     except BROKEN as error:
         what = (str(error).splitlines() or [type(error).__name__])[0]
         raise RecordingError(f"{path}: it is damaged: {what}") from None
