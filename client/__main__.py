@@ -141,7 +141,9 @@ def fly(argv: Sequence[str]) -> None:
         if kernel := sys.modules.get(
             "skytether.shared.base.kernel"
         ):  # a vehicle with compiled functions is used
-            terminal.prepare(kernel.missing())
+            from skytether.shared.base import machine_code
+
+            terminal.prepare(machine_code.missing())
             kernel.load()
         line = vehicles.connection(flying[0], scenario)
         if line is not None:

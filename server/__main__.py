@@ -20,7 +20,7 @@ from skytether.server.endpoint import VEHICLES_MAX, Server
 from skytether.server.gate import Gate, PlainGate
 from skytether.server.reception import PATHS, STANDBY
 from skytether.server.schemes import table
-from skytether.shared.base import kernel
+from skytether.shared.base import kernel, machine_code
 from skytether.shared.endpoints.endpoint import PATH_SOCKETS, Address, Form
 from skytether.shared.endpoints.steady import Steady
 from skytether.shared.endpoints.stopwatch import Stopwatch
@@ -111,7 +111,7 @@ def _ready(scenario: Scenario) -> None:
     for room in (PATHS, STANDBY):
         import_module(room)
     others = table.others(scenario)
-    terminal.prepare(kernel.missing(without=others))
+    terminal.prepare(machine_code.missing(without=others))
     kernel.load(without=others)
 
 

@@ -7,12 +7,12 @@ import skytether.quadrotor.loops
 import skytether.server.__main__
 import skytether.sim.flight  # noqa: F401 - they are the kernels of flights
 from skytether.server.schemes import table
-from skytether.shared.base import kernel
+from skytether.shared.base import kernel, machine_code
 from skytether.shell.commandline import terminal
 
 table.load_all()
 kernel.check_types()
 if __name__ == "__main__":
-    terminal.prepare(kernel.missing())
+    terminal.prepare(machine_code.missing())
 else:
     kernel.load()

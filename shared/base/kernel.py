@@ -6,8 +6,8 @@ and arrays that belong together with their NamedTuple. A record is described by 
 annotated field per line, which is never instantiated but is the record's type for mypy. A part is a
 function that only kernels call, and is compiled into each of them.
 
-What must not wait in flight compiles its kernels earlier: `missing` lists the kernels without
-machine code, `load` prepares all of them. Importing compiles nothing.
+What must not wait in flight compiles its kernels earlier: `machine_code.missing` lists the kernels
+without machine code, `load` prepares all of them. Importing compiles nothing.
 
 Machine code is stored on disk, beside the sources or in NUMBA_CACHE_DIR. Numba itself only checks
 whether the kernel's own file has changed; here every function and constant that a kernel uses is
@@ -21,9 +21,7 @@ import linecache
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
-from importlib import import_module
-from pathlib import Path
-from typing import Annotated, Any, NamedTuple, TypeVar, get_type_hints
+from typing import Annotated, Any, TypeVar, get_type_hints
 
 import numba
 import numpy as np
@@ -95,7 +93,7 @@ def _at_first_call(dispatcher: Any) -> Any:
     """
 
     def first(*arguments: Any) -> Any:
-        _compile(dispatcher)
+        compile_kernel(dispatcher)
         answer = dispatcher(*arguments)
         (compiled,) = dispatcher.overloads.values()
         # A partial function without arguments: its function can be replaced, and calling it costs
@@ -125,85 +123,25 @@ def check_types() -> None:
 KERNELS: list[Any] = []
 
 
-class Missing(NamedTuple):
-    """Kernel without machine code in memory or on disk."""
-
-    name: str
-    is_stored: bool
-    compile: Callable[[], None]
-    """Function that compiles the kernel, or loads machine code compiled by another process
-    since."""
-    is_compiled: Callable[[], bool]
-    """Whether another process has compiled it since."""
-
-
-def missing(without: Collection[str] = ()) -> list[Missing]:
-    """Kernels without machine code in memory or on disk, the slowest to compile first; `without`
-    names modules to leave out.
-    """
-    uncompiled = [
-        each
-        for each in KERNELS
-        if each.__module__ not in without and not (each.overloads or _is_stored(each))
-    ]
-    return [
-        Missing(
-            _name(each),
-            not isinstance(each._cache, caching.NullCache),
-            partial(_compile, each),
-            partial(_is_stored, each),
-        )
-        for each in sorted(uncompiled, key=_extent, reverse=True)
-    ]
-
-
-def compile_named(name: str) -> None:
-    import_module(name.partition(":")[0])
-    (dispatcher,) = (each for each in KERNELS if _name(each) == name)
-    _compile(dispatcher)
-
-
-def _name(dispatcher: Any) -> str:
-    return f"{dispatcher.__module__}:{dispatcher.py_func.__qualname__}"
-
-
-def _extent(dispatcher: Any) -> int:
-    """Number of arguments, including the parts of tuples; the compile time grows with it."""
-
-    def parts(kind: Any) -> int:
-        return sum(map(parts, kind)) if isinstance(kind, numba.types.BaseTuple) else 1
-
-    return sum(map(parts, _signature(dispatcher)))
-
-
 def load(without: Collection[str] = ()) -> None:
     """Load or compile every kernel, so that none has to be compiled in flight; `without` names
     modules to leave out.
     """
     for each in KERNELS:
         if each.__module__ not in without:
-            _compile(each)
-
-
-def _is_stored(dispatcher: Any) -> bool:
-    _store_on_disk(dispatcher)
-    cache = dispatcher._cache
-    if isinstance(cache, caching.NullCache):
-        return False
-    key = cache._index_key(_signature(dispatcher), dispatcher.targetctx.codegen())
-    return key in cache._cache_file._load_index()  # loading the code itself takes ten times as long
+            compile_kernel(each)
 
 
 @global_compiler_lock  # type: ignore[untyped-decorator]
-def _compile(dispatcher: Any) -> None:
+def compile_kernel(dispatcher: Any) -> None:
     if dispatcher.overloads:
         return
-    _store_on_disk(dispatcher)
+    store_on_disk(dispatcher)
     if dispatcher.targetoptions.get("_nrt", True):
         rtsys.initialize(
             dispatcher.targetctx
         )  # reference counting, which `KernelCache` does not set up
-    signature = _signature(dispatcher)
+    signature = signature_of(dispatcher)
     try:
         dispatcher.compile(signature)
     except OSError:  # for example, a full disk: compiled, but not stored
@@ -212,14 +150,14 @@ def _compile(dispatcher: Any) -> None:
     dispatcher.disable_compile()
 
 
-def _store_on_disk(dispatcher: Any) -> None:
+def store_on_disk(dispatcher: Any) -> None:
     if isinstance(dispatcher._cache, KernelCache):
         return
     with suppress(RuntimeError):  # no folder is writable
         dispatcher._cache = KernelCache(dispatcher.py_func)
 
 
-def _signature(dispatcher: Any) -> tuple[Any, ...]:
+def signature_of(dispatcher: Any) -> tuple[Any, ...]:
     hints = get_type_hints(dispatcher.py_func, include_extras=True)
     hints.pop("return", None)
     return tuple(map(_type, hints.values()))
@@ -420,15 +358,6 @@ class CacheFolders(caching.CompileResultCacheImpl):  # type: ignore[misc]
     """
 
     _locator_classes = (NamedFolder, SourceFolder, UserFolder)
-
-
-def folder() -> Path | None:
-    """Folder with the machine code of one of the parts of every flight; None: not stored."""
-    with suppress(RuntimeError):  # no folder is writable
-        place = CacheFolders(stamp)
-        place.locator.ensure_cache_path()
-        return Path(place.locator.get_cache_path())
-    return None
 
 
 class KernelCache(caching.FunctionCache):  # type: ignore[misc]

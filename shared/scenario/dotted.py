@@ -9,6 +9,7 @@ from typing import Any
 
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.base.hint import hint
+from skytether.shared.scenario import arguments
 from skytether.shared.scenario.grammar import GrammarError
 from skytether.shared.scenario.rooms import TEXTS
 
@@ -64,7 +65,7 @@ def value(table: Any, key: str) -> Any:
     for depth, name in enumerate(sections):
         table, text = table[name], ".".join(sections[: depth + 1])
         if isinstance(table, str) and text in TEXTS:
-            return TEXTS[text].argument(table, key.removeprefix(f"{text}."))
+            return arguments.argument(TEXTS[text], table, key.removeprefix(f"{text}."))
     return table[last]
 
 
@@ -82,7 +83,7 @@ def with_argument(key: str, text: str, path: str, value: object) -> str:
     """
     table, at = TEXTS[key], path.removeprefix(f"{key}.")
     try:
-        return table.with_argument(text, at, value)
+        return arguments.with_argument(table, text, at, value)
     except KeyError:
         name, _, last = at.partition(".")
         names = [each.name for each in table[name].parameters] if name in table else list(table)

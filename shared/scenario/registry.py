@@ -313,43 +313,8 @@ class PluginTable(dict[str, Entry]):
         for call in reversed(self.calls(text)):
             if any(file for _, file in self._args(call)):
                 values = [change(str(value)) if file else value for value, file in self._args(call)]
-                text = self._with(text, call, values)
+                text = self.with_values(text, call, values)
         return text
-
-    def with_argument(self, text: str, at: str, value: object) -> str:
-        """Text with one argument of an entry changed.
-
-        Args:
-            text: entries combined with & and |.
-            at: `entry.parameter`, or `entry` for its first parameter.
-            value: new value.
-
-        Raises:
-            KeyError: there is no such entry, or it has no such parameter.
-            GrammarError: the text does not name the entry, or is invalid.
-        """
-        calls, index = self._argument(text, at)
-        for call in reversed(calls):
-            values: list[Any] = list(call.values)
-            values[index] = value
-            text = self._with(text, call, values)
-        return text
-
-    def argument(self, text: str, at: str) -> Value:
-        """Value of an argument, of the first such entry in a text; see `with_argument`."""
-        calls, index = self._argument(text, at)
-        return calls[0].values[index]
-
-    def _argument(self, text: str, at: str) -> tuple[list[Call], int]:
-        """All calls of an entry in a text, and the index of the parameter."""
-        name, _, key = at.partition(".")
-        names = [parameter.name for parameter in self[name].parameters]
-        if not names or (key and key not in names):
-            raise KeyError(at)
-        calls = [each for each in grammar.leaves(self.parse(text)) if each.name == name]
-        if not calls:
-            raise GrammarError(text, f"{name} in it")
-        return calls, names.index(key) if key else 0
 
     def _bound(self, call: Call) -> Call:
         entry = self.get(call.name)
@@ -366,7 +331,7 @@ class PluginTable(dict[str, Entry]):
         last = len(parameters) - 1
         return [(each, parameters[min(i, last)].file) for i, each in enumerate(call.values)]
 
-    def _with(self, text: str, call: Call, values: Sequence[Any]) -> str:
+    def with_values(self, text: str, call: Call, values: Sequence[Any]) -> str:
         """Text in which a call has these values, all of them written out."""
         files = [file for _, file in self._args(call)]
         shown = [

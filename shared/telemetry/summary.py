@@ -13,7 +13,8 @@ from skytether.shared.law.model import Array
 from skytether.shared.scenario.pace import is_known, is_too_fast
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.drops import drops
-from skytether.shared.telemetry.record import DOWNLINK, UPLINK, Reason, Rows, sent_by
+from skytether.shared.telemetry.record import DOWNLINK, UPLINK, Reason, Rows
+from skytether.shared.telemetry.sent import sent_by
 from skytether.shared.wire.protocol import NO_HORIZON, Mode
 
 AT_BOUND = 1.0 - 1e-6
@@ -54,7 +55,7 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
     """Number of packets with a horizon that the server sent; the other uplink packets are
     heartbeats and the handshake's."""
     uplink_above: int | None = None
-    """Number of these that the trigger's figure sent, see `shared.telemetry.record.SentBy`."""
+    """Number of these that the trigger's figure sent, see `shared.telemetry.sent.SentBy`."""
     uplink_due: int | None = None
     """Number of the other ones, which were due."""
     uplink_packets: int | None

@@ -14,7 +14,7 @@ from typing import Annotated
 from skytether.autopilot import faults
 from skytether.autopilot.endpoint import Autopilot
 from skytether.autopilot.flavours import FlavourName
-from skytether.shared.base import kernel
+from skytether.shared.base import kernel, machine_code
 from skytether.shared.telemetry.record import TRUTH_COLUMNS
 from skytether.shell.commandline import command, terminal
 from skytether.shell.commandline.argument import Argument
@@ -100,5 +100,5 @@ def pilot(argv: Sequence[str]) -> None:
 
 def _ready() -> None:
     """Import and compile everything that flies before a peer waits for it."""
-    terminal.prepare(kernel.missing())
+    terminal.prepare(machine_code.missing())
     kernel.load()

@@ -13,7 +13,7 @@ import tyro
 
 from skytether.cli import page_process, processes
 from skytether.server.schemes import table
-from skytether.shared.base import kernel
+from skytether.shared.base import machine_code
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import Record
@@ -58,7 +58,7 @@ def duel(argv: Sequence[str]) -> None:
     at = command.address("--page", options.page)
     scenarios = together(options)
     names = titles(options.scenarios)
-    terminal.prepare(kernel.missing(table.others(*scenarios)))
+    terminal.prepare(machine_code.missing(table.others(*scenarios)))
     if options.virtual:
         frames = [
             list(of_flight(scenario, name, flight.fly(scenario)))

@@ -20,7 +20,7 @@ from skytether.figures import film
 from skytether.figures import flights as figures
 from skytether.server.schemes import table
 from skytether.shared import formats
-from skytether.shared.base import kernel
+from skytether.shared.base import kernel, machine_code
 from skytether.shared.endpoints.stopwatch import Stopwatch
 from skytether.shared.events.flight import NotFlown
 from skytether.shared.formats import plans, tracks
@@ -29,7 +29,8 @@ from skytether.shared.missions.mission import Mission
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.drops import drops
-from skytether.shared.telemetry.record import Record, sent_by
+from skytether.shared.telemetry.record import Record
+from skytether.shared.telemetry.sent import sent_by
 from skytether.shared.telemetry.summary import plugin_errors, separations, summarise
 from skytether.shell.commandline import command, plugins, terminal
 from skytether.shell.commandline.argument import Argument
@@ -167,7 +168,7 @@ def fleet(argv: Sequence[str]) -> None:
     name = Path(options.config.reference.file).name or options.scenario
     count = terminal.counted(vehicles, "vehicle")
     title = f"{count}, {name}, {where}, seed {options.config.seed}"
-    terminal.prepare(kernel.missing(table.others(options.config)))
+    terminal.prepare(machine_code.missing(table.others(options.config)))
     with (
         command.interruptible() as interrupted,
         terminal.progress(f"flying {title}", options.config.duration) as on_second,

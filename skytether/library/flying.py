@@ -161,12 +161,12 @@ def prepare(*scenarios: Scenario) -> None:
     """
     import skytether.sim.flight  # noqa: F401 - its kernels are those of every flight
     from skytether.server.schemes import table
-    from skytether.shared.base import kernel
+    from skytether.shared.base import machine_code
     from skytether.shell.commandline import terminal
 
     if not scenarios:
         table.load_all()
-    terminal.prepare(kernel.missing(table.others(*scenarios) if scenarios else ()))
+    terminal.prepare(machine_code.missing(table.others(*scenarios) if scenarios else ()))
 
 
 def _checked(name: str, scenario: Scenario, keys: Mapping[str, Any]) -> Scenario:

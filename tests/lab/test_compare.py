@@ -45,6 +45,7 @@ from skytether.lab.pages.comparison import FLIGHTS_MIN, UNTOLD, budgets_table, l
 from skytether.lab.pages.report import Drawn, html
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.scenario import reading
+from skytether.shared.scenario.arguments import argument
 from skytether.shared.scenario.dotted import text_key
 from skytether.shared.scenario.reading import COMPARED
 from skytether.shared.scenario.registry import TRIGGERS
@@ -592,7 +593,7 @@ def test_the_tables_are_what_each_contender_flew(out: Path, tuned: Path) -> None
     weights = {row["contender"]: row for row in rows(out / "weights.csv")}
     assert list(weights) == [*QUICK]
     here = float(weights["trajectory-expected"]["control.trigger.expected_gap"])
-    expected = TRIGGERS.argument(found.control.trigger, "expected_gap")
+    expected = argument(TRIGGERS, found.control.trigger, "expected_gap")
     assert here == pytest.approx(expected, rel=1e-3)
 
 

@@ -71,23 +71,23 @@ REFUSED = (
 )
 PREPARED = """
 import caller
-from skytether.shared.base import kernel
+from skytether.shared.base import machine_code
 from skytether.shell.commandline.terminal import prepare
-prepare(kernel.missing())
+prepare(machine_code.missing())
 """
 
 
 SIDE_BY_SIDE = """
 import os, sys, time
 import caller, second
-from skytether.shared.base import kernel
+from skytether.shared.base import machine_code
 from skytether.shell.host.compiling import compile_kernels
 
 os.sched_getaffinity = lambda _: {0, 1}
 if sys.argv[1:] == ["alone"]:
     sys.executable = "/bin/false"
 done = []
-kernels = kernel.missing()
+kernels = machine_code.missing()
 
 def after_the_helper(each):
     def compile():
@@ -99,7 +99,7 @@ def after_the_helper(each):
 compile_kernels([after_the_helper(each) for each in kernels], lambda: done.append(1))
 for each in (caller.double, second.double):
     print(sum(each.dispatcher.stats.cache_hits.values()), len(each.dispatcher.overloads))
-print([each.name for each in kernels], len(done), kernel.missing())
+print([each.name for each in kernels], len(done), machine_code.missing())
 """
 
 
@@ -336,7 +336,7 @@ import sys
 import msgspec
 from numba.core import event
 from skytether.server.schemes import table
-from skytether.shared.base import files, kernel
+from skytether.shared.base import files, kernel, machine_code
 from skytether.shared.scenario import reading
 from skytether.sim import flight
 

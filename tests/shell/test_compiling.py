@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from skytether.shared.base.kernel import Missing
+from skytether.shared.base.machine_code import Missing
 from skytether.shell.commandline import terminal
 from skytether.shell.host import compiling
 from skytether.view.browser.flight import PageFlight

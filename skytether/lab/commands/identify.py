@@ -28,7 +28,7 @@ from skytether.lab.identify.steps import (
     fenced,
 )
 from skytether.ros2.graph import Node
-from skytether.shared.base import files, kernel
+from skytether.shared.base import files, machine_code
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.endpoints.line import Line
@@ -188,7 +188,9 @@ def _fly(scenario: Scenario, plan: ExperimentPlan, *, sets: bool) -> SizeFlown:
     if within is not scenario:
         _say(f"no fence: the vehicle stays within {within.fence.radius_m:g} m of its start")
     flight = Identifying(within, flies, Experiment(within, plan))
-    terminal.prepare(kernel.missing() if "skytether.shared.base.kernel" in sys.modules else [])
+    terminal.prepare(
+        machine_code.missing() if "skytether.shared.base.kernel" in sys.modules else []
+    )
     title = f"identifying {scenario.vehicle.kind}"
     with terminal.progress(title, plan.duration_s) as bar:
 

@@ -32,7 +32,7 @@ from skytether.lab.engine.journal import StudyJournal, name_of
 from skytether.lab.engine.search import Point, Search, SearchPoint, Values, best
 from skytether.lab.engine.sweep import Results, Runs, Sweep
 from skytether.server.schemes import table
-from skytether.shared.base import kernel
+from skytether.shared.base import kernel, machine_code
 from skytether.shared.scenario.whole import Scenario
 from skytether.shell.commandline import command, plugins, terminal
 from skytether.shell.commandline.argument import Argument
@@ -225,7 +225,7 @@ def crew(flags: Flags, title: str, total: float, unit: str = "runs") -> Iterator
     """
     if not flags.scheduler:  # Compile now: otherwise every worker would compile all kernels.
         table.load_all()
-        terminal.prepare(kernel.missing())
+        terminal.prepare(machine_code.missing())
     with (
         command.interruptible() as interrupted,
         _executor(flags) as executor,

@@ -22,7 +22,7 @@ from skytether.lab.pages import report
 from skytether.lab.pages.plates import Samples
 from skytether.lab.pages.report import Reproduction
 from skytether.server.schemes.table import others
-from skytether.shared.base import files, kernel
+from skytether.shared.base import files, machine_code
 from skytether.shared.law.model import Array
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.whole import Scenario
@@ -89,7 +89,7 @@ def _measure(
     sweeps = options.out / "sweeps"
     # Refuse a folder of another reproduction before anything is flown.
     StudyJournal(sweeps / table.name, table.first().settings(), Runs).close()
-    terminal.prepare(kernel.missing(others(scenario)))
+    terminal.prepare(machine_code.missing(others(scenario)))
     # Real-time measurements come first, while the cores are idle.
     delay_ms = _delays(options.out, scenario, scale)
     real = {method: _really(options.out, table, method, scale) for method in (EVERY, EVENT)}

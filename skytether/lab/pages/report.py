@@ -142,7 +142,7 @@ def traffic_table(columns: Mapping[str, MethodFlights]) -> Table:
 
 
 SENT_BY = ("uplink_above", "uplink_due")
-"""Plans sent, by cause, see `shared.telemetry.record.SentBy`."""
+"""Plans sent, by cause, see `shared.telemetry.sent.SentBy`."""
 REAL = {
     "column": ("column", ""),
     "UDP": ("rmse_xy_udp", ".4f"),

@@ -16,7 +16,7 @@ from skytether.shell.commandline.command import write
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from skytether.shared.base.kernel import Missing
+    from skytether.shared.base.machine_code import Missing
 
 
 class Bar(Protocol):
@@ -62,7 +62,7 @@ def prepare(kernels: Sequence["Missing"], folder: Path | None = None) -> None:
     """
     if not kernels:
         return
-    from skytether.shared.base import kernel
+    from skytether.shared.base import machine_code
     from skytether.shell.host.compiling import alone, compile_kernels, tell
 
     waiting = "waiting for another command, which compiles the control loops"
@@ -71,7 +71,7 @@ def prepare(kernels: Sequence["Missing"], folder: Path | None = None) -> None:
         print(waiting, file=sys.stderr, flush=True)
         tell(folder, waiting)
 
-    with alone(kernel.folder(), wait):
+    with alone(machine_code.folder(), wait):
         left = [each for each in kernels if not each.is_compiled()]
         if not left:
             tell(folder, "")

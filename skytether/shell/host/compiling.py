@@ -21,7 +21,7 @@ from skytether.shell.host import system
 
 # for type checking only: the client aboard is installed without numba
 if TYPE_CHECKING:
-    from skytether.shared.base.kernel import Missing
+    from skytether.shared.base.machine_code import Missing
 
 LOCK = "compiling.lock"
 POLL_S = 0.1
@@ -137,7 +137,7 @@ def _have_compiled(kernels: "deque[Missing]", on_done: Callable[[], None]) -> No
 
 def _help() -> None:
     """Compile the kernels named on stdin, one a line; answer each with a line on stdout."""
-    from skytether.shared.base.kernel import compile_named
+    from skytether.shared.base.machine_code import compile_named
 
     for line in sys.stdin:
         compile_named(line.rstrip("\n"))

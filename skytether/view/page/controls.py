@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from skytether.shared.scenario import dotted, registry, rooms
+from skytether.shared.scenario import arguments, dotted, registry, rooms
 from skytether.shared.scenario.grammar import GrammarError, leaves
 from skytether.shared.scenario.schemes import properties
 
@@ -70,7 +70,7 @@ def argument(values: Values, key: str) -> Any:
     """
     text = dotted.text_key(key)
     at = key.removeprefix(f"{text}.")
-    return values[key] if key == text else rooms.TEXTS[text].argument(values[text], at)
+    return values[key] if key == text else arguments.argument(rooms.TEXTS[text], values[text], at)
 
 
 def texts(values: Values) -> dict[str, str]:
@@ -95,7 +95,8 @@ def healed(values: Values) -> dict[str, Any]:
 
 
 def _with(text_key: str, text: str, key: str, value: Any) -> str:
-    return rooms.TEXTS[text_key].with_argument(text, key.removeprefix(f"{text_key}."), value)
+    at = key.removeprefix(f"{text_key}.")
+    return arguments.with_argument(rooms.TEXTS[text_key], text, at, value)
 
 
 def _number(values: Values, key: str) -> float | None:

@@ -40,8 +40,9 @@ from skytether.shared.telemetry.feed import (
     columns_of,
     table,
 )
-from skytether.shared.telemetry.record import DOWNLINK, UPLINK, Reason, SentBy, compared, sent_by
+from skytether.shared.telemetry.record import DOWNLINK, UPLINK, Reason
 from skytether.shared.telemetry.record import Rows as Table
+from skytether.shared.telemetry.sent import SentBy, compared, sent_by
 from skytether.shared.wire.framing import PATHS_MAX
 from skytether.shared.wire.protocol import Mode
 from skytether.view.page.changes import Mark, mark, together

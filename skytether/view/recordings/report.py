@@ -25,7 +25,8 @@ from skytether.shared.events.flight import DOES
 from skytether.shared.law.model import Array
 from skytether.shared.scenario.reading import to_toml
 from skytether.shared.scenario.whole import Scenario
-from skytether.shared.telemetry.record import Rows, compared
+from skytether.shared.telemetry.record import Rows
+from skytether.shared.telemetry.sent import compared
 from skytether.shared.telemetry.summary import Summary, desired, position_error
 from skytether.shared.wire.protocol import NO_HORIZON, Mode
 from skytether.view.recordings.outcome import Outcome, listed, spans
