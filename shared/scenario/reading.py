@@ -7,21 +7,19 @@ read here, so that endpoints open no files. `skytether list scenarios` lists the
 
 import io
 import math
-import re
-import typing
 import zipfile
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Literal
+from typing import Any
 
 import msgspec
 
 from skytether import scenarios
 from skytether.shared.base import input_files, toml
 from skytether.shared.base.errors import ConfigError
-from skytether.shared.base.hint import hint
+from skytether.shared.base.hint import hint, short
 from skytether.shared.scenario import rooms, schema
 from skytether.shared.scenario.contradictions import contradictions
 from skytether.shared.scenario.grammar import GrammarError
@@ -32,8 +30,6 @@ from skytether.shared.scenario.whole import Scenario, WithFiles
 SCENARIOS = Path(scenarios.__file__).parent
 EXTENDS_MAX = 20
 """Largest length of a chain of `extends`."""
-GIVEN_MAX = 200
-"""Largest number of characters of a value that a message repeats."""
 FILES: Mapping[str, tuple[PluginTable, int]] = MappingProxyType(
     {
         "network.uplink": (IMPAIRMENTS, 128 * 1024 * 1024),
@@ -122,7 +118,10 @@ def convert(raw: Mapping[str, Any], source: str = "") -> Scenario:
     try:
         scenario = msgspec.convert(raw, Scenario)
     except msgspec.ValidationError as error:
-        raise ConfigError(f"{_where(source)}{_explain(str(error), raw)}") from None
+        from skytether.shared.scenario.wrong_values import explain
+
+        why = explain(str(error), raw, Scenario)
+        raise ConfigError(f"{_where(source)}{why}") from None
     _refuse_first(_infinite(to_table(scenario)), source)
     several = scenario.network.paths if len(scenario.network.paths) > 1 else ()
     network = msgspec.structs.replace(scenario.on_path(0).network, paths=several)
@@ -144,7 +143,7 @@ def _without_contradictions(
 
 def _refuse_first(wrong: Iterator[Contradiction], source: str) -> None:
     for key, given, expected in wrong:
-        raise ConfigError(f"{_where(source)}{key}: got {_short(str(given))}, expected {expected}")
+        raise ConfigError(f"{_where(source)}{key}: got {short(str(given))}, expected {expected}")
 
 
 def _where(source: str) -> str:
@@ -279,7 +278,7 @@ def _content(where: str, name: str, most: int) -> bytes:
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else error
         expected = f"a file that can be read ({reason})"
-        raise ConfigError(f"{where}: got {_short(repr(name))}, expected {expected}") from None
+        raise ConfigError(f"{where}: got {short(repr(name))}, expected {expected}") from None
 
 
 def _zipped(folder: Path, most: int) -> bytes:
@@ -367,87 +366,6 @@ def _overlay(
         else:
             merged[name] = value
     return merged
-
-
-_PLAIN = {
-    "Number out of range": "a smaller number",
-    "float": "a number",
-    "int": "a whole number",
-    "bool": "true or false",
-    "str": "a text",
-    "array": "a list",
-    "object": "a table",
-}
-"""Words of msgspec's messages, and their replacements."""
-
-_ERROR = re.compile(r"(?P<what>.*?)(?: - at `\$\.?(?P<path>[^`]*)`)?", re.DOTALL)
-
-
-def _explain(message: str, raw: Mapping[str, Any]) -> str:
-    """Message of msgspec, reworded as `key: got …, expected …`."""
-    # Unknown keys first: their names may contain anything, also the syntax of msgspec's messages.
-    if unknown := _unknown_key(raw, Scenario):
-        return unknown
-    parts = _ERROR.fullmatch(message)
-    assert parts is not None
-    what, path = parts["what"], parts["path"] or ""
-    section, given = Scenario, raw
-    for part in filter(None, path.split(".")):
-        key, *index = part.replace("]", "").split("[")
-        given = given[key] if isinstance(given, Mapping) else given
-        for digits in index:
-            given = given[int(digits)] if digits.isdigit() else given
-        section = typing.get_type_hints(section).get(key, section)
-        if index and hasattr(typing.get_args(section)[0], "__struct_fields__"):
-            section = typing.get_args(section)[0]
-    if what.startswith("Invalid enum value") or " | " in what:
-        return f"{path}: got {_represented(given)}, expected {_choices(section)}"
-    expected = what.removeprefix("Expected ").split(", got ")[0].replace("`", "")
-    for theirs, ours in _PLAIN.items():
-        expected = re.sub(rf"^{theirs}\b", ours, expected)
-    return f"{path or 'the scenario'}: got {_represented(given)}, expected {expected}"
-
-
-def _unknown_key(table: object, section: Any, at: str = "") -> str | None:
-    """Message about the first unknown key of a table; None if all are known."""
-    if isinstance(table, list | tuple) and typing.get_origin(section) is tuple:
-        section = typing.get_args(section)[0]
-        each = (_unknown_key(one, section, f"{at[:-1]}[{i}].") for i, one in enumerate(table))
-        return next(filter(None, each), None)
-    if not (isinstance(table, Mapping) and hasattr(section, "__struct_fields__")):
-        return None
-    kinds = typing.get_type_hints(section)
-    for key, value in table.items():
-        if key not in kinds and not at and key in rooms.SECTIONS:
-            return f"{key}: {rooms.SECTIONS[key]} is not installed"
-        if key not in kinds:
-            return (
-                f"{at}{_short(str(key))}: no such key; {hint(str(key), section.__struct_fields__)}"
-            )
-        if below := _unknown_key(value, kinds[key], f"{at}{key}."):
-            return below
-    return None
-
-
-def _represented(given: object) -> str:
-    try:
-        return _short(repr(given))
-    except ValueError:  # Python formats no number of more than 4300 digits
-        return "a number of thousands of digits"
-
-
-def _short(given: str) -> str:
-    return given if len(given) <= GIVEN_MAX else f"{given[:GIVEN_MAX]}…"
-
-
-def _choices(kind: Any) -> str:
-    """Allowed values in words: the words of a Literal, or the types of a union."""
-    parts = typing.get_args(kind)
-    if typing.get_origin(kind) is tuple:
-        return _PLAIN["array"]
-    if typing.get_origin(kind) is Literal:
-        return " or ".join(map(repr, parts))
-    return " or ".join(map(_choices, parts)) if parts else _PLAIN[kind.__name__]
 
 
 def _infinite(value: object, key: str = "") -> Iterator[Contradiction]:

@@ -2,25 +2,14 @@
 
     [version, type, vehicle, ...]
 
-| type | message     | sent by | fields after `vehicle`                                     |
-|------|-------------|---------|------------------------------------------------------------|
-| 1    | HELLO       | client  | boot_id, terms                                             |
-| 2    | WELCOME     | server  | session, boot_id, server_boot_id, server_ns, refusal,      |
-|      |             |         | terms                                                      |
-| 3    | OBSERVATION | client  | session, step, flown, delay, backward_us, heard, mode,     |
-|      |             |         | motion, number, silence                                    |
-| 4    | HORIZON     | server  | session, step, server_us, age, inputs, feedback, number,   |
-|      |             |         | silence [, leadership]                                     |
-| 5    | HEARTBEAT   | server  | session, server_us, idle, degraded, number, silence        |
-| 6    | CLOSE       | both    | session                                                    |
-| 7    | TRAJECTORY  | server  | session, step, server_us, age, spacing, knots, number,     |
-|      |             |         | silence [, leadership]                                     |
-| 8    | TIME        | client  | session, step, epoch_us, error_us                          |
-| 9    | PATH        | both    | session, path, proof, prices                               |
-| 10   | LEAD        | both    | session, number, leads, largest, step, in_force, spacing,  |
-|      |             |         | knots, limits                                              |
+Each message is a class below; `docs/protocol.md` describes its bytes. With the scheme
+"trajectory", TRAJECTORY replaces HORIZON. Fields of several messages:
 
-With the scheme "trajectory", TRAJECTORY replaces HORIZON. `docs/protocol.md` describes the bytes.
+    server_us   time stamp: the server's clock when the packet was sent
+    age         steps from the server's newest observation to `step`
+    number      number of packets that the sender has sent in the session before, modulo NUMBERS
+    silence     longest silence that the sender allows the other end [half steps]; 0 for no bound
+    leadership  number of the leadership, see `Lead`; 0 is not sent
 
 A state is sampled at the start of its step, so the step number is also its time stamp. Other time
 stamps are in microseconds modulo 2^32 (71 minutes); the receiver adds the multiple of 2^32 that
@@ -61,17 +50,10 @@ KNOTS_MAX = 16
 STAMPS = 2**32
 """Modulus of time stamps [µs]: 71 minutes."""
 
-REFERENCE_P = 0
-"""Column of `Horizon.feedback`: position of x̄ at the horizon's step [m]."""
-REFERENCE_V = 1
-"""Column of `Horizon.feedback`: velocity of x̄ at the horizon's step [m/s]."""
+REFERENCE_P, REFERENCE_V, DISTURBANCE, GAIN_P, GAIN_V = range(5)
+"""Columns of `Horizon.feedback`: position [m] and velocity [m/s] of x̄ at the horizon's step, the
+disturbance ŵ that the inputs compensate [m/s], and K on position [1/s] and on velocity."""
 REFERENCE = [REFERENCE_P, REFERENCE_V]
-DISTURBANCE = 2
-"""Column of `Horizon.feedback`: disturbance ŵ that the inputs compensate [m/s]."""
-GAIN_P = 3
-"""Column of `Horizon.feedback`: K on position [1/s]."""
-GAIN_V = 4
-"""Column of `Horizon.feedback`: K on velocity."""
 FEEDBACK = 5
 
 NO_FEEDBACK = np.empty((0, 0), np.float32)
@@ -173,9 +155,7 @@ class Observation(NamedTuple):
     """Desired velocity that is flown from `step` on [m/s]; shape (axes,), or NO_INPUT with the
     scheme "trajectory". Sent as float32."""
     number: int = 0
-    """Number of packets that the vehicle has sent in the session before, modulo NUMBERS."""
     silence: int = 0
-    """Longest silence that the vehicle allows the server [half steps]; 0 for no bound."""
     unsaved: int = 0
     """1 if a restart of the client would not continue this flight, since its state cannot be saved,
     else 0."""
@@ -189,20 +169,15 @@ class Horizon(NamedTuple):
     step: int
     """Step k of the first input, on the vehicle's grid."""
     server_us: int
-    """Time stamp: the server's clock when the packet was sent."""
     age: int
-    """Steps from the server's newest observation to `step`."""
     inputs: NDArray[np.float32]
     """Desired velocity [m/s]; shape (axes, d + H), d committed ones first, 0 … `ahead_max`."""
     feedback: NDArray[np.float32] = NO_FEEDBACK
     """Parameters of the feedback aboard, in the columns REFERENCE_P … GAIN_V; shape (axes,
     FEEDBACK), or (axes, 0) without feedback."""
     number: int = 0
-    """Number of packets that the server has sent in the session before, modulo NUMBERS."""
     silence: int = 0
-    """Longest silence that the server allows the vehicle [half steps]; 0 for no bound."""
     leadership: int = 0
-    """Number of the leadership, see `Lead`; 0 is not sent."""
 
 
 class Trajectory(NamedTuple):
@@ -213,55 +188,45 @@ class Trajectory(NamedTuple):
     step: int
     """Step k of the first knot, on the vehicle's grid."""
     server_us: int
-    """Time stamp: the server's clock when the packet was sent."""
     age: int
-    """Steps from the server's newest observation to `step`."""
     spacing: int
     knots: NDArray[np.float32]
     """Position [m] and velocity [m/s] of each knot; shape (axes, knots, 2)."""
     number: int = 0
-    """Number of packets that the server has sent in the session before, modulo NUMBERS."""
     silence: int = 0
-    """Longest silence that the server allows the vehicle [half steps]; 0 for no bound."""
     leadership: int = 0
-    """Number of the leadership, see `Lead`; 0 is not sent."""
 
 
 class Idle(IntEnum):
-    PLANS = 0
-    """Plans are made, and sent when the trigger says so."""
-    OBSERVATION = 1
-    """The newest observation is older than `link.age_max_s`, or would be when a plan began."""
-    DELAY = 2
-    """The delay to the vehicle is longer than a horizon can cover."""
-    UNSOLVED = 3
-    STANDBY = 4
+    """Why the server sends no plan, or PLANS: plans are made, and sent when the trigger says so."""
+
+    def __new__(cls, number: int, text: str = "") -> "Idle":
+        made = int.__new__(cls, number)
+        made._value_, made.text = number, text
+        return made
+
+    text: str
+
+    PLANS = 0, "no newer horizon has arrived"
+    # … or would be older when a plan began.
+    OBSERVATION = 1, "its newest observation at the server is older than link.age_max_s"
+    DELAY = 2, "the delay to it is longer than a horizon can cover"
+    UNSOLVED = 3, "the solver has found no plan"
+    STANDBY = 4, "another server leads it"
 
     def __str__(self) -> str:
-        return IDLE_TEXTS[self]
-
-
-IDLE_TEXTS = {
-    Idle.PLANS: "no newer horizon has arrived",
-    Idle.OBSERVATION: "its newest observation at the server is older than link.age_max_s",
-    Idle.DELAY: "the delay to it is longer than a horizon can cover",
-    Idle.UNSOLVED: "the solver has found no plan",
-    Idle.STANDBY: "another server leads it",
-}
+        return self.text
 
 
 class Heartbeat(NamedTuple):
     vehicle: int
     session: int
     server_us: int
-    """Time stamp: the server's clock when the packet was sent."""
     idle: int
     degraded: int
     """1 if the server misses too many ticks, else 0."""
     number: int = 0
-    """Number of packets that the server has sent in the session before, modulo NUMBERS."""
     silence: int = 0
-    """Longest silence that the server allows the vehicle [half steps]; 0 for no bound."""
 
 
 class Close(NamedTuple):

@@ -32,7 +32,7 @@ from skytether.shared.scenario import reading
 from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import Record
 from skytether.shared.telemetry.summary import summarise
-from skytether.shared.wire.protocol import IDLE_TEXTS, Idle
+from skytether.shared.wire.protocol import Idle
 from skytether.sim.flight import fly, fly_batch
 
 Delay = Callable[[float], float]
@@ -162,9 +162,9 @@ def assert_hovers_or_flies(flight: Record) -> None:
     here = [event for host, event in said if host == "client" and isinstance(event, ModeChanged)]
     there = [event for host, event in said if host == "server"]
     assert here[-1].after == "hover"
-    assert flight.failure.why in (IDLE_TEXTS[Idle.DELAY], IDLE_TEXTS[Idle.OBSERVATION], SILENT)
+    assert flight.failure.why in (Idle.DELAY.text, Idle.OBSERVATION.text, SILENT)
     assert isinstance(there[-1], PlanningStopped)
-    assert there[-1].why in (IDLE_TEXTS[Idle.DELAY], IDLE_TEXTS[Idle.OBSERVATION])
+    assert there[-1].why in (Idle.DELAY.text, Idle.OBSERVATION.text)
 
 
 SILENT = "the server is silent"
