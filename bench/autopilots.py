@@ -21,14 +21,14 @@ from bench import straight
 from bench.harness import Study, TextTable
 from bench.laws import Law
 from bench.straight import state_at, summary_of, within
-from skytether.autopilot.endpoint import Autopilot
+from skytether.autopilot.endpoint import TRUTH_COLUMNS, Autopilot
 from skytether.autopilot.faults import ScriptedFault
 from skytether.autopilot.flavours import FlavourName
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.events.flight import Flying
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.whole import Scenario
-from skytether.shared.telemetry.record import TRUTH_COLUMNS, Record, Recorder, Rows, parse
+from skytether.shared.telemetry.record import Record, Recorder, Rows, parse
 from skytether.shared.telemetry.summary import Summary, position_error, summarise
 from skytether.shared.wire.protocol import Mode
 from skytether.shell.commandline import command
@@ -176,7 +176,7 @@ def as_it_was(scenario: Scenario, flown: Record, truth: Rows) -> Record:
 
     Args:
         flown: record of the flight, with states as estimated aboard.
-        truth: rows of `record.TRUTH_COLUMNS`, on the clock of the record's events.
+        truth: rows of `autopilot.endpoint.TRUTH_COLUMNS`, on the clock of the record's events.
     """
     times_ns = began_ns(flown) + flown.client["step"] * scenario.dt_ns
     client = flown.client.copy()

@@ -14,7 +14,7 @@ import numpy as np
 
 from bench.laws import Law
 from bench.station import Station, station_columns
-from skytether.autopilot.endpoint import Autopilot
+from skytether.autopilot.endpoint import TRUTH_COLUMNS, Autopilot
 from skytether.autopilot.flavours import FlavourName
 from skytether.netem.proxy import Proxy
 from skytether.shared.base.chance import stream
@@ -23,7 +23,6 @@ from skytether.shared.events.flight import Event, Failure
 from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import (
     PACKET_COLUMNS,
-    TRUTH_COLUMNS,
     FlightEvent,
     Reason,
     Record,
@@ -102,7 +101,7 @@ def joined(
 
     Args:
         station: rows of `station_columns`.
-        truth: rows of `record.TRUTH_COLUMNS`, on the station's clock.
+        truth: rows of `autopilot.endpoint.TRUTH_COLUMNS`, on the station's clock.
         netem: rows of netem's part, on the station's clock.
         failure: event after which the vehicle could not be flown.
     """

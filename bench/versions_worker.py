@@ -20,7 +20,12 @@ from bench.harness import HOT, PACED, machine
 from bench.problems import derive
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.scenario.whole import Scenario
-from skytether.sim.flight import fly, fly_batch
+from skytether.sim.flight import fly
+
+try:
+    from skytether.sim.batch import fly_batch
+except ModuleNotFoundError:  # an older version
+    from skytether.sim.flight import fly_batch  # type: ignore[attr-defined, no-redef]
 
 
 def where() -> dict[str, Any]:

@@ -9,7 +9,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from skytether.autopilot.endpoint import Autopilot
+from skytether.autopilot.endpoint import TRUTH_COLUMNS, Autopilot
 from skytether.autopilot.faults import parse as parse_fault
 from skytether.autopilot.flavours import FlavourName, FlightMode
 from skytether.client import vehicles
@@ -23,7 +23,7 @@ from skytether.shared.endpoints.endpoint import Datagram, Endpoint
 from skytether.shared.events.flight import Event, ModeChanged
 from skytether.shared.scenario.reading import check
 from skytether.shared.scenario.whole import Scenario
-from skytether.shared.telemetry.record import TRUTH_COLUMNS, Recorder, Rows, client_columns, parse
+from skytether.shared.telemetry.record import Recorder, Rows, client_columns, parse
 from skytether.shared.wire.protocol import Mode
 from skytether.sim.world import Clock, World
 

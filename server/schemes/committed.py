@@ -35,6 +35,7 @@ from skytether.server.planning.scheme import Fleet, Foresight, SchemeCode
 from skytether.server.schemes import horizons, sent_horizons
 from skytether.server.schemes import sent as tracker
 from skytether.server.schemes.disturbance import FOLLOW_S, observe_disturbance
+from skytether.server.schemes.feedback import feedback_gain
 from skytether.server.schemes.horizons import HorizonScheme
 from skytether.server.schemes.loss_scenarios import foresee_losses
 from skytether.server.schemes.observer import decay_of
@@ -60,7 +61,6 @@ from skytether.server.schemes.sent_horizons import (
 from skytether.shared.base.kernel import I1, kernel
 from skytether.shared.law.model import Array, Flags, Indices
 from skytether.shared.law.terms import Terms
-from skytether.shared.scenario.gain import feedback_gain
 from skytether.shared.scenario.schema import ControlConfig
 from skytether.shared.wire.protocol import (
     DISTURBANCE,

@@ -21,12 +21,12 @@ from skytether.server.mpc import exact, hierarchical, riccati
 from skytether.server.planning.compiled import Laws, advance, laws_of
 from skytether.server.planning.scheme import Fleet, Foresight, SchemeCode
 from skytether.server.schemes import horizons
+from skytether.server.schemes.feedback import feedback_gain
 from skytether.server.schemes.horizons import HorizonScheme
 from skytether.server.schemes.observer import decay_of, updated_disturbance
 from skytether.shared.base.kernel import F2, F3, I1, S3, kernel, part
 from skytether.shared.law.model import Array, Flags, Indices
 from skytether.shared.law.terms import INDEXED, Terms
-from skytether.shared.scenario.gain import feedback_gain
 from skytether.shared.scenario.schema import ControlConfig
 from skytether.shared.wire.protocol import (
     DISTURBANCE,

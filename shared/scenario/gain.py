@@ -1,4 +1,4 @@
-"""Gains of the regulators aboard: eq. (9) with infinite horizon and unbounded input.
+"""Gain of the regulator aboard: eq. (9) with infinite horizon and unbounded input.
 
 Along a trajectory the regulator is the linear-quadratic regulator of eq. (9), which weighs changes
 of the input. The cost of each step and the optimal input are
@@ -6,9 +6,6 @@ of the input. The cost of each step and the optimal input are
     xᵀ Q x + R u² + S (u - u(k-1))²         u = λ u(k-1) - (1 - λ) K x
 
 so at each step the input moves from the previous one towards -K x by the share 1 - λ.
-
-Around a horizon of inputs the feedback uses position and velocity only, u = -K x, because the
-previous input depends on which packets arrived. There S is added to R.
 
 K accounts for the model's gain. It needs no dead time: the feedback uses the state predicted for
 the time when the next input takes effect (`shared.law.dead_time`).
@@ -18,29 +15,11 @@ from functools import lru_cache
 
 import numpy as np
 
-from skytether.shared.law.model import Array, Model
-from skytether.shared.scenario.schema import ControlConfig, Scenario
+from skytether.shared.law.model import Array
+from skytether.shared.scenario.schema import Scenario
 
 ROUNDS = 10_000
 """Largest number of iterations of the Riccati recursion, for weights with slow convergence."""
-
-
-def feedback_gain(scenario: Scenario) -> Array:
-    """Gain K of the feedback around a horizon, on position [1/s] and velocity; shape (axes, 2)."""
-    model, control = scenario.terms().model, scenario.control
-    if not control.feedback:
-        return np.zeros_like(model.B)
-    return stationary_gain(model, control)
-
-
-def stationary_gain(model: Model, control: ControlConfig) -> Array:
-    """Gain K of the feedback around a horizon, on position [1/s] and velocity; shape (axes, 2).
-
-    S of the weights is added to R.
-    """
-    weight = control.input_weight + control.change_weight
-    gain = _converged_gain(model.A.tobytes(), model.B.tobytes(), control.state_weight, weight, 0.0)
-    return gain[:, :2]
 
 
 def regulator(scenario: Scenario) -> Array:
@@ -49,13 +28,13 @@ def regulator(scenario: Scenario) -> Array:
     """
     model, control = scenario.terms().model, scenario.control
     Q, R, S = control.state_weight, control.input_weight, control.change_weight
-    gain = _converged_gain(model.A.tobytes(), model.B.tobytes(), Q, R, S)
+    gain = converged_gain(model.A.tobytes(), model.B.tobytes(), Q, R, S)
     lag = -gain[:, 2:]
     return np.concatenate([gain[:, :2] / (1.0 - lag), lag], axis=1)
 
 
 @lru_cache(maxsize=64)
-def _converged_gain(
+def converged_gain(
     a: bytes,
     b: bytes,
     state_weight: tuple[float, float],

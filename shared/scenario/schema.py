@@ -11,7 +11,7 @@ valid, but not together.
 """
 
 import hashlib
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from itertools import chain
 from typing import Annotated, Any, Literal, Self, TypeVar
 
@@ -26,7 +26,7 @@ from skytether.shared.law.model import Array
 from skytether.shared.law.terms import Terms
 from skytether.shared.scenario import reference as shapes
 from skytether.shared.scenario import rooms, schemes
-from skytether.shared.scenario.grammar import TEXT_MAX, leaves
+from skytether.shared.scenario.grammar import TEXT_MAX
 from skytether.shared.scenario.owners import (
     InFlight,
     Key,
@@ -42,12 +42,7 @@ from skytether.shared.scenario.owners import (
     Term,
 )
 from skytether.shared.scenario.registry import (
-    PLANNERS,
     REFERENCES,
-    SCHEMES,
-    TRIGGERS,
-    VEHICLES,
-    Entry,
     Files,
     file_of,
     load,
@@ -389,7 +384,6 @@ class SimulationConfig(Section, frozen=True):
     and even ones; 0: no time of day."""
 
 
-T = TypeVar("T", NetworkConfig, PathConfig)
 S = TypeVar("S", bound=Section)
 
 
@@ -459,18 +453,6 @@ class Scenario(Section, frozen=True):
         )
         seed = int(stream(self.seed, "path", index).integers(2**32)) if index else self.seed
         return msgspec.structs.replace(self, seed=seed, network=network)
-
-    def impaired(self, change: Callable[[str], str]) -> Self:
-        """Scenario with the text of each direction changed, on every path."""
-
-        def changed(each: T) -> T:
-            up, down = change(each.uplink), change(each.downlink)
-            return msgspec.structs.replace(each, uplink=up, downlink=down)
-
-        network = msgspec.structs.replace(
-            changed(self.network), paths=tuple(map(changed, self.network.paths))
-        )
-        return msgspec.structs.replace(self, network=network)
 
     @property
     def uplink(self) -> Any:
@@ -595,17 +577,6 @@ class Scenario(Section, frozen=True):
     def keeps_apart(self) -> bool:
         """Whether vehicles keep apart: each flies its motion to the end, or holds its place."""
         return self.reference.shape.partition("(")[0].strip() in rooms.APART
-
-    def entries(self) -> Iterator[Entry]:
-        """Entries of the scheme, the planner, the policies of the trigger, the shape and the
-        vehicle.
-        """
-        yield SCHEMES[schemes.call(self.control.scheme).name]
-        yield PLANNERS[PLANNERS.one(self.control.planner).name]
-        for policy in leaves(TRIGGERS.parse(self.control.trigger)):
-            yield TRIGGERS[policy.name]
-        yield REFERENCES[REFERENCES.one(self.reference.shape).name]
-        yield VEHICLES[VEHICLES.one(self.vehicle.kind).name]
 
     def _tabledigest(self) -> str:
         """Digest of `reference.file`, and of the origin of its coordinates."""

@@ -184,14 +184,6 @@ PACKET_COLUMNS: np.dtype[np.void] = np.dtype(
 )
 """Columns of netem's part: one row for each packet."""
 
-TRUTH_COLUMNS: np.dtype[np.void] = np.dtype(
-    [
-        ("time_ns", "<i8"),  # [the autopilot's clock]
-        ("state", "<f8", (3, 2)),  # true position [m] and velocity [m/s]
-    ]
-)
-"""Columns of a simulated autopilot's part: one row for each of its ticks."""
-
 
 class Sink(Protocol):
     """Destination of a part of the record, such as a binary file."""

@@ -12,10 +12,9 @@ from dataclasses import dataclass
 from typing import Annotated
 
 from skytether.autopilot import faults
-from skytether.autopilot.endpoint import Autopilot
+from skytether.autopilot.endpoint import TRUTH_COLUMNS, Autopilot
 from skytether.autopilot.flavours import FlavourName
 from skytether.shared.base import kernel, machine_code
-from skytether.shared.telemetry.record import TRUTH_COLUMNS
 from skytether.shell.commandline import command, terminal
 from skytether.shell.commandline.argument import Argument
 from skytether.shell.commandline.command import CommandError, ScenarioName

@@ -44,6 +44,14 @@ BEHIND_MAX_NS = SECOND_NS
 FORCE = 21196.0
 """Magic number that forces arming or disarming."""
 
+TRUTH_COLUMNS: np.dtype[np.void] = np.dtype(
+    [
+        ("time_ns", "<i8"),  # [the autopilot's clock]
+        ("state", "<f8", (3, 2)),  # true position [m] and velocity [m/s]
+    ]
+)
+"""Columns of a simulated autopilot's part: one row for each of its ticks."""
+
 PILOTS: dict[FlavourName, type[PilotedVehicle]] = {"ardupilot": ArduPilot, "px4": PX4}
 POSITION_IGNORED, VELOCITY_IGNORED = 0b111, 0b111000
 """Bits of a set-point's type mask; those of acceleration are 0b111000000."""
@@ -92,7 +100,7 @@ class Autopilot(Endpoint):
         scenario: scenario, of which frame, battery, wind and seed are used.
         peers: addresses that it sends to from the start.
         ready_s: time until it may be armed; None for its flavour's.
-        recorder: takes the true state at each tick, as rows of `record.TRUTH_COLUMNS`.
+        recorder: takes the true state at each tick, as rows of TRUTH_COLUMNS.
     """
 
     changeable = keys_of(InFlight.WIND)

@@ -133,9 +133,9 @@ def fly_batch(scenario: Given, seeds: Iterable[int], /, **keys: Any) -> list[Fli
         if numbers.count(number) > 1:
             raise ConfigError(f"seeds: got {number} twice, expected seeds that differ")
     prepare(*each)
-    from skytether.sim import flight  # imports the planner and numba, which takes a while
+    from skytether.sim import batch  # imports the planner and numba, which takes a while
 
-    records = flight.fly_batch(flown, numbers)
+    records = batch.fly_batch(flown, numbers)
     return [Flight(run, record, name=name) for run, record in zip(each, records, strict=True)]
 
 

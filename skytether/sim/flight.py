@@ -11,7 +11,7 @@ vehicles of each run are numbered from 1.
 """
 
 import io
-from collections import Counter, defaultdict, deque
+from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import cache, partial
@@ -28,12 +28,11 @@ from skytether.netem.proxy import Proxy, of_paths
 from skytether.server.endpoint import Server
 from skytether.server.gate import Gate
 from skytether.shared.base.chance import stream
-from skytether.shared.base.errors import ConfigError
 from skytether.shared.base.kernel import compile_all
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS, seconds_to_ns
-from skytether.shared.endpoints.endpoint import Address, Datagram, Endpoint, by_name
+from skytether.shared.endpoints.endpoint import Address, Endpoint
 from skytether.shared.endpoints.stopwatch import Stopwatch
-from skytether.shared.events.flight import Event, Fault, VehicleEvent
+from skytether.shared.events.flight import Event, VehicleEvent
 from skytether.shared.scenario.reference import Reference
 from skytether.shared.scenario.registry import load
 from skytether.shared.scenario.whole import Scenario
@@ -48,7 +47,6 @@ from skytether.shared.telemetry.record import (
     plan_columns,
     server_columns,
 )
-from skytether.shared.wire.drop import Drop
 from skytether.sim.world import Clock, World
 
 # Aboard the client's code is plain Python; thousands of clients in one process need it compiled.
@@ -62,10 +60,6 @@ BOOT_ID = 2**63 + 2**31
 """Boot id of every endpoint. It takes as many bytes as a random one, and so do session numbers."""
 SERVER: Address = ("server", 0)
 STANDBY: Address = ("standby", 0)
-COMPANY_MAX = 100
-"""Largest number of runs that share a server. More would be no faster, and vehicle numbers must fit
-one byte.
-"""
 ASK_NS = 10 * MILLISECOND_NS
 """Virtual time between two calls of `stopped` [ns]."""
 EVENTS_MAX = 65_536
@@ -126,7 +120,7 @@ def fly(
         ends = load("skytether.sim.sealed", "keys").Sealed(scenario.seed, vehicles)
     columns, sink = plan_columns(scenario.model.axes, scenario.control.horizon), io.BytesIO()
     plan_recorder = Recorder(columns, sink)
-    (flight,) = _fly(
+    (flight,) = fly_runs(
         scenario,
         (scenario.seed,),
         on_second,
@@ -142,61 +136,6 @@ def fly(
         standby=standby,
     )
     return replace(flight, plan=parse(sink.getvalue()))
-
-
-def fly_batch(
-    scenario: Scenario,
-    seeds: Sequence[int],
-    *,
-    changes: Sequence[tuple[float, Mapping[str, Any]]] = (),
-    on_second: Callable[[int], None] = lambda _: None,
-    stopped: Callable[[], bool] | None = None,
-) -> list[Record]:
-    """Fly a scenario once for each of these seeds, many times faster than one by one.
-
-    Each flight equals that of `fly` with the same seed, to the last bit, except that the server's
-    `figures` contain only the drops. If the server's computing time exceeds a step, the runs are
-    flown one by one: which ticks the server misses depends on when it began.
-
-    Args:
-        seeds: different seeds that replace the scenario's.
-        changes, stopped: as in `fly`.
-        on_second: as in `fly`; the time restarts every COMPANY_MAX runs.
-
-    Raises:
-        ConfigError: a plug-in raised an exception.
-    """
-    in_time = seconds_to_ns(scenario.simulation.compute_s) <= scenario.dt_ns
-    # Vehicles of one server share a budget, and on a mission keep clear of each other.
-    alone = not in_time or scenario.keeps_apart or scenario.control.shared_bytes_per_s
-    company = 1 if alone else COMPANY_MAX
-    groups = [seeds[first : first + company] for first in range(0, len(seeds), company)]
-    flights = [
-        flight
-        for group in groups
-        for flight in _fly(scenario, group, on_second, stopped, changes=changes)
-    ]
-    for _, _, event in (event for flight in flights for event in flight.events):
-        if isinstance(event, Fault):
-            raise ConfigError(event.traceback.splitlines()[-1])
-    return flights
-
-
-class SharedServer(Server):
-    """Server of several runs, which also counts dropped datagrams by run."""
-
-    def __init__(self, *args: Any, **options: Any) -> None:
-        super().__init__(*args, **options)
-        self.dropped_by_host: defaultdict[str, Counter[Drop]] = defaultdict(Counter)
-        """Number of dropped datagrams, by the sending host and the reason."""
-
-    def receive(self, datagram: Datagram, *, now_ns: int) -> None:
-        dropped = self._reception.hear(datagram, now_ns=now_ns)
-        if dropped is not None:
-            self.dropped_by_host[datagram.peer[0]][dropped] += 1
-
-    def dropped_of(self, hosts: Sequence[str]) -> Counter[Drop]:
-        return sum((self.dropped_by_host[host] for host in hosts), Counter[Drop]())
 
 
 class Run:
@@ -333,7 +272,7 @@ class Run:
         return Record(client, server, netem, failure, figures, tuple(self._events))
 
 
-def _fly(
+def fly_runs(
     scenario: Scenario,
     seeds: Sequence[int],
     on_second: Callable[[int], None],
@@ -348,7 +287,18 @@ def _fly(
     actions: Sequence[tuple[float, Callable[[World], None]]] = (),
     *,
     standby: Endpoint | bool = False,
+    make_server: Callable[..., Server] = Server,
+    figures_of: Callable[[Any, Sequence[str]], Mapping[str, Any]] = lambda server, _: (
+        server.figures()
+    ),
 ) -> list[Record]:
+    """Fly the runs of several seeds side by side; see `fly` for the other arguments.
+
+    Args:
+        make_server: makes the server of all runs.
+        figures_of: the server's figures for the datagrams of some hosts.
+    """
+
     def on_event(time_ns: int, host: str, event: Event) -> None:
         if host in (SERVER[0], STANDBY[0]):
             if not isinstance(event, VehicleEvent):
@@ -374,7 +324,7 @@ def _fly(
     header_bytes, row_bytes = sink.tell(), recorder.columns.itemsize
 
     def started(entropy: Callable[[int], bytes]) -> Server:
-        return (SharedServer if len(seeds) > 1 else Server)(
+        return make_server(
             scenario,
             boot_id=BOOT_ID,
             entropy=entropy,
@@ -395,17 +345,12 @@ def _fly(
     def server_rows() -> int:
         return (sink.tell() - header_bytes) // row_bytes
 
-    def server_figures(hosts: Sequence[str]) -> Mapping[str, Any]:
-        if isinstance(server, SharedServer):
-            return {"dropped": by_name(server.dropped_of(hosts))}
-        return server.figures()
-
     runs = [
         Run(
             world,
             run,
             server_rows,
-            server_figures,
+            partial(figures_of, server),
             number,
             vehicles,
             ends,

@@ -14,7 +14,7 @@ from bench.laws import Heard, Law, setpoint
 from bench.station import Station, station_columns
 from bench.straight import joined, summary_of
 from helpers import packaged
-from skytether.autopilot.endpoint import Autopilot
+from skytether.autopilot.endpoint import TRUTH_COLUMNS, Autopilot
 from skytether.autopilot.faults import parse as fault
 from skytether.autopilot.flavours import FlavourName
 from skytether.mavlink.codec import Codec
@@ -27,12 +27,7 @@ from skytether.shared.events.flight import Finished, Flying
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.curves import figure_eight
 from skytether.shared.scenario.whole import Scenario
-from skytether.shared.telemetry.record import (
-    PACKET_COLUMNS,
-    TRUTH_COLUMNS,
-    Record,
-    Recorder,
-)
+from skytether.shared.telemetry.record import PACKET_COLUMNS, Record, Recorder
 from skytether.shared.telemetry.summary import Summary, summarise
 from skytether.sim.world import World
 

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from airborne import OFFSET_NS, SAFE
-from skytether.autopilot.endpoint import Autopilot
+from skytether.autopilot.endpoint import TRUTH_COLUMNS, Autopilot
 from skytether.autopilot.flavours import FlavourName
 from skytether.client import vehicles
 from skytether.client.endpoint import Client
@@ -30,7 +30,7 @@ from skytether.shared.scenario.dotted import set_keys
 from skytether.shared.scenario.reading import check
 from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry import record
-from skytether.shared.telemetry.record import TRUTH_COLUMNS, Recorder, client_columns, parse
+from skytether.shared.telemetry.record import Recorder, client_columns, parse
 from skytether.shared.telemetry.summary import least_separation
 from skytether.shell.processes.log import LogLine
 from skytether.sim.world import Clock, World

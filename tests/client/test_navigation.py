@@ -28,7 +28,8 @@ from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import Rows
 from skytether.shared.telemetry.summary import summarise
 from skytether.shared.wire.protocol import Message
-from skytether.sim.flight import fly, fly_batch
+from skytether.sim.batch import fly_batch
+from skytether.sim.flight import fly
 
 DT_NS = 50 * MILLISECOND_NS
 NOISE = {"position_noise_m": 0.02, "velocity_noise_mps": 0.05}

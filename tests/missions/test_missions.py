@@ -51,7 +51,7 @@ from skytether.shared.telemetry.record import Rows
 from skytether.shared.telemetry.summary import least_separation
 from skytether.shared.wire.drop import Drop, ProtocolError
 from skytether.shared.wire.protocol import NO_HORIZON, NO_INPUT, Mode, Observation, Trajectory
-from skytether.sim import flight
+from skytether.sim import batch, flight
 from two_vehicles import (
     DT_S,
     alone,
@@ -1154,7 +1154,7 @@ def test_a_batch_flies_each_mission_alone() -> None:
     """Runs of a batch share a server, and must not keep apart from each other."""
     swaps = scenario(2, duration=4.0)
     alone = flight.fly(msgspec.structs.replace(swaps, seed=2))
-    assert flight.fly_batch(swaps, [1, 2])[1].trace_hash() == alone.trace_hash()
+    assert batch.fly_batch(swaps, [1, 2])[1].trace_hash() == alone.trace_hash()
 
 
 # -- published tasks ---------------------------------------------------------------------------

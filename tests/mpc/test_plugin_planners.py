@@ -25,7 +25,8 @@ from skytether.shared.law.model import Array
 from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import Record
 from skytether.shell.commandline import plugins
-from skytether.sim.flight import fly, fly_batch
+from skytether.sim.batch import fly_batch
+from skytether.sim.flight import fly
 
 pytestmark = pytest.mark.usefixtures("plugin_tables")
 

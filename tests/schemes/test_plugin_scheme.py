@@ -18,7 +18,8 @@ from skytether.shared.base.errors import ConfigError
 from skytether.shared.scenario.whole import Scenario
 from skytether.shared.wire.protocol import Mode
 from skytether.shell.commandline import plugins
-from skytether.sim.flight import fly, fly_batch
+from skytether.sim.batch import fly_batch
+from skytether.sim.flight import fly
 
 pytestmark = pytest.mark.usefixtures("plugin_tables")
 

@@ -19,7 +19,8 @@ from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import UPLINK, Record
 from skytether.shared.telemetry.summary import summarise
 from skytether.shared.wire.protocol import NO_HORIZON, Horizon, Mode, Observation
-from skytether.sim.flight import fly, fly_batch
+from skytether.sim.batch import fly_batch
+from skytether.sim.flight import fly
 
 H, BOUND, MOST = 6, 4, 50
 ROW = np.array([0])

@@ -16,8 +16,9 @@ from skytether.shared.events.flight import NoAnswer, SessionEnded
 from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import Record
 from skytether.shared.wire.protocol import Heartbeat, encode
-from skytether.sim import flight
-from skytether.sim.flight import COMPANY_MAX, fly, fly_batch
+from skytether.sim import batch, flight
+from skytether.sim.batch import COMPANY_MAX, fly_batch
+from skytether.sim.flight import fly
 
 
 def scenario(**changes: Any) -> Scenario:
@@ -225,7 +226,7 @@ def test_vehicles_and_sessions_take_as_many_bytes_in_any_run() -> None:
 
 
 def test_more_runs_than_share_a_server_are_flown_in_turn(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(flight, "COMPANY_MAX", 3)
+    monkeypatch.setattr(batch, "COMPANY_MAX", 3)
     flown = scenario(duration=0.2)
     flights = fly_batch(flown, range(4))
     assert len(flights) == 4

@@ -18,7 +18,8 @@ from skytether.shared.law.model import Array
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.dotted import set_keys
 from skytether.shared.scenario.whole import Scenario
-from skytether.sim.flight import fly, fly_batch
+from skytether.sim.batch import fly_batch
+from skytether.sim.flight import fly
 
 DT_NS = 50 * MILLISECOND_NS
 DT_S = DT_NS / SECOND_NS

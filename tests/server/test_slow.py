@@ -33,7 +33,8 @@ from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import Record
 from skytether.shared.telemetry.summary import summarise
 from skytether.shared.wire.protocol import Idle
-from skytether.sim.flight import fly, fly_batch
+from skytether.sim.batch import fly_batch
+from skytether.sim.flight import fly
 
 Delay = Callable[[float], float]
 """Delay of a packet [s], by the time since the first packet [s]."""

@@ -9,9 +9,10 @@ from scipy.linalg import solve_discrete_are
 from scipy.optimize import minimize
 
 from helpers import packaged
+from skytether.server.schemes.feedback import feedback_gain
+from skytether.server.schemes.feedback import stationary_gain as gain_for
 from skytether.shared.law.model import Array, discretise, white_acceleration
-from skytether.shared.scenario.gain import feedback_gain, regulator
-from skytether.shared.scenario.gain import stationary_gain as gain_for
+from skytether.shared.scenario.gain import regulator
 from skytether.shared.scenario.schema import ControlConfig
 from skytether.shared.scenario.whole import Scenario
 from skytether.sim.flight import fly

@@ -8,6 +8,7 @@ import pytest
 
 import helpers
 from helpers import packaged
+from skytether.lab.engine.margins import impaired
 from skytether.shared.endpoints.endpoint import PATH_SOCKETS
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.schema import PATHS_MAX, PathConfig
@@ -124,7 +125,7 @@ def test_a_flag_for_all_paths_is_a_list_of_tables() -> None:
 
 
 def test_a_change_of_the_impairments_changes_every_path() -> None:
-    two = packaged("demo", paths(NEAR, FAR)).impaired(lambda each: f"{each} & ordered")
+    two = impaired(packaged("demo", paths(NEAR, FAR)), lambda each: f"{each} & ordered")
     assert [path.downlink for path in two.paths] == [f"{NEAR} & ordered", f"{FAR} & ordered"]
     assert two.network.uplink == f"{NEAR} & ordered"
 

@@ -27,7 +27,8 @@ from skytether.shared.scenario.registry import PLUGIN_TABLES, REFERENCES, TRIGGE
 from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import Record
 from skytether.shell.commandline import plugins
-from skytether.sim.flight import fly, fly_batch
+from skytether.sim.batch import fly_batch
+from skytether.sim.flight import fly
 
 pytestmark = pytest.mark.usefixtures("plugin_tables")
 

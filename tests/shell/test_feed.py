@@ -58,7 +58,7 @@ from skytether.shell.driving.feed import (
 )
 from skytether.shell.host.local import LocalError
 from skytether.shell.processes import process
-from skytether.sim import flight
+from skytether.sim import batch, flight
 from skytether.view.browser import serve
 from virtual_loop import virtually
 
@@ -682,7 +682,7 @@ def test_the_plans_told_are_those_that_are_sent(
 
 def test_flights_of_a_batch_keep_no_plans() -> None:
     flown = msgspec.structs.replace(DEMO, duration=6.0)
-    (one,) = flight.fly_batch(flown, [1])
+    (one,) = batch.fly_batch(flown, [1])
     assert len(one.plan) == 0
 
 

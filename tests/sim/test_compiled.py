@@ -11,7 +11,8 @@ from helpers import interpreted, packaged
 from skytether.shared.base.compilable import COMPILABLE
 from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import Reason, Record
-from skytether.sim.flight import fly, fly_batch
+from skytether.sim.batch import fly_batch
+from skytether.sim.flight import fly
 
 SHORT = {"duration": 2.0, "settle": 0.0}
 

@@ -25,7 +25,8 @@ from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import DOWNLINK, UPLINK, Reason, Record, client_columns
 from skytether.shared.telemetry.summary import Summary, position_error, summarise
 from skytether.shell.commandline.terminal import summary_rows
-from skytether.sim.flight import fly, fly_batch
+from skytether.sim.batch import fly_batch
+from skytether.sim.flight import fly
 
 
 def summary(flown: Scenario, flight: Record) -> Summary:

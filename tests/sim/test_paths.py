@@ -20,7 +20,8 @@ from skytether.shared.telemetry.record import DOWNLINK, UPLINK, Record
 from skytether.shared.telemetry.summary import summarise
 from skytether.shell.commandline.terminal import summary_rows
 from skytether.sim import flight
-from skytether.sim.flight import fly, fly_batch
+from skytether.sim.batch import fly_batch
+from skytether.sim.flight import fly
 
 SLOTS_PER_S = SECOND_NS // SLOT_NS
 BLACK_HOLE = {"uplink": "loss(1)", "downlink": "loss(1)"}

@@ -32,7 +32,7 @@ from skytether.shell.commandline import command, terminal
 from skytether.shell.commandline.argument import Argument
 from skytether.shell.commandline.command import CommandError
 from skytether.shell.commandline.options import read
-from skytether.sim.flight import fly_batch
+from skytether.sim.batch import fly_batch
 
 
 @dataclass(frozen=True)

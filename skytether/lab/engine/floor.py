@@ -36,7 +36,7 @@ from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import PACKET_COLUMNS, UPLINK, Reason, Rows, client_columns
 from skytether.shared.telemetry.summary import Summary, summarise
 from skytether.shared.wire.protocol import NO_HORIZON, Mode
-from skytether.sim.flight import fly_batch
+from skytether.sim.batch import fly_batch
 
 UNKNOWN = ("target", "live")
 """Shapes of a reference that only the server knows during the flight."""

@@ -10,7 +10,7 @@ their digests.
 import hashlib
 import os
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from importlib import metadata
 from pathlib import Path
 from typing import Any, BinaryIO, Generic, TypeVar
@@ -19,7 +19,17 @@ import msgspec
 
 from skytether.shared.base import files, toml
 from skytether.shared.base.errors import ConfigError
+from skytether.shared.scenario import schemes
 from skytether.shared.scenario.dotted import flat
+from skytether.shared.scenario.grammar import leaves
+from skytether.shared.scenario.registry import (
+    PLANNERS,
+    REFERENCES,
+    SCHEMES,
+    TRIGGERS,
+    VEHICLES,
+    Entry,
+)
 from skytether.shared.scenario.whole import Scenario
 
 SETTINGS, ENTRIES = "settings.toml", "journal.jsonl"
@@ -118,9 +128,20 @@ def sealed(content: bytes) -> bytes:
 def digests(scenarios: Sequence[Scenario]) -> dict[str, str]:
     """Digests of all files and plug-ins that some scenarios name, for the settings."""
     files = {file.name: digest(file.content) for each in scenarios for file in each.files}
-    entries = (entry for each in scenarios for entry in each.entries())
+    entries = (entry for each in scenarios for entry in entries_of(each))
     plugged = {entry.source: entry.version for entry in entries if not entry.is_ours}
     return plugged | dict(sorted(files.items()))
+
+
+def entries_of(scenario: Scenario) -> Iterator[Entry]:
+    """Entries of scheme, planner, policies of the trigger, shape and vehicle."""
+    control = scenario.control
+    yield SCHEMES[schemes.call(control.scheme).name]
+    yield PLANNERS[PLANNERS.one(control.planner).name]
+    for policy in leaves(TRIGGERS.parse(control.trigger)):
+        yield TRIGGERS[policy.name]
+    yield REFERENCES[REFERENCES.one(scenario.reference.shape).name]
+    yield VEHICLES[VEHICLES.one(scenario.vehicle.kind).name]
 
 
 def digest(content: bytes) -> str:

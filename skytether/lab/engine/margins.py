@@ -15,8 +15,8 @@ scenario's own trigger.
 """
 
 import math
-from collections.abc import Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple, TypeVar
 
 import msgspec
 import numpy as np
@@ -26,11 +26,16 @@ from skytether.lab.engine.intervals import interval, jackknife
 from skytether.shared.law.model import Array
 from skytether.shared.scenario.grammar import leaves
 from skytether.shared.scenario.registry import PERIOD_MAX, TRIGGERS
-from skytether.shared.scenario.schema import ReferenceConfig, SensorConfig
+from skytether.shared.scenario.schema import (
+    NetworkConfig,
+    PathConfig,
+    ReferenceConfig,
+    SensorConfig,
+)
 from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import Record
 from skytether.shared.telemetry.summary import AT_BOUND
-from skytether.sim.flight import fly_batch
+from skytether.sim.batch import fly_batch
 
 PUSH_S, FOLLOWED_S = 0.25, 24.0
 """Length of a push, and time for which its response is evaluated, six time constants of a typical
@@ -61,6 +66,20 @@ RATE_RUNS, LIMIT_RUNS = 4, 4
 HALVINGS = 7
 
 
+T = TypeVar("T", NetworkConfig, PathConfig)
+
+
+def impaired(scenario: Scenario, change: Callable[[str], str]) -> Scenario:
+    """Scenario with the text of each direction changed, on every path."""
+
+    def changed(each: T) -> T:
+        return replace(each, uplink=change(each.uplink), downlink=change(each.downlink))
+
+    network = scenario.network
+    several = replace(changed(network), paths=tuple(map(changed, network.paths)))
+    return replace(scenario, network=several)
+
+
 class Differing(NamedTuple):
     tau: float = 1.0
     """Time constants relative to those of the model."""
@@ -85,7 +104,7 @@ class Differing(NamedTuple):
         )
         if self.delay_s:
             later = f"constant({self.delay_s!r})"
-            scenario = scenario.impaired(lambda each: " & ".join(filter(None, (each, later))))
+            scenario = impaired(scenario, lambda each: " & ".join(filter(None, (each, later))))
         return replace(scenario, vehicle=vehicle)
 
 

@@ -24,7 +24,7 @@ from skytether.shared.scenario import reading
 from skytether.shared.scenario.dotted import set_keys
 from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.summary import Summary, summarise
-from skytether.sim.flight import fly_batch
+from skytether.sim.batch import fly_batch
 
 CHUNK = 25
 """Number of runs in a task; the last task of a cell may have fewer."""
