@@ -21,7 +21,6 @@ from skytether.server.planning.scheme import (
     Figures,
     Fleet,
     Planning,
-    in_turn,
 )
 from skytether.server.schemes import table
 from skytether.server.triggers.trigger import (
@@ -75,7 +74,7 @@ class Controller:
         clock: ClockMap,
         stopwatch: Stopwatch,
         references: Callable[[int], Reference] | None = None,
-        planning: Planning = in_turn,
+        planning: Planning | None = None,
     ) -> None:
         control = scenario.control
         # Arrays of a block are allocated once and reused for each block of a tick.

@@ -15,7 +15,7 @@ from skytether.server.controller import Controller
 from skytether.server.gate import Gate, PlainGate
 from skytether.server.leads import Leads
 from skytether.server.planning.clock import ClockMap
-from skytether.server.planning.scheme import Planning, in_turn
+from skytether.server.planning.scheme import Planning
 from skytether.server.reception import Reception
 from skytether.server.schemes import table
 from skytether.server.sessions import Session, Sessions
@@ -74,7 +74,7 @@ class Server(Endpoint):
         plan_recorder: Recorder | None = None,
         stopwatch: Stopwatch | None = None,
         references: Callable[[int], Reference] | None = None,
-        planning: Planning = in_turn,
+        planning: Planning | None = None,
     ) -> None:
         super().__init__()
         if too_fast := first_too_fast(scenario):

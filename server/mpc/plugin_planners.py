@@ -9,6 +9,7 @@ A planner optimises a cost that nobody else knows. So its plan counts as the opt
 of flying on with the inputs already sent is that of their difference from it, ΔUᵀ 𝓗 ΔU of eq. (9).
 """
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import count
@@ -63,7 +64,7 @@ class PluginPlanners:
         self._text = text = fleet.scenario.control.planner
         self._scenario, self._named = fleet.scenario, PLANNERS.one(text)
         self._problem = Problem.of(fleet.scenario)
-        self._states, self._planning = states, fleet.planning
+        self._states, self._planning = states, fleet.planning or in_turn
         self._errors = PluginErrors(f"the planner {text}", NO_PLAN, ERRORS, fleet.tell)
         self._numbers = count()
         self._own: dict[int, VehiclePlanner] = {}
@@ -193,3 +194,14 @@ class InputPlanner(Planner):
         inputs, start, step = (each[kept] for each in self._sent)
         memory.inputs[GENERATOR, rows[kept]] = inputs
         memory.start[rows[kept]], memory.step[rows[kept]] = start, step
+
+
+def in_turn(calls: Sequence[tuple[int, Callable[[], Any]]]) -> list[Any]:
+    """Call planners one after the other, however long they take, as in virtual time."""
+    answers = []
+    for _, call in calls:
+        try:
+            answers.append(call())
+        except Exception as error:
+            answers.append(error)
+    return answers

@@ -185,17 +185,6 @@ Planning = Callable[[Sequence[tuple[int, Callable[[], Any]]]], list[Any]]
 returned, or its exception; TimeoutError if it takes too long, `queue.Full` if too many hang."""
 
 
-def in_turn(calls: Sequence[tuple[int, Callable[[], Any]]]) -> list[Any]:
-    """Call planners one after the other, however long they take, as in virtual time."""
-    answers = []
-    for _, call in calls:
-        try:
-            answers.append(call())
-        except Exception as error:
-            answers.append(error)
-    return answers
-
-
 class Fleet(NamedTuple):
     scenario: Scenario
     terms: Terms
@@ -209,7 +198,8 @@ class Fleet(NamedTuple):
     stopwatch: Stopwatch
     tell: Tell
     """Called at each error of a plug-in in flight."""
-    planning: Planning = in_turn
+    planning: Planning | None = None
+    """Calls planners of plug-ins; None: one after the other."""
 
 
 class Scheme(ABC):

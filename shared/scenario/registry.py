@@ -33,16 +33,6 @@ from skytether.shared.scenario.grammar import Call, Combination, Expression, Gra
 
 F = TypeVar("F", bound=Callable[..., Any])
 
-LOW, HIGH = {"ge": "<=", "gt": "<"}, {"le": "<=", "lt": "<"}
-"""Bounds of a number from below and above, by their names in msgspec.Meta."""
-FURTHER = {
-    "multiple_of": "a multiple of",
-    "pattern": "with the pattern",
-    "min_length": "of a length from",
-    "max_length": "of a length up to",
-}
-"""Other bounds, by their names in msgspec.Meta, and their words in messages."""
-
 UNITS: Mapping[str, Mapping[str, tuple[float, float]]] = MappingProxyType(
     {
         "bytes_per_s": {"kbit": (1e3, 8.0), "mbit": (1e6, 8.0), "gbit": (1e9, 8.0)},
@@ -109,27 +99,7 @@ class Parameter:
 
     @property
     def file(self) -> bool:
-        return _bounds(self.type)[0] is str
-
-    def __str__(self) -> str:
-        kind, bounds = _bounds(self.type)
-        if self.file or typing.get_origin(kind) is Literal:
-            what = "a file" if self.file else " or ".join(typing.get_args(kind))
-            return " ".join([self.name, what, *_further(bounds)])
-        low = [f"{bounds[key]:.15g} {sign} " for key, sign in LOW.items() if key in bounds]
-        high = [f" {sign} {bounds[key]:.15g}" for key, sign in HIGH.items() if key in bounds]
-        ends = ["(whole)"] * (kind is int) + _further(bounds)
-        return " ".join(["".join([*low, self.name, *high]), *ends])
-
-
-def _bounds(hint: Any) -> tuple[Any, dict[str, Any]]:
-    kind, *marks = typing.get_args(hint) if typing.get_origin(hint) is Annotated else (hint,)
-    pairs = [(key, getattr(mark, key)) for mark in marks for key in (*LOW, *HIGH, *FURTHER)]
-    return kind, {key: bound for key, bound in pairs if bound is not None}
-
-
-def _further(bounds: dict[str, Any]) -> list[str]:
-    return [f"({FURTHER[key]} {bounds[key]})" for key in FURTHER if key in bounds]
+        return self.type is str or typing.get_args(self.type)[:1] == (str,)
 
 
 @dataclass(frozen=True, slots=True)
@@ -177,19 +147,6 @@ class Entry:
         if not all(value is not None and parameter.takes(value) for parameter, value in values):
             return None
         return tuple(msgspec.convert(value, parameter.type) for parameter, value in values)
-
-    def form(self, name: str) -> str:
-        """How a scenario writes the entry, with its parameters and bounds, for messages."""
-        if not self.parameters:
-            return name
-        shown = ", ".join(
-            f"{each.name}{'…' if each.is_rest else ''}"
-            if each.default is None
-            else f"{each.name}={each.default}"
-            for each in self.parameters
-        )
-        bounds = [str(each) for each in self.parameters if str(each) != each.name]
-        return f"{name}({shown})" + (f" with {' and '.join(bounds)}" if bounds else "")
 
 
 def load(module: str, what: str) -> Any:
@@ -323,7 +280,7 @@ class PluginTable(dict[str, Entry]):
             raise GrammarError(call.text, f"{article} {self.kind}; {hint(call.name, self)}")
         values = entry.bound(call)
         if values is None:
-            raise GrammarError(call.text, entry.form(call.name))
+            raise GrammarError(call.text, _forms().form(call.name, entry))
         return replace(call, values=values, keys=())
 
     def _args(self, call: Call) -> list[tuple[Value, bool]]:
@@ -387,6 +344,11 @@ class PluginTable(dict[str, Entry]):
             self._built_in[name] = self[name]
 
 
+def _forms() -> Any:
+    """Module that puts entries into words, loaded after a user's mistake."""
+    return load("skytether.shared.scenario.forms", "forms")
+
+
 def _parameters(
     what: str, make: Callable[..., Any], given: int, *, texts: bool
 ) -> tuple[Parameter, ...]:
@@ -438,7 +400,8 @@ def _parameter(what: str, taken: inspect.Parameter, hint: Any, *, texts: bool) -
         raise ConfigError(f"{what}: bounds of {taken.name}: {reason}") from None
     parameter = Parameter(taken.name, bounded, default, is_rest)
     if default is not None and not parameter.takes(default):
-        raise ConfigError(f"{what}: got the default {taken.name} = {default}, expected {parameter}")
+        expected = _forms().parameter_text(parameter)
+        raise ConfigError(f"{what}: got the default {taken.name} = {default}, expected {expected}")
     return parameter
 
 

@@ -145,7 +145,7 @@ def preload(changeable: Collection[str]) -> None:
         for name in table if key in changeable else ():
             with suppress(ConfigError):  # a room that is not installed
                 _ = table[name]
-    if changeable:
-        load(f"{SHARED}scenario.wrong_values", "a change")
+    for module in ("forms", "wrong_values") if changeable else ():
+        load(f"{SHARED}scenario.{module}", "a change")
     if "network.uplink" in changeable:
         load("skytether.netem.bottleneck", "rate")

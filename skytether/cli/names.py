@@ -7,6 +7,7 @@ from typing import Annotated
 from skytether.cli.commands import KINDS
 from skytether.client.vehicles import vehicle
 from skytether.shared.scenario import reading, registry
+from skytether.shared.scenario.forms import form
 from skytether.shared.scenario.planners import planner
 from skytether.shared.scenario.schemes import scheme
 from skytether.shell.commandline import command, options
@@ -54,6 +55,6 @@ def list_names(argv: Sequence[str]) -> None:
     elif chosen.kind in TABLES:
         for name, entry in TABLES[chosen.kind].items():
             source = "" if entry.is_ours else f" (from {entry.source})"
-            print(f"{entry.form(name)}\n    {entry.about}{source}")
+            print(f"{form(name, entry)}\n    {entry.about}{source}")
     else:
         raise CommandError(f"got {chosen.kind}, expected {', '.join(KINDS)}", CONFIGURATION)
