@@ -21,9 +21,10 @@ from skytether.netem.proxy import FLOWS_MAX, Proxy
 from skytether.netem.relay import Relay
 from skytether.netem.tunnel import Tunnel
 from skytether.shared.base.errors import ConfigError
-from skytether.shared.endpoints.directions import FLIGHT, KEYS, RELAY, RUN, Directions, named
+from skytether.shared.endpoints.directions import FLIGHT, Directions
 from skytether.shared.endpoints.endpoint import Address
 from skytether.shared.endpoints.line import CONNECTIONS_MAX, Listen, parse_address
+from skytether.shared.endpoints.other_directions import KEYS, RELAY, RUN, named
 from skytether.shared.events.flight import address_text
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.whole import Scenario

@@ -21,9 +21,9 @@ from skytether.netem.impairments.direction import Impairments
 from skytether.netem.impairments.draws import SLOT_NS, Fate
 from skytether.netem.link import Lane, Link
 from skytether.shared.base.units import MILLISECOND_NS
-from skytether.shared.endpoints.directions import KEYS, RELAY
 from skytether.shared.endpoints.endpoint import Address, Datagram, make_datagram
 from skytether.shared.endpoints.line import CLIENT, PIECE_BYTES, SERVER
+from skytether.shared.endpoints.other_directions import KEYS, RELAY
 from skytether.shared.events.flight import FlowOpened, Unreachable
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Recorder

@@ -12,8 +12,8 @@ from skytether.netem.emulator import Direction, Emulator
 from skytether.netem.fate import Fates
 from skytether.netem.link import Lane
 from skytether.shared.base.packets import OUTSIDE, PROGRAM, flow_of, too_long
-from skytether.shared.endpoints.directions import RUN
 from skytether.shared.endpoints.endpoint import Datagram
+from skytether.shared.endpoints.other_directions import RUN
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Recorder
 

@@ -1,10 +1,8 @@
 """Errors of a plug-in's code in flight: they are counted and reported, and end no flight."""
 
-from collections.abc import Callable
 from traceback import format_exception
 
-Tell = Callable[[str, str], None]
-"""Called at each error with the name of its count, and the text to report, or an empty one."""
+from skytether.server.planning.scheme import Tell
 
 
 class PluginErrors:

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from skytether.server.planning.clock import UNSEEN, ClockMap
 from skytether.server.planning.desired import Desired
-from skytether.server.planning.plugin_errors import Tell
 from skytether.shared.base.kernel import F2, F3, F4, I1, S3, record, records
 from skytether.shared.endpoints.stopwatch import Stopwatch
 from skytether.shared.events.flight import Event
@@ -183,6 +182,10 @@ class SentPlans(NamedTuple):
 Planning = Callable[[Sequence[tuple[int, Callable[[], Any]]]], list[Any]]
 """Function that calls planners of plug-ins, each with a number of its own: returns what each has
 returned, or its exception; TimeoutError if it takes too long, `queue.Full` if too many hang."""
+
+
+Tell = Callable[[str, str], None]
+"""Called at each error with the name of its count, and the text to report, or an empty one."""
 
 
 class Fleet(NamedTuple):

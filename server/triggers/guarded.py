@@ -5,7 +5,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from skytether.server.planning.plugin_errors import PluginErrors, Tell
+from skytether.server.planning.plugin_errors import PluginErrors
+from skytether.server.planning.scheme import Tell
 from skytether.server.triggers.trigger import (
     Figures,
     Situation,

@@ -16,7 +16,7 @@ import msgspec
 
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.base.hint import hint
-from skytether.shared.endpoints import directions
+from skytether.shared.endpoints import other_directions
 from skytether.shared.endpoints.endpoint import Endpoint
 from skytether.shared.events.flight import Changed, ChangeRefused, Event
 from skytether.shared.scenario import reading
@@ -57,7 +57,7 @@ class Running:
         settings: Mapping[str, Any] = MappingProxyType({}),
     ) -> None:
         self.endpoint = endpoint
-        self._names = directions.NAMES.get(endpoint.directions, {})
+        self._names = other_directions.NAMES.get(endpoint.directions, {})
         self._scenario = scenario
         self.settings = settings
         """All values that were set in flight, by key; replaced by a new object at each change."""
@@ -91,7 +91,7 @@ class Running:
             if objection := self.endpoint.objection(scenario, frozenset(values)):
                 raise ConfigError(objection)
         except ConfigError as error:
-            reason = directions.named(str(error), self._names)
+            reason = other_directions.named(str(error), self._names)
             self.refuse(reason)
             raise ConfigError(reason) from None
         # Only after checking the whole scenario: a change is made completely, or not at all.

@@ -13,9 +13,10 @@ from skytether.netem.proxy import Proxy
 from skytether.netem.relay import Relay
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.endpoints.change import Running
-from skytether.shared.endpoints.directions import FLIGHT, NAMES, RELAY, named
+from skytether.shared.endpoints.directions import FLIGHT
 from skytether.shared.endpoints.endpoint import Address
 from skytether.shared.endpoints.line import Listen
+from skytether.shared.endpoints.other_directions import NAMES, RELAY, named
 from skytether.shared.scenario import reading
 from skytether.shell.commandline import plugins
 from skytether.shell.driving.driver import Shell, new_event_loop

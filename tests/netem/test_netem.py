@@ -32,8 +32,9 @@ from skytether.netem.proxy import Proxy
 from skytether.netem.relay import Relay
 from skytether.shared.base.units import HEADER_BYTES, MILLISECOND_NS, SECOND_NS
 from skytether.shared.endpoints.change import Answer, Running
-from skytether.shared.endpoints.directions import FLIGHT, NAMES, RELAY, RUN, Directions
+from skytether.shared.endpoints.directions import FLIGHT, Directions
 from skytether.shared.endpoints.endpoint import Address, Datagram
+from skytether.shared.endpoints.other_directions import NAMES, RELAY, RUN
 from skytether.shared.formats.recorded import recorded_in
 from skytether.shared.scenario.reading import load
 from skytether.shared.scenario.registry import File

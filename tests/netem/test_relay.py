@@ -5,9 +5,9 @@ from hypothesis import strategies as st
 
 from skytether.netem.relay import RETRY_NS, Relay
 from skytether.shared.base.units import SECOND_NS
-from skytether.shared.endpoints.directions import RELAY
 from skytether.shared.endpoints.endpoint import Datagram
 from skytether.shared.endpoints.line import CLIENT, PIECE_BYTES, SERVER
+from skytether.shared.endpoints.other_directions import RELAY
 from skytether.shared.scenario.schema import NetworkConfig
 from skytether.shared.scenario.whole import Scenario
 

@@ -20,9 +20,9 @@ from skytether.netem.relay import Relay
 from skytether.netem.tunnel import Tunnel
 from skytether.shared.base.packets import PROGRAM
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
-from skytether.shared.endpoints.directions import RELAY
 from skytether.shared.endpoints.endpoint import Datagram
 from skytether.shared.endpoints.line import CLIENT
+from skytether.shared.endpoints.other_directions import RELAY
 from skytether.shared.scenario.schema import NetworkConfig
 from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import DOWNLINK, PACKET_COLUMNS, Recorder, parse

@@ -32,7 +32,7 @@ OURS = """
     from skytether.server.schemes.horizons import HorizonScheme
     from skytether.server.schemes.predictive import Estimator
     from skytether.server.schemes.trajectory import Guidance
-    from skytether.shared.scenario.gain import feedback_gain
+    from skytether.server.schemes.feedback import feedback_gain
     from skytether.shared.scenario.schemes import FIGURES
 
     class Horizons(HorizonScheme):

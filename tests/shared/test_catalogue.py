@@ -15,7 +15,7 @@ from skytether.netem.proxy import Proxy
 from skytether.server.endpoint import POINT, TRIGGER
 from skytether.server.missions.mission_planner import GOALS, ZONES
 from skytether.shared.base.meanings import meanings
-from skytether.shared.endpoints.directions import RELAY, RUN
+from skytether.shared.endpoints.other_directions import RELAY, RUN
 from skytether.shared.scenario.catalogue import KEYS, keys, keys_of
 from skytether.shared.scenario.owners import InFlight, Key, OfServer, Owner
 from skytether.shared.scenario.schema import Section, Strength

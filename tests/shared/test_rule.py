@@ -15,6 +15,7 @@ from skytether.server.planning import compiled as law
 from skytether.server.planning.clock import ClockMap
 from skytether.server.planning.scheme import Foresight, empty_foresight
 from skytether.server.schemes.committed import Replay
+from skytether.server.schemes.feedback import feedback_gain
 from skytether.shared.base.kernel import part
 from skytether.shared.law import rule
 from skytether.shared.law.model import Array, Axis, advance
@@ -28,7 +29,6 @@ from skytether.shared.law.rule import (
     reference_input,
     remaining,
 )
-from skytether.shared.scenario.gain import feedback_gain
 from skytether.shared.scenario.reading import check
 from skytether.shared.scenario.whole import Scenario
 from skytether.shared.wire.protocol import NO_HORIZON, Horizon, Mode, Observation

@@ -5,7 +5,8 @@ import re
 import pytest
 
 from skytether.shared.base.units import SECOND_NS
-from skytether.shared.endpoints.directions import FLIGHT, RELAY, RUN, Directions
+from skytether.shared.endpoints.directions import FLIGHT, Directions
+from skytether.shared.endpoints.other_directions import RELAY, RUN
 from skytether.shared.events.flight import Changed
 from skytether.shared.scenario import reading
 from skytether.shared.telemetry.feed import Figures, Opened, Said
