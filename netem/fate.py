@@ -12,20 +12,13 @@ An impairment of a plug-in that raises an exception, or sets an impossible value
 that its errors end no flight.
 """
 
-import traceback
 from collections import Counter
-from dataclasses import replace
+from typing import Any
 
 from skytether.netem.impairments.direction import Impairments
 from skytether.netem.impairments.draws import Draws, Fate, Stream
 from skytether.netem.impairments.impairment import Impairment
-from skytether.shared.base.units import SECOND_NS
-from skytether.shared.scenario.registry import IMPAIRMENTS
-
-DELAY_MAX_NS = 86_400 * SECOND_NS
-"""Largest delay that a plug-in may set [ns]."""
-COPIES_MAX = 100
-"""Largest number of copies that a plug-in may set."""
+from skytether.shared.scenario.registry import IMPAIRMENTS, load
 
 
 class Fates:
@@ -55,7 +48,8 @@ class Fates:
         self._impairments: list[tuple[Impairment, Draws]] = []
         self.fault = ""
         """Traceback of the first error of a plug-in, or empty."""
-        self._guarded = False
+        self._guarded: Any = None
+        """`guarded.fate_of` if one of the impairments is of a plug-in, else None."""
         kinds: Counter[str] = Counter()
         names: Counter[str] = Counter()
         for name_, each in of.parts:
@@ -71,7 +65,9 @@ class Fates:
                 stream, which, moments = Stream(*at, own), 0, f"moments of {own}"
             draws = Draws(stream, which, (*lasting, moments), by_number=by_number)
             self._impairments.append((each, draws))
-            self._guarded |= not IMPAIRMENTS[name_].is_ours
+            if not IMPAIRMENTS[name_].is_ours:
+                module = load("skytether.netem.impairments.guarded", f"impairment {name_}")
+                self._guarded = module.fate_of
 
     def at(self, slot: int, rank: int = 0) -> Fate:
         """Fate of a packet.
@@ -85,34 +81,9 @@ class Fates:
         # Built-in impairments are trusted: guarding against a plug-in takes a copy per impairment
         # and packet.
         if self._guarded:
-            return self._guarded_fate(fate)
+            fate, fault = self._guarded(fate, self._impairments)
+            self.fault = self.fault or fault
+            return fate
         for impairment, draws in self._impairments:
             impairment(fate, draws)
         return fate
-
-    def _guarded_fate(self, fate: Fate) -> Fate:
-        for impairment, draws in self._impairments:
-            # On a copy: a plug-in that fails half-way must have no effect.
-            tried = replace(fate)
-            try:
-                impairment(tried, draws)
-                fate = _possible(tried)
-            except Exception:
-                self.fault = self.fault or traceback.format_exc()
-        return fate
-
-
-def _possible(fate: Fate) -> Fate:
-    """Fate after a plug-in, with its numbers converted to integers.
-
-    Raises:
-        ValueError, TypeError: the fate contains an impossible value.
-    """
-    if not 0 <= fate.delay_ns <= DELAY_MAX_NS:
-        raise ValueError(f"got delay_ns = {fate.delay_ns}, expected 0 to {DELAY_MAX_NS}")
-    if not 0 <= fate.copies <= COPIES_MAX:
-        raise ValueError(f"got copies = {fate.copies}, expected 0 to {COPIES_MAX}")
-    if fate.flipped is not None and not 0.0 <= fate.flipped < 1.0:
-        raise ValueError(f"got flipped = {fate.flipped}, expected a share below 1")
-    # A plug-in may set a float; the heap of the link compares integers.
-    return replace(fate, delay_ns=int(fate.delay_ns), copies=int(fate.copies))

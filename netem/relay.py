@@ -12,6 +12,7 @@ end sends no more.
 
 from collections import deque
 from collections.abc import Iterable
+from copy import copy
 from dataclasses import replace
 from typing import Any
 
@@ -160,7 +161,7 @@ class Relay(Emulator):
                 yield stream.lane, self._streams[CLIENT, number].lane
 
     def impairments(self, name: Direction) -> Impairments:
-        return super().impairments(name).for_streams()
+        return _for_streams(super().impairments(name))
 
     def fates(self, name: Direction, flow: int) -> Fates:
         at = self._scenario.seed, name, flow
@@ -183,7 +184,7 @@ class Relay(Emulator):
 def objection(scenario: Scenario) -> str:
     """Why the network of a scenario suits no byte streams, in words; empty if it does."""
     for key, of in zip(KEYS, (scenario.uplink, scenario.downlink), strict=True):
-        if names := of.only_packets():
+        if names := _only_packets(of):
             expected = "nothing that acts on packets alone, for TCP is relayed as a stream of bytes"
             what = f"{key}: got {' and '.join(names)}, expected {expected}"
             return f"{what}; under `skytether netem run` its packets pass"
@@ -192,3 +193,19 @@ def objection(scenario: Scenario) -> str:
 
 def _other(side: str) -> str:
     return SERVER if side == CLIENT else CLIENT
+
+
+def _only_packets(of: Impairments) -> list[str]:
+    """Names of what byte streams cannot have."""
+    names = [name for name, each in of.parts if each.only_packets]
+    return [*names, "drop=codel"] if of.queue and of.queue.drop == "codel" else names
+
+
+def _for_streams(of: Impairments) -> Impairments:
+    """The same for pieces of byte streams: they stay in order, and its queue drops none."""
+    same = copy(of)
+    same.is_ordered = True
+    if same.queue:
+        same.queue = copy(same.queue)
+        same.queue.drop, same.queue.keeps_all = "tail", True
+    return same

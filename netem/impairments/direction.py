@@ -5,7 +5,6 @@ impairments act on it, with random numbers of the time at which it entered: dela
 packet lost by one is lost.
 """
 
-from copy import copy
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
@@ -46,20 +45,6 @@ class Impairments:
         for each in made:
             self.loss += each.loss * (1.0 - self.loss)
         """Mean share of packets that are lost, without the losses of the queue."""
-
-    def only_packets(self) -> list[str]:
-        """Names of what byte streams cannot have."""
-        names = [name for name, each in self.parts if each.only_packets]
-        return [*names, "drop=codel"] if self.queue and self.queue.drop == "codel" else names
-
-    def for_streams(self) -> "Impairments":
-        """The same for pieces of byte streams: they stay in order, and its queue drops none."""
-        same = copy(self)
-        same.is_ordered = True
-        if same.queue:
-            same.queue = copy(same.queue)
-            same.queue.drop, same.queue.keeps_all = "tail", True
-        return same
 
 
 def impairments(text: str, files: Files = ()) -> Impairments:

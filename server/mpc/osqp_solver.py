@@ -10,7 +10,8 @@ import osqp
 from scipy import sparse
 
 from skytether.server.mpc.problem import Problem
-from skytether.server.mpc.solver import NEAR, SolverFailed
+from skytether.server.mpc.riccati import NEAR
+from skytether.server.mpc.solver import SolverFailed
 from skytether.shared.law.model import Array, Flags
 
 ITERATIONS_MAX = 4000

@@ -18,10 +18,12 @@ from typing import NamedTuple
 import numpy as np
 
 from skytether.server.mpc.problem import MPC, WIDTH, SimdBatch, simd_memory
-from skytether.server.mpc.solver import NEAR
 from skytether.server.planning.compiled import advance, axis_at
 from skytether.shared.base.kernel import B1, F1, F2, F3, F4, inline, kernel, lanes, part
 from skytether.shared.law.model import Axis
+
+NEAR = 1.0 - 1e-6
+"""Share of the bound above which a guessed input, rounded to float32, counts as at the bound."""
 
 ROUNDS_MAX = 8
 """Number of iterations in which the whole set may change; recorded flights needed five at most."""

@@ -4,9 +4,6 @@ from typing import Protocol
 
 from skytether.shared.law.model import Array, Flags
 
-NEAR = 1.0 - 1e-6
-"""Share of the bound above which a guessed input, rounded to float32, counts as at the bound."""
-
 
 class SolverFailed(Exception):
     """The QP of one vehicle has no reliable solution."""
