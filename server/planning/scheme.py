@@ -209,7 +209,8 @@ class Scheme(ABC):
     """A scheme of delay compensation: predicts vehicles, plans for them and encodes the plans.
 
     At each step and for each block of vehicles the server calls `foresee`, `plan`, `remember` and
-    `encode`, in this order.
+    `encode`, in this order: with the `rows` of the vehicles and the `step` k of each, both of shape
+    (n,).
     """
 
     properties: ClassVar[SchemeProperties]
@@ -258,23 +259,13 @@ class Scheme(ABC):
 
     @abstractmethod
     def foresee(self, rows: Indices, step: Indices, foresight: Foresight) -> None:
-        """Fill in the predictions; the newest observation of each vehicle is young enough.
-
-        Args:
-            rows: rows of the vehicles; shape (n,).
-            step: step k of each; shape (n,).
-            foresight: output: all fields except the plans.
+        """Fill in all of the foresight but the plans; the newest observation of each vehicle is
+        young enough.
         """
 
     @abstractmethod
     def plan(self, rows: Indices, step: Indices, foresight: Foresight) -> None:
-        """Plan, and fill in `figures` and `planned`.
-
-        Args:
-            rows: rows of the vehicles; shape (n,).
-            step: step k of each; shape (n,).
-            foresight: their predictions; output: `horizons`.
-        """
+        """Plan: fill in `figures`, `planned` and the `horizons` of the foresight."""
 
     def remember(  # noqa: B027 - many schemes ignore what is sent
         self, rows: Indices, step: Indices, foresight: Foresight, event: Flags
@@ -282,9 +273,6 @@ class Scheme(ABC):
         """Store the plans, before those that the trigger chose are encoded and sent.
 
         Args:
-            rows: rows of the vehicles; shape (n,).
-            step: step k of each; shape (n,).
-            foresight: their predictions and plans.
             event: True for vehicles whose plan is sent; shape (n,).
         """
 

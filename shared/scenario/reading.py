@@ -5,9 +5,7 @@ the differences from the other. Every value is checked here, and every file that
 read here, so that endpoints open no files. `skytether list scenarios` lists the built-in scenarios.
 """
 
-import io
 import math
-import zipfile
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
@@ -20,7 +18,7 @@ from skytether import scenarios
 from skytether.shared.base import input_files, toml
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.base.hint import hint, short
-from skytether.shared.scenario import rooms, schema
+from skytether.shared.scenario import registry, rooms, schema
 from skytether.shared.scenario.contradictions import contradictions
 from skytether.shared.scenario.grammar import GrammarError
 from skytether.shared.scenario.registry import IMPAIRMENTS, File, Files, PluginTable
@@ -274,25 +272,14 @@ def files_of(key: str, text: str, source: str = "", have: Files = ()) -> Files:
 def _content(where: str, name: str, most: int) -> bytes:
     try:
         path = Path(name)
-        return _zipped(path, most) if path.is_dir() else input_files.read(path, most)
+        if path.is_dir():
+            content: bytes = registry.load("skytether.shared.base.folders", name).zipped(path, most)
+            return content
+        return input_files.read(path, most)
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else error
         expected = f"a file that can be read ({reason})"
         raise ConfigError(f"{where}: got {short(repr(name))}, expected {expected}") from None
-
-
-def _zipped(folder: Path, most: int) -> bytes:
-    """The CSV files in a folder, as a zip that is equal for equal files."""
-    content, left = io.BytesIO(), most
-    with zipfile.ZipFile(content, "w") as archive:
-        for path in sorted(folder.glob("*.[cC][sS][vV]")):
-            try:
-                own = input_files.read(path, left)
-            except OSError as error:
-                raise ValueError(f"{path.name}: {error.strerror}") from None
-            left -= len(own)
-            archive.writestr(zipfile.ZipInfo(path.name), own)
-    return content.getvalue()
 
 
 def _with_texts(raw: Mapping[str, Any], source: str) -> dict[str, Any]:
