@@ -1,18 +1,6 @@
-"""Events of a vehicle's paths to its server, and of their sockets."""
+"""Events of a vehicle's paths to its server; `processes` has those of their sockets."""
 
-from skytether.shared.events.flight import Event, VehicleEvent
-
-
-class PathMissing(Event):
-    sentence = "the path {path} is down: {reason}; it is tried again every second"
-    path: str
-    """LOCAL=HOST:PORT, as the user has written it."""
-    reason: str
-
-
-class PathFound(Event):
-    sentence = "the path {path} is up"
-    path: str
+from skytether.shared.events.flight import VehicleEvent
 
 
 class PathDied(VehicleEvent):

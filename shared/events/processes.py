@@ -27,6 +27,18 @@ class HostFound(Event):
     address: str
 
 
+class PathMissing(Event):
+    sentence = "the path {path} is down: {reason}; it is tried again every second"
+    path: str
+    """LOCAL=HOST:PORT, as the user has written it."""
+    reason: str
+
+
+class PathFound(Event):
+    sentence = "the path {path} is up"
+    path: str
+
+
 class PageServed(Event):
     address: str
     """Address for a browser; includes a token if the page may change the flight."""

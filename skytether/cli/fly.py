@@ -15,7 +15,6 @@ import msgspec
 
 from skytether.cli import page_process, processes
 from skytether.client import vehicles
-from skytether.figures import flights as figures
 from skytether.server.schemes import table
 from skytether.shared.base import machine_code
 from skytether.shared.base.errors import ConfigError
@@ -29,7 +28,6 @@ from skytether.shared.events.flight import (
     RecordIncomplete,
     ReferenceTooFast,
 )
-from skytether.shared.events.standby import LeaderChanged
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import Record
@@ -47,10 +45,12 @@ from skytether.sim import flight
 UNSEEN = Fault, ReferenceTooFast
 """Events of a flight in virtual time that are printed after it."""
 PRINTED = (
-    *(ModeChanged, LeaderChanged, PlanningStopped, RecordIncomplete, Changed, ChangeRefused),
+    *(ModeChanged, PlanningStopped, RecordIncomplete, Changed, ChangeRefused),
     *UNSEEN,
 )
 """Events that are printed during the flight."""
+PRINTED_OF_ROOMS = ("LeaderChanged",)
+"""Names of further ones, of rooms that need not be installed."""
 POLL_S = 0.2
 """Interval at which Ctrl-C is checked while the page stays open."""
 Flown = tuple[Scenario, "Future[Record]"]
@@ -111,6 +111,8 @@ def fly(argv: Sequence[str]) -> None:
     options = command.parse(FlyOptions(), argv, "skytether fly", fly.__doc__)
     scenario = options.config
     if options.figure:
+        from skytether.figures import flights as figures
+
         figures.check(options.figure)
     if options.record:
         from skytether.cli import recorder
@@ -200,6 +202,8 @@ def _show(
         title += "; others in virtual time"
     terminal.finish(summary, title, options.json, summaries)
     if options.figure:
+        from skytether.figures import flights as figures
+
         figures.flights(options.figure, flights)
     if missing := _missing(scenario, flown) or unrecorded:
         raise CommandError(missing)
@@ -310,5 +314,6 @@ def _tell(event: Event) -> None:
     """Print events of the link and of the record above the progress bar."""
     begins = isinstance(event, ModeChanged) and event.before in ON_THE_GROUND
     stands_by = isinstance(event, PlanningStopped) and event.why == str(Idle.STANDBY)
-    if isinstance(event, PRINTED) and not (begins or stands_by):
+    is_printed = isinstance(event, PRINTED) or type(event).__name__ in PRINTED_OF_ROOMS
+    if is_printed and not (begins or stands_by):
         page_process.say(event)

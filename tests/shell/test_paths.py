@@ -17,8 +17,7 @@ import pytest
 from helpers import LOOPBACK, Idle, ran
 from skytether.shared.endpoints.endpoint import PATH_SOCKETS, Address, Datagram
 from skytether.shared.events.flight import Event
-from skytether.shared.events.paths import PathFound, PathMissing
-from skytether.shared.events.processes import HostFound, HostMissing
+from skytether.shared.events.processes import HostFound, HostMissing, PathFound, PathMissing
 from skytether.shell.driving import driver
 from skytether.shell.driving.driver import Shell
 from skytether.shell.host import paths as path_sockets

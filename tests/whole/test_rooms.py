@@ -194,6 +194,8 @@ def test_the_kernel_flies_without_a_room(room: str, tmp_path: Path) -> None:
     assert loaded(tmp_path)
     every_scheme = (sys.executable, "-P", "-c", LOAD_ALL)
     assert ran(*every_scheme, env=environment(tmp_path)).returncode == 0
+    flown = ran(*SKYTETHER, *FLIES.split(), "--duration", "5", env=environment(tmp_path))
+    assert flown.returncode == 0, flown.stderr
     listed = ran(*SKYTETHER, "--help", env=environment(tmp_path))
     assert (listed.returncode, listed.stderr) == (0, "")
     if command:

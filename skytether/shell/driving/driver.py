@@ -27,8 +27,7 @@ from skytether.shared.endpoints.endpoint import Address, Datagram, Endpoint, For
 from skytether.shared.endpoints.line import LINE, Line, Listen
 from skytether.shared.endpoints.stopwatch import Stopwatch
 from skytether.shared.events.flight import Event, Fault
-from skytether.shared.events.paths import PathFound, PathMissing
-from skytether.shared.events.processes import HostFound, HostMissing
+from skytether.shared.events.processes import HostFound, HostMissing, PathFound, PathMissing
 from skytether.shell.driving.connections import Connections
 from skytether.shell.driving.control import Control
 from skytether.shell.driving.feed import Feed

@@ -26,11 +26,12 @@ from skytether.shared.events.flight import (
     StateLeapt,
     SteppedLate,
 )
-from skytether.shared.events.paths import PathDied, PathHealed, PathMissing
+from skytether.shared.events.paths import PathDied, PathHealed
 from skytether.shared.events.processes import (
     HostFound,
     HostMissing,
     NotRecalled,
+    PathMissing,
     Recalled,
     TimeUnknown,
 )
