@@ -14,7 +14,7 @@ from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, replace
 from hashlib import blake2b
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import msgspec
 
@@ -22,18 +22,17 @@ from skytether.client import vehicles
 from skytether.client.endpoint import Client
 from skytether.client.fleet import ClientFleet
 from skytether.client.link import ClientLink, PlainLink
-from skytether.client.memory import SavedState, recall
 from skytether.client.vehicle import Vehicle, VehicleMemory
 from skytether.shared.endpoints.endpoint import PATH_SOCKETS, STANDBY_SOCKETS
 from skytether.shared.endpoints.steady import Steady
 from skytether.shared.events.aboard import ParametersUnsafe
 from skytether.shared.events.flight import Event, NoSession, SessionRefused, address_text
 from skytether.shared.events.processes import NotRecalled, Recalled
+from skytether.shared.scenario.registry import load
 from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import client_columns
 from skytether.shared.telemetry.summary import summarise
-from skytether.shared.wire import keys, protocol
-from skytether.shared.wire.keys import Keyring
+from skytether.shared.wire import protocol
 from skytether.shell.commandline import command, terminal
 from skytether.shell.commandline.argument import Argument
 from skytether.shell.commandline.command import CommandError, ScenarioName
@@ -41,6 +40,10 @@ from skytether.shell.driving.memory import MemoryFile, folder
 from skytether.shell.host.paths import NetworkPath
 from skytether.shell.processes import process
 from skytether.shell.processes.process import ProcessOptions
+
+if TYPE_CHECKING:
+    from skytether.client.memory import SavedState
+    from skytether.shared.wire.keys import Keyring
 
 NONE = "none"
 """Value of --standby for no standby server."""
@@ -111,7 +114,9 @@ def fly(argv: Sequence[str]) -> None:
         numbers_text = f"{numbers[0]} to {numbers[-1]}" if len(numbers) > 1 else numbers[0]
         raise CommandError(f"--id: got {numbers_text}, expected 0 to 65535", 2)
     command.check_sockets("--vehicles", len(numbers))
-    keyring = keys.load(options.keys) if options.keys else None
+    keyring: Keyring | None = (
+        load("skytether.shared.wire.keys", "--keys").load(options.keys) if options.keys else None
+    )
     protocol.preload()
     alone = len(numbers) == 1
 
@@ -256,7 +261,7 @@ def _servers(paths: Sequence[NetworkPath], standby: Sequence[NetworkPath]) -> st
 
 @contextmanager
 def _memory(
-    options: ClientOptions, flying: Sequence[Vehicle], keyring: Keyring | None
+    options: ClientOptions, flying: Sequence[Vehicle], keyring: "Keyring | None"
 ) -> Iterator[MemoryFile | None]:
     """File that keeps the client's state for its next run; None with `vehicle.memory = "none"`.
 
@@ -290,16 +295,18 @@ def _memory(
 
 def _before(
     memory: MemoryFile, scenario: Scenario, number: int, warnings: list[Event]
-) -> SavedState | None:
+) -> "SavedState | None":
     """State saved by an earlier run. A warning for the log is added to `warnings`."""
+    room = load("skytether.client.memory", "vehicle.memory")
     try:
         saved = memory.read()
         if saved is None:
             return None
-        before = recall(*saved, time.monotonic_ns(), scenario.terms())
+        before: SavedState = room.recall(*saved, time.monotonic_ns(), scenario.terms())
     except ValueError as error:
         warnings.append(NotRecalled(vehicle=number, reason=str(error)))
         # The vehicle may have been armed, so it is armed again only by an operator.
-        return SavedState(frame=VehicleMemory(armed=True))
+        forgotten: SavedState = room.SavedState(frame=VehicleMemory(armed=True))
+        return forgotten
     warnings.append(Recalled(vehicle=number, goes_on=before.boot_id is not None))
     return before

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 from importlib import import_module
 from pathlib import Path
 from socket import socket
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from skytether.server.endpoint import VEHICLES_MAX, Server
 from skytether.server.gate import Gate, PlainGate
@@ -25,10 +25,9 @@ from skytether.shared.endpoints.endpoint import PATH_SOCKETS, Address, Form
 from skytether.shared.endpoints.steady import Steady
 from skytether.shared.endpoints.stopwatch import Stopwatch
 from skytether.shared.events.flight import address_text
+from skytether.shared.scenario.registry import load
 from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import RECORDING, plan_columns, server_columns
-from skytether.shared.wire import keys
-from skytether.shared.wire.keys import Keyring
 from skytether.shell.commandline import command, terminal
 from skytether.shell.commandline.argument import Argument
 from skytether.shell.commandline.command import CommandError
@@ -37,6 +36,9 @@ from skytether.shell.host import system
 from skytether.shell.host.udp import AddressError
 from skytether.shell.processes import process, workers
 from skytether.shell.processes.process import ProcessOptions
+
+if TYPE_CHECKING:
+    from skytether.shared.wire.keys import Keyring
 
 
 @dataclass(frozen=True)
@@ -82,7 +84,9 @@ def serve(argv: Sequence[str]) -> None:
     if options.workers > 1:
         command.check_count("--bind with --workers", len(bind), 1)
     command.optional_address("--metrics", options.metrics)
-    keyring = keys.load(options.keys) if options.keys else None
+    keyring: Keyring | None = (
+        load("skytether.shared.wire.keys", "--keys").load(options.keys) if options.keys else None
+    )
     for each in bind:
         command.check_sealed(each, secure=bool(keyring) or options.insecure)
     if options.workers == 1:
@@ -137,7 +141,7 @@ def _numbered(options: ServerOptions, number: int) -> ServerOptions:
 
 def _work(
     options: ServerOptions,
-    keyring: Keyring | None,
+    keyring: "Keyring | None",
     bind: list[Address | socket],
     number: int = 0,
 ) -> None:

@@ -101,7 +101,12 @@ for name, module in sorted(sys.modules.items()):
     if name.startswith("skytether") and getattr(module, "__file__", None):
         print(name, len(open(module.__file__).read().splitlines()))
 """
-LOAD_ALL = "from skytether.server.schemes import table; table.load_all()"
+LOAD_ALL = """
+import skytether.client.__main__, skytether.netem.__main__, skytether.server.__main__
+from skytether.server.schemes import table
+
+table.load_all()
+"""
 
 
 def loaded(at: Path | None) -> dict[str, int]:
@@ -192,8 +197,8 @@ def test_the_kernel_flies_without_a_room(room: str, tmp_path: Path) -> None:
         at = copy / place
         shutil.rmtree(at) if at.is_dir() else at.unlink()
     assert loaded(tmp_path)
-    every_scheme = (sys.executable, "-P", "-c", LOAD_ALL)
-    assert ran(*every_scheme, env=environment(tmp_path)).returncode == 0
+    every_module = (sys.executable, "-P", "-c", LOAD_ALL)
+    assert ran(*every_module, env=environment(tmp_path)).returncode == 0
     flown = ran(*SKYTETHER, *FLIES.split(), "--duration", "5", env=environment(tmp_path))
     assert flown.returncode == 0, flown.stderr
     listed = ran(*SKYTETHER, "--help", env=environment(tmp_path))

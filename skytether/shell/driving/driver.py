@@ -19,9 +19,8 @@ from itertools import groupby
 from operator import itemgetter
 from socket import socket
 from types import MappingProxyType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from skytether.ros2.graph import Node
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.endpoints.endpoint import Address, Datagram, Endpoint, Form, make_datagram
 from skytether.shared.endpoints.line import LINE, Line, Listen
@@ -31,7 +30,6 @@ from skytether.shared.events.processes import HostFound, HostMissing, PathFound,
 from skytether.shell.driving.connections import Connections
 from skytether.shell.driving.control import Control
 from skytether.shell.driving.feed import Feed
-from skytether.shell.driving.graph import GraphSession
 from skytether.shell.driving.memory import MemoryFile
 from skytether.shell.driving.program import Program, ProgramLine
 from skytether.shell.driving.stream import ByteStream
@@ -52,6 +50,12 @@ from skytether.shell.host.udp import (
     within_reach_of,
 )
 
+if TYPE_CHECKING:
+    from skytether.ros2.graph import Node
+    from skytether.shell.driving.graph import GraphSession
+
+    AnyLine = Line | Node | Program | Listen
+
 BURST_MAX = BATCH_MAX
 """Largest number of datagrams read from one socket before timers and other sockets have their
 turn."""
@@ -70,7 +74,6 @@ DATAGRAM_BYTES_MAX = 65535
 RESOLVE_EVERY_S = 2.0
 """Interval at which names are looked up again [s]: a restarted host may have a new address."""
 CHECK_PATHS_EVERY_S = 1.0
-AnyLine = Line | Node | Program | Listen
 Numbers = dict[Address, Address]
 """Numeric addresses by the peers' names."""
 
@@ -123,7 +126,7 @@ class Shell:
         forms: Sequence[Form] = (),
         control: Control | None = None,
         feed: Feed | None = None,
-        line: AnyLine | None = None,
+        line: "AnyLine | None" = None,
         *,
         paths: Mapping[int, NetworkPath] = MappingProxyType({}),
         is_patient: bool = False,
@@ -198,14 +201,16 @@ class Shell:
         path = self._paths.get(number)
         return path.names if path else self._names
 
-    def _add(self, line: AnyLine) -> None:
-        if isinstance(line, Node):
-            self._line = GraphSession(line, self._hear_line)
-        elif isinstance(line, Program):
+    def _add(self, line: "AnyLine") -> None:
+        if isinstance(line, Program):
             self._line = ProgramLine(line, self._hear_line)
         elif isinstance(line, Listen):
             self._line = Connections(line, self._hear_line, self._hear_refusal)
             self.addresses[0] = self._line.address
+        elif not isinstance(line, Line):
+            from skytether.shell.driving.graph import GraphSession  # a room
+
+            self._line = GraphSession(line, self._hear_line)
         elif line.kind in ("tcp", "serial"):
             self._line = ByteStream(line, lambda piece: self._hear_line(Datagram(piece, LINE, 1)))
         elif line.kind == "udp":

@@ -33,7 +33,7 @@ from skytether.shell.commandline.command import (
     write,
 )
 from skytether.shell.driving.control import controlled
-from skytether.shell.driving.driver import AnyLine, Shell, run
+from skytether.shell.driving.driver import Shell, run
 from skytether.shell.driving.feed import Feed
 from skytether.shell.driving.journal import Journal, take_up
 from skytether.shell.driving.memory import MemoryFile
@@ -48,6 +48,7 @@ from skytether.shell.processes.log import Log, LogFormat
 
 # for type checking only: slow to import, and not needed in flight
 if TYPE_CHECKING:
+    from skytether.shell.driving.driver import AnyLine
     from skytether.shell.processes.exporter import Metrics
 
 
@@ -126,7 +127,7 @@ class Process:
         """Recorder of a further part of the record, for the feed only; None without a feed."""
         return _followed(Recorder(columns), self.feed, part, columns) if self.feed else None
 
-    def _log(self, line: AnyLine | None) -> Log:
+    def _log(self, line: "AnyLine | None") -> Log:
         beside: Callable[[Event], None] = self.feed.say if self.feed else lambda _: None
         to_stderr = isinstance(line, Program)
         return Log(self.name, self.options.log, beside, to_stderr=to_stderr)
@@ -148,7 +149,7 @@ class Process:
         forms: Sequence[Form] = (),
         insecure: bool = False,
         stopwatch: Stopwatch | None = None,
-        line: AnyLine | None = None,
+        line: "AnyLine | None" = None,
         is_patient: bool = False,
         memory: MemoryFile | None = None,
         ready: Callable[[], None] = lambda: None,
