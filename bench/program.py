@@ -72,12 +72,12 @@ def missing() -> str:
 def run(command: Sequence[str], *options: str) -> tuple[str, dict[str, Any]]:
     """Output of a program under `netem run`, and netem's counters."""
     with TemporaryDirectory() as folder:
-        told = Path(folder) / "counts.json"
-        line = [sys.executable, "-P", "-m", "skytether", "netem", "run", f"--json={told}"]
+        counts = Path(folder) / "counts.json"
+        line = [sys.executable, "-P", "-m", "skytether", "netem", "run", f"--json={counts}"]
         done = subprocess.run(
             [*line, *options, "--", *command], stdout=subprocess.PIPE, text=True, check=True
         )
-        return done.stdout, json.loads(told.read_text())
+        return done.stdout, json.loads(counts.read_text())
 
 
 def round_trip_ms(count: int, *options: str) -> float:
@@ -163,16 +163,18 @@ def unimpaired(seconds: int, *more: str) -> dict[str, float]:
 def without_netem(command: Sequence[str]) -> str:
     """Output of a program in a namespace with slirp4netns alone."""
     with TemporaryDirectory() as folder, ExitStack() as stack:
-        script, told = ALONE.format(at=folder, line=" ".join(command)), Path(folder, "pid")
+        script, pid_file = ALONE.format(at=folder, line=" ".join(command)), Path(folder, "pid")
         program = subprocess.Popen(
             ["unshare", "--user", "--map-root-user", "--net", "sh", "-c", script],
             stdout=subprocess.PIPE,
             text=True,
         )
         stack.callback(program.kill)
-        while program.poll() is None and not (told.exists() and told.read_text().endswith("\n")):
+        while program.poll() is None and not (
+            pid_file.exists() and pid_file.read_text().endswith("\n")
+        ):
             time.sleep(0.01)
-        line = ["slirp4netns", "--configure", "--mtu=1500", told.read_text().strip(), "tap0"]
+        line = ["slirp4netns", "--configure", "--mtu=1500", pid_file.read_text().strip(), "tap0"]
         slirp = subprocess.Popen(line, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
         stack.callback(slirp.wait)
         stack.callback(slirp.kill)

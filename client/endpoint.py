@@ -22,7 +22,7 @@ from skytether.client.session import ServerSession
 from skytether.client.vehicle import Vehicle
 from skytether.shared.base.units import MICROSECOND_NS, SECOND_NS, seconds_to_ns
 from skytether.shared.endpoints.endpoint import (
-    VEHICLES_TOLD_MAX,
+    VEHICLES_SHOWN_MAX,
     Address,
     Datagram,
     Endpoint,
@@ -410,12 +410,12 @@ class Client(Endpoint):
 
 def figures(clients: Sequence[Client]) -> dict[str, Any]:
     """Figures of the clients in one process, see `Endpoint.figures`."""
-    others = clients[VEHICLES_TOLD_MAX:]
+    others = clients[VEHICLES_SHOWN_MAX:]
     return {
         "vehicles": len(clients),
         "missed": sum(client.missed for client in clients),
         "by_vehicle": {
-            str(client.vehicle): client.vehicle_figures() for client in clients[:VEHICLES_TOLD_MAX]
+            str(client.vehicle): client.vehicle_figures() for client in clients[:VEHICLES_SHOWN_MAX]
         },
         "others_dropped": by_name(sum((client.dropped for client in others), Counter())),
     }

@@ -17,9 +17,9 @@ from skytether.shared.law.spline import along
 from skytether.shared.law.terms import Terms
 from skytether.shared.wire.protocol import DISTURBANCE, GAIN_P, GAIN_V, REFERENCE
 
-TOLD = [GAIN_P, GAIN_V, DISTURBANCE]
+SENT = [GAIN_P, GAIN_V, DISTURBANCE]
 TABLED = [rule.GAIN_P, rule.GAIN_V, rule.DISTURBANCE]
-"""Columns of a horizon's feedback on the wire (TOLD), and the columns of the table that they
+"""Columns of a horizon's feedback on the wire (SENT), and the columns of the table that they
 fill."""
 
 
@@ -104,7 +104,7 @@ class HorizonFollower:
         self.reference = np.zeros((terms.axes, 2))
         """Reference state x̄ of the feedback at the newest stage [m, m/s]; shape (axes, 2)."""
         if feedback is not None:
-            self._table[:, TABLED] = feedback[:, TOLD]
+            self._table[:, TABLED] = feedback[:, SENT]
             self.reference[:] = feedback[:, REFERENCE]
         self._reference_stage = 0
 

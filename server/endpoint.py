@@ -21,7 +21,7 @@ from skytether.server.schemes import table
 from skytether.server.sessions import Session, Sessions
 from skytether.server.tick import Grid, Ticker
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS, seconds_to_ns
-from skytether.shared.endpoints.endpoint import VEHICLES_TOLD_MAX, Datagram, Endpoint, by_name
+from skytether.shared.endpoints.endpoint import VEHICLES_SHOWN_MAX, Datagram, Endpoint, by_name
 from skytether.shared.endpoints.stopwatch import Stopwatch
 from skytether.shared.endpoints.time_of_day import TimeOfDay
 from skytether.shared.events.flight import Leaving, ReferenceTooFast, SessionEnded
@@ -226,7 +226,7 @@ class Server(Endpoint):
 
     def figures(self) -> dict[str, Any]:
         ticks = self._ticker.durations
-        shown = self.sessions.first(VEHICLES_TOLD_MAX)
+        shown = self.sessions.first(VEHICLES_SHOWN_MAX)
         vehicle_figures = {str(session.vehicle): self._of_vehicle(session) for session in shown}
         return {
             "vehicles": len(self.sessions),

@@ -202,13 +202,13 @@ class MoveSampler:
         stop = replace(stop, amounts=(0.0, *stop.amounts[1:]))
         moves = [stop]
         for number in self._vehicles:
-            told = Move(MoveKind.CUTS, number, "uplink", stop.start_ns, ONE_NS)
+            cut = Move(MoveKind.CUTS, number, "uplink", stop.start_ns, ONE_NS)
             match rng.integers(3):
                 case 1:
-                    moves.append(told)
+                    moves.append(cut)
                 case 2:
                     late_s = self._age_s()
-                    moves.append(replace(told, kind=MoveKind.DELAYS, amounts=(late_s, late_s)))
+                    moves.append(replace(cut, kind=MoveKind.DELAYS, amounts=(late_s, late_s)))
         return tuple(moves)
 
     def _age_s(self) -> float:

@@ -354,9 +354,9 @@ class Raid:
         tracks = self._lives.tracks()
         counts, margins = Counter[str](), dict.fromkeys(ASSUMED, 0.0)
         for server in self._lives.server_runs:
-            told = server.figures()
-            counts.update(told["counts"])
-            margins = {each: max(near, told["margins"][each]) for each, near in margins.items()}
+            figures = server.figures()
+            counts.update(figures["counts"])
+            margins = {each: max(near, figures["margins"][each]) for each, near in margins.items()}
         return Approach(
             moves=self._moves,
             apart=self._apart(tracks),

@@ -32,7 +32,7 @@ STANDBY_SOCKETS = (5, 6, 7, 8)
 EVENTS_MAX = 1024
 """Number of events kept until the driver reads them; older ones are dropped and counted."""
 
-VEHICLES_TOLD_MAX = 16
+VEHICLES_SHOWN_MAX = 16
 """Number of vehicles with individual figures."""
 
 

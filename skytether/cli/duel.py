@@ -27,7 +27,7 @@ from skytether.shell.host.web import HOST_PORT
 from skytether.sim import flight
 from skytether.view.browser.flight import PageFlight
 from skytether.view.browser.replay import Player
-from skytether.view.browser.serve import until_told
+from skytether.view.browser.serve import serve_until_interrupted
 from skytether.view.frames import of_flight
 
 
@@ -66,7 +66,7 @@ def duel(argv: Sequence[str]) -> None:
         ]
         flights = [PageFlight(name) for name in names]
         with closing(Player(flights, frames)) as player:
-            until_told(at, flights, now_ns=player.now_ns, more=player.controls)
+            serve_until_interrupted(at, flights, now_ns=player.now_ns, more=player.controls)
         return
     _really(scenarios, names, options.page)
 

@@ -15,7 +15,7 @@ from skytether.shell.commandline.options import read
 from skytether.shell.host.web import HOST_PORT
 from skytether.view.browser.flight import PageFlight
 from skytether.view.browser.replay import Player
-from skytether.view.browser.serve import until_told
+from skytether.view.browser.serve import serve_until_interrupted
 
 
 @dataclass(frozen=True)
@@ -34,4 +34,4 @@ def replay(argv: Sequence[str]) -> None:
     recorded = recordings.opened(options.file)
     flight = PageFlight()
     with closing(Player([flight], [recorded.frames])) as player:
-        until_told(at, [flight], now_ns=player.now_ns, more=player.controls)
+        serve_until_interrupted(at, [flight], now_ns=player.now_ns, more=player.controls)

@@ -24,7 +24,7 @@ from skytether.ros2.graph import Node
 from skytether.ros2.messages import MessageError, Vector
 from skytether.shared.base import toml
 from skytether.shared.endpoints.change import Answer
-from skytether.shared.endpoints.endpoint import VEHICLES_TOLD_MAX, Datagram
+from skytether.shared.endpoints.endpoint import VEHICLES_SHOWN_MAX, Datagram
 from skytether.shared.endpoints.line import Line, parse_line
 from skytether.shared.events.flight import ChangeRefused
 from skytether.shared.missions.mission import format_goals, parse_goals
@@ -75,7 +75,7 @@ def connect(argv: Sequence[str]) -> None:
         message = f"--domain: got {options.domain}, expected a number from 0 to 232"
         raise CommandError(message, CONFIGURATION)
 
-    async def until_told() -> None:
+    async def until_interrupted() -> None:
         task = asyncio.ensure_future(Bridge(options, line, out).run())
         for number in (signal.SIGINT, signal.SIGTERM):
             system.handle(asyncio.get_running_loop(), number, task.cancel)
@@ -83,7 +83,7 @@ def connect(argv: Sequence[str]) -> None:
             await task
 
     with closing(Log("ros2", "text")) as out:
-        asyncio.run(until_told())
+        asyncio.run(until_interrupted())
 
 
 class Bridge:
@@ -95,7 +95,7 @@ class Bridge:
         self._columns: np.dtype[np.void] | None = None
         """Columns of plans; None without plans."""
         self._nodes: dict[int, tuple[Node, GraphSession]] = {}
-        """Nodes by the numbers of their vehicles, at most VEHICLES_TOLD_MAX."""
+        """Nodes by the numbers of their vehicles, at most VEHICLES_SHOWN_MAX."""
         self._paths: dict[int, Sequence[Vector]] = {}
         """Newest path of each node's vehicle [m]."""
         self._wanted: dict[int, Vector] = {}
@@ -133,7 +133,7 @@ class Bridge:
                     self._loop.call_soon_threadsafe(self._show, vehicle, positions)
 
     def _show(self, vehicle: int, positions: Sequence[Vector]) -> None:
-        if vehicle not in self._nodes and len(self._nodes) < VEHICLES_TOLD_MAX:
+        if vehicle not in self._nodes and len(self._nodes) < VEHICLES_SHOWN_MAX:
             self._nodes[vehicle] = self._opened(vehicle)
         if vehicle in self._nodes:
             self._paths[vehicle] = positions

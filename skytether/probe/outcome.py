@@ -133,7 +133,9 @@ def outcome(
     ways = {"uplink": measured.uplink, "downlink": measured.downlink}
     clocks, down, up = (analysis.delays_of_log if log else analysis.delays)(measured)
     delays = {"uplink": up, "downlink": down}
-    directions = {name: _way_told(way, delays[name], measured.size) for name, way in ways.items()}
+    directions = {
+        name: _direction_figures(way, delays[name], measured.size) for name, way in ways.items()
+    }
     near = measured.downlink.sent_ns
     path = PathFigures(
         listener=listener,
@@ -154,7 +156,7 @@ def outcome(
     return ProbeOutcome(clocks, delays, path)
 
 
-def _way_told(way: Way, delays: Delays, size: int) -> DirectionFigures:
+def _direction_figures(way: Way, delays: Delays, size: int) -> DirectionFigures:
     rate = delays.rate
     service_s = (size + HEADER_BYTES) / rate.bytes_per_s if rate else 0.0
     lost = ~delays.came

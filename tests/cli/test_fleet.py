@@ -22,7 +22,7 @@ from skytether.netem.proxy import Proxy
 from skytether.server.endpoint import Server
 from skytether.shared.base.chance import stream
 from skytether.shared.base.units import SECOND_NS
-from skytether.shared.endpoints.endpoint import VEHICLES_TOLD_MAX, Address, Datagram
+from skytether.shared.endpoints.endpoint import VEHICLES_SHOWN_MAX, Address, Datagram
 from skytether.shared.events.flight import NoAnswer
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.whole import Scenario
@@ -111,7 +111,7 @@ def test_a_fleet_is_driven_by_its_first_wake_and_ends_with_its_last_vehicle() ->
 
 
 def test_drops_of_vehicles_without_figures_of_their_own_are_added_up() -> None:
-    vehicles, _ = clients(GUSTY, VEHICLES_TOLD_MAX + 2, ("server", 1))
+    vehicles, _ = clients(GUSTY, VEHICLES_SHOWN_MAX + 2, ("server", 1))
     fleet = ClientFleet(vehicles)
     for number in range(len(vehicles)):
         fleet.receive(Datagram(b"?", ("server", 1), number), now_ns=0)

@@ -21,7 +21,7 @@ from helpers import packaged
 from skytether.client.endpoint import Client
 from skytether.client.fleet import ClientFleet
 from skytether.client.simulated.vehicle import simulated
-from skytether.shared.endpoints.endpoint import VEHICLES_TOLD_MAX
+from skytether.shared.endpoints.endpoint import VEHICLES_SHOWN_MAX
 from skytether.shared.endpoints.stopwatch import Stopwatch
 from skytether.shared.events.processes import Measured
 from skytether.shared.scenario import reading
@@ -234,7 +234,7 @@ def test_vehicles_told_of_are_bounded(figures: dict[str, dict[str, Any]]) -> Non
     told = {
         labels for name, labels in numbers("client", figures["client"]) if "client_step" in name
     }
-    assert len({label for labels in told for label in labels}) == VEHICLES_TOLD_MAX
+    assert len({label for labels in told for label in labels}) == VEHICLES_SHOWN_MAX
 
 
 def test_figures_of_a_client_in_flight_have_ages() -> None:

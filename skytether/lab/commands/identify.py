@@ -17,7 +17,7 @@ from skytether.lab.commands.pool import writing
 from skytether.lab.identify import outcome, picture
 from skytether.lab.identify.fit import Fit, fit, misfit, verdict
 from skytether.lab.identify.flight import Identifying
-from skytether.lab.identify.outcome import AXES, AxisOutcome, AxisTold
+from skytether.lab.identify.outcome import AXES, AxisOutcome, AxisResults
 from skytether.lab.identify.responses import responses
 from skytether.lab.identify.steps import (
     STEP_MIN_MPS,
@@ -97,8 +97,8 @@ class IdentificationTold(msgspec.Struct, frozen=True):
     ended: str
     hold_s: float
     flown_s: float
-    axes: list[AxisTold]
-    sizes: list[list[AxisTold]]
+    axes: list[AxisResults]
+    sizes: list[list[AxisResults]]
     costs: list[dict[str, float]]
 
 
@@ -254,8 +254,8 @@ def _tell(options: IdentifyOptions, scenario: Scenario, flown: Sequence[SizeFlow
         ended=first.flight.why,
         hold_s=first.flight.experiment.plan.hold_s,
         flown_s=first.flight.flown_s,
-        axes=_all_told(first),
-        sizes=[_all_told(each) for each in flown[1:]],
+        axes=_all_results(first),
+        sizes=[_all_results(each) for each in flown[1:]],
         costs=costs,
     )
     with writing(out):
@@ -271,7 +271,7 @@ def _tell(options: IdentifyOptions, scenario: Scenario, flown: Sequence[SizeFlow
         _show_costs(flown, costs)
 
 
-def _all_told(flown: SizeFlown) -> list[AxisTold]:
+def _all_results(flown: SizeFlown) -> list[AxisResults]:
     return [outcome.axis_results(name, axis) for name, axis in zip(AXES, flown.axes, strict=False)]
 
 

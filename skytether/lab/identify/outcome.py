@@ -137,7 +137,7 @@ def _u_max(flown: Scenario, axes: Sequence[AxisOutcome], numbers: Sequence[Numbe
     ]
 
 
-class AxisTold(msgspec.Struct, frozen=True):
+class AxisResults(msgspec.Struct, frozen=True):
     """Results of an axis in identified.json; None for unknown values."""
 
     axis: str
@@ -156,13 +156,13 @@ class AxisTold(msgspec.Struct, frozen=True):
     largest_at_s: float | None = None
 
 
-def axis_results(name: str, axis: AxisOutcome) -> AxisTold:
+def axis_results(name: str, axis: AxisOutcome) -> AxisResults:
     steps, fit = len(axis.responses), axis.fit
     if fit is None:
-        return AxisTold(name, axis.speed, steps, axis.cut, describe(axis))
+        return AxisResults(name, axis.speed, steps, axis.cut, describe(axis))
     gain, tau, late = (each if math.isfinite(each) else None for each in fit.within)
     off = fit.misfit
-    return AxisTold(
+    return AxisResults(
         name,
         axis.speed,
         steps,

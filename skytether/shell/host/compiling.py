@@ -63,27 +63,27 @@ def _locked(descriptor: int) -> bool:
     return True
 
 
-TOLD = "compiling"
+PROGRESS = "compiling"
 """Name of the file in a flight's folder that says how far compiling is, for the page."""
-TOLD_BYTES = 200
+PROGRESS_BYTES = 200
 
 
 def tell(folder: Path | None, text: str) -> None:
-    """Leave a text for `told` in a flight's folder, if it has one; without a text, none."""
+    """Leave a text for `progress` in a flight's folder, if it has one; without a text, none."""
     if folder is None:
         return
     with suppress(OSError):
         if text:
-            with files.replacing(folder / TOLD, is_synced=False) as file:
+            with files.replacing(folder / PROGRESS, is_synced=False) as file:
                 file.write(text.encode())
         else:
-            (folder / TOLD).unlink(missing_ok=True)
+            (folder / PROGRESS).unlink(missing_ok=True)
 
 
 def progress(folder: Path | None) -> str:
-    """What a command has told of its compiling; empty if nothing, or once it is over."""
+    """What a command says of its compiling; empty if nothing, or once it is over."""
     with suppress(OSError, ValueError):
-        return input_files.read(folder / TOLD, TOLD_BYTES).decode() if folder else ""
+        return input_files.read(folder / PROGRESS, PROGRESS_BYTES).decode() if folder else ""
     return ""
 
 

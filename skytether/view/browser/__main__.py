@@ -23,7 +23,7 @@ from skytether.shell.commandline.options import read
 from skytether.shell.host import system
 from skytether.shell.host.web import HOST_PORT
 from skytether.shell.processes.log import LogFormat
-from skytether.view.browser.serve import followed, until_told
+from skytether.view.browser.serve import followed, serve_until_interrupted
 
 NICE = 5
 """Niceness of the page's process, so that it yields to the processes that fly."""
@@ -65,4 +65,4 @@ def show(argv: Sequence[str]) -> None:
             stack.enter_context(followed(each, "" if alone else each.name))
             for each in options.folders
         ]
-        until_told(at, flights, options.log)
+        serve_until_interrupted(at, flights, options.log)

@@ -91,7 +91,7 @@ def next_free(host: str, port: int) -> int:
     raise CommandError(f"--page: {address_text(host, port)}: cannot be listened on: {why}", RUN)
 
 
-def until_told(
+def serve_until_interrupted(
     at: Address,
     flights: Sequence[PageFlight],
     log: LogFormat = "text",

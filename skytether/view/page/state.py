@@ -659,22 +659,22 @@ class State:
         return heard.role if heard else ""
 
     def figures(self, role: str) -> dict[str, Any]:
-        """Figures of the first process of a role that tells any; empty without one."""
+        """Figures of the first process of a role that has any; empty without one."""
         all_figures = (each.figures for each in self._processes.values() if each.role == role)
         return next(filter(None, all_figures), {})
 
     def of_vehicle(self, role: str, number: int) -> dict[str, Any]:
         """Figures of a vehicle by its client, or by the server that plans for it; or else by any
-        process of the role that tells them.
+        process of the role that has them.
         """
         track = self.vehicles.get(number)
         own = {"client": track.client, "server": track.server}.get(role) if track else None
-        told_ = {
+        by_process = {
             name: group(each.figures, "by_vehicle", str(number))
             for name, each in self._processes.items()
             if each.role == role
         }
-        return told_.get(own or "") or next(filter(None, told_.values()), {})
+        return by_process.get(own or "") or next(filter(None, by_process.values()), {})
 
     @property
     def every_step(self) -> float:

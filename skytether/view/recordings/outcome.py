@@ -43,18 +43,18 @@ from skytether.shared.telemetry.summary import Track, nearest, position_error, t
 from skytether.shared.wire.protocol import Mode
 from skytether.view.recordings.recorded import Recorded
 
-TOLD = (
+SHOWN = (
     *(HostMissing, HostFound, PathMissing, PathDied, PathHealed, LeaderChanged, ModeChanged),
     *(ServerSilent, ServerHeard, LeftTube, LeftMotion, SteppedLate, StateLeapt, FenceHolds),
     *(ClockContradicted, TimeUnknown, BegunAnew, Recalled, NotRecalled, NotFlown),
     *(Fault, Degraded, RecordIncomplete, Changed, ChangeRefused),
 )
-"""Events that tell what failed, and what took over."""
+"""Events that say what failed, and what took over."""
 GROUND = {str(mode) for mode in (Mode.INIT, Mode.SYNC, Mode.READY)}
 WITHIN_S = 2.0
-"""Time within which the same event of several vehicles is told once."""
+"""Time within which the same event of several vehicles is shown once."""
 BRIEF_S = 1.0
-"""Length of a path's outage below which it is not told."""
+"""Length of a path's outage below which it is not shown."""
 VEHICLES_MAX = 64
 """Largest number of vehicles that have a row, and distances to each other."""
 
@@ -190,7 +190,7 @@ class Outcome:
     def happened(self) -> list[tuple[float, tuple[int, ...], str]]:
         """What failed and took over: time [s], vehicles and sentence, in order of time.
 
-        The same event of several vehicles is told once, and outages of a path below BRIEF_S not at
+        The same event of several vehicles is shown once, and outages of a path below BRIEF_S not at
         all.
         """
         found: list[tuple[float, list[int], str]] = []
@@ -198,7 +198,7 @@ class Outcome:
         begin_s: dict[str, float] = {}
         for time_ns, _, event in self._recorded.events():
             at_s, vehicle = self.time_s(time_ns), getattr(event, "vehicle", None)
-            if not isinstance(event, TOLD) or _is_ordinary(event) or self._is_brief(event, at_s):
+            if not isinstance(event, SHOWN) or _is_ordinary(event) or self._is_brief(event, at_s):
                 continue
             text = re.sub(r"^vehicle \d+:? ", "", str(event))
             if vehicle and text in newest and at_s - begin_s[text] < WITHIN_S:
@@ -209,7 +209,7 @@ class Outcome:
         return [(at_s, tuple(sorted(set(who))), text) for at_s, who, text in found]
 
     def _is_brief(self, event: Event, at_s: float) -> bool:
-        """Whether an event begins or ends a path's outage that is too brief to be told."""
+        """Whether an event begins or ends a path's outage that is too brief to be shown."""
         if not isinstance(event, PathDied | PathHealed):
             return False
         outages = self.dead_paths.get(event.path, [])

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 EVENTS_MAX = 400
-TOLD_MAX = 20
+HAPPENED_MAX = 20
 WIDTH = 9.0
 LETTERS = 9
 
@@ -114,8 +114,8 @@ def page(recorded: Recorded, figures: Sequence[tuple[str, str]]) -> str:
         "recording": recorded.path.name,
     }
     heard = "Time is that of the flight, whose first step is 0."
-    if (untold := len(events) - EVENTS_MAX) > 0:
-        heard += f" {untold} more events are in the recording."
+    if (further := len(events) - EVENTS_MAX) > 0:
+        heard += f" {further} more events are in the recording."
     heading = ("time [s]", "process", "event")
     happened = Table("events", "", heard, "", heading, events[:EVENTS_MAX], is_grouped=False)
     return rendered(
@@ -171,10 +171,12 @@ def _first(outcome: Outcome) -> list[Table]:
         [f"{at_s:.1f}", listed(who) if who else "–", text] for at_s, who, text in outcome.happened
     ]
     says = "" if events else "Nothing failed."
-    if len(events) > TOLD_MAX:
-        says = f"The first {TOLD_MAX} of {len(events)}; all events are below."
+    if len(events) > HAPPENED_MAX:
+        says = f"The first {HAPPENED_MAX} of {len(events)}; all events are below."
     heading = ["time [s]", "vehicles", "event"] if events else []
-    table = Table("told", "What failed, and what took over", says, "", heading, events[:TOLD_MAX])
+    table = Table(
+        "happened", "What failed, and what took over", says, "", heading, events[:HAPPENED_MAX]
+    )
     return [table, *found] if events else [*found, table]
 
 
