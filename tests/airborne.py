@@ -322,8 +322,8 @@ class Air:
         return float(np.sqrt(np.mean(np.sum(error[times > settle_s] ** 2, axis=1))))
 
     def json(self) -> list[dict[str, Any]]:
-        told = [event for _, name, event in self.events if name == "client"]
-        return [msgspec.json.decode(msgspec.json.encode(event)) for event in told]
+        events = [event for _, name, event in self.events if name == "client"]
+        return [msgspec.json.decode(msgspec.json.encode(event)) for event in events]
 
 
 def flying(flavour: FlavourName, *faults: str, seconds: float = 1.0, **table: Any) -> Air:

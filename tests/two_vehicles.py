@@ -139,8 +139,8 @@ def each_of(flown: Record) -> list[Rows]:
 
 
 def separation_m(flown: Record, height_scale: float = 1.0) -> float:
-    told = flown.figures["client"]["by_vehicle"]
-    began_s = [told[str(rows["vehicle"][0])]["began_s"] for rows in each_of(flown)]
+    figures = flown.figures["client"]["by_vehicle"]
+    began_s = [figures[str(rows["vehicle"][0])]["began_s"] for rows in each_of(flown)]
     least = least_separation(each_of(flown), began_s, DT_S, height_scale)
     assert least is not None
     return least

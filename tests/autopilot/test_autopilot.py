@@ -143,8 +143,8 @@ def test_px4_errs_as_measured() -> None:
     for _ in range(9000):
         truth.append([companion.flight.position(), companion.flight.quadrotor.velocity()])
         companion.run(0.02)
-    told = [m for _, m in companion.heard[began:] if m.get_type() == "LOCAL_POSITION_NED"]
-    east = np.array([[m.y, m.vy] for m in told])[-9000:]
+    positions = [m for _, m in companion.heard[began:] if m.get_type() == "LOCAL_POSITION_NED"]
+    east = np.array([[m.y, m.vy] for m in positions])[-9000:]
     position, velocity = east.T - np.array(truth)[-len(east) :, :, 1].T
     assert 0.08 < velocity.std() < 0.34
     assert 0.05 < position.std() < 0.23
@@ -420,13 +420,13 @@ def test_parameters_are_read_and_set(flavour: FlavourName) -> None:
     own, bytewise = FLAVOURS[flavour].parameters, FLAVOURS[flavour].bytewise
     for number in range(len(own)):
         companion.send(dialect.MAVLink_param_request_read_message(1, 1, b"", number))
-    told = {
+    parameters_read = {
         message.param_id: parameters.from_wire(
             message.param_value, message.param_type, bytewise=bytewise
         )
         for message in companion.all("PARAM_VALUE")
     }
-    assert told == pytest.approx(own, rel=1e-6)
+    assert parameters_read == pytest.approx(own, rel=1e-6)
     name = "COM_OBL_RC_ACT" if bytewise else "GUID_TIMEOUT"
     set_parameter(companion, name, 5)
     companion.send(dialect.MAVLink_param_request_read_message(1, 1, name.encode(), -1))
@@ -514,10 +514,10 @@ def test_the_attitude_is_that_of_what_it_flies(ardupilot: Companion) -> None:
     ardupilot.velocity = (1.0, 1.0, 0.0)
     ardupilot.run(0.5)
     ardupilot.command(512, dialect.MAVLINK_MSG_ID_ATTITUDE)
-    told = ardupilot.last("ATTITUDE")
-    assert told.pitch < -0.05
-    assert told.roll > 0.05
-    assert abs(told.yaw) < 0.03
+    attitude = ardupilot.last("ATTITUDE")
+    assert attitude.pitch < -0.05
+    assert attitude.roll > 0.05
+    assert abs(attitude.yaw) < 0.03
 
 
 def test_position_and_velocity_are_flown_together(ardupilot: Companion) -> None:

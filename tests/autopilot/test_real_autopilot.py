@@ -198,9 +198,9 @@ async def test_arducopter_stands_where_its_client_is_killed(tmp_path: Path) -> N
             await asyncio.sleep(12.0)
             client.process.send_signal(signal.SIGKILL)
             await asyncio.sleep(6.0)
-            told = heard.newest[PLACE]
-            assert np.hypot(told.vx, told.vy) < 10.0  # cm/s
-            assert told.relative_alt > 2_000  # mm
+            position = heard.newest[PLACE]
+            assert np.hypot(position.vx, position.vy) < 10.0  # cm/s
+            assert position.relative_alt > 2_000  # mm
     finally:
         listening.close()
 

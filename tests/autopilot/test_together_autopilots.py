@@ -164,10 +164,10 @@ def test_the_documented_autopilots_swap_places_over_udp(tmp_path: Path) -> None:
         for each in there:
             each.send_signal(signal.SIGTERM)
             each.wait(30)
-    told = reading.load("swap-autopilot")
+    scenario = reading.load("swap-autopilot")
     rows = [record.read(file) for file in files]
     for number, track in zip(NUMBERS, rows, strict=True):
-        goal = told.make_reference(number)(np.array(told.duration))[:, 0]
+        goal = scenario.make_reference(number)(np.array(scenario.duration))[:, 0]
         start, end = track["state"][0, :, 0], track["state"][-1, :, 0]
         assert np.linalg.norm(end - goal) < np.linalg.norm(start - goal)
     began_s = [
@@ -176,6 +176,6 @@ def test_the_documented_autopilots_swap_places_over_udp(tmp_path: Path) -> None:
         for event in map(msgspec.json.Decoder(LogLine).decode, lines.splitlines())
         if isinstance(event.event, Counted)
     ]
-    least_m = least_separation(rows, began_s, told.control.dt)
+    least_m = least_separation(rows, began_s, scenario.control.dt)
     assert least_m is not None
-    assert least_m > 0.5 * told.mission.separation_m
+    assert least_m > 0.5 * scenario.mission.separation_m

@@ -106,8 +106,8 @@ def test_a_mistake_is_one_clear_line(
     line: str, said: str, capfd: pytest.CaptureFixture[str]
 ) -> None:
     assert main(line.split()) == (1 if "cannot find" in said else 2)
-    (told,) = capfd.readouterr().err.splitlines()
-    assert told.startswith(said)
+    (printed,) = capfd.readouterr().err.splitlines()
+    assert printed.startswith(said)
 
 
 @pytest.mark.parametrize(
@@ -203,11 +203,11 @@ def test_a_flight_tells_what_was_dropped_and_why(
     network = ["--network.downlink", "constant(0.1) & duplicate(0.5) & loss(0.2)"]
     assert main([*argv, *network]) == 0
     summary = json.loads(file.read_text())
-    told = summary["drops"]
-    assert told["netem"].keys() == {"uplink lost", "downlink lost"}
-    assert sum(told["netem"].values()) == summary["lost"] > 0
-    assert told["server"].keys() == {"replayed"}
-    count = told["server"]["replayed"]
+    drops = summary["drops"]
+    assert drops["netem"].keys() == {"uplink lost", "downlink lost"}
+    assert sum(drops["netem"].values()) == summary["lost"] > 0
+    assert drops["server"].keys() == {"replayed"}
+    count = drops["server"]["replayed"]
     assert re.search(rf"dropped by server +│ replayed {count} ", capfd.readouterr().out)
 
 
@@ -251,15 +251,15 @@ def test_a_flag_may_end_a_contradiction_of_the_file(
 def test_a_table_in_millimetres_is_flown_with_a_warning(
     tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    table, told = tmp_path / "mm.csv", tmp_path / "told.json"
+    table, file = tmp_path / "mm.csv", tmp_path / "summary.json"
     table.write_text("t,x,y\n0,0,0\n2,0,0\n12,5100,0\n")
-    argv = ["fly", "demo", "--virtual", "--duration", "10", "--settle", "0", "--json", str(told)]
+    argv = ["fly", "demo", "--virtual", "--duration", "10", "--settle", "0", "--json", str(file)]
     argv += ["--reference.shape", "csv", "--reference.file", str(table)]
     assert main(argv) == 0
     said = capfd.readouterr()
     assert len(re.findall(r" 510 m/s at 2 s.* 1\.6 m/s", said.err)) == 1
     assert "too fast" in said.out
-    assert json.loads(told.read_text())["too_fast"] == pytest.approx(0.8, abs=0.01)
+    assert json.loads(file.read_text())["too_fast"] == pytest.approx(0.8, abs=0.01)
 
 
 def test_a_second_scenario_is_judged_as_it_is_flown(
@@ -280,14 +280,14 @@ def test_a_second_scenario_is_judged_as_it_is_flown(
 def test_a_flight_is_compared_with_several_others(capfd: pytest.CaptureFixture[str]) -> None:
     argv = ["fly", "demo", "--virtual", "--duration", "4", "--settle", "0"]
     assert main([*argv, "--beside", "demo-paper", "--beside", "demo-no-compensation"]) == 0
-    told = capfd.readouterr().out
-    (names,) = (line for line in told.splitlines() if "demo-paper" in line)
+    output = capfd.readouterr().out
+    (names,) = (line for line in output.splitlines() if "demo-paper" in line)
     assert re.findall(r"[\w-]+", names) == ["demo", "demo-paper", "demo-no-compensation"]
     alone = []
     for name in ("demo", "demo-paper", "demo-no-compensation"):
         assert main(["fly", name, *argv[2:]]) == 0
         alone += re.findall(r"largest error \[m\] +│ (\S+)", capfd.readouterr().out)
-    (errors,) = (line for line in told.splitlines() if "largest error" in line)
+    (errors,) = (line for line in output.splitlines() if "largest error" in line)
     assert re.findall(r"[\d.]+", errors) == alone
 
 
@@ -497,8 +497,8 @@ def test_a_flight_whose_disk_fills_is_flown_and_shown_as_far_as_it_is_recorded(
     fly = start(*argv, file_bytes=5000)
     assert fly.ended() == 1, fly.said
     *said, last = fly.said
-    told = re.findall(r"/(\w+): File too large: the record is incomplete", "\n".join(said))
-    assert sorted(told) == ["client", "server"]
+    found = re.findall(r"/(\w+): File too large: the record is incomplete", "\n".join(said))
+    assert sorted(found) == ["client", "server"]
     steps = json.loads(file.read_text())["steps"]
     assert 0 < steps < 80
     assert any(re.search(rf"steps +│ {steps} in ", line) for line in said)

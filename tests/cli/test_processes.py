@@ -101,8 +101,8 @@ async def test_a_child_whose_record_is_incomplete_has_told_so(
             pass
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
-    told = RecordIncomplete(file=file, reason="File too large")
-    assert told in [line.event for line in heard]
+    event = RecordIncomplete(file=file, reason="File too large")
+    assert event in [line.event for line in heard]
     assert (netem.fell_short, netem.failed, netem.process.returncode) == (True, False, 1)
     assert netem.last_words() == f"netem: {file}: File too large: 0 of 0 rows are recorded"
 

@@ -42,16 +42,16 @@ def test_a_goal_without_a_mission_is_the_place_of_a_live_point() -> None:
     ],
 )
 def test_a_goal_that_cannot_be_understood_is_refused(payload: bytes, said: str) -> None:
-    told: list[Any] = []
+    events: list[Any] = []
 
     class Out:
-        hear = told.append
+        hear = events.append
 
     line = parse_line("--address", "tcp:127.0.0.1:7447")
     bridge = Bridge(Ros2Options(Path()), line, Out())  # type: ignore[arg-type]
     bridge._hear(1, Node("h", 1, 0, "n", PLAN, GOAL), Datagram(payload, (GOAL.name, 0), 1))
     assert not bridge._wanted
-    (refused,) = told
+    (refused,) = events
     assert refused.reason.startswith(f"/skytether_1/goal_pose: {said}")
 
 

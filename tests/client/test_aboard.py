@@ -112,11 +112,11 @@ def test_one_heartbeat_a_second_is_that_of_an_onboard_computer(flown: Air) -> No
 def test_measurements_are_those_of_their_stamps(flown: Air) -> None:
     rows = flown.rows()
     assert np.isfinite(rows["measured"]).all()
-    told = flown.figures()
-    assert told["measurements"] > 500
-    assert {name: count for name, count in told["dropped"].items() if count} == {}
+    figures = flown.figures()
+    assert figures["measurements"] > 500
+    assert {name: count for name, count in figures["dropped"].items() if count} == {}
     assert rows["estimate"][0, 2, 0] == pytest.approx(2.0, abs=0.35)
-    assert told["drift_ppm"] == pytest.approx(50.0, abs=5.0)
+    assert figures["drift_ppm"] == pytest.approx(50.0, abs=5.0)
 
 
 def test_the_way_into_the_air_is_the_autopilots_own(flown: Air) -> None:
@@ -145,12 +145,12 @@ def test_px4_is_not_told_of_a_station_where_it_acts_on_the_loss_of_one() -> None
 
 
 def test_figures_have_what_a_pilot_looks_at(flown: Air) -> None:
-    told = flown.figures()
-    assert told["mode"] in ("LAND", "OFFBOARD")  # PX4 returns to the mode before its landing
-    assert (told["armed"], told["garbage_bytes"]) == (0, 0)
-    assert 0.9 < told["battery"] <= 1.0
-    assert told["home"]["altitude_m"] == pytest.approx(flown.flight.flavour.home[2])
-    assert set(told["fence"]) & {"FENCE_ALT_MAX", "GF_MAX_VER_DIST"}
+    figures = flown.figures()
+    assert figures["mode"] in ("LAND", "OFFBOARD")  # PX4 returns to the mode before its landing
+    assert (figures["armed"], figures["garbage_bytes"]) == (0, 0)
+    assert 0.9 < figures["battery"] <= 1.0
+    assert figures["home"]["altitude_m"] == pytest.approx(flown.flight.flavour.home[2])
+    assert set(figures["fence"]) & {"FENCE_ALT_MAX", "GF_MAX_VER_DIST"}
 
 
 # Parameters
@@ -196,8 +196,8 @@ def test_parameters_are_set_and_read_back_where_that_is_allowed(flavour: Flavour
     after = air.flight.parameters
     changed = {name: after[name] for name in after if after[name] != before[name]}
     assert changed == SAFE[flavour]
-    (told,) = air.of(ParametersSet)
-    assert {name for name, _, _ in told.changes} == set(changed)
+    (event,) = air.of(ParametersSet)
+    assert {name for name, _, _ in event.changes} == set(changed)
 
 
 def test_a_parameter_that_cannot_be_set_is_refused() -> None:

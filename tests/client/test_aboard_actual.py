@@ -49,9 +49,9 @@ def test_a_clock_that_runs_up_to_2_percent_wrong_is_followed(ppm: float) -> None
     air = Air("px4", autopilot_ppm=ppm, duration=25.0)
     air.fly()
     air.end()
-    told = air.figures()
-    assert sum(told["dropped"].values()) < 10, told
-    assert told["drift_ppm"] == pytest.approx(-ppm, rel=0.03)
+    figures = air.figures()
+    assert sum(figures["dropped"].values()) < 10, figures
+    assert figures["drift_ppm"] == pytest.approx(-ppm, rel=0.03)
     assert not [mode for mode in modes(air) if mode[0] == "brake"]
 
 
@@ -236,8 +236,8 @@ def test_an_autopilot_that_restarts_on_the_ground_is_taken_from_its_new_address(
     air.tap.dumb = True
     air.run(4.0)
     beat()
-    (told,) = air.of(AutopilotMoved)
-    assert told.after.endswith(":2")
+    (event,) = air.of(AutopilotMoved)
+    assert event.after.endswith(":2")
     assert air.client._port._connection.peer[1] == 2
     assert not air.client._flies.is_ready
 
@@ -250,9 +250,9 @@ def test_in_flight_another_address_is_not_taken_and_what_comes_from_it_is_told()
     heartbeats(air, from_port=2)()
     heartbeats(air, from_port=2)()
     assert not air.of(AutopilotMoved)
-    (told,) = air.of(AutopilotElsewhere)
-    assert told.came_from.endswith(":2")
-    assert "HEARTBEAT of system 1" in told.content
+    (event,) = air.of(AutopilotElsewhere)
+    assert event.came_from.endswith(":2")
+    assert "HEARTBEAT of system 1" in event.content
 
 
 def heartbeats(air: Air, from_port: int) -> Callable[[], None]:

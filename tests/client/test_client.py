@@ -190,8 +190,8 @@ def test_a_restarted_server_whose_clock_is_ahead_is_no_sleep_of_the_vehicle() ->
     assert server.client.dropped[Drop.UNASKED] == 1
     server.client._session._awaits_welcome = True
     server.say(restarted)
-    told = [event.reason for event in server.client.events() if isinstance(event, ModeChanged)]
-    assert told == [str(Reason.RESTARTED)]
+    reasons = [event.reason for event in server.client.events() if isinstance(event, ModeChanged)]
+    assert reasons == [str(Reason.RESTARTED)]
 
 
 def test_a_welcome_that_no_hello_asked_for_changes_nothing() -> None:

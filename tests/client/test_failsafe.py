@@ -129,8 +129,8 @@ class Hand(ByHand):
     @property
     def changes(self) -> list[tuple[str, str]]:
         self.events += self.client.events()
-        told = [event for event in self.events if isinstance(event, ModeChanged)]
-        return [(event.after, event.reason) for event in told]
+        events = [event for event in self.events if isinstance(event, ModeChanged)]
+        return [(event.after, event.reason) for event in events]
 
 
 def aboard(**times_s: float) -> Failsafe:
@@ -382,13 +382,13 @@ def test_a_vehicle_that_is_not_armed_flies_nothing() -> None:
 def test_without_a_newer_horizon_it_coasts_and_says_nothing() -> None:
     """Coasting begins after a second; the next horizon is flown at once."""
     hand = tracking()
-    told = hand.changes
+    changes = hand.changes
     hand.fly(1.1)
     assert (hand.mode, hand.takes, hand.speed) == (Mode.COAST, True, SPEED)
     hand.plan()
     hand.fly(0.02)
     assert hand.mode is Mode.TRACK
-    assert hand.changes == told
+    assert hand.changes == changes
 
 
 def test_an_exhausted_horizon_is_braked_along_and_the_next_is_taken_at_once() -> None:

@@ -97,10 +97,10 @@ def test_a_vehicle_that_lands_is_not_said_to_be_held_by_its_fence() -> None:
         vehicle={"steady_wind_mps": [0.14, 0.0], "wind": 0.0, "land_after_s": 12.0},
         network={"uplink": "constant(0.05) & outage(10, 50)", "downlink": "constant(0.05)"},
     )
-    told = [(each.time_ns / 1e9, each.event) for each in fly(blown).events]
-    modes = [(t, event.after) for t, event in told if isinstance(event, ModeChanged)]
+    events = [(each.time_ns / 1e9, each.event) for each in fly(blown).events]
+    modes = [(t, event.after) for t, event in events if isinstance(event, ModeChanged)]
     (land_s,) = (t for t, after in modes if after == str(Mode.LAND))
-    held_s = [t for t, event in told if isinstance(event, FenceHolds)]
+    held_s = [t for t, event in events if isinstance(event, FenceHolds)]
     assert held_s
     assert max(held_s) < land_s < 40.0
 
@@ -147,8 +147,8 @@ def test_the_speed_towards_a_bound_lets_the_vehicle_stop(
     T = terms.tau_s[0] + SLOW_STEPS * flown.control.dt
     b, bound = flown.vehicle.brake_mps2, high[0] if way > 0.0 else low[0]
     places = [(bound - way * squares * b * T * T, 0.0), (0.0, 0.0)]
-    told = Fence(flown).limited([way * 99.0, 0.0], places, [99.0, 99.0])
-    assert told == pytest.approx([way * speed * b * T / terms.gain[0], 0.0])
+    limited = Fence(flown).limited([way * 99.0, 0.0], places, [99.0, 99.0])
+    assert limited == pytest.approx([way * speed * b * T / terms.gain[0], 0.0])
 
 
 def test_the_radius_is_kept_for_the_strongest_and_slowest_axis_from_where_the_vehicle_began() -> (
@@ -169,5 +169,5 @@ def test_the_radius_is_kept_for_the_strongest_and_slowest_axis_from_where_the_ve
 
 def test_the_way_back_inside_is_no_faster_than_the_fence_allows() -> None:
     flown = scenario(fence=FAR_M | {"speed_mps": 1.0, "wind_mps": 0.2})
-    told = Fence(flown).limited([0.0, 0.0], [(30.0, 0.0), (0.0, 0.0)], flown.u_max.tolist())
-    assert told == pytest.approx([-1.0, 0.0])
+    limited = Fence(flown).limited([0.0, 0.0], [(30.0, 0.0), (0.0, 0.0)], flown.u_max.tolist())
+    assert limited == pytest.approx([-1.0, 0.0])

@@ -32,8 +32,8 @@ def test_a_leap_is_told_in_metres_and_pushes_nobody() -> None:
     """The fence is 8 m wide and the jump 12 m; the vehicle brakes where it is, and hovers."""
     air = leapt()
     began = place(air)
-    (told,) = air.of(StateLeapt)
-    assert told.by_m == pytest.approx(LEAP, abs=0.1)
+    (event,) = air.of(StateLeapt)
+    assert event.by_m == pytest.approx(LEAP, abs=0.1)
     air.run(6.0)
     assert air.mode is Mode.HOVER
     # Braking from 1.5 m/s at 2 m/s², plus dead time and inertia.

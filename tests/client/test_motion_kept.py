@@ -289,8 +289,8 @@ def test_a_client_that_is_asked_to_end_flies_its_motion_first() -> None:
     for _ in range(20):
         flight.step()
     latest_ns = flight.client.leave(now_ns=flight.now_ns)
-    (told,) = (each for each in flight.client.events() if isinstance(each, Leaving))
-    assert told.vehicles == (4,)
+    (event,) = (each for each in flight.client.events() if isinstance(each, Leaving))
+    assert event.vehicles == (4,)
     flight.send_motion(flight.client._pilot.step, np.zeros(flight.terms.axes))
     rows = finish(flight)
     assert flight.last - 1 <= rows["step"][-1] <= flight.last

@@ -94,16 +94,16 @@ def test_what_ten_sigmas_of_noise_cannot_explain_is_a_leap(
         for far, leaps in ((least - 1e-9, False), (least + 1e-9, True)):
             known = Navigation(scenario(sensor=NOISE))
             x = {"position": [3.0, 3.0], "velocity": [0.0, 0.0]}
-            told = []
+            leapt = []
             for step in range(3):
                 measured = Measurement(step * DT_NS, **deepcopy(x))
                 known.advance([measured], np.zeros(2), now_ns=step * DT_NS)
-                told.append(known.leapt)
+                leapt.append(known.leapt)
                 before = x["velocity"][axis]
                 x[number][axis] += sign * far if step == 0 else 0.0
                 # The position moves with the mean velocity of the step.
                 x["position"][axis] += 0.025 * (before + x["velocity"][axis])
-            assert told == [False, leaps, False]
+            assert leapt == [False, leaps, False]
 
 
 # -- the sensor --------------------------------------------------------------------------------
@@ -136,9 +136,9 @@ def test_a_delay_counts_whole_steps_rounded_up() -> None:
 def test_noise_and_bias_are_those_that_were_asked_for() -> None:
     bias = {"position_bias_m": [0.3, -0.1], "velocity_bias_mps": [0.0, 0.2]}
     sensor = Sensor(scenario(sensor=NOISE | bias), np.random.default_rng(1))
-    told = np.array([sensor.measure(np.ones((2, 2)))[1:] for _ in range(20_000)])
-    np.testing.assert_allclose(told.mean(axis=0), [[1.3, 0.9], [1.0, 1.2]], atol=0.002)
-    np.testing.assert_allclose(told.std(axis=0), [[0.02] * 2, [0.05] * 2], rtol=0.02)
+    measured = np.array([sensor.measure(np.ones((2, 2)))[1:] for _ in range(20_000)])
+    np.testing.assert_allclose(measured.mean(axis=0), [[1.3, 0.9], [1.0, 1.2]], atol=0.002)
+    np.testing.assert_allclose(measured.std(axis=0), [[0.02] * 2, [0.05] * 2], rtol=0.02)
 
 
 @pytest.mark.parametrize(

@@ -70,11 +70,11 @@ def horizon(step: int) -> Horizon:
 
 def test_what_is_news_is_told_at_once() -> None:
     """The first step of a session, another horizon in force or mode, and a step after sleep."""
-    told, compensator = reporter()
+    reports, compensator = reporter()
 
     def due(step: int, session: int = 7, mode: Mode = Mode.READY, silence: int = 0) -> bool:
         compensator.choose(step, STILL, ZERO, ZERO)
-        return told.is_due(session, step, mode, STILL, ZERO, silence)
+        return reports.is_due(session, step, mode, STILL, ZERO, silence)
 
     assert due(0)
     assert not due(1)
@@ -91,12 +91,12 @@ def test_what_is_news_is_told_at_once() -> None:
 
 def test_a_vehicle_that_waits_for_a_horizon_reports_again() -> None:
     """At once, after about a round trip, and then at doubled intervals."""
-    told, compensator = reporter("periodic(80)")
+    reports, compensator = reporter("periodic(80)")
 
     def sent(steps: range, mode: Mode) -> Iterator[int]:
         for step in steps:
             compensator.choose(step, STILL, ZERO, ZERO)
-            if told.is_due(7, step, mode, STILL, [0.0, 0.0], 0):
+            if reports.is_due(7, step, mode, STILL, [0.0, 0.0], 0):
                 yield step
 
     assert list(sent(range(10), Mode.SYNC)) == [0]

@@ -216,8 +216,8 @@ def test_what_others_say_that_moves_nothing_is_no_command(message: Message) -> N
 def test_set_points_of_others_are_noticed_within_a_second() -> None:
     air, message = tracking(), velocity()
     say(air, message, 0.5)
-    (told,) = air.of(SecondCommander)
-    assert (told.system, told.component, told.said) == (255, 190, message.get_type())
+    (event,) = air.of(SecondCommander)
+    assert (event.system, event.component, event.said) == (255, 190, message.get_type())
     assert modes(air)[-1] == ("brake", str(Reason.RIVAL))
     say(air, message, 3.0)
     assert modes(air)[-1] == ("land", str(Reason.RIVAL))

@@ -376,8 +376,8 @@ def test_another_publisher_is_reported_by_name_and_stops_the_robot() -> None:
     for _ in range(30):
         say("/cmd_vel", b"")
         ground.run(0.1)
-    (told,) = ground.of(SecondPublisher)
-    assert told.nodes == ("/robot/teleop",)
+    (event,) = ground.of(SecondPublisher)
+    assert event.nodes == ("/robot/teleop",)
     assert ground.mode is Mode.LAND
 
 

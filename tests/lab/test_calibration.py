@@ -342,5 +342,5 @@ def test_a_trajectory_edited_between_two_calls_is_refused(
 def test_an_impossible_search_is_refused(
     argv: list[str], said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    told = refused_before_writing(["calibrate", "paper", *argv], tmp_path, capsys)
-    assert told == f"calibrate: {said}"
+    message = refused_before_writing(["calibrate", "paper", *argv], tmp_path, capsys)
+    assert message == f"calibrate: {said}"

@@ -857,5 +857,5 @@ def test_ctrl_c_ends_a_search_in_order_and_the_same_command_goes_on(
 def test_an_impossible_comparison_is_refused(
     argv: list[str], said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    told = refused_before_writing(["compare", *argv], tmp_path, capsys)
-    assert told == f"compare: {said}"
+    message = refused_before_writing(["compare", *argv], tmp_path, capsys)
+    assert message == f"compare: {said}"

@@ -185,8 +185,8 @@ def test_a_fault_is_told_with_the_input_that_makes_it_again(
     assert command.attack("calm", tmp_path, 1, 1050, 60.0).startswith("calm: 1050 inputs in ")
     with pytest.raises(ZeroDivisionError):
         command.attack("fussy", tmp_path, 1, 10_000, 60.0)
-    told, payload = capsys.readouterr().err.split(": ")
-    assert told.startswith("fussy, seed 1, input ")
+    fault, payload = capsys.readouterr().err.split(": ")
+    assert fault.startswith("fussy, seed 1, input ")
     with pytest.raises(ZeroDivisionError):
         Fussy(tmp_path)(bytes.fromhex(payload))
 

@@ -466,11 +466,11 @@ def test_other_sizes_of_step_and_files_for_programs(
     monkeypatch.chdir(tmp_path)
     argv = ["simulated", "--speed", "0.5", "--also", "0.2", "--repeats", "1", "--hold", "3"]
     assert command.main(identify, [*argv, "--vehicle.wind", "0"], "identify") == 0
-    told = json.loads(Path("identified/identified.json").read_text())
-    assert (told["ended"], told["hold_s"]) == ("", 3.0)
-    assert [each["steps"] for each in told["axes"]] == [4, 4]
-    assert [each["step_mps"] for each in told["sizes"][0]] == [0.2, 0.2]
-    assert all(off < 0.001 for cost in told["costs"] for off in cost.values())
+    content = json.loads(Path("identified/identified.json").read_text())
+    assert (content["ended"], content["hold_s"]) == ("", 3.0)
+    assert [each["steps"] for each in content["axes"]] == [4, 4]
+    assert [each["step_mps"] for each in content["sizes"][0]] == [0.2, 0.2]
+    assert all(off < 0.001 for cost in content["costs"] for off in cost.values())
     rows = list(csv.DictReader(Path("identified/measured.csv").read_text().splitlines()))
     assert set(rows[0]) == {"time_s", "p_x", "p_y", "v_x", "v_y", "u_x", "u_y"}
     assert {float(row["u_x"]) for row in rows if 3.1 < float(row["time_s"]) < 6.0} == {0.5}

@@ -33,7 +33,7 @@ def test_a_vehicle_found_at_rest_in_a_zone_is_told_and_led_out() -> None:
     """The server restarted with a zone across motions; all vehicles leave it."""
     flight = Lives(swap(), deaths=[Death(6.0, 0.5, zones="box(-2, 2, -2, 2)")])
     flight.fly(45.0)
-    told = [event for _, _, event in flight.events if isinstance(event, InZone)]
-    assert told
+    events = [event for _, _, event in flight.events if isinstance(event, InZone)]
+    assert events
     assert flight.inside_s(zone_texts.parse("box(-2, 2, -2, 2)", 2), since_s=40.0) == 0.0
     assert flight.least_m() > 0.5

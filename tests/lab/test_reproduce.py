@@ -308,5 +308,5 @@ def test_a_folder_of_another_reproduction_is_refused(
 def test_an_impossible_reproduction_is_refused(
     argv: list[str], said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    told = refused_before_writing(["reproduce", *argv], tmp_path, capsys)
-    assert told == f"reproduce: {said}"
+    message = refused_before_writing(["reproduce", *argv], tmp_path, capsys)
+    assert message == f"reproduce: {said}"

@@ -226,8 +226,8 @@ def journal_of(plan: Sweep, folder: Path) -> StudyJournal[Runs]:
 @pytest.mark.parametrize(("said", "other"), OTHERS.items(), ids=OTHERS)
 def test_a_sweep_with_other_settings_is_refused(said: str, other: Sweep, tmp_path: Path) -> None:
     journal_of(ONE, tmp_path).close()
-    told = refusal(lambda: journal_of(other, tmp_path))
-    assert told == f"{tmp_path}: {said} to continue there; or choose another --out"
+    message = refusal(lambda: journal_of(other, tmp_path))
+    assert message == f"{tmp_path}: {said} to continue there; or choose another --out"
 
 
 def test_another_version_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -239,8 +239,8 @@ def test_another_version_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 
 
 def test_two_sweeps_do_not_write_to_one_folder(tmp_path: Path) -> None:
-    told = pytest.raises(OSError, match="another command is writing it")
-    with closing(journal_of(ONE, tmp_path)), told:
+    refused = pytest.raises(OSError, match="another command is writing it")
+    with closing(journal_of(ONE, tmp_path)), refused:
         journal_of(ONE, tmp_path)
     journal_of(ONE, tmp_path).close()
 
@@ -326,8 +326,8 @@ def test_a_trajectory_edited_between_two_sweeps_is_refused(tmp_path: Path) -> No
     journal_of(plan, tmp_path / "out").close()
     journal_of(plan, tmp_path / "out").close()
     paths[1].write_text(OTHER_LINE)
-    told = refusal(lambda: journal_of(Sweep("mine", scenario, [grid], 3), tmp_path / "out"))
-    assert told.startswith(f"{tmp_path}/out: files.{paths[1]}: got '")
+    message = refusal(lambda: journal_of(Sweep("mine", scenario, [grid], 3), tmp_path / "out"))
+    assert message.startswith(f"{tmp_path}/out: files.{paths[1]}: got '")
 
 
 def test_a_task_flies_along_its_file_as_it_was_when_the_sweep_began(tmp_path: Path) -> None:
@@ -485,8 +485,8 @@ def test_ctrl_c_ends_a_sweep_in_one_line_and_keeps_what_was_done(tmp_path: Path)
 def test_an_impossible_sweep_is_refused(
     argv: list[str], line: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    told = refused_before_writing(["sweep", "paper", *argv], tmp_path, capsys)
-    assert told == f"sweep: {line}"
+    message = refused_before_writing(["sweep", "paper", *argv], tmp_path, capsys)
+    assert message == f"sweep: {line}"
 
 
 # -- a cluster -----------------------------------------------------------------------------------

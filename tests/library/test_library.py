@@ -90,10 +90,10 @@ assert "numpy" not in sys.modules and "asyncio" not in sys.modules
 skytether.Flight, skytether.fly, skytether.Scenario, skytether.World, skytether.ConfigError
 print(*(name for name in {HEAVY} if name in sys.modules))
 """
-    told = subprocess.run(
+    printed = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, check=True
     ).stdout
-    assert told == "\n"
+    assert printed == "\n"
 
 
 # -- scenarios -------------------------------------------------------------------------------
@@ -137,10 +137,10 @@ def test_a_scenario_made_by_hand_is_checked() -> None:
 def test_a_reference_that_nothing_can_follow_is_told() -> None:
     keys = {"reference.radius_m": 8.0, "reference.period_s": 10.0, "model.gain": 0.5}
     flight = fly("demo", **SHORT, **keys)
-    (told,) = (each for each in flight.events if isinstance(each.event, ReferenceTooFast))
-    assert told.event == ReferenceTooFast(at_s=0.0, speed_mps=told.event.speed_mps, most_mps=0.8)
-    assert told.event.speed_mps == pytest.approx(2.0 * np.pi * 8.0 / 10.0)
-    assert told.time_ns < 10**9
+    (event,) = (each for each in flight.events if isinstance(each.event, ReferenceTooFast))
+    assert event.event == ReferenceTooFast(at_s=0.0, speed_mps=event.event.speed_mps, most_mps=0.8)
+    assert event.event.speed_mps == pytest.approx(2.0 * np.pi * 8.0 / 10.0)
+    assert event.time_ns < 10**9
     assert flight.summary.too_fast == 1.0
     usual = fly("demo", **SHORT)
     assert usual.summary.too_fast == 0.0

@@ -41,11 +41,11 @@ def test_a_server_that_is_asked_to_end_waits_until_its_vehicles_rest() -> None:
     before = [int(lives.track(number)[1].shape[0]) for number in lives.bodies]
     assert all(before)
     lives.end_server()
-    (told,) = (each for _, _, each in lives.events if isinstance(each, Leaving))
-    assert set(told.vehicles) == {1, 2, 3, 4}
+    (event,) = (each for _, _, each in lives.events if isinstance(each, Leaving))
+    assert set(event.vehicles) == {1, 2, 3, 4}
     while lives.running and lives.world.now_ns < 30 * SECOND_NS:
         lives.run(lives.world.now_ns / SECOND_NS + 0.05)
-    assert lives.world.now_ns < (7.0 + told.most_s) * SECOND_NS
+    assert lives.world.now_ns < (7.0 + event.most_s) * SECOND_NS
     for each in lives.bodies.values():
         assert np.hypot(*each.plant.state()[:, 1]) < 0.3  # wind
     for (client, sink), *_ in lives._lives.values():
@@ -100,23 +100,23 @@ def test_a_step_that_begins_too_late_is_told_and_the_latest_is_a_figure() -> Non
         lives.world.at(seconds_to_ns(at_s), partial(lives.world.freeze, "client 2"))
         lives.world.at(seconds_to_ns(at_s + length_s), partial(lives.world.thaw, "client 2"))
     lives.run(10.0)
-    (told,) = (each for _, _, each in lives.events if isinstance(each, SteppedLate))
-    assert told.vehicle == 2
-    assert stalls_s[6.0] - FOUR.control.dt < told.late_s <= stalls_s[6.0]
+    (event,) = (each for _, _, each in lives.events if isinstance(each, SteppedLate))
+    assert event.vehicle == 2
+    assert stalls_s[6.0] - FOUR.control.dt < event.late_s <= stalls_s[6.0]
     late_ms = {
         number: life[-1].client.vehicle_figures()["late_ms"]
         for number, life in lives._lives.items()
     }
-    assert late_ms == {1: 0.0, 2: 1000.0 * told.late_s, 3: 0.0, 4: 0.0}
+    assert late_ms == {1: 0.0, 2: 1000.0 * event.late_s, 3: 0.0, 4: 0.0}
 
 
 def test_the_server_tells_how_near_a_flight_came_to_what_the_theorem_assumes() -> None:
     lives = Lives(FOUR)
     lives.run(40.0)
-    told = lives.server_runs[-1].figures()
-    assert 0.05 < told["margins"]["tube"] < 1.0
-    assert 0.1 < told["margins"]["join"] <= 1.0
-    assert not {"left_motion", "joined_late", "left_tube"} & told["counts"].keys()
+    figures = lives.server_runs[-1].figures()
+    assert 0.05 < figures["margins"]["tube"] < 1.0
+    assert 0.1 < figures["margins"]["join"] <= 1.0
+    assert not {"left_motion", "joined_late", "left_tube"} & figures["counts"].keys()
 
 
 @pytest.mark.parametrize("at_s", [5.0, 6.0])

@@ -394,21 +394,21 @@ def test_nobody_plans_while_a_vehicle_flies_what_another_server_sent() -> None:
 def test_a_trajectory_is_taken_aboard_until_it_is_too_late() -> None:
     terms = scenario(2).terms()
     knots = np.zeros((2, 1, 2), np.float32)
-    told = Trajectory(1, 1, 100, 0, 10, SPACING, knots)
-    assert Compensator(terms).offer(told, 100 + terms.join, 90)
+    trajectory = Trajectory(1, 1, 100, 0, 10, SPACING, knots)
+    assert Compensator(terms).offer(trajectory, 100 + terms.join, 90)
     with pytest.raises(ProtocolError) as refused:
-        Compensator(terms).offer(told, 101 + terms.join, 90)
+        Compensator(terms).offer(trajectory, 101 + terms.join, 90)
     assert refused.value.reason is Drop.TOO_LATE
 
 
 def test_a_motion_is_not_taken_aboard_before_its_first_knot() -> None:
     """The motion in force has not come that far yet. A copy arrives in time."""
     aboard, knots = Compensator(scenario(2).terms()), np.zeros((2, 1, 2), np.float32)
-    told = Trajectory(1, 1, 100, 0, 10, SPACING, knots)
+    trajectory = Trajectory(1, 1, 100, 0, 10, SPACING, knots)
     with pytest.raises(ProtocolError) as refused:
-        aboard.offer(told, 99, 90)
+        aboard.offer(trajectory, 99, 90)
     assert refused.value.reason is Drop.TOO_EARLY
-    assert aboard.offer(told, 100, 90)
+    assert aboard.offer(trajectory, 100, 90)
 
 
 def test_motions_that_may_be_flown_include_the_one_to_be_sent_now() -> None:
@@ -501,15 +501,15 @@ def test_who_gets_a_motion_again_says_so_again() -> None:
     compensator = Compensator(terms)
     reporter = Reporter(terms, "deviation(9)", compensator)
     knots = np.zeros((2, 1, 2), np.float32)
-    told = Trajectory(1, 1, 100, 0, 10, SPACING, knots)
+    trajectory = Trajectory(1, 1, 100, 0, 10, SPACING, knots)
     still, flown = np.zeros((2, 2)), np.zeros(2)
 
     def is_due(step: int) -> bool:
         return reporter.is_due(1, step, Mode.TRACK, still, flown, 0)
 
-    assert compensator.offer(told, 102, 90)
+    assert compensator.offer(trajectory, 102, 90)
     assert [is_due(step) for step in (102, 103)] == [True, False]
-    assert not compensator.offer(told, 104, 90)
+    assert not compensator.offer(trajectory, 104, 90)
     assert [is_due(step) for step in (104, 105)] == [True, False]
 
 
@@ -1128,10 +1128,10 @@ def test_the_fleet_tells_how_near_they_came(
     file = tmp_path / "s.json"
     shape = ["--reference.shape", "swap(4)", "--duration", "8", "--settle", "1"]
     assert main(["fleet", "swap", "--virtual", *shape, "--json", str(file)]) == 0
-    told = json.loads(file.read_text())
-    assert told["vehicles"] == 4
-    assert told["separation_m"] == 0.5
-    assert 0.5 < told["least_separation_m"] < 8.0
+    content = json.loads(file.read_text())
+    assert content["vehicles"] == 4
+    assert content["separation_m"] == 0.5
+    assert 0.5 < content["least_separation_m"] < 8.0
     capsys.readouterr()
     assert main(["fleet", "swap", "--virtual", "--vehicles", "5", *shape]) == 2
     assert "--vehicles: got 5, expected 4 on this mission" in capsys.readouterr().err

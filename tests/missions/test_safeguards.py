@@ -326,9 +326,9 @@ def test_a_vehicle_that_rests_in_a_zone_leaves_it_the_shortest_way() -> None:
     end = planned(made).position[-1]
     assert zone.clearance(end[None]).min() >= clearances(scenario(2)).tube_m
     assert 4.2 < end[0] < 5.5
-    (told,) = made.events
-    assert isinstance(told, InZone)
-    number, name = told.vehicle, told.zone
+    (event,) = made.events
+    assert isinstance(event, InZone)
+    number, name = event.vehicle, event.zone
     assert (number, name.startswith("box")) == (1, True)
 
 

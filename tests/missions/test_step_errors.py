@@ -363,9 +363,9 @@ def test_the_figures_tell_what_a_clock_costs(monkeypatch: pytest.MonkeyPatch) ->
     lives = Lives(mission("swap", "swap(2)", 30.0))
     for at_s, at_least_m, at_most_m in ((2.0, 0.0, 0.01), (7.0, 0.2, 0.7)):
         lives.run(at_s)
-        told = lives.server_runs[-1].figures()["by_vehicle"]["1"]
-        assert 440.0 < told["clock_bound_ms"] < 500.0
-        assert at_least_m <= told["clock_m"] <= at_most_m
+        figures = lives.server_runs[-1].figures()["by_vehicle"]["1"]
+        assert 440.0 < figures["clock_bound_ms"] < 500.0
+        assert at_least_m <= figures["clock_m"] <= at_most_m
     assert "clock_steps" not in lives.server_runs[-1].figures()["counts"]
 
 
@@ -432,8 +432,8 @@ def test_with_the_time_of_day_at_both_ends_clocks_are_known(
     known = msgspec.structs.replace(SWAP, duration=40.0, simulation=simulation)
     flown = flight.fly(known, vehicles=8)
     assert separation_m(flown) > 0.5
-    told = flown.figures["server"]["by_vehicle"]
-    assert max(each["clock_bound_ms"] for each in told.values()) < 25.0
+    figures = flown.figures["server"]["by_vehicle"]
+    assert max(each["clock_bound_ms"] for each in figures.values()) < 25.0
     assert not [each for each in flown.events if isinstance(each.event, ClockContradicted)]
 
 

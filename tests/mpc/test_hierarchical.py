@@ -361,12 +361,12 @@ def test_inputs_that_are_never_flown_are_not_compared(flown: int) -> None:
         return plan(planner, rows, np.array([41]), found).figures[0]
 
     before = figures()
-    for told in (found.held, found.inputs_if_lost):
-        told[..., flown:] += 0.5
+    for inputs in (found.held, found.inputs_if_lost):
+        inputs[..., flown:] += 0.5
     assert figures() == before
     if flown:
-        for told in (found.held, found.inputs_if_lost):
-            told[..., 0] += 0.5
+        for inputs in (found.held, found.inputs_if_lost):
+            inputs[..., 0] += 0.5
         assert figures()["cost_gap"] != before["cost_gap"]
         assert figures()["expected_gap"] != before["expected_gap"]
 

@@ -224,9 +224,9 @@ def test_a_wrong_direction_is_told_in_a_line(
     flags: list[str], said: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["netem", "--bind", "127.0.0.1:0", *flags]) == 2
-    told = capsys.readouterr().err
-    assert said in told
-    assert told.count("\n") == 1
+    output = capsys.readouterr().err
+    assert said in output
+    assert output.count("\n") == 1
 
 
 def directed(**given: Any) -> Scenario:

@@ -408,8 +408,8 @@ def test_a_packet_that_comes_back_ends_after_a_number_of_laps(count: int) -> Non
     netems = [make_proxy() for _ in range(count)]
     assert circulate(*netems, packets=1) == count * (LAPS_MAX + 1)
     assert circulate(*netems, packets=100) <= 101 * count * (LAPS_MAX + 1)
-    told = [event for netem in netems for event in netem.events() if isinstance(event, Returned)]
-    assert told == [Returned(times=LAPS_MAX + 1)]
+    events = [event for netem in netems for event in netem.events() if isinstance(event, Returned)]
+    assert events == [Returned(times=LAPS_MAX + 1)]
 
 
 def test_if_laps_were_not_counted_a_packet_would_circulate_for_ever(
@@ -461,8 +461,8 @@ def test_a_datagram_longer_than_the_mtu_passes_neither_way() -> None:
     hear(proxy, bytes(1301), SERVER, socket)
     assert proxy.outbox() == []
     assert (proxy.downlink.counts.oversized, proxy.uplink.counts.oversized) == (1, 1)
-    told = [event for event in proxy.events() if isinstance(event, TooLong)]
-    assert told == [TooLong(size=1301, most=1300)]
+    events = [event for event in proxy.events() if isinstance(event, TooLong)]
+    assert events == [TooLong(size=1301, most=1300)]
     assert pass_on(proxy, b"?", ALICE) == socket
 
 
@@ -475,8 +475,8 @@ def test_a_server_that_is_gone_is_told_each_time_it_goes() -> None:
             proxy.undelivered(socket, "Connection refused")
         ask(proxy, ALICE)
     proxy.undelivered(0, "Connection refused")
-    told = [event for event in proxy.events() if isinstance(event, Unreachable)]
-    assert told == [Unreachable(host=SERVER[0], port=SERVER[1], reason="Connection refused")] * 2
+    events = [event for event in proxy.events() if isinstance(event, Unreachable)]
+    assert events == [Unreachable(host=SERVER[0], port=SERVER[1], reason="Connection refused")] * 2
     links = proxy.downlink.counts, proxy.uplink.counts
     assert [(counts.forwarded, counts.undelivered) for counts in links] == [(3, 6), (2, 1)]
 

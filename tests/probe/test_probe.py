@@ -90,10 +90,10 @@ def test_an_answer_tells_of_as_many_arrivals_as_have_room(
     answer = ProbeAnswer(bytes(SESSION_BYTES), 3, sent_ns, 7, 7 + len(arrivals), tuple(arrivals))
     payload = encode(answer, size)
     assert len(payload) <= size
-    told = decode(payload)
-    assert isinstance(told, ProbeAnswer)
-    assert len(told.arrivals) >= min(2, len(arrivals))
-    assert told == answer._replace(arrivals=answer.arrivals[: len(told.arrivals)])
+    decoded = decode(payload)
+    assert isinstance(decoded, ProbeAnswer)
+    assert len(decoded.arrivals) >= min(2, len(arrivals))
+    assert decoded == answer._replace(arrivals=answer.arrivals[: len(decoded.arrivals)])
 
 
 @given(st.binary(max_size=200))
@@ -272,9 +272,9 @@ def test_every_packet_is_measured_as_it_was() -> None:
     )
     measured, truth = measure(uplink, downlink, seconds=80.0, clock=Clock(HOUR_NS))
     found = outcome(measured, "x", secure=False)
-    told = rows(measured, found.clocks)
+    measured_rows = rows(measured, found.clocks)
     for direction in (UPLINK, DOWNLINK):
-        mine, real = in_order(told, direction), in_order(truth, direction)
+        mine, real = in_order(measured_rows, direction), in_order(truth, direction)
         came, passed = mine[~mine["lost"]], real[~real["lost"] & (real["bytes"] >= 399)]
         # netem writes packets as they leave, including those that are sent after the last probe.
         passed = passed[: len(came)]
@@ -300,11 +300,13 @@ def test_gaps_of_a_picture_are_the_trains() -> None:
 def test_a_clock_that_drifts_is_found_out() -> None:
     """Offset and drift of the listener's clock are within the stated uncertainty."""
     measured, _ = measure("gamma(0.05, 0.06, 0.005)", "gamma(0.05, 0.06, 0.005)", seconds=200.0)
-    told = outcome(measured, "x", secure=False).figures
-    assert told.drift_doubt_ppm < 5.0
-    assert told.drift_ppm == pytest.approx(CLOCK.drift_ppb / 1e3, abs=4.0 * told.drift_doubt_ppm)
-    assert told.offset_s == pytest.approx(3600.0, abs=told.offset_doubt_s)
-    assert told.offset_doubt_s == pytest.approx(told.round_trip_least_s / 2)
+    figures = outcome(measured, "x", secure=False).figures
+    assert figures.drift_doubt_ppm < 5.0
+    assert figures.drift_ppm == pytest.approx(
+        CLOCK.drift_ppb / 1e3, abs=4.0 * figures.drift_doubt_ppm
+    )
+    assert figures.offset_s == pytest.approx(3600.0, abs=figures.offset_doubt_s)
+    assert figures.offset_doubt_s == pytest.approx(figures.round_trip_least_s / 2)
 
 
 @pytest.mark.parametrize(
@@ -317,8 +319,8 @@ def test_a_clock_that_drifts_is_found_out() -> None:
 def test_a_finite_rate_is_found_where_there_is_one(text: str, rate: float | None) -> None:
     """Within three per cent and the stated uncertainty; none where there is none."""
     measured, _ = measure(text, text, seconds=60.0)
-    told = outcome(measured, "x", secure=False).figures
-    for way in (told.uplink, told.downlink):
+    figures = outcome(measured, "x", secure=False).figures
+    for way in (figures.uplink, figures.downlink):
         assert (way.rate_bytes_per_s is None) == (rate is None)
         if rate and way.rate_bytes_per_s and way.rate_low and way.rate_high:
             assert way.rate_bytes_per_s == pytest.approx(rate, rel=0.03)
@@ -330,8 +332,8 @@ def test_a_finite_rate_is_found_where_there_is_one(text: str, rate: float | None
 def test_the_models_are_those_of_the_network_and_fly() -> None:
     text = "gamma(0.02, 0.06, 0.03) & gilbert_elliott(0.2, 0.5)"
     measured, _ = measure(text, text, seconds=60.0)
-    told = outcome(measured, "x", secure=False).figures
-    for way in (told.uplink, told.downlink):
+    figures = outcome(measured, "x", secure=False).figures
+    for way in (figures.uplink, figures.downlink):
         assert models(way.text) == models(text)
         assert way.rate_bytes_per_s is None
         made = impairments(way.text)
@@ -542,12 +544,12 @@ def test_a_path_over_loopback_is_measured_and_sealed(
         flags = [each for pair in zip(out, files, strict=True) for each in pair]
         limits = ["--duration", "2", "--rate", "50"]
         assert main(["probe", address, *limits, *flags, *keys]) == 0
-    told = json.loads((tmp_path / "p.json").read_text())
-    assert told["secure"]
+    content = json.loads((tmp_path / "p.json").read_text())
+    assert content["secure"]
     for name in ("uplink", "downlink"):
-        assert 0 < told[name]["came"] <= told[name]["sent"]
+        assert 0 < content[name]["came"] <= content[name]["sent"]
         with (tmp_path / "probed" / f"{name}.csv").open() as file_of_rows:
-            assert len(list(csv.DictReader(file_of_rows))) == told[name]["sent"]
+            assert len(list(csv.DictReader(file_of_rows))) == content[name]["sent"]
     assert (tmp_path / "p.png").stat().st_size > 10_000
     assert len(parse((tmp_path / "p.rows").read_bytes())) > 0
     printed = capsys.readouterr().out
@@ -578,13 +580,13 @@ def test_two_paths_are_probed_at_once_of_which_one_is_cut(
         paths = [f"127.0.0.1={listener}", f"127.0.0.2={netem}"]
         flags = [each for path in paths for each in ("--path", path)]
         assert main(["probe", *flags, *limits, *out, *keys]) == 0
-    told = json.loads((tmp_path / "json").read_text())
-    assert [each["listener"] for each in told["paths"]] == paths
-    assert [each["secure"] for each in told["paths"]] == [sealed, sealed]
-    first, second = told["outages"]["paths"]
+    content = json.loads((tmp_path / "json").read_text())
+    assert [each["listener"] for each in content["paths"]] == paths
+    assert [each["secure"] for each in content["paths"]] == [sealed, sealed]
+    first, second = content["outages"]["paths"]
     assert second["share"] > 0.2
-    assert told["outages"]["product"] == pytest.approx(first["share"] * second["share"])
-    assert told["outages"]["common"]["share"] <= first["share"]
+    assert content["outages"]["product"] == pytest.approx(first["share"] * second["share"])
+    assert content["outages"]["common"]["share"] <= first["share"]
     flown = reading.load(str(tmp_path / "out" / "paths.toml"))
     assert flown.on_path(1).downlink.loss > 0.2
     assert set(parse((tmp_path / "record").read_bytes())["path"].tolist()) == {0, 1}

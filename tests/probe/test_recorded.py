@@ -49,16 +49,16 @@ def test_the_documented_command_reads_a_log(
     monkeypatch.chdir(tmp_path)
     flags = [word for word in line.split() if word not in {"--figure", "ping.png"}]
     assert main([*flags, "--record", "it.rows"]) == 0
-    told = json.loads((tmp_path / "ping.json").read_text())
-    assert told["log"] == "round trips"
-    assert told["uplink"] == told["downlink"]
-    way = told["uplink"]
+    content = json.loads((tmp_path / "ping.json").read_text())
+    assert content["log"] == "round trips"
+    assert content["uplink"] == content["downlink"]
+    way = content["uplink"]
     kept = np.delete(DELAYS_MS, np.array(lost) - 1) / 2e3
     assert (way["sent"], way["came"], way["bursts"]) == (400, 379, 2)
     assert way["mean_s"] == pytest.approx(kept.mean(), abs=1e-6)
     assert way["quantiles_s"]["1"] == pytest.approx(kept.max(), abs=1e-6)
-    assert told["round_trip_mean_s"] == pytest.approx(2.0 * kept.mean(), abs=1e-6)
-    assert told["every_s"] == pytest.approx(0.2, abs=1e-6)
+    assert content["round_trip_mean_s"] == pytest.approx(2.0 * kept.mean(), abs=1e-6)
+    assert content["every_s"] == pytest.approx(0.2, abs=1e-6)
     assert "gilbert_elliott" in impairments(way["text"]).parts[1][0]
     for name in ("uplink", "downlink"):
         file = tmp_path / "probed" / f"{name}.csv"
@@ -76,9 +76,9 @@ def docs() -> str:
 def test_a_table_of_one_way_is_taken_as_it_is() -> None:
     rows = "".join(f"{n / 10},{0.02 + n / 1e4},0\n" for n in range(100))
     measured = recorded.of_log(recorded_in(File("it", f"time_s,delay_s,lost\n{rows}".encode())))
-    told = outcome(measured, "it", secure=False, log="one way").figures
-    assert told.uplink.mean_s == pytest.approx(0.02 + 49.5e-4)
-    assert told.round_trip_least_s == pytest.approx(0.04)
+    figures = outcome(measured, "it", secure=False, log="one way").figures
+    assert figures.uplink.mean_s == pytest.approx(0.02 + 49.5e-4)
+    assert figures.round_trip_least_s == pytest.approx(0.04)
 
 
 def test_rows_that_a_table_lacks_are_said(
@@ -100,9 +100,9 @@ def test_logs_of_two_modems_are_compared_at_the_same_times(
     (tmp_path / "second.log").write_text(log([*range(106, 116), 300], begin_s=1.7e9 + 10.0))
     monkeypatch.chdir(tmp_path)
     assert main([*line.split(), "--json", "it.json", "--record", "it.rows"]) == 0
-    told = json.loads((tmp_path / "it.json").read_text())
-    assert [each["listener"] for each in told["paths"]] == ["first.log", "second.log"]
-    found = told["outages"]
+    content = json.loads((tmp_path / "it.json").read_text())
+    assert [each["listener"] for each in content["paths"]] == ["first.log", "second.log"]
+    found = content["outages"]
     assert found["seconds"] == pytest.approx(70.0, abs=0.5)
     assert [each["count"] for each in (*found["paths"], found["common"])] == [1, 1, 1]
     assert [each["longest_s"] for each in found["paths"]] == pytest.approx([2.0, 2.0], abs=0.01)

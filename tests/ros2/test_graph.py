@@ -49,6 +49,6 @@ def test_any_text_is_a_token_or_none(text: str) -> None:
 
 def test_an_attachment_has_33_bytes_in_the_order_of_rmw_zenoh() -> None:
     publisher = graph.identity(TALKER.publisher(SESSION))
-    told = graph.attachment(2, 3, publisher)
-    assert told == bytes([2, *[0] * 7, 3, *[0] * 7, 16]) + publisher
-    assert len(told) == 33
+    attachment = graph.attachment(2, 3, publisher)
+    assert attachment == bytes([2, *[0] * 7, 3, *[0] * 7, 16]) + publisher
+    assert len(attachment) == 33

@@ -271,9 +271,9 @@ def test_a_mistake_costs_its_vehicle_the_plan_and_nobody_else(
     """Logged once; the vehicle flies its plan to the end and hovers, the other one flies on."""
     plug(tmp_path, failing(method, wrong))
     flight = fly(scenario("chase"), vehicles=2)
-    (told,) = faults(flight)
-    assert told.startswith(f"the scheme chase: {said}")
-    assert told.endswith("; a vehicle for which it fails is sent no plan at that step")
+    (fault,) = faults(flight)
+    assert fault.startswith(f"the scheme chase: {said}")
+    assert fault.endswith("; a vehicle for which it fails is sent no plan at that step")
     assert flight.figures["server"]["counts"]["scheme_errors"] > 10
     last = {int(row["vehicle"]): row["mode"] for row in flight.client}
     assert [mode == Mode.TRACK for mode in last.values()].count(True) == 1

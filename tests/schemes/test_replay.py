@@ -70,8 +70,8 @@ def see(
 ) -> bool:
     """Receive an observation; the vehicle flies by the rule unless `flown` is given."""
     u = by_rule(replay, step, in_force) if flown is None else flown
-    told = Mode.TRACK, takes, state, u
-    return replay.observe(0, Observation(1, 1, step, in_force, since, 0, 0, *told))
+    observed = Mode.TRACK, takes, state, u
+    return replay.observe(0, Observation(1, 1, step, in_force, since, 0, 0, *observed))
 
 
 def by_rule(replay: Replay, step: int, in_force: int) -> Array:

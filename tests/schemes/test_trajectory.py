@@ -169,8 +169,8 @@ def test_along_a_spline_the_models_velocity_is_the_splines() -> None:
 def test_input_is_that_of_the_spline_and_feedback_less_the_disturbance() -> None:
     """The sum is clamped to the bound."""
     held = guide(scenario(), (1.0, 0.5))
-    u, told = follow(held, 4, 1.2, 0.5, 1.1, 0.4, 0.03, 0.0)
-    assert told == pytest.approx(0.5)
+    u, without_feedback = follow(held, 4, 1.2, 0.5, 1.1, 0.4, 0.03, 0.0)
+    assert without_feedback == pytest.approx(0.5)
     assert u == pytest.approx(0.5 + 2.0 * 0.1 + 0.5 * 0.1 - 0.03)
     u, _ = follow(held, 4, 9.0, 0.5, 1.1, 0.4, 0.0, 0.0)
     assert u == held.bound
@@ -180,10 +180,10 @@ def test_input_moves_from_the_one_before_by_the_regulator_s_share() -> None:
     """By the same share of the difference at each step: 1 - λ."""
     held = guide(scenario(), (1.0, 0.5), lag=0.75)
     state = (1.2, 0.5, 1.1, 0.4, 0.03)
-    wanted, told = regulated(held, 4, *state)
+    wanted, without_feedback = regulated(held, 4, *state)
     assert wanted == pytest.approx(0.5 + 2.0 * 0.1 + 0.5 * 0.1 - 0.03)
     u, same = follow(held, 4, *state, -0.4)
-    assert same == told
+    assert same == without_feedback
     assert u == pytest.approx(-0.4 + 0.25 * (wanted + 0.4))
     assert follow(held, 4, *state, wanted)[0] == pytest.approx(wanted)
 
@@ -209,9 +209,11 @@ def test_behind_its_last_stage_it_is_braked_along_and_comes_to_rest() -> None:
     held = guide(
         scenario(), (0.0, 1.0), length=20, last=1.0, speed=1.0, brake=0.1, gain_p=0.0, gain_v=0.0
     )
-    told = [follow(held, stage, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)[1] for stage in range(18, 33)]
-    np.testing.assert_allclose(told[:2], 1.0)
-    np.testing.assert_allclose(told[2:], np.maximum(1.0 - 0.1 * np.arange(1, 14), 0.0), atol=1e-12)
+    inputs = [follow(held, stage, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)[1] for stage in range(18, 33)]
+    np.testing.assert_allclose(inputs[:2], 1.0)
+    np.testing.assert_allclose(
+        inputs[2:], np.maximum(1.0 - 0.1 * np.arange(1, 14), 0.0), atol=1e-12
+    )
     lead, before = (0.0, 0.0), 0
     for stage in (5, 20, 21, 200, 201):
         lead, before = guided_to(held, before, stage, *lead), stage
@@ -294,9 +296,9 @@ def test_target_is_sent_as_one_knot() -> None:
     server = Server(scenario())
     server.observe(7)
     server.at(8, (1.0, 0.5), (-2.0, -0.25), send=True)
-    told = server.found.splines
-    assert told.number.tolist() == [1]
-    np.testing.assert_array_equal(told.knots[0, :, :2], [[1.0, 0.5], [-2.0, -0.25]])
+    splines = server.found.splines
+    assert splines.number.tolist() == [1]
+    np.testing.assert_array_equal(splines.knots[0, :, :2], [[1.0, 0.5], [-2.0, -0.25]])
 
 
 def test_a_target_faster_than_the_bound_is_sent_at_the_bound() -> None:
@@ -482,7 +484,7 @@ FAST = {
 
 @pytest.mark.long
 def test_bounds_shape_what_is_told() -> None:
-    plans, told = (
+    plans, unplanned = (
         [
             flight.summary
             for flight in skytether.fly_batch(
@@ -491,9 +493,9 @@ def test_bounds_shape_what_is_told() -> None:
         ]
         for scheme, trigger in (("committed", "cost_gap(2)"), ("trajectory", "expected_gap(0.05)"))
     )
-    error, error_told = (np.mean([run.rmse_xy for run in runs]) for runs in (plans, told))
-    assert error_told < 1.1 * error
-    assert sum(run.uplink_packets for run in told) < sum(run.uplink_packets for run in plans)
+    error, error_unplanned = (np.mean([run.rmse_xy for run in runs]) for runs in (plans, unplanned))
+    assert error_unplanned < 1.1 * error
+    assert sum(run.uplink_packets for run in unplanned) < sum(run.uplink_packets for run in plans)
 
 
 @pytest.mark.parametrize("horizon", [1, 8])
@@ -587,8 +589,8 @@ def test_whatever_finite_knots_say_what_is_flown_is_within_the_bound(
     flown = scenario()
     terms = flown.terms()
     compensator = Compensator(terms, regulator(flown))
-    told = message(10, np.array([knots, knots], np.float32), age=1, spacing=spacing)
-    compensator.offer(told, 10, 9)
+    trajectory = message(10, np.array([knots, knots], np.float32), age=1, spacing=spacing)
+    compensator.offer(trajectory, 10, 9)
     state = np.array([[0.0, 0.0], [1.0, -1.0]])
     inputs, _ = compensator.choose(10 + stage, state, np.zeros(2), np.array(terms.u_max))
     assert all(math.isfinite(u) for u in inputs)

@@ -394,9 +394,9 @@ def test_a_point_that_is_not_moved_any_more_rests_where_it_was_moved_to() -> Non
 
 
 def test_a_point_whose_velocity_is_told_goes_on() -> None:
-    told = point(np.array([1.0, 0.0]))
-    np.testing.assert_allclose(told.at(100 * SECOND_NS)[:, 0], [0.0, 0.0])
-    np.testing.assert_allclose(told.at(160 * SECOND_NS), [[60.0, 1.0], [0.0, 0.0]])
+    moved = point(np.array([1.0, 0.0]))
+    np.testing.assert_allclose(moved.at(100 * SECOND_NS)[:, 0], [0.0, 0.0])
+    np.testing.assert_allclose(moved.at(160 * SECOND_NS), [[60.0, 1.0], [0.0, 0.0]])
 
 
 def test_a_leap_makes_no_velocity_that_no_vehicle_can_fly() -> None:

@@ -43,7 +43,7 @@ def seen(step: int, changed: dict[str, Any] | None = None) -> Observation:
     angle, pace = 0.25 * step * TERMS.dt_s, 0.5
     x = 2.0 * np.array([[np.cos(angle), 0.0], [np.sin(angle), 0.0]])
     x[:, 1] = -pace * np.sin(angle), pace * np.cos(angle)
-    told = Observation(
+    observation = Observation(
         1,
         1,
         step,
@@ -56,7 +56,7 @@ def seen(step: int, changed: dict[str, Any] | None = None) -> Observation:
         state=x,
         input=np.zeros(2),
     )
-    return told._replace(**changed or {})
+    return observation._replace(**changed or {})
 
 
 def judge(plausibility: Plausibility, told: Observation, *, row: int = 0, step: int = -1) -> Belief:
@@ -131,8 +131,8 @@ def test_a_vehicle_is_known_by_its_own_observations(row: int) -> None:
 
 
 def elsewhere(step: int, metres: float = 100.0) -> Observation:
-    told = seen(step)
-    return told._replace(state=told.state + np.array([[metres, 0.0], [0.0, 0.0]]))
+    observation = seen(step)
+    return observation._replace(state=observation.state + np.array([[metres, 0.0], [0.0, 0.0]]))
 
 
 B, J = Belief.BELIEVED, Belief.JUMP
@@ -174,7 +174,9 @@ def test_a_row_of_observations_is_judged_by_those_before(
     heard: list[tuple[Observation, Belief]],
 ) -> None:
     plausibility = after()
-    assert [judge(plausibility, told) for told, _ in heard] == [verdict for _, verdict in heard]
+    assert [judge(plausibility, observation) for observation, _ in heard] == [
+        verdict for _, verdict in heard
+    ]
 
 
 def test_a_forgotten_vehicle_is_believed_whatever_it_says_first() -> None:
@@ -205,15 +207,17 @@ def test_whatever_a_vehicle_may_say_is_believed(
     rng, plausibility, step = np.random.default_rng(seed), Plausibility(TERMS, 1), 100
     for gap in gaps:
         step += gap
-        told = seen(step)
-        told = told._replace(state=told.state + rng.normal(scale=0.1, size=(2, 2)))
+        observation = seen(step)
+        observation = observation._replace(
+            state=observation.state + rng.normal(scale=0.1, size=(2, 2))
+        )
         up_ns, down_ns = (int(rng.integers(jitter_ms * MS + 1)) for _ in range(2))
         # The server's clock drifts against the vehicle's.
         drift_ns = (step - 100) * DT_NS * drift_ppm // 1_000_000
         forward_ns = BEGAN_NS + drift_ns + down_ns
         backward_us = stamp_us(up_ns - BEGAN_NS - drift_ns)
         backward_ns = stamped_ns(backward_us, near_ns=-forward_ns)
-        assert plausibility.judge(0, told, forward_ns, backward_ns) == Belief.BELIEVED
+        assert plausibility.judge(0, observation, forward_ns, backward_ns) == Belief.BELIEVED
 
 
 @pytest.mark.parametrize("first", [True, False])
@@ -240,20 +244,23 @@ def test_how_far_a_vehicle_may_have_come_grows_with_the_time_since_the_last_one(
             assert judge(plausibility, seen(100, still)) == Belief.BELIEVED
             # A change of velocity moves the vehicle by the mean velocity.
             gone = share * np.array([p + 0.5 * v * steps * TERMS.dt_s, v])
-            told = seen(100 + steps, {"state": np.array([gone, [0.0, 0.0]])})
-            assert judge(plausibility, told) == verdict
+            observation = seen(100 + steps, {"state": np.array([gone, [0.0, 0.0]])})
+            assert judge(plausibility, observation) == verdict
 
 
 @quick
 @given(st.integers(0, 3), st.integers(0, 63))
 def test_a_flipped_bit_of_a_state_is_a_jump_or_as_good_as_none(number: int, bit: int) -> None:
-    told = seen(105)
-    state = told.state.copy()
+    observation = seen(105)
+    state = observation.state.copy()
     state.view(np.uint64).ravel()[number] ^= np.uint64(1 << bit)
-    if np.isfinite(state).all() and judge(after(), told._replace(state=state)) == Belief.BELIEVED:
-        assert np.abs(state - told.state).max() < 5.0
+    if (
+        np.isfinite(state).all()
+        and judge(after(), observation._replace(state=state)) == Belief.BELIEVED
+    ):
+        assert np.abs(state - observation.state).max() < 5.0
     else:
-        assert np.abs(state - told.state).max() > 0.9 or not np.isfinite(state).all()
+        assert np.abs(state - observation.state).max() > 0.9 or not np.isfinite(state).all()
 
 
 # -- in flight -------------------------------------------------------------------------------------

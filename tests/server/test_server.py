@@ -232,13 +232,13 @@ def test_of_the_refusals_that_were_told_the_newest_64_are_remembered() -> None:
 def test_strangers_are_told_of_every_ten_seconds_with_their_number() -> None:
     gate = SecureGate(Keyring("keys", {}), entropy=stream(2, "gate").bytes)
     server = Server(scenario(), boot_id=1, entropy=stream(1, "entropy").bytes, gate=gate)
-    told = []
+    events = []
     for second in range(25):
         peer = (f"stranger {second}", second)
         server.receive(Datagram(b"?", peer), now_ns=(100 + second) * SECOND_NS)
-        told += [(second, event) for event in server.events()]
+        events += [(second, event) for event in server.events()]
     assert server.dropped == {Drop.NOT_SEALED: 25}
-    assert told == [
+    assert events == [
         (
             second,
             Unauthenticated(
@@ -491,8 +491,8 @@ def test_more_than_five_ticks_missed_within_a_second_make_a_degraded_server(
         found += [tick] * grid.degraded
     assert found == degraded
     assert grid.missed == sum(late.values())
-    told = [Degraded(degraded=True), Degraded(degraded=False)] if degraded else []
-    assert list(events) == told
+    expected = [Degraded(degraded=True), Degraded(degraded=False)] if degraded else []
+    assert list(events) == expected
 
 
 def test_a_wake_before_its_time_does_nothing() -> None:
@@ -619,8 +619,8 @@ def test_whoever_was_welcomed_last_and_comes_in_time_gets_a_row(
                     numbers[vehicle, boot_id] = session.number
                     due[vehicle] = (boot_id, now_ns + WELCOME_NS)
             case "observe" if (vehicle, boot_id) in numbers:
-                told = 0, -1, 0, 0, 0, Mode.READY, 1, np.zeros((2, 2)), np.zeros(2)
-                said = Observation(vehicle, numbers[vehicle, boot_id], *told)
+                rest = 0, -1, 0, 0, 0, Mode.READY, 1, np.zeros((2, 2)), np.zeros(2)
+                said = Observation(vehicle, numbers[vehicle, boot_id], *rest)
                 granted, refused = due.get(vehicle, (-1, 0)), ""
                 try:
                     (sessions.find(said) or sessions.begin(said, now_ns)).heard_ns = now_ns
@@ -697,8 +697,8 @@ def with_session(capacity: int = 1) -> tuple[Sessions, Session]:
     ear = partial(Hearing, SILENCE_NS, 50 * MILLISECOND_NS, None)
     sessions = Sessions(capacity, stream(1, "entropy").bytes, SILENCE_NS, ear, NO_LEADS)
     welcomed = sessions.welcome(hello(1, 5), HERE, LINE, DAY_NS)
-    told = 0, -1, 0, 0, 0, Mode.READY, 1, np.zeros((2, 2)), np.zeros(2)
-    session = sessions.begin(Observation(1, welcomed.number, *told), DAY_NS)
+    rest = 0, -1, 0, 0, 0, Mode.READY, 1, np.zeros((2, 2)), np.zeros(2)
+    session = sessions.begin(Observation(1, welcomed.number, *rest), DAY_NS)
     session.heard_ns = DAY_NS
     return sessions, session
 

@@ -203,9 +203,9 @@ def test_steps_at_which_a_policy_wants_to_send(text: str, lives: list[Life]) -> 
 def test_periodic_counts_for_each_vehicle_by_itself() -> None:
     trigger = trigger_of("periodic(4)", capacity=6)
     rows = np.array([5, 2])
-    told = figures_of(2)
-    told["step"] = [3, 5]
-    trigger.sent(rows, told)
+    figures = figures_of(2)
+    figures["step"] = [3, 5]
+    trigger.sent(rows, figures)
     verdict = trigger.test(facing(rows, figures_of(2, step=7)))
     assert verdict.event.tolist() == [True, False]
 

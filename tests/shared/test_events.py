@@ -191,9 +191,9 @@ def test_lines_that_nobody_reads_are_counted_for_whoever_reads_later(
         assert [pipe.read(4096) for _ in range(filled)] == [b"before"] * filled
         assert [pipe.read(4096)[24:] for _ in range(10)] == [line[24:]] * 10
         os.set_blocking(pipe.fileno(), False)
-        while (told := pipe.read(4096)) is None:  # until the thread notices that the pipe is empty
+        while (piece := pipe.read(4096)) is None:  # until the thread notices that the pipe is empty
             log.each_second()
-        assert told.decode()[24:] == "client: … and 990 more lines\n"
+        assert piece.decode()[24:] == "client: … and 990 more lines\n"
         log.close()
 
 
@@ -229,13 +229,13 @@ def test_an_endpoints_events_are_told_as_far_as_they_can_be_read(
         log.say(Plaintext(local=True))
     log.close()
     lines = capfd.readouterr().out.splitlines()
-    told = [line for line in lines if "flying" in line]
-    assert [line[24:] for line in told[:5]] == [
+    flying = [line for line in lines if "flying" in line]
+    assert [line[24:] for line in flying[:5]] == [
         f"client: vehicle {number}: session open, flying" for number in range(5)
     ]
     left_out = [int(found[1].replace(" ", "")) for found in re.finditer(OMITTED, "\n".join(lines))]
-    assert len(told) + sum(left_out) == 4318
-    assert len(told) < 500  # five per second of the test
+    assert len(flying) + sum(left_out) == 4318
+    assert len(flying) < 500  # five per second of the test
     assert sum("PLAINTEXT" in line for line in lines) == 9
 
 

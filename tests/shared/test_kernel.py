@@ -275,10 +275,10 @@ def test_kernels_are_compiled_by_another_process_beside(tmp_path: Path, helpers:
         text=True,
         check=True,
     )
-    read, told = ("1 1", 2) if helpers == "helped" else ("0 1", 1)
+    read, calls = ("1 1", 2) if helpers == "helped" else ("0 1", 1)
     *hits, compiled = done.stdout.splitlines()
     assert sorted(hits) == ["0 1", read]
-    assert compiled == f"['caller:double', 'second:double'] {told} []"
+    assert compiled == f"['caller:double', 'second:double'] {calls} []"
 
 
 @pytest.mark.long

@@ -73,8 +73,8 @@ def test_one_axis_in_numbers_steps_as_all_in_arrays(step: Callable[..., Any]) ->
     x, u = rng.normal(size=(3, 2)), rng.normal(size=3)
     for _ in range(100):
         singles = [
-            step(axis, *state, float(told))
-            for axis, state, told in zip(model.axes(), x.tolist(), u, strict=True)
+            step(axis, *state, float(u_axis))
+            for axis, state, u_axis in zip(model.axes(), x.tolist(), u, strict=True)
         ]
         x = model.step(x, u)
         np.testing.assert_array_equal(singles, x)

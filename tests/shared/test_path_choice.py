@@ -418,40 +418,40 @@ def test_any_other_packet_reports_what_was_overtaken_as_well() -> None:
 
 def test_packets_that_are_always_overtaken_are_soon_awaited_for_longer() -> None:
     ends, late_by_ns = Ends(), SECOND_NS // 2
-    told = []
+    judged = []
     for _ in range(30):
         ends.exchange(2)
         late = overtaken(ends)
         ends.now_ns += late_by_ns
-        told.append(bool(ends.far.looks(ends.now_ns)))
+        judged.append(bool(ends.far.looks(ends.now_ns)))
         ends.arrive(ends.far, late, 0)
         ends.send(on=BOTH, back=True)
-    assert told[0]
-    assert not any(told[10:])
+    assert judged[0]
+    assert not any(judged[10:])
 
 
 def test_a_path_that_dies_and_one_that_is_well_again_are_told_once() -> None:
     """One over which nothing has arrived yet is not, nor one that loses single packets."""
     ends = Ends()
     assert ends.near.turned(ends.now_ns) == []
-    told = []
+    outages = []
 
     def go_on(steps: int) -> None:
         for _ in range(steps):
             ends.now_ns += STEP_NS
             ends.send(on=BOTH)
             ends.send(on=BOTH, back=True)
-            told.extend(ends.near.turned(ends.now_ns))
+            outages.extend(ends.near.turned(ends.now_ns))
 
     go_on(40)
     ends.dead = {1}
     go_on(1)
     ends.dead = set()
     go_on(20)
-    assert told == []
+    assert outages == []
     ends.dead = {1}
     go_on(40)
-    assert told == [(1, True)]
+    assert outages == [(1, True)]
     ends.dead = set()
     go_on(40)
-    assert told == [(1, True), (1, False)]
+    assert outages == [(1, True), (1, False)]

@@ -603,9 +603,9 @@ UNFLYABLE = {
 @pytest.mark.parametrize(("body", "said"), UNFLYABLE.values(), ids=UNFLYABLE)
 def test_a_reference_that_cannot_be_flown_is_refused(body: str, said: str, tmp_path: Path) -> None:
     plug(tmp_path, f"@reference\ndef mine(scenario):\n    {body}\n")
-    told = refusal(lambda: scenario(reference={"shape": "mine"}))
+    message = refusal(lambda: scenario(reference={"shape": "mine"}))
     expected = f"expected a trajectory that can be flown ({said})"
-    assert told == f"test: reference.shape: got 'mine', {expected}"
+    assert message == f"test: reference.shape: got 'mine', {expected}"
 
 
 @pytest.mark.parametrize(

@@ -198,8 +198,8 @@ def test_a_trajectory_and_what_is_told_of_it_are_read_as_they_were_written(
 @given(st.floats(-1e6, 1e6))
 def test_a_state_is_told_as_float32(position: float) -> None:
     """To 6 digits and a half: 0.06 mm at a kilometre."""
-    told = OBSERVATION._replace(state=np.full((2, 2), position))
-    read = decode(encode(told), TERMS)
+    observation = OBSERVATION._replace(state=np.full((2, 2), position))
+    read = decode(encode(observation), TERMS)
     assert isinstance(read, Observation)
     assert read.state.dtype == np.float64
     assert np.abs(read.state - position).max() <= max(abs(position) * 2**-24, 1e-45)
@@ -245,10 +245,10 @@ def test_the_delays_of_both_directions_come_out(
     welcomed_ns = sent_ns - slept_ns
     server_ns = stamped_ns(stamp_us(sent_ns), welcomed_ns + slept_ns + back_ns - late_ns)
     assert 0 <= sent_ns - server_ns < MICROSECOND
-    told = stamp_us(received_ns - began_ns - server_ns + MICROSECOND - 1)
+    stamp = stamp_us(received_ns - began_ns - server_ns + MICROSECOND - 1)
     observed_ns = received_ns + held_ns
     forward_ns = observed_ns + late_ns - (observed_ns - began_ns)
-    backward_ns = stamped_ns(told, -forward_ns)
+    backward_ns = stamped_ns(stamp, -forward_ns)
     assert 0 <= backward_ns + began_ns - back_ns < 2 * MICROSECOND
 
 
@@ -256,11 +256,11 @@ def test_the_delays_of_both_directions_come_out(
 def test_what_was_held_back_for_long_makes_a_round_trip_of_less_than_nothing(minutes: int) -> None:
     """Or a time that contradicts its own stamp, which is implausible."""
     delay_ns, held_ns, began_ns = 440 * 10**6, minutes * 60 * 10**9, 10**15
-    told = stamp_us(delay_ns - began_ns)
+    stamp = stamp_us(delay_ns - began_ns)
     in_time_ns, late_ns = began_ns + delay_ns, began_ns + delay_ns + held_ns
-    backward_ns = stamped_ns(told, -late_ns)
+    backward_ns = stamped_ns(stamp, -late_ns)
     assert backward_ns + in_time_ns < -35 * 60 * 10**9
-    assert stamped_ns(told, -in_time_ns) + in_time_ns == 2 * delay_ns
+    assert stamped_ns(stamp, -in_time_ns) + in_time_ns == 2 * delay_ns
 
 
 @pytest.mark.parametrize("axes", [2, 3])

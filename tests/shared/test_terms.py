@@ -177,10 +177,10 @@ def test_ends_that_differ_in_a_term_are_refused_and_told(key: str, tmp_path: Pat
     ours, theirs = differing(key, tmp_path)
     server, client = shake_hands(ours, theirs)
     (difference,) = differences(ours.terms(), theirs.terms())
-    for told in (" ".join(map(str, server.events())), " ".join(map(str, client.events()))):
-        assert key in told
-        assert difference.here in told
-        assert difference.there in told
+    for text in (" ".join(map(str, server.events())), " ".join(map(str, client.events()))):
+        assert key in text
+        assert difference.here in text
+        assert difference.there in text
     assert client.failure is not None
     assert client.finished
     assert not server.figures()["vehicles"]

@@ -558,9 +558,9 @@ async def test_a_process_tells_its_readers_while_it_is_driven(tmp_path: Path) ->
         assert scenario.uplink.loss == loss
     assert isinstance(before, Opened)
     columns = columns_of(before.parts["netem"])
-    told = [table(frame.rows, columns) for frame in seen.frames["netem"] if type(frame) is Rows]
-    np.testing.assert_array_equal(np.concatenate(told), parse(sink.getvalue()))
-    assert np.concatenate(told)["number"].tolist() == [25, 77, 100]
+    tables = [table(frame.rows, columns) for frame in seen.frames["netem"] if type(frame) is Rows]
+    np.testing.assert_array_equal(np.concatenate(tables), parse(sink.getvalue()))
+    assert np.concatenate(tables)["number"].tolist() == [25, 77, 100]
     assert seen.losses() == [0.25, 1.0]
 
 
@@ -689,9 +689,9 @@ def test_flights_of_a_batch_keep_no_plans() -> None:
 def test_events_are_of_the_log_and_limited() -> None:
     from skytether.shell.processes.log import Log
 
-    told: list[Event] = []
-    with closing(Log("netem", "json", told.append)) as log:
+    events: list[Event] = []
+    with closing(Log("netem", "json", events.append)) as log:
         for _ in range(100):
             log.hear(Degraded(degraded=True))
         log.each_second(last=True)
-    assert [type(event).__name__ for event in told] == ["Degraded"] * 5 + ["Omitted"]
+    assert [type(event).__name__ for event in events] == ["Degraded"] * 5 + ["Omitted"]

@@ -256,9 +256,9 @@ def test_on_a_full_disk_the_file_is_removed_if_the_endpoint_waits_for_it(
         endpoint.wanted.append(b"new")
         kept.look()
         work(kept)
-    told = kept.news()
-    assert told
-    assert told.removed is waits
+    news = kept.news()
+    assert news
+    assert news.removed is waits
     assert path.exists() is not waits
     assert endpoint.told_nothing == waits
     work(kept)

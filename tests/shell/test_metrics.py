@@ -110,17 +110,17 @@ def numbers(process: str, told: dict[str, Any]) -> dict[tuple[str, tuple[str, ..
 @pytest.mark.parametrize("process", ["server", "netem", "client", "alone"])
 def test_every_figure_is_told_or_left_out(process: str, figures: dict[str, dict[str, Any]]) -> None:
     kind = "client" if process == "alone" else process
-    told, unknown = families(kind, figures[process])
+    exported, unknown = families(kind, figures[process])
     assert unknown == []
     known = {(PREFIX + each.name).removesuffix("_total") for each in TABLES[kind]}
-    assert {family.name for family in told} <= known
+    assert {family.name for family in exported} <= known
     assert {name for name, _ in numbers(kind, figures[process])} <= names()
 
 
 def test_a_figure_that_is_not_known_is_found(figures: dict[str, dict[str, Any]]) -> None:
-    told = figures["server"] | {"brand": {"new": 1}}
-    assert families("server", told)[1] == ["brand/new"]
-    assert numbers("server", told)["skytether_unmapped_figures", ()] == 1.0
+    changed = figures["server"] | {"brand": {"new": 1}}
+    assert families("server", changed)[1] == ["brand/new"]
+    assert numbers("server", changed)["skytether_unmapped_figures", ()] == 1.0
     assert numbers("server", figures["server"])["skytether_unmapped_figures", ()] == 0.0
 
 
@@ -144,8 +144,8 @@ def test_no_line_of_the_tables_is_about_nothing(figures: dict[str, dict[str, Any
     for process, table in TABLES.items():
         paths = [path for path, _ in flat(figures[process])]
         for figure in [*(each.figure for each in table), *LEFT_OUT[process]]:
-            told = [path for path in paths if matched(figure, path) is not None]
-            assert told or figure in rare, (process, figure)
+            matching = [path for path in paths if matched(figure, path) is not None]
+            assert matching or figure in rare, (process, figure)
 
 
 def test_names_follow_prometheus() -> None:
@@ -164,23 +164,25 @@ def test_names_follow_prometheus() -> None:
 
 def test_numbers_are_the_figures_in_base_units(figures: dict[str, dict[str, Any]]) -> None:
     server, netem = figures["server"], figures["netem"]
-    told = numbers("server.2", server)
-    assert told["skytether_info", ("process=server.2", "scenario=demo")] == 1.0
-    assert told["skytether_step_seconds", ()] == 0.05
-    assert told["skytether_server_steps_total", ()] == server["counts"]["steps"] > 100
-    assert told["skytether_server_dropped_datagrams_total", ("reason=forged",)] == 3.0
-    bound_s = told["skytether_server_vehicle_clock_bound_seconds", ("vehicle=1",)]
+    values = numbers("server.2", server)
+    assert values["skytether_info", ("process=server.2", "scenario=demo")] == 1.0
+    assert values["skytether_step_seconds", ()] == 0.05
+    assert values["skytether_server_steps_total", ()] == server["counts"]["steps"] > 100
+    assert values["skytether_server_dropped_datagrams_total", ("reason=forged",)] == 3.0
+    bound_s = values["skytether_server_vehicle_clock_bound_seconds", ("vehicle=1",)]
     assert bound_s == pytest.approx(server["by_vehicle"]["1"]["clock_bound_ms"] / 1e3)
-    ticks = told["skytether_server_tick_seconds_bucket", ("le=+Inf",)]
-    assert ticks == told["skytether_server_tick_seconds_count", ()] > 100
-    assert told["skytether_feed_dropped_readers_total", ()] == 1.0
-    told = numbers("netem", netem)
+    ticks = values["skytether_server_tick_seconds_bucket", ("le=+Inf",)]
+    assert ticks == values["skytether_server_tick_seconds_count", ()] > 100
+    assert values["skytether_feed_dropped_readers_total", ()] == 1.0
+    values = numbers("netem", netem)
     up = ("direction=uplink",)
-    assert told["skytether_netem_bytes_total", up] == netem["uplink"]["bytes"]
-    late = told["skytether_netem_lateness_seconds", (*up, "quantile=0.99")]
+    assert values["skytether_netem_bytes_total", up] == netem["uplink"]["bytes"]
+    late = values["skytether_netem_lateness_seconds", (*up, "quantile=0.99")]
     assert late == netem["uplink"]["error_ms_p99"] / 1e3
     buckets = [
-        value for (name, _), value in told.items() if name == "skytether_netem_delay_seconds_bucket"
+        value
+        for (name, _), value in values.items()
+        if name == "skytether_netem_delay_seconds_bucket"
     ]
     half = len(buckets) // 2
     assert buckets[:half] == sorted(buckets[:half])
@@ -188,53 +190,53 @@ def test_numbers_are_the_figures_in_base_units(figures: dict[str, dict[str, Any]
 
 
 def test_the_server_that_leads_is_a_label(figures: dict[str, dict[str, Any]]) -> None:
-    told = numbers("client", figures["client"])
-    assert told["skytether_client_leadership", ("vehicle=1",)] == 0.0
-    assert told["skytether_client_leader", ("server=netem 1:0", "vehicle=1")] == 1.0
+    values = numbers("client", figures["client"])
+    assert values["skytether_client_leadership", ("vehicle=1",)] == 0.0
+    assert values["skytether_client_leader", ("server=netem 1:0", "vehicle=1")] == 1.0
 
 
 @pytest.mark.parametrize("end", ["server", "client"])
 def test_paths_have_numbers_of_their_own(end: str, figures: dict[str, dict[str, Any]]) -> None:
-    told, paths = numbers(end, figures[end]), figures[end]["by_vehicle"]["1"]["paths"]
+    values, paths = numbers(end, figures[end]), figures[end]["by_vehicle"]["1"]["paths"]
     for path, each in enumerate(paths, start=1):
         of_path = f"path={path}", "vehicle=1"
-        assert told[f"skytether_{end}_path_packets_total", of_path] == each["packets"] > 10
-        assert told[f"skytether_{end}_path_bytes_total", of_path] == each["bytes"]
-        assert told[f"skytether_{end}_path_loss_ratio", of_path] == each["loss"]
-        assert told[f"skytether_{end}_path_failure_ratio", of_path] == each["failure"]
-        assert told[f"skytether_{end}_path_later_copies_total", of_path] == each["copies"]
-        acknowledged_s = told[f"skytether_{end}_path_acknowledgement_seconds", of_path]
+        assert values[f"skytether_{end}_path_packets_total", of_path] == each["packets"] > 10
+        assert values[f"skytether_{end}_path_bytes_total", of_path] == each["bytes"]
+        assert values[f"skytether_{end}_path_loss_ratio", of_path] == each["loss"]
+        assert values[f"skytether_{end}_path_failure_ratio", of_path] == each["failure"]
+        assert values[f"skytether_{end}_path_later_copies_total", of_path] == each["copies"]
+        acknowledged_s = values[f"skytether_{end}_path_acknowledgement_seconds", of_path]
         assert acknowledged_s == pytest.approx(each["delay_ms"] / 1e3)
-    with_paths = {labels for name, labels in told if "_path_" in name}
+    with_paths = {labels for name, labels in values if "_path_" in name}
     assert with_paths == {("path=1", "vehicle=1"), ("path=2", "vehicle=1")}
 
 
 def test_a_path_without_an_acknowledgement_has_no_time_of_one() -> None:
-    told = numbers("server", {"by_vehicle": {"1": {"paths": [{"packets": 3, "delay_ms": None}]}}})
+    values = numbers("server", {"by_vehicle": {"1": {"paths": [{"packets": 3, "delay_ms": None}]}}})
     of_path = "path=1", "vehicle=1"
-    assert told["skytether_server_path_packets_total", of_path] == 3.0
-    assert ("skytether_server_path_acknowledgement_seconds", of_path) not in told
+    assert values["skytether_server_path_packets_total", of_path] == 3.0
+    assert ("skytether_server_path_acknowledgement_seconds", of_path) not in values
 
 
 def test_a_vehicle_is_in_one_mode(figures: dict[str, dict[str, Any]]) -> None:
     for process in ("client", "alone"):
-        told = numbers("client", figures[process])
+        values = numbers("client", figures[process])
         modes = {
             labels[0].removeprefix("mode="): value
-            for (name, labels), value in told.items()
+            for (name, labels), value in values.items()
             if name == "skytether_client_mode" and labels[1] == "vehicle=0"
         }
         assert modes == {str(mode): float(mode is Mode.INIT) for mode in Mode}
-        assert told["skytether_client_horizons_total", ("vehicle=0",)] == 1.0
-        assert told["skytether_client_missed_steps_total", ()] == 0.0
+        assert values["skytether_client_horizons_total", ("vehicle=0",)] == 1.0
+        assert values["skytether_client_missed_steps_total", ()] == 0.0
 
 
 def test_vehicles_told_of_are_bounded(figures: dict[str, dict[str, Any]]) -> None:
     """Twenty fly, and sixteen are reported, because Prometheus stores each for weeks."""
-    told = {
+    shown = {
         labels for name, labels in numbers("client", figures["client"]) if "client_step" in name
     }
-    assert len({label for labels in told for label in labels}) == VEHICLES_SHOWN_MAX
+    assert len({label for labels in shown for label in labels}) == VEHICLES_SHOWN_MAX
 
 
 def test_figures_of_a_client_in_flight_have_ages() -> None:
@@ -249,9 +251,9 @@ def test_figures_of_a_client_in_flight_have_ages() -> None:
         patch.setattr(Client, "_fly", spied)
         flown = flight.fly(msgspec.structs.replace(DEMO, duration=8.0))
     assert "age_ms" not in seen[0]
-    ages = [-1 if "age_ms" not in told else round(told["age_ms"] * 1e6) for told in seen]
+    ages = [-1 if "age_ms" not in each else round(each["age_ms"] * 1e6) for each in seen]
     assert ages == flown.client["age_ns"].tolist()
-    plans = [round(told["plan_age_ms"]) for told in seen if "plan_age_ms" in told]
+    plans = [round(each["plan_age_ms"]) for each in seen if "plan_age_ms" in each]
     held = flown.client[flown.client["in_force"] >= 0]
     assert plans == ((held["step"] - held["in_force"]) * 50).tolist()
 
@@ -412,9 +414,9 @@ def test_a_request_that_is_too_long_is_not_answered(by_hand: Metrics, request_: 
 
 
 def test_processes_without_a_table_serve_what_every_process_has() -> None:
-    told = numbers("autopilot", {"ticks": 7, **PROCESS})
-    assert told["skytether_cpu_seconds_total", ()] == 1.5
-    assert told["skytether_unmapped_figures", ()] == 0.0
+    values = numbers("autopilot", {"ticks": 7, **PROCESS})
+    assert values["skytether_cpu_seconds_total", ()] == 1.5
+    assert values["skytether_unmapped_figures", ()] == 0.0
 
 
 def test_the_oldest_of_too_many_connections_is_closed(

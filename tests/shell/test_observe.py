@@ -60,14 +60,14 @@ def exported(flown: tuple[dict[str, set[str]], str]) -> dict[str, set[str]]:
 
 async def _flown(feeds: Path) -> tuple[dict[str, set[str]], str]:
     """Metrics of each process in flight, and the output of the documented reader of a feed."""
-    told: dict[str, Address] = {}
+    ports: dict[str, Address] = {}
     flying = asyncio.Event()
 
     def hear(process: str) -> Any:
         def on_event(line: LogLine) -> None:
             event = line.event
             if isinstance(event, Measured):
-                told[process] = event.host, event.port
+                ports[process] = event.host, event.port
             if isinstance(event, ModeChanged) and event.after == "track":
                 flying.set()
 
@@ -90,7 +90,7 @@ async def _flown(feeds: Path) -> tuple[dict[str, set[str]], str]:
         while "skytether_client_age_seconds" not in found:
             assert asyncio.get_running_loop().time() < deadline
             await asyncio.sleep(0.2)
-            for address in told.values():
+            for address in ports.values():
                 body = await asyncio.to_thread(fetched, address, "/metrics")
                 for family in text_string_to_metric_families(body):
                     for sample in family.samples:

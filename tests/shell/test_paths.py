@@ -167,9 +167,9 @@ async def test_a_path_whose_interface_is_not_there_fails_alone() -> None:
     assert {number for *_, number in client.heard} == {2}
     assert set(client.failed) == {0}
     assert shell.send_errors == len(client.failed)
-    (told,) = events
-    assert isinstance(told, PathMissing)
-    assert told.path == str(absent)
+    (event,) = events
+    assert isinstance(event, PathMissing)
+    assert event.path == str(absent)
 
 
 @virtually

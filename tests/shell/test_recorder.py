@@ -72,8 +72,8 @@ def test_a_full_disk_is_said_once_and_ends_the_command_when_all_is_done(full: Pa
 
     with pytest.raises(CommandError) as error:
         fly()
-    told = RecordIncomplete(file="record", reason="No space left on device")
-    assert flown == [told, None, 0]
+    event = RecordIncomplete(file="record", reason="No space left on device")
+    assert flown == [event, None, 0]
     assert error.value.code == 1
     assert "0 of 3 rows" in str(error.value)
 

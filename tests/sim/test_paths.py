@@ -139,7 +139,7 @@ def test_the_demo_with_two_links_flies_over_both() -> None:
 
 
 def test_both_ends_say_when_a_path_dies_and_is_well_again_and_which_it_is() -> None:
-    told = fly(packaged("demo-two-links", duration=12.0)).events
+    events = fly(packaged("demo-two-links", duration=12.0)).events
     for process, via in (
         ("client", {"netem 1:0", "netem 1/2:0"}),
         ("server", {"netem 1:1", "netem 1/2:1"}),
@@ -147,7 +147,7 @@ def test_both_ends_say_when_a_path_dies_and_is_well_again_and_which_it_is() -> N
         for kind in (PathDied, PathHealed):
             found = [
                 each.event
-                for each in told
+                for each in events
                 if isinstance(each.event, kind) and each.process == process
             ]
             assert found

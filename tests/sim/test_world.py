@@ -174,17 +174,17 @@ def test_every_event_is_told_with_its_time_and_host_before_the_end_of_its_endpoi
             super().wake(now_ns=now_ns)
             self._events.append(Flying(vehicle=len(self.log)))
 
-    told: list[tuple[int, str, Event] | str] = []
-    world = World(on_event=lambda *event: told.append(event))
+    heard: list[tuple[int, str, Event] | str] = []
+    world = World(on_event=lambda *event: heard.append(event))
     for name, wakes_ns, offset_ns in (("one", [50, 80], 0), ("two", [1060], 1000)):
         world.add(
             name,
             Talker(wakes_ns),
             clock=Clock(offset_ns),
-            on_finished=lambda name=name: told.append(f"{name} has finished"),
+            on_finished=lambda name=name: heard.append(f"{name} has finished"),
         )
     run(world)
-    assert told == [
+    assert heard == [
         (50, "one", Flying(vehicle=1)),
         (60, "two", Flying(vehicle=1)),
         "two has finished",

@@ -93,13 +93,13 @@ def test_vehicles_that_are_under_way_at_the_end_have_not_arrived(tmp_path: Path)
 
 def test_what_failed_is_told_once_for_all_vehicles(recording: Path) -> None:
     found = outcome(recording)
-    told = {text: (at_s, who) for at_s, who, text in found.happened}
-    (leads,) = (each for each in told if "leads it now" in each)
-    assert told[leads][1] == (1, 2, 3, 4)
-    (died,) = (each for each in told if "nothing arrives over path 1" in each)
-    (healed,) = (each for each in told if "path 1 (lte) is well again" in each)
-    assert told[died][1] == told[healed][1] == (1, 2)
-    assert not any("waits for" in each for each in told)
+    happened = {text: (at_s, who) for at_s, who, text in found.happened}
+    (leads,) = (each for each in happened if "leads it now" in each)
+    assert happened[leads][1] == (1, 2, 3, 4)
+    (died,) = (each for each in happened if "nothing arrives over path 1" in each)
+    (healed,) = (each for each in happened if "path 1 (lte) is well again" in each)
+    assert happened[died][1] == happened[healed][1] == (1, 2)
+    assert not any("waits for" in each for each in happened)
     spans = found.dead_paths[1]
     assert [(who, pytest.approx(end_s - begin_s)) for who, begin_s, end_s in spans] == [
         (1, HEALED_S - DIED_S),

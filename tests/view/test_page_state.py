@@ -99,8 +99,8 @@ def test_the_curves_of_a_vehicle_are_its_record() -> None:
     np.testing.assert_array_equal(curves.threshold[here], planned["threshold"])
     aged = flown["age_ns"] >= 0
     np.testing.assert_array_equal(curves.age_s[here][aged], flown["age_ns"][aged] / SECOND_NS)
-    told = summarise(shown.scenario, "demo", client, server)
-    assert track.sent == (told.uplink_above, told.uplink_due)
+    summary = summarise(shown.scenario, "demo", client, server)
+    assert track.sent == (summary.uplink_above, summary.uplink_due)
     assert sum(track.sent) == server["event"].sum()
     text = unescape(re.sub("<[^>]*>", " ", shown_of(shown.state, 1, shown.now_ns)))
     found = re.search(r"plans sent\D*(\d+)\D*(\d+)", text)
@@ -321,9 +321,9 @@ def turned(key: str, before: object, after: object) -> Changed:
     ],
 )
 def test_a_change_is_told_by_what_differs(key: str, before: Any, after: Any, said: str) -> None:
-    told = changes.in_words(turned(key, before, after))
-    assert said.lower() in told.lower()
-    assert len(told) < 60
+    text = changes.in_words(turned(key, before, after))
+    assert said.lower() in text.lower()
+    assert len(text) < 60
 
 
 def changing(*told: tuple[float, str, Event]) -> State:
@@ -487,8 +487,8 @@ def test_vehicles_with_clients_of_their_own_are_all_shown() -> None:
     assert {state.link(number, now_ns).word for number in (1, 2, 3)} == {"GOOD"}
     for name, armed in (("client-1", 1), ("client-3", 0)):
         number = name.rpartition("-")[2]
-        told = {"by_vehicle": {number: {"autopilot": {"mode": name, "armed": armed}}}}
-        state.take(name, Figures(time_ns=now_ns, figures=told))
+        figures = {"by_vehicle": {number: {"autopilot": {"mode": name, "armed": armed}}}}
+        state.take(name, Figures(time_ns=now_ns, figures=figures))
     assert "client-3, disarmed" in words.figures(state, 3, now_ns)
     assert "client-1, armed" in words.figures(state, 1, now_ns)
     assert "autopilot" not in words.figures(state, 2, now_ns)
@@ -525,8 +525,8 @@ def test_figures_are_those_of_the_server_that_plans() -> None:
         if name == "server 2":
             for frame in plans:
                 state.take(name, frame)
-        told = {"by_vehicle": {"1": {"waits": waits}}}
-        state.take(name, Figures(time_ns=state.newest_ns + 1, figures=told))
+        figures = {"by_vehicle": {"1": {"waits": waits}}}
+        state.take(name, Figures(time_ns=state.newest_ns + 1, figures=figures))
     assert state.waits(1) == "the new one"
 
 

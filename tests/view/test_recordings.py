@@ -120,12 +120,12 @@ def refusal(argv: list[str], of: Any, capsys: pytest.CaptureFixture[str]) -> tup
 
 def refused(path: Path, folder: Path, capsys: pytest.CaptureFixture[str]) -> list[str]:
     tables, page = str(folder / "tables"), str(folder / "page.html")
-    told = [
+    refusals = [
         refusal([str(path), "--csv", tables], export, capsys),
         refusal([str(path), "--html", page], report, capsys),
     ]
-    assert [code for code, _ in told] == [2, 2]
-    return [line for _, line in told]
+    assert [code for code, _ in refusals] == [2, 2]
+    return [line for _, line in refusals]
 
 
 # --- Round trips.
@@ -588,16 +588,16 @@ def live(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> Iterator[tuple[Live, Feeds, list[str]]]:
     monkeypatch.setattr(recorder, "Subscriber", Feeds)
-    told: list[str] = []
+    complaints: list[str] = []
     made = Live(
         tmp_path / "live.mcap",
         {"client": tmp_path / "nobody"},
         SCENARIO,
         "demo",
         secure=False,
-        tell=lambda event: told.append(str(event)),
+        tell=lambda event: complaints.append(str(event)),
     )
-    yield made, Feeds.newest, told
+    yield made, Feeds.newest, complaints
     Feeds.newest.lost("client")
     made.finish()
 
@@ -617,7 +617,7 @@ def test_a_feed_that_begins_anew_is_recorded_once(
     live: tuple[Live, Feeds, list[str]], tmp_path: Path
 ) -> None:
     """It repeats its last frames, and none was missed."""
-    made, feeds, told = live
+    made, feeds, complaints = live
     for frame in (opened(client_columns(2)), row_at(1), row_at(2)):
         feeds.take("client", frame)
     feeds.lost("client")
@@ -626,7 +626,7 @@ def test_a_feed_that_begins_anew_is_recorded_once(
     feeds.lost("client")
     assert made.finish() is None
     assert recorded_steps(tmp_path / "live.mcap") == [1, 2, 3]
-    assert told == []
+    assert complaints == []
 
 
 def test_a_feed_that_begins_anew_would_be_recorded_twice(
@@ -644,14 +644,14 @@ def test_a_feed_that_begins_anew_would_be_recorded_twice(
 
 
 def test_a_gap_in_a_feed_is_told_once(live: tuple[Live, Feeds, list[str]], tmp_path: Path) -> None:
-    made, feeds, told = live
+    made, feeds, complaints = live
     for begin in (1, 3, 5):
         for frame in (opened(client_columns(2)), row_at(begin)):
             feeds.take("client", frame)
         feeds.lost("client")
     said = f"{tmp_path / 'live.mcap'}: the recorder could not keep up with client"
     assert made.finish() == said
-    assert told == [f"{said}: the record is incomplete, the flight goes on"]
+    assert complaints == [f"{said}: the record is incomplete, the flight goes on"]
     assert recorded_steps(tmp_path / "live.mcap") == [1, 3, 5]
 
 
@@ -668,7 +668,7 @@ def test_rows_that_never_came_are_missed_at_the_end(live: tuple[Live, Feeds, lis
 def test_a_disk_that_fills_up_costs_the_recording_alone(
     live: tuple[Live, Feeds, list[str]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    made, feeds, told = live
+    made, feeds, complaints = live
 
     def full(*_: object) -> None:
         raise OSError(28, "No space left on device")
@@ -682,7 +682,7 @@ def test_a_disk_that_fills_up_costs_the_recording_alone(
     fault_ = made.finish()
     assert fault_ is not None
     assert fault_.endswith("live.mcap: No space left on device")
-    assert len(told) == 1
+    assert len(complaints) == 1
 
 
 @pytest.mark.long
@@ -699,9 +699,9 @@ def test_a_flight_over_udp_is_recorded_from_its_first_step_on(tmp_path: Path) ->
     assert len(back.parts["netem"]) == shown["uplink_packets"] + shown["downlink_packets"]
     assert len(back.parts["plan"])
     assert msgspec.to_builtins(back.summary) == shown
-    told = [type(event).__name__ for *_, event in back.events()]
+    events = [type(event).__name__ for *_, event in back.events()]
     counted = {process for _, process, frame in back.frames if isinstance(frame, Figures)}
-    assert {"Listening", "Flying", "Finished"} <= set(told)
+    assert {"Listening", "Flying", "Finished"} <= set(events)
     assert counted == {"server", "netem", "client"}
 
 

@@ -28,8 +28,8 @@ DOCKERFILE = (ROOT / "Dockerfile").read_text()
 
 
 def argv(service: str, scenario: str) -> list[str]:
-    told = SERVICES[service]["command"]
-    named = [re.sub(r"\$\{SCENARIO:-demo\}", scenario, each) for each in told]
+    command = SERVICES[service]["command"]
+    named = [re.sub(r"\$\{SCENARIO:-demo\}", scenario, each) for each in command]
     return [re.sub(r"\$\{\w+:-(.*?)\}", r"\1", each) for each in named]
 
 

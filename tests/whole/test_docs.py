@@ -276,12 +276,12 @@ def test_the_documented_changes_are_made_in_flight(
                 assert command.main(set_keys, shlex.split(line)[2:], "set") == 0
         finally:
             flight.send_signal(signal.SIGINT)
-            _, told = flight.communicate()
+            _, output = flight.communicate()
     said = capsys.readouterr().out.splitlines()
     assert said[0] == "armed = false"
     made = [line for line in said if "from now on" in line]
     assert len(made) == 9
-    assert sorted(made) == sorted(line for line in told.splitlines() if "from now on" in line)
+    assert sorted(made) == sorted(line for line in output.splitlines() if "from now on" in line)
 
 
 @at_night_over_udp
@@ -347,9 +347,9 @@ def test_the_documented_python_runs_and_prints_what_it_says(
     for block in python_blocks(ROOT / document):
         exec(block, names)
         printed = capsys.readouterr().out.splitlines()
-        told = re.findall(r"^# → (.*)$", block, re.MULTILINE)
-        assert not told or printed == told, block
-        compared += len(told)
+        found = re.findall(r"^# → (.*)$", block, re.MULTILINE)
+        assert not found or printed == found, block
+        compared += len(found)
     assert compared
 
 

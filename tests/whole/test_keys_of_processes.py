@@ -40,8 +40,8 @@ def test_a_wrong_key_is_one_line_at_each_end(start: Callable[..., Process], tmp_
     assert server.end() == 0
     assert ended.returncode == 1
     assert len(ended.stderr.splitlines()) == 1
-    (told,) = [event for event in server.events() if isinstance(event, Unauthenticated)]
-    assert told.reason == "forged"
+    (refusal,) = [event for event in server.events() if isinstance(event, Unauthenticated)]
+    assert refusal.reason == "forged"
     assert not any(isinstance(event, Plaintext) for event in server.events())
 
 

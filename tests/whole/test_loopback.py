@@ -188,8 +188,8 @@ async def refused_and_heard_again(loopback: Address, family: socket.AddressFamil
                 assert (await heard(client))[0] == b"again"
     task.cancel()
     assert (counts.packets, counts.forwarded, counts.undelivered) == (21, 1, 20)
-    told = [event for event in events if isinstance(event, Unreachable)]
-    assert told == [Unreachable(host=host, port=port, reason="Connection refused")]
+    unreachable = [event for event in events if isinstance(event, Unreachable)]
+    assert unreachable == [Unreachable(host=host, port=port, reason="Connection refused")]
 
 
 class Asker(Echo):

@@ -132,7 +132,7 @@ def test_no_observation_in_a_session_stops_the_server(
     welcome = decode(payload, TERMS)
     assert isinstance(welcome, Welcome)
     state = np.full((2, 2), 3e38)
-    told = Observation(
+    observation = Observation(
         vehicle=1,
         session=welcome.session,
         step=step,
@@ -148,10 +148,13 @@ def test_no_observation_in_a_session_stops_the_server(
     for number in range(10):
         now_ns = began_ns + number * TERMS.dt_ns
         with np.errstate(all="ignore"):
-            server.receive(Datagram(encode(told), STRANGER), now_ns=now_ns)
-            server.receive(Datagram(encode(told._replace(in_force=-1)), STRANGER), now_ns=now_ns)
-            server.receive(Datagram(encode(told._replace(since=0)), STRANGER), now_ns=now_ns)
+            server.receive(Datagram(encode(observation), STRANGER), now_ns=now_ns)
             server.receive(
-                Datagram(encode(told._replace(in_force=-1, since=0)), STRANGER), now_ns=now_ns
+                Datagram(encode(observation._replace(in_force=-1)), STRANGER), now_ns=now_ns
+            )
+            server.receive(Datagram(encode(observation._replace(since=0)), STRANGER), now_ns=now_ns)
+            server.receive(
+                Datagram(encode(observation._replace(in_force=-1, since=0)), STRANGER),
+                now_ns=now_ns,
             )
             server.wake(now_ns=now_ns)

@@ -66,5 +66,5 @@ def test_a_client_too_many_and_one_under_a_number_in_flight_are_told_why() -> No
     )
     assert str(other.failure) == f"vehicle 2 {refused}: the server is full; see its --vehicles"
     assert flying.failure is None
-    assert any("another client flies" in told for told in ground.told)
-    assert any("the server is full (room for 1)" in told for told in ground.told)
+    assert any("another client flies" in line for line in ground.told)
+    assert any("the server is full (room for 1)" in line for line in ground.told)

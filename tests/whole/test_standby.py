@@ -190,8 +190,8 @@ def test_a_standby_is_kept_while_the_time_out_is_long() -> None:
         scenario("demo", link={"timeout_s": 20.0, "age_max_s": 60.0}), duration=40.0
     )
     record = fly(flown, standby=True)
-    told = [each for each in record.events if each.process == "standby"]
-    assert [type(each.event) for each in told].count(SessionEnded) == 0
+    events = [each for each in record.events if each.process == "standby"]
+    assert [type(each.event) for each in events].count(SessionEnded) == 0
     assert changes(record) == []
 
 

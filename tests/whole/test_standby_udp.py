@@ -59,8 +59,8 @@ def test_a_standby_that_cannot_be_found_costs_nothing(start: Callable[..., Proce
         *("--insecure", "--log", "json", "--duration", "4", "--settle", "0", *PATIENT),
     )
     assert client.ended() == 0, client.said
-    told = [each for each in client.events() if isinstance(each, HostMissing)]
-    assert [each.host for each in told] == ["ground.invalid"]
+    events = [each for each in client.events() if isinstance(each, HostMissing)]
+    assert [each.host for each in events] == ["ground.invalid"]
     listening = next(each for each in client.events() if isinstance(each, Listening))
     assert listening.waiting_for.endswith(", or the standby server at ground.invalid:1")
     assert server.end() == 0
@@ -70,8 +70,8 @@ def test_a_server_is_named_as_leader_and_stays_it() -> None:
     """A standby server speaks rarely; its silence before it was named does not count."""
     changes = [(7.3, {"link.leader": "standby"}), (13.0, {"link.leader": "server"})]
     flight = fly(packaged("demo", duration=20.0), standby=True, secure=True, changes=changes)
-    told = [each for each in flight.events if isinstance(each.event, LeaderChanged)]
-    assert [(each.time_ns / 1e9, each.event.number) for each in told] == [(7.3, 1), (13.0, 2)]
+    events = [each for each in flight.events if isinstance(each.event, LeaderChanged)]
+    assert [(each.time_ns / 1e9, each.event.number) for each in events] == [(7.3, 1), (13.0, 2)]
     assert not [each for each in flight.events if getattr(each.event, "after", None) == "brake"]
 
 
