@@ -10,8 +10,8 @@ from typing import NamedTuple
 from skytether.client.alone import MotionInForce, OneServer
 from skytether.client.failsafe import Failsafe
 from skytether.client.link import ClientLink, PlainLink
+from skytether.client.route import Route
 from skytether.client.session import ServerSession
-from skytether.client.way import Way
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.base.units import seconds_to_ns
 from skytether.shared.endpoints.endpoint import (
@@ -103,7 +103,7 @@ def connect(
                 boot_id=boot_id ^ i,
                 server=i,
                 servers=servers,
-                way=_way(scenario, paths, sockets, names, reached.prices, out, events),
+                route=_route(scenario, paths, sockets, names, reached.prices, out, events),
                 timeout_ns=timeout_ns,
                 connect_s=scenario.link.connect_s,
                 link=links[i] or PlainLink(),
@@ -115,7 +115,7 @@ def connect(
     return servers, at
 
 
-def _way(
+def _route(
     scenario: Scenario,
     addresses: Sequence[Address],
     sockets: Sequence[int],
@@ -123,11 +123,11 @@ def _way(
     prices: Sequence[float],
     out: list[Datagram],
     events: Events,
-) -> Way:
-    """Way to a server."""
+) -> Route:
+    """Route to a server."""
     if len(addresses) == 1:
-        return Way(addresses, sockets, out)
-    way: Way = load("skytether.client.paths", "paths").SeveralPaths(
+        return Route(addresses, sockets, out)
+    route: Route = load("skytether.client.paths", "paths").SeveralPaths(
         addresses,
         sockets,
         out,
@@ -137,4 +137,4 @@ def _way(
         spread=scenario.link.spread,
         timeout_ns=seconds_to_ns(scenario.link.timeout_s),
     )
-    return way
+    return route

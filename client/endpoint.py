@@ -342,7 +342,7 @@ class Client(Endpoint):
                     observation = observation._replace(unsaved=1)
                 session.send(observation, now_ns=now_ns)
                 self._tell_time(session, now_ns)
-            session.way.watch(session, now_ns)
+            session.route.watch(session, now_ns)
 
     def objection(self, scenario: Scenario, keys: frozenset[str]) -> str:
         return self._orders.objection(scenario, keys)
@@ -402,7 +402,7 @@ class Client(Endpoint):
         vehicle_figures = pilot.figures() | counts
         vehicle_figures |= self._servers.figures()
         if pilot.next_ns is not None:
-            vehicle_figures |= self._session.way.figures(pilot.starts_ns(pilot.flown))
+            vehicle_figures |= self._session.route.figures(pilot.starts_ns(pilot.flown))
         if self._port is not None:
             vehicle_figures["autopilot"] = self._port.figures()
         return vehicle_figures

@@ -1,24 +1,24 @@
-"""The way from a vehicle to a server over several paths, each an address with a socket.
+"""The route from a vehicle to a server over several paths, each an address with a socket.
 
-It takes the place of `client.way.Way`; `client.connections` loads it for a server with several
+It takes the place of `client.route.Route`; `client.connections` loads it for a server with several
 addresses. `shared.wire.paths` chooses the paths of each message.
 """
 
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from skytether.client.way import Conversation, Way
+from skytether.client.route import Conversation, Route
 from skytether.shared.endpoints.endpoint import Address, Datagram, Events
 from skytether.shared.events.flight import address_text
 from skytether.shared.events.paths import PathDied, PathHealed
 from skytether.shared.wire.framing import Report
 from skytether.shared.wire.path_proof import PathProof
-from skytether.shared.wire.paths import Paths
-from skytether.shared.wire.protocol import Message, encode
+from skytether.shared.wire.paths import EVERYWHERE, Paths
+from skytether.shared.wire.protocol import Close, Message, encode
 
 
-class SeveralPaths(Way):
-    """See `Way`.
+class SeveralPaths(Route):
+    """See `Route`.
 
     Args:
         events: list to which events for the operator are appended.
@@ -91,12 +91,11 @@ class SeveralPaths(Way):
             turned = PathDied if is_dead else PathHealed
             self._events.append(turned(vehicle=session.vehicle, path=path, via=self._names[path]))
 
-    def post(
-        self, seal: Callable[[bytes], bytes], payload: bytes, worth: float, now_ns: int
-    ) -> None:
+    def post(self, seal: Callable[[bytes], bytes], message: Message, now_ns: int) -> None:
         assert self._paths is not None
+        worth = EVERYWHERE if isinstance(message, Close) else 1.0
         chosen = self._paths.choose(worth, now_ns, self._all)
-        self._send(self._paths, seal, payload, chosen, now_ns, worth=worth)
+        self._send(self._paths, seal, encode(message), chosen, now_ns, worth=worth)
 
     def figures(self, now_ns: int) -> dict[str, Any]:
         return {"paths": self._paths.figures(now_ns)} if self._paths else {}

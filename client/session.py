@@ -11,8 +11,8 @@ from typing import Literal
 
 from skytether.client.alone import OneServer, Watch
 from skytether.client.link import AGAIN_NS, ClientLink
+from skytether.client.route import Route
 from skytether.client.server_clock import ServerClock
-from skytether.client.way import Way
 from skytether.shared.base.units import SECOND_NS, seconds_to_ns
 from skytether.shared.endpoints.endpoint import Address, Events
 from skytether.shared.events.flight import (
@@ -27,7 +27,7 @@ from skytether.shared.law.terms import Terms
 from skytether.shared.scenario.catalogue import differences
 from skytether.shared.telemetry.record import Reason
 from skytether.shared.wire.drop import Drop, ProtocolError
-from skytether.shared.wire.framing import EVERYWHERE, split
+from skytether.shared.wire.framing import split
 from skytether.shared.wire.protocol import (
     Close,
     Heartbeat,
@@ -74,7 +74,7 @@ class ServerSession:
         boot_id: number unique to this run of the client.
         server: which of the vehicle's servers this is, from 0.
         servers: all servers, of which one leads.
-        way: way to the server.
+        route: route to the server.
         timeout_ns: time without a packet after which an end takes the link for lost [ns].
         connect_s: time after which a vehicle that was never answered gives up [s].
         hearing: measures losses, and chooses the longest silence to allow the server.
@@ -89,7 +89,7 @@ class ServerSession:
         boot_id: int,
         server: int = 0,
         servers: OneServer,
-        way: Way,
+        route: Route,
         timeout_ns: int,
         connect_s: float,
         link: ClientLink,
@@ -99,7 +99,7 @@ class ServerSession:
     ) -> None:
         self._terms, self.vehicle, self._boot_id = terms, vehicle, boot_id
         self._index, self._servers = server, servers
-        self.way, self._timeout_ns = way, timeout_ns
+        self.route, self._timeout_ns = route, timeout_ns
         self._connect_ns = seconds_to_ns(connect_s)
         self.link = link
         self.hearing = hearing
@@ -136,7 +136,7 @@ class ServerSession:
 
     @property
     def address(self) -> Address:
-        return self.way.addresses[0]
+        return self.route.addresses[0]
 
     @property
     def leads(self) -> bool:
@@ -166,12 +166,12 @@ class ServerSession:
         Raises:
             ProtocolError: the datagram must be dropped.
         """
-        if self.way.is_copy(datagram, path):
+        if self.route.is_copy(datagram, path):
             raise ProtocolError(Drop.COPY)
         payload = self.link.open(datagram, now_ns=now_ns)
         if payload is None:
             for answer in self.link.outbox():
-                self.way.put(answer, path)
+                self.route.put(answer, path)
             # The answer to a CHALLENGE carries the HELLO, so none is due for a while, unless a
             # stranger has provoked it by repeating an earlier one: its WELCOME is not taken.
             if self._awaits_welcome:
@@ -190,13 +190,13 @@ class ServerSession:
         if isinstance(message, Stamped):
             server_ns = self.clock.sent_ns(message.server_us, now_ns)
         if report:
-            self.way.heard(report, message, datagram, path, now_ns)
+            self.route.heard(report, message, datagram, path, now_ns)
         if isinstance(message, Stamped):
             return self._take_stamped(message, server_ns, now_ns)
         if isinstance(message, Close):
             self._watch.meet(Reason.CLOSED, now_ns=now_ns)
         elif not (
-            self.way.take(self, message, path, now_ns)
+            self.route.take(self, message, path, now_ns)
             or self._servers.take(self._index, message, now_ns)
         ):
             raise ProtocolError(Drop.NOT_FOR_A_CLIENT)
@@ -255,7 +255,7 @@ class ServerSession:
             self.sent, self.sent_step = 0, -1
             self._servers.begin(self._index)
             self.hearing.begin()
-            self.way.begin()
+            self.route.begin()
         self.number, self._server_boot_id = welcome.session, welcome.server_boot_id
         self._is_open = True
         self.link.adopt(now_ns=now_ns)
@@ -305,7 +305,7 @@ class ServerSession:
             self.hello_ns = now_ns + again_ns * (1 if self.leads else RARE_TIMES)
             self._awaits_welcome = True
             hello = encode(Hello(self.vehicle, self._boot_id, self._terms))
-            self.way.greet(self.link.hello(hello, now_ns=now_ns))
+            self.route.greet(self.link.hello(hello, now_ns=now_ns))
 
     def rest(self, *, now_ns: int) -> None:
         """Delay the next HELLO of a session that waits for its vehicle to take off."""
@@ -329,8 +329,7 @@ class ServerSession:
 
     def post(self, message: Message, now_ns: int) -> None:
         """Seal a message and send it."""
-        worth = EVERYWHERE if isinstance(message, Close) else 1.0
-        self.way.post(self.link.seal, encode(message), worth, now_ns)
+        self.route.post(self.link.seal, message, now_ns)
 
     def close(self) -> None:
         """Close the session; only another WELCOME opens one."""
@@ -354,7 +353,7 @@ class ServerSession:
         if self._is_unanswered or self._refusal is not None or waited_ns < UNANSWERED_NS:
             return
         self._is_unanswered = True
-        (host, port), others = self.address, self.way.others
+        (host, port), others = self.address, self.route.others
         left_s = left_ns / SECOND_NS
         self._events.append(
             Unanswered(vehicle=self.vehicle, host=host, port=port, others=others, left_s=left_s)
@@ -371,7 +370,7 @@ class ServerSession:
                 vehicle=self.vehicle,
                 host=host,
                 port=port,
-                others=self.way.others,
+                others=self.route.others,
                 waited_s=waited_s,
                 secure=self.link.secure,
             )

@@ -33,7 +33,6 @@ from skytether.shared.scenario.reference import Reference
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Recorder
 from skytether.shared.wire.drop import Drop
-from skytether.shared.wire.framing import EVERYWHERE
 from skytether.shared.wire.protocol import CLOSES, Close, Refusal, encode
 
 VEHICLES_MAX = 64
@@ -179,7 +178,7 @@ class Server(Endpoint):
         for _ in range(CLOSES):
             for session in self.sessions:
                 close = Close(session.vehicle, session.number)
-                self._out += session.sealed(encode(close), now_ns, worth=EVERYWHERE)
+                self._out += session.sealed(encode(close), now_ns)
 
     def learn_time(self, utc_ns: int, error_ns: int, *, now_ns: int) -> None:
         """See `Endpoint`; narrows the clock offsets of vehicles that report the time of day."""
@@ -221,7 +220,7 @@ class Server(Endpoint):
             "step": int(self.controller.last_step[row]),
             "clock_bound_ms": round(bound_ms, 3),
         }
-        vehicle_figures |= self.sessions.ways.figures(session, self._ticked_ns)
+        vehicle_figures |= self.sessions.routes.figures(session, self._ticked_ns)
         return vehicle_figures | self.controller.scheme.vehicle_figures(row)
 
     def figures(self) -> dict[str, Any]:

@@ -13,8 +13,8 @@ import numpy as np
 
 from skytether.server.controller import Decisions
 from skytether.server.gate import ReplyPath
+from skytether.server.routes import Routes
 from skytether.server.sessions import Session
-from skytether.server.ways import Ways
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.endpoints.endpoint import Address, Datagram, Events
 from skytether.shared.events.flight import address_text
@@ -22,9 +22,18 @@ from skytether.shared.events.paths import PathDied, PathHealed
 from skytether.shared.wire.drop import Drop, ProtocolError
 from skytether.shared.wire.framing import Report
 from skytether.shared.wire.path_proof import PathProof
-from skytether.shared.wire.paths import Paths
-from skytether.shared.wire.protocol import Message, encode
+from skytether.shared.wire.paths import EVERYWHERE, Paths
+from skytether.shared.wire.protocol import (
+    Close,
+    Horizon,
+    Message,
+    Trajectory,
+    encode,
+    kind_of,
+    number_of,
+)
 
+CLOSE, PLANS = number_of(Close), (number_of(Horizon), number_of(Trajectory))
 PLACES = 2
 """Number of addresses of a path that are in use at once."""
 FORMER_NS = 2 * SECOND_NS
@@ -66,6 +75,8 @@ class ServerPaths:
         self._secret = entropy(hashlib.blake2s.MAX_KEY_SIZE)
         self._places: dict[int, dict[Place, int]] = {}
         """Proven addresses of each path, and when they were last heard [ns]; the newest is last."""
+        self.plan_worth = 0.0
+        """What the loss of the next plan costs, in packets."""
 
     def number(self, place: Place) -> int | None:
         """Number of the path with a proven address; None if there is none."""
@@ -112,7 +123,9 @@ class ServerPaths:
         # The highest bit is set, so that msgpack uses nine bytes for every number.
         return int.from_bytes(digest) | 2**63
 
-    def sealed(self, payload: bytes, line: ReplyPath, now_ns: int, worth: float) -> list[Datagram]:
+    def sealed(self, payload: bytes, line: ReplyPath, now_ns: int) -> list[Datagram]:
+        kind = kind_of(payload)
+        worth = EVERYWHERE if kind == CLOSE else self.plan_worth if kind in PLANS else 0.0
         among = sorted(self._places)
         chosen = self.paths.choose(worth, now_ns, among)
         return self._put(payload, line, chosen, now_ns, worth=worth)
@@ -169,8 +182,8 @@ class ServerPaths:
         return bool(self._places)
 
 
-class SeveralWays(Ways):
-    """Ways to vehicles of which some have several paths.
+class RoutesOverPaths(Routes):
+    """Routes to vehicles of which some have several paths.
 
     Args:
         entropy: returns this many random bytes.
@@ -235,7 +248,7 @@ class SeveralWays(Ways):
         return question
 
     def narrow(self, session: Session) -> None:
-        if session.way:
+        if session.route:
             self.forget(session)
 
     def restart(self, session: Session) -> None:
@@ -244,24 +257,30 @@ class SeveralWays(Ways):
             paths.paths.peer_may_restart = True
 
     def forget(self, session: Session) -> None:
-        session.way = None
+        session.route = None
         if self.of.get(session.vehicle) is session:
             del self.of[session.vehicle]
             for place in [place for place, each in self.at.items() if each is session]:
                 del self.at[place]
 
-    def worths(self, decisions: Decisions) -> dict[int, float]:
-        """See `Ways`.
+    def appraise(self, decisions: Decisions) -> None:
+        """Note what the loss of each plan costs.
 
         A trigger sends if the cost of flying on exceeds its threshold, so the threshold is the
         price of a packet.
         """
         rows, verdict = decisions.batch.rows, decisions.verdict
-        if not self.of or not verdict.compares:
-            return {}
-        with np.errstate(divide="ignore", invalid="ignore"):
-            worths = np.nan_to_num(verdict.figure / verdict.threshold, nan=0.0)
-        return dict(zip(rows.tolist(), worths.tolist(), strict=False))
+        if not self.of:
+            return
+        worths: dict[int, float] = {}
+        if verdict.compares:
+            with np.errstate(divide="ignore", invalid="ignore"):
+                each = np.nan_to_num(verdict.figure / verdict.threshold, nan=0.0)
+            worths = dict(zip(rows.tolist(), each.tolist(), strict=False))
+        for session in self.of.values():
+            paths = _paths(session)
+            assert paths
+            paths.plan_worth = worths.get(session.row, 0.0)
 
     def watch(
         self, put: Callable[[int, Sequence[Datagram]], None], events: Events, now_ns: int
@@ -280,14 +299,14 @@ class SeveralWays(Ways):
     def _note(self, session: Session, paths: ServerPaths) -> None:
         """Note the paths of a session and their proven addresses, in place of earlier ones."""
         self.forget(session)
-        session.way = paths
+        session.route = paths
         self.of[session.vehicle] = session
         self.at |= dict.fromkeys(paths.places, session)
 
 
 def _paths(session: Session) -> ServerPaths | None:
     """Paths of a session; None with a single address."""
-    return session.way if isinstance(session.way, ServerPaths) else None
+    return session.route if isinstance(session.route, ServerPaths) else None
 
 
 def _hear(

@@ -12,9 +12,9 @@ from skytether.server.gate import Gate, GateCall
 from skytether.server.leads import Leads
 from skytether.server.planning.clock import ClockMap, Contradiction
 from skytether.server.plausibility import ANEW, BELIEVED, Belief, Plausibility
+from skytether.server.routes import Routes
 from skytether.server.sessions import Session, Sessions
 from skytether.server.tick import Grid
-from skytether.server.ways import Ways
 from skytether.shared.base.units import MICROSECOND_NS, SECOND_NS, seconds_to_ns
 from skytether.shared.endpoints.endpoint import Address, Datagram, Events
 from skytether.shared.endpoints.stopwatch import Stopwatch
@@ -143,7 +143,7 @@ class Reception:
 
     def hear(self, datagram: Datagram, *, now_ns: int) -> Drop | None:
         self._stopwatch.start()
-        if self._sessions.ways.is_copy(datagram, now_ns):
+        if self._sessions.routes.is_copy(datagram, now_ns):
             self.dropped[Drop.COPY] += 1
             return Drop.COPY
         try:
@@ -181,7 +181,7 @@ class Reception:
             return False
         if datagram.peer not in (session.address, session.home):
             session.other, session.other_ns = datagram.peer, now_ns
-        return self._sessions.ways.is_repeat(session, datagram)
+        return self._sessions.routes.is_repeat(session, datagram)
 
     def _take(self, call: GateCall, datagram: Datagram, now_ns: int) -> None:
         """Process one message.
@@ -222,7 +222,7 @@ class Reception:
         if step is not None:
             self._refuse_overtaken(session, step)
         if report:
-            sessions.ways.hear(session, report, message, datagram, now_ns)
+            sessions.routes.hear(session, report, message, datagram, now_ns)
         match message:
             case Close():
                 sessions.end(session)
@@ -235,7 +235,7 @@ class Reception:
                 session.heard_ns = now_ns
                 self._answer(sessions.leads.take(session, message), call, datagram)
             case _:
-                answer = sessions.ways.take(session, message, datagram, now_ns)
+                answer = sessions.routes.take(session, message, datagram, now_ns)
                 session.heard_ns = now_ns
                 if answer:
                     self._answer(answer, call, datagram)
@@ -265,7 +265,7 @@ class Reception:
         if refusal is Refusal.ACCEPTED:
             session = self._sessions.welcome(hello, address, call.line, now_ns, datagram.socket)
             number = session.number
-            self._sessions.ways.restart(session)
+            self._sessions.routes.restart(session)
         welcome = Welcome(
             hello.vehicle, number, hello.boot_id, self._boot_id, now_ns, refusal, self._terms
         )
@@ -344,7 +344,7 @@ class Reception:
         if call.moves:
             session.move(datagram.peer, call.line, now_ns, datagram.socket)
             if not report:
-                self._sessions.ways.narrow(session)
+                self._sessions.routes.narrow(session)
         if observation.unsaved > session.unsaved:
             self._events.append(CannotResume(vehicle=session.vehicle))
         session.unsaved = bool(observation.unsaved)
@@ -360,11 +360,11 @@ class Reception:
     ) -> None:
         """Note the report of an observation; ask for a proof where it comes from a new address."""
         sessions = self._sessions
-        if type(sessions.ways) is Ways:
-            sessions.ways = load(PATHS, "paths").SeveralWays(
+        if type(sessions.routes) is Routes:
+            sessions.routes = load(PATHS, "paths").RoutesOverPaths(
                 sessions.entropy, self._spread, self._timeout_ns
             )
-        question = sessions.ways.observe(session, report, datagram, now_ns, is_newest=call.moves)
+        question = sessions.routes.observe(session, report, datagram, now_ns, is_newest=call.moves)
         if question:
             self._answer(question, call, datagram)
 

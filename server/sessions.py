@@ -18,7 +18,7 @@ import numpy as np
 
 from skytether.server.gate import ReplyPath
 from skytether.server.leads import Leads
-from skytether.server.ways import Way, Ways
+from skytether.server.routes import Route, Routes
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.endpoints.endpoint import Address, Datagram
 from skytether.shared.law.heartbeat import NUMBERS, SESSION_NS, Hearing
@@ -75,7 +75,7 @@ class Session:
     """Time of the newest such repeat."""
     socket: int = 0
     """Number of the server's socket at which the vehicle was heard."""
-    way: Way | None = None
+    route: Route | None = None
     """Sends to the vehicle over several paths; None if `address` is the only one."""
     lead: Any = None
     """What a room notes of who leads the vehicle; None if it has no other server."""
@@ -89,19 +89,16 @@ class Session:
         """Whether the longest silence that the vehicle allows has passed since the last packet."""
         return 0 < self.asked_ns <= now_ns - self.sent_ns
 
-    def sealed(self, payload: bytes, now_ns: int, worth: float = 0.0) -> Sequence[Datagram]:
+    def sealed(self, payload: bytes, now_ns: int) -> Sequence[Datagram]:
         """Datagrams that carry a message to the vehicle: one, or copies for several addresses or
         paths.
 
         Its address may have changed since its HELLO, or somebody may forward copies of its packets
         that arrive first; in that case it must still be reached at its home address, or where the
         repeats come from.
-
-        Args:
-            worth: what the loss of the message costs, in packets.
         """
-        if self.way and self.way.is_ready:
-            return self.way.sealed(payload, self.line, now_ns, worth)
+        if self.route and self.route.is_ready:
+            return self.route.sealed(payload, self.line, now_ns)
         # Sealed once: with keys the vehicle opens the first copy, and drops others as repeats.
         packet = self.line.seal(payload)
         if self.address == self.home and self.other is None:
@@ -157,8 +154,8 @@ class Sessions:
         """Rows in use, ascending; shape (n,)."""
         self.vehicle = np.zeros(capacity, dtype=np.int64)
         """Number of the vehicle in each row; shape (capacity,)."""
-        self.ways = Ways()
-        """Ways to the vehicles; another once one of them has several paths."""
+        self.routes = Routes()
+        """Routes to the vehicles; another once one of them has several paths."""
         self.leads = leads
         """Who leads the vehicles."""
         self.idle = np.zeros(capacity, dtype=np.int64)
@@ -280,7 +277,7 @@ class Sessions:
             raise ProtocolError(Drop.TAKEN)
         del waiting[session.vehicle]
         if before is not None:
-            self.ways.forget(before)
+            self.routes.forget(before)
             session.row = before.row
         elif session.vehicle in self._reserved:
             session.row = self._reserved.pop(session.vehicle)
@@ -302,7 +299,7 @@ class Sessions:
 
     def end(self, session: Session) -> None:
         del self._live[session.vehicle], self._by_row[session.row]
-        self.ways.forget(session)
+        self.routes.forget(session)
         if self._keeps_rows:
             self._reserved[session.vehicle] = session.row
         else:

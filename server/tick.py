@@ -136,7 +136,7 @@ class Ticker:
         # Last, since a horizon sent at this tick replaces a heartbeat.
         if heartbeats:
             self._send_heartbeats(heartbeats, now_ns)
-        self._sessions.ways.watch(self._put, self._events, now_ns)
+        self._sessions.routes.watch(self._put, self._events, now_ns)
         self._stopwatch.lap("encode")
         self.durations.add(self._stopwatch.total_ns - before_ns)
 
@@ -154,7 +154,7 @@ class Ticker:
         # The time of sending, not the tick's due time: the vehicle measures the delay by this
         # stamp.
         batch, sessions, sent_us = decisions.batch, self._sessions, stamp_us(now_ns)
-        worths = sessions.ways.worths(decisions)
+        sessions.routes.appraise(decisions)
 
         def header(row: int) -> Header:
             session = sessions.at(row)
@@ -164,7 +164,7 @@ class Ticker:
         for row, payload in self._controller.scheme.encode(batch, header):
             session = sessions.at(row)
             plan = sessions.leads.signed(session, payload)
-            self._send(session, plan, now_ns, worths.get(row, 0.0), is_plan=True)
+            self._put(row, session.sealed(plan, now_ns), is_plan=True)
 
     def _send_heartbeats(self, due: Sequence[Session], now_ns: int) -> None:
         for session in due:
@@ -179,18 +179,7 @@ class Ticker:
                     session.number_next(now_ns),
                     session.hearing.silence,
                 )
-                self._send(session, encode(beat), now_ns, is_plan=False)
-
-    def _send(
-        self,
-        session: Session,
-        payload: bytes,
-        now_ns: int,
-        worth: float = 0.0,
-        *,
-        is_plan: bool,
-    ) -> None:
-        self._put(session.row, session.sealed(payload, now_ns, worth), is_plan=is_plan)
+                self._put(session.row, session.sealed(encode(beat), now_ns))
 
     def _put(self, row: int, datagrams: Sequence[Datagram], *, is_plan: bool = False) -> None:
         self._out += datagrams

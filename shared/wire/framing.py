@@ -9,8 +9,6 @@ from typing import NamedTuple
 from skytether.shared.wire.drop import Drop, ProtocolError
 
 PATHS_MAX = 4
-EVERYWHERE = 1e9
-"""Worth of a message that goes over every path."""
 HEAD, BIN8 = Struct("<HH"), 0xC4
 
 

@@ -34,6 +34,8 @@ from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
 from skytether.shared.wire.drop import Drop, ProtocolError
 from skytether.shared.wire.framing import BIN8, HEAD, PATHS_MAX, Report
 
+EVERYWHERE = 1e9
+"""Worth of a message that goes over every path."""
 SEQUENCES = 2**16
 """Modulus of sequence numbers: half of them are more than may be under way, so that a packet that
 is late, by however much, is never taken for one that is ahead."""

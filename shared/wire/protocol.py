@@ -524,6 +524,11 @@ def _is_plain_plan(message: Message) -> bool:
     return isinstance(message, Horizon | Trajectory) and not message.leadership
 
 
+def number_of(message: type[Any]) -> int:
+    """Type number of a message, by its class."""
+    return _NUMBERS[message]
+
+
 def encode(message: Message) -> bytes:
     """Datagram of a message; arrays are sent as little-endian bytes."""
     if type(message) is Observation:

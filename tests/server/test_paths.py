@@ -4,7 +4,7 @@ import numpy as np
 
 from helpers import packaged
 from skytether.server.endpoint import Server
-from skytether.server.paths import FORMER_NS, Place, ServerPaths, SeveralWays
+from skytether.server.paths import FORMER_NS, Place, RoutesOverPaths, ServerPaths
 from skytether.shared.base.chance import stream
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.endpoints.endpoint import Address, Datagram
@@ -115,9 +115,9 @@ class Vehicle:
         assert self.say(message._replace(proof=question.proof), place) == []
 
 
-def ways(vehicle: Vehicle) -> SeveralWays:
-    found = vehicle.server.sessions.ways
-    assert isinstance(found, SeveralWays)
+def routes(vehicle: Vehicle) -> RoutesOverPaths:
+    found = vehicle.server.sessions.routes
+    assert isinstance(found, RoutesOverPaths)
     return found
 
 
@@ -129,7 +129,7 @@ def test_addresses_that_a_path_has_left_are_forgotten() -> None:
         vehicle.now_ns += SECOND_NS
     vehicle.prove(1, SECOND)
     newest = {Place(("vehicle", port), 0) for port in (18, 19)}
-    assert {*ways(vehicle).at} == {*newest, SECOND}
+    assert {*routes(vehicle).at} == {*newest, SECOND}
 
 
 def test_a_forwarder_of_copies_does_not_take_a_path_away() -> None:
@@ -142,15 +142,15 @@ def test_a_forwarder_of_copies_does_not_take_a_path_away() -> None:
         vehicle.step += SECOND_NS // vehicle.dt_ns
         vehicle.prove(0, Place(("forwarder", port), 0))
         vehicle.observe(FIRST)
-    session = ways(vehicle).of[1]
-    paths = session.way
+    session = routes(vehicle).of[1]
+    paths = session.route
     assert isinstance(paths, ServerPaths)
     assert {*paths.places} == {FIRST, Place(("forwarder", 2), 0)}
     line = session.line
-    sent = paths.sealed(b"\x93plan", line, vehicle.now_ns, 1.0)
+    sent = paths.sealed(b"\x93plan", line, vehicle.now_ns)
     assert {each.peer for each in sent} == {FIRST.peer, ("forwarder", 2)}
     later_ns = vehicle.now_ns + FORMER_NS + 1
-    sent = paths.sealed(b"\x93plan", line, later_ns, 1.0)
+    sent = paths.sealed(b"\x93plan", line, later_ns)
     assert [each.peer for each in sent] == [("forwarder", 2)], "the vehicle has another address"
 
 
@@ -164,7 +164,7 @@ def test_path_is_asked_for_a_proof_as_soon_as_it_is_heard_at_another_address() -
     assert peer == MOVED.peer
     assert isinstance(question, PathProof)
     assert vehicle.say(question._replace(path=0), MOVED) == []
-    assert {*ways(vehicle).at} == {FIRST, MOVED, SECOND}
+    assert {*routes(vehicle).at} == {FIRST, MOVED, SECOND}
 
 
 def test_copy_over_another_path_is_dropped_as_a_copy() -> None:
@@ -200,8 +200,8 @@ def test_client_that_was_started_again_with_more_paths_is_heard() -> None:
     vehicle.observe(FIRST)
     session = vehicle.server.sessions.live(1)
     assert session
-    assert isinstance(session.way, ServerPaths)
-    assert len(session.way.prices) == 3
+    assert isinstance(session.route, ServerPaths)
+    assert len(session.route.prices) == 3
     assert not vehicle.server.dropped
 
 
@@ -212,8 +212,8 @@ def test_prices_are_those_that_the_vehicle_named_last() -> None:
     vehicle.say(PathProof(1, vehicle.session, 1, 0, (1000, 7000)), SECOND)
     session = vehicle.server.sessions.live(1)
     assert session
-    assert isinstance(session.way, ServerPaths)
-    assert [path.price for path in session.way.paths.each] == [1.0, 7.0]
+    assert isinstance(session.route, ServerPaths)
+    assert [path.price for path in session.route.paths.each] == [1.0, 7.0]
 
 
 def test_client_that_was_started_again_in_its_session_is_acknowledged_at_once() -> None:
@@ -230,8 +230,8 @@ def test_client_that_was_started_again_in_its_session_is_acknowledged_at_once() 
     vehicle.observe(FIRST)
     session = vehicle.server.sessions.live(1)
     assert session
-    assert isinstance(session.way, ServerPaths)
-    report, _ = split(session.way.paths.report())
+    assert isinstance(session.route, ServerPaths)
+    report, _ = split(session.route.paths.report())
     assert report
     assert (report.newest, report.arrived) == (1, (1, 0))
 
@@ -246,15 +246,15 @@ def test_a_path_message_that_was_overtaken_keeps_no_session_and_sets_no_price() 
         vehicle.observe(FIRST)
     session = vehicle.server.sessions.live(1)
     assert session
-    assert isinstance(session.way, ServerPaths)
+    assert isinstance(session.route, ServerPaths)
     heard_ns = session.heard_ns
     vehicle.now_ns += 1
     # Even where the vehicle may have begun its numbers anew.
-    session.way.paths.peer_may_restart = True
+    session.route.paths.peer_may_restart = True
     assert vehicle.send(late, FIRST) == []
     assert vehicle.server.dropped == {Drop.OVERTAKEN: 1}
     assert session.heard_ns == heard_ns
-    assert session.way.prices == PRICES
+    assert session.route.prices == PRICES
     vehicle.observe(FIRST)
     assert vehicle.server.dropped == {Drop.OVERTAKEN: 1}
-    assert session.way.paths.peer_may_restart
+    assert session.route.paths.peer_may_restart

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
 from skytether.shared.wire.drop import ProtocolError
-from skytether.shared.wire.framing import EVERYWHERE, split
-from skytether.shared.wire.paths import AGAIN_NS, LOOK_NS, WINDOW, Paths
+from skytether.shared.wire.framing import split
+from skytether.shared.wire.paths import AGAIN_NS, EVERYWHERE, LOOK_NS, WINDOW, Paths
 
 DELAY_NS, STEP_NS, SILENCE_NS = 50 * MILLISECOND_NS, 100 * MILLISECOND_NS, SECOND_NS // 2
 BOTH = (0, 1)

@@ -1,4 +1,4 @@
-"""Ways to vehicles. The plain form: each vehicle has one address, which its session knows.
+"""Routes to vehicles. The plain form: each vehicle has one address, which its session knows.
 
 A room may put another in its place, as `server.paths` does for vehicles with several paths.
 """
@@ -13,21 +13,19 @@ from skytether.shared.wire.framing import Report
 from skytether.shared.wire.protocol import Message
 
 
-class Way(Protocol):
-    """Sends packets to a vehicle with several paths, see `Session.way`."""
+class Route(Protocol):
+    """Sends packets to a vehicle with several paths, see `Session.route`."""
 
     @property
     def is_ready(self) -> bool:
         """Whether it may be used."""
 
-    def sealed(
-        self, payload: bytes, line: ReplyPath, now_ns: int, worth: float
-    ) -> Sequence[Datagram]:
+    def sealed(self, payload: bytes, line: ReplyPath, now_ns: int) -> Sequence[Datagram]:
         """Datagrams that carry a message; see `Session.sealed`."""
 
 
-class Ways:
-    """Ways to all vehicles of a server; a session is a `sessions.Session`."""
+class Routes:
+    """Routes to all vehicles of a server; a session is a `sessions.Session`."""
 
     def is_copy(self, datagram: Datagram, now_ns: int) -> bool:
         """Whether a datagram has come before, over another path."""
@@ -73,9 +71,8 @@ class Ways:
     def forget(self, session: Any) -> None:
         """Forget a session that has ended."""
 
-    def worths(self, decisions: Any) -> dict[int, float]:
-        """What the loss of each vehicle's plan costs, in packets, by its row; 0 unless given."""
-        return {}
+    def appraise(self, decisions: Any) -> None:
+        """Note what is decided for vehicles, before their plans are sent."""
 
     def watch(
         self, put: Callable[[int, Sequence[Datagram]], None], events: Events, now_ns: int

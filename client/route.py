@@ -1,4 +1,4 @@
-"""The way from a vehicle to a server: one link. A room may put another in its place, as
+"""The route from a vehicle to a server: one link. A room may put another in its place, as
 `client.paths` does.
 """
 
@@ -10,11 +10,11 @@ from skytether.shared.endpoints.endpoint import Address, Datagram
 from skytether.shared.events.flight import address_text
 from skytether.shared.law.heartbeat import Hearing
 from skytether.shared.wire.framing import Report
-from skytether.shared.wire.protocol import Message
+from skytether.shared.wire.protocol import Message, encode
 
 
 class Conversation(Protocol):
-    """The session to which a way belongs."""
+    """The session to which a route belongs."""
 
     vehicle: int
     number: int | None
@@ -25,7 +25,7 @@ class Conversation(Protocol):
         """Note a packet of the session."""
 
 
-class Way:
+class Route:
     """One link: an address, and the socket from which it is reached.
 
     Args:
@@ -51,19 +51,9 @@ class Way:
         """Send a HELLO."""
         self.put(hello)
 
-    def post(
-        self,
-        seal: Callable[[bytes], bytes],
-        payload: bytes,
-        worth: float,
-        now_ns: int,
-    ) -> None:
-        """Seal a message and send it.
-
-        Args:
-            worth: what its loss costs, in packets.
-        """
-        self.put(seal(payload))
+    def post(self, seal: Callable[[bytes], bytes], message: Message, now_ns: int) -> None:
+        """Seal a message and send it."""
+        self.put(seal(encode(message)))
 
     # -- what a room may add ---------------------------------------------------------------------
 
