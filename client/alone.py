@@ -1,15 +1,18 @@
-"""A client with one server that leads its vehicle, and without saved state.
+"""A client with one server, which its vehicle follows, and without saved state.
 
 Rooms may put others in their places: `client.servers` with a standby server, and `client.memory`,
 with which the next run of a client continues in the middle of a flight.
 """
 
 from collections.abc import Callable
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 from skytether.client.failsafe import Failsafe
-from skytether.shared.telemetry.record import Reason
-from skytether.shared.wire.protocol import Message
+from skytether.shared.base.errors import ConfigError
+from skytether.shared.scenario.catalogue import keys_of
+from skytether.shared.scenario.owners import InFlight
+from skytether.shared.scenario.schema import Scenario
+from skytether.shared.wire.protocol import Horizon, Message, Trajectory
 
 LEADER_KEY = "link.leader"
 NAMES = ("server", "standby")
@@ -65,30 +68,55 @@ class Fresh:
         """Note that the bytes returned last were written, or that the file was removed."""
 
 
-class Watch(Protocol):
-    """What has to know of a server's packets and faults: the failsafe, or nobody."""
+class Role:
+    """What a server is to its vehicle. The plain form: the vehicle follows its only server.
 
-    def heard(self, *, now_ns: int) -> None:
-        """Note a packet of the session."""
+    Args:
+        failsafe: receives the packets and faults of a server that the vehicle follows.
+    """
 
-    def malformed(self, *, now_ns: int) -> None:
-        """Note a malformed message that was sent by the server itself."""
+    is_followed = True
+    """Whether the vehicle flies the plans of the server."""
+    may_observe = True
+    """Whether the server may be sent observations."""
 
-    def meet(self, cause: Reason, *, now_ns: int) -> None:
-        """Act on a cause on the server's side."""
+    def __init__(self, failsafe: Failsafe) -> None:
+        self.heard: Callable[..., None] = failsafe.heard
+        """Notes a packet of the session."""
+        self.malformed: Callable[..., None] = failsafe.malformed
+        """Notes a malformed message that was sent by the server itself."""
+        self.meet: Callable[..., None] = failsafe.meet
+        """Acts on a cause on the server's side."""
+
+    def begin(self) -> None:
+        """Note another session with the server."""
+
+    def accepts(self, plan: Horizon | Trajectory) -> bool:
+        """Whether a plan of the server may be flown."""
+        return plan.leadership == 0
+
+    def take(self, message: Message, now_ns: int) -> bool:
+        """Take a message of the room; False if it has none."""
+        return False
+
+    def lost_after_ns(self, timeout_ns: int) -> int:
+        """Silence after which the server counts as lost [ns].
+
+        Args:
+            timeout_ns: the same for a server that the vehicle follows [ns].
+        """
+        return timeout_ns
 
 
 class OneServer:
-    """Servers of a vehicle: one, which leads and is sent no LEAD.
+    """Servers of a vehicle: one, which it follows.
 
     Args:
-        failsafe: receives the packets and faults of the server that leads.
+        failsafe: receives the packets and faults of the server that is followed.
     """
 
-    leader = 0
-    """Which server leads."""
-    number = 0
-    """Number of its leadership."""
+    keys = keys_of(InFlight.LEADER)
+    """Keys with which an operator lets another server lead."""
 
     def __init__(self, failsafe: Failsafe) -> None:
         self.failsafe = failsafe
@@ -96,40 +124,43 @@ class OneServer:
         """Session with each server; the caller appends them."""
 
     @property
-    def leading(self) -> Any:
-        """Session with the server that leads."""
-        return self.sessions[self.leader]
+    def followed(self) -> Any:
+        """Session with the server whose plans are flown."""
+        return self.sessions[0]
 
-    def watch(self, server: int) -> Watch:
-        """What notes the packets and faults of a server."""
-        return self.failsafe
-
-    def begin(self, server: int) -> None:
-        """Note another session with a server."""
-
-    def take(self, server: int, message: Message, now_ns: int) -> bool:
-        """Take a message of the room; False if it has none."""
-        return False
+    def role(self, server: int) -> Role:
+        """What a server is to the vehicle."""
+        return Role(self.failsafe)
 
     def follow(self, *, step: int, on_ground: bool, now_ns: int) -> None:
-        """Decide which server leads; called at each step, and on the ground.
+        """Decide which server is followed; called at each step, and on the ground.
 
         Args:
             step: step of the vehicle.
         """
 
-    def may_observe(self, server: int) -> bool:
-        """Whether a server may be sent observations."""
-        return True
+    def check(self, scenario: Scenario) -> None:
+        """Check the values of `keys` at the start.
 
-    def name(self, server: int, *, now_ns: int) -> None:
-        """Let a server lead, on an operator's order."""
+        Raises:
+            ConfigError: a value may be given only in flight.
+        """
+        if (named := scenario.link.leader) != NAMES[0]:
+            expected = f"expected {NAMES[0]!r}: it is chosen in flight"
+            raise ConfigError(f"{LEADER_KEY}: got {named!r}, {expected}")
 
-    def objection(self, named: str) -> str:
-        """Why a server cannot be made the leader by `link.leader`; empty if it can."""
-        if named == NAMES[0]:
+    def objection(self, scenario: Scenario) -> str:
+        """Why an operator's order about `keys` is refused at present; empty if it is not."""
+        if (named := scenario.link.leader) == NAMES[0]:
             return ""
         return f"{LEADER_KEY}: got {named!r}, expected 'server' without a standby server"
+
+    def obey(self, scenario: Scenario, *, now_ns: int) -> None:
+        """Act on an operator's order about `keys`."""
+
+    def to_keep(self) -> dict[str, Any]:
+        """Fields of `memory.SavedState`."""
+        return {}
 
     def figures(self) -> dict[str, Any]:
         return {}

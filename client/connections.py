@@ -101,14 +101,12 @@ def connect(
                 # To the other server it is another client: packets that are led astray must
                 # not replace the session there.
                 boot_id=boot_id ^ i,
-                server=i,
-                servers=servers,
+                role=servers.role(i),
                 route=_route(scenario, paths, sockets, names, reached.prices, out, events),
                 timeout_ns=timeout_ns,
                 connect_s=scenario.link.connect_s,
                 link=links[i] or PlainLink(),
                 hearing=Hearing(timeout_ns, terms.dt_ns, fixed_ns),
-                watch=servers.watch(i),
                 events=events,
             )
         )

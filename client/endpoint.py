@@ -131,10 +131,10 @@ class Client(Endpoint):
         self._log = FlightLog(
             scenario, vehicle, self._pilot, self._failsafe, self._servers, self._events
         )
-        self._ground = [
-            GroundReports(vehicle, each.address, self._timeout_ns, self._events)
+        self._ground = {
+            each: GroundReports(vehicle, each.address, self._timeout_ns, self._events)
             for each in self._sessions
-        ]
+        }
         self._time: TimeOfDay | None = None
         self._time_due_ns = 0
         self.horizons = 0
@@ -144,8 +144,8 @@ class Client(Endpoint):
 
     @property
     def _session(self) -> ServerSession:
-        """Session with the server that leads."""
-        session: ServerSession = self._servers.leading
+        """Session with the server whose plans are flown."""
+        session: ServerSession = self._servers.followed
         return session
 
     @property
@@ -236,7 +236,7 @@ class Client(Endpoint):
 
     def _to_keep(self) -> dict[str, Any]:
         """Fields of `memory.SavedState`; on the ground those that change there."""
-        pilot, known = self._pilot, {"frame": self._flies.frame, "leadership": self._servers.number}
+        pilot, known = self._pilot, {"frame": self._flies.frame} | self._servers.to_keep()
         if pilot.next_ns is None:
             return known
         return known | {
@@ -305,7 +305,7 @@ class Client(Endpoint):
 
     def _watch_ground(self, now_ns: int) -> None:
         session, waits_for = self._session, self._flies.waits_for
-        ground = self._ground[self._servers.leader]
+        ground = self._ground[session]
         if session.number is not None:
             ground.hear(session.number, session.clock.echo.received_ns, now_ns=now_ns)
         elif self._flies.is_ready:
@@ -329,11 +329,11 @@ class Client(Endpoint):
             if not may_tell:
                 return
         self._servers.follow(step=pilot.flown, on_ground=False, now_ns=now_ns)
-        for server, session in enumerate(self._sessions):
+        for session in self._sessions:
             observation = None
-            if not self._servers.may_observe(server):
+            if not session.role.may_observe:
                 continue
-            if session.leads:
+            if session.role.is_followed:
                 observation = pilot.observation(session)
             elif session.is_observation_due(pilot.flown):
                 observation = pilot.observe(session)
@@ -359,7 +359,7 @@ class Client(Endpoint):
         error_ns = self._time.error_at(now_ns)
         if error_ns is None:
             return
-        self._time_due_ns = now_ns + (TIME_NS if session.leads else 0)
+        self._time_due_ns = now_ns + (TIME_NS if session.role.is_followed else 0)
         epoch_us = stamp_us(self._pilot.began_ns + self._time.ahead_ns)
         error_us = min(-(-error_ns // MICROSECOND_NS) + 1, TIME_ERROR_MAX_US)
         session.tell_time(self._pilot.flown, epoch_us, error_us, now_ns=now_ns)

@@ -75,7 +75,7 @@ class FlightLog:
         if reason not in PLANLESS:
             return str(reason)
         is_lost = self._failsafe.is_lost(now_ns)
-        return str(Reason.LOST) if is_lost else str(self._servers.leading.idle)
+        return str(Reason.LOST) if is_lost else str(self._servers.followed.idle)
 
     def report_step(self, now_ns: int) -> None:
         """Report what the pilot has met in the step that it has just flown."""

@@ -1,10 +1,10 @@
 """Orders of an operator in flight: keys of the scenario that a vehicle takes while it flies.
 
-`armed` allows plans to be flown, `vehicle.after_leap` chooses the frame after a leap of the
-position, and `link.leader` the server that leads. A vehicle may take further keys of its own.
+`armed` allows plans to be flown, and `vehicle.after_leap` chooses the frame after a leap of the
+position. The servers and the vehicle have further keys.
 """
 
-from skytether.client.alone import LEADER_KEY, NAMES, OneServer
+from skytether.client.alone import OneServer
 from skytether.client.failsafe import Failsafe
 from skytether.client.pilot import Pilot
 from skytether.client.vehicle import Vehicle
@@ -19,8 +19,6 @@ ARMED = keys_of(InFlight.ARMED)
 AFTER_LEAP = "vehicle.after_leap"
 LEAP = keys_of(InFlight.LEAP)
 """Key with which an operator chooses the frame to use after a leap of the position."""
-LEADER = keys_of(InFlight.LEADER)
-"""Key with which an operator lets another server lead."""
 
 
 class Orders:
@@ -38,24 +36,21 @@ class Orders:
         failsafe: Failsafe,
         servers: OneServer,
     ) -> None:
-        for key, setting, at_start in (
-            (AFTER_LEAP, scenario.vehicle.after_leap, "ask"),
-            (LEADER_KEY, scenario.link.leader, NAMES[0]),
-        ):
-            if setting != at_start:
-                expected = f"expected {at_start!r}: it is chosen in flight"
-                raise ConfigError(f"{key}: got {setting!r}, {expected}")
+        if (choice := scenario.vehicle.after_leap) != "ask":
+            expected = "expected 'ask': it is chosen in flight"
+            raise ConfigError(f"{AFTER_LEAP}: got {choice!r}, {expected}")
+        servers.check(scenario)
         self._flies, self._pilot = flies, pilot
         self._failsafe, self._servers = failsafe, servers
-        self.keys = flies.changeable | ARMED | LEAP | LEADER
+        self.keys = flies.changeable | ARMED | LEAP | servers.keys
 
     def objection(self, scenario: Scenario, keys: frozenset[str]) -> str:
         """Why an order is refused at present; empty if it is not.
 
         After a leap, arming requires the operator to choose the frame, which says where the
-        vehicle is. A server that is not heard cannot be made the leader.
+        vehicle is.
         """
-        if keys & LEADER and (objection := self._servers.objection(scenario.link.leader)):
+        if keys & self._servers.keys and (objection := self._servers.objection(scenario)):
             return objection
         leap_m, choice = self._pilot.leap_m, scenario.vehicle.after_leap
         if leap_m is None and keys & LEAP and choice != "ask":
@@ -79,7 +74,7 @@ class Orders:
                     self._pilot.decide(keeps_frame=frame == "old")
                 case choice:
                     self._failsafe.stays = choice == "stay"
-        if keys & LEADER:
-            self._servers.name(NAMES.index(scenario.link.leader), now_ns=now_ns)
+        if keys & self._servers.keys:
+            self._servers.obey(scenario, now_ns=now_ns)
         if keys & self._flies.changeable:
             self._flies.change(scenario)

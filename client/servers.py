@@ -11,7 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from skytether.client.alone import LEADER_KEY, NAMES, MotionInForce, OneServer, Watch
+from skytether.client.alone import LEADER_KEY, NAMES, MotionInForce, OneServer, Role
 from skytether.client.failsafe import CLOSING, Failsafe
 from skytether.client.leadership import Leadership
 from skytether.client.session import ServerSession
@@ -22,9 +22,10 @@ from skytether.shared.events.standby import LeaderChanged, LimitsDiffer
 from skytether.shared.law.heartbeat import SESSION_NS
 from skytether.shared.law.terms import Difference
 from skytether.shared.scenario.catalogue import differences
+from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Reason
 from skytether.shared.wire.lead import Lead
-from skytether.shared.wire.protocol import Message
+from skytether.shared.wire.protocol import Horizon, Message, Trajectory
 
 SOON_NS = 200 * MILLISECOND_NS
 """Time after which a server that has to lead is sent LEAD again if it has not answered [ns]."""
@@ -34,6 +35,9 @@ answers HELLOs only, of which the first need several packets each way."""
 DEPARTURES = frozenset({Reason.CLOSED, Reason.RESTARTED})
 """Causes after which a server stops leading if another is heard."""
 NEVER_NS = -(2**63)
+LOST_TIMES = 6
+"""Silence after which a server that does not lead counts as lost, as a multiple of the time-out;
+half of SESSION_NS bounds it."""
 
 
 @dataclass(slots=True)
@@ -96,29 +100,27 @@ class Servers(OneServer):
         gets one for each silence."""
 
     @property
-    def leader(self) -> int:  # type: ignore[override] # changes in flight
-        return self.leadership.leader
-
-    @property
-    def number(self) -> int:  # type: ignore[override] # changes in flight
-        return self.leadership.number
+    def followed(self) -> ServerSession:
+        return self.sessions[self.leadership.leader]
 
     def begin(self, server: int) -> None:
+        """Note another session with a server."""
         self._lead_states[server] = LeadState()
         self.leadership.begin(server)
 
-    def may_observe(self, server: int) -> bool:
-        """See `OneServer`: a server that does not know who leads would take itself for the
-        leader.
-        """
+    def knows_leader(self, server: int) -> bool:
+        """Whether a server has answered that it knows who leads."""
         return self._lead_states[server].number is not None
 
-    def figures(self) -> dict[str, Any]:
-        address = address_text(*self.leading.address)
-        return {"leadership": {"number": self.number, "server": address}}
+    def to_keep(self) -> dict[str, Any]:
+        return {"leadership": self.leadership.number}
 
-    def watch(self, server: int) -> Watch:
-        return self.failsafe if self._count == 1 else _OfLeader(self, server)
+    def figures(self) -> dict[str, Any]:
+        address = address_text(*self.followed.address)
+        return {"leadership": {"number": self.leadership.number, "server": address}}
+
+    def role(self, server: int) -> Role:
+        return OneOfServers(self, server)
 
     # -- deciding ----------------------------------------------------------------------------
 
@@ -133,7 +135,7 @@ class Servers(OneServer):
             self._counted_from_ns = now_ns
         self._was_on_ground = on_ground
         heard_ns = [NEVER_NS if each.heard_ns is None else each.heard_ns for each in self.sessions]
-        useful_ns = self.leading.useful_ns
+        useful_ns = self.followed.useful_ns
         leader_ns = max(NEVER_NS if useful_ns is None else useful_ns, self._counted_from_ns)
         if on_ground:
             leader_ns += GROUND_NS + self._timeout_ns // 2
@@ -160,7 +162,7 @@ class Servers(OneServer):
         Returns:
             whether another leads; otherwise the failsafe has to act on the cause.
         """
-        if self.sessions[server].leads:
+        if self.sessions[server].role.is_followed:
             others = [i for i, each in enumerate(self.sessions) if i != server]
             may_lead = filter(self.leadership.may_lead, others)
             ready = [i for i in may_lead if not self.sessions[i].is_lost(now_ns)]
@@ -171,13 +173,16 @@ class Servers(OneServer):
             self.sessions[server].close()
         return True
 
-    def objection(self, named: str) -> str:
-        """Why a server cannot be made the leader by `link.leader`; empty if it can."""
+    def obey(self, scenario: Scenario, *, now_ns: int) -> None:
+        self.name(NAMES.index(scenario.link.leader), now_ns=now_ns)
+
+    def objection(self, scenario: Scenario) -> str:
+        named = scenario.link.leader
         server = NAMES.index(named)
         if server >= len(self.sessions):
             return f"{LEADER_KEY}: got {named!r}, expected 'server' without a standby server"
         session = self.sessions[server]
-        if not session.leads and session.is_lost(self._now_ns):
+        if not session.role.is_followed and session.is_lost(self._now_ns):
             at = address_text(*session.address)
             return f"{LEADER_KEY}: got {named!r}, but the server at {at} is not heard"
         if not self.leadership.may_lead(server):
@@ -200,9 +205,9 @@ class Servers(OneServer):
         for state, session in zip(self._lead_states, self.sessions, strict=True):
             if session.number is None or now_ns < state.again_ns:
                 continue
-            asks = doubts and not session.leads
-            if asks or (state.number != self.number and not session.is_lost(now_ns)):
-                again_ns = SOON_NS if asks or session.leads else SECOND_NS
+            asks = doubts and not session.role.is_followed
+            if asks or (state.number != self.leadership.number and not session.is_lost(now_ns)):
+                again_ns = SOON_NS if asks or session.role.is_followed else SECOND_NS
                 state.again_ns, state.asked = now_ns + again_ns, (step, now_ns)
                 session.post(self._lead(session, step), now_ns)
 
@@ -228,11 +233,13 @@ class Servers(OneServer):
     def _is_alone(self, now_ns: int) -> bool:
         """Whether no other server is heard that may lead."""
         may_lead = filter(self.leadership.may_lead, range(self._count))
-        return all(self.sessions[i].leads or self.sessions[i].is_lost(now_ns) for i in may_lead)
+        return all(
+            self.sessions[i].role.is_followed or self.sessions[i].is_lost(now_ns) for i in may_lead
+        )
 
     def _lead(self, session: ServerSession, step: int) -> Lead:
         assert session.number is not None
-        number, leads = self.leadership.number, session.leads
+        number, leads = self.leadership.number, session.role.is_followed
         message = Lead(self._vehicle, session.number, number, int(leads), step=step)
         motion = self._motion() if leads else None
         if motion is None:
@@ -262,7 +269,7 @@ class Servers(OneServer):
         """Report that another server leads; the failsafe goes by its packets from now on."""
         if self._reported == self.leadership.number:
             return
-        self._reported, session = self.leadership.number, self.leading
+        self._reported, session = self.leadership.number, self.followed
         if session.heard_ns is not None:
             self.failsafe.heard(now_ns=max(session.heard_ns, self.failsafe.heard_ns or 0))
         (host, port), number = session.address, self._reported
@@ -271,20 +278,50 @@ class Servers(OneServer):
         )
 
 
-class _OfLeader(Watch):
-    """Packets and faults of one of several servers: those of the leader reach the failsafe."""
+class OneOfServers(Role):
+    """What one of several servers is to the vehicle; faults of the leader alone reach the failsafe.
+
+    Args:
+        server: its number, from 0.
+    """
 
     def __init__(self, servers: Servers, server: int) -> None:
         self._servers, self._server = servers, server
+        super().__init__(servers.failsafe)
+        self.heard, self.malformed, self.meet = self._heard, self._malformed, self._meet
 
-    def heard(self, *, now_ns: int) -> None:
-        if self._servers.leadership.leader == self._server:
+    @property
+    def is_followed(self) -> bool:  # type: ignore[override] # changes in flight
+        return self._servers.leadership.leader == self._server
+
+    @property
+    def may_observe(self) -> bool:  # type: ignore[override] # changes in flight
+        """See `Role`: a server that does not know who leads would take itself for the leader."""
+        return self._servers.knows_leader(self._server)
+
+    def begin(self) -> None:
+        self._servers.begin(self._server)
+
+    def accepts(self, plan: Horizon | Trajectory) -> bool:
+        return self.is_followed and plan.leadership == self._servers.leadership.number
+
+    def take(self, message: Message, now_ns: int) -> bool:
+        return self._servers.take(self._server, message, now_ns)
+
+    def lost_after_ns(self, timeout_ns: int) -> int:
+        """See `Role`: before the server forgets the session."""
+        if self.is_followed:
+            return timeout_ns
+        return max(timeout_ns, min(LOST_TIMES * timeout_ns, SESSION_NS // 2))
+
+    def _heard(self, *, now_ns: int) -> None:
+        if self.is_followed:
             self._servers.failsafe.heard(now_ns=now_ns)
 
-    def malformed(self, *, now_ns: int) -> None:
-        if self._servers.leadership.leader == self._server:
+    def _malformed(self, *, now_ns: int) -> None:
+        if self.is_followed:
             self._servers.failsafe.malformed(now_ns=now_ns)
 
-    def meet(self, cause: Reason, *, now_ns: int) -> None:
+    def _meet(self, cause: Reason, *, now_ns: int) -> None:
         if not self._servers.leave(self._server, cause, now_ns=now_ns):
             self._servers.failsafe.meet(cause, now_ns=now_ns)

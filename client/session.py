@@ -9,7 +9,7 @@ delays. `client.failsafe` decides how packets and silence change the vehicle's m
 
 from typing import Literal
 
-from skytether.client.alone import OneServer, Watch
+from skytether.client.alone import Role
 from skytether.client.link import AGAIN_NS, ClientLink
 from skytether.client.route import Route
 from skytether.client.server_clock import ServerClock
@@ -22,7 +22,7 @@ from skytether.shared.events.flight import (
     SessionRefused,
     Unanswered,
 )
-from skytether.shared.law.heartbeat import NUMBERS, RARE_TIMES, SESSION_NS, STANDBY_TIMES, Hearing
+from skytether.shared.law.heartbeat import NUMBERS, RARE_TIMES, Hearing
 from skytether.shared.law.terms import Terms
 from skytether.shared.scenario.catalogue import differences
 from skytether.shared.telemetry.record import Reason
@@ -72,8 +72,7 @@ class ServerSession:
     Args:
         terms: terms that the server has to agree to.
         boot_id: number unique to this run of the client.
-        server: which of the vehicle's servers this is, from 0.
-        servers: all servers, of which one leads.
+        role: what the server is to the vehicle.
         route: route to the server.
         timeout_ns: time without a packet after which an end takes the link for lost [ns].
         connect_s: time after which a vehicle that was never answered gives up [s].
@@ -87,19 +86,16 @@ class ServerSession:
         *,
         vehicle: int,
         boot_id: int,
-        server: int = 0,
-        servers: OneServer,
+        role: Role,
         route: Route,
         timeout_ns: int,
         connect_s: float,
         link: ClientLink,
         hearing: Hearing,
-        watch: Watch,
         events: Events,
     ) -> None:
         self._terms, self.vehicle, self._boot_id = terms, vehicle, boot_id
-        self._index, self._servers = server, servers
-        self.route, self._timeout_ns = route, timeout_ns
+        self.role, self.route, self._timeout_ns = role, route, timeout_ns
         self._connect_ns = seconds_to_ns(connect_s)
         self.link = link
         self.hearing = hearing
@@ -108,7 +104,6 @@ class ServerSession:
         """Longest silence that the server allows the vehicle [half steps]; 0 for no bound."""
         self.sent = 0
         """Number of packets sent in the session, modulo NUMBERS."""
-        self._watch = watch
         self.heard_ns: int | None = None
         """Time of the newest packet of the session; None before the first, and once it is closed.
         """
@@ -138,22 +133,16 @@ class ServerSession:
     def address(self) -> Address:
         return self.route.addresses[0]
 
-    @property
-    def leads(self) -> bool:
-        return self._servers.leader == self._index
-
     def is_lost(self, now_ns: int) -> bool:
         timeout_ns = self._timeout_ns
         if self.heard_ns is None or now_ns - self.heard_ns <= timeout_ns:
             return self.heard_ns is None
-        if not self.leads:  # before the server forgets the session
-            timeout_ns = max(timeout_ns, min(STANDBY_TIMES * timeout_ns, SESSION_NS // 2))
-        return now_ns - self.heard_ns > timeout_ns
+        return now_ns - self.heard_ns > self.role.lost_after_ns(timeout_ns)
 
     @property
     def silence(self) -> int:
         """Longest silence that the vehicle allows the server [half steps]."""
-        return self.hearing.silence if self.leads else self.hearing.rare
+        return self.hearing.silence if self.role.is_followed else self.hearing.rare
 
     # -- receiving ---------------------------------------------------------------------------
 
@@ -194,11 +183,8 @@ class ServerSession:
         if isinstance(message, Stamped):
             return self._take_stamped(message, server_ns, now_ns)
         if isinstance(message, Close):
-            self._watch.meet(Reason.CLOSED, now_ns=now_ns)
-        elif not (
-            self.route.take(self, message, path, now_ns)
-            or self._servers.take(self._index, message, now_ns)
-        ):
+            self.role.meet(Reason.CLOSED, now_ns=now_ns)
+        elif not (self.route.take(self, message, path, now_ns) or self.role.take(message, now_ns)):
             raise ProtocolError(Drop.NOT_FOR_A_CLIENT)
         return None
 
@@ -210,7 +196,7 @@ class ServerSession:
         self.silence_asked = message.silence
         self.hearing.hear(message.number, server_ns)
         if not isinstance(message, Heartbeat):
-            if not self.leads or message.leadership != self._servers.number:
+            if not self.role.accepts(message):
                 raise ProtocolError(Drop.NOT_THE_LEADER)
             self.idle = str(Idle.PLANS)
             return message
@@ -226,7 +212,7 @@ class ServerSession:
         except ProtocolError:
             # In plaintext anybody could make the vehicle brake with five packets.
             if self.link.secure:
-                self._watch.malformed(now_ns=now_ns)
+                self.role.malformed(now_ns=now_ns)
             raise
 
     def _welcome(self, welcome: Welcome, now_ns: int) -> None:
@@ -253,7 +239,7 @@ class ServerSession:
             self.clock.begin()
         if self.number != welcome.session:
             self.sent, self.sent_step = 0, -1
-            self._servers.begin(self._index)
+            self.role.begin()
             self.hearing.begin()
             self.route.begin()
         self.number, self._server_boot_id = welcome.session, welcome.server_boot_id
@@ -262,7 +248,7 @@ class ServerSession:
         self._heard(welcome.server_ns, now_ns)
         self._awaits_welcome = True  # another HELLO may be answered by a session that lives longer
         if restarted:
-            self._watch.meet(Reason.RESTARTED, now_ns=now_ns)
+            self.role.meet(Reason.RESTARTED, now_ns=now_ns)
 
     def _note_refusal(self, refusal: Refusal, now_ns: int) -> None:
         """Report why there is no session, once per reason; a late refusal is ignored."""
@@ -283,14 +269,14 @@ class ServerSession:
     def _heard(self, server_ns: int, now_ns: int) -> None:
         """Note a packet of the session that was sent at a time of the server [ns]."""
         if self.clock.hear(server_ns, now_ns):
-            self._watch.meet(Reason.STALLED, now_ns=now_ns)
+            self.role.meet(Reason.STALLED, now_ns=now_ns)
         self.note_heard(now_ns)
 
     def note_heard(self, now_ns: int) -> None:
         """Note a packet of the session."""
         self._awaits_welcome = False
         self.heard_ns = self.useful_ns = now_ns
-        self._watch.heard(now_ns=now_ns)
+        self.role.heard(now_ns=now_ns)
 
     # -- sending -----------------------------------------------------------------------------
 
@@ -302,7 +288,7 @@ class ServerSession:
         if wanted and now_ns >= self.hello_ns:
             unheard = self.number is None and self._refusal is None
             again_ns = self.link.hello_ns if unheard else AGAIN_NS
-            self.hello_ns = now_ns + again_ns * (1 if self.leads else RARE_TIMES)
+            self.hello_ns = now_ns + again_ns * (1 if self.role.is_followed else RARE_TIMES)
             self._awaits_welcome = True
             hello = encode(Hello(self.vehicle, self._boot_id, self._terms))
             self.route.greet(self.link.hello(hello, now_ns=now_ns))
@@ -324,7 +310,7 @@ class ServerSession:
         self.post(Time(self.vehicle, self.number, step, epoch_us, error_us), now_ns)
 
     def is_observation_due(self, step: int) -> bool:
-        """Whether a server that does not lead is to be sent an observation."""
+        """Whether a server that is not followed is to be sent an observation."""
         return self.sent_step < 0 or 2 * (step - self.sent_step) >= self.hearing.rare
 
     def post(self, message: Message, now_ns: int) -> None:

@@ -35,9 +35,9 @@ SILENCE_MAX = 2**16 - 1
 """Longest silence that can be requested [half steps]."""
 SESSION_NS = 30 * SECOND_NS
 """Silence after which the server forgets a vehicle."""
-RARE_TIMES, STANDBY_TIMES = 2, 6
-"""Between a vehicle and a server that does not lead it: longest silence, and silence after which
-the vehicle takes the server for lost, as multiples of the time-out; SESSION_NS bounds both."""
+RARE_TIMES = 2
+"""Longest silence between a vehicle and a server that it does not follow, as a multiple of the
+time-out; SESSION_NS bounds it."""
 # Three were worse: the observations from which plans were made became so old that at 30 % loss 5 of
 # 30 flights of `target` braked before a newer plan came; with two, none.
 PATIENCE = 2
@@ -96,7 +96,7 @@ class Hearing:
         the time-out, or its number may have come round again."""
         rare_ns = min(RARE_TIMES * timeout_ns, SESSION_NS // 4)
         self.rare = min(rare_ns // self._half_step_ns, SILENCE_MAX)
-        """Longest silence between a vehicle and a server that does not lead it [half steps]."""
+        """Longest silence between a vehicle and a server that it does not follow [half steps]."""
         table = silences(timeout_ns, step_ns)
         self._losses, self._silences = [loss for loss, _ in table], [ns for _, ns in table]
         self._received = 0

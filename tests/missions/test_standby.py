@@ -186,7 +186,7 @@ def test_a_stolen_vehicle_that_speaks_of_a_standby_costs_the_others_its_room_onl
     lives = Lives(scenario)
     lives.run(4.0)
     client = lives._lives[1][-1].client
-    session = client._servers.leading
+    session = client._servers.followed
     assert session.number is not None
     lead = Lead(1, session.number, 1, 0)
     lives.world.act("client 1", lambda *, now_ns: session.post(lead, now_ns))
