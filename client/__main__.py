@@ -9,12 +9,13 @@ if __name__ == "__main__":  # called before the slow imports below
 
 import secrets
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from hashlib import blake2b
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated
 
 import msgspec
 
@@ -22,8 +23,9 @@ from skytether.client import vehicles
 from skytether.client.endpoint import Client
 from skytether.client.fleet import ClientFleet
 from skytether.client.link import ClientLink, PlainLink
+from skytether.client.memory import SavedState, recall
+from skytether.client.several import PATH_SOCKETS, STANDBY_SOCKETS, Several
 from skytether.client.vehicle import Vehicle, VehicleMemory
-from skytether.shared.endpoints.endpoint import PATH_SOCKETS, STANDBY_SOCKETS
 from skytether.shared.endpoints.steady import Steady
 from skytether.shared.events.aboard import ParametersUnsafe
 from skytether.shared.events.flight import Event, NoSession, SessionRefused, address_text
@@ -156,22 +158,20 @@ def fly(argv: Sequence[str]) -> None:
         if options.set_parameters and not flying[0].set_parameters():
             kind = f"got vehicle.kind = {scenario.vehicle.kind!r}, expected one with parameters"
             raise CommandError(f"--set-parameters: {kind}", command.CONFIGURATION)
-        several = _several(paths, scenario)
-        if standby:
-            standby_link = link(numbers[0])
-            several |= {"standby": [each.peer for each in standby], "standby_link": standby_link}
+        several = None
+        if len(paths) > 1 or standby:
+            several = _several(paths, standby, scenario, partial(link, numbers[0]))
         clients = [
             Client(
                 scenario,
                 flies,
-                server=paths[0].peer,
+                server=several or paths[0].peer,
                 vehicle=number,
                 boot_id=secrets.randbits(64),
-                link=link(number),
+                link=None if several else link(number),
                 recorder=running.recorder,
                 keeps=memory is not None,
                 before=before,
-                **several,
             )
             for number, flies in zip(numbers, flying, strict=True)
         ]
@@ -220,19 +220,25 @@ def _paths(options: ClientOptions) -> Sequence[NetworkPath]:
     return command.paths("--path", options.path)
 
 
-def _several(paths: Sequence[NetworkPath], scenario: Scenario) -> dict[str, Any]:
-    """Arguments of `Client` for several paths, with the scenario's prices; empty for one."""
+def _several(
+    paths: Sequence[NetworkPath],
+    standby: Sequence[NetworkPath],
+    scenario: Scenario,
+    link: Callable[[], ClientLink],
+) -> Several:
+    """How a vehicle reaches its servers, with the scenario's prices of several paths."""
     prices = [path.price for path in scenario.paths]
-    if len(paths) == 1:
-        return {}
-    if 1 < len(prices) != len(paths):
+    if len(paths) > 1 and 1 < len(prices) != len(paths):
         message = f"--path: got {len(paths)}, expected {len(prices)}, as many as network.paths"
         raise CommandError(message, command.CONFIGURATION)
-    return {
-        "paths": [path.peer for path in paths],
-        "prices": prices if len(prices) > 1 else (),
-        "path_names": [str(path) for path in paths],
-    }
+    return Several(
+        [path.peer for path in paths],
+        link(),
+        prices=prices if len(paths) > 1 and len(prices) > 1 else (),
+        names=[str(path) for path in paths] if len(paths) > 1 else (),
+        standby=[each.peer for each in standby],
+        standby_link=link() if standby else None,
+    )
 
 
 def _standby(options: ClientOptions) -> Sequence[NetworkPath]:

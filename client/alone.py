@@ -1,16 +1,22 @@
 """A client with one server, which its vehicle follows, and without saved state.
 
-Rooms may put others in their places: `client.servers` with a standby server, and `client.memory`,
-with which the next run of a client continues in the middle of a flight.
+Rooms may put others in their places: `client.servers` with a standby server, `client.several` with
+several addresses, and `client.memory`, with which the next run of a client continues in the middle
+of a flight.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 from skytether.client.failsafe import Failsafe
+from skytether.client.link import ClientLink, PlainLink
+from skytether.client.route import Route
 from skytether.shared.base.errors import ConfigError
+from skytether.shared.endpoints.endpoint import Address, Datagram, Events
+from skytether.shared.law.terms import Terms
 from skytether.shared.scenario.catalogue import keys_of
 from skytether.shared.scenario.owners import InFlight
+from skytether.shared.scenario.registry import load
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.wire.protocol import Horizon, Message, Trajectory
 
@@ -164,3 +170,51 @@ class OneServer:
 
     def figures(self) -> dict[str, Any]:
         return {}
+
+
+class Parts(NamedTuple):
+    """Parts of a client that its connections use."""
+
+    scenario: Scenario
+    terms: Terms
+    vehicle: int
+    boot_id: int
+    failsafe: Failsafe
+    before: Any
+    """State saved by the previous run: `memory.SavedState`, or `Fresh`."""
+    motion: Callable[[], MotionInForce | None]
+    """Returns the motion in force of a mission; None on the ground, or without one."""
+    may_tell: Callable[[int], bool]
+    """Saves the state if the client does so; returns whether it may be sent at a time [ns]."""
+    out: list[Datagram]
+    events: Events
+    """List to which events for the operator are appended."""
+
+
+class Reach:
+    """How a vehicle reaches its servers. The plain form: one server at one address.
+
+    Args:
+        server: address of the server, or of the netem in front of it.
+        link: link to the server; None: without keys.
+    """
+
+    def __init__(self, server: Address, link: ClientLink | None = None) -> None:
+        self._server = server
+        self.links: Sequence[ClientLink] = (link or PlainLink(),)
+        """Link to each server."""
+
+    def routes(self, parts: Parts) -> list[Route]:
+        """Route to each server."""
+        return [Route((self._server,), (0,), parts.out)]
+
+    def servers(self, parts: Parts) -> OneServer:
+        """Servers, without their sessions; a previous run may have had a standby server.
+
+        Raises:
+            ConfigError: the scenario is not suited for these servers.
+        """
+        if not parts.before.leadership:
+            return OneServer(parts.failsafe)
+        servers: OneServer = load("skytether.client.servers", "a standby server").Servers(1, parts)
+        return servers

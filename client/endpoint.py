@@ -10,8 +10,8 @@ from collections import Counter
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from skytether.client.alone import Fresh
-from skytether.client.connections import Reached, connect
+from skytether.client.alone import Fresh, Parts, Reach
+from skytether.client.connections import connect
 from skytether.client.failsafe import CLOSING, HOLD, TRANSITIONS, Failsafe, brake_ns
 from skytether.client.flight_log import FlightLog
 from skytether.client.ground import GroundReports
@@ -45,7 +45,6 @@ from skytether.shared.wire.protocol import CLOSES, Close, Mode, stamp_us
 if TYPE_CHECKING:
     from skytether.client.memory import SavedState
 
-NOWHERE: Address = ("", 0)
 VEHICLE_SOCKET = 1
 """Socket used by the vehicle's own port; the server's is 0."""
 LATEST_NS = SECOND_NS
@@ -60,13 +59,11 @@ class Client(Endpoint):
 
     Args:
         scenario: scenario of the vehicle; its terms must equal the server's.
-        server: address of the server, or of the netem in front of it.
-        paths: the same on each path, if there are several; `server` is then not used.
-        prices: price of a packet on each path; default: all alike.
-        path_names: what the log calls each path; default: its address.
-        standby: the same as `paths` for a second server, which leads when the first does not.
+        server: address of the server, or of the netem in front of it; or how the vehicle reaches
+            several, see `client.several`.
         vehicle: number of the vehicle, unique among the vehicles of the server.
         boot_id: number unique to this run of the client.
+        link: link to the server at an address; None: without keys.
         keeps: whether the state needed after a restart of the client is saved, see `client.memory`.
         before: state saved by the previous run of the client; None if there was none.
     """
@@ -76,15 +73,10 @@ class Client(Endpoint):
         scenario: Scenario,
         flies: Vehicle,
         *,
-        server: Address = NOWHERE,
-        paths: Sequence[Address] = (),
-        prices: Sequence[float] = (),
-        path_names: Sequence[str] = (),
-        standby: Sequence[Address] = (),
+        server: Address | Reach,
         vehicle: int,
         boot_id: int,
         link: ClientLink | None = None,
-        standby_link: ClientLink | None = None,
         recorder: Recorder | None = None,
         keeps: bool = False,
         before: "SavedState | None" = None,
@@ -111,20 +103,20 @@ class Client(Endpoint):
             returns=scenario.vehicle.on_loss == "return",
         )
         self._pilot = Pilot(scenario, vehicle, flies, self._failsafe, recorder)
-        self._servers, self._at = connect(
-            scenario,
-            terms,
-            Reached(paths or (server,), prices, path_names, standby),
-            (link, standby_link),
-            self._failsafe,
+        parts = Parts(
+            scenario=scenario,
+            terms=terms,
             vehicle=vehicle,
             boot_id=self._memory.boot_id,
-            leadership=self._memory.before.leadership,
+            failsafe=self._failsafe,
+            before=self._memory.before,
             motion=self._pilot.motion_in_force,
             may_tell=self._may_tell,
             out=self._out,
             events=self._events,
         )
+        reach = server if isinstance(server, Reach) else Reach(server, link)
+        self._servers, self._ends = connect(reach, parts)
         self._sessions: list[ServerSession] = self._servers.sessions
         self._orders = Orders(scenario, flies, self._pilot, self._failsafe, self._servers)
         self.changeable = self._orders.keys
@@ -183,13 +175,13 @@ class Client(Endpoint):
             self._attend(self._port, now_ns)
             return
         # Before decryption: a packet from another address costs one comparison.
-        at = self._at.get((datagram.socket, datagram.peer))
-        if at is None:
+        end = self._ends.get((datagram.socket, datagram.peer))
+        if end is None:
             self.dropped[Drop.ELSEWHERE] += 1
             return
-        server, path = at
+        session, path = end
         try:
-            horizon = self._sessions[server].hear(datagram.payload, path=path, now_ns=now_ns)
+            horizon = session.hear(datagram.payload, path=path, now_ns=now_ns)
             if self._pilot.next_ns is None:
                 self._begin(now_ns)
             elif self._failsafe.mode is Mode.INIT:  # the flight went on before there was a session

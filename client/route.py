@@ -2,7 +2,7 @@
 `client.paths` does.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, Protocol
 
 from skytether.client.link import ClientLink
@@ -43,6 +43,11 @@ class Route:
     def others(self) -> tuple[str, ...]:
         """All addresses but the first, in words."""
         return tuple(address_text(*each) for each in self.addresses[1:])
+
+    @property
+    def ends(self) -> Iterable[tuple[int, Address]]:
+        """Socket and peer of each address."""
+        return zip(self._sockets, self.addresses, strict=False)
 
     def put(self, datagram: bytes, path: int = 0) -> None:
         self._out.append(Datagram(datagram, self.addresses[path], self._sockets[path]))

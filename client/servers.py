@@ -7,16 +7,14 @@ It takes the place of `client.alone.OneServer`; `client.connections` loads it if
 server.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from skytether.client.alone import LEADER_KEY, NAMES, MotionInForce, OneServer, Role
-from skytether.client.failsafe import CLOSING, Failsafe
+from skytether.client.alone import LEADER_KEY, NAMES, OneServer, Parts, Role
+from skytether.client.failsafe import CLOSING
 from skytether.client.leadership import Leadership
 from skytether.client.session import ServerSession
-from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
-from skytether.shared.endpoints.endpoint import Events
+from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS, seconds_to_ns
 from skytether.shared.events.flight import address_text
 from skytether.shared.events.standby import LeaderChanged, LimitsDiffer
 from skytether.shared.law.heartbeat import SESSION_NS
@@ -57,35 +55,20 @@ class Servers(OneServer):
 
     Args:
         count: number of servers.
-        number: number of the leadership of an earlier run of the client; 0 at first.
-        timeout_ns: silence after which the vehicle takes a server for lost [ns].
-        motion: returns the motion in force of a mission; None on the ground, or without one.
-        may_tell: saves the number if the vehicle saves its state; returns whether it may be sent
-            at a time [ns].
-        events: list to which events for the operator are appended.
+        parts: parts of the client.
     """
 
-    def __init__(
-        self,
-        count: int,
-        number: int,
-        failsafe: Failsafe,
-        *,
-        vehicle: int,
-        timeout_ns: int,
-        dt_ns: int,
-        motion: Callable[[], MotionInForce | None],
-        may_tell: Callable[[int], bool],
-        events: Events,
-    ) -> None:
-        super().__init__(failsafe)
+    def __init__(self, count: int, parts: Parts) -> None:
+        super().__init__(parts.failsafe)
+        number, timeout_ns = parts.before.leadership, seconds_to_ns(parts.scenario.link.timeout_s)
         # A vehicle that has lost its standby server tells the other that it leads now.
         number += bool(number and count == 1)
         self.leadership = Leadership(count, number, timeout_ns)
         self.sessions: list[ServerSession] = []
         self._lead_states = [LeadState() for _ in range(count)]
-        self._count, self._vehicle, self._events, self._dt_ns = count, vehicle, events, dt_ns
-        self._timeout_ns, self._motion, self._may_tell = timeout_ns, motion, may_tell
+        self._count, self._vehicle, self._events = count, parts.vehicle, parts.events
+        self._dt_ns, self._timeout_ns = parts.terms.dt_ns, timeout_ns
+        self._motion, self._may_tell = parts.motion, parts.may_tell
         self._reported = number
         """Number of the leadership that was last reported."""
         self._differing: dict[int, tuple[Difference, ...]] = {}

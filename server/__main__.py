@@ -20,14 +20,17 @@ from skytether.server.endpoint import VEHICLES_MAX, Server
 from skytether.server.gate import Gate, PlainGate
 from skytether.server.reception import PATHS, STANDBY
 from skytether.server.schemes import table
-from skytether.shared.base import kernel, machine_code
-from skytether.shared.endpoints.endpoint import PATH_SOCKETS, Address, Form
+from skytether.shared.base import kernel
+from skytether.shared.endpoints.endpoint import Address, Form
 from skytether.shared.endpoints.steady import Steady
 from skytether.shared.endpoints.stopwatch import Stopwatch
 from skytether.shared.events.flight import address_text
 from skytether.shared.scenario.registry import load
 from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import RECORDING, plan_columns, server_columns
+from skytether.shared.wire import keys
+from skytether.shared.wire.framing import PATHS_MAX
+from skytether.shared.wire.keys import Keyring
 from skytether.shell.commandline import command, terminal
 from skytether.shell.commandline.argument import Argument
 from skytether.shell.commandline.command import CommandError
@@ -80,7 +83,7 @@ def serve(argv: Sequence[str]) -> None:
     command.check_count("--workers", options.workers, 64 if system.FORKS else 1)
     command.check_sockets("--workers", options.workers)
     bind = [command.address("--bind", text) for text in options.bind or ("127.0.0.1:47001",)]
-    command.check_count("--bind", len(bind), len(PATH_SOCKETS))
+    command.check_count("--bind", len(bind), PATHS_MAX)
     if options.workers > 1:
         command.check_count("--bind with --workers", len(bind), 1)
     command.optional_address("--metrics", options.metrics)

@@ -16,6 +16,7 @@ import numpy as np
 
 from skytether.client.endpoint import Client
 from skytether.client.memory import recall
+from skytether.client.several import Several
 from skytether.client.simulated.plant import FirstOrderPlant
 from skytether.client.simulated.sensor import Sensor
 from skytether.client.simulated.vehicle import SimulatedVehicle
@@ -171,8 +172,7 @@ class Lives:
         client = Client(
             self.scenario,
             self.bodies[number],
-            server=NETWORK,
-            standby=self._standby,
+            server=Several([NETWORK], standby=self._standby),
             vehicle=number,
             boot_id=number * 1000 + runs,
             recorder=Recorder(client_columns(self.scenario.model.axes), sink),

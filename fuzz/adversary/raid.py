@@ -19,9 +19,10 @@ import numpy as np
 
 from fuzz.adversary.lives import CLOCK, STANDBY_FLOWS, Lives, Saved, world_s
 from fuzz.engine import HeldPackets, shrink
+from skytether.client.several import STANDBY_SOCKETS
 from skytether.shared.base.chance import stream
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS, seconds_to_ns
-from skytether.shared.endpoints.endpoint import STANDBY_SOCKETS, Datagram
+from skytether.shared.endpoints.endpoint import Datagram
 from skytether.shared.law.terms import Terms
 from skytether.shared.missions import mission
 from skytether.shared.missions.derived import zones

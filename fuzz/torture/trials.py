@@ -33,6 +33,7 @@ from skytether.client import secure as client_secure
 from skytether.client.endpoint import Client
 from skytether.client.failsafe import GOOD_NS
 from skytether.client.link import AGAIN_NS
+from skytether.client.several import Several
 from skytether.client.simulated.plant import FirstOrderPlant
 from skytether.client.simulated.sensor import Sensor
 from skytether.client.simulated.vehicle import SimulatedVehicle
@@ -372,12 +373,14 @@ class Torture:
         client = Client(
             self.scenario,
             SimulatedVehicle(self.scenario.dt_ns, plant, sensor),
-            paths=(SABOTEUR, SECOND_PATH) if self.trial.two_paths else (SABOTEUR,),
+            server=Several(
+                (SABOTEUR, SECOND_PATH) if self.trial.two_paths else (SABOTEUR,),
+                life.links[0],
+                standby=[STANDBY_PATH] if self.trial.standby else [],
+                standby_link=life.links[-1],
+            ),
             vehicle=vehicle,
             boot_id=self._boot_id(),
-            link=life.links[0],
-            standby=[STANDBY_PATH] if self.trial.standby else [],
-            standby_link=life.links[-1],
             recorder=life,
         )
         life.disturbance = lambda: tuple(client.disturbance.tolist())

@@ -24,11 +24,6 @@ NETWORK_BYTES = 8
 """Length of the network part of an IPv6 address, which identifies a host [B]: whoever has one
 address of a 64-bit network has all of them."""
 
-PATH_SOCKETS = (0, 2, 3, 4)
-"""Numbers of a client's sockets, one for each path to its server; 1 is its autopilot's."""
-STANDBY_SOCKETS = (5, 6, 7, 8)
-"""The same for each path to its standby server."""
-
 EVENTS_MAX = 1024
 """Number of events kept until the driver reads them; older ones are dropped and counted."""
 

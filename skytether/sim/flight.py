@@ -22,6 +22,7 @@ import msgspec
 import numpy as np
 
 from skytether.client import vehicles as kinds
+from skytether.client.alone import Reach
 from skytether.client.endpoint import Client
 from skytether.client.link import ClientLink
 from skytether.netem.proxy import Proxy, of_paths
@@ -181,9 +182,6 @@ class Run:
             world.add(host, netem)
         addresses: list[Address] = [(host, 0) for host in self._netems]
         standby = [addresses.pop()] if has_standby else []
-        reached: dict[str, Any] = {"server": addresses[0]}
-        if len(addresses) > 1:
-            reached = {"paths": addresses, "prices": [each.price for each in scenario.paths]}
         self.hosts: dict[str, Endpoint] = dict([*self._netems.items()][:1])
         """Endpoints of netem, of the first path, and of the vehicles, in this order."""
         self._events: deque[FlightEvent] = deque(maxlen=EVENTS_MAX)
@@ -193,17 +191,28 @@ class Run:
             round(simulation.clock_drift_ppm * 1000),
         )
         start_ns = int(stream(scenario.seed, "phase").integers(scenario.dt_ns))
+
+        def reach(vehicle: int) -> Reach:
+            link = ends.link(scenario.seed, vehicle)
+            if len(addresses) == 1 and not standby:
+                return Reach(addresses[0], link)
+            several: Reach = load("skytether.client.several", "several servers or paths").Several(
+                addresses,
+                link,
+                prices=[each.price for each in scenario.paths],
+                standby=standby,
+                standby_link=ends.link(scenario.seed, vehicle, "standby"),
+            )
+            return several
+
         self._clients = [
             Client(
                 scenario,
                 kinds.make(scenario, vehicle),
                 vehicle=self._before + vehicle,
+                server=reach(self._before + vehicle),
                 boot_id=BOOT_ID,
-                link=ends.link(scenario.seed, self._before + vehicle),
-                standby=standby,
-                standby_link=ends.link(scenario.seed, self._before + vehicle, "standby"),
                 recorder=recorder,
-                **reached,
             )
             for vehicle in range(1, vehicles + 1)
         ]

@@ -9,9 +9,10 @@ from by_hand import ByHand
 from helpers import packaged
 from skytether.client.endpoint import Client
 from skytether.client.link import HELLO_NS
+from skytether.client.several import PATH_SOCKETS, Several
 from skytether.client.simulated.vehicle import SimulatedVehicle, simulated
 from skytether.shared.base.units import SECOND_NS
-from skytether.shared.endpoints.endpoint import PATH_SOCKETS, Address, Datagram
+from skytether.shared.endpoints.endpoint import Address, Datagram
 from skytether.shared.events.flight import (
     Finished,
     Flying,
@@ -82,7 +83,7 @@ def test_an_unreachable_server_ends_the_client_with_a_reason() -> None:
 
 def test_a_server_that_is_not_heard_on_any_path_is_named_by_all_its_addresses() -> None:
     flown, places = scenario(link={"connect_s": 15.0}), (("wifi", 1), ("lte", 2))
-    client = Client(flown, simulated(flown, 1), paths=places, vehicle=4, boot_id=99)
+    client = Client(flown, simulated(flown, 1), server=Several(places), vehicle=4, boot_id=99)
     while (now_ns := client.next_wake_ns()) is not None:
         client.wake(now_ns=now_ns)
     waits, failure = client.events()
@@ -394,7 +395,7 @@ def test_only_the_servers_address_is_heard() -> None:
 def test_a_path_message_that_was_overtaken_is_no_sign_of_life() -> None:
     flown = packaged("demo-two-links")
     places: list[Address] = [("one", 1), ("two", 1)]
-    client = Client(flown, simulated(flown, 1), paths=places, vehicle=4, boot_id=99)
+    client = Client(flown, simulated(flown, 1), server=Several(places), vehicle=4, boot_id=99)
     client.wake(now_ns=SECOND_NS)
     peer, session = Paths((1000, 1000), SECOND_NS), client._session
 

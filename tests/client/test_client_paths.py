@@ -2,6 +2,7 @@
 
 from helpers import packaged
 from skytether.client.endpoint import Client
+from skytether.client.several import Several
 from skytether.client.simulated.vehicle import simulated
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.endpoints.endpoint import Address, Datagram
@@ -15,7 +16,7 @@ SERVER: Address = ("server", 0)
 def test_report_of_an_earlier_session_is_not_taken_for_one_of_this() -> None:
     flown = packaged("paper-every-step")
     client = Client(
-        flown, simulated(flown, 1), paths=(SERVER, ("server", 2)), vehicle=4, boot_id=99
+        flown, simulated(flown, 1), server=Several((SERVER, ("server", 2))), vehicle=4, boot_id=99
     )
     welcome = Welcome(4, 7, 99, 1, 1234, Refusal.ACCEPTED, flown.terms())
     late, now_ns = Paths((1.0, 1.0), SECOND_NS), 5 * SECOND_NS

@@ -10,10 +10,11 @@ from helpers import packaged
 from skytether.client.endpoint import Client
 from skytether.client.leadership import ASK_SHARE, NUMBER_MAX, Leadership
 from skytether.client.memory import SavedState, recall
+from skytether.client.several import STANDBY_SOCKETS, Several
 from skytether.client.simulated.vehicle import SimulatedVehicle, simulated
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.base.units import SECOND_NS, seconds_to_ns
-from skytether.shared.endpoints.endpoint import STANDBY_SOCKETS, Address, Datagram
+from skytether.shared.endpoints.endpoint import Address, Datagram
 from skytether.shared.events.standby import LeaderChanged
 from skytether.shared.law.terms import Limits
 from skytether.shared.scenario.whole import Scenario
@@ -94,8 +95,7 @@ class Vehicle:
         self.client = Client(
             scenario,
             flies or simulated(scenario, 1),
-            server=SERVERS[0],
-            standby=[SERVERS[1]] if has_standby else [],
+            server=Several([SERVERS[0]], standby=[SERVERS[1]]) if has_standby else SERVERS[0],
             vehicle=4,
             boot_id=99,
             keeps=True,

@@ -15,7 +15,8 @@ from types import SimpleNamespace
 import pytest
 
 from helpers import LOOPBACK, Idle, ran
-from skytether.shared.endpoints.endpoint import PATH_SOCKETS, Address, Datagram
+from skytether.client.several import PATH_SOCKETS
+from skytether.shared.endpoints.endpoint import Address, Datagram
 from skytether.shared.events.flight import Event
 from skytether.shared.events.processes import HostFound, HostMissing, PathFound, PathMissing
 from skytether.shell.driving import driver

@@ -21,13 +21,14 @@ from skytether.shared.base import extras, files
 from skytether.shared.base.errors import ConfigError, RecordingError
 from skytether.shared.base.extras import ExtraMissing
 from skytether.shared.base.printable import printable
-from skytether.shared.endpoints.endpoint import PATH_SOCKETS, Address
+from skytether.shared.endpoints.endpoint import Address
 from skytether.shared.endpoints.line import HOST_PORT, parse_address
 from skytether.shared.events.flight import Event, address_text
 from skytether.shared.events.processes import NoFailsafe
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.dotted import set_keys
 from skytether.shared.scenario.whole import Scenario
+from skytether.shared.wire.framing import PATHS_MAX
 from skytether.shell.commandline import plugins
 from skytether.shell.commandline.argument import HELP_KEYS, Argument
 from skytether.shell.commandline.options import key_values, read
@@ -143,7 +144,7 @@ def paths(flag: str, texts: Sequence[str], *, needs_local: bool = True) -> list[
     Args:
         needs_local: whether HOST:PORT alone is refused.
     """
-    check_count(flag, len(texts), len(PATH_SOCKETS))
+    check_count(flag, len(texts), PATHS_MAX)
     parsed: list[NetworkPath] = []
     for text in texts:
         path = parse_path(text if needs_local or "=" in text else f"={text}")

@@ -1,0 +1,84 @@
+"""A vehicle that reaches its server over several paths, or has a standby server as well."""
+
+from collections.abc import Sequence
+
+from skytether.client.alone import OneServer, Parts, Reach
+from skytether.client.link import ClientLink, PlainLink
+from skytether.client.route import Route
+from skytether.shared.base.errors import ConfigError
+from skytether.shared.base.units import seconds_to_ns
+from skytether.shared.endpoints.endpoint import Address
+from skytether.shared.scenario.registry import load
+
+PATH_SOCKETS = (0, 2, 3, 4)
+"""Numbers of a client's sockets, one for each path to its server; 1 is its autopilot's."""
+STANDBY_SOCKETS = (5, 6, 7, 8)
+"""The same for each path to its standby server."""
+
+
+class Several(Reach):
+    """See `Reach`.
+
+    Args:
+        paths: address of the server, or of the netem in front of it, on each path.
+        link: link to the server; None: without keys.
+        prices: price of a packet on each path; if there are not as many as paths, all alike.
+        names: what the log calls each path; empty: its address.
+        standby: the same as `paths` for a second server, which leads when the first does not; empty
+            without one.
+        standby_link: link to that server.
+    """
+
+    def __init__(
+        self,
+        paths: Sequence[Address],
+        link: ClientLink | None = None,
+        *,
+        prices: Sequence[float] = (),
+        names: Sequence[str] = (),
+        standby: Sequence[Address] = (),
+        standby_link: ClientLink | None = None,
+    ) -> None:
+        super().__init__(paths[0], link)
+        self._paths, self._standby, self._prices, self._names = paths, standby, prices, names
+        if standby:
+            self.links = (*self.links, standby_link or PlainLink())
+
+    def routes(self, parts: Parts) -> list[Route]:
+        routes = [self._route(parts, self._paths, PATH_SOCKETS, self._names)]
+        if self._standby:
+            routes.append(self._route(parts, self._standby, STANDBY_SOCKETS, ()))
+        return routes
+
+    def servers(self, parts: Parts) -> OneServer:
+        """See `Reach`.
+
+        Raises:
+            ConfigError: heartbeats are too rare for a standby server.
+        """
+        if not self._standby:
+            return super().servers(parts)
+        link = parts.scenario.link
+        if 3 * (link.fixed_ns or 0) > seconds_to_ns(link.timeout_s):
+            expected = "expected at most a third of link.timeout_s with a standby server"
+            raise ConfigError(f"link.heartbeat_s: got {link.heartbeat_s}, {expected}")
+        servers: OneServer = load("skytether.client.servers", "a standby server").Servers(2, parts)
+        return servers
+
+    def _route(
+        self, parts: Parts, paths: Sequence[Address], sockets: Sequence[int], names: Sequence[str]
+    ) -> Route:
+        if len(paths) == 1:
+            return Route(paths, sockets, parts.out)
+        prices, link = self._prices, parts.scenario.link
+        route: Route = load("skytether.client.paths", "paths").SeveralPaths(
+            paths,
+            sockets,
+            parts.out,
+            events=parts.events,
+            names=names,
+            prices=prices if len(prices) == len(paths) else (1.0,) * len(paths),
+            spread=link.spread,
+            timeout_ns=seconds_to_ns(link.timeout_s),
+        )
+        return route
