@@ -16,9 +16,9 @@ from pathlib import Path
 from socket import socket
 from typing import TYPE_CHECKING, Annotated
 
+from skytether.server import assignment, routes
 from skytether.server.endpoint import VEHICLES_MAX, Server
 from skytether.server.gate import Gate, PlainGate
-from skytether.server.reception import PATHS, STANDBY
 from skytether.server.schemes import table
 from skytether.shared.base import kernel
 from skytether.shared.endpoints.endpoint import Address, Form
@@ -115,7 +115,7 @@ def _ready(scenario: Scenario) -> None:
     """Load the compiled planner, and what a vehicle's packet may call for, now: before workers are
     forked, so that they share its memory, and before a tick would have to wait for it.
     """
-    for room in (PATHS, STANDBY):
+    for room in (assignment.ROOM, routes.ROOM):
         import_module(room)
     others = table.others(scenario)
     terminal.prepare(machine_code.missing(without=others))

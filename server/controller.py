@@ -42,7 +42,7 @@ from skytether.shared.wire.protocol import Idle, Observation, RoomMessage
 if TYPE_CHECKING:
     from skytether.server.budget import SharedBudget
 
-PLANS, OBSERVATION, DELAY, UNSOLVED, STANDBY = map(int, Idle)
+PLANS, OBSERVATION, DELAY, UNSOLVED, OTHER_SERVER = map(int, Idle)
 BLOCK = 128
 """Number of vehicles planned for together: their data stay in the cache, and no array is so large
 (128 KiB) that the C library would get new memory from the kernel for it each time."""
@@ -117,8 +117,8 @@ class Controller:
         """Step of the newest observation of each vehicle, or -1; shape (capacity,)."""
         self.idle = np.zeros(capacity, dtype=np.int64)
         """Reason for the missing plan of each vehicle, one of `Idle`; shape (capacity,)."""
-        self._leads = np.ones(capacity, dtype=np.bool_)
-        """Whether this server leads each vehicle; shape (capacity,)."""
+        self._is_own = np.ones(capacity, dtype=np.bool_)
+        """Whether this server plans for each vehicle; shape (capacity,)."""
         self._plans_due: dict[int, int] = {}
         """Number of plans still due, whatever the trigger says, by row."""
         self._takes = np.ones(capacity, dtype=np.bool_)
@@ -181,14 +181,14 @@ class Controller:
         """Note that the client of a vehicle has restarted without its state; see `Scheme`."""
         return self.scheme.restart(row)
 
-    def lead(
-        self, row: int, message: RoomMessage | None, *, leads: bool = True, plans_due: int = 0
+    def assign(
+        self, row: int, message: RoomMessage | None, *, is_own: bool = True, plans_due: int = 0
     ) -> None:
-        """Note whether this server leads a vehicle; if it does, it sends a plan at once, whatever
-        it sent before. See `server.leads.Leader`.
+        """Note whether this server plans for a vehicle; if so, it sends a plan at once, whatever it
+        sent before. See `assignment.Decider`.
         """
-        self._leads[row] = leads
-        if leads:
+        self._is_own[row] = is_own
+        if is_own:
             self._sent_step[row] = -1
             self._trigger.forget(row)
         if plans_due:
@@ -232,7 +232,7 @@ class Controller:
             self._age_max,
             self._clock.seen,
             self.scheme.uplink_max_ns,
-            self._leads,
+            self._is_own,
             self.idle,
             able,
         ):
@@ -311,7 +311,7 @@ def _able(
     age_max: int,
     seen: Seen,
     uplink_max: int,
-    led: B1,
+    is_own: B1,
     idle: I1,
     able: B1,
 ) -> int:
@@ -323,8 +323,8 @@ def _able(
         if step <= last_step[row] or observed_step[row] < 0:
             continue
         idle[row] = PLANS
-        if not led[row]:
-            idle[row] = STANDBY
+        if not is_own[row]:
+            idle[row] = OTHER_SERVER
         elif step - observed_step[row] > age_max:
             idle[row] = OBSERVATION
         elif shortest_ns(seen, row) > uplink_max:

@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
+from skytether.server.assignment import Assignment
 from skytether.server.controller import Controller
 from skytether.server.gate import Gate, PlainGate
-from skytether.server.leads import Leads
 from skytether.server.planning.clock import ClockMap
 from skytether.server.planning.scheme import Planning
 from skytether.server.reception import Reception
@@ -97,7 +97,7 @@ class Server(Endpoint):
             entropy,
             silence_ns,
             partial(Hearing, silence_ns, terms.dt_ns, scenario.link.fixed_ns),
-            Leads(self.controller, scheme.limits),
+            Assignment(self.controller, scheme.limits),
             keeps_rows=scheme.keeps_rows,
         )
         self._grid = Grid(terms.dt_ns, self._events)
@@ -149,7 +149,7 @@ class Server(Endpoint):
             self._expire_ns = (now_ns // SECOND_NS + 1) * SECOND_NS
             for session in self.sessions.expire(now_ns):
                 self._events.append(SessionEnded(vehicle=session.vehicle))
-            self._out += self.sessions.leads.spread(self.sessions, now_ns)
+            self._out += self.sessions.assignment.spread(self.sessions, now_ns)
         if self.sessions.rows.size:
             self._ticked_ns = now_ns
             self._ticker.tick(tick_ns, now_ns)
@@ -190,7 +190,7 @@ class Server(Endpoint):
             self.controller.change_trigger(scenario.control)
         scheme = self.controller.scheme
         scheme.change(scenario, keys)
-        self.sessions.leads.change(scheme.limits, now_ns)
+        self.sessions.assignment.change(scheme.limits, now_ns)
         if keys & POINT:
             moved = "reference.points_m" in keys
             position = scenario.make_reference()(np.zeros(()))[:, 0] if moved else None

@@ -198,6 +198,9 @@ class RoutesOverPaths(Routes):
         self.at: dict[Place, Session] = {}
         """The same sessions, by the proven address of each path."""
 
+    def of_several(self, entropy: Callable[[int], bytes], spread: str, timeout_ns: int) -> Routes:  # noqa: ARG002
+        return self
+
     def is_copy(self, datagram: Datagram, now_ns: int) -> bool:
         place = Place(datagram.peer, datagram.socket)
         session = self.at.get(place)

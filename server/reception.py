@@ -6,13 +6,11 @@ counted by reason.
 """
 
 from collections import Counter, deque
-from typing import Protocol
 
+from skytether.server.assignment import Decider
 from skytether.server.gate import Gate, GateCall
-from skytether.server.leads import Leads
 from skytether.server.planning.clock import ClockMap, Contradiction
 from skytether.server.plausibility import ANEW, BELIEVED, Belief, Plausibility
-from skytether.server.routes import Routes
 from skytether.server.sessions import Session, Sessions
 from skytether.server.tick import Grid
 from skytether.shared.base.units import MICROSECOND_NS, SECOND_NS, seconds_to_ns
@@ -33,10 +31,8 @@ from skytether.shared.events.flight import (
     Unauthenticated,
     address_text,
 )
-from skytether.shared.law.model import Indices
 from skytether.shared.law.terms import Terms
 from skytether.shared.scenario.catalogue import differences
-from skytether.shared.scenario.registry import load
 from skytether.shared.scenario.schema import LinkConfig
 from skytether.shared.wire.drop import Drop, ProtocolError
 from skytether.shared.wire.framing import Report, split
@@ -58,10 +54,6 @@ from skytether.shared.wire.protocol import (
     stamped_ns,
 )
 
-PATHS = "skytether.server.paths"
-"""Room for vehicles with several paths; the first report in front of an observation loads it."""
-LEAD, STANDBY = "skytether.shared.wire.lead", "skytether.server.standby"
-"""Room for vehicles with two servers, which its message loads."""
 REFUSALS_REPORTED = 64
 """Number of stored refusals; a repeated HELLO is not reported again."""
 REPORT_NS = 10 * SECOND_NS
@@ -78,25 +70,6 @@ CONTRADICTED = {
     Contradiction.TIME_OF_DAY: "the time of day of one end is wrong: it is no longer used",
 }
 """Contradictions of the clock estimate, in words for the operator."""
-
-
-class Decider(Protocol):
-    """What decides on the plans of the vehicles, as reception knows it; see `Controller`."""
-
-    observed_step: Indices
-    """Step of the newest observation of each vehicle, or -1; shape (capacity,)."""
-
-    def begin(self, row: int, vehicle: int) -> None:
-        """Begin with a vehicle in a row that was forgotten."""
-
-    def forget(self, row: int) -> None:
-        """Forget everything about the vehicle of a row."""
-
-    def restart(self, row: int) -> bool:
-        """Note that a client has restarted without its state; whether that is to be reported."""
-
-    def observe(self, row: int, observation: Observation) -> bool:
-        """Store an observation unless a newer one is stored; True if stored."""
 
 
 class Reception:
@@ -213,9 +186,9 @@ class Reception:
         now_ns: int,
     ) -> None:
         """Process a message; nothing of it is believed before it is found to be recent."""
-        says_leader = type(message).__module__ == LEAD
         sessions = self._sessions
-        session = sessions.welcomed(message) if says_leader else sessions.find(message)
+        assigns = sessions.assignment.takes(message)
+        session = sessions.welcomed(message) if assigns else sessions.find(message)
         if session is None:
             raise ProtocolError(Drop.UNKNOWN_SESSION)
         step = getattr(message, "step", None)
@@ -229,11 +202,10 @@ class Reception:
                 self._events.append(SessionEnded(vehicle=session.vehicle))
             case Time():
                 self._hear_time(session, message, now_ns)
-            case _ if says_leader:
-                if type(sessions.leads) is Leads:
-                    sessions.leads = load(STANDBY, "a standby server").LeadsOfTwo(sessions.leads)
+            case _ if assigns:
+                sessions.assignment = sessions.assignment.of_several()
                 session.heard_ns = now_ns
-                self._answer(sessions.leads.take(session, message), call, datagram)
+                self._answer(sessions.assignment.take(session, message), call, datagram)
             case _:
                 answer = sessions.routes.take(session, message, datagram, now_ns)
                 session.heard_ns = now_ns
@@ -360,10 +332,9 @@ class Reception:
     ) -> None:
         """Note the report of an observation; ask for a proof where it comes from a new address."""
         sessions = self._sessions
-        if type(sessions.routes) is Routes:
-            sessions.routes = load(PATHS, "paths").RoutesOverPaths(
-                sessions.entropy, self._spread, self._timeout_ns
-            )
+        sessions.routes = sessions.routes.of_several(
+            sessions.entropy, self._spread, self._timeout_ns
+        )
         question = sessions.routes.observe(session, report, datagram, now_ns, is_newest=call.moves)
         if question:
             self._answer(question, call, datagram)
@@ -399,7 +370,7 @@ class Reception:
         session.line = call.line
         self._plausibility.forget(session.row)
         self._anew(session.row, (session.vehicle, session.boot_id))
-        self._sessions.leads.begin(session)
+        self._sessions.assignment.begin(session)
         self._controller.begin(session.row, session.vehicle)
         host, port = session.address
         self._events.append(SessionOpened(vehicle=session.vehicle, host=host, port=port))

@@ -8,9 +8,13 @@ from typing import Any, Protocol
 
 from skytether.server.gate import ReplyPath
 from skytether.shared.endpoints.endpoint import Datagram, Events
+from skytether.shared.scenario.registry import load
 from skytether.shared.wire.drop import Drop, ProtocolError
 from skytether.shared.wire.framing import Report
 from skytether.shared.wire.protocol import Message
+
+ROOM = "skytether.server.paths"
+"""Module of vehicles with several paths; the first report in front of an observation loads it."""
 
 
 class Route(Protocol):
@@ -26,6 +30,17 @@ class Route(Protocol):
 
 class Routes:
     """Routes to all vehicles of a server; a session is a `sessions.Session`."""
+
+    def of_several(self, entropy: Callable[[int], bytes], spread: str, timeout_ns: int) -> "Routes":
+        """Routes to vehicles of which some have several paths.
+
+        Args:
+            entropy: returns this many random bytes.
+            spread: `link.spread`.
+            timeout_ns: time without a packet after which a vehicle takes the link for lost [ns].
+        """
+        routes: Routes = load(ROOM, "paths").RoutesOverPaths(entropy, spread, timeout_ns)
+        return routes
 
     def is_copy(self, datagram: Datagram, now_ns: int) -> bool:
         """Whether a datagram has come before, over another path."""

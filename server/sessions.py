@@ -16,8 +16,8 @@ from typing import Any
 
 import numpy as np
 
+from skytether.server.assignment import Assignment
 from skytether.server.gate import ReplyPath
-from skytether.server.leads import Leads
 from skytether.server.routes import Route, Routes
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.endpoints.endpoint import Address, Datagram
@@ -78,7 +78,7 @@ class Session:
     route: Route | None = None
     """Sends to the vehicle over several paths; None if `address` is the only one."""
     lead: Any = None
-    """What a room notes of who leads the vehicle; None if it has no other server."""
+    """What a room notes of the vehicle's servers; None if it has no other server."""
 
     def number_next(self, now_ns: int) -> int:
         number = self.sent
@@ -120,7 +120,7 @@ class Sessions:
         entropy: returns this many random bytes, for the numbers of sessions.
         silence_ns: time after which a silent vehicle may count as gone [ns].
         hearing: makes a `Hearing` for each session.
-        leads: who leads the vehicles.
+        assignment: which of the vehicles the server plans for.
         keeps_rows: whether a row stays reserved for its vehicle after its session. On a mission the
             other vehicles keep away from a vehicle that has fallen silent.
     """
@@ -131,7 +131,7 @@ class Sessions:
         entropy: Callable[[int], bytes],
         silence_ns: int,
         hearing: Callable[[], Hearing],
-        leads: Leads,
+        assignment: Assignment,
         *,
         keeps_rows: bool = False,
     ) -> None:
@@ -156,8 +156,8 @@ class Sessions:
         """Number of the vehicle in each row; shape (capacity,)."""
         self.routes = Routes()
         """Routes to the vehicles; another once one of them has several paths."""
-        self.leads = leads
-        """Who leads the vehicles."""
+        self.assignment = assignment
+        """Which of the vehicles the server plans for."""
         self.idle = np.zeros(capacity, dtype=np.int64)
         """`Idle` reason of the vehicle in each row, as last reported; shape (capacity,)."""
 

@@ -8,7 +8,7 @@ server in real time loads it before its first packet.
 from collections.abc import Iterable, Iterator
 from typing import Any, NamedTuple
 
-from skytether.server.leads import Leads
+from skytether.server.assignment import Assignment
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.endpoints.endpoint import Datagram
 from skytether.shared.wire.lead import Lead, with_leadership
@@ -29,14 +29,17 @@ class SessionLead(NamedTuple):
     """Step of the vehicle in its newest LEAD."""
 
 
-class LeadsOfTwo(Leads):
-    """Takes the place of a server's plain `Leads` at the first LEAD."""
+class AssignmentOfTwo(Assignment):
+    """Takes the place of a server's plain `Assignment` at the first LEAD."""
 
-    def __init__(self, plain: Leads) -> None:
+    def __init__(self, plain: Assignment) -> None:
         super().__init__(plain.controller, plain.limits)
         self.changes, self.changed_ns = plain.changes, plain.changed_ns
         self._largest = 0
         """Largest number of a leadership that a vehicle has reported."""
+
+    def of_several(self) -> Assignment:
+        return self
 
     def begin(self, session: Any) -> None:
         said: SessionLead | None = session.lead
@@ -76,7 +79,9 @@ class LeadsOfTwo(Leads):
         leads = lead is None or bool(lead.leads)
         self._largest = max(self._largest, lead.number if lead else 0)
         takes_over = leads and lead and lead.number and self.limits is None
-        self.controller.lead(row, lead, leads=leads, plans_due=TAKEOVER_PLANS if takes_over else 0)
+        self.controller.assign(
+            row, lead, is_own=leads, plans_due=TAKEOVER_PLANS if takes_over else 0
+        )
 
     def _number(self, said: SessionLead) -> int:
         """Number of the leadership that a vehicle should follow: the largest, if all follow one

@@ -163,7 +163,7 @@ class Ticker:
 
         for row, payload in self._controller.scheme.encode(batch, header):
             session = sessions.at(row)
-            plan = sessions.leads.signed(session, payload)
+            plan = sessions.assignment.signed(session, payload)
             self._put(row, session.sealed(plan, now_ns), is_plan=True)
 
     def _send_heartbeats(self, due: Sequence[Session], now_ns: int) -> None:

@@ -59,7 +59,7 @@ from skytether.shared.wire.protocol import (
 
 HERE: Address = ("vehicle", 1)
 LINE = PlainGate().open(Datagram(b"", ("", 0)), now_ns=0).line
-NO_LEADS: Any = None
+NO_ASSIGNMENT: Any = None
 """Of sessions without a standby server, which never ask."""
 SILENCE_NS = 1500 * MILLISECOND_NS
 """Time after which another life of a vehicle may take its number, in all of these tests."""
@@ -604,7 +604,7 @@ def test_whoever_was_welcomed_last_and_comes_in_time_gets_a_row(
     """
     ear = partial(Hearing, SILENCE_NS, 50 * MILLISECOND_NS, None)
     entropy, now_ns = stream(1, "entropy").bytes, DAY_NS
-    sessions = Sessions(3, entropy, SILENCE_NS, ear, NO_LEADS, keeps_rows=keeps)
+    sessions = Sessions(3, entropy, SILENCE_NS, ear, NO_ASSIGNMENT, keeps_rows=keeps)
     kept: dict[int, int] = {}
     terms = scenario().terms()
     numbers: dict[tuple[int, int], int] = {}
@@ -695,7 +695,7 @@ def test_each_series_of_impossible_states_is_reported_once() -> None:
 def with_session(capacity: int = 1) -> tuple[Sessions, Session]:
     """Sessions, of which that of vehicle 1 was opened by life 5 of its client at DAY_NS."""
     ear = partial(Hearing, SILENCE_NS, 50 * MILLISECOND_NS, None)
-    sessions = Sessions(capacity, stream(1, "entropy").bytes, SILENCE_NS, ear, NO_LEADS)
+    sessions = Sessions(capacity, stream(1, "entropy").bytes, SILENCE_NS, ear, NO_ASSIGNMENT)
     welcomed = sessions.welcome(hello(1, 5), HERE, LINE, DAY_NS)
     rest = 0, -1, 0, 0, 0, Mode.READY, 1, np.zeros((2, 2)), np.zeros(2)
     session = sessions.begin(Observation(1, welcomed.number, *rest), DAY_NS)
@@ -709,7 +709,7 @@ def hello(vehicle: int, boot_id: int) -> Hello:
 
 def test_numbers_of_sessions_take_as_many_bytes_whatever_the_entropy() -> None:
     ear = partial(Hearing, SILENCE_NS, 50 * MILLISECOND_NS, None)
-    sessions = Sessions(1, bytes, SILENCE_NS, ear, NO_LEADS)
+    sessions = Sessions(1, bytes, SILENCE_NS, ear, NO_ASSIGNMENT)
     assert sessions.welcome(hello(1, 5), HERE, LINE, DAY_NS).number == 2**31
 
 

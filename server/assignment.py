@@ -1,0 +1,92 @@
+"""Which vehicles a server plans for. The plain form: each of them.
+
+`server.standby` takes its place once a vehicle says that it has two servers.
+"""
+
+from collections.abc import Iterable
+from typing import Any, Protocol
+
+from skytether.shared.endpoints.endpoint import Datagram
+from skytether.shared.law.model import Indices
+from skytether.shared.law.terms import Limits
+from skytether.shared.scenario.registry import load
+from skytether.shared.wire.drop import Drop, ProtocolError
+from skytether.shared.wire.protocol import Message, Observation, RoomMessage
+
+ROOM, MESSAGES = "skytether.server.standby", "skytether.shared.wire.lead"
+"""Modules of vehicles with two servers, and of what such a vehicle says."""
+
+
+class Decider(Protocol):
+    """What decides on the plans of the vehicles, for those who hear them; see `Controller`."""
+
+    observed_step: Indices
+    """Step of the newest observation of each vehicle, or -1; shape (capacity,)."""
+
+    def begin(self, row: int, vehicle: int) -> None:
+        """Begin with a vehicle in a row that was forgotten."""
+
+    def forget(self, row: int) -> None:
+        """Forget everything about the vehicle of a row."""
+
+    def restart(self, row: int) -> bool:
+        """Note that a client has restarted without its state; whether that is to be reported."""
+
+    def observe(self, row: int, observation: Observation) -> bool:
+        """Store an observation unless a newer one is stored; True if stored."""
+
+    def assign(
+        self, row: int, message: RoomMessage | None, *, is_own: bool = True, plans_due: int = 0
+    ) -> None:
+        """Note whether this server plans for a vehicle.
+
+        Args:
+            message: what the vehicle has said of it; None if it has no other server.
+            plans_due: number of plans to send next, whatever the trigger says.
+        """
+
+
+class Assignment:
+    """Vehicles that a server plans for; a session is a `sessions.Session`."""
+
+    def __init__(self, controller: Decider, limits: Limits | None) -> None:
+        self.controller, self.limits = controller, limits
+        """Limits of motions, see `Scheme.limits`; None if vehicles may follow different servers."""
+        self.changes = 0
+        """Number of their changes in flight."""
+        self.changed_ns: int | None = None
+        """Time of the newest change."""
+
+    def change(self, limits: Limits | None, now_ns: int) -> None:
+        if limits is not self.limits:
+            self.limits, self.changed_ns = limits, now_ns
+            self.changes += 1
+
+    def takes(self, message: Message) -> bool:
+        """Whether a message says which server plans for its vehicle."""
+        return type(message).__module__ == MESSAGES
+
+    def of_several(self) -> "Assignment":
+        """Assignment of vehicles of which some have several servers."""
+        assignment: Assignment = load(ROOM, "a standby server").AssignmentOfTwo(self)
+        return assignment
+
+    def begin(self, session: Any) -> None:
+        """Begin with a vehicle in a row that was forgotten."""
+        self.controller.assign(session.row, None)
+
+    def take(self, session: Any, message: Message) -> Message:
+        """Take a message of the room; returns the answer.
+
+        Raises:
+            ProtocolError: the session has no such messages.
+        """
+        raise ProtocolError(Drop.FIELD)
+
+    def signed(self, session: Any, plan: bytes) -> bytes:
+        """Plan as it is sent to a vehicle."""
+        return plan
+
+    def spread(self, sessions: Iterable[Any], now_ns: int) -> Iterable[Datagram]:
+        """What vehicles have to know of their servers, once a second."""
+        return ()
