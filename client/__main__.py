@@ -226,15 +226,14 @@ def _several(
     scenario: Scenario,
     link: Callable[[], ClientLink],
 ) -> Several:
-    """How a vehicle reaches its servers, with the scenario's prices of several paths."""
-    prices = [path.price for path in scenario.paths]
-    if len(paths) > 1 and 1 < len(prices) != len(paths):
-        message = f"--path: got {len(paths)}, expected {len(prices)}, as many as network.paths"
+    """How a vehicle reaches its servers."""
+    expected = len(scenario.paths)
+    if len(paths) > 1 and 1 < expected != len(paths):
+        message = f"--path: got {len(paths)}, expected {expected}, as many as network.paths"
         raise CommandError(message, command.CONFIGURATION)
     return Several(
         [path.peer for path in paths],
         link(),
-        prices=prices if len(paths) > 1 and len(prices) > 1 else (),
         names=[str(path) for path in paths] if len(paths) > 1 else (),
         standby=[each.peer for each in standby],
         standby_link=link() if standby else None,

@@ -18,6 +18,7 @@ from skytether.shared.scenario.catalogue import keys_of
 from skytether.shared.scenario.owners import InFlight
 from skytether.shared.scenario.registry import load
 from skytether.shared.scenario.schema import Scenario
+from skytether.shared.wire.drop import Drop, ProtocolError
 from skytether.shared.wire.protocol import Horizon, Message, Trajectory
 
 LEADER_KEY = "link.leader"
@@ -97,9 +98,14 @@ class Role:
     def begin(self) -> None:
         """Note another session with the server."""
 
-    def accepts(self, plan: Horizon | Trajectory) -> bool:
-        """Whether a plan of the server may be flown."""
-        return plan.leadership == 0
+    def check(self, plan: Horizon | Trajectory) -> None:
+        """Check a plan of the server.
+
+        Raises:
+            ProtocolError: it must not be flown.
+        """
+        if plan.leadership != 0:
+            raise ProtocolError(Drop.NOT_THE_LEADER)
 
     def take(self, message: Message, now_ns: int) -> bool:
         """Take a message of the room; False if it has none."""

@@ -22,6 +22,7 @@ from skytether.shared.law.terms import Difference
 from skytether.shared.scenario.catalogue import differences
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Reason
+from skytether.shared.wire.drop import Drop, ProtocolError
 from skytether.shared.wire.lead import Lead
 from skytether.shared.wire.protocol import Horizon, Message, Trajectory
 
@@ -285,8 +286,9 @@ class OneOfServers(Role):
     def begin(self) -> None:
         self._servers.begin(self._server)
 
-    def accepts(self, plan: Horizon | Trajectory) -> bool:
-        return self.is_followed and plan.leadership == self._servers.leadership.number
+    def check(self, plan: Horizon | Trajectory) -> None:
+        if not self.is_followed or plan.leadership != self._servers.leadership.number:
+            raise ProtocolError(Drop.NOT_THE_LEADER)
 
     def take(self, message: Message, now_ns: int) -> bool:
         return self._servers.take(self._server, message, now_ns)

@@ -196,8 +196,7 @@ class ServerSession:
         self.silence_asked = message.silence
         self.hearing.hear(message.number, server_ns)
         if not isinstance(message, Heartbeat):
-            if not self.role.accepts(message):
-                raise ProtocolError(Drop.NOT_THE_LEADER)
+            self.role.check(message)
             self.idle = str(Idle.PLANS)
             return message
         if message.idle in DEAF:

@@ -22,7 +22,6 @@ class Several(Reach):
     Args:
         paths: address of the server, or of the netem in front of it, on each path.
         link: link to the server; None: without keys.
-        prices: price of a packet on each path; if there are not as many as paths, all alike.
         names: what the log calls each path; empty: its address.
         standby: the same as `paths` for a second server, which leads when the first does not; empty
             without one.
@@ -34,13 +33,12 @@ class Several(Reach):
         paths: Sequence[Address],
         link: ClientLink | None = None,
         *,
-        prices: Sequence[float] = (),
         names: Sequence[str] = (),
         standby: Sequence[Address] = (),
         standby_link: ClientLink | None = None,
     ) -> None:
         super().__init__(paths[0], link)
-        self._paths, self._standby, self._prices, self._names = paths, standby, prices, names
+        self._paths, self._standby, self._names = paths, standby, names
         if standby:
             self.links = (*self.links, standby_link or PlainLink())
 
@@ -70,13 +68,14 @@ class Several(Reach):
     ) -> Route:
         if len(paths) == 1:
             return Route(paths, sockets, parts.out)
-        prices, link = self._prices, parts.scenario.link
+        link, prices = parts.scenario.link, [path.price for path in parts.scenario.paths]
         route: Route = load("skytether.client.paths", "paths").SeveralPaths(
             paths,
             sockets,
             parts.out,
             events=parts.events,
             names=names,
+            # All alike where the scenario has another number of paths.
             prices=prices if len(prices) == len(paths) else (1.0,) * len(paths),
             spread=link.spread,
             timeout_ns=seconds_to_ns(link.timeout_s),

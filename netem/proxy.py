@@ -173,8 +173,8 @@ class Proxy(Emulator):
         return {"flows": len(self._by_socket), "refused": self.refused} | super().figures()
 
 
-def of_paths(each: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Figures of the netems of a session's paths together, as those of one netem.
+def merged(each: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Figures of the netems of one session, one for each path, as those of one netem.
 
     Counts of several paths are added up, and `by_path` has the figures of each, from 1.
     """

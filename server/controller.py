@@ -269,10 +269,10 @@ class Controller:
         if self._budget:
             # A trigger that compares nothing, as `periodic`, gives no figure to rank its vehicles
             # by.
-            worth = verdict.figure if verdict.compares else figures["cost_gap"]
+            compared = verdict.figure if verdict.compares else figures["cost_gap"]
             # A vehicle without a plan cannot wait for bytes.
             urgent = self._heartbeat_due[rows] | figures["fresh"] | (self._sent_step[rows] < 0)
-            event = self._budget.choose(rows, event, urgent, worth, situation.since_sent_s)
+            event = self._budget.choose(rows, event, urgent, compared, situation.since_sent_s)
             events = int(np.count_nonzero(event))
         # After the budget: the committed scheme may only replay horizons that are really sent.
         self.scheme.remember(rows, step, predicted, event)  # eq. (12)

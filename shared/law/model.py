@@ -67,14 +67,14 @@ class Model(NamedTuple):
             x: initial state; shape (axes, 2).
             inputs: one per step [m/s]; shape (axes, n).
         """
-        paths = []
+        states = []
         for axis, (p, v), along in zip(self.axes(), x.tolist(), inputs.tolist(), strict=True):
-            path = [(p, v)]
+            of_axis = [(p, v)]
             for u in along:
                 p, v = advance(axis, p, v, u)  # noqa: PLW2901 - predicted step by step
-                path.append((p, v))
-            paths.append(path)
-        return np.array(paths).swapaxes(0, 1)
+                of_axis.append((p, v))
+            states.append(of_axis)
+        return np.array(states).swapaxes(0, 1)
 
     @property
     def A(self) -> Array:  # noqa: N802 - the paper's letter

@@ -86,8 +86,7 @@ def contradictions(
     yield from no_network
     if not (no_network or any_network):
         # One path suffices to fly over.
-        each = [list(_too_late(scenario.on_path(i))) for i in range(len(scenario.paths))]
-        yield from min(each, key=len)
+        yield from min((list(_too_late(each)) for each in scenario.networks), key=len)
     yield from _no_trigger(control)
     yield from _no_policies("vehicle.report", vehicle.report, REPORTS, control)
     yield from _no_way(scenario, checked)
@@ -153,16 +152,17 @@ def _too_late(scenario: Scenario) -> Iterator[Contradiction]:
 
 
 def _no_impairments(scenario: Scenario) -> Iterator[Contradiction]:
-    for i, path in enumerate(scenario.paths):
-        at = f"network.paths[{i}]" if scenario.network.paths else "network"
+    networks = scenario.networks
+    for i, each in enumerate(networks):
+        at = f"network.paths[{i}]" if len(networks) > 1 else "network"
         for way in ("uplink", "downlink"):
             try:
-                getattr(scenario.on_path(i), way)
+                getattr(each, way)
             except GrammarError as error:
                 yield f"{at}.{way}", repr(error.given), error.expected
             except Exception as error:
                 expected = f"impairments that can be made ({type(error).__name__}: {error})"
-                yield f"{at}.{way}", repr(getattr(path, way)), expected
+                yield f"{at}.{way}", repr(getattr(each.network, way)), expected
 
 
 def _no_trigger(control: ControlConfig) -> Iterator[Contradiction]:

@@ -440,12 +440,16 @@ class Scenario(Section, frozen=True):
         network = self.network
         return network.paths or (PathConfig(uplink=network.uplink, downlink=network.downlink),)
 
+    @property
+    def network_of_standby(self) -> Self:
+        """Scenario of the network to a standby server, which is impaired like the first."""
+        return self.on_path(len(self.paths))
+
     def on_path(self, index: int) -> Self:
         """Scenario of one path alone; the first has the scenario's seed, others one of their own.
 
         Args:
-            index: number of the path, from 0; one more than there are is that to a standby server,
-                which is impaired like the first.
+            index: number of the path, from 0; one more than there are: see `network_of_standby`.
         """
         path = (*self.paths, self.paths[0])[index]
         network = msgspec.structs.replace(
@@ -453,6 +457,23 @@ class Scenario(Section, frozen=True):
         )
         seed = int(stream(self.seed, "path", index).integers(2**32)) if index else self.seed
         return msgspec.structs.replace(self, seed=seed, network=network)
+
+    @property
+    def networks(self) -> list[Self]:
+        """Scenario of each network between a vehicle and its server alone: one, or one a path."""
+        return [self.on_path(index) for index in range(len(self.paths))]
+
+    def impaired(self, change: Callable[[str], str]) -> Self:
+        """Scenario with the text of each direction changed, on every path."""
+
+        def changed(each: T) -> T:
+            up, down = change(each.uplink), change(each.downlink)
+            return msgspec.structs.replace(each, uplink=up, downlink=down)
+
+        network = msgspec.structs.replace(
+            changed(self.network), paths=tuple(map(changed, self.network.paths))
+        )
+        return msgspec.structs.replace(self, network=network)
 
     @property
     def uplink(self) -> Any:

@@ -21,7 +21,7 @@ import msgspec
 import numpy as np
 
 from skytether.cli.page_process import say
-from skytether.netem.proxy import of_paths
+from skytether.netem.proxy import merged
 from skytether.shared.base import files
 from skytether.shared.endpoints.endpoint import Address
 from skytether.shared.events.flight import Failure, Flying, NotFlown, RecordIncomplete, address_text
@@ -346,7 +346,7 @@ def record_of(
         server = np.concatenate([server, _rows(parts / STANDBY, server.dtype)])
         server = server[np.argsort(server["step"], kind="stable")]
     if paths := [figures.pop(name) for name in names if name in figures]:
-        figures["netem"] = of_paths(paths)
+        figures["netem"] = merged(paths)
     return Record(
         client=_rows(parts / "client", client_columns(axes)),
         server=server,

@@ -25,7 +25,7 @@ from skytether.client import vehicles as kinds
 from skytether.client.alone import Reach
 from skytether.client.endpoint import Client
 from skytether.client.link import ClientLink
-from skytether.netem.proxy import Proxy, of_paths
+from skytether.netem.proxy import Proxy, merged
 from skytether.server.endpoint import Server
 from skytether.server.gate import Gate
 from skytether.shared.base.chance import stream
@@ -173,10 +173,11 @@ class Run:
         self._netems: dict[str, Proxy] = {}
         self.flown: dict[str, Flown] = {}
         """Endpoint and scenario of each host."""
-        servers = [SERVER] * len(scenario.paths) + [STANDBY] * has_standby
-        for i, server in enumerate(servers):
+        networks = [(SERVER, each) for each in scenario.networks]
+        if has_standby:
+            networks.append((STANDBY, scenario.network_of_standby))
+        for i, (server, own) in enumerate(networks):
             host = f"netem {scenario.seed}/{i + 1}" if i else f"netem {scenario.seed}"
-            own = scenario.on_path(i)
             netem = Proxy(own, server=server, flows=vehicles, recorder=packets, path=i)
             self._netems[host], self.flown[host] = netem, (netem, own)
             world.add(host, netem)
@@ -199,7 +200,6 @@ class Run:
             several: Reach = load("skytether.client.several", "several servers or paths").Several(
                 addresses,
                 link,
-                prices=[each.price for each in scenario.paths],
                 standby=standby,
                 standby_link=ends.link(scenario.seed, vehicle, "standby"),
             )
@@ -252,7 +252,7 @@ class Run:
         each = {str(one.vehicle - self._before): one.vehicle_figures() for one in self._clients}
         return {
             "server": self._server_figures([*self._netems]),
-            "netem": of_paths([netem.figures() for netem in self._netems.values()]),
+            "netem": merged([netem.figures() for netem in self._netems.values()]),
             "client": {"by_vehicle": each},
         }
 
