@@ -20,11 +20,11 @@ from typing import Annotated
 import msgspec
 
 from skytether.client import vehicles
+from skytether.client.alone import Reach
 from skytether.client.endpoint import Client
 from skytether.client.fleet import ClientFleet
 from skytether.client.link import ClientLink, PlainLink
 from skytether.client.memory import SavedState, recall
-from skytether.client.several import PATH_SOCKETS, STANDBY_SOCKETS, Several
 from skytether.client.vehicle import Vehicle, VehicleMemory
 from skytether.shared.endpoints.steady import Steady
 from skytether.shared.events.aboard import ParametersUnsafe
@@ -158,9 +158,9 @@ def fly(argv: Sequence[str]) -> None:
         if options.set_parameters and not flying[0].set_parameters():
             kind = f"got vehicle.kind = {scenario.vehicle.kind!r}, expected one with parameters"
             raise CommandError(f"--set-parameters: {kind}", command.CONFIGURATION)
-        several = None
+        several, sockets = None, {0: paths[0]}
         if len(paths) > 1 or standby:
-            several = _several(paths, standby, scenario, partial(link, numbers[0]))
+            several, sockets = _several(paths, standby, scenario, partial(link, numbers[0]))
         clients = [
             Client(
                 scenario,
@@ -183,8 +183,7 @@ def fly(argv: Sequence[str]) -> None:
         running.drive(
             Steady(endpoint),
             bind=None,
-            paths=dict(zip(PATH_SOCKETS, paths, strict=False))
-            | dict(zip(STANDBY_SOCKETS, standby, strict=False)),
+            paths=sockets,
             waiting_for=(
                 f"its {scenario.vehicle.kind} vehicle at {scenario.vehicle.address}"
                 if line
@@ -225,19 +224,21 @@ def _several(
     standby: Sequence[NetworkPath],
     scenario: Scenario,
     link: Callable[[], ClientLink],
-) -> Several:
-    """How a vehicle reaches its servers."""
+) -> tuple[Reach, dict[int, NetworkPath]]:
+    """How a vehicle reaches its servers, and the path of each of its sockets."""
     expected = len(scenario.paths)
     if len(paths) > 1 and 1 < expected != len(paths):
         message = f"--path: got {len(paths)}, expected {expected}, as many as network.paths"
         raise CommandError(message, command.CONFIGURATION)
-    return Several(
+    several = load("skytether.client.several", "several paths or servers")
+    reach = several.Several(
         [path.peer for path in paths],
         link(),
         names=[str(path) for path in paths] if len(paths) > 1 else (),
         standby=[each.peer for each in standby],
         standby_link=link() if standby else None,
     )
+    return reach, several.by_socket(paths, standby)
 
 
 def _standby(options: ClientOptions) -> Sequence[NetworkPath]:

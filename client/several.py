@@ -1,6 +1,7 @@
 """A vehicle that reaches its server over several paths, or has a standby server as well."""
 
 from collections.abc import Sequence
+from typing import TypeVar
 
 from skytether.client.alone import OneServer, Parts, Reach
 from skytether.client.link import ClientLink, PlainLink
@@ -14,6 +15,16 @@ PATH_SOCKETS = (0, 2, 3, 4)
 """Numbers of a client's sockets, one for each path to its server; 1 is its autopilot's."""
 STANDBY_SOCKETS = (5, 6, 7, 8)
 """The same for each path to its standby server."""
+
+T = TypeVar("T")
+
+
+def by_socket(paths: Sequence[T], standby: Sequence[T]) -> dict[int, T]:
+    """Paths to the server and to its standby server, by the number of their socket."""
+    return {
+        **dict(zip(PATH_SOCKETS, paths, strict=False)),
+        **dict(zip(STANDBY_SOCKETS, standby, strict=False)),
+    }
 
 
 class Several(Reach):

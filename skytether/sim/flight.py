@@ -197,7 +197,7 @@ class Run:
             link = ends.link(scenario.seed, vehicle)
             if len(addresses) == 1 and not standby:
                 return Reach(addresses[0], link)
-            several: Reach = load("skytether.client.several", "several servers or paths").Several(
+            several: Reach = load("skytether.client.several", "several paths or servers").Several(
                 addresses,
                 link,
                 standby=standby,

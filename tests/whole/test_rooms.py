@@ -35,6 +35,7 @@ ROOMS: dict[str, tuple[str, str]] = {
         "client/servers.py client/leadership.py shared/wire/lead.py shared/events/standby.py",
         f"{FLIES} --standby",
     ),
+    "several addresses": ("client/several.py", f"{FLIES} --standby"),
     "saved state": ("client/memory.py", "client demo --vehicle.memory saved --server localhost:9"),
     "keys": (
         (
