@@ -58,7 +58,7 @@ def help_text(default: Any, prog: str, about: str) -> str:
             )
             groups[group_of.get(flag, OPTIONS)].append(entry)
     groups[OPTIONS].append(Entry("-h, --help", "Show this help and exit."))
-    usage = _filled(f"usage: {' '.join([prog, *arguments, '[OPTIONS]'])}", rest=" " * 7)
+    usage = _filled(f"usage: {' '.join([prog, *arguments, '[OPTIONS]'])}", rest=MARGIN)
     parts = [usage, *_paragraphs(about)]
     if flies:
         said = f"Every key of a scenario is a flag, as in --duration 20; {HELP_KEYS} lists all."
