@@ -54,7 +54,7 @@ class Network(NamedTuple):
     """Largest UDP payload of a datagram [B]."""
 
 
-class Report(NamedTuple):
+class ObservationReport(NamedTuple):
     """Observation at the agent's end."""
 
     step: int
@@ -70,7 +70,7 @@ class Report(NamedTuple):
 @dataclass(slots=True)
 class Message:
     session: int
-    content: Held | Report
+    content: Held | ObservationReport
     missing: set[int]
     """Numbers of the datagrams that have not arrived."""
 
@@ -85,7 +85,7 @@ class Part(bytes):
 @dataclass(slots=True)
 class Robot:
     player: Player
-    report: Report
+    report: ObservationReport
     """Newest report at the agent's end."""
     uplink: Lane
     downlink: Lane
@@ -152,7 +152,7 @@ class Remote:
             self._flows += 1
             robot = Robot(
                 player := self._make_player(),
-                Report(self.step, player.number(self.step), 0, 0, observation),
+                ObservationReport(self.step, player.number(self.step), 0, 0, observation),
                 self._lane("uplink", flow),
                 self._lane("downlink", flow),
                 OrderedDict(),
@@ -203,7 +203,9 @@ class Remote:
         ):
             _remember(robot.snapshots, self.step, copy(robot.player))
             number = robot.player.number(self.step)
-            report = Report(self.step, number, robot.acknowledged, robot.since, observation)
+            report = ObservationReport(
+                self.step, number, robot.acknowledged, robot.since, observation
+            )
             whole = REPORT_BYTES + size
             message = Message(robot.session, report, set(range(self._datagrams(whole))))
             self._send(self.downlink, robot.downlink, index, message, whole, self.now_ns)
@@ -257,7 +259,7 @@ class Remote:
             if made is not None:
                 learn(self._bound, index, report.since - made[0])
 
-    def report(self, index: int) -> Report:
+    def report(self, index: int) -> ObservationReport:
         return self._robots[index].report
 
     def info(self, index: int) -> dict[str, Any]:

@@ -31,7 +31,7 @@ MARGIN, INDENT_MAX = "  ", 26
 SHORT = {bool: "", int: "N", float: "NUMBER", str: "TEXT"}
 
 
-class Entry(NamedTuple):
+class OptionText(NamedTuple):
     form: str
     """Flag and the name of its value, as in `--seed N`."""
     text: str
@@ -39,7 +39,7 @@ class Entry(NamedTuple):
 
 def help_text(default: Any, prog: str, about: str) -> str:
     """Help of a command with these default options."""
-    groups: dict[str, list[Entry]] = {title: [] for title in (ARGUMENTS, OPTIONS, *GROUPS)}
+    groups: dict[str, list[OptionText]] = {title: [] for title in (ARGUMENTS, OPTIONS, *GROUPS)}
     group_of = {flag: title for title, flags in GROUPS.items() for flag in flags}
     flies, arguments = hasattr(default, "config"), []
     for hint, name, text, value, required in _fields(default):
@@ -49,15 +49,15 @@ def help_text(default: Any, prog: str, about: str) -> str:
         if argument.positional:
             arguments.append(metavar if required else f"[{metavar}]")
             groups[ARGUMENTS].append(
-                Entry(metavar, text if required else _with_default(text, value))
+                OptionText(metavar, text if required else _with_default(text, value))
             )
         else:
             flag = name.replace("_", "-")
-            entry = Entry(
+            entry = OptionText(
                 f"--{flag} {metavar}".rstrip(), _with_default(text, value, required=required)
             )
             groups[group_of.get(flag, OPTIONS)].append(entry)
-    groups[OPTIONS].append(Entry("-h, --help", "Show this help and exit."))
+    groups[OPTIONS].append(OptionText("-h, --help", "Show this help and exit."))
     usage = _filled(f"usage: {' '.join([prog, *arguments, '[OPTIONS]'])}", rest=MARGIN)
     parts = [usage, *_paragraphs(about)]
     if flies:
@@ -68,7 +68,7 @@ def help_text(default: Any, prog: str, about: str) -> str:
 
 def keys_text(scenario: Scenario, prog: str) -> str:
     """Help of a scenario's keys, with its values as defaults."""
-    groups: dict[str, list[Entry]] = {}
+    groups: dict[str, list[OptionText]] = {}
 
     def add(section: msgspec.Struct, prefix: str, title: str) -> None:
         texts, hints = meanings(type(section)), hints_of(type(section))
@@ -82,7 +82,7 @@ def keys_text(scenario: Scenario, prog: str) -> str:
                 switch = "[no-]" * isinstance(value, bool)
                 form = f"--{prefix}{switch}{flag} {_metavar(hints[name], '')}".rstrip()
                 shown = str(value).lower() if switch else value
-                groups[title].append(Entry(form, _with_default(texts.get(name, ""), shown)))
+                groups[title].append(OptionText(form, _with_default(texts.get(name, ""), shown)))
 
     add(scenario, "", "flight")
     return f"usage: {prog} [SCENARIO] [--KEY VALUE ...]\n\n{_grouped(groups)}"
@@ -133,7 +133,7 @@ def _with_default(text: str, value: Any, *, required: bool = False) -> str:
     return f"{text} (default: {shown})"
 
 
-def _grouped(groups: Mapping[str, Sequence[Entry]]) -> str:
+def _grouped(groups: Mapping[str, Sequence[OptionText]]) -> str:
     forms = [len(entry.form) for entries in groups.values() for entry in entries]
     indent = min(max(forms) + 2 * len(MARGIN), INDENT_MAX)
     blocks = []

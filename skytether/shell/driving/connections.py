@@ -27,7 +27,7 @@ BREAKS_OFF = struct.pack("ii", 1, 0)
 Hear = Callable[[bytes, Address], None]
 
 
-class HalfConnection:
+class SocketHalf:
     """One direction of a connection, from a source, whose peer is `peer`, to a target."""
 
     def __init__(
@@ -83,7 +83,7 @@ class Connections:
     ) -> None:
         self._server, self._most, self._refused = listen.server, listen.most, refused
         self._hear: Hear = lambda piece, peer: hear(Datagram(piece, peer, 1))
-        self._ways: dict[Address, HalfConnection] = {}
+        self._ways: dict[Address, SocketHalf] = {}
         """Ways by the peer to which they lead."""
         self._running: set[asyncio.Task[None]] = set()
         self._opened = 0
@@ -150,8 +150,8 @@ class Connections:
             each.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         (here, one), (there, other) = ends.items()
         down, up = (
-            HalfConnection(one, other, here, self._hear),
-            HalfConnection(other, one, there, self._hear),
+            SocketHalf(one, other, here, self._hear),
+            SocketHalf(other, one, there, self._hear),
         )
         self._ways |= {there: down, here: up}
         try:
