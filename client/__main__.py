@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from hashlib import blake2b
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import msgspec
 
@@ -24,7 +24,6 @@ from skytether.client.alone import Reach
 from skytether.client.endpoint import Client
 from skytether.client.fleet import ClientFleet
 from skytether.client.link import ClientLink, PlainLink
-from skytether.client.memory import SavedState, recall
 from skytether.client.vehicle import Vehicle, VehicleMemory
 from skytether.shared.endpoints.steady import Steady
 from skytether.shared.events.aboard import ParametersUnsafe

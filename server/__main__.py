@@ -20,7 +20,7 @@ from skytether.server import assignment, routes
 from skytether.server.endpoint import VEHICLES_MAX, Server
 from skytether.server.gate import Gate, PlainGate
 from skytether.server.schemes import table
-from skytether.shared.base import kernel
+from skytether.shared.base import kernel, machine_code
 from skytether.shared.endpoints.endpoint import Address, Form
 from skytether.shared.endpoints.steady import Steady
 from skytether.shared.endpoints.stopwatch import Stopwatch
@@ -28,9 +28,7 @@ from skytether.shared.events.flight import address_text
 from skytether.shared.scenario.registry import load
 from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import RECORDING, plan_columns, server_columns
-from skytether.shared.wire import keys
 from skytether.shared.wire.framing import PATHS_MAX
-from skytether.shared.wire.keys import Keyring
 from skytether.shell.commandline import command, terminal
 from skytether.shell.commandline.argument import Argument
 from skytether.shell.commandline.command import CommandError

@@ -463,18 +463,6 @@ class Scenario(Section, frozen=True):
         """Scenario of each network between a vehicle and its server alone: one, or one a path."""
         return [self.on_path(index) for index in range(len(self.paths))]
 
-    def impaired(self, change: Callable[[str], str]) -> Self:
-        """Scenario with the text of each direction changed, on every path."""
-
-        def changed(each: T) -> T:
-            up, down = change(each.uplink), change(each.downlink)
-            return msgspec.structs.replace(each, uplink=up, downlink=down)
-
-        network = msgspec.structs.replace(
-            changed(self.network), paths=tuple(map(changed, self.network.paths))
-        )
-        return msgspec.structs.replace(self, network=network)
-
     @property
     def uplink(self) -> Any:
         """`netem.impairments.direction.Impairments` from server to vehicle, of the first path;

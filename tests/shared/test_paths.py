@@ -9,6 +9,7 @@ import pytest
 import helpers
 from helpers import packaged
 from skytether.client.several import PATH_SOCKETS
+from skytether.lab.engine.margins import impaired
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.schema import PATHS_MAX, PathConfig
 from skytether.shared.scenario.whole import Scenario
