@@ -88,7 +88,8 @@ class Emulator(Endpoint):
 
     def _forward(self, now_ns: int) -> None:
         for link in (self.uplink, self.downlink):
-            if link.is_due(now_ns):
+            due_ns = link.next_due_ns()
+            if due_ns is not None and due_ns <= now_ns:
                 self._leave(link.release(now_ns=now_ns))
 
     def _leave(self, datagrams: list[Datagram]) -> None:

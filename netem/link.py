@@ -331,10 +331,6 @@ class Link:
             recorder.append_packed(rows)
         return out
 
-    def is_due(self, now_ns: int) -> bool:
-        due_ns = self.next_due_ns()
-        return due_ns is not None and due_ns <= now_ns
-
     def next_due_ns(self) -> int | None:
         """Time at which the next packet is due, or passes the bottleneck; None without packets."""
         front = self._queue.front

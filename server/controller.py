@@ -10,8 +10,9 @@ every step, since planning is a small part of the cost of a step.
 
 from collections import Counter
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
+import msgspec
 import numpy as np
 
 from skytether.server.planning.clock import ClockMap, Seen, shortest_ns
@@ -48,7 +49,7 @@ BLOCK = 128
 (128 KiB) that the C library would get new memory from the kernel for it each time."""
 
 
-class Decisions(NamedTuple):
+class Decisions(msgspec.Struct, frozen=True):
     """Plans and decisions for n vehicles at a step; valid until the next decisions are made."""
 
     batch: Batch

@@ -309,7 +309,7 @@ class Reception:
         )
         self._report_clock(session.vehicle, contradiction)
         if not self._controller.observe(row, observation):
-            session.stale += 1
+            self._sessions.stale[session.row] += 1
             return
         # Only the packet with the highest counter may change the address: a copy sent from
         # elsewhere does not, once the original has arrived.

@@ -62,8 +62,6 @@ class Session:
     """Whether the newest observation was rejected."""
     unsaved: bool = False
     """Whether a restart of the client would not continue its flight, by the newest observation."""
-    stale: int = 0
-    """Number of observations that arrived after a newer one."""
     asked_ns: int = 0
     """Longest silence that the vehicle asks of the server [ns]; 0 for no bound."""
     sent: int = 0
@@ -154,6 +152,9 @@ class Sessions:
         """Rows in use, ascending; shape (n,)."""
         self.vehicle = np.zeros(capacity, dtype=np.int64)
         """Number of the vehicle in each row; shape (capacity,)."""
+        self.stale = np.zeros(capacity, dtype=np.int64)
+        """Number of observations of each session that arrived after a newer one; shape
+        (capacity,)."""
         self.routes = Routes()
         """Routes to the vehicles; another once one of them has several paths."""
         self.assignment = assignment
@@ -286,7 +287,7 @@ class Sessions:
             session.row = heappop(self._free_rows)
         session.sent_ns = now_ns
         self._live[session.vehicle] = self._by_row[session.row] = session
-        self.vehicle[session.row] = session.vehicle
+        self.vehicle[session.row], self.stale[session.row] = session.vehicle, 0
         self._note_rows()
         return session
 

@@ -210,7 +210,7 @@ class Ticker:
             event=decisions.event,
             solved=figures["solved"],
             solve_ns=decisions.solve_ns,
-            stale=[self._sessions.at(row).stale for row in rows.tolist()],
+            stale=self._sessions.stale[rows],
             missed=self._grid.missed,
         )
         self._stopwatch.lap("record")
@@ -219,10 +219,11 @@ class Ticker:
         """Figures of plans for the record; NaN if there is none."""
         figures, verdict, missing = decisions.figures, decisions.verdict, float("nan")
         names = self._controller.columns
-        columns: dict[str, Array | float] = {name: figures[name] for name in names}
-        solved = figures["solved"]
-        if not solved.all():
-            columns = {name: np.where(solved, figure, missing) for name, figure in columns.items()}
+        columns: dict[str, Array | float] = {}
+        solved, are_solved = figures["solved"], False not in figures["solved"]
+        for name in names:
+            figure = figures[name]
+            columns[name] = figure if are_solved else np.where(solved, figure, missing)
         if EXPECTED_GAP in columns and not self._controller.doubts:
             columns[EXPECTED_GAP] = missing
         columns[OWN] = verdict.figure if verdict.compared is Compared.OWN else missing

@@ -41,7 +41,9 @@ class SimulatedVehicle(Vehicle):
         self._began_ns = 0
         self._step = -1
         """Step at whose start the plant's state is valid; -1 before the flight."""
-        self._velocity = np.zeros(len(plant.state()))
+        self._state = plant.state()
+        """State at the start of the step."""
+        self._velocity = np.zeros(len(self._state))
 
     def fly(self, velocity: Array) -> None:
         self._velocity = velocity
@@ -50,23 +52,20 @@ class SimulatedVehicle(Vehicle):
         """Measurements that became available; first advances the plant to the present step."""
         available: list[Measurement] = []
         if self._step < 0:
-            self._began_ns, self._step = now_ns, 0
-            self._measure(available)
+            self._began_ns = now_ns
         # The plant's state is that of the start of a step. The plant has no clock and is advanced
         # on demand.
         while self._began_ns + (self._step + 1) * self._dt_ns <= now_ns:
-            self.plant.advance(self._velocity)
-            self._step += 1
-            self._measure(available)
+            if self._step >= 0:
+                self.plant.advance(self._velocity)
+            self._step, self._state = self._step + 1, self.plant.state()
+            measured = self.sensor.measure(self._state, began_ns=self._began_ns)
+            if measured.position or measured.velocity:
+                available.append(measured)
         return available
 
-    def _measure(self, available: list[Measurement]) -> None:
-        measured = self.sensor.measure(self.plant.state(), began_ns=self._began_ns)
-        if measured.position or measured.velocity:
-            available.append(measured)
-
     def truth(self) -> Array:
-        return self.plant.state()
+        return self._state
 
     def change(self, scenario: Scenario) -> None:
         self.plant.change(scenario.vehicle)

@@ -21,7 +21,6 @@ from skytether.client.simulated.plant import FirstOrderPlant
 from skytether.client.simulated.sensor import Sensor
 from skytether.client.simulated.vehicle import SimulatedVehicle
 from skytether.client.simulated.weather import Weather
-from skytether.client.vehicle import Measurement
 from skytether.netem.proxy import Proxy
 from skytether.server.endpoint import Server
 from skytether.server.missions.mission_planner import MissionPlanner
@@ -65,13 +64,13 @@ class Body(SimulatedVehicle):
         """Times [s; client's clock] and positions [m] of steps without a client."""
 
     def fly_alone(self, now_ns: int) -> None:
-        measurements, lost, velocity = list[Measurement](), self._step, self._velocity
+        lost, velocity = self._step, self._velocity
         while lost >= 0 and self._began_ns + (self._step + 1) * self._dt_ns <= now_ns:
             is_held = (self._step - lost) * self._dt_ns < HOLD_NS
             if not self.holds:
                 self.plant.advance(velocity if is_held else 0.0 * velocity)
             self._step += 1
-            self._measure(measurements)
+            self.sensor.measure(self.plant.state(), began_ns=self._began_ns)
             time_s = (self._began_ns + self._step * self._dt_ns) / SECOND_NS
             self.unflown.append((time_s, self.plant.state()[:, 0].tolist()))
         self.holds = False

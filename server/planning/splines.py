@@ -29,9 +29,7 @@ class SplineScheme(Scheme):
         # horizon has: the age must lead to the step of an existing observation.
         age = np.where(old > 0, np.maximum(age, 0), age)
         columns = (sent, rows, step, age, splines.spacing[sent], splines.number[sent])
-        for i, row, k, age_steps, spacing, n in zip(
-            *(column.tolist() for column in columns), strict=True
-        ):
+        for i, row, k, age_steps, spacing, n in zip(*map(np.ndarray.tolist, columns), strict=True):
             knots = splines.knots[i, :, : 2 * n].reshape(-1, n, 2)
             vehicle, session, sent_us, number, silence = header(row)
             fields = (vehicle, session, k, sent_us, age_steps, spacing, knots, number, silence)

@@ -13,6 +13,8 @@ from helpers import ran
 PACKAGE = Path(skytether.__file__).parent
 LINES = 18_000
 """Largest number of lines that a flight of `demo` loads; each step towards the kernel lowers it."""
+CALLS = 150
+"""Largest number of Python calls that a step of a vehicle of `demo` takes in virtual time."""
 FLIES = "fly demo --virtual"
 ROOMS: dict[str, tuple[str, str]] = {
     # places in the package, and a command that needs them
@@ -135,6 +137,32 @@ def test_a_flight_of_one_vehicle_loads_no_room_and_few_lines() -> None:
     beside = tuple(f"{room}." for room in rooms)
     assert {each for each in lines if each in rooms or each.startswith(beside)} <= read
     assert sum(lines.values()) <= LINES
+
+
+COUNT = """
+import sys
+import msgspec
+from skytether.shared.scenario import reading
+from skytether.sim import flight
+
+calls, seconds = 0, []
+
+def count(frame, event, arg):
+    global calls
+    calls += event == "call"
+
+demo = msgspec.structs.replace(reading.load("demo"), duration=4.0, settle=0.0)
+sys.setprofile(count)
+flight.fly(demo, on_second=lambda _: seconds.append(calls))
+sys.setprofile(None)
+print((seconds[-1] - seconds[-2]) * demo.control.dt)
+"""
+
+
+def test_a_step_of_a_vehicle_takes_few_calls() -> None:
+    flown = ran(sys.executable, "-P", "-c", COUNT)
+    assert flown.returncode == 0, flown.stderr
+    assert float(flown.stdout) <= CALLS
 
 
 CHANGE = """
