@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skytether.shared.law import rule, spline
-from skytether.shared.law.model import Array, Model
+from skytether.shared.law.model import Array, Axis, Model
 from skytether.shared.law.rule import bounded
 from skytether.shared.law.spline import along
 from skytether.shared.law.terms import Terms
@@ -54,6 +54,8 @@ class Follower(Protocol):
 class Constants(NamedTuple):
     terms: Terms
     model: Model
+    axes: list[Axis]
+    """The model by axis."""
     horizon: Array
     """Parameters of flight along a horizon that do not depend on it, in the columns of
     `shared.law.rule`; shape (axes, n)."""
@@ -72,7 +74,7 @@ class Constants(NamedTuple):
         guide[:, spline.DT_S], guide[:, spline.BRAKE] = terms.dt_s, terms.brake
         guide[:, spline.BOUND] = terms.u_max
         guide[:, [spline.GAIN_P, spline.GAIN_V, spline.LAG]] = regulator
-        return cls(terms, model, horizon, guide)
+        return cls(terms, model, model.axes(), horizon, guide)
 
 
 class HorizonFollower:
@@ -144,16 +146,15 @@ class SplineFollower:
     def __init__(
         self, constants: Constants, knots: NDArray[np.floating], spacing: int, length: int
     ) -> None:
-        terms = constants.terms
+        bounds, dt_s = constants.terms.u_max, constants.terms.dt_s
         self.length = length
         self.spacing, self.sent = spacing, knots
         self.last = spacing * (knots.shape[1] - 1)
         """Stage of the last knot."""
         self._knots = np.array(knots, np.float64, order="C").reshape(len(knots), -1)
-        axes = zip(constants.model.axes(), self._knots, terms.u_max, strict=True)
         last = [
-            bounded(along(model, row, spacing, terms.dt_s, length - 1), bound)
-            for model, row, bound in axes
+            bounded(along(model, row, spacing, dt_s, length - 1), bound)
+            for model, row, bound in zip(constants.axes, self._knots, bounds, strict=True)
         ]
         self._table = table = constants.guide.copy()
         table[:, spline.SPACING], table[:, spline.LENGTH] = spacing, length

@@ -7,7 +7,6 @@ decides what the vehicle may do, `client.compensator` which input of a horizon i
 """
 
 import math
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -64,6 +63,9 @@ class Pilot:
     ) -> None:
         self._terms = scenario.terms()
         self._dt_ns, self._keeps_apart = self._terms.dt_ns, scenario.keeps_apart
+        self._splines = self._terms.splines
+        self._late = LATE_SHARE * self._terms.reach
+        """Passed steps of a horizon above which it counts as late."""
         self.steps = scenario.steps
         self._number, self._vehicle = number, vehicle
         self._navigation = Navigation(scenario)
@@ -72,7 +74,7 @@ class Pilot:
         self._holds = scenario.keeps_apart or (vehicle.drifts and failsafe.brakes)
         """Whether a hovering vehicle holds its place: velocities alone let it drift, and other
         vehicles of a mission keep clear of that place."""
-        along = regulator(scenario) if self._terms.splines or self._holds else None
+        along = regulator(scenario) if self._splines or self._holds else None
         self.compensator = Compensator(self._terms, along)
         self._reporter = Reporter(self._terms, scenario.vehicle.report, self.compensator)
         self._fence: Guard | None = None
@@ -161,7 +163,7 @@ class Pilot:
             if isinstance(horizon, Horizon):
                 # Committed inputs come first, and have normally been flown at its arrival.
                 passed -= horizon.inputs.shape[1] - terms.planned
-            self._failsafe.horizon_arrived(late=passed > LATE_SHARE * terms.reach, now_ns=now_ns)
+            self._failsafe.horizon_arrived(late=passed > self._late, now_ns=now_ns)
         observed = horizon.step - horizon.age
         takes_from = self._takes_from if self._failsafe.takes else None
         if takes_from is None or 0 <= observed < takes_from:
@@ -411,7 +413,7 @@ class Pilot:
             failsafe.mode,
             int(failsafe.takes),
             self._navigation.predicted,
-            NO_INPUT if self._terms.splines else self._input,
+            NO_INPUT if self._splines else self._input,
             session.sent,
             session.silence,
         )
@@ -419,12 +421,15 @@ class Pilot:
     def _record(self) -> None:
         if self._recorder is None:
             return
-        compensator, failsafe = self.compensator, self._failsafe
-        observed = compensator.observed
+        compensator, failsafe, navigation = self.compensator, self._failsafe, self._navigation
+        observed, truth = compensator.observed, self._vehicle.truth()
         self._recorder.append_row(
             self._number,
             self.flown,
-            *self._recorded_states(),
+            *(navigation.estimate if truth is None else truth).ravel().tolist(),
+            *navigation.measured.ravel().tolist(),
+            *navigation.predicted.ravel().tolist(),
+            *self._input.tolist(),
             compensator.covered,
             compensator.in_force,
             -1 if observed < 0 else (self.flown - observed) * self._dt_ns,
@@ -433,13 +438,6 @@ class Pilot:
             failsafe.mode,
             failsafe.reason,
         )
-
-    def _recorded_states(self) -> Sequence[float]:
-        """Estimated or true, measured and predicted state, and input, flattened for the record."""
-        navigation, truth = self._navigation, self._vehicle.truth()
-        states = navigation.estimate if truth is None else truth
-        recorded = (states, navigation.measured, navigation.predicted, self._input)
-        return [number for array in recorded for number in array.ravel().tolist()]
 
     def figures(self) -> dict[str, Any]:
         """Figures of the flight so far; ages only while a horizon is in force."""

@@ -37,33 +37,6 @@ def distance_m(tau_s: Numbers, believed: Table, states: Table) -> float:
     return math.sqrt(total)
 
 
-class BelievedState:
-    """State that the server predicts for the vehicle, if no packet is lost."""
-
-    def __init__(self, terms: Terms, compensator: Compensator) -> None:
-        self._tau_s, self._compensator = np.array(terms.tau_s), compensator
-        self._states = np.zeros((terms.axes, 2))
-
-    def off_m(self, states: Array) -> float:
-        """Distance of the vehicle from the predicted state [m], see `distance_m`; states of shape
-        (axes, 2).
-        """
-        return distance_m(self._tau_s, self._states, states)
-
-    def advance_from(self, states: Array, flown: Array) -> None:
-        """Advance from a step with an observation to the next.
-
-        Args:
-            states: state in the observation; shape (axes, 2).
-            flown: input flown from there on, of each axis [m/s].
-        """
-        self._states = self._compensator.foresee(states, flown)
-
-    def silent(self) -> None:
-        """Advance from a step without an observation to the next."""
-        self._states = self._compensator.foresee(self._states)
-
-
 class Reporter:
     """Decides at each step whether to send an observation.
 
@@ -73,11 +46,13 @@ class Reporter:
     """
 
     def __init__(self, terms: Terms, report: str, compensator: Compensator) -> None:
-        self._dt_s = terms.dt_s
+        self._dt_s, self._tau_s = terms.dt_s, np.array(terms.tau_s)
         self._compensator = compensator
         self.always = is_always(report)
         self._wants = make_report(report)
-        self.belief = BelievedState(terms, compensator)
+        self.believed = np.zeros((terms.axes, 2))
+        """State at the next step that the server predicts if no packet is lost, position [m] and
+        velocity [m/s] of each axis; shape (axes, 2)."""
         self._session: int | None = None
         """Session of the newest observation; None before the first."""
         self._reported: tuple[int, Mode, int] | None = None
@@ -114,15 +89,15 @@ class Reporter:
         due = self._waits(step, mode) or session != self._session
         if not due:
             is_news, steps = slept or situation != self._reported, step - self._reported_step
-            off_m = self.belief.off_m(states)
+            off_m = distance_m(self._tau_s, self.believed, states)
             due = 0 < silence <= 2 * steps
             due |= self._wants(Unreported(off_m, is_news, steps, self._dt_s))
         self._step = step
         if due:
             self._session, self._reported, self._reported_step = session, situation, step
-            self.belief.advance_from(states, flown)
+            self.believed = self._compensator.foresee(states, flown)
         else:
-            self.belief.silent()
+            self.believed = self._compensator.foresee(self.believed)
         return due
 
     def _waits(self, step: int, mode: Mode) -> bool:

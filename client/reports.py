@@ -6,20 +6,20 @@ first of a session, and one after the longest silence that the server allows.
 """
 
 from collections.abc import Callable
-from typing import Annotated, NamedTuple
+from typing import Annotated
 
-from msgspec import Meta
+from msgspec import Meta, Struct
 
 from skytether.shared.scenario.grammar import Call, Combination, Expression
 from skytether.shared.scenario.registry import PERIOD_MAX, REPORTS
 
 
-class Unreported(NamedTuple):
+class Unreported(Struct, frozen=True):
     """Input of a policy, at one step: the deviation of the server's prediction from the vehicle."""
 
     off_m: float
     """Distance of the vehicle from the state that the server predicts [m], see
-    `client.reporting.BelievedState`."""
+    `client.reporting.distance_m`."""
     is_news: bool
     """Whether, since the last observation, another horizon has come into force, the mode has
     changed, or the horizon in force was received again, so that its acknowledgement may have been

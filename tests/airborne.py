@@ -2,7 +2,7 @@
 
 import io
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -99,20 +99,23 @@ class Tap(Endpoint):
         self._heard.append((now_ns, datagram.payload))
         if not self.deaf:
             self.inner.receive(datagram, now_ns=now_ns)
+        self._pass_on()
 
     def wake(self, *, now_ns: int) -> None:
         self.inner.wake(now_ns=now_ns)
+        self._pass_on()
 
     def next_wake_ns(self) -> int | None:
         return self.inner.next_wake_ns()
 
-    def outbox(self) -> list[Datagram]:
+    def _pass_on(self) -> None:
         sent = self.inner.outbox()
         if self.alter is not None:
             sent = [self._altered(datagram) for datagram in sent]
-        if self.dumb:
-            return []
-        return sent + [Datagram(payload, ("client", 1)) for payload in self._take()]
+        if not self.dumb:
+            self._out += sent
+            self._out += [Datagram(payload, ("client", 1)) for payload in self._take()]
+        self._events += self.inner.events()
 
     def _altered(self, datagram: Datagram) -> Datagram:
         assert self.alter is not None
@@ -123,9 +126,6 @@ class Tap(Endpoint):
     def _take(self) -> list[bytes]:
         extra, self.extra = self.extra, []
         return extra
-
-    def events(self) -> Sequence[Event]:
-        return self.inner.events()
 
 
 def altered(kind: str, **fields: Callable[[Any], Any]) -> Callable[[Message], bytes | None]:

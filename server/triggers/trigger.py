@@ -10,7 +10,7 @@ plan (`fresh`: first step, or a gap longer than H) fires in every policy but `bu
 """
 
 from collections.abc import Callable, Sequence
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 import numpy as np
@@ -151,6 +151,12 @@ class Verdict(NamedTuple):
         return self.compared is not Compared.NOTHING
 
 
+_verdict: Callable[[tuple[Flags, Array, Array, Compared]], Verdict] = partial(
+    tuple.__new__, Verdict
+)
+"""Verdict from its four values, in half the time of calling `Verdict`."""
+
+
 class Trigger:
     """Base class of a policy with memory; one instance serves all vehicles.
 
@@ -187,7 +193,7 @@ def above(situation: Situation, figure: Array | Compared, threshold: float) -> V
     compared = figure if isinstance(figure, Compared) else Compared.OWN
     values = situation.figures[COLUMNS[figure]] if isinstance(figure, Compared) else figure
     event = situation.figures["fresh"] | (values > threshold)
-    return Verdict(event, values, _constant(len(values), threshold), compared)
+    return _verdict((event, values, _constant(len(values), threshold), compared))
 
 
 @lru_cache(maxsize=256)
@@ -206,7 +212,7 @@ def all_of(n: int) -> Flags:
 
 def timed(event: Flags, figures: Figures) -> Verdict:
     """Verdict of a policy that compares no figure."""
-    return Verdict(event, figures["state_gap"], _constant(len(event), 0.0), Compared.NOTHING)
+    return _verdict((event, figures["state_gap"], _constant(len(event), 0.0), Compared.NOTHING))
 
 
 class _Stateless(Trigger):
@@ -248,7 +254,7 @@ class Combined(Trigger):
         # The record has one figure: that of the leftmost policy which compares one.
         shown = left if left.compares or not right.compares else right
         event = self._combine(left.event, right.event)
-        return Verdict(event, shown.figure, shown.threshold, shown.compared)
+        return _verdict((event, shown.figure, shown.threshold, shown.compared))
 
     def sent(self, rows: Indices, figures: Figures) -> None:
         self._left.sent(rows, figures)

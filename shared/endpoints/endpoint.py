@@ -116,6 +116,8 @@ class Endpoint(ABC):
         # Shared with the parts of the endpoint, so never replaced.
         self._out: list[Datagram] = []
         self._events = Events()
+        self.pending = self._out, self._events
+        """Datagrams and events that `outbox` and `events` return next."""
 
     @abstractmethod
     def receive(self, datagram: Datagram, *, now_ns: int) -> None:

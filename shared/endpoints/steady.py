@@ -28,7 +28,7 @@ class Steady(Endpoint):
 
     def __init__(self, inner: Endpoint) -> None:
         super().__init__()
-        self._inner = inner
+        self._inner, self.pending = inner, inner.pending
         self.changeable, self.patience_ns = inner.changeable, inner.patience_ns
         self.keeps, self.directions = inner.keeps, inner.directions
         self._seen_ns: int | None = None

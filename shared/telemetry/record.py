@@ -220,7 +220,8 @@ class Recorder:
         rows = np.zeros(count, self.columns)
         for name, value in values.items():
             rows[name] = value
-        self._write(rows.tobytes())
+        for sink in self._sinks:
+            sink.write(rows.tobytes())
 
     def append_row(self, *values: float) -> None:
         """Append one row, faster: a value for every column in order, arrays flattened."""
@@ -232,11 +233,9 @@ class Recorder:
         """Append rows encoded by `pack`, in few pieces."""
         # A full sink drops a whole piece, so pieces are short.
         for first in range(0, len(rows), PIECE_ROWS):
-            self._write(b"".join(rows[first : first + PIECE_ROWS]))
-
-    def _write(self, rows: bytes) -> None:
-        for sink in self._sinks:
-            sink.write(rows)
+            piece = b"".join(rows[first : first + PIECE_ROWS])
+            for sink in self._sinks:
+                sink.write(piece)
 
 
 def _row(columns: np.dtype[np.void]) -> Struct:

@@ -61,7 +61,7 @@ BOOT_ID = 2**63 + 2**31
 """Boot id of every endpoint. It takes as many bytes as a random one, and so do session numbers."""
 SERVER: Address = ("server", 0)
 STANDBY: Address = ("standby", 0)
-ASK_NS = 10 * MILLISECOND_NS
+ASK_NS = 100 * MILLISECOND_NS
 """Virtual time between two calls of `stopped` [ns]."""
 EVENTS_MAX = 65_536
 """Number of newest events of a flight that are kept."""
@@ -114,7 +114,7 @@ def fly(
         actions: times [s], and functions that act on the world then, for example stop a host.
         stopwatch: stopwatch for the server's stages; its times differ from flight to flight.
         on_second: called with the time flown [s], once per second of flight.
-        stopped: called often; the flight ends once the result is true.
+        stopped: called every ASK_NS; the flight ends once the result is true.
     """
     ends = PLAIN
     if secure:
@@ -380,13 +380,10 @@ def fly_runs(
         load("skytether.sim.changes", "changes in flight").plan(world, others | own, changes)
     for time_s, act in actions:
         world.at(seconds_to_ns(time_s), partial(act, world))
-    ask_ns, second_ns, flying = 0, SECOND_NS, runs.copy()
+    second_ns, flying = SECOND_NS, runs.copy()
 
     def over() -> bool:
-        nonlocal ask_ns, second_ns
-        if world.now_ns < ask_ns and flying[-1].flying:
-            return False
-        ask_ns = world.now_ns + ASK_NS
+        nonlocal second_ns
         if world.now_ns >= second_ns:
             flown_s = world.now_ns // SECOND_NS
             second_ns = (flown_s + 1) * SECOND_NS
@@ -397,7 +394,7 @@ def fly_runs(
         return not flying or (stopped is not None and stopped())
 
     longest_s = scenario.link.connect_s + 2.0 * scenario.duration + 10.0
-    world.run(over, limit_ns=seconds_to_ns(longest_s))
+    world.run(over, limit_ns=seconds_to_ns(longest_s), every_ns=ASK_NS)
     recorded = parse(sink.getvalue())
     return [run.flight(recorded) for run in runs]
 

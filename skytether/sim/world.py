@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from heapq import heapify, heappop, heappush
 from typing import Protocol
 
-from skytether.shared.endpoints.endpoint import Address, Datagram, Endpoint
+from skytether.shared.endpoints.endpoint import Address, Datagram, Endpoint, make_datagram
 from skytether.shared.events.flight import Event
 
 BILLION = 1_000_000_000
@@ -139,6 +139,8 @@ class World:
         None for a wake; an action has a function in place of the host.
         """
         self._scheduled = 0
+        self._look_ns = 0
+        """Time before which `run` does not look at its condition."""
         self._arriving: deque[tuple[Host, Datagram]] = deque()
         """Datagrams that arrive at the present time, in the order in which they were sent."""
 
@@ -258,13 +260,23 @@ class World:
         finally:
             self._after(host, self.now_ns)
 
-    def run(self, until: Callable[[], bool], *, limit_ns: int) -> None:
-        """Run the world until a condition holds, or until a time."""
-        agenda, arriving, receive = self._agenda, self._arriving, self._receive
-        while (agenda or arriving) and not until():
+    def run(self, until: Callable[[], bool], *, limit_ns: int, every_ns: int = 0) -> None:
+        """Run the world until a condition holds, or until a time.
+
+        Args:
+            every_ns: least time between two looks at the condition; the end of an endpoint is a
+                reason to look at once.
+        """
+        agenda, arriving = self._agenda, self._arriving
+        self._look_ns = self.now_ns
+        while agenda or arriving:
+            if self.now_ns >= self._look_ns:
+                if until():
+                    return
+                self._look_ns = self.now_ns + every_ns
             # Datagrams sent at an earlier time are on the agenda, and arrive first.
             if arriving and not (agenda and agenda[0][:2] <= (self.now_ns, ARRIVAL)):
-                receive(*arriving.popleft())
+                self._receive(*arriving.popleft())
                 continue
             if agenda[0][0] > limit_ns:
                 return
@@ -272,10 +284,14 @@ class World:
             self.now_ns = entry[0]
             if entry[3] is None:
                 entry[4]()
-            elif entry[4] is None:
-                self._wake(entry[3])
-            else:
-                receive(entry[3], entry[4])
+            elif entry[4] is not None:
+                self._receive(entry[3], entry[4])
+            elif entry[3].armed_ns == self.now_ns:  # else its next wake has changed since
+                host = entry[3]
+                host.armed_ns = None
+                host.endpoint.wake(now_ns=host.clock.local(self.now_ns))
+                host.busy_until_ns = self.now_ns + host.compute_ns
+                self._after(host, host.busy_until_ns)
 
     def _at(self, time_ns: int, turn: int, host: Host, datagram: Datagram | None) -> None:
         self._scheduled += 1
@@ -297,15 +313,6 @@ class World:
             self._scheduled += 1
             heappush(self._agenda, (time_ns, host.turn, self._scheduled, host, None))
 
-    def _wake(self, host: Host) -> None:
-        now_ns = self.now_ns
-        if host.armed_ns != now_ns:
-            return  # the endpoint has changed its next wake since
-        host.armed_ns = None
-        host.endpoint.wake(now_ns=host.clock.local(now_ns))
-        host.busy_until_ns = now_ns + host.compute_ns
-        self._after(host, host.busy_until_ns)
-
     def _receive(self, host: Host, datagram: Datagram) -> None:
         host.endpoint.receive(datagram, now_ns=host.clock.local(self.now_ns))
         self._after(host, self.now_ns)
@@ -318,18 +325,22 @@ class World:
             if (content := endpoint.keep(now_ns=now_ns)) is not None:
                 host.memory = content, now_ns
                 endpoint.kept()
-        for payload, (name, socket), source in endpoint.outbox():
-            receiver = self._hosts.get(name)
-            if receiver is None:
-                continue
-            arrived = Datagram(payload, (host.name, source), socket)
-            if leaves_ns == self.now_ns:
-                self._arriving.append((receiver, arrived))
-            else:
-                self._at(leaves_ns, ARRIVAL, receiver, arrived)
-        for event in endpoint.events():
-            self._on_event(self.now_ns, host.name, event)
+        out, events = endpoint.pending
+        if out:
+            for payload, (name, socket), source in endpoint.outbox():
+                receiver = self._hosts.get(name)
+                if receiver is None:
+                    continue
+                arrived = make_datagram((payload, (host.name, source), socket))
+                if leaves_ns == self.now_ns:
+                    self._arriving.append((receiver, arrived))
+                else:
+                    self._at(leaves_ns, ARRIVAL, receiver, arrived)
+        if events:
+            for event in endpoint.events():
+                self._on_event(self.now_ns, host.name, event)
         self._arm(host)
         if host.on_finished is not None and endpoint.finished:
             host.on_finished()
             host.on_finished = None
+            self._look_ns = self.now_ns

@@ -9,7 +9,7 @@ import pytest
 import skytether
 from skytether.client import reporting
 from skytether.client.compensator import Compensator
-from skytether.client.reporting import BelievedState, Reporter
+from skytether.client.reporting import Reporter, distance_m
 from skytether.client.reports import Unreported, make_report
 from skytether.shared.scenario.grammar import GrammarError
 from skytether.shared.scenario.reading import load
@@ -111,15 +111,16 @@ def test_the_belief_is_the_rule_of_flight() -> None:
     compensator = Compensator(terms)
     feedback = np.array([[0.2, 0.1, 0.05, 1.5, 0.5]] * 2, np.float32)
     compensator.offer(horizon(3)._replace(feedback=feedback), 4, 2)
-    belief, x = BelievedState(terms, compensator), np.array([[0.5, -0.3], [-0.2, 0.4]])
+    tau_s, believed = np.array(terms.tau_s), np.zeros((2, 2))
+    x = np.array([[0.5, -0.3], [-0.2, 0.4]])
     for step in range(4, 40):
         u = np.array(compensator.choose(step, x, ZERO, ZERO)[0])
-        belief.advance_from(x, u) if step == 4 else belief.silent()
+        believed = compensator.foresee(x, u) if step == 4 else compensator.foresee(believed)
         x = terms.model.step(x, u + np.float32(0.05))
-        assert belief.off_m(x) == pytest.approx(0.0, abs=1e-6)
+        assert distance_m(tau_s, believed, x) == pytest.approx(0.0, abs=1e-6)
     aside, faster = [[0.3, 0.0], [0.0, 0.0]], [[0.0, 0.1], [0.0, 0.0]]
-    assert belief.off_m(x + aside) == pytest.approx(0.3, abs=1e-6)
-    assert belief.off_m(x + faster) == pytest.approx(0.1 * terms.tau_s[0], abs=1e-6)
+    assert distance_m(tau_s, believed, x + aside) == pytest.approx(0.3, abs=1e-6)
+    assert distance_m(tau_s, believed, x + faster) == pytest.approx(0.1 * terms.tau_s[0], abs=1e-6)
 
 
 # -- flights ---------------------------------------------------------------------------------
