@@ -7,7 +7,6 @@ contenders fly with the same seeds of network and wind, counted from each flight
 flight is repeated with the network cut for a while.
 """
 
-import io
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -28,7 +27,7 @@ from skytether.shared.base.units import SECOND_NS
 from skytether.shared.events.flight import Flying
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.whole import Scenario
-from skytether.shared.telemetry.record import Record, Recorder, Rows, parse
+from skytether.shared.telemetry.record import MemoryRecorder, Record, Rows
 from skytether.shared.telemetry.summary import Summary, position_error, summarise
 from skytether.shared.wire.protocol import Mode
 from skytether.shell.commandline import command
@@ -154,17 +153,16 @@ def fly(scenario: Scenario, law: Law | None, flavour: FlavourName, changes: Chan
         return straight.fly(scenario, law, flavour, changes)
     autopilot, truth = autopilot_of(scenario, flavour)
     record = flight.fly(scenario, beside={"autopilot": autopilot}, changes=changes)
-    return as_it_was(scenario, record, parse(truth.getvalue()))
+    return as_it_was(scenario, record, truth.rows())
 
 
 def autopilot_of(
     scenario: Scenario, flavour: FlavourName, faults: Sequence[ScriptedFault] = ()
-) -> tuple[Autopilot, io.BytesIO]:
-    """Autopilot that is ready to fly, and the file for its true states: rows of TRUTH_COLUMNS."""
-    truth = io.BytesIO()
-    recorder = Recorder(TRUTH_COLUMNS, truth)
+) -> tuple[Autopilot, MemoryRecorder]:
+    """Autopilot that is ready to fly, and the recorder of its true states."""
+    truth = MemoryRecorder(TRUTH_COLUMNS)
     autopilot = Autopilot(
-        scenario, flavour, ready_s=straight.READY_S, faults=faults, recorder=recorder
+        scenario, flavour, ready_s=straight.READY_S, faults=faults, recorder=truth
     )
     for name, value in SAFE[flavour].items():
         autopilot.flight.set(name, value)

@@ -24,7 +24,6 @@ from skytether.shared.base.units import SECOND_NS, seconds_to_ns
 from skytether.shared.events.flight import ModeChanged
 from skytether.shared.law.model import Array
 from skytether.shared.scenario.whole import Scenario
-from skytether.shared.telemetry.record import parse
 from skytether.shared.wire.protocol import Mode
 from skytether.shell.commandline import command
 from skytether.sim import flight
@@ -155,7 +154,7 @@ def fly(case: CaseName, flavour: FlavourName, seed: int) -> FaultOutcome:
         ]
     )
     on_s = next((time_s for name, time_s in modes if name == TRACK), WATCHED_S)
-    rows = parse(truth.getvalue())
+    rows = truth.rows()
     times_s = rows["time_ns"] / SECOND_NS - fault_s
     seen = (times_s >= 0.0) & (times_s <= on_s)
     speeds = np.linalg.norm(rows["state"][seen, :2, 1], axis=1)

@@ -6,7 +6,6 @@ its client rows have the vehicle's true state, and its server rows the steps at 
 has sent.
 """
 
-import io
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -24,12 +23,11 @@ from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import (
     PACKET_COLUMNS,
     FlightEvent,
+    MemoryRecorder,
     Reason,
     Record,
-    Recorder,
     Rows,
     client_columns,
-    parse,
     server_columns,
 )
 from skytether.shared.telemetry.summary import Summary, summarise
@@ -62,14 +60,11 @@ def fly(
     def on_event(time_ns: int, host: str, event: Event) -> None:
         events.append(FlightEvent(time_ns, host, event))
 
-    sinks = io.BytesIO(), io.BytesIO(), io.BytesIO()
     columns = station_columns(scenario.model.axes), TRUTH_COLUMNS, PACKET_COLUMNS
-    to_station, to_truth, to_netem = map(Recorder, columns, sinks)
-    station = Station(scenario, law, to_station)
-    netem = Proxy(scenario, server=("station", 0), flows=1, recorder=to_netem)
-    autopilot = Autopilot(
-        scenario, flavour, peers=[("netem", 0)], ready_s=READY_S, recorder=to_truth
-    )
+    steps, truths, packets = map(MemoryRecorder, columns)
+    station = Station(scenario, law, steps)
+    netem = Proxy(scenario, server=("station", 0), flows=1, recorder=packets)
+    autopilot = Autopilot(scenario, flavour, peers=[("netem", 0)], ready_s=READY_S, recorder=truths)
     simulation = scenario.simulation
     clock = Clock(
         seconds_to_ns(max(simulation.clock_offset_s, 0.0)),
@@ -82,10 +77,11 @@ def fly(
     world.add("station", station)
     plan(world, {"netem": (netem, scenario), "autopilot": (autopilot, scenario)}, changes)
     world.run(lambda: station.finished, limit_ns=seconds_to_ns(scenario.duration + AROUND_S))
-    parts = [parse(sink.getvalue()) for sink in sinks]
-    truth = parts[1].copy()
+    truth = truths.rows().copy()
     truth["time_ns"] = [clock.world(time_ns) for time_ns in truth["time_ns"].tolist()]
-    return joined(scenario, parts[0], truth, parts[2], failure=station.failure, events=events)
+    return joined(
+        scenario, steps.rows(), truth, packets.rows(), failure=station.failure, events=events
+    )
 
 
 def joined(

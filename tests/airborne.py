@@ -1,6 +1,5 @@
 """Flights with a scripted autopilot in virtual time: server, netem, client and autopilot."""
 
-import io
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -23,7 +22,7 @@ from skytether.shared.endpoints.endpoint import Datagram, Endpoint
 from skytether.shared.events.flight import Event, ModeChanged
 from skytether.shared.scenario.reading import check
 from skytether.shared.scenario.whole import Scenario
-from skytether.shared.telemetry.record import Recorder, Rows, client_columns, parse
+from skytether.shared.telemetry.record import MemoryRecorder, Rows, client_columns
 from skytether.shared.wire.protocol import Mode
 from skytether.sim.world import Clock, World
 
@@ -170,27 +169,26 @@ class Air:
         **table: Any,
     ) -> None:
         self.scenario = scenario(**table)
-        self.truth = io.BytesIO()
-        """True states of the vehicle: rows of TRUTH_COLUMNS."""
+        self.truth = MemoryRecorder(TRUTH_COLUMNS)
+        """True states of the vehicle."""
         self.autopilot = Autopilot(
             self.scenario,
             flavour,
             peers=[("client", 1)] if self.scenario.vehicle.address.startswith("udp:") else [],
             ready_s=ready_s,
             faults=[parse_fault(each) for each in faults],
-            recorder=Recorder(TRUTH_COLUMNS, self.truth),
+            recorder=self.truth,
         )
         self.autopilot.flight.parameters |= SAFE[flavour] if parameters is None else parameters
         self.tap = Tap(self.autopilot)
         self.events: list[tuple[int, str, Event]] = []
         self.world = World(lambda time_ns, host, event: self.events.append((time_ns, host, event)))
-        self._sink, self.lives = io.BytesIO(), 0
-        columns = client_columns(self.scenario.model.axes)
+        self.lives = 0
         flies = vehicles.make(self.scenario, 1)
         if sets:
             assert flies.set_parameters()
         self.flies: Any = flies
-        self._recorder = Recorder(columns, self._sink)
+        self._recorder = MemoryRecorder(client_columns(self.scenario.model.axes))
         self.client = self._client(0, None)
         clock = Clock(OFFSET_NS, round(1000 * drift_ppm))
         self.world.add(host, self.tap, clock=Clock(0, round(1000 * autopilot_ppm)))
@@ -291,7 +289,7 @@ class Air:
         return self.client._failsafe.mode
 
     def rows(self) -> Rows:
-        return parse(self._sink.getvalue())
+        return self._recorder.rows()
 
     def said(self, host: str = "client") -> list[str]:
         return [str(event) for _, name, event in self.events if name == host]

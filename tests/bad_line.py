@@ -24,7 +24,6 @@ from skytether.shared.endpoints.endpoint import Address, Datagram, Endpoint
 from skytether.shared.events.aboard import AutopilotMode
 from skytether.shared.events.flight import Flying
 from skytether.shared.scenario import reading
-from skytether.shared.telemetry.record import parse
 from skytether.shared.wire.protocol import Mode
 
 CLIENT, AUTOPILOT = ("client", 1), ("autopilot", 0)
@@ -285,7 +284,7 @@ def _figures(air: OverLine, flavour: FlavourName, seed: int, pilot_s: float, arm
     rows = rows[rows["mode"] != Mode.MANUAL]
     began_ns = next(t for t, _, event in air.events if isinstance(event, Flying))
     steps_s = rows["step"] * air.scenario.control.dt
-    truth = state_at(parse(air.truth.getvalue()), began_ns + rows["step"] * air.scenario.dt_ns)
+    truth = state_at(air.truth.rows(), began_ns + rows["step"] * air.scenario.dt_ns)
     truth = truth[:, :, 0]
     error = truth - air.scenario.make_reference()(steps_s)[:, :, 0]
     settled = steps_s > SETTLE_S

@@ -1,7 +1,5 @@
 """Client whose server is played by the test, message by message."""
 
-import io
-
 import numpy as np
 
 from skytether.client.endpoint import Client
@@ -11,7 +9,7 @@ from skytether.client.vehicle import Vehicle
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.endpoints.endpoint import Address, Datagram
 from skytether.shared.scenario.whole import Scenario
-from skytether.shared.telemetry.record import Recorder, Rows, client_columns, parse
+from skytether.shared.telemetry.record import MemoryRecorder, Rows, client_columns
 from skytether.shared.wire.protocol import (
     Horizon,
     Message,
@@ -39,7 +37,7 @@ class ByHand:
     ) -> None:
         self.scenario, self.terms, self.dt_ns = flown, flown.terms(), flown.dt_ns
         self.flies = flies or simulated(flown, 1)
-        self.sink = io.BytesIO()
+        self._steps = MemoryRecorder(client_columns(flown.model.axes))
         self.client = Client(
             flown,
             self.flies,
@@ -47,7 +45,7 @@ class ByHand:
             vehicle=4,
             boot_id=99,
             link=link,
-            recorder=Recorder(client_columns(flown.model.axes), self.sink),
+            recorder=self._steps,
         )
         self.now_ns = 5 * SECOND_NS
         self.session = 7
@@ -88,4 +86,4 @@ class ByHand:
         self.say(Horizon(4, self.session, step, 5678, age, inputs))
 
     def rows(self) -> Rows:
-        return parse(self.sink.getvalue())
+        return self._steps.rows()

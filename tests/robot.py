@@ -4,7 +4,6 @@ It follows `cmd_vel` with a lag, stops when no command has come for TIME_OUT_NS,
 odometry by its own clock. In virtual time it is two hosts, named like its topics.
 """
 
-import io
 import json
 import math
 import socket
@@ -28,7 +27,7 @@ from skytether.shared.endpoints.endpoint import Datagram, Endpoint
 from skytether.shared.events.flight import Event
 from skytether.shared.scenario.reading import check
 from skytether.shared.scenario.whole import Scenario
-from skytether.shared.telemetry.record import Recorder, Rows, client_columns, parse
+from skytether.shared.telemetry.record import MemoryRecorder, Rows, client_columns
 from skytether.shared.wire.protocol import Mode
 from skytether.sim.world import Clock, World
 
@@ -239,8 +238,7 @@ class Ground:
                 self.events.append((time_ns, event))
 
         self.world = World(hear)
-        self._sink = io.BytesIO()
-        self._recorder = Recorder(client_columns(2), self._sink)
+        self._recorder = MemoryRecorder(client_columns(2))
         self.flies: Any = None
         self.client = self._client(0, None)
         clock = Clock(EPOCH_NS, round(1000 * drift_ppm))
@@ -298,7 +296,7 @@ class Ground:
         return [(at, self.robot.twist(message)) for at, message in times if since_s <= at < until_s]
 
     def rows(self) -> Rows:
-        return parse(self._sink.getvalue())
+        return self._recorder.rows()
 
 
 # -- on an actual Zenoh network ------------------------------------------------------------

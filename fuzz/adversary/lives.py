@@ -5,7 +5,6 @@ then drifts with the wind; one whose client has ended in order holds its place, 
 autopilot. Keys set by the operator survive a restart of the server.
 """
 
-import io
 from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
@@ -32,7 +31,7 @@ from skytether.shared.endpoints.endpoint import Address, Endpoint
 from skytether.shared.events.flight import Event
 from skytether.shared.missions.mission import Mission
 from skytether.shared.scenario.whole import Scenario
-from skytether.shared.telemetry.record import Recorder, client_columns, parse
+from skytether.shared.telemetry.record import MemoryRecorder, client_columns
 from skytether.shared.telemetry.summary import Track, track
 from skytether.shared.wire.protocol import Mode
 from skytether.sim.flight import SERVER, STANDBY
@@ -86,7 +85,7 @@ def _sensor(scenario: Scenario, number: int, life: int) -> Sensor:
 
 class Life(NamedTuple):
     client: Client
-    sink: io.BytesIO
+    steps: MemoryRecorder
 
 
 class Lives:
@@ -165,7 +164,7 @@ class Lives:
         return server
 
     def _client(self, number: int, runs: int, kept: Saved | None = None) -> Client:
-        before, sink = None, io.BytesIO()
+        before, steps = None, MemoryRecorder(client_columns(self.scenario.model.axes))
         if kept is not None:
             before = recall(*kept, CLOCK.local(self.world.now_ns), self.scenario.terms())
         client = Client(
@@ -174,11 +173,11 @@ class Lives:
             server=Several([NETWORK], standby=self._standby),
             vehicle=number,
             boot_id=number * 1000 + runs,
-            recorder=Recorder(client_columns(self.scenario.model.axes), sink),
+            recorder=steps,
             keeps=self._keeps(number),
             before=before,
         )
-        self._lives[number].append(Life(client, sink))
+        self._lives[number].append(Life(client, steps))
         return client
 
     def _keeps(self, number: int) -> bool:
@@ -260,8 +259,8 @@ class Lives:
         """
         dt_s, scale = self.scenario.control.dt, self.scenario.mission.height_scale
         tracks: list[Track] = []
-        for client, sink in self._lives[number]:
-            rows = parse(sink.getvalue())
+        for client, steps in self._lives[number]:
+            rows = steps.rows()
             if tracks or (rows["mode"] == Mode.TRACK).any():
                 began_s = client.began_ns / SECOND_NS
                 tracks.append(track(rows, began_s, dt_s, scale, whole=bool(tracks)))

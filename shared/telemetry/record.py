@@ -7,6 +7,7 @@ incomplete last row is left out.
 """
 
 import hashlib
+import io
 import json
 import math
 import re
@@ -214,9 +215,7 @@ class Recorder:
         self._sinks.append(sink)
 
     def append(self, count: int, **values: Any) -> None:
-        """Append `count` rows. A value is a scalar for all rows, or an array
-        with one item per row.
-        """
+        """Append `count` rows; a value is a scalar for all rows, or an array of one per row."""
         rows = np.zeros(count, self.columns)
         for name, value in values.items():
             rows[name] = value
@@ -236,6 +235,25 @@ class Recorder:
             piece = b"".join(rows[first : first + PIECE_ROWS])
             for sink in self._sinks:
                 sink.write(piece)
+
+
+class MemoryRecorder(Recorder):
+    """Recorder that keeps its rows in memory."""
+
+    def __init__(self, columns: np.dtype[np.void]) -> None:
+        super().__init__(columns)
+        self._kept = io.BytesIO()
+        self.follow(self._kept)
+
+    @property
+    def count(self) -> int:
+        """Number of rows so far."""
+        return self._kept.tell() // self.columns.itemsize
+
+    def rows(self, first: int = 0) -> Rows:
+        """Rows so far, from number `first` on; a negative number counts from the end."""
+        kept = self._kept.getbuffer()[first * self.columns.itemsize :]
+        return np.frombuffer(bytes(kept), self.columns)
 
 
 def _row(columns: np.dtype[np.void]) -> Struct:

@@ -32,7 +32,7 @@ from skytether.shared.scenario import reading
 from skytether.shared.scenario.dotted import set_keys
 from skytether.shared.scenario.reference import Reference
 from skytether.shared.scenario.whole import Scenario
-from skytether.shared.telemetry.record import Compared, Rows
+from skytether.shared.telemetry.record import Compared
 from skytether.sim.flight import BOOT_ID, MIDNIGHT_NS, PLAIN, SERVER, Run
 from skytether.sim.world import Clock, World
 
@@ -119,9 +119,8 @@ class Flight:
 
     def squares_m2(self) -> NDArray[np.float64]:
         """Squared distance of each vehicle from its target by the truth [m²]; 0 before it flies."""
-        rows: Rows = self.run.newest(2 * self._vehicles)
         found = np.zeros(self._vehicles)
-        for row in rows:
+        for row in self.run.steps.rows(-2 * self._vehicles):
             vehicle = int(row["vehicle"]) - 1
             at_s = np.array([row["step"] * self._scenario.control.dt])
             desired = self._references[vehicle](at_s)[0, :, 0]

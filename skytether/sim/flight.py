@@ -10,7 +10,6 @@ between runs, always take the same number of bytes on the wire. Events are equal
 vehicles of each run are numbered from 1.
 """
 
-import io
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -19,7 +18,6 @@ from types import MappingProxyType
 from typing import Any
 
 import msgspec
-import numpy as np
 
 from skytether.client import vehicles as kinds
 from skytether.client.alone import Reach
@@ -40,11 +38,11 @@ from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import (
     PACKET_COLUMNS,
     FlightEvent,
+    MemoryRecorder,
     Record,
     Recorder,
     Rows,
     client_columns,
-    parse,
     plan_columns,
     server_columns,
 )
@@ -119,8 +117,7 @@ def fly(
     ends = PLAIN
     if secure:
         ends = load("skytether.sim.sealed", "keys").Sealed(scenario.seed, vehicles)
-    columns, sink = plan_columns(scenario.model.axes, scenario.control.horizon), io.BytesIO()
-    plan_recorder = Recorder(columns, sink)
+    plan_recorder = MemoryRecorder(plan_columns(scenario.model.axes, scenario.control.horizon))
     (flight,) = fly_runs(
         scenario,
         (scenario.seed,),
@@ -136,7 +133,7 @@ def fly(
         actions,
         standby=standby,
     )
-    return replace(flight, plan=parse(sink.getvalue()))
+    return replace(flight, plan=plan_recorder.rows())
 
 
 class Run:
@@ -165,11 +162,9 @@ class Run:
     ) -> None:
         self._server_rows, self._server_figures = server_rows, server_figures
         self._before = number * vehicles
-        self._sinks = io.BytesIO(), io.BytesIO()
-        self._axes = scenario.model.axes
-        recorder = Recorder(client_columns(self._axes), self._sinks[0])
-        self._header_bytes = self._sinks[0].tell()
-        packets = Recorder(PACKET_COLUMNS, self._sinks[1])
+        self.steps = MemoryRecorder(client_columns(scenario.model.axes))
+        """Rows of the vehicles, in the order of their steps."""
+        self._packets = MemoryRecorder(PACKET_COLUMNS)
         self._netems: dict[str, Proxy] = {}
         self.flown: dict[str, Flown] = {}
         """Endpoint and scenario of each host."""
@@ -178,7 +173,7 @@ class Run:
             networks.append((STANDBY, scenario.network_of_standby))
         for i, (server, own) in enumerate(networks):
             host = f"netem {scenario.seed}/{i + 1}" if i else f"netem {scenario.seed}"
-            netem = Proxy(own, server=server, flows=vehicles, recorder=packets, path=i)
+            netem = Proxy(own, server=server, flows=vehicles, recorder=self._packets, path=i)
             self._netems[host], self.flown[host] = netem, (netem, own)
             world.add(host, netem)
         addresses: list[Address] = [(host, 0) for host in self._netems]
@@ -212,7 +207,7 @@ class Run:
                 vehicle=self._before + vehicle,
                 server=reach(self._before + vehicle),
                 boot_id=BOOT_ID,
-                recorder=recorder,
+                recorder=self.steps,
             )
             for vehicle in range(1, vehicles + 1)
         ]
@@ -228,7 +223,7 @@ class Run:
             self.flown[host] = client, scenario
         self.flying = vehicles
         self._ends: tuple[int | None, int | None] = None, None
-        """Rows of the server and bytes of netem when the last vehicle finished."""
+        """Numbers of rows of the server and of netem when the last vehicle finished."""
         self._figures: dict[str, Any] | None = None
         """Figures of each process when the last vehicle finished."""
 
@@ -245,7 +240,7 @@ class Run:
     def _one_has_finished(self) -> None:
         self.flying -= 1
         if not self.flying:
-            self._ends = self._server_rows(), self._sinks[1].tell()
+            self._ends = self._server_rows(), self._packets.count
             self._figures = self._figures_now()
 
     def _figures_now(self) -> dict[str, Any]:
@@ -256,20 +251,11 @@ class Run:
             "client": {"by_vehicle": each},
         }
 
-    def newest(self, count: int) -> Rows:
-        """The newest rows of the vehicles, at most `count`, in the order of their steps."""
-        columns = client_columns(self._axes)
-        with self._sinks[0].getbuffer() as written:
-            recorded = min(count, (len(written) - self._header_bytes) // columns.itemsize)
-            newest = written[len(written) - recorded * columns.itemsize :]
-            return np.frombuffer(newest.tobytes(), columns)
-
     def flight(self, server_rows: Rows) -> Record:
         """Record of the run, with vehicles numbered from 1, from the server's rows of all runs."""
-        rows_end, bytes_end = self._ends
-        client = parse(self._sinks[0].getvalue()).copy()
-        netem = parse(self._sinks[1].getvalue()[:bytes_end])
-        server = server_rows[:rows_end]
+        server_end, netem_end = self._ends
+        client, netem = self.steps.rows().copy(), self._packets.rows()[:netem_end]
+        server = server_rows[:server_end]
         last = self._before + len(self._clients)
         server = server[(server["vehicle"] > self._before) & (server["vehicle"] <= last)]
         for rows in (client, server):
@@ -318,7 +304,7 @@ def fly_runs(
         else:
             run_of[host].hear(time_ns, host, event)
 
-    world, sink = World(on_event), io.BytesIO()
+    world = World(on_event)
     entropy = stream(scenario.seed, "entropy").bytes
     each = [msgspec.structs.replace(scenario, seed=seed) for seed in seeds]
     error_ns = seconds_to_ns(scenario.simulation.time_error_s)
@@ -329,8 +315,7 @@ def fly_runs(
         return each[run].measured_reference(number + 1)
 
     has_own = scenario.keeps_apart or scenario.reference.shape == "target"
-    recorder = Recorder(server_columns(scenario.model.axes, scenario.control.scheme), sink)
-    header_bytes, row_bytes = sink.tell(), recorder.columns.itemsize
+    recorder = MemoryRecorder(server_columns(scenario.model.axes, scenario.control.scheme))
 
     def started(entropy: Callable[[int], bytes]) -> Server:
         return make_server(
@@ -351,14 +336,11 @@ def fly_runs(
         of_standby = stream(scenario.seed, "standby").bytes
         servers[STANDBY[0]] = started(of_standby) if standby is True else standby
 
-    def server_rows() -> int:
-        return (sink.tell() - header_bytes) // row_bytes
-
     runs = [
         Run(
             world,
             run,
-            server_rows,
+            lambda: recorder.count,
             partial(figures_of, server),
             number,
             vehicles,
@@ -395,7 +377,7 @@ def fly_runs(
 
     longest_s = scenario.link.connect_s + 2.0 * scenario.duration + 10.0
     world.run(over, limit_ns=seconds_to_ns(longest_s), every_ns=ASK_NS)
-    recorded = parse(sink.getvalue())
+    recorded = recorder.rows()
     return [run.flight(recorded) for run in runs]
 
 

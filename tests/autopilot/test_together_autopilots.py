@@ -1,6 +1,5 @@
 """Three autopilots on one mission: in virtual time, and over UDP as in docs/together.md."""
 
-import io
 import re
 import shlex
 import signal
@@ -30,7 +29,7 @@ from skytether.shared.scenario.dotted import set_keys
 from skytether.shared.scenario.reading import check
 from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry import record
-from skytether.shared.telemetry.record import Recorder, client_columns, parse
+from skytether.shared.telemetry.record import MemoryRecorder, client_columns
 from skytether.shared.telemetry.summary import least_separation
 from skytether.shell.processes.log import LogLine
 from skytether.sim.world import Clock, World
@@ -68,17 +67,16 @@ class Flown(NamedTuple):
 
 
 def fly(flavour: FlavourName, scenarios: Mapping[int, Scenario]) -> Flown:
-    world, clients, truths, sinks = World(lambda *_: None), [], [], []
+    world, clients, truths, steps = World(), [], [], []
     for number, flown in scenarios.items():
-        truths.append(io.BytesIO())
-        sinks.append(io.BytesIO())
-        pilot = Autopilot(flown, flavour, ready_s=1.0, recorder=Recorder(TRUTH_COLUMNS, truths[-1]))
+        truths.append(MemoryRecorder(TRUTH_COLUMNS))
+        steps.append(MemoryRecorder(client_columns(3)))
+        pilot = Autopilot(flown, flavour, ready_s=1.0, recorder=truths[-1])
         pilot.flight.parameters |= SAFE[flavour]
         world.add(f"autopilot{number}", pilot)
-        recorder = Recorder(client_columns(3), sinks[-1])
         flies, server_at = vehicles.make(flown, number), ("netem", 0)
         client = Client(
-            flown, flies, server=server_at, vehicle=number, boot_id=number, recorder=recorder
+            flown, flies, server=server_at, vehicle=number, boot_id=number, recorder=steps[-1]
         )
         clients.append(client)
         world.add(f"client{number}", client, clock=Clock(number * OFFSET_NS))
@@ -89,10 +87,10 @@ def fly(flavour: FlavourName, scenarios: Mapping[int, Scenario]) -> Flown:
     assert [client.failure for client in clients] == [None, None, None]
     paths = [
         # The local frame of each begins at its start.
-        parse(truth.getvalue())["state"][:, :, 0] + flown.start_m(number) * [1.0, 1.0, 0.0]
+        truth.rows()["state"][:, :, 0] + flown.start_m(number) * [1.0, 1.0, 0.0]
         for number, truth in zip(scenarios, truths, strict=True)
     ]
-    return Flown(server, paths, [parse(sink.getvalue()) for sink in sinks])
+    return Flown(server, paths, [each.rows() for each in steps])
 
 
 @pytest.mark.long

@@ -1,6 +1,5 @@
 """Many vehicles: in one process, on one server, on several workers, and their traffic."""
 
-import io
 import json
 import os
 import signal
@@ -27,7 +26,7 @@ from skytether.shared.events.flight import NoAnswer
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.drops import drops
-from skytether.shared.telemetry.record import Recorder, Rows, client_columns, parse
+from skytether.shared.telemetry.record import MemoryRecorder, Rows, client_columns
 from skytether.shell.processes import workers
 from skytether.sim.world import Clock, World
 from warm import skytether
@@ -39,9 +38,8 @@ GUSTY = reading.check(
 )
 
 
-def clients(scenario: Scenario, count: int, server: Address) -> tuple[list[Client], io.BytesIO]:
-    sink = io.BytesIO()
-    recorder = Recorder(client_columns(scenario.model.axes), sink)
+def clients(scenario: Scenario, count: int, server: Address) -> tuple[list[Client], MemoryRecorder]:
+    recorder = MemoryRecorder(client_columns(scenario.model.axes))
     made = [
         Client(
             scenario,
@@ -53,7 +51,7 @@ def clients(scenario: Scenario, count: int, server: Address) -> tuple[list[Clien
         )
         for number in range(1, count + 1)
     ]
-    return made, sink
+    return made, recorder
 
 
 def flown(count: int, *, together: bool) -> Rows:
@@ -67,7 +65,7 @@ def flown(count: int, *, together: bool) -> Rows:
         clock=Clock(13_000_000),
     )
     netem = world.add("netem", Proxy(GUSTY, server=server))
-    vehicles, sink = clients(GUSTY, count, netem)
+    vehicles, recorder = clients(GUSTY, count, netem)
     fleet = ClientFleet(vehicles)
     if together:
         world.add("fleet", fleet)
@@ -78,7 +76,7 @@ def flown(count: int, *, together: bool) -> Rows:
         lambda: fleet.finished if together else all(client.finished for client in vehicles),
         limit_ns=60 * SECOND_NS,
     )
-    rows = parse(sink.getvalue())
+    rows = recorder.rows()
     return rows[np.lexsort((rows["step"], rows["vehicle"]))]
 
 

@@ -8,7 +8,6 @@ import pytest
 from airborne import BOTH, Air, flying
 from skytether.autopilot.flavours import FlavourName
 from skytether.client.mavlink.vehicle import MavlinkVehicle
-from skytether.shared.telemetry.record import parse
 from skytether.shared.wire.protocol import Mode
 
 HOVER_S, SPAN_M = 30.0, 1.0
@@ -35,7 +34,7 @@ def places(air: Air, seconds: float) -> np.ndarray:
     """True positions in the next seconds [m]; shape (n, 3)."""
     since_ns = air.world.now_ns
     air.run(seconds)
-    rows = parse(air.truth.getvalue())
+    rows = air.truth.rows()
     return np.array(rows["state"][rows["time_ns"] >= since_ns][:, :, 0])
 
 

@@ -13,7 +13,6 @@ from skytether.client import vehicles
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.events.aboard import AutopilotRefused, ParametersUnsafe
 from skytether.shared.events.flight import ModeChanged
-from skytether.shared.telemetry.record import parse
 from skytether.shared.wire.protocol import Mode
 
 FENCE = {"low_m": [-8.0, -8.0, 0.5], "high_m": [8.0, 8.0, 6.0], "wind_mps": 0.5}
@@ -46,7 +45,7 @@ def test_a_lost_vehicle_hovers_and_returns_home_inside_its_fence() -> None:
     air.lands(90.0)
     assert not air.setpoints(quiet_ns)
     assert np.hypot(*air.flight.position()[:2]) < 0.7
-    rows = parse(air.truth.getvalue())
+    rows = air.truth.rows()
     places = rows["state"][rows["time_ns"] > died_ns][:, :, 0]
     assert np.abs(places[:, :2]).max() < 8.0
     assert places[:, 2].max() < 6.0

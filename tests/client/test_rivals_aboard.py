@@ -15,7 +15,7 @@ from skytether.client.mavlink.rivals import QUIET_NS, Rivals
 from skytether.mavlink.codec import Codec, Message
 from skytether.mavlink.dialect import dialect
 from skytether.shared.events.aboard import SecondCommander, Strays
-from skytether.shared.telemetry.record import Reason, parse
+from skytether.shared.telemetry.record import Reason
 from skytether.shared.wire.protocol import Mode
 
 FENCE = {"low_m": [-8.0, -8.0, 0.5], "high_m": [8.0, 8.0, 9.0]}
@@ -86,7 +86,7 @@ def test_a_slow_commander_is_noticed_and_the_fence_holds(
     noticed = modes(air).index(("brake", str(Reason.STRAYED)))
     assert "track" not in [after for after, _ in modes(air)[noticed:]]
     air.lands()
-    places = parse(air.truth.getvalue())["state"][:, :2, 0]
+    places = air.truth.rows()["state"][:, :2, 0]
     assert np.abs(places).max() < 8.0
 
 

@@ -44,7 +44,6 @@ from skytether.shared.law.model import Array, Indices
 from skytether.shared.law.motion import Motion
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.whole import Scenario
-from skytether.shared.telemetry.record import parse
 from skytether.shell.commandline import command
 from skytether.shell.commandline.command import CommandError
 from skytether.sim.flight import SERVER, STANDBY
@@ -136,7 +135,7 @@ def test_a_client_is_restarted_with_the_state_that_it_had_some_time_before() -> 
     """It flies the motion of then; in time the whole flight is known."""
     raid = Raid(FOUR, (move(MoveKind.RESTORES, 2, "", LATE_S, 0.2, LATE_S - EARLY_S, 0.0),))
     raid.run()
-    first, second = (parse(life.sink.getvalue()) for life in raid._lives._lives[2])
+    first, second = (life.steps.rows() for life in raid._lives._lives[2])
     before = first["in_force"][first["step"] == round(EARLY_S / FOUR.control.dt)]
     assert second["in_force"][0] <= before[0] < first["in_force"][-1]
 

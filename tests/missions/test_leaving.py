@@ -17,7 +17,7 @@ from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS, seconds_to_ns
 from skytether.shared.events.flight import Leaving, SteppedLate
 from skytether.shared.missions.events import LeftMotion
 from skytether.shared.scenario.whole import Scenario
-from skytether.shared.telemetry.record import Reason, parse
+from skytether.shared.telemetry.record import Reason
 
 FOUR = packaged("swap", duration=40.0, reference={"shape": "swap(4)"})
 EIGHT = packaged("swap", duration=40.0, reference={"shape": "swap(8)"})
@@ -48,8 +48,8 @@ def test_a_server_that_is_asked_to_end_waits_until_its_vehicles_rest() -> None:
     assert lives.world.now_ns < (7.0 + event.most_s) * SECOND_NS
     for each in lives.bodies.values():
         assert np.hypot(*each.plant.state()[:, 1]) < 0.3  # wind
-    for (client, sink), *_ in lives._lives.values():
-        rows = parse(sink.getvalue())
+    for (client, steps), *_ in lives._lives.values():
+        rows = steps.rows()
         assert rows["in_force"].max() * 0.05 <= 7.0 + FOUR.link.join_s
         assert client.finished is False
     lives.start_server({})
@@ -141,7 +141,7 @@ def test_vehicles_that_start_apart_end_at_rest_and_keep_apart() -> None:
     found = raid.run()
     assert spare_m(scenario, found) > 0.3
     for number, lives in raid._lives._lives.items():
-        rows = parse(lives[-1].sink.getvalue())
+        rows = lives[-1].steps.rows()
         flown = rows[rows["in_force"] >= 0]
         assert len(flown), number
         assert set(flown["mode"]) <= {int(each) for each in FOLLOWING} | {rows["mode"][-1]}
@@ -153,7 +153,7 @@ def test_a_client_that_is_asked_to_end_rests_and_comes_back() -> None:
     raid = Raid(FOUR, (ends,))
     assert spare_m(FOUR, raid.run()) > 0.3
     first, second = raid._lives._lives[3]
-    rows = parse(first.sink.getvalue())
+    rows = first.steps.rows()
     assert np.hypot(*rows["state"][-1, :, 1]) < 0.3
-    assert len(parse(second.sink.getvalue()))
+    assert len(second.steps.rows())
     assert raid._lives.world.now_ns > 18 * SECOND_NS + MILLISECOND_NS

@@ -1,6 +1,5 @@
 """`netem.link`: one direction of the network, and its counters."""
 
-import io
 from collections.abc import Iterable
 from heapq import heappop, heappush
 
@@ -19,9 +18,8 @@ from skytether.shared.telemetry.record import (
     DOWNLINK,
     PACKET_COLUMNS,
     UPLINK,
-    Recorder,
+    MemoryRecorder,
     Rows,
-    parse,
 )
 
 PEER = ("192.0.2.1", 5000)
@@ -245,12 +243,12 @@ def test_the_delay_histogram_is_of_delays_as_drawn() -> None:
 
 def recorded(direction: int, lane: Lane, names: str) -> Rows:
     """Rows of a link for packets 1 µs apart that all leave in the end."""
-    sink = io.BytesIO()
-    link = Link(direction, 1472, Recorder(PACKET_COLUMNS, sink))
+    recorder = MemoryRecorder(PACKET_COLUMNS)
+    link = Link(direction, 1472, recorder)
     for index, name in enumerate(names):
         link.accept(packet(name), lane, now_ns=1000 * index)
     link.release(now_ns=10**9)
-    return parse(sink.getvalue())
+    return recorder.rows()
 
 
 def test_the_fate_of_every_packet_is_written_down() -> None:

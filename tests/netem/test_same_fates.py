@@ -1,6 +1,5 @@
 """Programs that send alike meet the same fates in each run, whenever they send."""
 
-import io
 import socket
 import struct
 from collections.abc import Callable
@@ -25,7 +24,7 @@ from skytether.shared.endpoints.line import CLIENT
 from skytether.shared.endpoints.other_directions import RELAY
 from skytether.shared.scenario.schema import NetworkConfig
 from skytether.shared.scenario.whole import Scenario
-from skytether.shared.telemetry.record import DOWNLINK, PACKET_COLUMNS, Recorder, parse
+from skytether.shared.telemetry.record import DOWNLINK, PACKET_COLUMNS, MemoryRecorder, Recorder
 from skytether.shell.processes.process import Process
 
 AIR = "gamma(0.01, 0.1, 0.05) & loss(0.3) & duplicate(0.2) & corrupt(0.2)"
@@ -66,9 +65,9 @@ KINDS = {
 
 def fates(name: str, gaps_ns: list[int]) -> tuple[list[Any], list[bytes], Any]:
     """Flow, number, loss and delay of each packet of two flows; what arrives; and retries."""
-    sink = io.BytesIO()
+    recorder = MemoryRecorder(PACKET_COLUMNS)
     kind, heard = KINDS[name]
-    netem, now_ns = made(kind, AIR, Recorder(PACKET_COLUMNS, sink)), SECOND_NS
+    netem, now_ns = made(kind, AIR, recorder), SECOND_NS
     for number, gap_ns in enumerate(gaps_ns):
         now_ns += gap_ns
         for flow in (0, 1):
@@ -76,7 +75,7 @@ def fates(name: str, gaps_ns: list[int]) -> tuple[list[Any], list[bytes], Any]:
             netem.receive(heard(flow, number), now_ns=now_ns)
     while (due_ns := netem.next_wake_ns()) is not None:
         netem.wake(now_ns=due_ns)
-    rows = parse(sink.getvalue())
+    rows = recorder.rows()
     rows = rows[rows["direction"] == DOWNLINK]
     columns = (
         ("flow", "number", "lost") if name == "relay" else ("flow", "number", "lost", "delay_ns")
@@ -121,13 +120,12 @@ def test_packets_of_a_flight_have_fates_by_their_time() -> None:
     """Two controllers send at times of their own, and meet the same network at each time."""
 
     def delays(times_ms: range) -> dict[int, int]:
-        sink = io.BytesIO()
-        recorder = Recorder(PACKET_COLUMNS, sink)
+        recorder = MemoryRecorder(PACKET_COLUMNS)
         netem = made(partial(Proxy, server=FAR), "gamma(0.01, 0.1, 0.05)", recorder)
         for at_ms in times_ms:
             netem.receive(heard_by_a_proxy(0, at_ms), now_ns=at_ms * MILLISECOND_NS)
         netem.wake(now_ns=10 * SECOND_NS)
-        rows = parse(sink.getvalue())
+        rows = recorder.rows()
         return dict(zip(rows["arrived_ns"].tolist(), rows["delay_ns"].tolist(), strict=True))
 
     often, seldom = delays(range(0, 200, 1)), delays(range(0, 200, 10))

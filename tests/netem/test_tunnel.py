@@ -1,6 +1,5 @@
 """The network of a program, in virtual time."""
 
-import io
 import struct
 from ipaddress import ip_address
 
@@ -14,7 +13,7 @@ from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
 from skytether.shared.endpoints.endpoint import Address, Datagram
 from skytether.shared.scenario.schema import NetworkConfig
 from skytether.shared.scenario.whole import Scenario
-from skytether.shared.telemetry.record import DOWNLINK, PACKET_COLUMNS, Recorder, parse
+from skytether.shared.telemetry.record import DOWNLINK, PACKET_COLUMNS, MemoryRecorder, Recorder
 
 UDP = 17
 
@@ -80,8 +79,7 @@ def fates(
     seed: int, jitter_ns: int, *, concurrent: bool = False
 ) -> list[tuple[int, int, bool, int]]:
     """Flow, number, loss and delay of each packet of a program that sends 300, every 7 ms or so."""
-    sink = io.BytesIO()
-    recorder = Recorder(PACKET_COLUMNS, sink)
+    recorder = MemoryRecorder(PACKET_COLUMNS)
     air = "uniform(0.01, 0.2) & loss(0.3)"
     tunnel = make_tunnel(air, air, seed=seed, recorder=recorder)
     rng = np.random.default_rng(jitter_ns)
@@ -91,7 +89,7 @@ def fates(
         if concurrent and rng.random() < 0.5:
             send(tunnel, packet(6000), at_ns=at_ns)
     tunnel.wake(now_ns=10 * SECOND_NS)
-    rows = parse(sink.getvalue())
+    rows = recorder.rows()
     ours = rows[(rows["direction"] == DOWNLINK) & (rows["flow"] == 0)]
     columns = ("flow", "number", "lost", "delay_ns")
     return sorted(tuple(row[name].item() for name in columns) for row in ours)

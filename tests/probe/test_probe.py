@@ -5,7 +5,6 @@ import json
 import subprocess
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager, suppress
-from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -45,7 +44,7 @@ from skytether.shared.telemetry.record import (
     DOWNLINK,
     PACKET_COLUMNS,
     UPLINK,
-    Recorder,
+    MemoryRecorder,
     Rows,
     parse,
 )
@@ -238,9 +237,8 @@ def measure(
     uplink: str, downlink: str, *, seconds: float, clock: Clock = CLOCK
 ) -> tuple[MeasuredPath, Rows]:
     """Measure a netem network in virtual time, 20 packets a second; with netem's rows."""
-    sink, world = BytesIO(), World()
+    recorder, world = MemoryRecorder(PACKET_COLUMNS), World()
     listener = world.add("listener", Listener(PlainGate(), b"secret" * 5), clock=clock)
-    recorder = Recorder(PACKET_COLUMNS, sink)
     scenario = reading.check({"network": {"uplink": uplink, "downlink": downlink}}, "measured")
     netem = world.add("netem", Proxy(scenario, server=listener, recorder=recorder))
     prober = Prober(
@@ -253,7 +251,7 @@ def measure(
     )
     world.add("prober", prober)
     world.run(lambda: prober.finished, limit_ns=round((seconds + 120.0) * SECOND_NS))
-    return prober.measured(), parse(sink.getvalue())
+    return prober.measured(), recorder.rows()
 
 
 def models(text: str) -> set[str]:

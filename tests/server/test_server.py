@@ -1,6 +1,5 @@
 """The server as an endpoint: sessions, ticks, and messages."""
 
-import io
 from functools import partial
 from typing import Any
 
@@ -34,7 +33,7 @@ from skytether.shared.events.flight import (
 from skytether.shared.law.heartbeat import NUMBERS, SESSION_NS, Hearing
 from skytether.shared.law.terms import Difference
 from skytether.shared.scenario.whole import Scenario
-from skytether.shared.telemetry.record import Recorder, Rows, parse, server_columns
+from skytether.shared.telemetry.record import MemoryRecorder, Rows, server_columns
 from skytether.shared.wire.drop import Drop, ProtocolError
 from skytether.shared.wire.keys import Keyring
 from skytether.shared.wire.lead import Lead
@@ -75,14 +74,13 @@ class Vehicles:
     def __init__(self, flown: Scenario, boot_id: int = 77, capacity: int = VEHICLES_MAX) -> None:
         self.terms = flown.terms()
         self.dt_ns = flown.dt_ns
-        self.sink = io.BytesIO()
-        recorder = Recorder(server_columns(flown.model.axes, flown.control.scheme), self.sink)
+        self._steps = MemoryRecorder(server_columns(flown.model.axes, flown.control.scheme))
         self.server = Server(
             flown,
             boot_id=boot_id,
             entropy=stream(1, "entropy").bytes,
             capacity=capacity,
-            recorder=recorder,
+            recorder=self._steps,
         )
         # Ticks lie on multiples of 50 ms: the first is 30 ms after the first message.
         self.now_ns = 10 * SECOND_NS + 20 * MILLISECOND_NS
@@ -155,7 +153,7 @@ class Vehicles:
         return horizon, peer
 
     def rows(self) -> Rows:
-        return parse(self.sink.getvalue())
+        return self._steps.rows()
 
 
 def live(step: int = 0, **more: Any) -> tuple[Vehicles, Welcome]:

@@ -1,6 +1,5 @@
 """`shared.endpoints.steady`: an endpoint continues when the clock of its host jumps."""
 
-import io
 from collections.abc import Callable, Sequence
 from functools import cache
 from math import inf, sqrt
@@ -21,7 +20,7 @@ from skytether.shared.endpoints.steady import Steady
 from skytether.shared.events.flight import Degraded
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.whole import Scenario
-from skytether.shared.telemetry.record import Recorder, client_columns, parse
+from skytether.shared.telemetry.record import MemoryRecorder, client_columns
 from skytether.shared.telemetry.summary import summarise
 from skytether.sim.world import Clock, World
 
@@ -152,10 +151,11 @@ def rmse(
         server_clock, client_clock: clocks at the start.
         steps: time in the flight [s], host, and step of its clock [ns].
     """
-    world, sinks = World(), {seed: io.BytesIO() for seed in seeds}
+    columns, world = client_columns(DEMO.model.axes), World()
+    recorders = {seed: MemoryRecorder(columns) for seed in seeds}
     server = Server(DEMO, boot_id=2**63, entropy=stream(seeds[0], "entropy").bytes)
     clients = {}
-    for seed, sink in sinks.items():
+    for seed, recorder in recorders.items():
         scenario = replace(DEMO, seed=seed)
         clients[seed] = Client(
             scenario,
@@ -163,7 +163,7 @@ def rmse(
             server=(f"netem {seed}", 0),
             vehicle=seed,
             boot_id=2**63,
-            recorder=Recorder(client_columns(scenario.model.axes), sink),
+            recorder=recorder,
         )
         world.add(f"netem {seed}", Proxy(scenario, server=("server", 0)))
         world.add(f"client {seed}", wrap(clients[seed]), clock=client_clock)
@@ -180,9 +180,7 @@ def rmse(
         limit_ns=2 * seconds_to_ns(DEMO.duration),
     )
     return [
-        summarise(DEMO, "test", parse(sinks[seed].getvalue())).rmse_xy or inf
-        if client.finished
-        else inf
+        summarise(DEMO, "test", recorders[seed].rows()).rmse_xy or inf if client.finished else inf
         for seed, client in clients.items()
     ]
 

@@ -9,6 +9,7 @@ import pytest
 
 from skytether.shared.telemetry.record import (
     PACKET_COLUMNS,
+    MemoryRecorder,
     Recorder,
     client_columns,
     parse,
@@ -58,6 +59,14 @@ def test_one_row_is_written_as_many_are(columns: Columns) -> None:
     numbers = [number for values in rows.values() for number in values.ravel().tolist()]
     Recorder(columns, sink).append_row(*numbers)
     assert sink.getvalue() == written(columns, 1)
+
+
+def test_rows_kept_in_memory_are_those_written_to_a_file(columns: Columns) -> None:
+    recorder, rows = MemoryRecorder(columns), parse(written(columns))
+    recorder.append(3, **some_rows(columns, 3))
+    assert recorder.count == 3
+    for first in (0, 1, -2, -5):
+        np.testing.assert_array_equal(recorder.rows(first), rows[first:])
 
 
 @pytest.mark.parametrize("count", [0, 8, 10])

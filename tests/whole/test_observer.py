@@ -1,6 +1,5 @@
 """Observer of a flight who copies each packet and forwards the answers."""
 
-import io
 import math
 from dataclasses import dataclass, field
 
@@ -19,7 +18,7 @@ from skytether.shared.endpoints.endpoint import Address, Datagram
 from skytether.shared.events.flight import Event, ModeChanged
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.whole import Scenario
-from skytether.shared.telemetry.record import Recorder, client_columns, parse
+from skytether.shared.telemetry.record import MemoryRecorder, client_columns
 from skytether.shared.telemetry.summary import summarise
 from skytether.sim.sealed import make_keys
 from skytether.sim.world import World
@@ -72,7 +71,8 @@ class Outcome:
 
 
 def fly(flown: Scenario, *, attacked: bool, restart_s: float) -> Outcome:
-    keyring, sink, outcome = make_keys(flown.seed, 1), io.BytesIO(), Outcome(math.nan)
+    keyring, outcome = make_keys(flown.seed, 1), Outcome(math.nan)
+    steps = MemoryRecorder(client_columns(flown.model.axes))
     entropy = stream(flown.seed, "entropy", int(attacked)).bytes
 
     def server(life: int) -> Server:
@@ -100,14 +100,14 @@ def fly(flown: Scenario, *, attacked: bool, restart_s: float) -> Outcome:
         vehicle=1,
         boot_id=1,
         link=link,
-        recorder=Recorder(client_columns(flown.model.axes), sink),
+        recorder=steps,
     )
     world.add("client", client)
     restart_ns = round(restart_s * SECOND_NS)
     world.at(restart_ns, lambda: world.restart("server", server(2)))  # it is killed
     world.run(lambda: client.finished, limit_ns=round((flown.duration + 20.0) * SECOND_NS))
     assert client.finished
-    summary = summarise(flown, "test", parse(sink.getvalue()))
+    summary = summarise(flown, "test", steps.rows())
     assert summary.rmse_xy is not None
     outcome.rmse_m, outcome.keys, outcome.copied = summary.rmse_xy, len(used), observer.copied
     return outcome
