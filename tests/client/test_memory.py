@@ -60,7 +60,7 @@ def test_a_vehicle_whose_process_restarts_goes_on_along_its_motion_and_others_ke
     """The server sees only a silence: session, steps and motion continue."""
     flight = flown(Restart(5, 7.6))
     assert flight.least_m() > SWAP.mission.separation_m
-    assert flight.server.controller.counts["left_tube"] == 0
+    assert flight.server_runs[-1].controller.counts["left_tube"] == 0
     (resumed,) = (
         event
         for _, host, event in flight.events
@@ -217,7 +217,7 @@ def test_a_disk_that_is_full_or_read_only_ends_no_mission(
         for client in clients:
             if removes and client.waits_for_disk:
                 client.kept(nothing=True)
-    heard_s = flight.server.controller.observed_step.min() * SWAP.control.dt
+    heard_s = flight.server_runs[-1].controller.observed_step.min() * SWAP.control.dt
     assert heard_s > 15.0
     assert flight.least_m() > SWAP.mission.separation_m
     told = [event for _, host, event in flight.events if host == SERVER[0]]
