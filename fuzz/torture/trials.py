@@ -296,12 +296,7 @@ class Torture:
         )
 
     def _add(
-        self,
-        name: str,
-        make: Callable[[int], Steady],
-        *,
-        within_ns: int = 1,
-        compute_ns: int = 0,
+        self, name: str, make: Callable[[int], Steady], *, within_ns: int = 1, compute_ns: int = 0
     ) -> None:
         """Add a host and its process, which starts at a random time before `within_ns`."""
         self._processes[name] = process = Process(name, make)

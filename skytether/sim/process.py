@@ -1,7 +1,6 @@
 """Processes in virtual time: they stop, end in order, and start again on their host.
 
-Each run of a process is an endpoint of its own. The host keeps its address, its clock and what a
-run has saved (`World.memory`).
+Each run is an endpoint of its own. The host keeps address, clock and saved state (`World.memory`).
 """
 
 from collections.abc import Callable
@@ -14,7 +13,7 @@ Run = TypeVar("Run", bound=Endpoint)
 
 
 class Process(Generic[Run]):
-    """Process of a host, whose first run is to be added to the world.
+    """Process of a host; `endpoint` is its newest run, and the first one is added to the world.
 
     Its methods take the world first, so that they can be `actions` of `sim.flight.fly`.
 
@@ -25,9 +24,7 @@ class Process(Generic[Run]):
 
     def __init__(self, host: str, make: Callable[..., Run]) -> None:
         self.host, self._make = host, make
-        self.endpoint = make(0)
-        """Newest run."""
-        self.runs, self.is_up = 1, True
+        self.endpoint, self.runs, self.is_up = make(0), 1, True
 
     def start(self, world: World, *args: Any) -> None:
         """Start the next run, in place of one that is up."""
