@@ -212,7 +212,8 @@ class Failsafe:
         self._alone = Reason.HOMEWARD if returns else Reason.ALONE
         """Cause used after a long silence of the server."""
         self.transitions: list[Transition] = []
-        """Transitions on which the pilot has not acted yet, oldest first."""
+        """Transitions on which the pilot has not acted yet, oldest first. It acts after each packet
+        and in each step, so they are few: 5 at most, in tests under faults."""
         self.mode = Mode.INIT
         self.reason = Reason.BEGUN
         """Newest cause that changed mode or reason; while hovering, why the vehicle braked."""
