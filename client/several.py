@@ -49,12 +49,13 @@ class Several(Reach):
         standby_link: ClientLink | None = None,
     ) -> None:
         super().__init__(paths[0], link)
-        self._paths, self._standby, self._names = paths, standby, names
+        self.addresses = paths
+        self._standby, self._names = standby, names
         if standby:
             self.links = (*self.links, standby_link or PlainLink())
 
     def routes(self, parts: Parts) -> list[Route]:
-        routes = [self._route(parts, self._paths, PATH_SOCKETS, self._names)]
+        routes = [self._route(parts, self.addresses, PATH_SOCKETS, self._names)]
         if self._standby:
             routes.append(self._route(parts, self._standby, STANDBY_SOCKETS, ()))
         return routes

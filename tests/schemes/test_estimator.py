@@ -10,11 +10,11 @@ from hypothesis import strategies as st
 from skytether.server.controller import Controller
 from skytether.server.planning.clock import ClockMap
 from skytether.server.planning.scheme import Foresight, empty_foresight
+from skytether.server.schemes.feedback import feedback_gain
 from skytether.server.schemes.predictive import Estimator
 from skytether.shared.endpoints.stopwatch import Stopwatch
 from skytether.shared.law.model import Array, Indices, discretise
 from skytether.shared.scenario import reading
-from skytether.shared.scenario.gain import feedback_gain
 from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.summary import summarise
 from skytether.shared.wire.protocol import NO_HORIZON, Mode, Observation

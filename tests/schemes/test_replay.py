@@ -11,10 +11,10 @@ from skytether.server.mpc.hierarchical import Planner
 from skytether.server.planning.clock import ClockMap
 from skytether.server.planning.scheme import Foresight, empty_foresight
 from skytether.server.schemes.committed import Replay
+from skytether.server.schemes.feedback import feedback_gain
 from skytether.server.schemes.sent import LOSS_WEIGHT
 from skytether.shared.law import rule
 from skytether.shared.law.model import Array, Flags, Indices
-from skytether.shared.scenario.gain import feedback_gain
 from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import UPLINK, Record
 from skytether.shared.telemetry.summary import summarise

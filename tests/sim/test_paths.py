@@ -8,7 +8,10 @@ import numpy as np
 import pytest
 
 from helpers import packaged
+from skytether.client import paths
 from skytether.client.endpoint import Client
+from skytether.client.paths import SeveralPaths
+from skytether.client.several import Several
 from skytether.netem.fate import Fates
 from skytether.netem.impairments.draws import SLOT_NS
 from skytether.shared.base.units import SECOND_NS
@@ -28,21 +31,16 @@ BLACK_HOLE = {"uplink": "loss(1)", "downlink": "loss(1)"}
 GOOD = {"uplink": "constant(0.1) & loss(0.2)", "downlink": "constant(0.05)", "price": 3.0}
 
 
-def two_paths(*paths: dict[str, Any], **changes: Any) -> Scenario:
-    network = {"network": {"paths": list(paths or (BLACK_HOLE, GOOD))}}
+def two_paths(*each: dict[str, Any], **changes: Any) -> Scenario:
+    network = {"network": {"paths": list(each or (BLACK_HOLE, GOOD))}}
     return packaged("paper", network, {"duration": 3.0, "settle": 0.0}, changes)
 
 
 class OnSecondPath(Client):
     """Client that uses its second path alone."""
 
-    given: tuple[Sequence[Address], Sequence[float]] = (), ()
-
-    def __init__(
-        self, *args: Any, paths: Sequence[Address], prices: Sequence[float], **options: Any
-    ) -> None:
-        OnSecondPath.given = paths, prices
-        super().__init__(*args, server=paths[1], **options)
+    def __init__(self, *args: Any, server: Several, **options: Any) -> None:
+        super().__init__(*args, server=server.addresses[1], **options)
 
 
 @pytest.fixture
@@ -51,9 +49,25 @@ def flown(monkeypatch: pytest.MonkeyPatch) -> Record:
     return fly(two_paths())
 
 
-def test_a_client_gets_the_address_and_the_price_of_each_path(flown: Record) -> None:
+def test_a_client_gets_the_address_and_the_price_of_each_path(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    given = []
+
+    class Noted(SeveralPaths):
+        def __init__(
+            self, addresses: Sequence[Address], *args: Any, prices: Sequence[float], **options: Any
+        ) -> None:
+            given.append((addresses, prices))
+            super().__init__(addresses, *args, prices=prices, **options)
+
+    monkeypatch.setattr(paths, "SeveralPaths", Noted)
+    fly(two_paths())
+    assert given == [([("netem 1", 0), ("netem 1/2", 0)], [1.0, 3.0])]
+
+
+def test_a_vehicle_on_one_of_two_paths_reaches_its_netem_alone(flown: Record) -> None:
     assert len(flown.client)
-    assert OnSecondPath.given == ([("netem 1", 0), ("netem 1/2", 0)], [1.0, 3.0])
     opened = [each for each in flown.events if isinstance(each.event, FlowOpened)]
     assert [(each.host, each.process) for each in opened] == [("netem 1/2", "netem")]
 
