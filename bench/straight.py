@@ -33,7 +33,8 @@ from skytether.shared.telemetry.record import (
 from skytether.shared.telemetry.summary import Summary, summarise
 from skytether.shared.wire.protocol import NO_HORIZON, Mode
 from skytether.sim.changes import plan
-from skytether.sim.world import Clock, World
+from skytether.sim.hosts import Clock
+from skytether.sim.world import World
 
 READY_S = 1.0
 """Time from the autopilot's start until it may be armed [s]; short, because simulated filters need

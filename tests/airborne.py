@@ -24,7 +24,8 @@ from skytether.shared.scenario.reading import check
 from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import MemoryRecorder, Rows, client_columns
 from skytether.shared.wire.protocol import Mode
-from skytether.sim.world import Clock, World
+from skytether.sim.hosts import Clock
+from skytether.sim.world import World
 
 SAFE: dict[FlavourName, dict[str, float]] = {
     "ardupilot": {"GUID_TIMEOUT": 1.0, "FS_GCS_ENABLE": 5, "SYSID_MYGCS": 245},

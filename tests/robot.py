@@ -29,7 +29,8 @@ from skytether.shared.scenario.reading import check
 from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import MemoryRecorder, Rows, client_columns
 from skytether.shared.wire.protocol import Mode
-from skytether.sim.world import Clock, World
+from skytether.sim.hosts import Clock
+from skytether.sim.world import World
 
 SECOND, MS = 1_000_000_000, 1_000_000
 EPOCH_NS = 1_790_000_000 * SECOND

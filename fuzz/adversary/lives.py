@@ -35,8 +35,9 @@ from skytether.shared.telemetry.record import MemoryRecorder, client_columns
 from skytether.shared.telemetry.summary import Track, track
 from skytether.shared.wire.protocol import Mode
 from skytether.sim.flight import SERVER, STANDBY
+from skytether.sim.hosts import Clock
 from skytether.sim.process import Process
-from skytether.sim.world import Clock, World
+from skytether.sim.world import World
 
 Saved = tuple[bytes, int]
 """State that a client has saved, and when [ns; host's clock]."""

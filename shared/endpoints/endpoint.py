@@ -2,7 +2,7 @@
 
 An endpoint opens no socket, reads no clock, draws no unseeded number and prints nothing. Its output
 is datagrams (`outbox`), typed events (`events`) and, on request, numbers (`figures`).
-`shell.driving.driver` drives one on real UDP sockets; `sim.world` drives many in virtual time.
+`shell.driving.driver` drives one on real UDP sockets; `sim.hosts` drives many in virtual time.
 """
 
 import ipaddress

@@ -34,7 +34,8 @@ from skytether.shared.scenario.reference import Reference
 from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import Compared
 from skytether.sim.flight import BOOT_ID, MIDNIGHT_NS, PLAIN, SERVER, Run
-from skytether.sim.world import Clock, World
+from skytether.sim.hosts import Clock
+from skytether.sim.world import World
 
 SINCE_MAX_S = 60.0
 OBSERVED = ("expected_gap", "error_x_m", "error_y_m", "since_sent_s", "heartbeat_due")

@@ -11,11 +11,11 @@ from skytether.shared.endpoints.change import Running
 from skytether.shared.endpoints.endpoint import Endpoint
 from skytether.shared.scenario.dotted import text_key
 from skytether.shared.scenario.whole import Scenario
-from skytether.sim.world import World
+from skytether.sim.hosts import Hosts
 
 
 def plan(
-    world: World,
+    world: Hosts,
     flown: Mapping[str, tuple[Endpoint, Scenario]],
     changes: Sequence[tuple[float, Mapping[str, Any]]],
 ) -> None:

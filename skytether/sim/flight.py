@@ -5,7 +5,7 @@ server, which solves for all of them at once. Each run has its own network, wind
 its seed. Three rules make the records equal. The server's ticks lie on the grid of its own clock,
 and a random phase from the seed shifts the start of the vehicles instead. The server's computing
 time delays the packets that it sends, not those that it receives, and at one instant the server is
-woken after all other hosts (`sim.world`). The numbers of vehicles and sessions, which differ
+woken after all other hosts (`sim.hosts`). The numbers of vehicles and sessions, which differ
 between runs, always take the same number of bytes on the wire. Events are equal as well, once the
 vehicles of each run are numbered from 1.
 """
@@ -46,7 +46,7 @@ from skytether.shared.telemetry.record import (
     plan_columns,
     server_columns,
 )
-from skytether.sim.world import Clock, World
+from skytether.sim.hosts import Clock, Hosts
 
 # Aboard the client's code is plain Python; thousands of clients in one process need it compiled.
 # Loaded now, so that its functions are compiled, too, and before anything flies.
@@ -89,7 +89,7 @@ def fly(
     standby: Endpoint | bool = False,
     beside: Mapping[str, Endpoint] = MappingProxyType({}),
     changes: Sequence[tuple[float, Mapping[str, Any]]] = (),
-    actions: Sequence[tuple[float, Callable[[World], None]]] = (),
+    actions: Sequence[tuple[float, Callable[[Any], None]]] = (),
     stopwatch: Stopwatch | None = None,
     on_second: Callable[[int], None] = lambda _: None,
     stopped: Callable[[], bool] | None = None,
@@ -109,7 +109,7 @@ def fly(
         beside: endpoints of further hosts by name, such as an autopilot at `vehicle.address`.
         changes: times [s, counted as in `Record.events`], and the keys and values that change then,
             as in `shared.endpoints.change`; a refused change is an event, and the flight continues.
-        actions: times [s], and functions that act on the world then, for example stop a host.
+        actions: times [s], and functions that act on the `World` then, for example stop a host.
         stopwatch: stopwatch for the server's stages; its times differ from flight to flight.
         on_second: called with the time flown [s], once per second of flight.
         stopped: called every ASK_NS; the flight ends once the result is true.
@@ -150,7 +150,7 @@ class Run:
 
     def __init__(
         self,
-        world: World,
+        world: Hosts,
         scenario: Scenario,
         server_rows: Callable[[], int],
         server_figures: Callable[[Sequence[str]], Mapping[str, Any]],
@@ -279,7 +279,7 @@ def fly_runs(
     plan_recorder: Recorder | None = None,
     own_server: Endpoint | None = None,
     beside: Mapping[str, Endpoint] = MappingProxyType({}),
-    actions: Sequence[tuple[float, Callable[[World], None]]] = (),
+    actions: Sequence[tuple[float, Callable[[Any], None]]] = (),
     *,
     standby: Endpoint | bool = False,
     make_server: Callable[..., Server] = Server,
@@ -304,7 +304,8 @@ def fly_runs(
         else:
             run_of[host].hear(time_ns, host, event)
 
-    world = World(on_event)
+    make_world = load("skytether.sim.world", "actions").World if actions else Hosts
+    world: Hosts = make_world(on_event)
     entropy = stream(scenario.seed, "entropy").bytes
     each = [msgspec.structs.replace(scenario, seed=seed) for seed in seeds]
     error_ns = seconds_to_ns(scenario.simulation.time_error_s)
@@ -381,7 +382,7 @@ def fly_runs(
     return [run.flight(recorded) for run in runs]
 
 
-def _tell_time(world: World, hosts: Mapping[str, Endpoint], error_ns: int) -> None:
+def _tell_time(world: Hosts, hosts: Mapping[str, Endpoint], error_ns: int) -> None:
     """Tell each host the time of day, wrong by `error_ns` one way or the other; 0 tells nothing."""
     for number, (host, each) in enumerate(hosts.items() if error_ns else ()):
         wrong_ns = error_ns if number % 2 else -error_ns

@@ -32,7 +32,8 @@ from skytether.shared.telemetry import record
 from skytether.shared.telemetry.record import MemoryRecorder, client_columns
 from skytether.shared.telemetry.summary import least_separation
 from skytether.shell.processes.log import LogLine
-from skytether.sim.world import Clock, World
+from skytether.sim.hosts import Clock
+from skytether.sim.world import World
 
 NUMBERS = (1, 2, 3)
 DOCUMENT = Path(__file__).parents[2] / "docs" / "together.md"

@@ -28,7 +28,8 @@ from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.drops import drops
 from skytether.shared.telemetry.record import MemoryRecorder, Rows, client_columns
 from skytether.shell.processes import workers
-from skytether.sim.world import Clock, World
+from skytether.sim.hosts import Clock
+from skytether.sim.world import World
 from warm import skytether
 
 GUSTY = reading.check(

@@ -27,7 +27,8 @@ from skytether.shared.endpoints.endpoint import Datagram
 from skytether.shared.events.aboard import OdometryDropped, SecondPublisher
 from skytether.shared.events.flight import AutopilotWaits
 from skytether.shared.wire.protocol import Mode
-from skytether.sim.world import Clock, World
+from skytether.sim.hosts import Clock
+from skytether.sim.world import World
 
 STEP = 0.05
 

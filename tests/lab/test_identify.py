@@ -41,7 +41,8 @@ from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import Reason
 from skytether.shell.commandline import command
 from skytether.sim import flight
-from skytether.sim.world import Clock, World
+from skytether.sim.hosts import Clock
+from skytether.sim.world import World
 
 CALM = {"wind": 0.0, "gust_mps2": 0.0}
 

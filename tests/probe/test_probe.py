@@ -50,7 +50,8 @@ from skytether.shared.telemetry.record import (
 )
 from skytether.shared.wire.drop import Drop, ProtocolError
 from skytether.shared.wire.protocol import PAYLOAD_BYTES_MAX
-from skytether.sim.world import Clock, World
+from skytether.sim.hosts import Clock
+from skytether.sim.world import World
 
 LISTENER = ("listener", 0)
 HOUR_NS = 3600 * SECOND_NS

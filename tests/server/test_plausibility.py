@@ -25,7 +25,7 @@ from skytether.shared.telemetry.summary import summarise
 from skytether.shared.wire.drop import Drop
 from skytether.shared.wire.protocol import Mode, Observation, stamp_us, stamped_ns
 from skytether.sim.flight import fly
-from skytether.sim.world import Clock
+from skytether.sim.hosts import Clock
 
 quick = settings(max_examples=30)
 

@@ -22,7 +22,8 @@ from skytether.shared.scenario import reading
 from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import MemoryRecorder, client_columns
 from skytether.shared.telemetry.summary import summarise
-from skytether.sim.world import Clock, World
+from skytether.sim.hosts import Clock
+from skytether.sim.world import World
 
 HOUR_NS = 3600 * SECOND_NS
 MIDNIGHT_NS = 24 * HOUR_NS

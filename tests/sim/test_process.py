@@ -4,8 +4,9 @@ import pytest
 
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
 from skytether.shared.endpoints.endpoint import Datagram, Endpoint
+from skytether.sim.hosts import Clock
 from skytether.sim.process import Process
-from skytether.sim.world import Clock, World
+from skytether.sim.world import World
 
 
 class Run(Endpoint):
