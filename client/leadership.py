@@ -9,7 +9,7 @@ On a mission it follows no server that plans within other limits than the one th
 
 from collections.abc import Sequence
 
-from skytether.shared.law.terms import Limits
+from skytether.shared.law.limits import Limits
 
 NUMBER_MAX, JUMP_MAX = 2**32 - 1, 10_000
 """Largest number, and largest rise at once to a number that a server sends."""

@@ -18,6 +18,7 @@ from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS, seconds_to_ns
 from skytether.shared.events.flight import address_text
 from skytether.shared.events.standby import LeaderChanged, LimitsDiffer
 from skytether.shared.law.heartbeat import SESSION_NS
+from skytether.shared.law.limits import LIMITS
 from skytether.shared.law.terms import Difference
 from skytether.shared.scenario.catalogue import differences
 from skytether.shared.scenario.schema import Scenario
@@ -235,7 +236,7 @@ class Servers(OneServer):
         ours, theirs = lead.limits[lead.leader], lead.limits[server]
         assert ours is not None
         assert theirs is not None
-        differing = differences(ours, theirs)
+        differing = differences(ours, theirs, LIMITS)
         return LimitsDiffer(vehicle=self._vehicle, host=host, port=port, differences=differing)
 
     def _report_limits(self) -> None:

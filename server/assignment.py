@@ -8,7 +8,6 @@ from typing import Any, Protocol
 
 from skytether.shared.endpoints.endpoint import Datagram
 from skytether.shared.law.model import Indices
-from skytether.shared.law.terms import Limits
 from skytether.shared.scenario.registry import load
 from skytether.shared.wire.drop import Drop, ProtocolError
 from skytether.shared.wire.protocol import Message, Observation, RoomMessage
@@ -49,7 +48,7 @@ class Decider(Protocol):
 class Assignment:
     """Vehicles that a server plans for; a session is a `sessions.Session`."""
 
-    def __init__(self, controller: Decider, limits: Limits | None) -> None:
+    def __init__(self, controller: Decider, limits: Any) -> None:
         self.controller, self.limits = controller, limits
         """Limits of motions, see `Scheme.limits`; None if vehicles may follow different servers."""
         self.changes = 0
@@ -57,7 +56,7 @@ class Assignment:
         self.changed_ns: int | None = None
         """Time of the newest change."""
 
-    def change(self, limits: Limits | None, now_ns: int) -> None:
+    def change(self, limits: Any, now_ns: int) -> None:
         if limits is not self.limits:
             self.limits, self.changed_ns = limits, now_ns
             self.changes += 1

@@ -19,7 +19,7 @@ from skytether.shared.base.kernel import F2, F3, F4, I1, S3, record, records
 from skytether.shared.endpoints.stopwatch import Stopwatch
 from skytether.shared.events.flight import Event
 from skytether.shared.law.model import Array, Flags, Indices
-from skytether.shared.law.terms import Limits, Terms
+from skytether.shared.law.terms import Terms
 from skytether.shared.scenario.reference import Reference
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.scenario.schemes import SchemeProperties
@@ -296,9 +296,9 @@ class Scheme(ABC):
     """Keys that may be changed in flight, beside the server's own."""
     keeps_rows = False
     """Whether vehicles keep their rows when they fall silent."""
-    limits: Limits | None = None
-    """Limits of motions of vehicles that all have to follow one server, which its standby must have
-    too; None if each vehicle may follow another."""
+    limits: Any = None
+    """Limits (`shared.law.limits`) of motions of vehicles that all have to follow one server, which
+    its standby must have too; None if each vehicle may follow another."""
 
     def change(self, scenario: Scenario, keys: frozenset[str]) -> None:  # noqa: B027
         """Act on changed keys; the caller has asked `objection` first."""

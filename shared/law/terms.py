@@ -29,19 +29,6 @@ ALONG_SPLINES = ("trajectory",)
 """Ways in which splines of the desired trajectory are sent instead of inputs."""
 
 
-class Limits(NamedTuple):
-    """Limits within which a server plans the motions of a mission. They may change in flight; two
-    servers of a vehicle must plan within the same.
-    """
-
-    speed_mps: float
-    acceleration_mps2: float
-    asymmetry_s: float
-    """Bound of the error of clocks, as `link.asymmetry_s` [s]."""
-    zones: str
-    """Digest of the zones."""
-
-
 class Terms(NamedTuple):
     """Values on which both ends must agree before a flight: plain numbers and texts."""
 

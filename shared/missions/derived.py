@@ -2,8 +2,8 @@
 
 import numpy as np
 
+from skytether.shared.law.limits import Limits
 from skytether.shared.law.motion import Clearances, bend_m
-from skytether.shared.law.terms import Limits
 from skytether.shared.missions import zone_texts
 from skytether.shared.missions.keys import MissionConfig
 from skytether.shared.missions.zones import Zones

@@ -6,11 +6,12 @@ to one end, or to each end separately. A key without an owner in its type fails 
 
 from collections.abc import Iterator, Mapping
 from types import MappingProxyType
+from typing import NamedTuple
 
 import msgspec
 
 from skytether.shared.base.units import SECOND_NS
-from skytether.shared.law.terms import Difference, Limits, Terms
+from skytether.shared.law.terms import Difference
 from skytether.shared.scenario.owners import Key, Owner
 from skytether.shared.scenario.schema import Section
 from skytether.shared.scenario.whole import Scenario
@@ -40,24 +41,15 @@ TERMS: Mapping[str, str] = MappingProxyType(
 """Dotted key of each term, by the term's field in `Terms`."""
 
 
-LIMITS: Mapping[str, str] = MappingProxyType(
-    {
-        "speed_mps": "mission.speed_mps",
-        "acceleration_mps2": "mission.acceleration_mps2",
-        "asymmetry_s": "link.asymmetry_s",
-        "zones": "mission.zones",
-    }
-)
-"""Dotted key of each limit of a mission's motions, by the field in `Limits`."""
-
-
 def keys_of(*groups: str) -> frozenset[str]:
     """Dotted names of the keys in these groups, which may change in flight."""
     return frozenset(name for name, key in KEYS.items() if key.in_flight in groups)
 
 
-def differences(here: Terms | Limits, there: Terms | Limits) -> tuple[Difference, ...]:
-    names = TERMS if isinstance(here, Terms) else LIMITS
+def differences(
+    here: NamedTuple, there: NamedTuple, names: Mapping[str, str] = TERMS
+) -> tuple[Difference, ...]:
+    """Fields with two values; `names` has the dotted key of each."""
     return tuple(
         Difference(names[field], _text(field, ours), _text(field, theirs))
         for field, ours, theirs in zip(here._fields, here, there, strict=True)

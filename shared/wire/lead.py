@@ -9,7 +9,8 @@ import msgpack
 import numpy as np
 from numpy.typing import NDArray
 
-from skytether.shared.law.terms import Limits, Terms
+from skytether.shared.law.limits import Limits
+from skytether.shared.law.terms import Terms
 from skytether.shared.wire.drop import Drop, ProtocolError
 from skytether.shared.wire.protocol import FLAG, U16, U31, U32, OrNone, add, is_plain, knots_in
 

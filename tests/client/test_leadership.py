@@ -16,7 +16,7 @@ from skytether.shared.base.errors import ConfigError
 from skytether.shared.base.units import SECOND_NS, seconds_to_ns
 from skytether.shared.endpoints.endpoint import Address, Datagram
 from skytether.shared.events.standby import LeaderChanged
-from skytether.shared.law.terms import Limits
+from skytether.shared.law.limits import Limits
 from skytether.shared.scenario.whole import Scenario
 from skytether.shared.wire.drop import Drop
 from skytether.shared.wire.lead import Lead

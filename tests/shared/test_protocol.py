@@ -11,7 +11,8 @@ from hypothesis.extra.numpy import arrays
 
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
 from skytether.shared.law.heartbeat import NUMBERS, Hearing
-from skytether.shared.law.terms import Difference, Limits, Terms
+from skytether.shared.law.limits import Limits
+from skytether.shared.law.terms import Difference, Terms
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.catalogue import differences
 from skytether.shared.wire import protocol
