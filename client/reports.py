@@ -11,7 +11,7 @@ from typing import Annotated
 from msgspec import Meta, Struct
 
 from skytether.shared.scenario.grammar import Call, Combination, Expression
-from skytether.shared.scenario.registry import PERIOD_MAX, REPORTS
+from skytether.shared.scenario.registry import REPORTS
 
 
 class Unreported(Struct, frozen=True):
@@ -30,27 +30,6 @@ class Unreported(Struct, frozen=True):
 
 Report = Callable[[Unreported], bool]
 """Function that decides whether to send an observation."""
-
-
-@REPORTS
-def always(now: Unreported) -> bool:  # noqa: ARG001
-    """Sends at every step."""
-    return True
-
-
-@REPORTS
-def periodic(now: Unreported, N: Annotated[int, Meta(ge=1, le=PERIOD_MAX)]) -> bool:
-    """Sends N steps after the last observation."""
-    return now.steps >= N
-
-
-@REPORTS
-def deviation(now: Unreported, metres: Annotated[float, Meta(ge=0, le=1e9)]) -> bool:
-    """Sends if the vehicle is farther than this many metres from where the server expects it, if
-    another horizon has come into force or the same one was received again, or if its mode has
-    changed.
-    """
-    return now.is_news or now.off_m > metres
 
 
 @REPORTS

@@ -103,7 +103,8 @@ REFERENCES.offer(f"{SHARED}scenario.points", "live")
 REFERENCES.offer(f"{SHARED}missions.shapes", "swap", "sphere")
 REFERENCES.offer(f"{SHARED}formats.shapes", "mission", "show")
 
-REPORTS.offer("skytether.client.reports", "always", "periodic", "deviation", "silence")
+REPORTS.offer("skytether.client.report_policies", "always", "periodic", "deviation")
+REPORTS.offer("skytether.client.reports", "silence")
 
 TRIGGERS.offer(f"{TRIGGER}schedules", "always")
 TRIGGERS.offer(f"{TRIGGER}policies", "heartbeat")
