@@ -8,6 +8,7 @@ own clock, so losing the server does not shift its steps.
 
 from collections import Counter
 from collections.abc import Sequence
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 from skytether.client.alone import Fresh, Parts, Reach
@@ -16,10 +17,10 @@ from skytether.client.failsafe import CLOSING, HOLD, TRANSITIONS, Failsafe, brak
 from skytether.client.flight_log import FlightLog
 from skytether.client.ground import GroundReports
 from skytether.client.link import ClientLink
-from skytether.client.orders import Orders
 from skytether.client.pilot import Pilot
 from skytether.client.session import ServerSession
 from skytether.client.vehicle import Vehicle
+from skytether.shared.base.errors import ConfigError
 from skytether.shared.base.units import MICROSECOND_NS, SECOND_NS, seconds_to_ns
 from skytether.shared.endpoints.endpoint import (
     VEHICLES_SHOWN_MAX,
@@ -36,6 +37,8 @@ from skytether.shared.events.flight import (
     address_text,
 )
 from skytether.shared.law.model import Array
+from skytether.shared.scenario.catalogue import keys_of
+from skytether.shared.scenario.owners import InFlight
 from skytether.shared.scenario.registry import load
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Reason, Recorder
@@ -45,6 +48,8 @@ from skytether.shared.wire.protocol import CLOSES, Close, Mode, stamp_us
 if TYPE_CHECKING:
     from skytether.client.memory import SavedState
 
+ORDERS = keys_of(InFlight.ARMED, InFlight.LEAP)
+"""Keys of an operator's orders to any vehicle, see `orders`."""
 VEHICLE_SOCKET = 1
 """Socket used by the vehicle's own port; the server's is 0."""
 LATEST_NS = SECOND_NS
@@ -118,8 +123,11 @@ class Client(Endpoint):
         reach = server if isinstance(server, Reach) else Reach(server, link)
         self._servers, self._ends = connect(reach, parts)
         self._sessions: list[ServerSession] = self._servers.sessions
-        self._orders = Orders(scenario, flies, self._pilot, self._failsafe, self._servers)
-        self.changeable = self._orders.keys
+        if (choice := scenario.vehicle.after_leap) != "ask":
+            expected = "expected 'ask': it is chosen in flight"
+            raise ConfigError(f"vehicle.after_leap: got {choice!r}, {expected}")
+        self._servers.check(scenario)
+        self.changeable = flies.changeable | ORDERS | self._servers.keys
         self._log = FlightLog(
             scenario, vehicle, self._pilot, self._failsafe, self._servers, self._events
         )
@@ -336,8 +344,13 @@ class Client(Endpoint):
                 self._tell_time(session, now_ns)
             session.route.watch(session, now_ns)
 
+    @cached_property
+    def _orders(self) -> Any:
+        orders = load("skytether.client.orders", "a change")
+        return orders.Orders(self._flies, self._pilot, self._failsafe, self._servers)
+
     def objection(self, scenario: Scenario, keys: frozenset[str]) -> str:
-        return self._orders.objection(scenario, keys)
+        return str(self._orders.objection(scenario, keys))
 
     def change(self, scenario: Scenario, keys: frozenset[str], *, now_ns: int) -> None:
         self._orders.obey(scenario, keys, now_ns=now_ns)

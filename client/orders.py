@@ -8,7 +8,6 @@ from skytether.client.alone import OneServer
 from skytether.client.failsafe import Failsafe
 from skytether.client.pilot import Pilot
 from skytether.client.vehicle import Vehicle
-from skytether.shared.base.errors import ConfigError
 from skytether.shared.events.flight import metres
 from skytether.shared.scenario.catalogue import keys_of
 from skytether.shared.scenario.owners import InFlight
@@ -22,27 +21,13 @@ LEAP = keys_of(InFlight.LEAP)
 
 
 class Orders:
-    """Orders to one vehicle.
-
-    Raises:
-        ConfigError: the scenario has a value that only an order may give.
-    """
+    """Orders to one vehicle; loaded with the first, or before the flight (`rooms.preload`)."""
 
     def __init__(
-        self,
-        scenario: Scenario,
-        flies: Vehicle,
-        pilot: Pilot,
-        failsafe: Failsafe,
-        servers: OneServer,
+        self, flies: Vehicle, pilot: Pilot, failsafe: Failsafe, servers: OneServer
     ) -> None:
-        if (choice := scenario.vehicle.after_leap) != "ask":
-            expected = "expected 'ask': it is chosen in flight"
-            raise ConfigError(f"{AFTER_LEAP}: got {choice!r}, {expected}")
-        servers.check(scenario)
         self._flies, self._pilot = flies, pilot
         self._failsafe, self._servers = failsafe, servers
-        self.keys = flies.changeable | ARMED | LEAP | servers.keys
 
     def objection(self, scenario: Scenario, keys: frozenset[str]) -> str:
         """Why an order is refused at present; empty if it is not.

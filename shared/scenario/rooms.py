@@ -148,5 +148,7 @@ def preload(changeable: Collection[str]) -> None:
                 _ = table[name]
     for module in ("forms", "wrong_values") if changeable else ():
         load(f"{SHARED}scenario.{module}", "a change")
+    if "armed" in changeable:
+        load("skytether.client.orders", "a change")
     if "network.uplink" in changeable:
         load("skytether.netem.bottleneck", "rate")
