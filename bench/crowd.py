@@ -29,7 +29,7 @@ from skytether.shared.base.units import HEADER_BYTES
 from skytether.shared.law.model import Array
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.whole import Scenario
-from skytether.shared.telemetry import record
+from skytether.shared.telemetry.parts import read
 from skytether.shared.telemetry.record import Rows
 from skytether.shared.telemetry.summary import position_error
 from skytether.shared.wire.protocol import Mode
@@ -231,7 +231,7 @@ def fly(udp: bool, cell: Cell) -> CrowdPoint:
             vehicles=cell.vehicles,
             watched=False,
         )
-        client = record.read(parts / "client")
+        client = read(parts / "client")
         netem = json.loads((parts / "netem.json").read_bytes())
     return judge(scenario, *cell, client, netem)
 

@@ -34,7 +34,7 @@ from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
 from skytether.shared.endpoints.endpoint import Datagram
 from skytether.shared.events.flight import Flying
 from skytether.shared.scenario.whole import Scenario
-from skytether.shared.telemetry import record
+from skytether.shared.telemetry import parts
 from skytether.shared.telemetry.summary import position_error
 from skytether.shared.wire import channel, handshake
 from skytether.shell.driving import driver
@@ -274,8 +274,8 @@ def _fly(kind: str, counts: FloodCounts, lateness: WakeLateness) -> Flood:
             newcomer.stop()
         fleet.process.wait(PATIENCE_S)
         end = server.figures()
-        rows = [record.read(folder / "fleet")]
-        rows += [record.read(folder / "newcomer")] if flies else []
+        rows = [parts.read(folder / "fleet")]
+        rows += [parts.read(folder / "newcomer")] if flies else []
         passed_ns = after.time_ns - before.time_ns
     good, gone = sum(map(len, rows)), after.gone - before.gone
     strange = sum(not is_admitted(packet) for packet in packets)

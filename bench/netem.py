@@ -35,7 +35,8 @@ from bench.children import HOST, ChildProcess
 from bench.harness import TextTable, median, progress, quantile_ms, sleep_until
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
 from skytether.shared.events.processes import Counted
-from skytether.shared.telemetry.record import DOWNLINK, read
+from skytether.shared.telemetry.parts import read
+from skytether.shared.telemetry.record import DOWNLINK
 from skytether.shell.host.udp import open_socket
 
 HEAD = struct.Struct("<qq")

@@ -40,7 +40,7 @@ from skytether.shared.base.units import SECOND_NS
 from skytether.shared.events.flight import Flying, ModeChanged
 from skytether.shared.law.model import Array
 from skytether.shared.scenario.whole import Scenario
-from skytether.shared.telemetry import record
+from skytether.shared.telemetry import parts
 from skytether.shared.telemetry.record import Rows
 from skytether.shared.wire.protocol import Mode
 
@@ -226,7 +226,7 @@ class Processes:
         lives = []
         for part, child in self._parts:
             if flying := child.all(Flying):
-                lives.append(ProcessLife.of(record.read(part), flying[0].time_ns, flown_scenario))
+                lives.append(ProcessLife.of(parts.read(part), flying[0].time_ns, flown_scenario))
         return lives
 
 

@@ -13,7 +13,7 @@ import msgspec
 import numpy as np
 
 from skytether.shared.endpoints.directions import FLIGHT, Directions
-from skytether.shared.telemetry import record
+from skytether.shared.telemetry import parts
 from skytether.shared.telemetry.every_event import EveryEvent
 from skytether.shared.telemetry.record import Rows as Table
 
@@ -120,7 +120,7 @@ def described(columns: Mapping[str, np.dtype[np.void]]) -> dict[str, str]:
 def columns_of(described: str) -> np.dtype[np.void]:
     """Columns of a part from their description; raises FeedError if it is invalid."""
     try:
-        columns = record.columns_of(msgspec.json.decode(described))
+        columns = parts.columns_of(msgspec.json.decode(described))
     except (ValueError, RecursionError) as error:
         raise FeedError(f"got no columns: {error}") from None
     if columns.itemsize > ROW_BYTES_MAX:

@@ -10,11 +10,9 @@ import hashlib
 import io
 import json
 import math
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
-from pathlib import Path
 from struct import Struct
 from typing import Any, NamedTuple, Protocol
 
@@ -26,8 +24,6 @@ from skytether.shared.scenario.schemes import properties
 
 Rows = NDArray[np.void]
 
-_NUMBER = re.compile("[<|][biuf][1248]")
-"""Numbers in numpy's notation: byte order, kind and size [B]."""
 RECORDING = ".mcap"
 """Suffix of a file that is a recording of a flight, not a part of the record."""
 
@@ -263,44 +259,6 @@ def _row(columns: np.dtype[np.void]) -> Struct:
         kind = columns[name]
         row += f"{math.prod(kind.shape)}{formats[kind.base.str[1:]]}"
     return Struct(row)
-
-
-def columns_of(descr: Any) -> np.dtype[np.void]:
-    """Columns from numpy's description as JSON: names, kinds of numbers and shapes.
-
-    Raises:
-        ValueError: the description is invalid.
-    """
-    try:
-        fields = [(name, kind, *map(tuple, shape)) for name, kind, *shape in descr]
-        # numpy evaluates other kinds like Python code, with any kind of error if they are invalid.
-        if not all(_NUMBER.fullmatch(kind) for _, kind, *_ in fields):
-            raise ValueError("got a column of another kind, expected numbers")
-        columns = np.dtype(fields)
-    except TypeError as error:
-        raise ValueError(str(error)) from None
-    if not columns.itemsize:
-        raise ValueError("there are none")
-    return columns
-
-
-def parse(part: bytes) -> Rows:
-    """Rows of a part; an incomplete last row (of a killed writer) is left out.
-
-    Raises:
-        ValueError: the bytes are not a part of a record.
-    """
-    header, _, body = part.partition(b"\n")
-    try:
-        columns = columns_of(json.loads(header))
-    except (ValueError, RecursionError) as error:
-        raise ValueError(f"not a part of a record: {error}") from None
-    return np.frombuffer(body[: len(body) - len(body) % columns.itemsize], columns)
-
-
-def read(path: Path) -> Rows:
-    """Rows of a part in a file; errors as in `parse`, and OSError."""
-    return parse(path.read_bytes())
 
 
 class FlightEvent(NamedTuple):

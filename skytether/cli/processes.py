@@ -28,6 +28,7 @@ from skytether.shared.events.flight import Failure, Flying, NotFlown, RecordInco
 from skytether.shared.events.processes import Counted, Listening
 from skytether.shared.scenario.reading import to_toml
 from skytether.shared.scenario.whole import Scenario
+from skytether.shared.telemetry.parts import read
 from skytether.shared.telemetry.record import (
     PACKET_COLUMNS,
     FlightEvent,
@@ -35,7 +36,6 @@ from skytether.shared.telemetry.record import (
     Rows,
     client_columns,
     plan_columns,
-    read,
     server_columns,
 )
 from skytether.shell.commandline import plugins

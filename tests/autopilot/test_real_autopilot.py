@@ -25,7 +25,8 @@ from skytether.shared.events.flight import Flying, ModeChanged
 from skytether.shared.events.flight import address_text as text
 from skytether.shared.scenario.reading import check, to_toml
 from skytether.shared.scenario.whole import Scenario
-from skytether.shared.telemetry.record import Rows, parse
+from skytether.shared.telemetry.parts import parse
+from skytether.shared.telemetry.record import Rows
 from skytether.shell.processes.log import LogLine
 
 pytestmark = [pytest.mark.autopilot, pytest.mark.timeout(300)]

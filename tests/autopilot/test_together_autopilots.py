@@ -28,7 +28,7 @@ from skytether.shared.scenario import reading
 from skytether.shared.scenario.dotted import set_keys
 from skytether.shared.scenario.reading import check
 from skytether.shared.scenario.whole import Scenario
-from skytether.shared.telemetry import record
+from skytether.shared.telemetry import parts, record
 from skytether.shared.telemetry.record import MemoryRecorder, client_columns
 from skytether.shared.telemetry.summary import least_separation
 from skytether.shell.processes.log import LogLine
@@ -164,7 +164,7 @@ def test_the_documented_autopilots_swap_places_over_udp(tmp_path: Path) -> None:
             each.send_signal(signal.SIGTERM)
             each.wait(30)
     scenario = reading.load("swap-autopilot")
-    rows = [record.read(file) for file in files]
+    rows = [parts.read(file) for file in files]
     for number, track in zip(NUMBERS, rows, strict=True):
         goal = scenario.make_reference(number)(np.array(scenario.duration))[:, 0]
         start, end = track["state"][0, :, 0], track["state"][-1, :, 0]

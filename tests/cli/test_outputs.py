@@ -21,7 +21,8 @@ import pytest
 from helpers import until
 from skytether.__main__ import COMMANDS, main
 from skytether.shared.base import files, input_files
-from skytether.shared.telemetry.record import PACKET_COLUMNS, read
+from skytether.shared.telemetry.parts import read
+from skytether.shared.telemetry.record import PACKET_COLUMNS
 from skytether.shell.commandline.command import CommandError
 from skytether.shell.processes.process import recorded
 

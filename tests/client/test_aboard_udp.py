@@ -21,7 +21,8 @@ from skytether.shared.events.flight import Flying
 from skytether.shared.events.flight import address_text as text
 from skytether.shared.scenario.reading import to_toml
 from skytether.shared.scenario.whole import Scenario
-from skytether.shared.telemetry.record import client_columns, parse
+from skytether.shared.telemetry.parts import parse
+from skytether.shared.telemetry.record import client_columns
 from skytether.shell.processes.log import LogLine
 
 pytestmark = [pytest.mark.long, pytest.mark.realtime]

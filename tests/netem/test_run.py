@@ -29,7 +29,8 @@ from robot import free_port
 from skytether.netem.__main__ import emulate_for
 from skytether.shared.base.packets import GATEWAY, GATEWAY6
 from skytether.shared.base.units import SECOND_NS
-from skytether.shared.telemetry.record import DOWNLINK, UPLINK, read
+from skytether.shared.telemetry.parts import read
+from skytether.shared.telemetry.record import DOWNLINK, UPLINK
 from skytether.shell.commandline.command import CommandError
 from skytether.shell.driving.program import GRACE_S
 from skytether.shell.host import system

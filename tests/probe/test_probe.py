@@ -40,14 +40,8 @@ from skytether.server.gate import PlainGate
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.endpoints.endpoint import Datagram
 from skytether.shared.scenario import reading
-from skytether.shared.telemetry.record import (
-    DOWNLINK,
-    PACKET_COLUMNS,
-    UPLINK,
-    MemoryRecorder,
-    Rows,
-    parse,
-)
+from skytether.shared.telemetry.parts import parse
+from skytether.shared.telemetry.record import DOWNLINK, PACKET_COLUMNS, UPLINK, MemoryRecorder, Rows
 from skytether.shared.wire.drop import Drop, ProtocolError
 from skytether.shared.wire.protocol import PAYLOAD_BYTES_MAX
 from skytether.sim.hosts import Clock

@@ -16,7 +16,7 @@ from skytether.probe.outcome import outcome
 from skytether.shared.formats.recorded import recorded_in
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.registry import File
-from skytether.shared.telemetry.record import parse
+from skytether.shared.telemetry.parts import parse
 
 ROOT = Path(__file__).parents[2]
 RNG = np.random.default_rng(7)

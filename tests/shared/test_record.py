@@ -7,13 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from skytether.shared.telemetry.parts import parse, read
 from skytether.shared.telemetry.record import (
     PACKET_COLUMNS,
     MemoryRecorder,
     Recorder,
     client_columns,
-    parse,
-    read,
     server_columns,
 )
 

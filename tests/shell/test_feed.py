@@ -44,7 +44,8 @@ from skytether.shared.telemetry.feed import (
     encode,
     table,
 )
-from skytether.shared.telemetry.record import PACKET_COLUMNS, Recorder, parse, plan_columns
+from skytether.shared.telemetry.parts import parse
+from skytether.shared.telemetry.record import PACKET_COLUMNS, Recorder, plan_columns
 from skytether.shared.wire.protocol import Message, Trajectory
 from skytether.shell.commandline import command
 from skytether.shell.driving.driver import Shell

@@ -9,7 +9,8 @@ import pytest
 from helpers import until
 from skytether.shared.base import files
 from skytether.shared.events.flight import RecordIncomplete
-from skytether.shared.telemetry.record import PACKET_COLUMNS, read
+from skytether.shared.telemetry.parts import read
+from skytether.shared.telemetry.record import PACKET_COLUMNS
 from skytether.shell.commandline.command import CommandError
 from skytether.shell.driving import recording
 from skytether.shell.driving.recording import RecordFile

@@ -29,7 +29,7 @@ import pytest
 
 from helpers import PATIENCE_S
 from skytether.shared.scenario import reading
-from skytether.shared.telemetry.record import read
+from skytether.shared.telemetry.parts import read
 from skytether.shared.telemetry.summary import Summary
 
 pytestmark = [pytest.mark.docker, pytest.mark.realtime, pytest.mark.timeout(900)]

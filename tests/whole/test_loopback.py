@@ -23,12 +23,12 @@ from skytether.shared.endpoints.endpoint import Address, Datagram, Endpoint
 from skytether.shared.events.flight import Event, FlowOpened, Unreachable
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.whole import Scenario
+from skytether.shared.telemetry.parts import parse
 from skytether.shared.telemetry.record import (
     PACKET_COLUMNS,
     Record,
     Recorder,
     client_columns,
-    parse,
     server_columns,
 )
 from skytether.shell.driving.driver import Shell, new_event_loop

@@ -15,7 +15,8 @@ from skytether.shared.events.flight import address_text
 from skytether.shared.law.model import Array
 from skytether.shared.scenario.reading import to_toml
 from skytether.shared.scenario.whole import Scenario
-from skytether.shared.telemetry.record import DOWNLINK, UPLINK, read
+from skytether.shared.telemetry.parts import read
+from skytether.shared.telemetry.record import DOWNLINK, UPLINK
 
 EVERY_S = 0.002
 BYTES = 350

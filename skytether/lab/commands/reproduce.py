@@ -26,7 +26,7 @@ from skytether.shared.base import files, machine_code
 from skytether.shared.law.model import Array
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.whole import Scenario
-from skytether.shared.telemetry import record
+from skytether.shared.telemetry import parts
 from skytether.shared.telemetry.record import Record
 from skytether.shell.commandline import command, terminal
 from skytether.shell.commandline.argument import Argument
@@ -148,12 +148,12 @@ def _really(out: Path, table: Study, method: str, scale: ReproductionSize) -> re
             shortfalls = processes.run(scenario, part, on_second=on_second, interrupted=interrupted)
         if shortfalls:
             raise CommandError("; ".join(map(str, shortfalls)))
-        steps = record.read(part / "client")["step"]
+        steps = parts.read(part / "client")["step"]
         if not len(steps) or steps[-1] < scenario.steps - 2:
             message = "interrupted; the same command goes on from here"
             raise CommandError(message, command.INTERRUPTED)
         part.rename(folder)
-    client, server, netem = (record.read(folder / part) for part in processes.NAMES)
+    client, server, netem = (parts.read(folder / part) for part in processes.NAMES)
     figures = json.loads((folder / "netem.json").read_bytes())
     return report.Real(scenario, Record(client, server, netem), figures)
 

@@ -6,7 +6,8 @@ from typing import BinaryIO
 import numpy as np
 
 from skytether.shared.events.flight import RecordIncomplete
-from skytether.shared.telemetry.record import Recorder, Rows, parse
+from skytether.shared.telemetry.parts import parse
+from skytether.shared.telemetry.record import Recorder, Rows
 from skytether.shell.host.writer import Writer
 
 ROOM_BYTES = 32 * 1024 * 1024
