@@ -15,7 +15,6 @@ from skytether.client.alone import Fresh, Parts, Reach
 from skytether.client.connections import connect
 from skytether.client.failsafe import CLOSING, HOLD, TRANSITIONS, Failsafe, brake_ns
 from skytether.client.flight_log import FlightLog
-from skytether.client.ground import GroundReports
 from skytether.client.link import ClientLink
 from skytether.client.pilot import Pilot
 from skytether.client.session import ServerSession
@@ -131,10 +130,13 @@ class Client(Endpoint):
         self._log = FlightLog(
             scenario, vehicle, self._pilot, self._failsafe, self._servers, self._events
         )
-        self._ground = {
-            each: GroundReports(vehicle, each.address, self._timeout_ns, self._events)
-            for each in self._sessions
-        }
+        self._ground: dict[ServerSession, Any] = {}
+        if self._port is not None:
+            ground = load("skytether.client.ground", "a vehicle on the ground")
+            self._ground = {
+                each: ground.GroundReports(vehicle, each.address, self._timeout_ns, self._events)
+                for each in self._sessions
+            }
         self._time: TimeOfDay | None = None
         self._time_due_ns = 0
         self.horizons = 0

@@ -26,6 +26,7 @@ from skytether.shared.law.leap import (
 )
 from skytether.shared.law.model import Array
 from skytether.shared.scenario import rooms
+from skytether.shared.scenario.registry import load
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.wire.protocol import FLOAT_MAX
 
@@ -74,7 +75,11 @@ class Navigation:
     def __init__(self, scenario: Scenario) -> None:
         sensor, axes = sensing(scenario), scenario.model.axes
         self._scenario, terms = scenario, scenario.terms()
-        self.filter = Kalman(scenario, sensor.delay) if filters(scenario) else Newest(axes)
+        self.filter: Any = (
+            Kalman(scenario, sensor.delay)
+            if filters(scenario)
+            else load("skytether.client.unfiltered", "sensor.filter").Newest(axes)
+        )
         self._inputs: Any = None
         """`PendingInputs` that do not act yet; None if the model has no dead time."""
         if any(terms.dead_time_s):
@@ -258,30 +263,3 @@ def has_leapt(
             after_v = v
         leaps |= position_leaps(p, v, after_p, after_v, time_p, noise_m)
     return leaps
-
-
-class Newest:
-    """Stand-in for a filter: the newest measured value of each number."""
-
-    def __init__(self, axes: int) -> None:
-        self._zero = np.zeros(axes)
-        self._state = np.full((axes, 2), math.nan)
-
-    def begin(self, measured: Measurement, numbers: Array) -> None:
-        self.take(measured, numbers)
-
-    def advance(self, due: Array, swing: Array | None = None) -> None:
-        pass
-
-    def disturbance(self) -> Array:
-        """Disturbance of each axis: unknown, so 0 [m/s]."""
-        return self._zero
-
-    def take(self, measured: Measurement, numbers: Array) -> None:
-        if measured.position is not None:
-            self._state[:, 0] = numbers[0]
-        if measured.velocity is not None:
-            self._state[:, 1] = numbers[1]
-
-    def estimate(self) -> Array:
-        return self._state.copy()
