@@ -6,7 +6,7 @@ module alone.
 
 import os
 import stat
-from errno import EACCES, EBUSY, EFBIG, EINVAL, ELOOP
+from errno import EBUSY, EFBIG, EINVAL
 from functools import reduce
 from operator import or_
 from pathlib import Path
@@ -67,44 +67,20 @@ def opened(path: Path, *, follows: bool = True, is_input: bool = True) -> Binary
     return file
 
 
-def read(path: Path, most: int, *, private: bool = False, is_input: bool = True) -> bytes:
+def read(path: Path, most: int, *, is_input: bool = True) -> bytes:
     """Content of a file of at most `most` bytes.
 
-    Args:
-        private: whether only its owner may be able to read, write or replace it.
-        is_input: see `opened`.
-
     Raises:
-        OSError: as `opened`; or the file is too large, or not private as required.
+        OSError: as `opened`; or the file is too large.
         ValueError: the name is invalid.
     """
-    if private:
-        check_private(path)
-    with opened(path, follows=not private, is_input=is_input) as file:
-        mode = stat.S_IMODE(os.fstat(file.fileno()).st_mode)
-        if private and mode & 0o177:
-            problem = f"its mode is {mode:04o}"
-            raise OSError(EACCES, f"{problem}, expected 0600: nobody else may read or write it")
-        content = file.read(most + 1)
-    if len(content) > most:
+    with opened(path, is_input=is_input) as file:
+        return content(file, most)
+
+
+def content(file: BinaryIO, most: int) -> bytes:
+    """Content of an open file of at most `most` bytes, see `read`."""
+    read = file.read(most + 1)
+    if len(read) > most:
         raise OSError(EFBIG, f"it is larger than {most} bytes")
-    return content
-
-
-def check_private(path: Path) -> None:
-    """Refuse a private file if others can put another file in its place: if it is a link, or in a
-    folder that anybody may write to or replace.
-
-    Raises:
-        OSError: says what was found and what was expected.
-        ValueError: the name is invalid.
-    """
-    if path.is_symlink():
-        raise OSError(ELOOP, "it is a link, expected the file itself")
-    for folder in (path.absolute().parent, path.parent.resolve()):
-        for each in (folder, *folder.parents):
-            mode = stat.S_IMODE(each.stat().st_mode)
-            # With the sticky bit, the folders within belong to their owners.
-            if mode & stat.S_IWOTH and (each == folder or not mode & stat.S_ISVTX):
-                problem = f"anybody may write to the folder {each}, whose mode is {mode:04o}"
-                raise OSError(EACCES, f"{problem}: expected one where nobody else may")
+    return read

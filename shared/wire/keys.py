@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
 
-from skytether.shared.base import input_files
+from skytether.shared.base import private_files
 from skytether.shared.base.errors import ConfigError
 
 SECRET_BYTES = 32
@@ -93,7 +93,7 @@ def load(path: Path, *, is_input: bool = True) -> Keyring:
     """
     name = str(path)
     try:
-        content = input_files.read(path, FILE_BYTES_MAX, private=True, is_input=is_input)
+        content = private_files.read(path, FILE_BYTES_MAX, is_input=is_input)
     except OSError as error:
         raise ConfigError(f"{name}: cannot be read: {error.strerror}") from None
     except ValueError as error:

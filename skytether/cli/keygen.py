@@ -9,7 +9,7 @@ from typing import Annotated
 
 import tyro
 
-from skytether.shared.base import files, input_files
+from skytether.shared.base import files, private_files
 from skytether.shared.wire import keys
 from skytether.shared.wire.keys import KEYS_MAX, NUMBERS, SECRET_BYTES, VEHICLES
 from skytether.shell.commandline import command
@@ -116,10 +116,10 @@ def _number(present: keys.Keyring, vehicle: int, asked: int | None) -> int:
 def _write(path: Path, lines: Sequence[str], *, add: bool) -> None:
     """Write lines to a new file of mode 0600, or to the end of an existing one."""
     try:
-        input_files.check_private(path)
+        private_files.check(path)
         before = HEAD.encode()
         if add:
-            before = input_files.read(path, keys.FILE_BYTES_MAX, private=True, is_input=False)
+            before = private_files.read(path, keys.FILE_BYTES_MAX, is_input=False)
             before += b"" if before.endswith(b"\n") else b"\n"
         with files.replacing(path, mode=0o600, is_new=not add) as file:
             file.write(before + "".join(lines).encode())

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import msgspec
 
-from skytether.shared.base import files, input_files
+from skytether.shared.base import files, private_files
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.endpoints.change import Running, with_values
 from skytether.shared.endpoints.endpoint import Endpoint
@@ -63,7 +63,7 @@ class Journal:
             CommandError: the journal cannot be used.
         """
         try:
-            content = input_files.read(self._path, BYTES_MAX, private=True, is_input=False)
+            content = private_files.read(self._path, BYTES_MAX, is_input=False)
             entry = msgspec.json.decode(content, type=_Entry)
             self._check(entry)
             self.scenario, self.values = with_values(self._base, entry.values), entry.values

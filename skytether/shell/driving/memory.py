@@ -22,7 +22,7 @@ from typing import BinaryIO
 
 import msgspec
 
-from skytether.shared.base import files, input_files
+from skytether.shared.base import files, private_files
 from skytether.shared.endpoints.endpoint import Endpoint
 from skytether.shared.events.processes import NotKept
 
@@ -115,7 +115,7 @@ class MemoryFile:
             MemoryRefused: the file must not be used.
         """
         try:
-            content = input_files.read(self._path, FILE_BYTES_MAX, private=True, is_input=False)
+            content = private_files.read(self._path, FILE_BYTES_MAX, is_input=False)
         except FileNotFoundError:
             return None
         except OSError as error:
