@@ -1,7 +1,6 @@
 """Contradictions: values of a scenario that are each valid, but not together."""
 
 from collections.abc import Iterator
-from itertools import pairwise
 
 from skytether.shared.scenario import reference as shapes
 from skytether.shared.scenario import rooms, schemes
@@ -194,32 +193,14 @@ def _no_policies(
 
 
 def _no_reference(scenario: Scenario) -> Iterator[Contradiction]:
-    ref, axes = scenario.reference, scenario.model.axes
-    least = {"waypoints": 2, "hover": 1}.get(ref.shape, 0)
-    if len(ref.points_m) < least:
-        yield "reference.points_m", list(ref.points_m), f"at least {least} with shape {ref.shape!r}"
-    for point in ref.points_m:
-        if len(point) != axes:
-            yield "reference.points_m", list(point), f"{axes} numbers a point"
-    if ref.shape.partition("(")[0].strip() == "sphere" and axes != 3:
-        yield "model.axes", axes, "3 with the shape sphere"
-    if ref.shape in ("circle", "figure-eight", "square"):
-        most_m = shapes.FAST_MPS * ref.period_s / 8.0  # a square's round is eight radii long
-        if ref.radius_m > most_m:
-            most = f"at most {most_m:g} with reference.period_s = {ref.period_s:g}"
-            yield "reference.radius_m", ref.radius_m, most
-    route = ref.points_m + ref.points_m[:1] * ref.loop
-    if ref.shape == "waypoints" and any(here == there for here, there in pairwise(route)):
-        yield "reference.points_m", [list(point) for point in route], "no point twice in a row"
-    elif ref.shape in ("waypoints", *rooms.FROM_FILE):
-        try:
-            scenario.unallocated_reference()
-        except ValueError as error:
-            if ref.shape in rooms.FROM_FILE:
-                yield "reference.file", repr(ref.file), f"a table of the trajectory ({error})"
-            else:
-                points = [list(point) for point in route]
-                yield "reference.points_m", points, "points that are further apart"
+    ref, curves = scenario.reference, ("circle", "figure-eight", "square")
+    if ref.points_m or ref.shape not in curves:
+        placed = load("skytether.shared.scenario.placed", f"reference.shape {ref.shape}")
+        yield from placed.contradictions(scenario)
+    most_m = shapes.FAST_MPS * ref.period_s / 8.0  # a square's round is eight radii long
+    if ref.shape in curves and ref.radius_m > most_m:
+        most = f"at most {most_m:g} with reference.period_s = {ref.period_s:g}"
+        yield "reference.radius_m", ref.radius_m, most
 
 
 def _no_shape(scenario: Scenario) -> list[Contradiction]:

@@ -3,7 +3,7 @@
 The order is that of help texts and documents. Nothing is imported here.
 """
 
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from contextlib import suppress
 from types import MappingProxyType
 from typing import Any
@@ -132,23 +132,3 @@ IMPAIRMENTS.offer(f"{NETEM}impairments.traces", "deliveries")
 
 ZONES.offer(f"{SHARED}missions.zone_texts", "box", "cylinder", "polygon", "fence", "corridor")
 ZONES.offer(f"{SHARED}formats.zones", "geojson", "kml", "plan")
-
-
-def preload(changeable: Collection[str]) -> None:
-    """Import what a change of these keys in flight may name, before the first packet: a step or a
-    packet would have to wait for it.
-    """
-    for key, table in (
-        ("control.trigger", TRIGGERS),
-        ("mission.zones", ZONES),
-        ("network.uplink", IMPAIRMENTS),
-    ):
-        for name in table if key in changeable else ():
-            with suppress(ConfigError):  # a room that is not installed
-                _ = table[name]
-    for module in ("forms", "wrong_values") if changeable else ():
-        load(f"{SHARED}scenario.{module}", "a change")
-    if "armed" in changeable:
-        load("skytether.client.orders", "a change")
-    if "network.uplink" in changeable:
-        load("skytether.netem.bottleneck", "rate")

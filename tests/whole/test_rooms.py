@@ -11,7 +11,7 @@ import skytether
 from helpers import ran
 
 PACKAGE = Path(skytether.__file__).parent
-LINES = 17_700
+LINES = 17_600
 """Largest number of lines that a flight of `demo` loads; each step towards the kernel lowers it."""
 CALLS = 150
 """Largest number of Python calls that a step of a vehicle of `demo` takes in virtual time."""
@@ -169,13 +169,14 @@ CHANGE = """
 import sys
 from skytether.netem.proxy import Proxy
 from skytether.server.endpoint import Server
-from skytether.shared.scenario import reading, rooms
+from skytether.shared.endpoints import change
+from skytether.shared.scenario import reading
 
 swap = reading.to_table(reading.load("swap"))
 one = reading.check(swap, "swap")
 netem = Proxy(one, server=("server", 0), flows=1)
 server = Server(one, boot_id=1, entropy=bytes)
-rooms.preload(server.changeable | netem.changeable)
+change.preload(server.changeable | netem.changeable)
 before = {*sys.modules}
 swap["network"]["uplink"] = "rate(9000) & uniform(0.1, 0.2)"
 swap["mission"]["zones"] = "box(9, 10, 9, 10)"

@@ -15,12 +15,12 @@ import msgspec
 import numpy as np
 
 from skytether.shared.base import extras, files
-from skytether.shared.endpoints.change import Running
+from skytether.shared.endpoints.change import Running, preload
 from skytether.shared.endpoints.endpoint import Address, Endpoint, Form
 from skytether.shared.endpoints.stopwatch import Stopwatch
 from skytether.shared.events.flight import Event, address_text
 from skytether.shared.events.processes import Counted, Listening, Measured, Plaintext
-from skytether.shared.scenario import reading, rooms
+from skytether.shared.scenario import reading
 from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.feed import Opened
 from skytether.shared.telemetry.record import RECORDING, Recorder
@@ -134,7 +134,7 @@ class Process:
 
     def _running(self, endpoint: Endpoint) -> Running:
         """The endpoint with its scenario, ready for changes in flight."""
-        rooms.preload(endpoint.changeable)
+        preload(endpoint.changeable)
         journal = self.journal
         return journal.running(endpoint) if journal else Running(endpoint, self.options.config)
 
