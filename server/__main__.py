@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Annotated
 from skytether.server import assignment, routes
 from skytether.server.endpoint import VEHICLES_MAX, Server
 from skytether.server.gate import Gate, PlainGate
-from skytether.server.schemes import table
+from skytether.server.schemes import loading
 from skytether.shared.base import kernel, machine_code
 from skytether.shared.endpoints.endpoint import Address, Form
 from skytether.shared.endpoints.steady import Steady
@@ -115,7 +115,7 @@ def _ready(scenario: Scenario) -> None:
     """
     for room in (assignment.ROOM, routes.ROOM):
         import_module(room)
-    others = table.others(scenario)
+    others = loading.others(scenario)
     terminal.prepare(machine_code.missing(without=others))
     kernel.load(without=others)
 

@@ -12,7 +12,7 @@ import msgspec
 import tyro
 
 from skytether.cli import page_process, processes
-from skytether.server.schemes import table
+from skytether.server.schemes import loading
 from skytether.shared.base import machine_code
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.whole import Scenario
@@ -58,7 +58,7 @@ def duel(argv: Sequence[str]) -> None:
     at = command.address("--page", options.page)
     scenarios = together(options)
     names = titles(options.scenarios)
-    terminal.prepare(machine_code.missing(table.others(*scenarios)))
+    terminal.prepare(machine_code.missing(loading.others(*scenarios)))
     if options.virtual:
         frames = [
             list(of_flight(scenario, name, flight.fly(scenario)))

@@ -18,7 +18,7 @@ from rich.text import Text
 from skytether.cli import page_process, processes
 from skytether.figures import film
 from skytether.figures import flights as figures
-from skytether.server.schemes import table
+from skytether.server.schemes import loading
 from skytether.shared import formats
 from skytether.shared.base import kernel, machine_code
 from skytether.shared.endpoints.stopwatch import Stopwatch
@@ -168,7 +168,7 @@ def fleet(argv: Sequence[str]) -> None:
     name = Path(options.config.reference.file).name or options.scenario
     count = terminal.counted(vehicles, "vehicle")
     title = f"{count}, {name}, {where}, seed {options.config.seed}"
-    terminal.prepare(machine_code.missing(table.others(options.config)))
+    terminal.prepare(machine_code.missing(loading.others(options.config)))
     with (
         command.interruptible() as interrupted,
         terminal.progress(f"flying {title}", options.config.duration) as on_second,
@@ -240,7 +240,7 @@ def _virtually(
     on_second: Callable[[float], None],
     interrupted: Callable[[], bool],
 ) -> FleetFlight:
-    kernel.load(table.others(options.config))
+    kernel.load(loading.others(options.config))
     began_s = time.process_time()
     flown = sim.fly(
         options.config,

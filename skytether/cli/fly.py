@@ -15,7 +15,7 @@ import msgspec
 
 from skytether.cli import page_process, processes
 from skytether.client import vehicles
-from skytether.server.schemes import table
+from skytether.server.schemes import loading
 from skytether.shared.base import machine_code
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.events.flight import (
@@ -137,7 +137,7 @@ def fly(argv: Sequence[str]) -> None:
     page = None if options.virtual or options.no_page else at
     with page_process.paged(page, options.control) as sockets:
         together = [scenario, *beside.values()]
-        missing = machine_code.missing(table.others(*together))
+        missing = machine_code.missing(loading.others(*together))
         terminal.prepare(missing, sockets)
         with _flying(beside.values()) as others:
             with (

@@ -160,13 +160,13 @@ def prepare(*scenarios: Scenario) -> None:
     unless this machine has them already, with a note on stderr.
     """
     import skytether.sim.flight  # noqa: F401 - its kernels are those of every flight
-    from skytether.server.schemes import table
+    from skytether.server.schemes import loading
     from skytether.shared.base import machine_code
     from skytether.shell.commandline import terminal
 
     if not scenarios:
-        table.load_all()
-    terminal.prepare(machine_code.missing(table.others(*scenarios) if scenarios else ()))
+        loading.load_all()
+    terminal.prepare(machine_code.missing(loading.others(*scenarios) if scenarios else ()))
 
 
 def _checked(name: str, scenario: Scenario, keys: Mapping[str, Any]) -> Scenario:

@@ -13,7 +13,7 @@ import pytest
 
 from helpers import faults, packaged, refusal
 from skytether.__main__ import main
-from skytether.server.schemes import table
+from skytether.server.schemes import loading
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.scenario.whole import Scenario
 from skytether.shared.wire.protocol import Mode
@@ -156,7 +156,7 @@ def test_a_vehicle_may_name_the_scheme_that_it_is_flown_as(tmp_path: Path) -> No
 
 def test_a_scheme_calls_no_kernels_of_ours_but_those_that_send(tmp_path: Path) -> None:
     plug(tmp_path, CHASE)
-    others = table.others(scenario("chase"))
+    others = loading.others(scenario("chase"))
     assert "skytether.server.schemes.horizons" not in others
     assert {"skytether.server.mpc.exact", "skytether.server.planning.splines"} <= others
 

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from numba import config as numba_config
 
-from skytether.server.schemes import table
+from skytether.server.schemes import loading
 from skytether.shared.base import files, kernel
 from skytether.shared.scenario import reading
 from skytether.shell.host.compiling import LOCK
@@ -335,7 +335,7 @@ import os
 import sys
 import msgspec
 from numba.core import event
-from skytether.server.schemes import table
+from skytether.server.schemes import loading
 from skytether.shared.base import files, kernel, machine_code
 from skytether.shared.scenario import reading
 from skytether.sim import flight
@@ -345,7 +345,7 @@ def in_memory():
 
 def fly(name):
     scenario = msgspec.structs.replace(reading.load(name), duration=8.0)
-    kernel.load(without=table.others(scenario))
+    kernel.load(without=loading.others(scenario))
     loaded = in_memory()
     with event.install_recorder("numba:compile") as compiled:
         flight.fly(scenario, vehicles=16 if scenario.is_mission else 1)
@@ -377,9 +377,9 @@ ALWAYS = {"clock", "controller", "desired", "plausibility"}
 def test_a_server_loads_no_kernel_of_another_scheme(scenario: str) -> None:
     """A module with kernels belongs to named schemes, or to all of them."""
     import_module("skytether.server.endpoint")
-    table.load_all()
-    own = table.others(reading.load("paper")) | table.others(reading.load("swap"))
-    own -= table.others(reading.load(scenario))
-    loaded = {each.__module__ for each in kernel.KERNELS} - table.others(reading.load(scenario))
+    loading.load_all()
+    own = loading.others(reading.load("paper")) | loading.others(reading.load("swap"))
+    own -= loading.others(reading.load(scenario))
+    loaded = {each.__module__ for each in kernel.KERNELS} - loading.others(reading.load(scenario))
     server = {name for name in loaded if name.startswith("skytether.server.")}
     assert {name.rpartition(".")[2] for name in server - own} <= ALWAYS

@@ -31,7 +31,7 @@ import skytether.lab.engine.sweep
 from skytether.lab.engine.journal import StudyJournal, name_of
 from skytether.lab.engine.search import Point, Search, SearchPoint, Values, best
 from skytether.lab.engine.sweep import Results, Runs, Sweep
-from skytether.server.schemes import table
+from skytether.server.schemes import loading
 from skytether.shared.base import kernel, machine_code
 from skytether.shared.scenario.whole import Scenario
 from skytether.shell.commandline import command, plugins, terminal
@@ -224,7 +224,7 @@ def crew(flags: Flags, title: str, total: float, unit: str = "runs") -> Iterator
     order.
     """
     if not flags.scheduler:  # Compile now: otherwise every worker would compile all kernels.
-        table.load_all()
+        loading.load_all()
         terminal.prepare(machine_code.missing())
     with (
         command.interruptible() as interrupted,

@@ -21,7 +21,7 @@ from skytether.lab.engine.sweep import Runs
 from skytether.lab.pages import report
 from skytether.lab.pages.plates import Samples
 from skytether.lab.pages.report import Reproduction
-from skytether.server.schemes.table import others
+from skytether.server.schemes.loading import others
 from skytether.shared.base import files, machine_code
 from skytether.shared.law.model import Array
 from skytether.shared.scenario import reading
