@@ -69,10 +69,10 @@ class Body(SimulatedVehicle):
             is_held = (self._step - lost) * self._dt_ns < HOLD_NS
             if not self.holds:
                 self.plant.advance(velocity if is_held else 0.0 * velocity)
-            self._step += 1
-            self.sensor.measure(self.plant.state(), began_ns=self._began_ns)
+            self._step, self._state = self._step + 1, self.plant.state()
+            self.sensor.measure(self._state, began_ns=self._began_ns)
             time_s = (self._began_ns + self._step * self._dt_ns) / SECOND_NS
-            self.unflown.append((time_s, self.plant.state()[:, 0].tolist()))
+            self.unflown.append((time_s, self._state[:, 0].tolist()))
         self.holds = False
 
     def reset(self, sensor: Sensor) -> None:

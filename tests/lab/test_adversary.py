@@ -125,6 +125,7 @@ def test_a_vehicle_without_a_client_flies_on_and_is_seen() -> None:
     assert times[0] == pytest.approx(4.05)
     assert x[19] - began == pytest.approx(0.5, abs=0.2)
     assert abs(x[99] - x[60]) < 0.3  # stopped, except for wind
+    np.testing.assert_array_equal(body.truth(), body.plant.state())
 
 
 EARLY_S, LATE_S = 5.0, 7.0
