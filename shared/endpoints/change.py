@@ -48,20 +48,25 @@ def preload(changeable: Collection[str]) -> None:
     """Import what a change of these keys in flight may name, before the first packet: a step or a
     packet would have to wait for it.
     """
-    for key, table in (
-        ("control.trigger", TRIGGERS),
-        ("mission.zones", rooms.ZONES),
-        ("network.uplink", IMPAIRMENTS),
+    modules: list[str] = []
+    for key, table, guarded in (
+        ("control.trigger", TRIGGERS, "skytether.server.triggers.guarded"),
+        ("mission.zones", rooms.ZONES, ""),
+        ("network.uplink", IMPAIRMENTS, "skytether.netem.impairments.guarded"),
     ):
         for name in table if key in changeable else ():
             with suppress(ConfigError):  # a room that is not installed
-                _ = table[name]
-    for module in ("forms", "wrong_values") if changeable else ():
-        load(f"skytether.shared.scenario.{module}", "a change")
-    if "armed" in changeable:
-        load("skytether.client.orders", "a change")
+                modules += [] if table[name].is_ours else [guarded]
     if "network.uplink" in changeable:
-        load("skytether.netem.bottleneck", "rate")
+        modules += ["skytether.netem.bottleneck", "skytether.shared.base.folders"]
+    if "armed" in changeable:
+        modules.append("skytether.client.orders")
+    if changeable:
+        modules += [f"skytether.shared.scenario.{each}" for each in ("forms", "wrong_values")]
+        hint("", ())  # imports difflib
+    for module in modules:
+        with suppress(ConfigError):
+            load(module, "a change")
 
 
 class Running:

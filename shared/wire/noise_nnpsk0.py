@@ -27,6 +27,9 @@ MESSAGE_BYTES = KEY_BYTES + TAG_BYTES
 
 _NONCE = bytes(12)
 
+# The first key imports the bindings of OpenSSL: here, so that no first HELLO makes a server wait.
+X25519PrivateKey.from_private_bytes(bytes(KEY_BYTES))
+
 
 class NoiseError(Exception):
     """A message of the handshake is invalid, or belongs to another handshake."""

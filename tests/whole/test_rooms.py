@@ -192,6 +192,59 @@ def test_a_change_in_flight_imports_nothing() -> None:
     assert (changed.stdout, changed.stderr) == ("\n", "")
 
 
+PLUGIN = """
+from skytether.plugin import Compared, Impairment, above, impairment, trigger
+
+@trigger
+def own(situation):
+    return above(situation, Compared.EXPECTED_GAP, 0.1)
+
+@impairment(name="own")
+class Own(Impairment):
+    def __call__(self, fate, draws):
+        fate.delay_ns += 1
+"""
+REQUESTS = """
+import sys
+from skytether.netem.proxy import Proxy
+from skytether.server.endpoint import Server
+from skytether.shared.base.errors import ConfigError
+from skytether.shared.endpoints import change
+from skytether.shared.endpoints.change import Running
+from skytether.shared.scenario import reading
+from skytether.shell.commandline import plugins
+
+folder, plugin = sys.argv[1:]
+plugins.load([plugin])
+demo = reading.load("demo")
+netem = Proxy(demo, server=("server", 0), flows=1)
+server = Server(demo, boot_id=1, entropy=bytes)
+change.preload(server.changeable | netem.changeable)
+before = {*sys.modules}
+for endpoint, key, value in (
+    (server, "control.triger", "always"),
+    (server, "control.trigger", 5),
+    (server, "control.trigger", "periodic(x)"),
+    (server, "control.trigger", "own"),
+    (netem, "network.uplink", "own"),
+    (netem, "network.uplink", f"trace('{folder}')"),
+):
+    try:
+        Running(endpoint, demo).change({key: value}, now_ns=0)
+        print(value)
+    except ConfigError:
+        pass
+print(*sorted(name for name in {*sys.modules} - before if not name.startswith("encodings.")))
+"""
+
+
+def test_a_refused_change_and_one_to_a_plugin_import_nothing(tmp_path: Path) -> None:
+    plugin = tmp_path / "own.py"
+    plugin.write_text(PLUGIN)
+    asked = ran(sys.executable, "-P", "-c", REQUESTS, str(tmp_path), str(plugin))
+    assert (asked.stdout, asked.stderr) == ("own\nown\n\n", "")
+
+
 MESSAGES = """
 import sys
 import msgpack
@@ -214,6 +267,22 @@ print(*sorted({*sys.modules} - before))
 def test_a_strangers_message_imports_nothing() -> None:
     heard = ran(sys.executable, "-P", "-c", MESSAGES)
     assert (heard.stdout, heard.stderr) == ("\n", "")
+
+
+HANDSHAKE = """
+import sys
+from skytether.shared.wire.noise_nnpsk0 import Initiator, Responder
+
+before = {*sys.modules}
+hello = Initiator(bytes(32), b"", b"1" * 32, b"")
+Responder(bytes(32), b"", hello.message).answer(b"2" * 32, b"")
+print(*sorted({*sys.modules} - before))
+"""
+
+
+def test_a_handshake_imports_nothing() -> None:
+    shaken = ran(sys.executable, "-P", "-c", HANDSHAKE)
+    assert (shaken.stdout, shaken.stderr) == ("\n", "")
 
 
 @pytest.mark.long
