@@ -1,6 +1,6 @@
 """The route from a vehicle to a server over several paths, each an address with a socket.
 
-It takes the place of `client.route.Route`; `client.connections` loads it for a server with several
+It takes the place of `client.route.Route`; `client.several` loads it for a server with several
 addresses. `shared.wire.paths` chooses the paths of each message.
 """
 

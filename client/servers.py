@@ -3,8 +3,8 @@
 The vehicle changes the leader by the rules of `client.leadership`; packets and faults of the leader
 alone reach the failsafe.
 
-It takes the place of `client.alone.OneServer`; `client.connections` loads it if there is a standby
-server.
+It takes the place of `client.alone.OneServer`; `client.several` loads it if there is a standby
+server, and `client.alone.Reach` if an earlier run of the client had one.
 """
 
 from dataclasses import dataclass

@@ -1,7 +1,7 @@
 """Paths from the server to a vehicle: the proven addresses, and what is sent to each.
 
-`SeveralWays` takes the place of `server.ways.Ways` at the first report of a vehicle with several
-paths (`server.reception`); a server in real time loads it before its first packet.
+`RoutesOverPaths` takes the place of `server.routes.Routes` at the first report of a vehicle with
+several paths (`server.reception`); a server in real time loads it before its first packet.
 """
 
 import hashlib

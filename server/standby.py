@@ -1,8 +1,8 @@
 """Leaders of vehicles that have two servers: what each vehicle says of its leader (LEAD), and the
 number of the leadership in every plan, see docs/together-proof.md.
 
-`LeadsOfTwo` takes the place of `server.leads.Leads` at the first LEAD (`server.reception`); a
-server in real time loads it before its first packet.
+`AssignmentOfTwo` takes the place of `server.assignment.Assignment` at the first LEAD
+(`server.reception`); a server in real time loads it before its first packet.
 """
 
 from collections.abc import Iterable, Iterator

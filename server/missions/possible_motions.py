@@ -1,9 +1,9 @@
 """Possible motions of all vehicles in arrays, with their uncertainty.
 
 The server knows the position of each vehicle on its motion up to the error of the step that it
-counts (`clock.StepError`). Between two vehicles only the sum of both errors matters: the number of
-steps by which the second vehicle may be ahead or behind. So the first vehicle is taken at its
-counted step, and the second anywhere between two steps: a swept piece of its path, longer the
+counts (`planning.clock.StepError`). Between two vehicles only the sum of both errors matters: the
+number of steps by which the second vehicle may be ahead or behind. So the first vehicle is taken at
+its counted step, and the second anywhere between two steps: a swept piece of its path, longer the
 faster it flies, and a point when it rests.
 
 In three dimensions a vehicle without contact lands after a while. From the first step at which it
@@ -45,7 +45,7 @@ class MotionArrays(NamedTuple):
     extra: F1
     """Additional distance to keep from this motion [m]."""
     early: F1
-    """Largest number of steps by which the vehicle is ahead, see `clock.StepError`."""
+    """Largest number of steps by which the vehicle is ahead, see `planning.clock.StepError`."""
     late: F1
     """Largest number of steps by which the vehicle is behind."""
     position: F3

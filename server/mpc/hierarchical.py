@@ -69,7 +69,7 @@ class PlanBatch(NamedTuple):
     foresight: Foresight
     figures: Figures
     together: F3
-    """Scratch for WIDTH vehicles, see `mpc.simd_memory`."""
+    """Scratch for WIDTH vehicles, see `problem.simd_memory`."""
     alone: F3
     single: I1
     """Scratch: index of one vehicle in the block; shape (1,)."""

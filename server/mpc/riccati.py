@@ -41,7 +41,7 @@ class RiccatiWorkspace(NamedTuple):
     """Backward passes with every input free, for FIRST and LATER weights and each axis; shape (2,
     axes, H, 7)."""
     memory: F3
-    """Scratch for a single vehicle, see `mpc.simd_memory`."""
+    """Scratch for a single vehicle, see `problem.simd_memory`."""
     together: F3
     """Scratch for WIDTH vehicles."""
 

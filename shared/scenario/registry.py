@@ -410,7 +410,7 @@ PERIOD_MAX = 1_000_000
 TRIGGERS = PluginTable(
     "policy", "policies such as 'state_gap & budget(5, 2) | silence(1)'", given=1, class_=2
 )
-"""Policies of `control.trigger`. A function is called with a `triggers.Situation` at each step; a
+"""Policies of `control.trigger`. A function is called with a `Situation` at each step; a
 class once, with the control section and the largest number of vehicles. See
 `server.triggers.trigger`."""
 REPORTS = PluginTable("report", "reports such as 'deviation(0.05) | silence(1)'", given=1, class_=1)

@@ -1,6 +1,6 @@
 """LEAD, the message that says which of its servers leads a vehicle, and the leadership of plans.
 
-The protocol imports this module as it does `path_proof`.
+The protocol knows its number, and imports this module as it does `path_proof`.
 """
 
 from typing import NamedTuple
