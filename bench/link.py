@@ -61,9 +61,9 @@ class LinkCounts:
     seconds: float = 10.0
     """Duration of each flight of the fleet [s]."""
     turns: int = 5
-    """Number of flights of the fleet, of each kind."""
+    """Number of flights of the fleet with keys, and as many without."""
     seeds: int = 20
-    """Number of flights of the demonstration, of each kind."""
+    """Number of flights of the demonstration with keys, and as many without."""
 
 
 FULL = LinkCounts()

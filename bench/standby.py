@@ -37,9 +37,10 @@ class FlownCell(msgspec.Struct, frozen=True):
     """Time from the death to the first plan in force of the new leader [s]."""
     brakes: int
     rmse_m: tuple[float, float]
-    """With the death, and of the same flight with a single server that lives [m]."""
+    """RMSE in the plane of the flight whose first server dies, and of the same flight with a single
+    server that does not [m]."""
     error_m: tuple[float, float]
-    """Largest error of both [m]."""
+    """Largest error of these two flights [m]."""
 
 
 def fly_cell(cell: Cell) -> FlownCell:

@@ -602,5 +602,5 @@ class Scenario(Section, frozen=True):
 
 
 def digest(content: bytes) -> str:
-    """Short digest of a file or text; "none" of nothing."""
+    """Short digest of a file or text; "none" if it is empty."""
     return hashlib.blake2s(content, digest_size=8).hexdigest() if content else "none"

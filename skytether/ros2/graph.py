@@ -61,7 +61,9 @@ class Node:
 
     @property
     def forms(self) -> tuple[Topic, ...]:
-        """The published topic with each of its types; a message's address has the index."""
+        """The published topic, once for each type that it may have. The address of a message to be
+        published has the index in this list.
+        """
         return self.publishes, *self.alternatives
 
     def tokens(self, session: str) -> list[str]:

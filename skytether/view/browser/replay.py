@@ -21,7 +21,8 @@ TICK_S = 0.04
 """Time between two batches of frames."""
 SPEEDS = ("0.25", "0.5", "1", "2", "4", "8", "16")
 Placed = tuple[int, int, str, Frame]
-"""Time of a frame since its flight's first [ns], index of its flight, process, and the frame."""
+"""Time of a frame since the first frame of its flight [ns], index of the flight, name of the
+process, and the frame."""
 
 
 class Player:
