@@ -10,8 +10,8 @@ if __name__ == "__main__":  # called before the slow imports below
 import secrets
 import time
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
-from importlib import import_module
 from pathlib import Path
 from socket import socket
 from typing import TYPE_CHECKING, Annotated
@@ -21,6 +21,7 @@ from skytether.server.endpoint import VEHICLES_MAX, Server
 from skytether.server.gate import Gate, PlainGate
 from skytether.server.schemes import loading
 from skytether.shared.base import kernel, machine_code
+from skytether.shared.base.errors import ConfigError
 from skytether.shared.endpoints.endpoint import Address, Form
 from skytether.shared.endpoints.steady import Steady
 from skytether.shared.endpoints.stopwatch import Stopwatch
@@ -114,7 +115,8 @@ def _ready(scenario: Scenario) -> None:
     forked, so that they share its memory, and before a tick would have to wait for it.
     """
     for room in (assignment.ROOM, routes.ROOM):
-        import_module(room)
+        with suppress(ConfigError):  # not installed: its messages are refused
+            load(room, "a message")
     others = loading.others(scenario)
     terminal.prepare(machine_code.missing(without=others))
     kernel.load(without=others)

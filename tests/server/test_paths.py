@@ -1,6 +1,7 @@
 """Paths from the server to a vehicle: how an address is proven, forgotten and found anew."""
 
 import numpy as np
+import pytest
 
 from helpers import packaged
 from skytether.server.endpoint import Server
@@ -113,6 +114,18 @@ class Vehicle:
         assert isinstance(question, PathProof)
         assert peer == place.peer
         assert self.say(message._replace(proof=question.proof), place) == []
+
+
+def test_a_server_without_the_room_of_paths_refuses_their_reports_and_serves_on(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("skytether.server.routes.ROOM", "skytether.server.no_paths")
+    vehicle = Vehicle()
+    vehicle.observe(FIRST)
+    assert vehicle.server.dropped[Drop.NOT_FOR_A_SERVER] == 1
+    vehicle.paths = None
+    vehicle.observe(FIRST)
+    assert vehicle.server.dropped.total() == 1
 
 
 def routes(vehicle: Vehicle) -> RoutesOverPaths:
