@@ -21,7 +21,7 @@ LEAP = keys_of(InFlight.LEAP)
 
 
 class Orders:
-    """Orders to one vehicle; loaded with the first, or before the flight (`change.preload`)."""
+    """Orders to one vehicle; loaded with the first, or before the flight (`preloading.preload`)."""
 
     def __init__(
         self, flies: Vehicle, pilot: Pilot, failsafe: Failsafe, servers: OneServer

@@ -6,9 +6,9 @@
 from collections.abc import Iterable
 from typing import Any, Protocol
 
-from skytether.server.routes import called_for
 from skytether.shared.endpoints.endpoint import Datagram
 from skytether.shared.law.model import Indices
+from skytether.shared.scenario.registry import load
 from skytether.shared.wire.drop import Drop, ProtocolError
 from skytether.shared.wire.protocol import Message, Observation, RoomMessage
 
@@ -67,7 +67,7 @@ class Assignment:
 
     def of_several(self) -> "Assignment":
         """Assignment of vehicles of which some have several servers."""
-        assignment: Assignment = called_for(ROOM).AssignmentOfTwo(self)
+        assignment: Assignment = load(ROOM, "a standby server").AssignmentOfTwo(self)
         return assignment
 
     def begin(self, session: Any) -> None:

@@ -13,6 +13,7 @@ from skytether.server.planning.clock import ClockMap, Contradiction
 from skytether.server.plausibility import ANEW, BELIEVED, Belief, Plausibility
 from skytether.server.sessions import Session, Sessions
 from skytether.server.tick import Grid
+from skytether.shared.base.errors import NotInstalledError
 from skytether.shared.base.units import MICROSECOND_NS, SECOND_NS, seconds_to_ns
 from skytether.shared.endpoints.endpoint import Address, Datagram, Events
 from skytether.shared.endpoints.stopwatch import Stopwatch
@@ -140,6 +141,9 @@ class Reception:
             self._take(call, datagram, now_ns)
         except ProtocolError as error:
             dropped = error.reason
+            self.dropped[dropped] += 1
+        except NotInstalledError:  # the room that the message calls for
+            dropped = Drop.NOT_FOR_A_SERVER
             self.dropped[dropped] += 1
         self._stopwatch.lap("observe")
         return dropped

@@ -7,7 +7,6 @@ from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
 from skytether.server.gate import ReplyPath
-from skytether.shared.base.errors import ConfigError
 from skytether.shared.endpoints.endpoint import Datagram, Events
 from skytether.shared.scenario.registry import load
 from skytether.shared.wire.drop import Drop, ProtocolError
@@ -16,18 +15,6 @@ from skytether.shared.wire.protocol import Message
 
 ROOM = "skytether.server.paths"
 """Module of vehicles with several paths; the first report in front of an observation loads it."""
-
-
-def called_for(module: str) -> Any:
-    """Module of a room that a vehicle's message calls for.
-
-    Raises:
-        ProtocolError: it is not installed here.
-    """
-    try:
-        return load(module, "a message")
-    except ConfigError:
-        raise ProtocolError(Drop.NOT_FOR_A_SERVER) from None
 
 
 class Route(Protocol):
@@ -52,7 +39,7 @@ class Routes:
             spread: `link.spread`.
             timeout_ns: time without a packet after which a vehicle takes the link for lost [ns].
         """
-        routes: Routes = called_for(ROOM).RoutesOverPaths(entropy, spread, timeout_ns)
+        routes: Routes = load(ROOM, "paths").RoutesOverPaths(entropy, spread, timeout_ns)
         return routes
 
     def is_copy(self, datagram: Datagram, now_ns: int) -> bool:

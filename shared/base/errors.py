@@ -2,9 +2,11 @@
 
 
 class ConfigError(Exception):
-    """The user's scenario cannot be flown; the message names file, key, given and expected
-    value.
-    """
+    """A scenario cannot be flown; the message names file, key, given and expected value."""
+
+
+class NotInstalledError(ConfigError):
+    """A scenario, or a message, calls for a room that is not installed."""
 
 
 class FlightError(Exception):

@@ -8,8 +8,7 @@ The answer is an `Answer`. `shell.driving.control` has the socket for both, and 
 the same changes in virtual time.
 """
 
-from collections.abc import Collection, Mapping
-from contextlib import suppress
+from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Any
 
@@ -20,11 +19,10 @@ from skytether.shared.base.hint import hint
 from skytether.shared.endpoints import other_directions
 from skytether.shared.endpoints.endpoint import Endpoint
 from skytether.shared.events.flight import Changed, ChangeRefused, Event
-from skytether.shared.scenario import reading, rooms
+from skytether.shared.scenario import reading
 from skytether.shared.scenario.catalogue import keys_of
 from skytether.shared.scenario.dotted import set_keys, text_key, value
 from skytether.shared.scenario.owners import InFlight
-from skytether.shared.scenario.registry import IMPAIRMENTS, TRIGGERS, load
 from skytether.shared.scenario.whole import Scenario
 
 REQUEST_BYTES_MAX = 4096
@@ -42,31 +40,6 @@ class Answer(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     """Keys that may change and their present values, if the request was empty."""
     names: dict[str, str] = {}
     """What the operator calls some of these keys, see `endpoints.directions`."""
-
-
-def preload(changeable: Collection[str]) -> None:
-    """Import what a change of these keys in flight may name, before the first packet: a step or a
-    packet would have to wait for it.
-    """
-    modules: list[str] = []
-    for key, table, guarded in (
-        ("control.trigger", TRIGGERS, "skytether.server.triggers.guarded"),
-        ("mission.zones", rooms.ZONES, ""),
-        ("network.uplink", IMPAIRMENTS, "skytether.netem.impairments.guarded"),
-    ):
-        for name in table if key in changeable else ():
-            with suppress(ConfigError):  # a room that is not installed
-                modules += [] if table[name].is_ours else [guarded]
-    if "network.uplink" in changeable:
-        modules += ["skytether.netem.bottleneck", "skytether.shared.base.folders"]
-    if "armed" in changeable:
-        modules.append("skytether.client.orders")
-    if changeable:
-        modules += [f"skytether.shared.scenario.{each}" for each in ("forms", "wrong_values")]
-        hint("", ())  # imports difflib
-    for module in modules:
-        with suppress(ConfigError):
-            load(module, "a change")
 
 
 class Running:

@@ -117,9 +117,8 @@ class Endpoint(ABC):
         self._out: list[Datagram] = []
         self._events = Events()
         self.pending = self._out, self._events
-        """Datagrams and events that `outbox` and `events` return next. In virtual time neither is
-        called while there are none, so an endpoint round another takes its `pending`, as `Steady`.
-        """
+        """Datagrams and events that `outbox` and `events` return next; an endpoint round another
+        takes the other's, for in virtual time neither is called while there are none."""
 
     @abstractmethod
     def receive(self, datagram: Datagram, *, now_ns: int) -> None:

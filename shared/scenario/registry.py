@@ -26,7 +26,7 @@ from typing import Annotated, Any, Literal, NamedTuple, TypeVar, overload
 import msgspec
 from msgspec import Meta
 
-from skytether.shared.base.errors import ConfigError
+from skytether.shared.base.errors import ConfigError, NotInstalledError
 from skytether.shared.base.hint import hint
 from skytether.shared.scenario import grammar
 from skytether.shared.scenario.grammar import Call, Combination, Expression, GrammarError, Value
@@ -161,7 +161,7 @@ def load(module: str, what: str) -> Any:
     except ModuleNotFoundError as error:
         if not f"{error.name}.".startswith("skytether."):
             raise
-        raise ConfigError(f"{what}: {error.name} is not installed") from None
+        raise NotInstalledError(f"{what}: {error.name} is not installed") from None
 
 
 def _offered() -> None:

@@ -169,14 +169,14 @@ CHANGE = """
 import sys
 from skytether.netem.proxy import Proxy
 from skytether.server.endpoint import Server
-from skytether.shared.endpoints import change
+from skytether.shell.processes.preloading import preload
 from skytether.shared.scenario import reading
 
 swap = reading.to_table(reading.load("swap"))
 one = reading.check(swap, "swap")
 netem = Proxy(one, server=("server", 0), flows=1)
 server = Server(one, boot_id=1, entropy=bytes)
-change.preload(server.changeable | netem.changeable)
+preload(server.changeable | netem.changeable)
 before = {*sys.modules}
 swap["network"]["uplink"] = "rate(9000) & uniform(0.1, 0.2)"
 swap["mission"]["zones"] = "box(9, 10, 9, 10)"
@@ -209,7 +209,7 @@ import sys
 from skytether.netem.proxy import Proxy
 from skytether.server.endpoint import Server
 from skytether.shared.base.errors import ConfigError
-from skytether.shared.endpoints import change
+from skytether.shell.processes.preloading import preload
 from skytether.shared.endpoints.change import Running
 from skytether.shared.scenario import reading
 from skytether.shell.commandline import plugins
@@ -219,7 +219,7 @@ plugins.load([plugin])
 demo = reading.load("demo")
 netem = Proxy(demo, server=("server", 0), flows=1)
 server = Server(demo, boot_id=1, entropy=bytes)
-change.preload(server.changeable | netem.changeable)
+preload(server.changeable | netem.changeable)
 before = {*sys.modules}
 for endpoint, key, value in (
     (server, "control.triger", "always"),

@@ -15,7 +15,7 @@ import msgspec
 import numpy as np
 
 from skytether.shared.base import extras, files
-from skytether.shared.endpoints.change import Running, preload
+from skytether.shared.endpoints.change import Running
 from skytether.shared.endpoints.endpoint import Address, Endpoint, Form
 from skytether.shared.endpoints.stopwatch import Stopwatch
 from skytether.shared.events.flight import Event, address_text
@@ -45,6 +45,7 @@ from skytether.shell.host.time_of_day import TimeTeller
 from skytether.shell.host.udp import AddressError, is_loopback
 from skytether.shell.processes import recorder_process
 from skytether.shell.processes.log import Log, LogFormat
+from skytether.shell.processes.preloading import preload
 
 # for type checking only: slow to import, and not needed in flight
 if TYPE_CHECKING:
