@@ -105,6 +105,11 @@ class Draws:
         self._pair, self._which, self._names = packets.pair, which, names
         self._by_number = by_number
 
+    @property
+    def flow(self) -> str | int:
+        """Number of the packets' flow, from 0; 0 where what lasts is common to all flows."""
+        return self._names[2]
+
     @cached_property
     def _events(self) -> Stream:
         return Stream(*self._names)

@@ -6,6 +6,7 @@ from msgspec import Meta
 
 from skytether.netem.impairments.draws import SLOT_S, Draws, Fate
 from skytether.netem.impairments.impairment import Impairment, Share, Time, impairment
+from skytether.shared.base.units import seconds_to_ns
 
 
 @impairment(name="gilbert_elliott")
@@ -62,3 +63,23 @@ class Outages(Impairment):
     def __call__(self, fate: Fate, draws: Draws) -> None:
         if draws.lasting(fate, self._cell_s) < self.loss:
             fate.lost = True
+
+
+@impairment(name="delivered")
+class Delivered(Impairment):
+    """Delivers what those before it lose or delay: flow, at_s, for_s, delay_s of each stretch."""
+
+    def __init__(self, *stretches: Annotated[float, Meta(ge=0, le=86400)]) -> None:
+        each = list(zip(*(iter(stretches),) * 4, strict=False))
+        if not each or len(stretches) % 4:
+            raise ValueError("four numbers a stretch: flow, at_s, for_s, delay_s at most")
+        self._stretches = [
+            (flow, round(at_s / SLOT_S), round((at_s + for_s) / SLOT_S), seconds_to_ns(most_s))
+            for flow, at_s, for_s, most_s in each
+        ]
+
+    def __call__(self, fate: Fate, draws: Draws) -> None:
+        for flow, first, end, most_ns in self._stretches:
+            if first <= fate.slot < end and flow == draws.flow:
+                fate.lost, fate.flipped = False, None
+                fate.delay_ns = min(fate.delay_ns, most_ns)

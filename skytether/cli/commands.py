@@ -38,6 +38,10 @@ COMMANDS_IN_GROUPS = {
         ),
     },
     "After a flight": {
+        "explain SCENARIO|FILE": (
+            "why a flight in virtual time braked or was far off",
+            "skytether.explain.command:explain_flight",
+        ),
         "replay FILE": (
             "a recording on the page that showed the flight",
             "skytether.cli.replay:replay",

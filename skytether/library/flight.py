@@ -37,6 +37,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+    from skytether.explain.explanation import Explanation
+
 PARTS = ("client", "server", "netem", "plan")
 """Parts of a record: rows of the vehicle's and the server's steps, of packets, and of plans."""
 UNITS = MappingProxyType({"m": "m", "mps": "m/s", "s": "s", "ns": "ns", "bytes": "B"})
@@ -128,6 +130,28 @@ class Flight:
     def failure(self) -> Failure | None:
         """Event after which the vehicle could not fly; None after a flight to the end."""
         return self.record.failure
+
+    @extras.named()
+    def explain(self, at: float | None = None, *, seeds: int = 0) -> "Explanation":
+        """Why the flight braked, or was far off: its moments, a cause, rescues and remedies.
+
+        The flight, in virtual time, is flown again up to a hundred times: see docs/explain.md.
+
+        Args:
+            at: time in the flight of the moment to explain, as that of events [s]; by default the
+                gravest is explained.
+            seeds: number of flights of each remedy with other seeds.
+
+        Raises:
+            ConfigError: the flight does not come about again, or there is no moment at that time.
+        """
+        from skytether.explain.cases import Case
+        from skytether.explain.explanation import explained
+        from skytether.explain.flying import trace
+
+        client = self.record.client
+        case = Case(self.scenario, len(np.unique(client["vehicle"])) or 1, self.secure)
+        return explained(case, self.name, at_s=at, seeds=seeds, trace=trace(client))
 
     @extras.named()
     def plot(self, ax: "Axes | None" = None) -> "Figure":

@@ -1,0 +1,139 @@
+"""Cases: flights that can be flown again, and what can be taken out of them.
+
+The network is changed by its own impairment `delivered`, and wind by keys: what is flown is a
+scenario that anybody can fly.
+"""
+
+from collections import defaultdict
+from dataclasses import dataclass, replace
+from typing import Any, Literal, TypeAlias
+
+import msgspec
+
+from skytether.netem.fate import Fates
+from skytether.netem.impairments.draws import SLOT_S
+from skytether.shared.scenario import reading
+from skytether.shared.scenario.dotted import set_keys
+from skytether.shared.scenario.whole import Scenario
+from skytether.shared.telemetry.record import UPLINK
+
+Lane: TypeAlias = tuple[int, int, int]
+"""Path, direction (UPLINK or DOWNLINK) and flow of packets, each from 0."""
+Keys: TypeAlias = tuple[tuple[str, Any], ...]
+"""Keys of a scenario and their values."""
+
+
+@dataclass(frozen=True, slots=True)
+class Stretch:
+    """Slots of a lane, in milliseconds from its flow's first packet."""
+
+    lane: Lane
+    first: int
+    end: int
+    """Slot after the last."""
+
+
+@dataclass(frozen=True, slots=True)
+class Bad(Stretch):
+    """Stretch in which the network loses, or delays beyond use, whatever enters it."""
+
+    is_late: bool = False
+    is_packet: bool = False
+    """Whether it is the fate of a single packet."""
+
+
+@dataclass(frozen=True, slots=True)
+class UsualDelay:
+    """The delay that every packet of a direction has."""
+
+    direction: int
+
+
+@dataclass(frozen=True, slots=True)
+class Setting:
+    """Property of the world, such as wind, that other values of some keys take away."""
+
+    name: str
+    keys: Keys
+
+
+@dataclass(frozen=True, slots=True)
+class Stall:
+    """Time for which a process stands still: it gets no packets and is not woken."""
+
+    process: Literal["server", "client"]
+    at_s: float
+    """Time in the flight at which it begins [s]."""
+    for_s: float
+
+
+Unit: TypeAlias = Bad | UsualDelay | Setting | Stall
+"""What can be taken out of a flight."""
+
+
+@dataclass(frozen=True, slots=True)
+class Delivered:
+    """Stretch in which every packet arrives, `most_s` after it was sent at the latest [s]."""
+
+    where: Stretch
+    most_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class Case:
+    """Flight to be flown: a scenario, and what differs from it."""
+
+    scenario: Scenario
+    vehicles: int = 1
+    secure: bool = False
+    stalls: tuple[Stall, ...] = ()
+    keys: Keys = ()
+    delivered: tuple[Delivered, ...] = ()
+    until_s: float | None = None
+    """Time in the flight after which the rest is not needed [s]; None: all of it is."""
+
+    def fates(self, lane: Lane) -> Fates:
+        """What the packets of a lane meet."""
+        path, direction, flow = lane
+        own, name = self.scenario.on_path(path), _name(direction)
+        return Fates(getattr(own, name), own.seed, name, flow)
+
+    def flown(self) -> Scenario:
+        """Scenario with what differs from it; raises ConfigError if it cannot be flown."""
+        scenario = self.scenario
+        if self.keys:
+            table = reading.to_table(scenario)
+            set_keys(dict(self.keys), table)
+            scenario = reading.check(table, checked=scenario)
+        texts = defaultdict[tuple[int, int], list[str]](list)
+        for each in self.delivered:
+            (path, direction, flow), slots = each.where.lane, each.where.end - each.where.first
+            times = f"{each.where.first * SLOT_S:.3f}, {slots * SLOT_S:.3f}, {each.most_s:.6f}"
+            texts[path, direction].append(f"{flow}, {times}")
+        for (path, direction), stretches in texts.items():
+            added = f"delivered({', '.join(stretches)})"
+            scenario = _impaired(scenario, path, _name(direction), added)
+        return scenario
+
+
+def _impaired(scenario: Scenario, path: int, name: str, added: str) -> Scenario:
+    """Scenario with one more impairment in a direction of a path."""
+    network = scenario.network
+    if network.paths:
+        paths = list(network.paths)
+        text = f"{getattr(paths[path], name)} & {added}"
+        paths[path] = msgspec.structs.replace(paths[path], **{name: text})
+        network = msgspec.structs.replace(network, paths=tuple(paths))
+    else:
+        text = getattr(network, name).strip() or "none"
+        network = msgspec.structs.replace(network, **{name: f"{text} & {added}"})
+    return msgspec.structs.replace(scenario, network=network)
+
+
+def _name(direction: int) -> str:
+    return "uplink" if direction == UPLINK else "downlink"
+
+
+def over_perfect_network(case: Case) -> Case:
+    """Case in which every packet arrives at once."""
+    return replace(case, scenario=case.scenario.impaired(lambda _: "none"))

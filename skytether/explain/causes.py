@@ -1,0 +1,256 @@
+"""Cause of a moment: the smallest set of units that suffices, and what each of them does.
+
+It is searched in ever wider worlds: first among what happened shortly before the moment, then from
+the flight's beginning on, then with the usual delay as a unit as well. The first world in which the
+moment does not come about without any unit has the cause; if there is none, it is the scenario.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from skytether.explain import units
+from skytether.explain.cases import Bad, Case, Lane, Setting, Stall, Unit, UsualDelay
+from skytether.explain.flying import FlyAll, Outcome
+from skytether.explain.moments import AFTER_S, Moment, comes_about, error_m
+from skytether.explain.smallest import smallest
+from skytether.explain.units import World
+
+BEFORE_S = 8.0
+"""Time before a moment in which its cause is searched first [s]: longer than two time-outs, a
+horizon and the delays."""
+SHORTEST_MS = 20
+"""Accuracy to which the shortest outage that suffices is found [ms]."""
+PACKETS_MAX = 64
+"""Largest number of packets each of which is delivered alone, the newest before the moment."""
+
+
+@dataclass(frozen=True, slots=True)
+class Part:
+    """Unit of a cause, and what it does."""
+
+    unit: Unit
+    start_s: float
+    """Time in the flight at which it begins [s]; 0 for what is always there."""
+    end_s: float
+    is_needed: bool
+    """Whether the moment does not come about without it."""
+    error_m: float
+    """Largest error without it [m]."""
+    packets: int = 0
+    """Number of packets that it lost or delayed."""
+    plans: int = 0
+    """Number of plans among them."""
+    shortest_s: tuple[float, float] | None = None
+    """Shortest outage that suffices, beginning or ending when this one does [s], smaller first."""
+
+
+@dataclass(frozen=True, slots=True)
+class Cause:
+    """Smallest set of units that suffices for a moment."""
+
+    parts: tuple[Part, ...]
+    """Empty if it comes about without all of them: then it is the scenario itself."""
+    since_s: float
+    """Time in the flight from which on units were looked for [s]."""
+    among: int
+    """Number of units that were looked at."""
+    error_m: float
+    """Largest error with this cause alone [m]."""
+    others: tuple[Part, ...] = ()
+    """Losses and late packets that were looked at and are not of the cause."""
+    innocent: tuple[tuple[str, float], ...] = ()
+    """What else happened, by group, and by how much the error would differ without [m]."""
+
+
+@dataclass(frozen=True, slots=True)
+class Packet:
+    """Packet that the network lost or delayed."""
+
+    time_s: float
+    """Time in the flight at which it was sent [s]."""
+    path: int
+    direction: int
+    is_plan: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Rescues:
+    """Packets of a cause that alone would have averted the moment, had they arrived in time."""
+
+    packets: tuple[Packet, ...]
+    tried: int
+
+
+def cause(
+    case: Case, moment: Moment, flown: Outcome, fly_all: FlyAll, at_once: int
+) -> tuple[Cause, World]:
+    """Cause of a moment, without what its parts do, and the world in which it was found."""
+    case = replace(case, until_s=moment.end_s + AFTER_S + 1.0)
+
+    def suffice(cases: Sequence[Case]) -> list[bool]:
+        return [comes_about(moment, each) for each in fly_all(cases)]
+
+    for since_s, with_delay in ((moment.start_s - BEFORE_S, False), (0.0, False), (0.0, True)):
+        until_s = moment.end_s + AFTER_S
+        here = units.world(case, flown, since_s, until_s, with_delay=with_delay)
+        bare, whole = suffice([here.only(()), here.only(here.units)])
+        # Where even all units do not suffice, packets that were lost by chance were sent at
+        # other times. A wider window has them.
+        if whole and not bare:
+            break
+    else:
+        (alone,) = fly_all([here.only(())])
+        return Cause((), 0.0, len(here.units), error_m(moment, alone)), here
+    found = smallest(here.units, lambda sets: suffice([here.only(each) for each in sets]), at_once)
+    (alone,) = fly_all([here.only(found)])
+    parts = tuple(_part(each, flown) for each in found)
+    others = tuple(
+        _part(each, flown) for each in here.units if isinstance(each, Bad) and each not in found
+    )
+    off_m = error_m(moment, alone)
+    return Cause(parts, max(0.0, since_s), len(here.units), off_m, others), here
+
+
+def _part(unit: Unit, flown: Outcome) -> Part:
+    if isinstance(unit, Stall):
+        return Part(unit, unit.at_s, unit.at_s + unit.for_s, False, np.nan)
+    if not isinstance(unit, Bad):
+        return Part(unit, 0.0, 0.0, False, np.nan)
+    began_s, which = flown.began_s[unit.lane], _met(unit, flown)
+    plans = int(flown.packets.is_plan[which].sum())
+    times = began_s + unit.first * 1e-3, began_s + unit.end * 1e-3
+    return Part(unit, *times, False, np.nan, len(which), plans)
+
+
+def _met(unit: Bad, flown: Outcome) -> list[int]:
+    """Numbers of the packets that met a unit."""
+    packets = flown.packets
+    within = np.flatnonzero((packets.slot >= unit.first) & (packets.slot < unit.end))
+    return [number for number in within.tolist() if packets.lane[number] == unit.lane]
+
+
+def needed(
+    found: Cause, here: World, moment: Moment, fly_all: FlyAll
+) -> tuple[Cause, list[Outcome]]:
+    """Cause with what the flight would have been without each of its parts, and without what else
+    happened; and the flight without each part.
+    """
+    parts, others = found.parts, _groups(found, here)
+    cases = [here.without(part.unit) for part in parts]
+    cases += [here.without(*group) for group in others.values()]
+    as_flown, *outcomes = fly_all([here.case, *cases])
+    errors = [error_m(moment, each) for each in outcomes]
+    checked = tuple(
+        replace(part, is_needed=not comes_about(moment, each), error_m=error)
+        for part, each, error in zip(parts, outcomes, errors, strict=False)
+    )
+    differ = [error - error_m(moment, as_flown) for error in errors[len(parts) :]]
+    innocent = tuple(zip(others, differ, strict=True))
+    return replace(found, parts=checked, innocent=innocent), outcomes[: len(parts)]
+
+
+def _groups(found: Cause, here: World) -> dict[str, list[Unit]]:
+    """Units that are not of the cause, by what they are."""
+    groups: dict[str, list[Unit]] = {}
+    for unit in here.units:
+        if unit not in [part.unit for part in found.parts]:
+            groups.setdefault(_group(unit), []).append(unit)
+    return groups
+
+
+def _group(unit: Unit) -> str:
+    match unit:
+        case Bad():
+            return "late packets" if unit.is_late else f"other losses of the {WAYS[unit.lane[1]]}"
+        case _:
+            return named(unit)
+
+
+WAYS = ("uplink", "downlink")
+WHAT = {
+    (False, False): "outage",
+    (False, True): "lost packet",
+    (True, False): "time of late packets",
+    (True, True): "late packet",
+}
+"""Nouns for bad stretches, by whether they are late and of a single packet."""
+
+
+def named(unit: Unit) -> str:
+    """Noun for a unit, without article."""
+    match unit:
+        case Setting():
+            return unit.name
+        case UsualDelay():
+            return f"usual delay of the {WAYS[unit.direction]}"
+        case Stall():
+            return f"stall of the {unit.process}"
+        case Bad():
+            return f"{WHAT[unit.is_late, unit.is_packet]} of {lane_name(unit.lane)}"
+
+
+def lane_name(lane: Lane) -> str:
+    path, direction, flow = lane
+    return f"{WAYS[direction]} {path + 1}" + (f" of vehicle {flow + 1}" if flow else "")
+
+
+def rescues(found: Cause, here: World, moment: Moment, flown: Outcome, fly_all: FlyAll) -> Rescues:
+    """Packets of the cause that alone avert the moment, among those sent before it."""
+    met = {
+        number: part.unit
+        for part in found.parts
+        if isinstance(part.unit, Bad)
+        for number in _met(part.unit, flown)
+        if flown.packets.time_s[number] < moment.start_s
+    }
+    numbers = sorted(met, key=lambda number: flown.packets.time_s[number])[-PACKETS_MAX:]
+    cases = []
+    for number in numbers:
+        lane, slot = flown.packets.lane[number], int(flown.packets.slot[number])
+        cases.append(here.without(Bad(lane, slot, slot + 1)))
+    averting = tuple(
+        Packet(
+            float(flown.packets.time_s[number]),
+            *flown.packets.lane[number][:2],
+            bool(flown.packets.is_plan[number]),
+        )
+        for number, each in zip(numbers, fly_all(cases), strict=True)
+        if not comes_about(moment, each)
+    )
+    return Rescues(averting, len(numbers))
+
+
+def lengths(found: Cause, here: World, moment: Moment, fly_all: FlyAll) -> Cause:
+    """Cause with the shortest length of each outage that is needed, by bisection from either end.
+
+    It is the length at which the moment begins to come about, if it comes about for all longer
+    ones.
+    """
+    tasks = [
+        (number, from_end, part.unit)
+        for number, part in enumerate(found.parts)
+        for from_end in (False, True)
+        if isinstance(part.unit, Bad) and part.is_needed and not part.unit.is_packet
+    ]
+    low = [0] * len(tasks)
+    high = [unit.end - unit.first for _, _, unit in tasks]
+    while open_ := [i for i in range(len(tasks)) if high[i] - low[i] > SHORTEST_MS]:
+        middle = {i: (low[i] + high[i]) // 2 for i in open_}
+        cases = []
+        for i in open_:
+            _, from_end, unit = tasks[i]
+            healed = (
+                replace(unit, end=unit.end - middle[i])
+                if from_end
+                else replace(unit, first=unit.first + middle[i])
+            )
+            cases.append(here.without(healed))
+        for i, each in zip(open_, fly_all(cases), strict=True):
+            (high if comes_about(moment, each) else low)[i] = middle[i]
+    parts = list(found.parts)
+    for number in {number for number, _, _ in tasks}:
+        least, most = sorted(high[i] for i, task in enumerate(tasks) if task[0] == number)
+        parts[number] = replace(parts[number], shortest_s=(least * 1e-3, most * 1e-3))
+    return replace(found, parts=tuple(parts))

@@ -1,0 +1,135 @@
+"""`skytether explain`: why a flight in virtual time went as it did."""
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+
+from skytether.cli import recordings
+from skytether.explain import picture
+from skytether.explain.cases import Case
+from skytether.explain.explanation import STEPS, Explanation, check_same, explain
+from skytether.explain.flying import Outcome, fly, trace
+from skytether.figures import flights as figures
+from skytether.lab.commands.pool import Flags, Interrupted, PoolFlags, crew
+from skytether.shared.scenario.whole import Scenario
+from skytether.shared.telemetry.record import RECORDING
+from skytether.shell.commandline import command
+from skytether.shell.commandline.argument import Argument
+from skytether.shell.commandline.command import CommandError, ScenarioFlags, ScenarioName
+from skytether.shell.commandline.options import read
+from skytether.shell.host import system
+
+
+@dataclass(frozen=True)
+class ExplainOptions:
+    """Options of `skytether explain`."""
+
+    scenario: ScenarioName = "demo"
+    """A scenario's name (`skytether list scenarios`), a .toml file, or a recording (.mcap) of a
+    flight in virtual time."""
+    at: Annotated[float | None, Argument(metavar="T")] = None
+    """Time in the flight of what is to be explained [s]; by default the gravest moment is."""
+    seeds: Annotated[int, Argument(metavar="N")] = 0
+    """Number of flights of each remedy with other seeds, which count up from the scenario's."""
+    vehicles: Annotated[int, Argument(metavar="N")] = 1
+    """Number of vehicles, as in `skytether fleet`; not with a recording, which has its own."""
+    json: Path | None = None
+    """File for the explanation."""
+    figure: Path | None = None
+    """File for a picture of it (.png, .pdf or .svg)."""
+    pool: PoolFlags = Flags()
+    config: ScenarioFlags = Scenario()
+
+
+def explain_flight(argv: Sequence[str]) -> None:
+    """Fly a scenario in virtual time, and say why something went wrong.
+
+    The same flight is flown again without its outages, its lost and late packets, its wind and
+    noise, until the smallest set is found that suffices. Then: whether each of it is needed,
+    whether a single packet would have averted it, how long an outage must be, and what other keys
+    would do, over the same network and, with --seeds, over that of other seeds.
+
+    It explains this flight, of the simulated vehicle. Ctrl-C leaves what is known by then.
+    """
+    if argv and argv[0].endswith(RECORDING):
+        options = read(ExplainOptions(), argv, "skytether explain", explain_flight.__doc__)
+        for option in command.OUTPUTS:
+            command.claim_output(f"--{option}", getattr(options, option, None))
+        name, case, recorded = _recorded(Path(options.scenario))
+    else:
+        options = command.parse(ExplainOptions(), argv, "skytether explain", explain_flight.__doc__)
+        command.check_count("--vehicles", options.vehicles, 255)
+        name, case, recorded = options.scenario, Case(options.config, options.vehicles), ""
+    if options.seeds:
+        command.check_count("--seeds", options.seeds, 10_000)
+    options.pool.check()
+    if options.figure is not None:
+        figures.check(options.figure)
+    _explain(options, name, case, recorded)
+
+
+def _recorded(path: Path) -> tuple[str, Case, str]:
+    """Name, case and hash of a recorded flight.
+
+    Raises:
+        CommandError: the flight cannot be flown again.
+    """
+    recorded = recordings.opened(path)
+    if recorded.about.began:
+        expected = "expected one in virtual time, which can be flown again"
+        raise CommandError(f"{path}: got a flight over UDP, {expected}", command.CONFIGURATION)
+    client = recorded.parts.get("client")
+    if client is None:
+        raise CommandError(f"{path}: no step was flown", command.CONFIGURATION)
+    case = Case(
+        recorded.scenario,
+        vehicles=len(np.unique(client["vehicle"])),
+        secure=recorded.about.secure,
+    )
+    return recorded.about.scenario, case, trace(client)
+
+
+def _explain(options: ExplainOptions, name: str, case: Case, recorded: str) -> None:
+    """Explain a flight and show what is known, also if that is not all.
+
+    Raises:
+        CommandError: interrupted, or a file cannot be written.
+    """
+    began_s, flights, known, interrupted = time.process_time(), 0, None, None
+    at_once = options.pool.workers or system.cores()
+    with crew(options.pool, f"explaining {name}", STEPS + bool(options.seeds), "steps") as flyers:
+
+        def fly_all(cases: Sequence[Case]) -> list[Outcome]:
+            nonlocal flights
+            outcomes = flyers.map(fly, cases)
+            flights += len(cases)
+            flyers.advance(0, f"{flights} flights: {step}")
+            return outcomes
+
+        step = "what went wrong"
+        steps = explain(case, name, fly_all, at_s=options.at, seeds=options.seeds, at_once=at_once)
+        try:
+            for step, known in steps:
+                check_same(known.flown, recorded or known.flown.trace, options.scenario)
+                flyers.advance(1, step)
+        except Interrupted as error:
+            interrupted = error
+        cpu_s = time.process_time() - began_s + flyers.cpu_s
+    if known is not None:
+        _show(options, known)
+        print(f"{flights} flights, {cpu_s:.0f} s of CPU")
+    if interrupted is not None:
+        message = f"interrupted at: {step}; what is above was known by then"
+        raise CommandError(message, command.INTERRUPTED) from interrupted
+
+
+def _show(options: ExplainOptions, known: Explanation) -> None:
+    if options.json is not None:
+        command.write(options.json, known.to_json())
+    if options.figure is not None and known.moment is not None:
+        figures.save(picture.drawn(known), options.figure, dpi=100)
+    print(known)

@@ -1,0 +1,203 @@
+"""`fly`: a case is flown in virtual time, and becomes an outcome. Nothing else here flies.
+
+A case and its outcome can be sent to another process and back.
+"""
+
+import hashlib
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import TypeAlias
+
+import numpy as np
+
+from skytether.explain.cases import Case, Lane, Stall
+from skytether.netem.impairments.draws import SLOT_NS
+from skytether.shared.base.units import SECOND_NS, seconds_to_ns
+from skytether.shared.events.flight import FlowOpened, Flying
+from skytether.shared.law.model import Array, Flags, Indices
+from skytether.shared.scenario.whole import Scenario
+from skytether.shared.telemetry.record import DOWNLINK, UPLINK, Record, Rows
+from skytether.shared.telemetry.summary import position_error, separations
+from skytether.shared.wire.protocol import Mode
+from skytether.sim import flight
+from skytether.sim.world import World
+
+WORSE = (Mode.BRAKE, Mode.LAND, Mode.RETURN, Mode.FAULT)
+"""Modes in which a vehicle no longer follows its plan because something went wrong."""
+STOPPED = (*WORSE, Mode.HOVER, Mode.INIT, Mode.SYNC, Mode.READY)
+"""Modes in which a brake may go on: at rest, waiting for a session and for a plan."""
+
+
+@dataclass(frozen=True, slots=True)
+class Track:
+    """Steps of a vehicle, from its first plan on; all arrays have a row for each step."""
+
+    vehicle: int
+    began_s: float
+    """Time in the flight of step 0 [s]."""
+    step_s: Array
+    """Time since step 0 [s]."""
+    error_m: Array
+    """Distance from the reference [m]; on a mission, where the goal is none, 0."""
+    mode: Indices
+    reason: Indices
+
+    @property
+    def time_s(self) -> Array:
+        """Time in the flight, as that of events [s]."""
+        return self.began_s + self.step_s
+
+
+@dataclass(frozen=True, slots=True)
+class Packets:
+    """Packets that entered the network; all arrays have a row for each packet."""
+
+    time_s: Array
+    """Time in the flight at which the packet entered [s]."""
+    lane: list[Lane]
+    slot: Indices
+    """Slot in which it entered, in milliseconds from the flow's first packet."""
+    delay_s: Array
+    lost: Flags
+    is_plan: Flags
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What came of a case."""
+
+    tracks: tuple[Track, ...]
+    packets: Packets
+    began_s: dict[Lane, float]
+    """Time in the flight of the first packet of each lane [s]."""
+    separation_s: Array
+    separation_m: Array
+    """Smallest distance between two vehicles of a mission at those times [m]."""
+    failure: str
+    """Why a vehicle could not fly; empty if all did."""
+    packets_per_s: float
+    trace: str
+    """Hash of the vehicles' rows, see `trace`."""
+
+
+FlyAll: TypeAlias = Callable[[Sequence[Case]], list[Outcome]]
+"""Outcomes of cases, in their order; raises `Interrupted` when asked to end."""
+
+
+def fly(case: Case) -> Outcome:
+    """Fly a case; raises ConfigError if it cannot be flown."""
+    scenario = case.flown()
+    reached_s = 0
+
+    def on_second(flown_s: int) -> None:
+        nonlocal reached_s
+        reached_s = flown_s
+
+    until_s = case.until_s
+    record = flight.fly(
+        scenario,
+        vehicles=case.vehicles,
+        secure=case.secure,
+        actions=[action for stall in case.stalls for action in _actions(stall, case)],
+        on_second=on_second,
+        stopped=None if until_s is None else lambda: reached_s >= until_s,
+    )
+    return outcome(scenario, record)
+
+
+def _actions(stall: Stall, case: Case) -> Iterable[tuple[float, Callable[[World], None]]]:
+    seed, vehicles = case.scenario.seed, range(1, case.vehicles + 1)
+    clients = [f"client {seed}.{vehicle}" for vehicle in vehicles]
+    for host in ["server"] if stall.process == "server" else clients:
+        yield stall.at_s, partial(World.freeze, name=host)
+        yield stall.at_s + stall.for_s, partial(World.thaw, name=host)
+
+
+def outcome(scenario: Scenario, record: Record) -> Outcome:
+    """Outcome of a recorded flight in virtual time."""
+    began_ns = _lanes_began_ns(record)
+    flying_ns = {
+        each.event.vehicle: each.time_ns for each in record.events if isinstance(each.event, Flying)
+    }
+    tracks, flown, began_s = [], [], []
+    for vehicle in np.unique(record.client["vehicle"]).tolist():
+        rows = record.client[record.client["vehicle"] == vehicle]
+        began = flying_ns[vehicle] / SECOND_NS
+        if (rows["mode"] == Mode.TRACK).any():
+            flown.append(rows)
+            began_s.append(began)
+            tracks.append(_track(scenario, rows, record.server, vehicle, began))
+    dt_s, scale = scenario.control.dt, scenario.mission.height_scale if scenario.keeps_apart else 1
+    times_s, nearest_m = separations(flown, began_s, dt_s, scale)
+    return Outcome(
+        tuple(tracks),
+        _packets(scenario, record, began_ns, flying_ns),
+        {lane: ns / SECOND_NS for lane, ns in began_ns.items()},
+        times_s,
+        nearest_m if scenario.keeps_apart else np.full(len(times_s), np.nan),
+        str(record.failure or ""),
+        len(record.netem) / max(1.0, float(np.ptp(record.netem["arrived_ns"])) / SECOND_NS),
+        trace(record.client),
+    )
+
+
+def trace(client: Rows) -> str:
+    """Hash of the vehicles' rows, equal if they flew alike to the last bit."""
+    return hashlib.sha256(client.tobytes()).hexdigest()
+
+
+def _track(scenario: Scenario, rows: Rows, server: Rows, vehicle: int, began_s: float) -> Track:
+    flown = rows[np.argmax(rows["mode"] == Mode.TRACK) :]
+    if scenario.keeps_apart:  # its reference is its next goal, from which it is far by right
+        error_m = np.zeros(len(flown))
+    else:
+        error_m = np.linalg.norm(position_error(scenario, flown, server), axis=1)
+    step_s = flown["step"] * scenario.control.dt
+    modes, reasons = flown["mode"].astype(np.int64), flown["reason"].astype(np.int64)
+    return Track(vehicle, began_s, step_s, error_m, modes, reasons)
+
+
+def _lanes_began_ns(record: Record) -> dict[Lane, int]:
+    """Time of the first packet of each flow, for both directions [ns]."""
+    began: dict[Lane, int] = {}
+    for time_ns, host, event in record.events:
+        if isinstance(event, FlowOpened):
+            path = int(host.partition("/")[2] or 1) - 1
+            for direction in (UPLINK, DOWNLINK):
+                began[path, direction, event.flow] = time_ns
+    return began
+
+
+def _packets(
+    scenario: Scenario,
+    record: Record,
+    began_ns: Mapping[Lane, int],
+    flying_ns: Mapping[int, int],
+) -> Packets:
+    """Packets by time. The server plans for the step that begins next."""
+    rows = record.netem[np.argsort(record.netem["arrived_ns"], kind="stable")]
+    names = rows["path"].tolist(), rows["direction"].tolist(), rows["flow"].tolist()
+    lanes: list[Lane] = list(zip(*names, strict=True))
+    since_ns = rows["arrived_ns"] - np.array([began_ns[lane] for lane in lanes], dtype=np.int64)
+    sent = record.server[record.server["event"]]
+    plans = set(zip(sent["vehicle"].tolist(), sent["step"].tolist(), strict=True))
+    compute_ns, vehicle_of = seconds_to_ns(scenario.simulation.compute_s), sorted(flying_ns)
+    is_plan = [
+        direction == UPLINK
+        and flow < len(vehicle_of)
+        and (
+            vehicle_of[flow],
+            (at_ns - compute_ns - flying_ns[vehicle_of[flow]]) // scenario.dt_ns + 1,
+        )
+        in plans
+        for (_, direction, flow), at_ns in zip(lanes, rows["arrived_ns"].tolist(), strict=True)
+    ]
+    return Packets(
+        rows["arrived_ns"] / SECOND_NS,
+        lanes,
+        since_ns // SLOT_NS,
+        rows["delay_ns"] / SECOND_NS,
+        rows["lost"].copy(),
+        np.array(is_plan, dtype=bool),
+    )

@@ -1,0 +1,242 @@
+"""Moments: what went wrong in a flight, found beside the same flight over a perfect network.
+
+    failure      a vehicle could not fly, or not to the end
+    brake        a vehicle brakes, lands or stands still, until it follows a plan again
+    error        its distance from the reference is far above that over a perfect network
+    separation   two vehicles of a mission came as close as they may, or closer
+    packets      the server sends far more packets in a second than over a perfect network
+
+The comparison is with a flight in the same wind after the same reference, not with the flight's own
+median: a flight that is always bad would hide itself.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from skytether.explain.flying import STOPPED, WORSE, Outcome, Track
+from skytether.shared.law.model import Array, Flags
+from skytether.shared.scenario.whole import Scenario
+from skytether.shared.telemetry.record import Reason
+from skytether.shared.wire.protocol import Mode
+
+FAR_TIMES = 3.0
+"""An error is far above the usual one from this multiple of it on, ..."""
+FAR_STEPS = 2.0
+"""... and by this many steps at full speed: less is repaired within a step or two."""
+AROUND_S = 1.0
+"""Time before and after, in which the perfect flight's largest error is the usual one [s]."""
+AFTER_S = 5.0
+"""Time after a moment within which the error that it left behind has its largest value [s]."""
+PAUSE_S = 1.0
+"""Time before and after a large error for which it counts as going on [s]."""
+NEAR = 1.05
+"""Distances below this multiple of the separation are near it."""
+WASTED_TIMES, WASTED_PER_S = 3.0, 10.0
+"""Packets are wasted above this multiple of the perfect flight's rate, and by this much [1/s]."""
+
+WARM_S = 5.0
+"""Time in the flight before which many plans are no waste: a vehicle that has just begun to fly."""
+
+Kind = Literal["failure", "brake", "error", "separation", "packets"]
+
+
+@dataclass(frozen=True, slots=True)
+class Moment:
+    """Stretch of a flight in which something went wrong."""
+
+    kind: Kind
+    vehicle: int
+    """Vehicle, from 1; 0 for all of them together."""
+    start_s: float
+    """Time in the flight at which it begins, as that of events [s]."""
+    end_s: float
+    says: str
+    """What happened, as a sentence without its subject."""
+    figure: float
+    """Largest error meanwhile [m]; separation: smallest distance [m]; packets: rate [1/s]."""
+    usual: float
+    """The same figure over a perfect network."""
+    level: float
+    """What `measured` reaches if the moment comes about."""
+
+
+def moments(flown: Outcome, perfect: Outcome, scenario: Scenario) -> list[Moment]:
+    """Moments of a flight in order of time, but for an error that a brake left behind."""
+    usual = {track.vehicle: track for track in perfect.tracks}
+    found = [
+        moment
+        for track in flown.tracks
+        for moment in _of_vehicle(track, usual.get(track.vehicle), scenario)
+    ]
+    found += [*_too_near(flown, perfect, scenario), *_wasted(flown, perfect)]
+    if flown.failure:
+        found.append(Moment("failure", 0, 0.0, scenario.duration, flown.failure, 0.0, 0.0, 1.0))
+    return sorted(found, key=lambda each: (each.start_s, each.vehicle))
+
+
+def worst(found: Sequence[Moment]) -> Moment:
+    """Moment to explain if none is named: the gravest kind, then the furthest from usual."""
+
+    def weight(each: Moment) -> tuple[int, float]:
+        return WEIGHTS[each.kind], abs(each.figure - each.usual)
+
+    return max(found, key=weight)
+
+
+WEIGHTS: Mapping[Kind, int] = {"failure": 3, "separation": 2, "brake": 2, "error": 1, "packets": 0}
+
+
+def measured(moment: Moment, outcome: Outcome) -> float:
+    """How much of a moment there is in another flight; from `moment.level` on it comes about."""
+    match moment.kind:
+        case "failure":
+            return float(bool(outcome.failure))
+        case "brake":
+            track = _track(outcome, moment.vehicle)
+            if track is None:  # it never flew
+                return 1.0
+            near = _within(track.time_s, moment.start_s - AROUND_S, moment.end_s + AROUND_S)
+            return float(np.isin(track.mode[near], WORSE).sum())
+        case "error":
+            return error_m(moment, outcome)
+        case "separation":
+            near = _within(outcome.separation_s, moment.start_s - AROUND_S, moment.end_s + AROUND_S)
+            return -_least(outcome.separation_m[near])
+        case "packets":
+            return _rate(outcome, moment.start_s - AROUND_S, moment.end_s + AROUND_S)
+
+
+def comes_about(moment: Moment, outcome: Outcome) -> bool:
+    return measured(moment, outcome) >= moment.level
+
+
+def error_m(moment: Moment, outcome: Outcome) -> float:
+    """Largest error of the moment's vehicle, meanwhile and shortly after [m]; with vehicle 0, of
+    any of them.
+    """
+    errors = [
+        track.error_m[_within(track.time_s, moment.start_s - AROUND_S, moment.end_s + AFTER_S)]
+        for track in outcome.tracks
+        if moment.vehicle in (track.vehicle, 0)
+    ]
+    return float(max((error.max(initial=0.0) for error in errors), default=np.nan))
+
+
+def _of_vehicle(track: Track, usual: Track | None, scenario: Scenario) -> Iterator[Moment]:
+    time_s, error = track.time_s, track.error_m
+    normal = np.zeros(len(error)) if usual is None else _usual_m(track, usual)
+    braked = _runs(np.isin(track.mode, WORSE), np.isin(track.mode, STOPPED))
+    step_mps = scenario.control.dt * float(np.max(scenario.u_max * scenario.true_gain))
+    bound = FAR_TIMES * normal + FAR_STEPS * step_mps
+    is_far = (error > bound) & (track.step_s >= scenario.settled_s)
+    for first, end in braked:
+        until = np.searchsorted(time_s, time_s[end - 1] + AFTER_S)
+        says = f"{DOES[Mode(track.mode[first])]} ({Reason(track.reason[first])})"
+        at = first, end, says, error[first:until], normal[first:until]
+        yield _moment("brake", track, *at, level=1.0)
+        is_far[first:until] = False
+    gap = np.ones(2 * round(PAUSE_S / scenario.control.dt) + 1)
+    goes_on = np.convolve(error > bound / 2.0, gap, "same") > 0.5
+    for first, end in _runs(is_far, goes_on):
+        own, usual_m = error[first:end], normal[first:end]
+        level = float(usual_m.max() + 0.5 * (own.max() - usual_m.max()))
+        yield _moment("error", track, first, end, "was far off", own, usual_m, level=level)
+
+
+def _moment(
+    kind: Kind,
+    track: Track,
+    first: int,
+    end: int,
+    says: str,
+    own: Array,
+    usual: Array,
+    *,
+    level: float,
+) -> Moment:
+    start_s, end_s = track.time_s[[first, end - 1]].tolist()
+    figures = float(own.max()), float(usual.max())
+    return Moment(kind, track.vehicle, start_s, end_s, says, *figures, level)
+
+
+def _usual_m(track: Track, usual: Track) -> Array:
+    """Largest error of the perfect flight around each step of a track [m]."""
+    first, end = (
+        np.searchsorted(usual.step_s, track.step_s + around) for around in (-AROUND_S, AROUND_S)
+    )
+    return np.array([usual.error_m[a:b].max(initial=0.0) for a, b in zip(first, end, strict=True)])
+
+
+def _too_near(flown: Outcome, perfect: Outcome, scenario: Scenario) -> Iterator[Moment]:
+    if not np.isfinite(flown.separation_m).any():
+        return
+    bound_m = scenario.mission.separation_m
+    near = flown.separation_m < NEAR * bound_m
+    for first, end in _runs(near, near):
+        start_s, end_s = flown.separation_s[[first, end - 1]].tolist()
+        least_m, usual_m = _least(flown.separation_m[first:end]), _least(perfect.separation_m)
+        says = f"came within {least_m:.3f} m, where {bound_m:g} m are required"
+        level = -(least_m + 0.5 * max(0.0, usual_m - least_m))
+        yield Moment("separation", 0, start_s, end_s, says, least_m, usual_m, level)
+
+
+def _wasted(flown: Outcome, perfect: Outcome) -> Iterator[Moment]:
+    usual = _rate(perfect, WARM_S, np.inf)
+    sent = _sent_s(flown)
+    each = np.array([_rate(flown, at_s, at_s + 1.0) for at_s in sent])
+    many = (each > WASTED_TIMES * usual) & (each > usual + WASTED_PER_S) & (sent > WARM_S)
+    for first, end in _runs(many, many):
+        start_s, end_s, most = (
+            float(sent[first]),
+            float(sent[end - 1]) + 1.0,
+            float(each[first:end].max()),
+        )
+        says = f"the server sent {most:.0f} plans in a second"
+        yield Moment("packets", 0, start_s, end_s, says, most, usual, 0.5 * (most + usual))
+
+
+def _sent_s(outcome: Outcome) -> Array:
+    """Times at which the server sent a plan [s]; once for all paths."""
+    return np.unique(outcome.packets.time_s[outcome.packets.is_plan])
+
+
+def _rate(outcome: Outcome, start_s: float, end_s: float) -> float:
+    """Largest number of plans in a second that begins between two times [1/s]."""
+    sent = _sent_s(outcome)
+    begun = sent[(sent >= start_s) & (sent < end_s)]
+    return float((np.searchsorted(sent, begun + 1.0) - np.searchsorted(sent, begun)).max(initial=0))
+
+
+def _runs(begin: Flags, goes_on: Flags) -> list[tuple[int, int]]:
+    """First index and end of each stretch that begins with one flag, and lasts with the other."""
+    runs, at = [], 0
+    while at < len(begin) and begin[at:].any():
+        first = at + int(np.argmax(begin[at:]))
+        rest = ~(goes_on | begin)[first:]
+        at = first + int(np.argmax(rest)) if rest.any() else len(begin)
+        runs.append((first, at))
+    return runs
+
+
+def _within(times_s: Array, start_s: float, end_s: float) -> Flags:
+    within: Flags = (times_s >= start_s) & (times_s <= end_s)
+    return within
+
+
+def _least(distances_m: Array) -> float:
+    return float(np.nanmin(distances_m)) if np.isfinite(distances_m).any() else np.inf
+
+
+def _track(outcome: Outcome, vehicle: int) -> Track | None:
+    return next((track for track in outcome.tracks if track.vehicle == vehicle), None)
+
+
+DOES = {
+    Mode.BRAKE: "braked",
+    Mode.LAND: "landed",
+    Mode.RETURN: "returned home",
+    Mode.FAULT: "stood still with a fault",
+}

@@ -1,0 +1,167 @@
+"""Remedies: the same flight with other keys, over the same fates, and flights of other seeds.
+
+The list follows from the cause: keys that say what is sent, how often, over which paths, how long
+the vehicle waits and how far a plan reaches, if the network is part of it; keys of the estimate,
+the filter and the model, if those are. Each costs packets, and an averted brake may be a larger
+error: both are shown.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import msgspec
+import numpy as np
+
+from skytether.explain.cases import Bad, Case, Keys, Setting, Stall, Unit, UsualDelay
+from skytether.explain.causes import Cause
+from skytether.explain.flying import WORSE, FlyAll, Outcome
+from skytether.explain.moments import Moment, comes_about, error_m
+from skytether.shared.base.errors import ConfigError
+from skytether.shared.scenario.whole import Scenario
+from skytether.shared.telemetry.record import DOWNLINK, UPLINK
+from skytether.shared.wire.protocol import INPUTS_MAX
+
+AS_FLOWN = "as flown"
+
+
+@dataclass(frozen=True, slots=True)
+class Elsewhere:
+    """Means over the flights of other seeds."""
+
+    flights: int
+    brakes: float
+    """Brakes, landings and faults in a flight."""
+    error_m: float
+    """Largest error of a flight, once it has settled [m]."""
+    packets_per_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class Remedy:
+    """Other keys, and what comes of the flight with them."""
+
+    name: str
+    keys: Keys
+    averts: bool
+    """Whether the moment does not come about."""
+    brakes: int
+    """Number of brakes, landings and faults in the whole flight."""
+    error_m: float
+    """Largest error during the moment and shortly after [m]."""
+    packets_per_s: float
+    """Packets of both directions [1/s]."""
+    elsewhere: Elsewhere | None = None
+
+
+def remedies(
+    found: Cause, case: Case, moment: Moment, fly_all: FlyAll
+) -> tuple[list[Remedy], list[Outcome]]:
+    """The flight with each remedy; the first is the flight as it was."""
+    tried = [(AS_FLOWN, Keys()), *possible(found, case)]
+    outcomes = fly_all([replace(case, keys=keys, until_s=None) for _, keys in tried])
+    flown = [
+        Remedy(
+            name,
+            keys,
+            not comes_about(moment, each),
+            brakes(each),
+            error_m(moment, each),
+            each.packets_per_s,
+        )
+        for (name, keys), each in zip(tried, outcomes, strict=True)
+    ]
+    return flown, outcomes
+
+
+def with_others(each: Remedy, case: Case, seeds: Sequence[int], fly_all: FlyAll) -> Remedy:
+    """Remedy with what comes of the flights of other seeds."""
+    scenario = case.scenario
+    cases = [
+        replace(case, keys=each.keys, scenario=msgspec.structs.replace(scenario, seed=seed))
+        for seed in seeds
+    ]
+    outcomes = fly_all(cases)
+    means = (
+        float(np.mean([figure(outcome) for outcome in outcomes]))
+        for figure in (brakes, lambda one: _largest_m(one, scenario), lambda one: one.packets_per_s)
+    )
+    return replace(each, elsewhere=Elsewhere(len(outcomes), *means))
+
+
+def brakes(outcome: Outcome) -> int:
+    """Number of times that a vehicle began to brake, to land or to stand still."""
+    worse = [np.isin(track.mode, WORSE) for track in outcome.tracks]
+    return sum(int((each[1:] & ~each[:-1]).sum()) for each in worse)
+
+
+def _largest_m(outcome: Outcome, scenario: Scenario) -> float:
+    errors = [each.error_m[each.step_s >= scenario.settled_s] for each in outcome.tracks]
+    return float(max((each.max(initial=0.0) for each in errors), default=np.nan))
+
+
+def possible(found: Cause, case: Case) -> Iterator[tuple[str, Keys]]:
+    """Names and keys of remedies that the scenario can be flown with."""
+    for name, keys in _listed([part.unit for part in found.parts], case.scenario):
+        try:
+            changed = replace(case, keys=keys).flown()
+        except ConfigError:
+            continue
+        if changed != case.scenario:
+            yield name, keys
+
+
+def _listed(units: Sequence[Unit], scenario: Scenario) -> Iterator[tuple[str, Keys]]:
+    ways = {each.lane[1] for each in units if isinstance(each, Bad)}
+    ways |= {each.direction for each in units if isinstance(each, UsualDelay)}
+    names = [each.name for each in units if isinstance(each, Setting)]
+    control, link, paths = scenario.control, scenario.link, scenario.network.paths
+    if ways:
+        yield _key("link.timeout_s", 2.0 * link.timeout_s)
+        yield _key("link.heartbeat_s", round(link.timeout_s / 5.0, 3))
+        yield _key("control.horizon", min(INPUTS_MAX, control.horizon * 3 // 2))
+        yield from (_key("link.spread", spread) for spread in ("best", "all") if len(paths) > 1)
+    if UPLINK in ways:
+        yield "every step sent", (("control.trigger", "always"),)
+    if DOWNLINK in ways:
+        yield "every step reported", (("vehicle.report", "always"),)
+    if ways and control.scheme == "trajectory":
+        trigger, report = "cost_gap(1.0) | silence(1)", "deviation(0.05) & periodic(4) | silence(1)"
+        yield (
+            "plans of inputs",
+            (
+                ("control.scheme", "committed"),
+                ("control.trigger", trigger),
+                ("vehicle.report", report),
+            ),
+        )
+    if ways and control.scheme != "trajectory":
+        trigger = "expected_gap(0.1) | heartbeat"
+        keys = ("control.scheme", "trajectory"), ("control.trigger", trigger)
+        yield "trajectories", (*keys, ("control.feedback", True))
+    if ways and len(paths) < 2:
+        network = scenario.paths[0]
+        path = {"uplink": network.uplink, "downlink": network.downlink}
+        yield "a second link like the first", (("network.paths", [path, path]),)
+    if "wind" in names or any("model" in name for name in names):
+        yield _key("control.observer_s", 1.0)
+        yield _key("control.feedback", value=True)
+    if any("sensors" in name for name in names):
+        yield _key("sensor.filter", "kalman")
+    if any("model" in name for name in names):
+        yield "the model identified", _identified(scenario)
+    if any(isinstance(each, Stall) for each in units):
+        yield _key("link.timeout_s", 2.0 * link.timeout_s)
+
+
+def _key(key: str, value: object) -> tuple[str, Keys]:
+    return f"{key} = {value}", ((key, value),)
+
+
+def _identified(scenario: Scenario) -> Keys:
+    """The model as the vehicle is."""
+    true = {
+        "tau_s": scenario.true_tau_s,
+        "gain": scenario.true_gain,
+        "dead_time_s": scenario.true_dead_time_s,
+    }
+    return tuple((f"model.{name}", each.tolist()) for name, each in true.items())

@@ -1,0 +1,204 @@
+"""Units of a cause: what can be taken out of a flight, and the flight without or with some of them.
+
+The network is a function of time: a lane's fates are asked every millisecond, so that an outage is
+there whether or not a packet was sent in it. Losses and delays that last for less than OUTAGE_MS
+are units for each packet that met them.
+"""
+
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from skytether.explain.cases import (
+    Bad,
+    Case,
+    Delivered,
+    Keys,
+    Lane,
+    Setting,
+    Stretch,
+    Unit,
+    UsualDelay,
+)
+from skytether.explain.flying import Outcome
+from skytether.shared.scenario.whole import Scenario
+
+OUTAGE_MS = 50
+"""Shortest stretch without a good slot that is an outage [ms]: by chance, independent losses of
+0.6 last that long once in 10¹¹ slots."""
+STRIDE_MS = OUTAGE_MS // 2
+"""Distance of the slots in which outages are searched [ms]."""
+SPREAD = 3.0
+"""A packet is late beyond the median delay by this multiple of the distance to the upper quartile.
+"""
+
+SETTINGS: Sequence[tuple[str, Keys]] = (
+    (
+        "wind",
+        (
+            ("vehicle.wind", 0.0),
+            ("vehicle.steady_wind_mps", ()),
+            ("vehicle.turbulence_mps", 0.0),
+            ("vehicle.gust_mps2", 0.0),
+        ),
+    ),
+    (
+        "errors of the sensors",
+        (
+            ("sensor.position_noise_m", 0.0),
+            ("sensor.velocity_noise_mps", 0.0),
+            ("sensor.position_bias_m", ()),
+            ("sensor.velocity_bias_mps", ()),
+            ("sensor.delay_s", 0.0),
+            ("reference.noise_m", 0.0),
+        ),
+    ),
+    (
+        "a vehicle that differs from its model",
+        (("vehicle.tau_s", ()), ("vehicle.gain", ()), ("vehicle.dead_time_s", ())),
+    ),
+    ("the server's computing time", (("simulation.compute_s", 0.001),)),
+)
+"""Properties of the world, and the values of keys that take them away."""
+
+
+@dataclass(frozen=True, slots=True)
+class World:
+    """A flight as it was, and what of it may be taken out."""
+
+    case: Case
+    units: tuple[Unit, ...]
+    """Units in an order in which those that belong together stand together."""
+    window: tuple[Stretch, ...]
+    """Stretch of each lane that belongs to the world: what lies outside stays as it was."""
+    usual_s: dict[tuple[int, int], float]
+    """Longest usual delay of a path and direction [s]."""
+
+    def without(self, *taken: Unit) -> Case:
+        """The flight as it was, without these units."""
+        delivered = [
+            Delivered(each, self._most_s(each.lane, taken))
+            for each in taken
+            if isinstance(each, Bad)
+        ]
+        directions = {each.direction for each in taken if isinstance(each, UsualDelay)}
+        left = [each for each in self.units if isinstance(each, Bad) and each not in taken]
+        delivered += [
+            Delivered(each, 0.0)
+            for stretch in self.window
+            if stretch.lane[1] in directions
+            for each in _between(stretch, left)
+        ]
+        return self._with(delivered, taken)
+
+    def only(self, kept: Collection[Unit]) -> Case:
+        """The flight with these units alone: every other packet in the window is delivered."""
+        taken = [each for each in self.units if each not in kept]
+        bad = [each for each in kept if isinstance(each, Bad)]
+        delivered = [
+            Delivered(each, self._most_s(each.lane, taken))
+            for stretch in self.window
+            for each in _between(stretch, bad)
+        ]
+        return self._with(delivered, taken)
+
+    def _most_s(self, lane: Lane, taken: Collection[Unit]) -> float:
+        return 0.0 if UsualDelay(lane[1]) in taken else self.usual_s[lane[:2]]
+
+    def _with(self, delivered: Sequence[Delivered], taken: Collection[Unit]) -> Case:
+        keys = [key for each in taken if isinstance(each, Setting) for key in each.keys]
+        stalls = tuple(each for each in self.case.stalls if each not in taken)
+        return replace(self.case, delivered=tuple(delivered), keys=tuple(keys), stalls=stalls)
+
+
+def _between(stretch: Stretch, bad: Collection[Bad]) -> Iterator[Stretch]:
+    """Parts of a stretch outside bad ones."""
+    first = stretch.first
+    for each in sorted(bad, key=lambda each: each.first):
+        if each.lane == stretch.lane and each.end > first and each.first < stretch.end:
+            if each.first > first:
+                yield Stretch(stretch.lane, first, each.first)
+            first = each.end
+    if first < stretch.end:
+        yield Stretch(stretch.lane, first, stretch.end)
+
+
+def world(
+    case: Case, flown: Outcome, start_s: float, end_s: float, *, with_delay: bool = False
+) -> World:
+    """World of a flight between two times in it [s].
+
+    Args:
+        with_delay: whether the usual delay of each direction is a unit as well.
+    """
+    usual_s: dict[tuple[int, int], float] = {}
+    window, bad = [], list[Unit]()
+    for lane, began_s in sorted(flown.began_s.items(), key=lambda item: _order(item[0])):
+        first, end = (max(0, round((at_s - began_s) * 1e3)) for at_s in (start_s, end_s))
+        stretch = Stretch(lane, first, end)
+        usual_s.setdefault(lane[:2], _usual_s(flown, lane))
+        window.append(stretch)
+        bad += _bad(case, flown, stretch, usual_s[lane[:2]])
+    settings = [Setting(*each) for each in SETTINGS if _is_there(case.scenario, each[1])]
+    delays = [UsualDelay(direction) for direction in (1, 0)] if with_delay else []
+    return World(case, (*settings, *delays, *case.stalls, *bad), tuple(window), usual_s)
+
+
+def _order(lane: Lane) -> tuple[int, int, int]:
+    """Downlinks first, which matter less, then the uplinks side by side."""
+    path, direction, flow = lane
+    return -direction, flow, path
+
+
+def _usual_s(flown: Outcome, lane: Lane) -> float:
+    """Longest delay of a packet that is not late [s]."""
+    packets = flown.packets
+    same = np.array([each[:2] == lane[:2] for each in packets.lane], dtype=bool)
+    delays_s = packets.delay_s[same & ~packets.lost]
+    if not len(delays_s):
+        return 0.0
+    half, upper = np.quantile(delays_s, (0.5, 0.75))
+    return float(half + SPREAD * (upper - half))
+
+
+def _is_there(scenario: Scenario, keys: Keys) -> bool:
+    """Whether a scenario has another value of one of the keys."""
+    for key, value in keys:
+        section, _, name = key.partition(".")
+        own = getattr(getattr(scenario, section), name)
+        if own != value and (isinstance(value, tuple) or own > value):
+            return True
+    return False
+
+
+def _bad(case: Case, flown: Outcome, within: Stretch, usual_s: float) -> Iterator[Bad]:
+    """Outages within a stretch, and the fates of single packets outside them, in order of time."""
+    fates, usual_ns = case.fates(within.lane), round(usual_s * 1e9)
+
+    def is_bad(slot: int) -> bool:
+        fate = fates.at(slot)
+        return fate.lost or fate.flipped is not None or fate.delay_ns > usual_ns
+
+    found: list[Bad] = []
+    at = within.first
+    while at < within.end:
+        if is_bad(at):
+            first = end = at
+            while first > 0 and is_bad(first - 1):
+                first -= 1
+            while is_bad(end) and end < within.end:
+                end += 1
+            if end - first >= OUTAGE_MS:
+                is_late = not any(fates.at(slot).lost for slot in range(first, end, STRIDE_MS))
+                found.append(Bad(within.lane, first, end, is_late))
+            at = end
+        at += STRIDE_MS
+    packets = flown.packets
+    for number in np.flatnonzero(packets.lost | (packets.delay_s > usual_s)).tolist():
+        slot = int(packets.slot[number])
+        is_here = packets.lane[number] == within.lane and within.first <= slot < within.end
+        if is_here and not any(each.first <= slot < each.end for each in found):
+            is_late = not bool(packets.lost[number])
+            found.append(Bad(within.lane, slot, slot + 1, is_late, is_packet=True))
+    yield from sorted(found, key=lambda each: each.first)
