@@ -5,7 +5,7 @@ scenario that anybody can fly.
 """
 
 from collections import defaultdict
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Literal, TypeAlias
 
 import msgspec
@@ -132,8 +132,3 @@ def _impaired(scenario: Scenario, path: int, name: str, added: str) -> Scenario:
 
 def _name(direction: int) -> str:
     return "uplink" if direction == UPLINK else "downlink"
-
-
-def over_perfect_network(case: Case) -> Case:
-    """Case in which every packet arrives at once."""
-    return replace(case, scenario=case.scenario.impaired(lambda _: "none"))

@@ -5,8 +5,8 @@ from dataclasses import dataclass, replace
 
 import msgspec
 
-from skytether.explain import causes, remedies, words
-from skytether.explain.cases import Case, over_perfect_network
+from skytether.explain import causes, remedies, units, words
+from skytether.explain.cases import Case
 from skytether.explain.causes import Cause, Rescues
 from skytether.explain.flying import FlyAll, Outcome, fly
 from skytether.explain.moments import WEIGHTS, Moment, moments, worst
@@ -70,7 +70,7 @@ def explain(
     Raises:
         ConfigError: there is no moment at that time.
     """
-    flown, perfect = fly_all([case, over_perfect_network(case)])
+    flown, perfect = fly_all([case, units.perfect(case)])
     found = tuple(moments(flown, perfect, case.scenario))
     moment = _chosen(found, at_s)
     known = Explanation(name, case.scenario.seed, found, moment, flown)

@@ -175,29 +175,41 @@ def _packets(
     began_ns: Mapping[Lane, int],
     flying_ns: Mapping[int, int],
 ) -> Packets:
-    """Packets by time. The server plans for the step that begins next."""
+    """Packets by time."""
     rows = record.netem[np.argsort(record.netem["arrived_ns"], kind="stable")]
     names = rows["path"].tolist(), rows["direction"].tolist(), rows["flow"].tolist()
     lanes: list[Lane] = list(zip(*names, strict=True))
     since_ns = rows["arrived_ns"] - np.array([began_ns[lane] for lane in lanes], dtype=np.int64)
-    sent = record.server[record.server["event"]]
-    plans = set(zip(sent["vehicle"].tolist(), sent["step"].tolist(), strict=True))
-    compute_ns, vehicle_of = seconds_to_ns(scenario.simulation.compute_s), sorted(flying_ns)
-    is_plan = [
-        direction == UPLINK
-        and flow < len(vehicle_of)
-        and (
-            vehicle_of[flow],
-            (at_ns - compute_ns - flying_ns[vehicle_of[flow]]) // scenario.dt_ns + 1,
-        )
-        in plans
-        for (_, direction, flow), at_ns in zip(lanes, rows["arrived_ns"].tolist(), strict=True)
-    ]
     return Packets(
         rows["arrived_ns"] / SECOND_NS,
         lanes,
         since_ns // SLOT_NS,
         rows["delay_ns"] / SECOND_NS,
         rows["lost"].copy(),
-        np.array(is_plan, dtype=bool),
+        _are_plans(scenario, record.server, rows, flying_ns),
     )
+
+
+def _are_plans(
+    scenario: Scenario, server: Rows, packets: Rows, flying_ns: Mapping[int, int]
+) -> Flags:
+    """Which packets have a plan: those that leave at a tick at which the server sends one.
+
+    The tick's step begins before the tick or after it, by the server's estimate of the vehicle's
+    clock: the number of steps between them is that with which most plans have left.
+    """
+    sent = server[server["event"]]
+    plans = set(zip(sent["vehicle"].tolist(), sent["step"].tolist(), strict=True))
+    vehicles = np.array([*sorted(flying_ns), 0])
+    vehicle = vehicles[np.minimum(packets["flow"], len(flying_ns))]
+    began_ns = np.array([flying_ns.get(each, 0) for each in vehicle.tolist()], dtype=np.int64)
+    compute_ns = seconds_to_ns(scenario.simulation.compute_s)
+    step = (packets["arrived_ns"] - compute_ns - began_ns) // scenario.dt_ns
+    is_up = packets["direction"] == UPLINK
+    matches = [
+        np.array([each in plans for each in zip(vehicle.tolist(), at.tolist(), strict=True)], bool)
+        & is_up
+        for at in (step, step + 1, step + 2)
+    ]
+    most: Flags = max(matches, key=np.count_nonzero)
+    return most

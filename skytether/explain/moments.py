@@ -1,13 +1,14 @@
-"""Moments: what went wrong in a flight, found beside the same flight over a perfect network.
+"""Moments: what went wrong in a flight, found beside a perfect one.
 
     failure      a vehicle could not fly, or not to the end
     brake        a vehicle brakes, lands or stands still, until it follows a plan again
-    error        its distance from the reference is far above that over a perfect network
+    error        its distance from the reference is far above that of the perfect flight
     separation   two vehicles of a mission came as close as they may, or closer
-    packets      the server sends far more packets in a second than over a perfect network
+    packets      the server sends far more packets in a second than in the perfect flight
 
-The comparison is with a flight in the same wind after the same reference, not with the flight's own
-median: a flight that is always bad would hide itself.
+The perfect flight has the same reference and wind, every packet arrives at once, and nothing else
+is wrong (`units.perfect`). A comparison with the flight's own median would hide a flight that is
+always bad.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -58,7 +59,7 @@ class Moment:
     figure: float
     """Largest error meanwhile [m]; separation: smallest distance [m]; packets: rate [1/s]."""
     usual: float
-    """The same figure over a perfect network."""
+    """The same figure of the perfect flight."""
     level: float
     """What `measured` reaches if the moment comes about."""
 

@@ -33,16 +33,17 @@ SPREAD = 3.0
 """A packet is late beyond the median delay by this multiple of the distance to the upper quartile.
 """
 
+WIND = "wind"
 SETTINGS: Sequence[tuple[str, Keys]] = (
     (
-        "wind",
+        WIND,
         (
             ("vehicle.wind", 0.0),
             ("vehicle.steady_wind_mps", ()),
             ("vehicle.turbulence_mps", 0.0),
-            ("vehicle.gust_mps2", 0.0),
         ),
     ),
+    ("gusts", (("vehicle.gust_mps2", 0.0),)),
     (
         "errors of the sensors",
         (
@@ -61,6 +62,19 @@ SETTINGS: Sequence[tuple[str, Keys]] = (
     ("the server's computing time", (("simulation.compute_s", 0.001),)),
 )
 """Properties of the world, and the values of keys that take them away."""
+
+
+def perfect(case: Case) -> Case:
+    """Case in which every packet arrives at once and nothing else is wrong; the wind is the same,
+    but for gusts.
+    """
+    settings = (keys for name, keys in SETTINGS if name != WIND and _is_there(case.scenario, keys))
+    return replace(
+        case,
+        scenario=case.scenario.impaired(lambda _: "none"),
+        keys=tuple(key for keys in settings for key in keys),
+        stalls=(),
+    )
 
 
 @dataclass(frozen=True, slots=True)

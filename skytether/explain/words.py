@@ -1,5 +1,6 @@
 """The explanation as text."""
 
+import math
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import groupby
@@ -8,6 +9,7 @@ from skytether.explain.cases import Bad
 from skytether.explain.causes import WHAT, Cause, Part, Rescues, lane_name, named
 from skytether.explain.moments import Moment
 from skytether.explain.remedies import Remedy
+from skytether.shared.telemetry.record import UPLINK
 
 RESCUES_SHOWN = 8
 """Largest number of packets whose times are listed."""
@@ -22,7 +24,7 @@ def text(
 ) -> str:
     """What is known of a moment, one of those found, in plain text; see `Explanation`."""
     if moment is None:
-        return "Nothing went wrong, beside a flight in the same wind over a perfect network."
+        return "Nothing went wrong, compared with a flight in the same wind over a perfect network."
     lines = [f"{_when(moment)}: {_subject(moment)}{moment.says}{_figures(moment)}."]
     if others := [each for each in found if each != moment]:
         listed = ", ".join(f"{each.start_s:.1f} s {each.says}" for each in others)
@@ -32,7 +34,10 @@ def text(
         if rescues is not None and rescues.tried:
             lines.append(_rescued(rescues))
         if cause.innocent:
-            lines.append(f"Not the cause: {', '.join(map(_innocent, cause.innocent))}.")
+            others = (f"{name}{_off(change_m, '+')}" for name, change_m in cause.innocent)
+            lines.append(
+                f"Not the cause, with the change of the error without: {', '.join(others)}."
+            )
     if remedies:
         lines += ["", *_remedies(remedies)]
     return "\n".join(lines)
@@ -50,8 +55,7 @@ def _subject(moment: Moment) -> str:
 
 def _figures(moment: Moment) -> str:
     if moment.kind in ("brake", "error"):
-        over = f"over a perfect network {moment.usual:.2f} m"
-        return f", {moment.figure:.2f} m from its reference at most ({over})"
+        return f", {moment.figure:.2f} m from its reference at most, else {moment.usual:.2f} m"
     return ""
 
 
@@ -60,22 +64,23 @@ def _cause(cause: Cause, moment: Moment) -> Iterator[str]:
     if not cause.parts:
         yield (
             f"Why: it is the scenario itself. With all of {_units(cause.among)} {since} taken away "
-            f"it comes about all the same ({cause.error_m:.2f} m)."
+            f"it comes about all the same{_off(cause.error_m)}."
         )
         return
     yield f"Why: {_joined(_counted(cause.parts))}{', together' * (len(cause.parts) > 1)}."
     rows = [_row(list(parts), moment) for _, parts in groupby(cause.parts, _kind)]
-    widths = [max(len(row[column]) for row in rows) for column in range(2)]
-    for first, second, rest in rows:
-        yield f"  {first:{widths[0]}}  {second:{widths[1]}}  {rest}".rstrip()
+    shown = [column for column in zip(*rows, strict=True) if any(column)]
+    widths = [max(map(len, column)) for column in shown]
+    for row in zip(*shown, strict=True):
+        yield "  ".join(["", *map(str.ljust, row, widths)]).rstrip()
     this = "This suffices" if len(cause.parts) == 1 else "These suffice"
     others = cause.among - len(cause.parts)
     yield (
-        f"{this}: without {_units(others, 'other')} {since}, it comes about all the same "
-        f"({cause.error_m:.2f} m)."
+        f"{this}: without {_units(others, 'other')} {since}, it comes about all the same"
+        f"{_off(cause.error_m)}."
     )
     idle = [part for part in cause.parts if not part.is_needed]
-    if idle and any(part.error_m == part.error_m for part in cause.parts):
+    if idle and len(idle) < len(cause.parts):
         yield f"Not needed by itself: {_joined(_counted(idle))}; something else would do instead."
 
 
@@ -110,43 +115,35 @@ def _kind(part: Part) -> object:
     return (unit.lane, unit.is_late) if isinstance(unit, Bad) and unit.is_packet else part
 
 
-def _row(parts: Sequence[Part], moment: Moment) -> tuple[str, str, str]:
+def _row(parts: Sequence[Part], moment: Moment) -> list[str]:
+    """Cells of a row: where, when, what was lost, how much is enough, and the flight without it."""
     first, last = parts[0], parts[-1]
-    unit = first.unit
+    unit, plans = first.unit, sum(part.plans for part in parts)
+    when = f"{first.start_s:.1f} to {first.end_s:.1f} s" if first.end_s else ""
     if not isinstance(unit, Bad):
-        when = f"{first.start_s:.1f} to {first.end_s:.1f} s" if first.end_s else ""
-        return named(unit), when, _without(parts, moment)
-    what = "late" if unit.is_late else "out"
+        return [named(unit), when, "", "", _without(parts, moment)]
+    verb, packets = "late" if unit.is_late else "lost", first.packets
     if unit.is_packet:
-        packets, plans = len(parts), sum(part.plans for part in parts)
-        when = (
-            f"{first.start_s:.2f} to {last.start_s:.2f} s"
-            if packets > 1
-            else f"{first.start_s:.2f} s"
-        )
-        what = ""
-    else:
-        packets, plans = first.packets, first.plans
-        when = f"{what} {first.start_s:.1f} to {first.end_s:.1f} s"
-    met = f"{packets} packet{'s' * (packets != 1)} {'late' if unit.is_late else 'lost'}"
-    if unit.lane[1] == 0:
-        met += f", {plans} of them plans"
-    long = ""
-    if first.shortest_s and len(parts) == 1:
-        least, most = first.shortest_s
-        long = f"; {least:.2f} to {most:.2f} s of it are enough"
-    return lane_name(unit.lane), when, f"{met}{long}; {_without(parts, moment)}"
+        packets = len(parts)
+        when = f"{first.start_s:.2f} s" + f" to {last.start_s:.2f} s" * (packets > 1)
+    met = f"{packets} packet{'s' * (packets != 1)} {verb}"
+    if unit.lane[1] == UPLINK:
+        met += f", {plans} of them plans" if packets > 1 else ", a plan" * plans
+    enough = ""
+    if first.shortest_s:
+        least, most = (f"{each:.2f}" for each in first.shortest_s)
+        enough = f"{least if least == most else f'{least} to {most}'} s of it are enough"
+    return [lane_name(unit.lane), when, met, enough, _without(parts, moment)]
 
 
 def _without(parts: Sequence[Part], moment: Moment) -> str:
-    needed = [part for part in parts if part.is_needed]
-    if parts[0].error_m != parts[0].error_m:  # not flown yet
+    needed = sum(part.is_needed for part in parts)
+    if math.isnan(parts[0].error_m) and not needed:  # not flown yet
         return ""
     if len(parts) > 1:
-        return f"{len(needed)} of {len(parts)} needed by itself"
-    how = "not" if parts[0].is_needed else "all the same"
-    off = f", {parts[0].error_m:.2f} m" if moment.kind in ("brake", "error") else ""
-    return f"without: {how}{off}"
+        return f"{needed} of {len(parts)} needed by itself"
+    off = _off(parts[0].error_m) if moment.kind in ("brake", "error") else ""
+    return f"without: {'does not' if needed else 'all the same'}{off}"
 
 
 def _rescued(rescues: Rescues) -> str:
@@ -161,9 +158,9 @@ def _rescued(rescues: Rescues) -> str:
     return f"A single packet would have averted it, {count} of {tried}: {', '.join(times)}{more}."
 
 
-def _innocent(group: tuple[str, float]) -> str:
-    name, change_m = group
-    return f"{name} ({change_m:+.2f} m without)"
+def _off(error_m: float, sign: str = "") -> str:
+    """Error in brackets; empty if there is none, because no step was flown."""
+    return "" if math.isnan(error_m) else f" ({error_m:{sign}.2f} m)"
 
 
 def _remedies(tried: Sequence[Remedy]) -> Iterator[str]:
@@ -173,7 +170,12 @@ def _remedies(tried: Sequence[Remedy]) -> Iterator[str]:
         heading += [f"{others.flights} other seeds: error", "brakes", "packets/s"]
     rows = [heading]
     for each in tried:
-        row = [each.name, f"{each.error_m:.2f} m", str(each.brakes), f"{each.packets_per_s:.1f}"]
+        row = [
+            each.name,
+            _off(each.error_m).strip(" ()"),
+            str(each.brakes),
+            f"{each.packets_per_s:.1f}",
+        ]
         if (over := each.elsewhere) is not None:
             row += [f"{over.error_m:.2f} m", f"{over.brakes:.2f}", f"{over.packets_per_s:.1f}"]
         rows.append(row + [""] * (len(heading) - len(row)))
