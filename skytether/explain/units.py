@@ -8,6 +8,7 @@ are units for each packet that met them.
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 
+import msgspec
 import numpy as np
 
 from skytether.explain.cases import (
@@ -68,10 +69,13 @@ def perfect(case: Case) -> Case:
     """Case in which every packet arrives at once and nothing else is wrong; the wind is the same,
     but for gusts.
     """
+    network, none = case.scenario.network, {"uplink": "none", "downlink": "none"}
+    paths = tuple(msgspec.structs.replace(each, **none) for each in network.paths)
+    network = msgspec.structs.replace(network, **none, paths=paths)
     settings = (keys for name, keys in SETTINGS if name != WIND and _is_there(case.scenario, keys))
     return replace(
         case,
-        scenario=case.scenario.impaired(lambda _: "none"),
+        scenario=msgspec.structs.replace(case.scenario, network=network),
         keys=tuple(key for keys in settings for key in keys),
         stalls=(),
     )

@@ -225,7 +225,7 @@ def test_whoever_interrupts_keeps_what_is_known_by_then() -> None:
 
     def keep_all() -> None:
         for _, known in explain(flight("demo-two-links", 9314), "demo", fly_some):
-            told.append(known)  # noqa: PERF402 - the last one, whatever is raised
+            told.append(known)
 
     with pytest.raises(KeyboardInterrupt):
         keep_all()
