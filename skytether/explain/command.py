@@ -59,6 +59,9 @@ def explain_flight(argv: Sequence[str]) -> None:
         options = read(ExplainOptions(), argv, "skytether explain", explain_flight.__doc__)
         for option in command.OUTPUTS:
             command.claim_output(f"--{option}", getattr(options, option, None))
+        if options.vehicles != ExplainOptions.vehicles:
+            message = f"--vehicles: got {options.vehicles} with a recording, which has its own"
+            raise CommandError(message, command.CONFIGURATION)
         name, case, recorded = _recorded(Path(options.scenario))
     else:
         options = command.parse(ExplainOptions(), argv, "skytether explain", explain_flight.__doc__)

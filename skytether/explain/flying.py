@@ -14,7 +14,7 @@ import numpy as np
 from skytether.explain.cases import Case, Lane, Stall
 from skytether.netem.impairments.draws import SLOT_NS
 from skytether.shared.base.units import SECOND_NS, seconds_to_ns
-from skytether.shared.events.flight import FlowOpened, Flying
+from skytether.shared.events.flight import Failure, FlowOpened, Flying
 from skytether.shared.law.model import Array, Flags, Indices
 from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import DOWNLINK, UPLINK, Record, Rows
@@ -76,6 +76,8 @@ class Outcome:
     """Smallest distance between two vehicles of a mission at those times [m]."""
     failure: str
     """Why a vehicle could not fly; empty if all did."""
+    failed_s: float
+    """Time in the flight at which that was certain [s]; 0 if all flew."""
     packets_per_s: float
     trace: str
     """Hash of the vehicles' rows, see `trace`."""
@@ -137,6 +139,10 @@ def outcome(scenario: Scenario, record: Record) -> Outcome:
         times_s,
         nearest_m if scenario.keeps_apart else np.full(len(times_s), np.nan),
         str(record.failure or ""),
+        next(
+            (each.time_ns / SECOND_NS for each in record.events if isinstance(each.event, Failure)),
+            0.0,
+        ),
         len(record.netem) / max(1.0, float(np.ptp(record.netem["arrived_ns"])) / SECOND_NS),
         trace(record.client),
     )

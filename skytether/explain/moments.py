@@ -74,7 +74,8 @@ def moments(flown: Outcome, perfect: Outcome, scenario: Scenario) -> list[Moment
     ]
     found += [*_too_near(flown, perfect, scenario), *_wasted(flown, perfect)]
     if flown.failure:
-        found.append(Moment("failure", 0, 0.0, scenario.duration, flown.failure, 0.0, 0.0, 1.0))
+        at_s = flown.failed_s
+        found.append(Moment("failure", 0, at_s, at_s, flown.failure, 0.0, 0.0, 1.0))
     return sorted(found, key=lambda each: (each.start_s, each.vehicle))
 
 

@@ -34,10 +34,8 @@ def text(
         if rescues is not None and rescues.tried:
             lines.append(_rescued(rescues))
         if cause.innocent:
-            others = (f"{name}{_off(change_m, '+')}" for name, change_m in cause.innocent)
-            lines.append(
-                f"Not the cause, with the change of the error without: {', '.join(others)}."
-            )
+            changes = (f"{name}{_off(change_m, '+')}" for name, change_m in cause.innocent)
+            lines.append(f"Not the cause (change of the error without it): {', '.join(changes)}.")
     if remedies:
         lines += ["", *_remedies(remedies)]
     return "\n".join(lines)
