@@ -73,8 +73,9 @@ def moments(flown: Outcome, perfect: Outcome, scenario: Scenario) -> list[Moment
         for moment in _of_vehicle(track, usual.get(track.vehicle), scenario)
     ]
     found += [*_too_near(flown, perfect, scenario), *_wasted(flown, perfect)]
-    if flown.failure:
-        at_s = flown.failed_s
+    at_s = flown.failed_s
+    # A flight that ends while the vehicle brakes is explained by the brake.
+    if flown.failure and not any(each.end_s >= at_s - AROUND_S for each in found):
         found.append(Moment("failure", 0, at_s, at_s, flown.failure, 0.0, 0.0, 1.0))
     return sorted(found, key=lambda each: (each.start_s, each.vehicle))
 
