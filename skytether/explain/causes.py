@@ -5,7 +5,7 @@ the flight's beginning on, then with the usual delay as a unit as well. The firs
 moment does not come about without any unit has the cause; if there is none, it is the scenario.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,7 +13,7 @@ import numpy as np
 from skytether.explain import units
 from skytether.explain.cases import Bad, Case, Lane, Setting, Stall, Unit, UsualDelay
 from skytether.explain.flying import FlyAll, Outcome
-from skytether.explain.moments import AFTER_S, Moment, comes_about, error_m
+from skytether.explain.moments import AFTER_S, Moment, comes_about, error_m, is_averted
 from skytether.explain.smallest import smallest
 from skytether.explain.units import World
 
@@ -22,6 +22,8 @@ BEFORE_S = 8.0
 horizon and the delays."""
 SHORTEST_MS = 20
 """Accuracy to which the shortest outage that suffices is found [ms]."""
+SETS_MAX = 3
+"""Largest number of sets that are searched, if each of them suffices."""
 PACKETS_MAX = 64
 """Largest number of packets each of which is delivered alone, the newest before the moment."""
 
@@ -58,10 +60,14 @@ class Cause:
     """Number of units that were looked at."""
     error_m: float
     """Largest error with this cause alone [m]."""
+    also: tuple[tuple[Part, ...], ...] = ()
+    """Further smallest sets, without units of those before, each of which suffices as well."""
     others: tuple[Part, ...] = ()
-    """Losses and late packets that were looked at and are not of the cause."""
+    """Losses and late packets that were looked at and are in none of the sets."""
     innocent: tuple[tuple[str, float], ...] = ()
     """What else happened, by group, and by how much the error would differ without [m]."""
+    is_all: bool = True
+    """Whether the moment does not come about without all of the sets together."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,28 +95,33 @@ def cause(
     """Cause of a moment, without what its parts do, and the world in which it was found."""
     case = replace(case, until_s=moment.end_s + AFTER_S + 1.0)
 
-    def suffice(cases: Sequence[Case]) -> list[bool]:
-        return [comes_about(moment, each) for each in fly_all(cases)]
+    def suffice(cases: Iterable[Case]) -> list[bool]:
+        return [comes_about(moment, each) for each in fly_all([*cases])]
 
+    until_s, tried = moment.end_s + AFTER_S, list[tuple[float, World]]()
     for since_s, with_delay in ((moment.start_s - BEFORE_S, False), (0.0, False), (0.0, True)):
-        until_s = moment.end_s + AFTER_S
         here = units.world(case, flown, since_s, until_s, with_delay=with_delay)
-        bare, whole = suffice([here.only(()), here.only(here.units)])
-        # Where even all units do not suffice, packets that were lost by chance were sent at
-        # other times. A wider window has them.
-        if whole and not bare:
-            break
-    else:
-        (alone,) = fly_all([here.only(())])
-        return Cause((), 0.0, len(here.units), error_m(moment, alone)), here
-    found = smallest(here.units, lambda sets: suffice([here.only(each) for each in sets]), at_once)
-    (alone,) = fly_all([here.only(found)])
-    parts = tuple(_part(each, flown) for each in found)
-    others = tuple(
-        _part(each, flown) for each in here.units if isinstance(each, Bad) and each not in found
-    )
-    off_m = error_m(moment, alone)
-    return Cause(parts, max(0.0, since_s), len(here.units), off_m, others), here
+        (bare,) = fly_all([here.only(())])
+        if not comes_about(moment, bare):
+            tried.append((since_s, here))
+            if is_averted(moment, bare):
+                break
+    if not tried:
+        return Cause((), 0.0, len(here.units), error_m(moment, bare)), here
+    since_s, here = tried[-1]
+    sets, rest, still = list[tuple[Unit, ...]](), here.units, True
+    while still and len(sets) < SETS_MAX:
+        found = smallest(rest, lambda some: suffice(map(here.only, some)), at_once)
+        sets.append(found)
+        rest = tuple(each for each in rest if each not in found)
+        taken = [each for each in here.units if each not in rest]
+        # What remains suffices, with every other packet delivered: then it has a set as well.
+        still = all(suffice([here.without(*taken), here.only(rest)]))
+    (alone,) = fly_all([here.only(sets[0])])
+    first, *also = (tuple(_part(each, flown) for each in found) for found in sets)
+    others = tuple(_part(each, flown) for each in rest if isinstance(each, Bad))
+    counts = max(0.0, since_s), len(here.units), error_m(moment, alone)
+    return Cause(first, *counts, tuple(also), others, is_all=not still), here
 
 
 def _part(unit: Unit, flown: Outcome) -> Part:
@@ -155,7 +166,7 @@ def _groups(found: Cause, here: World) -> dict[str, list[Unit]]:
     """Units that are not of the cause, by what they are."""
     groups: dict[str, list[Unit]] = {}
     for unit in here.units:
-        if unit not in [part.unit for part in found.parts]:
+        if all(unit != part.unit for parts in (found.parts, *found.also) for part in parts):
             groups.setdefault(_group(unit), []).append(unit)
     return groups
 

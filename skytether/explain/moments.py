@@ -62,6 +62,9 @@ class Moment:
     """The same figure of the perfect flight."""
     level: float
     """What `measured` reaches if the moment comes about."""
+    calm: float
+    """What it does not exceed if the moment is averted for good: of what is above the usual, a
+    quarter, where the level is at the half."""
 
 
 def moments(flown: Outcome, perfect: Outcome, scenario: Scenario) -> list[Moment]:
@@ -76,7 +79,7 @@ def moments(flown: Outcome, perfect: Outcome, scenario: Scenario) -> list[Moment
     at_s = flown.failed_s
     # A flight that ends while the vehicle brakes is explained by the brake.
     if flown.failure and not any(each.end_s >= at_s - AROUND_S for each in found):
-        found.append(Moment("failure", 0, at_s, at_s, flown.failure, 0.0, 0.0, 1.0))
+        found.append(Moment("failure", 0, at_s, at_s, flown.failure, 0.0, 0.0, 1.0, 0.0))
     return sorted(found, key=lambda each: (each.start_s, each.vehicle))
 
 
@@ -116,6 +119,11 @@ def comes_about(moment: Moment, outcome: Outcome) -> bool:
     return measured(moment, outcome) >= moment.level
 
 
+def is_averted(moment: Moment, outcome: Outcome) -> bool:
+    """Whether a flight is far from the moment, not only just below it."""
+    return measured(moment, outcome) <= moment.calm
+
+
 def error_m(moment: Moment, outcome: Outcome) -> float:
     """Largest error of the moment's vehicle, meanwhile and shortly after [m]; with vehicle 0, of
     any of them.
@@ -139,14 +147,14 @@ def _of_vehicle(track: Track, usual: Track | None, scenario: Scenario) -> Iterat
         until = np.searchsorted(time_s, time_s[end - 1] + AFTER_S)
         says = f"{DOES[Mode(track.mode[first])]} ({Reason(track.reason[first])})"
         at = first, end, says, error[first:until], normal[first:until]
-        yield _moment("brake", track, *at, level=1.0)
+        yield _moment("brake", track, *at, (1.0, 0.0))
         is_far[first:until] = False
     gap = np.ones(2 * round(PAUSE_S / scenario.control.dt) + 1)
     goes_on = np.convolve(error > bound / 2.0, gap, "same") > 0.5
     for first, end in _runs(is_far, goes_on):
         own, usual_m = error[first:end], normal[first:end]
-        level = float(usual_m.max() + 0.5 * (own.max() - usual_m.max()))
-        yield _moment("error", track, first, end, "was far off", own, usual_m, level=level)
+        levels = _levels(float(own.max()), float(usual_m.max()))
+        yield _moment("error", track, first, end, "was far off", own, usual_m, levels)
 
 
 def _moment(
@@ -157,12 +165,16 @@ def _moment(
     says: str,
     own: Array,
     usual: Array,
-    *,
-    level: float,
+    levels: tuple[float, float],
 ) -> Moment:
     start_s, end_s = track.time_s[[first, end - 1]].tolist()
     figures = float(own.max()), float(usual.max())
-    return Moment(kind, track.vehicle, start_s, end_s, says, *figures, level)
+    return Moment(kind, track.vehicle, start_s, end_s, says, *figures, *levels)
+
+
+def _levels(figure: float, usual: float) -> tuple[float, float]:
+    """`level` and `calm` of a moment: the usual figure and a half, or a quarter, of the rest."""
+    return usual + 0.5 * (figure - usual), usual + 0.25 * (figure - usual)
 
 
 def _usual_m(track: Track, usual: Track) -> Array:
@@ -182,23 +194,20 @@ def _too_near(flown: Outcome, perfect: Outcome, scenario: Scenario) -> Iterator[
         start_s, end_s = flown.separation_s[[first, end - 1]].tolist()
         least_m, usual_m = _least(flown.separation_m[first:end]), _least(perfect.separation_m)
         says = f"came within {least_m:.3f} m, where {bound_m:g} m are required"
-        level = -(least_m + 0.5 * max(0.0, usual_m - least_m))
-        yield Moment("separation", 0, start_s, end_s, says, least_m, usual_m, level)
+        levels = _levels(-least_m, -max(least_m, min(usual_m, 2.0 * bound_m)))
+        yield Moment("separation", 0, start_s, end_s, says, least_m, usual_m, *levels)
 
 
 def _wasted(flown: Outcome, perfect: Outcome) -> Iterator[Moment]:
     usual = _rate(perfect, WARM_S, np.inf)
     sent = _sent_s(flown)
-    each = np.array([_rate(flown, at_s, at_s + 1.0) for at_s in sent])
+    each = np.searchsorted(sent, sent + 1.0) - np.arange(len(sent))
     many = (each > WASTED_TIMES * usual) & (each > usual + WASTED_PER_S) & (sent > WARM_S)
     for first, end in _runs(many, many):
-        start_s, end_s, most = (
-            float(sent[first]),
-            float(sent[end - 1]) + 1.0,
-            float(each[first:end].max()),
-        )
-        says = f"the server sent {most:.0f} plans in a second"
-        yield Moment("packets", 0, start_s, end_s, says, most, usual, 0.5 * (most + usual))
+        start_s, end_s, most = sent[first], sent[end - 1] + 1.0, each[first:end].max()
+        times, levels = (float(start_s), float(end_s)), _levels(float(most), usual)
+        says = f"the server sent {most} plans in a second"
+        yield Moment("packets", 0, *times, says, float(most), usual, *levels)
 
 
 def _sent_s(outcome: Outcome) -> Array:

@@ -74,7 +74,8 @@ def _stretches(known: Explanation) -> tuple[list[Part], list[Part]]:
     cause = known.cause
     if cause is None:
         return [], []
-    return [part for part in cause.parts if isinstance(part.unit, Bad)], [*cause.others]
+    sets = (cause.parts, *cause.also)
+    return [part for each in sets for part in each if isinstance(part.unit, Bad)], [*cause.others]
 
 
 def _draw_lanes(axes: "Axes", known: Explanation, lanes: list[Lane]) -> None:

@@ -66,20 +66,28 @@ def _cause(cause: Cause, moment: Moment) -> Iterator[str]:
         )
         return
     yield f"Why: {_joined(_counted(cause.parts))}{', together' * (len(cause.parts) > 1)}."
-    rows = [_row(list(parts), moment) for _, parts in groupby(cause.parts, _kind)]
-    shown = [column for column in zip(*rows, strict=True) if any(column)]
-    widths = [max(map(len, column)) for column in shown]
-    for row in zip(*shown, strict=True):
-        yield "  ".join(["", *map(str.ljust, row, widths)]).rstrip()
+    yield from _table(cause.parts, moment)
     this = "This suffices" if len(cause.parts) == 1 else "These suffice"
     others = cause.among - len(cause.parts)
     yield (
         f"{this}: without {_units(others, 'other')} {since}, it comes about all the same"
         f"{_off(cause.error_m)}."
     )
-    idle = [part for part in cause.parts if not part.is_needed]
-    if idle and len(idle) < len(cause.parts):
-        yield f"Not needed by itself: {_joined(_counted(idle))}; something else would do instead."
+    for parts in cause.also:
+        suffice = "suffice" if len(parts) > 1 else "suffices"
+        yield f"Or: {_joined(_counted(parts))}, which {suffice} as well."
+        yield from _table(parts, moment)
+    if cause.also:
+        without = "it does not come about" if cause.is_all else "it comes about all the same"
+        yield f"Without all of them {without}."
+
+
+def _table(parts: Sequence[Part], moment: Moment) -> Iterator[str]:
+    rows = [_row(list(some), moment) for _, some in groupby(parts, _kind)]
+    shown = [column for column in zip(*rows, strict=True) if any(column)]
+    widths = [max(map(len, column)) for column in shown]
+    for row in zip(*shown, strict=True):
+        yield "  ".join(["", *map(str.ljust, row, widths)]).rstrip()
 
 
 def _units(count: int, other: str = "") -> str:

@@ -217,7 +217,7 @@ def test_whoever_interrupts_keeps_what_is_known_by_then() -> None:
     def fly_some(cases: Sequence[Case]) -> list[Outcome]:
         nonlocal flights
         flights += len(cases)
-        if flights > 12:
+        if flights > 16:
             raise KeyboardInterrupt
         return [fly(each) for each in cases]
 
