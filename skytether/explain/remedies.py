@@ -113,6 +113,8 @@ def possible(found: Cause, case: Case) -> Iterator[tuple[str, Keys]]:
 def _listed(units: Sequence[Unit], scenario: Scenario) -> Iterator[tuple[str, Keys]]:
     ways = {each.lane[1] for each in units if isinstance(each, Bad)}
     ways |= {each.direction for each in units if isinstance(each, UsualDelay)}
+    if not units:  # it is the scenario itself
+        ways = {UPLINK, DOWNLINK}
     names = [each.name for each in units if isinstance(each, Setting)]
     control, link, paths = scenario.control, scenario.link, scenario.network.paths
     if ways:

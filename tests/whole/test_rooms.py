@@ -80,6 +80,7 @@ ROOMS: dict[str, tuple[str, str]] = {
     "the laboratory's pages": ("lab/pages", "reproduce"),
     "the laboratory's commands": ("lab/commands", "compare"),
     "identification": ("lab/identify", "identify quadrotor"),
+    "explanations": ("explain", "explain demo"),
     "figures": ("figures", "reproduce"),
     "environments": ("gym", ""),
     "the library": ("library", ""),
