@@ -45,7 +45,7 @@ COMMANDS = [line for document in DOCUMENTS for block in blocks(document) for lin
 
 
 ELSEWHERE = {
-    *("autopilot", "compare", "duel", "export", "keygen", "page", "probe", "replay"),
+    *("autopilot", "compare", "duel", "explain", "export", "keygen", "page", "probe", "replay"),
     *("report", "reproduce", "set"),
     *("client", "netem", "server"),
 }
