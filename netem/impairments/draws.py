@@ -20,8 +20,7 @@ from struct import Struct
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
 
 SLOT_NS = MILLISECOND_NS
-"""Length of a slot: shorter than any step, so that two horizons or two observations never share
-one."""
+"""Length of a slot: shorter than any step, so that no two horizons or observations share one."""
 SLOT_S = SLOT_NS / SECOND_NS
 _PLACE = Struct("<qq")
 """Input of the hash: slot and rank, or cell and number."""
@@ -44,8 +43,7 @@ class Fate:
     copies: int = 0
     """Number of extra copies that arrive."""
     flipped: float | None = None
-    """Position of a flipped bit, as a fraction below 1 of the packet's length; None if no bit is
-    flipped."""
+    """Position of a flipped bit, as a fraction below 1 of the packet's length; None: of none."""
 
     @property
     def time_s(self) -> float:
@@ -104,11 +102,8 @@ class Draws:
     ) -> None:
         self._pair, self._which, self._names = packets.pair, which, names
         self._by_number = by_number
-
-    @property
-    def flow(self) -> str | int:
+        self.flow = names[2]
         """Number of the packets' flow, from 0; 0 where what lasts is common to all flows."""
-        return self._names[2]
 
     @cached_property
     def _events(self) -> Stream:
