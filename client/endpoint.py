@@ -238,10 +238,10 @@ class Client(Endpoint):
 
     def _to_keep(self) -> dict[str, Any]:
         """Fields of `memory.SavedState`; on the ground those that change there."""
-        pilot, known = self._pilot, {"frame": self._flies.frame} | self._servers.to_keep()
+        pilot, always = self._pilot, {"frame": self._flies.frame} | self._servers.to_keep()
         if pilot.next_ns is None:
-            return known
-        return known | {
+            return always
+        return always | {
             "began_ns": pilot.began_ns,
             "heard_ns": self._failsafe.heard_ns or pilot.began_ns,
             "motion": self._pilot.motion_in_force(),

@@ -41,7 +41,7 @@ from skytether.lab.engine.contenders import (
     Contender,
     TunedWeights,
 )
-from skytether.lab.pages.comparison import FLIGHTS_MIN, UNTOLD, budgets_table, leaders_table
+from skytether.lab.pages.comparison import FLIGHTS_MIN, UNDECIDED, budgets_table, leaders_table
 from skytether.lab.pages.report import Drawn, html
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.scenario import reading
@@ -456,8 +456,8 @@ def test_where_nearly_all_are_as_good_as_the_best_none_is_marked() -> None:
     compared = within(TARGET, *((5.0, each) for each in alike), (10.0, better), (10.0, alike[0]))
     table = budgets_table([compared])
     assert not [row for row in table.rows if row[4].endswith("*")]
-    assert [row[1:3] + row[4:6] for row in table.rows if UNTOLD in row] == [
-        ("which is best", "", UNTOLD, "")
+    assert [row[1:3] + row[4:6] for row in table.rows if UNDECIDED in row] == [
+        ("which is best", "", UNDECIDED, "")
     ]
     ((line, column),) = table.bold
     assert table.rows[line][1] == CONTENDERS[4].title

@@ -70,7 +70,7 @@ ABOUT = (
 )
 
 
-UNTOLD = "too few flights to tell"
+UNDECIDED = "too few flights to tell"
 SIMILAR = 2 / 3
 """Share of the contenders within a budget that may be as good as the best; of more, none is marked.
 """
@@ -105,14 +105,14 @@ def budgets_table(results: Sequence[ComparedCase]) -> Table:
                     bold.append((len(lines), column))
             lines.append((each.case.title, contender.title, *cells))
         if alike:
-            notes = (UNTOLD if budget in alike else "" for budget in BUDGETS)
+            notes = (UNDECIDED if budget in alike else "" for budget in BUDGETS)
             lines.append((each.case.title, "which is best", *notes))
     says = (
         "Mean RMSE xy [m] with its 95 % interval, and median, @ packets a second. Within a budget "
         "each contender flies at the threshold and with the reporting policy that had the smallest "
         "error on other seeds. The smallest mean is bold; * marks it, and means that do not differ "
         "from it significantly: the interval of their ratio on the same seeds contains 1. Where "
-        f"that is so for nearly all, there are {UNTOLD}, and none is marked. ! marks what has "
+        f"that is so for nearly all, there are {UNDECIDED}, and none is marked. ! marks what has "
         "sent more than the budget, which was kept on the other seeds. – means that no "
         "flown setting was within the budget and the case's limit on effort. The CSV has bytes and "
         "all other figures."

@@ -97,7 +97,7 @@ class MemoryFile:
         """Reason why the newest content could not be written, and reason reported last."""
         self._is_removed = False
         """Whether the file was removed, because it could not be written."""
-        self._told_nothing = False
+        self._kept_nothing = False
         """Whether the endpoint was told last that the next run finds nothing."""
 
     @property
@@ -202,7 +202,7 @@ class MemoryFile:
                 self._failure, self._is_removed = "", False
             except OSError as error:
                 failure = f"{self._path}: {error.strerror or error}"
-                stale = self._endpoint.waits_for_disk or self._told_nothing
+                stale = self._endpoint.waits_for_disk or self._kept_nothing
                 if stale and not self._is_removed:
                     self._remove()
                 self._failure = failure
@@ -225,13 +225,13 @@ class MemoryFile:
     def _remove(self) -> None:
         with contextlib.suppress(OSError):  # of a disk that is read-only
             self._path.unlink(missing_ok=True)
-            self._is_removed, self._reported, self._told_nothing = True, "", True
+            self._is_removed, self._reported, self._kept_nothing = True, "", True
             with contextlib.suppress(RuntimeError):  # the loop has closed meanwhile
                 self._loop.call_soon_threadsafe(lambda: self._endpoint.kept(nothing=True))
 
     def _tell(self) -> None:
         if self._wanted is None:
-            self._told_nothing = False
+            self._kept_nothing = False
             self._endpoint.kept()
 
 

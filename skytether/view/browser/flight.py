@@ -16,7 +16,7 @@ from skytether.shell.host.compiling import progress
 from skytether.view.browser.play import Operator
 from skytether.view.page import controls
 from skytether.view.page.changes import Mark, mark, together
-from skytether.view.page.state import LED, State
+from skytether.view.page.state import LIVE_POINT, State
 
 FINAL = {*ONCE, "armed"}
 """Keys whose changes are not taken back: decisions for once, and what may end a flight."""
@@ -51,7 +51,9 @@ class PageFlight:
         with self.lock, contextlib.suppress(ValueError):
             self.state.take(process, frame)
         changed = (
-            isinstance(frame, Said) and isinstance(frame.event, Changed) and frame.event.key != LED
+            isinstance(frame, Said)
+            and isinstance(frame.event, Changed)
+            and frame.event.key != LIVE_POINT
         )
         if isinstance(frame, Opened) and self._opened_ns.get(process) != frame.time_ns:
             self._opened_ns[process] = frame.time_ns
@@ -81,7 +83,7 @@ class PageFlight:
     def _answered(self, process: str, asked: Mapping[str, Any], answer: Answer | None) -> None:
         if answer and answer.values:
             self.values[process] = answer.values
-        elif answer and (answer.refused or LED not in asked):
+        elif answer and (answer.refused or LIVE_POINT not in asked):
             changed = {(process, each.key): each for each in answer.changed}
             self._say(asked, answer.refused or together(changed, 1), refused=bool(answer.refused))
         elif asked and not answer:

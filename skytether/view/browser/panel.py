@@ -31,7 +31,7 @@ from skytether.view.page.controls import (
 )
 from skytether.view.page.plots import POINTS, Look, Plots, more, of_flight, of_link
 from skytether.view.page.scene import GROUND_RGB, WIDE, Scene, in_space
-from skytether.view.page.state import GUIDED, LED, ZONED, VehicleTrack
+from skytether.view.page.state import GUIDED, LIVE_POINT, ZONED, VehicleTrack
 
 HELD_S = 1.5
 """Time for which a slider stays where the user has put it [s]."""
@@ -761,7 +761,8 @@ class _Lead:
     def _move(self, place: NDArray[Any]) -> None:
         for flight in self._flights:
             flight.ask(
-                flight.processes("server")[0], {LED: [np.round(place[: self._axes], 3).tolist()]}
+                flight.processes("server")[0],
+                {LIVE_POINT: [np.round(place[: self._axes], 3).tolist()]},
             )
 
     def show(self) -> None:

@@ -63,7 +63,7 @@ FOLDED_S = 10.0
 """Age of an event up to which one with the same words is counted, not repeated [s]."""
 AT_ONCE_S = 2.0
 """Time within which changes of one key, as a slider is dragged, are one change [s]."""
-LED = "reference.points_m"
+LIVE_POINT = "reference.points_m"
 """Key that changes many times a second while a target is dragged; its changes are not logged."""
 LOSS_S = 10.0
 """Time over which loss is measured."""
@@ -515,7 +515,7 @@ class State:
         if isinstance(event, Counted | Listening | Plaintext):
             return
         if isinstance(event, Changed):
-            if event.key != LED:
+            if event.key != LIVE_POINT:
                 self._change(process, event, time_s)
             return
         text, count = str(event).splitlines()[0], 1
