@@ -20,6 +20,10 @@ from skytether.shared.wire.protocol import NO_HORIZON, Mode
 AT_BOUND = 1.0 - 1e-6
 """Share of the bound above which an input counts as at the bound: inputs are rounded on the
 wire."""
+WORSE = (Mode.BRAKE, Mode.LAND, Mode.RETURN, Mode.FAULT)
+"""Modes in which a vehicle no longer follows its plan because something went wrong."""
+STOPPED = (*WORSE, Mode.HOVER, Mode.INIT, Mode.SYNC, Mode.READY)
+"""Modes in which a brake may go on: at rest, waiting for a session and for a plan."""
 
 
 class Summary(msgspec.Struct, frozen=True, kw_only=True):

@@ -51,7 +51,7 @@ class UsualDelay:
 
 @dataclass(frozen=True, slots=True)
 class Setting:
-    """Property of the world, such as wind, that other values of some keys take away."""
+    """Property, such as wind, that other values of some keys take away."""
 
     name: str
     keys: Keys

@@ -1,8 +1,9 @@
 """Cause of a moment: the smallest set of units that suffices, and what each of them does.
 
-It is searched in ever wider worlds: first among what happened shortly before the moment, then from
-the flight's beginning on, then with the usual delay as a unit as well. The first world in which the
-moment does not come about without any unit has the cause; if there is none, it is the scenario.
+It is searched among ever more circumstances: first among what happened shortly before the moment,
+then from the flight's beginning on, then with the usual delay as a unit as well. The cause is among
+the first without all of which the moment does not come about; if there are none, it is the
+scenario.
 """
 
 from collections.abc import Iterable
@@ -15,7 +16,7 @@ from skytether.explain.cases import Bad, Case, Lane, Setting, Stall, Unit, Usual
 from skytether.explain.flying import FlyAll, Outcome
 from skytether.explain.moments import AFTER_S, Moment, comes_about, error_m, is_averted
 from skytether.explain.smallest import smallest
-from skytether.explain.units import World
+from skytether.explain.units import Circumstances
 
 BEFORE_S = 8.0
 """Time before a moment in which its cause is searched first [s]: longer than two time-outs, a
@@ -91,16 +92,16 @@ class Rescues:
 
 def cause(
     case: Case, moment: Moment, flown: Outcome, fly_all: FlyAll, at_once: int
-) -> tuple[Cause, World]:
-    """Cause of a moment, without what its parts do, and the world in which it was found."""
+) -> tuple[Cause, Circumstances]:
+    """Cause of a moment, without what its parts do, and the circumstances it was found among."""
     case = replace(case, until_s=moment.end_s + AFTER_S + 1.0)
 
     def suffice(cases: Iterable[Case]) -> list[bool]:
         return [comes_about(moment, each) for each in fly_all([*cases])]
 
-    until_s, tried = moment.end_s + AFTER_S, list[tuple[float, World]]()
+    until_s, tried = moment.end_s + AFTER_S, list[tuple[float, Circumstances]]()
     for since_s, with_delay in ((moment.start_s - BEFORE_S, False), (0.0, False), (0.0, True)):
-        here = units.world(case, flown, since_s, until_s, with_delay=with_delay)
+        here = units.circumstances(case, flown, since_s, until_s, with_delay=with_delay)
         (bare,) = fly_all([here.only(())])
         if not comes_about(moment, bare):
             tried.append((since_s, here))
@@ -143,7 +144,7 @@ def _met(unit: Bad, flown: Outcome) -> list[int]:
 
 
 def needed(
-    found: Cause, here: World, moment: Moment, fly_all: FlyAll
+    found: Cause, here: Circumstances, moment: Moment, fly_all: FlyAll
 ) -> tuple[Cause, list[Outcome]]:
     """Cause with what the flight would have been without each of its parts, and without what else
     happened; and the flight without each part.
@@ -162,7 +163,7 @@ def needed(
     return replace(found, parts=checked, innocent=innocent), outcomes[: len(parts)]
 
 
-def _groups(found: Cause, here: World) -> dict[str, list[Unit]]:
+def _groups(found: Cause, here: Circumstances) -> dict[str, list[Unit]]:
     """Units that are not of the cause, by what they are."""
     groups: dict[str, list[Unit]] = {}
     for unit in here.units:
@@ -174,7 +175,8 @@ def _groups(found: Cause, here: World) -> dict[str, list[Unit]]:
 def _group(unit: Unit) -> str:
     match unit:
         case Bad():
-            return "late packets" if unit.is_late else f"other losses of the {WAYS[unit.lane[1]]}"
+            what = "late packets" if unit.is_late else "other losses"
+            return f"{what} of the {WAYS[unit.lane[1]]}"
         case _:
             return named(unit)
 
@@ -207,7 +209,9 @@ def lane_name(lane: Lane) -> str:
     return f"{WAYS[direction]} {path + 1}" + (f" of vehicle {flow + 1}" if flow else "")
 
 
-def rescues(found: Cause, here: World, moment: Moment, flown: Outcome, fly_all: FlyAll) -> Rescues:
+def rescues(
+    found: Cause, here: Circumstances, moment: Moment, flown: Outcome, fly_all: FlyAll
+) -> Rescues:
     """Packets of the cause that alone avert the moment, among those sent before it."""
     met = {
         number: part.unit
@@ -233,7 +237,7 @@ def rescues(found: Cause, here: World, moment: Moment, flown: Outcome, fly_all: 
     return Rescues(averting, len(numbers))
 
 
-def lengths(found: Cause, here: World, moment: Moment, fly_all: FlyAll) -> Cause:
+def lengths(found: Cause, here: Circumstances, moment: Moment, fly_all: FlyAll) -> Cause:
     """Cause with the shortest length of each outage that is needed, by bisection from either end.
 
     It is the length at which the moment begins to come about, if it comes about for all longer

@@ -1,6 +1,6 @@
 """Explanation of a flight, ever more complete: whoever interrupts it keeps what is there."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import msgspec
@@ -19,6 +19,8 @@ CURVES_MAX = 2
 """Largest number of flights without a part that are drawn."""
 STEPS = 6
 """Number of steps of an explanation, without those of other seeds."""
+FIRST = "what went wrong"
+"""Word for the first step."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,10 +46,13 @@ class Explanation:
     def __str__(self) -> str:
         return words.text(self.moments, self.moment, self.cause, self.rescues, self.remedies)
 
-    def to_json(self) -> bytes:
-        """What is known, as JSON: the fields without the flights."""
+    def to_json(self, following: str = "") -> bytes:
+        """What is known, as JSON: the fields without the flights, the text, and the step that comes
+        next; empty if all is known.
+        """
         names = "name", "seed", "moments", "moment", "cause", "rescues", "remedies"
-        return msgspec.json.encode({name: getattr(self, name) for name in names})
+        known = {name: getattr(self, name) for name in names}
+        return msgspec.json.encode({**known, "text": str(self), "next": following})
 
 
 def explain(
@@ -114,7 +119,13 @@ def _chosen(found: Sequence[Moment], at_s: float | None) -> Moment | None:
         expected = f"one of {times}, at which something went wrong" if found else "no time"
         because = "" if found else ": nothing went wrong in this flight"
         raise ConfigError(f"at: got {at_s:g}, expected {expected}{because}")
-    return min(near, key=lambda each: (distance_s(each), -WEIGHTS[each.kind]))
+
+    def order(each: Moment) -> tuple[float, float, int]:
+        # Times are printed with a tenth of a second; of several moments at once, the one that
+        # begins then is meant.
+        return round(distance_s(each), 1), round(abs(each.start_s - at_s), 1), -WEIGHTS[each.kind]
+
+    return min(near, key=order)
 
 
 def _curves(cause: Cause, without: Sequence[Outcome]) -> tuple[tuple[str, Outcome], ...]:
@@ -128,21 +139,35 @@ def _curves(cause: Cause, without: Sequence[Outcome]) -> tuple[tuple[str, Outcom
 
 
 def explained(
-    case: Case, name: str, *, at_s: float | None = None, seeds: int = 0, trace: str = ""
+    case: Case,
+    name: str,
+    *,
+    at_s: float | None = None,
+    seeds: int = 0,
+    trace: str = "",
+    on_flight: Callable[[int, str], None] = lambda *_: None,
 ) -> Explanation:
     """Whole explanation, flown in this process; arguments as of `explain`.
 
     Args:
         trace: see `check_same`; empty: whatever comes of the case is explained.
+        on_flight: called before each flight with the number of steps done, and a word for the one
+            under way.
 
     Raises:
         ConfigError: the flight of the case is another one than that of the record.
     """
+    done, step = 0, FIRST
 
     def fly_all(cases: Sequence[Case]) -> list[Outcome]:
-        return [fly(each) for each in cases]
+        outcomes = []
+        for each in cases:
+            on_flight(done, step)
+            outcomes.append(fly(each))
+        return outcomes
 
-    for _, known in explain(case, name, fly_all, at_s=at_s, seeds=seeds):
+    for following, known in explain(case, name, fly_all, at_s=at_s, seeds=seeds):
+        done, step = done + 1, following
         if trace:
             check_same(known.flown, trace, name)
             trace = ""

@@ -23,11 +23,6 @@ from skytether.shared.wire.protocol import Mode
 from skytether.sim import flight
 from skytether.sim.world import World
 
-WORSE = (Mode.BRAKE, Mode.LAND, Mode.RETURN, Mode.FAULT)
-"""Modes in which a vehicle no longer follows its plan because something went wrong."""
-STOPPED = (*WORSE, Mode.HOVER, Mode.INIT, Mode.SYNC, Mode.READY)
-"""Modes in which a brake may go on: at rest, waiting for a session and for a plan."""
-
 
 @dataclass(frozen=True, slots=True)
 class Track:

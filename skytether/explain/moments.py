@@ -17,10 +17,11 @@ from typing import Literal
 
 import numpy as np
 
-from skytether.explain.flying import STOPPED, WORSE, Outcome, Track
+from skytether.explain.flying import Outcome, Track
 from skytether.shared.law.model import Array, Flags
 from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import Reason
+from skytether.shared.telemetry.summary import STOPPED, WORSE
 from skytether.shared.wire.protocol import Mode
 
 FAR_TIMES = 3.0

@@ -14,11 +14,12 @@ import numpy as np
 
 from skytether.explain.cases import Bad, Case, Keys, Setting, Stall, Unit, UsualDelay
 from skytether.explain.causes import Cause
-from skytether.explain.flying import WORSE, FlyAll, Outcome
+from skytether.explain.flying import FlyAll, Outcome
 from skytether.explain.moments import Moment, comes_about, error_m
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import DOWNLINK, UPLINK
+from skytether.shared.telemetry.summary import WORSE
 from skytether.shared.wire.protocol import INPUTS_MAX
 
 AS_FLOWN = "as flown"

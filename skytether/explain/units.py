@@ -62,7 +62,7 @@ SETTINGS: Sequence[tuple[str, Keys]] = (
     ),
     ("the server's computing time", (("simulation.compute_s", 0.001),)),
 )
-"""Properties of the world, and the values of keys that take them away."""
+"""Properties of vehicle, wind and server, and the values of keys that take them away."""
 
 
 def perfect(case: Case) -> Case:
@@ -82,14 +82,14 @@ def perfect(case: Case) -> Case:
 
 
 @dataclass(frozen=True, slots=True)
-class World:
-    """A flight as it was, and what of it may be taken out."""
+class Circumstances:
+    """A flight as it was, and the units that may be taken out of it."""
 
     case: Case
     units: tuple[Unit, ...]
     """Units in an order in which those that belong together stand together."""
     window: tuple[Stretch, ...]
-    """Stretch of each lane that belongs to the world: what lies outside stays as it was."""
+    """Stretch of each lane in which packets may be delivered: what lies outside stays as it was."""
     usual_s: dict[tuple[int, int], float]
     """Longest usual delay of a path and direction [s]."""
 
@@ -142,10 +142,10 @@ def _between(stretch: Stretch, bad: Collection[Bad]) -> Iterator[Stretch]:
         yield Stretch(stretch.lane, first, stretch.end)
 
 
-def world(
+def circumstances(
     case: Case, flown: Outcome, start_s: float, end_s: float, *, with_delay: bool = False
-) -> World:
-    """World of a flight between two times in it [s].
+) -> Circumstances:
+    """Circumstances of a flight between two times in it [s].
 
     Args:
         with_delay: whether the usual delay of each direction is a unit as well.
@@ -160,7 +160,7 @@ def world(
         bad += _bad(case, flown, stretch, usual_s[lane[:2]])
     settings = [Setting(*each) for each in SETTINGS if _is_there(case.scenario, each[1])]
     delays = [UsualDelay(direction) for direction in (1, 0)] if with_delay else []
-    return World(case, (*settings, *delays, *case.stalls, *bad), tuple(window), usual_s)
+    return Circumstances(case, (*settings, *delays, *case.stalls, *bad), tuple(window), usual_s)
 
 
 def _order(lane: Lane) -> tuple[int, int, int]:

@@ -1,6 +1,8 @@
 """Flight from Python: its arrays, summary and events, its picture and its file."""
 
+import time
 from collections.abc import Iterable
+from contextlib import ExitStack
 from dataclasses import replace
 from functools import cached_property
 from os import PathLike
@@ -30,6 +32,7 @@ from skytether.shared.telemetry.record import (
 )
 from skytether.shared.telemetry.record import Rows as Table
 from skytether.shared.telemetry.summary import Summary, desired, summarise
+from skytether.shell.commandline import terminal
 from skytether.view.rows import Columns, arrays, readable
 
 if TYPE_CHECKING:
@@ -41,6 +44,8 @@ if TYPE_CHECKING:
 
 PARTS = ("client", "server", "netem", "plan")
 """Parts of a record: rows of the vehicle's and the server's steps, of packets, and of plans."""
+QUIET_S = 2.0
+"""Time from which on a progress bar is shown [s]."""
 UNITS = MappingProxyType({"m": "m", "mps": "m/s", "s": "s", "ns": "ns", "bytes": "B"})
 """Unit of an array by the last word of its name; other arrays have none."""
 
@@ -135,7 +140,8 @@ class Flight:
     def explain(self, at: float | None = None, *, seeds: int = 0) -> "Explanation":
         """Why the flight braked, or was far off: its moments, a cause, rescues and remedies.
 
-        The flight, in virtual time, is flown again up to a hundred times: see docs/explain.md.
+        The flight, in virtual time, is flown again up to a hundred times: see docs/explain.md. A
+        progress bar on stderr, if that is a terminal, shows how far it is.
 
         Args:
             at: time in the flight of the moment to explain, as that of events [s]; by default the
@@ -146,12 +152,31 @@ class Flight:
             ConfigError: the flight does not come about again, or there is no moment at that time.
         """
         from skytether.explain.cases import Case
-        from skytether.explain.explanation import explained
+        from skytether.explain.explanation import STEPS, explained
         from skytether.explain.flying import trace
 
         client = self.record.client
         case = Case(self.scenario, len(np.unique(client["vehicle"])) or 1, self.secure)
-        return explained(case, self.name, at_s=at, seeds=seeds, trace=trace(client))
+        began_s = time.monotonic()
+        with ExitStack() as stack:
+            bar: terminal.Bar | None = None
+
+            def on_flight(done: int, step: str) -> None:
+                nonlocal bar
+                if bar is None and time.monotonic() - began_s > QUIET_S:
+                    title, steps = f"explaining {self.name}", STEPS + bool(seeds)
+                    bar = stack.enter_context(terminal.progress(title, steps, "steps"))
+                if bar is not None:
+                    bar(done, step)
+
+            return explained(
+                case,
+                self.name,
+                at_s=at,
+                seeds=seeds,
+                trace=trace(client),
+                on_flight=on_flight,
+            )
 
     @extras.named()
     def plot(self, ax: "Axes | None" = None) -> "Figure":

@@ -1,6 +1,7 @@
 """`explain`: answers that are known, because the network is made for them or was looked at."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -12,12 +13,14 @@ import pytest
 import skytether
 from skytether.explain import moments, picture, units
 from skytether.explain.cases import Bad, Case, Setting, Stall, UsualDelay
-from skytether.explain.explanation import Explanation, explain, explained
+from skytether.explain.explanation import Explanation, _chosen, explain, explained
 from skytether.explain.flying import Outcome, fly
-from skytether.explain.moments import comes_about
+from skytether.explain.moments import Moment, comes_about
+from skytether.library import flight as flight_module
 from skytether.netem.impairments.outages import Delivered
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.telemetry.record import DOWNLINK, UPLINK
+from skytether.shell.commandline import terminal
 
 BURSTS = "paper(0.4, 0.02, 2.0) & gilbert_elliott(0.1, 2.0)"
 SHORT = "constant(0.05)"
@@ -67,10 +70,10 @@ def test_the_cause_holds_in_flights_of_its_own() -> None:
     known, own = two_links(), flight("demo-two-links", 9314)
     assert known.cause
     assert known.moment
-    world = units.world(own, fly(own), known.cause.since_s, known.moment.end_s + 5.0)
+    here = units.circumstances(own, fly(own), known.cause.since_s, known.moment.end_s + 5.0)
     parts = [part.unit for part in known.cause.parts]
-    assert comes_about(known.moment, fly(world.only(parts)))
-    assert not comes_about(known.moment, fly(world.without(*parts)))
+    assert comes_about(known.moment, fly(here.only(parts)))
+    assert not comes_about(known.moment, fly(here.without(*parts)))
 
 
 @pytest.mark.parametrize(
@@ -174,6 +177,48 @@ def test_a_good_flight_has_no_moment() -> None:
     assert str(known).startswith("Nothing went wrong")
     with pytest.raises(ConfigError, match="nothing went wrong"):
         picture.drawn(known)
+
+
+def test_a_long_explanation_shows_how_far_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    seen: list[tuple[float, str]] = []
+
+    @contextmanager
+    def progress(title: str, total: float, unit: str) -> Iterator[terminal.Bar]:
+        assert (title, total, unit) == ("explaining demo", 6, "steps")
+        yield lambda done, text="": seen.append((done, text))
+
+    monkeypatch.setattr(terminal, "progress", progress)
+    monkeypatch.setattr(flight_module, "QUIET_S", 0.0)
+    uplink = {"network.uplink": f"{SHORT} & outage(9, 3)", "network.downlink": SHORT}
+    skytether.fly("demo", seed=11, duration=16, **uplink).explain()
+    assert seen == sorted(seen, key=lambda each: each[0])
+    assert [*dict.fromkeys(text for _, text in seen)] == [
+        "what went wrong",
+        "what suffices",
+        "what is needed",
+        "single packets",
+        "how long an outage must be",
+        "remedies",
+    ]
+
+
+def test_late_packets_are_named_by_their_direction() -> None:
+    late = "lognormal(0.02, 0.1, 0.1)"
+    own = flight("demo", 11, f"{late} & outage(9, 3)", late, duration=16)
+    cause = up_to("single packets", own).cause
+    assert cause
+    innocent = {name for name, _ in cause.innocent}
+    assert {"late packets of the uplink", "late packets of the downlink"} <= innocent
+
+
+def test_of_two_moments_at_once_the_one_that_begins_then_is_meant() -> None:
+    first, second = (
+        Moment("brake", vehicle, start_s, 20.0, "braked", 1.0, 0.0, 1.0, 0.0)
+        for vehicle, start_s in ((1, 10.0), (2, 12.111))
+    )
+    assert _chosen([first, second], 12.11) is second
+    assert _chosen([first, second], 10.4) is first
+    assert _chosen([first, second], 18.0) is second
 
 
 def test_a_flight_that_is_always_bad_does_not_hide_itself() -> None:

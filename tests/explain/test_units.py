@@ -85,8 +85,8 @@ def test_the_fate_of_each_packet_is_that_of_its_slot() -> None:
 
 
 def test_an_outage_is_found_to_the_millisecond_and_losses_by_chance_packet_by_packet() -> None:
-    world = units.world(case(), flown(), 5.0, 9.0)
-    up = [each for each in world.units if isinstance(each, Bad) and each.lane[1] == UPLINK]
+    here = units.circumstances(case(), flown(), 5.0, 9.0)
+    up = [each for each in here.units if isinstance(each, Bad) and each.lane[1] == UPLINK]
     outage, *others = [each for each in up if not each.is_packet]
     assert others == []
     assert (outage.first, outage.end) == (6000, 8000)
@@ -101,24 +101,24 @@ def test_an_outage_is_found_to_the_millisecond_and_losses_by_chance_packet_by_pa
         slot for slot in lost if not 6000 <= slot < 8000
     }
     assert began_s < 1.0
-    assert Setting("wind", world.units[0].keys) == world.units[0]  # type: ignore[union-attr]
+    assert Setting("wind", here.units[0].keys) == here.units[0]  # type: ignore[union-attr]
 
 
 def test_only_the_kept_units_lose_packets_in_the_window() -> None:
-    world = units.world(case(), flown(), 5.0, 9.0)
-    (outage,) = (each for each in world.units if isinstance(each, Bad) and not each.is_packet)
-    packets = fly(world.only([outage])).packets
+    here = units.circumstances(case(), flown(), 5.0, 9.0)
+    (outage,) = (each for each in here.units if isinstance(each, Bad) and not each.is_packet)
+    packets = fly(here.only([outage])).packets
     slots = packets.slot[packets.lost & (packets.time_s > 5.1) & (packets.time_s < 8.9)]
     assert len(slots)
     assert ((slots >= outage.first) & (slots < outage.end)).all()
-    bare = fly(world.only(())).packets
+    bare = fly(here.only(())).packets
     assert not bare.lost[(bare.time_s > 5.1) & (bare.time_s < 8.9)].any()
 
 
 def test_without_a_unit_the_rest_stays_as_it_was_until_then() -> None:
-    world = units.world(case(), flown(), 5.0, 9.0)
-    (outage,) = (each for each in world.units if isinstance(each, Bad) and not each.is_packet)
-    (healed,), (whole,) = fly(world.without(outage)).tracks, flown().tracks
+    here = units.circumstances(case(), flown(), 5.0, 9.0)
+    (outage,) = (each for each in here.units if isinstance(each, Bad) and not each.is_packet)
+    (healed,), (whole,) = fly(here.without(outage)).tracks, flown().tracks
     before = whole.step_s < 5.0
     assert (healed.error_m[before[: len(healed.error_m)]] == whole.error_m[before]).all()
 
@@ -148,6 +148,6 @@ def test_a_process_that_stands_still_is_a_unit() -> None:
     stall = Stall("client", 5.0, 1.0)
     stalled = fly(replace(case(), stalls=(stall,)))
     assert (stalled.tracks[0].reason == 13).any()
-    world = units.world(replace(case(), stalls=(stall,)), stalled, 0.0, 9.0)
-    assert stall in world.units
-    assert fly(replace(world.without(stall), until_s=None)).trace == flown().trace
+    here = units.circumstances(replace(case(), stalls=(stall,)), stalled, 0.0, 9.0)
+    assert stall in here.units
+    assert fly(replace(here.without(stall), until_s=None)).trace == flown().trace
