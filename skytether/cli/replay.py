@@ -1,21 +1,24 @@
 """`skytether replay`: play a recording on the page that shows flights."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
 import tyro
+from viser import GuiApi
 
 from skytether.cli import recordings
 from skytether.shell.commandline import command
 from skytether.shell.commandline.argument import Argument
 from skytether.shell.commandline.options import read
 from skytether.shell.host.web import HOST_PORT
+from skytether.view.browser.explaining import Explainer
 from skytether.view.browser.flight import PageFlight
 from skytether.view.browser.replay import Player
 from skytether.view.browser.serve import serve_until_interrupted
+from skytether.view.recordings.outcome import brakes
 
 
 @dataclass(frozen=True)
@@ -33,5 +36,21 @@ def replay(argv: Sequence[str]) -> None:
     at = command.address("--page", options.page)
     recorded = recordings.opened(options.file)
     flight = PageFlight()
-    with closing(Player([flight], [recorded.frames])) as player:
-        serve_until_interrupted(at, [flight], now_ns=player.now_ns, more=player.controls)
+    with (
+        closing(Player([flight], [recorded.frames])) as player,
+        closing(Explainer(options.file, brakes(recorded))) as explainer,
+    ):
+        added = [player.controls]
+        if not recorded.about.began:  # in virtual time: it can be flown again
+            added.append(explainer.controls)
+
+        def more(gui: GuiApi) -> Callable[[], None]:
+            shows = [add(gui) for add in added]
+
+            def show() -> None:
+                for each in shows:
+                    each()
+
+            return show
+
+        serve_until_interrupted(at, [flight], now_ns=player.now_ns, more=more)

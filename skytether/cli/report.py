@@ -1,13 +1,17 @@
 """`skytether report`: make an HTML page with figures of a recording."""
 
 from collections.abc import Sequence
+from contextlib import redirect_stdout
 from dataclasses import dataclass
+from importlib import import_module
+from io import StringIO
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 
 from skytether.cli import recordings
+from skytether.cli.commands import COMMANDS
 from skytether.shared.base import files
 from skytether.shell.commandline import command, terminal
 from skytether.shell.commandline.argument import Argument
@@ -22,6 +26,8 @@ class ReportOptions:
     """The recording (.mcap)."""
     html: Path = Path("report.html")
     """File for the HTML page."""
+    explain: bool = False
+    """Begin with an explanation, as `skytether explain` prints it; of a flight in virtual time."""
     plugin: command.Plugins = ()
 
 
@@ -34,9 +40,19 @@ def report(argv: Sequence[str]) -> None:
     command.claim_output("--html", options.html)
     recorded = recordings.opened(options.file)
     figures = terminal.summary_rows(recorded.summary) if recorded.summary else []
-    html = page(recorded, figures)
+    explanation = _explanation(options.file) if options.explain else ""
+    html = page(recorded, figures, explanation)
     try:
         files.write(options.html, html.encode())
     except OSError as error:
         raise CommandError(f"{options.html}: cannot be written: {error.strerror}") from None
     print(options.html)
+
+
+def _explanation(file: Path) -> str:
+    """What `skytether explain` prints of a recording; raises what it raises."""
+    module, _, name = COMMANDS["explain"].partition(":")
+    explain = getattr(import_module(module), name)
+    with redirect_stdout(StringIO()) as printed:
+        explain([str(file)])
+    return printed.getvalue()

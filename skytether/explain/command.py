@@ -11,7 +11,7 @@ import numpy as np
 from skytether.cli import recordings
 from skytether.explain import picture
 from skytether.explain.cases import Case
-from skytether.explain.explanation import STEPS, Explanation, check_same, explain
+from skytether.explain.explanation import FIRST, STEPS, Explanation, check_same, explain
 from skytether.explain.flying import Outcome, fly, trace
 from skytether.figures import flights as figures
 from skytether.lab.commands.pool import Flags, Interrupted, PoolFlags, crew
@@ -38,7 +38,7 @@ class ExplainOptions:
     vehicles: Annotated[int, Argument(metavar="N")] = 1
     """Number of vehicles, as in `skytether fleet`; not with a recording, which has its own."""
     json: Path | None = None
-    """File for the explanation."""
+    """File for the explanation, written after each step."""
     figure: Path | None = None
     """File for a picture of it (.png, .pdf or .svg)."""
     pool: PoolFlags = Flags()
@@ -113,26 +113,28 @@ def _explain(options: ExplainOptions, name: str, case: Case, recorded: str) -> N
             flyers.advance(0, f"{flights} flights: {step}")
             return outcomes
 
-        step = "what went wrong"
+        step = FIRST
         steps = explain(case, name, fly_all, at_s=options.at, seeds=options.seeds, at_once=at_once)
         try:
             for step, known in steps:
                 check_same(known.flown, recorded or known.flown.trace, options.scenario)
                 flyers.advance(1, step)
+                if options.json is not None:  # at once, for who watches
+                    command.write(options.json, known.to_json(step))
         except Interrupted as error:
             interrupted = error
         cpu_s = time.process_time() - began_s + flyers.cpu_s
     if known is not None:
-        _show(options, known)
+        _show(options, known, step if interrupted else "")
         print(f"{flights} flights, {cpu_s:.0f} s of CPU")
     if interrupted is not None:
         message = f"interrupted at: {step}; what is above was known by then"
         raise CommandError(message, command.INTERRUPTED) from interrupted
 
 
-def _show(options: ExplainOptions, known: Explanation) -> None:
+def _show(options: ExplainOptions, known: Explanation, following: str) -> None:
     if options.json is not None:
-        command.write(options.json, known.to_json())
+        command.write(options.json, known.to_json(following))
     if options.figure is not None and known.moment is not None:
         figures.save(picture.drawn(known), options.figure, dpi=100)
     print(known)

@@ -58,12 +58,13 @@ class Facts:
 
 @dataclass(frozen=True, slots=True)
 class Folded:
-    """Part of a page that shows its title alone until it is opened."""
+    """Part of a page that can be closed; if not open, it shows its title alone."""
 
     title: str
     parts: Sequence["Part"] = ()
     text: str = ""
     """Preformatted text before the parts."""
+    is_open: bool = False
 
 
 Part = Table | Picture | Facts | Folded

@@ -478,6 +478,27 @@ def test_a_recording_can_be_scrubbed(browser: "sync_api.Browser", tmp_path: Path
 
 
 @pytest.mark.long
+def test_a_brake_of_a_recording_is_explained_beside_it(
+    browser: "sync_api.Browser", tmp_path: Path
+) -> None:
+    file = tmp_path / "braked.mcap"
+    record = [sys.executable, "-P", "-m", "skytether", "fly", "demo-two-links", "--virtual"]
+    subprocess.run(
+        [*record, "--seed", "9314", "--record", str(file)], check=True, capture_output=True
+    )
+    with (
+        served("replay", str(file), "--page", "127.0.0.1:0") as address,
+        opened(browser, address) as page,
+    ):
+        until(lambda: flown_s(page) > 0, "it plays")
+        page.get_by_role("button", name="12.1 s: vehicle 1 brakes: the server is silent").click()
+        explained = page.locator(".skytether-explained")
+        until(lambda: "What would have helped" in explained.inner_text(), "it is explained")
+        assert "Why: 2 outages of the uplink, together." in explained.inner_text()
+        picture(page, PICTURES / "explained-dark-wide.png")
+
+
+@pytest.mark.long
 def test_a_duel_shows_all(browser: "sync_api.Browser") -> None:
     names = "demo", "demo-paper", "demo-no-compensation"
     with (

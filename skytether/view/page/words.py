@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Sequence
 from html import escape
-from itertools import cycle
+from itertools import cycle, groupby
 from typing import Any
 
 import numpy as np
@@ -295,6 +295,34 @@ def note(text: str) -> str:
 
 def refused(why: str) -> str:
     return f'<div style="{_BODY};color:{CSS["red"]};margin:-0.4em 0 0.4em">{escape(why)}</div>'
+
+
+def explained(text: str, following: str, refused_: str, command: str) -> str:
+    """Explanation of a brake, as far as it is known.
+
+    Args:
+        text: as plain text; its tables are the indented lines.
+        following: what it waits for; empty if it is complete.
+        refused_: why there is none.
+        command: command that explains the same.
+    """
+    lines = ""
+    for is_table, some in groupby(text.splitlines(), _is_tabular):
+        if is_table:
+            table = escape("\n".join(some))
+            lines += f'<pre style="margin:0.2em 0;overflow-x:auto;font-size:0.85em">{table}</pre>'
+        else:
+            lines += "".join(f"<div>{escape(each) or '&nbsp;'}</div>" for each in some)
+    waits = note(f"Flying it again: {following} …") if following and not refused_ else ""
+    return (
+        f'<div class="skytether-explained"><div style="{_BODY}">{lines}</div>{waits}'
+        f'{refused(refused_) if refused_ else ""}<div style="{_BODY};{_DIM}">'
+        f'<code style="user-select:all">{escape(command)}</code></div></div>'
+    )
+
+
+def _is_tabular(line: str) -> bool:
+    return line.startswith("  ") and not line.startswith("  →")
 
 
 def answers(given: Sequence[tuple[str, bool]]) -> str:

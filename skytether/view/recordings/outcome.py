@@ -39,7 +39,14 @@ from skytether.shared.events.standby import LeaderChanged
 from skytether.shared.law.model import Array
 from skytether.shared.missions.events import LeftMotion, LeftTube
 from skytether.shared.telemetry.record import Rows
-from skytether.shared.telemetry.summary import Track, nearest, position_error, track
+from skytether.shared.telemetry.summary import (
+    STOPPED,
+    WORSE,
+    Track,
+    nearest,
+    position_error,
+    track,
+)
 from skytether.shared.wire.protocol import Mode
 from skytether.view.recordings.recorded import Recorded
 
@@ -53,6 +60,8 @@ SHOWN = (
 GROUND = {str(mode) for mode in (Mode.INIT, Mode.SYNC, Mode.READY)}
 WITHIN_S = 2.0
 """Time within which the same event of several vehicles is shown once."""
+AT_ONCE_S = 0.1
+"""Time within which vehicles brake at once: `explain --at` cannot tell them apart."""
 BRIEF_S = 1.0
 """Length of a path's outage below which it is not shown."""
 VEHICLES_MAX = 64
@@ -248,6 +257,26 @@ class Outcome:
             for time_ns, _, event in self._recorded.events()
             if isinstance(event, LeaderChanged)
         ]
+
+
+def brakes(recorded: Recorded) -> list[tuple[float, str]]:
+    """Times in the flight at which a vehicle brakes, lands or has a fault [s], and the event as a
+    sentence; of several vehicles at once, that of the first.
+    """
+    worse, stopped = ([str(mode) for mode in modes] for modes in (WORSE, STOPPED))
+    found: list[tuple[float, str]] = []
+    braking = set[int]()
+    for time_ns, _, event in recorded.events():
+        if not isinstance(event, ModeChanged):
+            continue
+        if event.after not in stopped:
+            braking.discard(event.vehicle)
+        elif event.after in worse and event.vehicle not in braking:
+            braking.add(event.vehicle)
+            at_s = time_ns / SECOND_NS
+            if not found or at_s - found[-1][0] > AT_ONCE_S:
+                found.append((at_s, str(event)))
+    return found
 
 
 def spans(rows: Rows) -> Iterator[tuple[Mode, slice]]:

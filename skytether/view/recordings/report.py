@@ -1,5 +1,6 @@
 """Report of a recorded flight: a page that opens offline, with figures, summary and events."""
 
+import shlex
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -12,6 +13,7 @@ from skytether.figures.flights import draw_packets, draw_reference
 from skytether.figures.page import (
     Facts,
     Folded,
+    Part,
     Picture,
     Table,
     as_png,
@@ -29,7 +31,7 @@ from skytether.shared.telemetry.record import Rows
 from skytether.shared.telemetry.sent import compared
 from skytether.shared.telemetry.summary import Summary, desired, position_error
 from skytether.shared.wire.protocol import NO_HORIZON, Mode
-from skytether.view.recordings.outcome import Outcome, listed, spans
+from skytether.view.recordings.outcome import Outcome, brakes, listed, spans
 from skytether.view.recordings.recorded import Recorded
 
 if TYPE_CHECKING:
@@ -65,11 +67,12 @@ class ReportedFlight:
         return spans(self.client)
 
 
-def page(recorded: Recorded, figures: Sequence[tuple[str, str]]) -> str:
+def page(recorded: Recorded, figures: Sequence[tuple[str, str]], explanation: str = "") -> str:
     """Page of a recording, as HTML.
 
     Args:
         figures: names and values of its summary.
+        explanation: why the flight went as it did, as text; empty if nobody has asked.
 
     Raises:
         RecordingError: no vehicle has flown a step.
@@ -123,6 +126,7 @@ def page(recorded: Recorded, figures: Sequence[tuple[str, str]]) -> str:
         f"{fleet} vehicle{'s' * (fleet != 1)}, {summary.duration_s:g} s {where}. "
         + (outcome.verdict if scenario.is_mission else _verdict(summary)),
         [
+            *_why(recorded, outcome, explanation),
             *_first(outcome),
             course(outcome) if fleet > 1 else timeline(flown),
             Folded(
@@ -178,6 +182,29 @@ def _first(outcome: Outcome) -> list[Table]:
         "happened", "What failed, and what took over", says, "", heading, events[:HAPPENED_MAX]
     )
     return [table, *found] if events else [*found, table]
+
+
+def _why(recorded: Recorded, outcome: Outcome, explanation: str) -> list[Part]:
+    """The explanation, and the command for each brake, which a flight over UDP has none for."""
+    parts: list[Part] = []
+    if explanation:
+        parts.append(Folded("Why", text=explanation, is_open=True))
+    explain = f"skytether explain {shlex.quote(recorded.path.name)} --at"
+    rows = [
+        [f"{at_s + outcome.time_s(0):.1f}", text, f"{explain} {at_s:.2f}"]
+        for at_s, text in brakes(recorded)
+    ]
+    if rows and not recorded.about.began:
+        says = (
+            "Each command flies the flight again, until the smallest set of losses is found. Times "
+            f"of an explanation begin {-outcome.time_s(0):.1f} s before the first step."
+        )
+        if len(rows) > HAPPENED_MAX:
+            says += f" The first {HAPPENED_MAX} of {len(rows)}."
+        heading = ("time [s]", "event", "why it did")
+        title = "Why it braked"
+        parts.append(Table("why", title, says, "", heading, rows[:HAPPENED_MAX], is_grouped=False))
+    return parts
 
 
 def course(outcome: Outcome) -> Picture:

@@ -1,0 +1,138 @@
+"""Explanations on the page of a recording, each by a process of `skytether explain`.
+
+The process flies for up to a minute, with less priority than the page. What it has found so far is
+read from the file that it writes after each step.
+"""
+
+import contextlib
+import os
+import shlex
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import viser
+
+from skytether.shell.commandline import plugins
+from skytether.shell.host import temporary
+from skytether.view.page import words
+
+NICE = 10
+"""Niceness of the processes that fly, so that they yield to those that draw."""
+POLL_S = 0.2
+BUTTONS_MAX = 12
+"""Largest number of brakes that have a button."""
+FIRST = "what went wrong"
+"""Step that the process has not written yet."""
+GRAVEST = "What went wrong?"
+"""Button of a flight without a brake."""
+HINT = "Flies the same flight again, without its losses, until the cause is found"
+
+
+@dataclass(frozen=True, slots=True)
+class Told:
+    """What is known of a brake."""
+
+    text: str = ""
+    next: str = "another explanation"
+    """What is waited for; empty if all is known."""
+    refused: str = ""
+    """Why it is not explained."""
+
+
+class Explainer:
+    """Explanations of a recorded flight in virtual time.
+
+    Args:
+        path: the recording.
+        brakes: time in the flight of each brake [s], and its event as a sentence.
+    """
+
+    def __init__(self, path: Path, brakes: Sequence[tuple[float, str]]) -> None:
+        self._path = path
+        self._brakes: list[tuple[float | None, str]] = [
+            (at_s, f"{at_s:.1f} s: {text}") for at_s, text in brakes[:BUTTONS_MAX]
+        ] or [(None, GRAVEST)]
+        self._is_more = len(brakes) > BUTTONS_MAX
+        self.told: dict[float | None, Told] = {}
+        """What is known, by the time in the flight that was asked for [s]; None: the gravest."""
+        self._pool = ThreadPoolExecutor(1)
+        self._closed = threading.Event()
+
+    def ask(self, at_s: float | None) -> None:
+        """Explain the brake at a time, after those that were asked for before, unless it is."""
+        if at_s not in self.told or self.told[at_s].refused:
+            self.told[at_s] = Told()
+            self._pool.submit(self._explain, at_s)
+
+    def _explain(self, at_s: float | None) -> None:
+        try:
+            self._run(at_s)
+        except OSError as error:
+            self.told[at_s] = Told(refused=str(error))
+
+    def _run(self, at_s: float | None) -> None:
+        with temporary.folder() as folder, (folder / "said").open("w+b") as said:
+            found = folder / "explanation.json"
+            argv = [*self._argv(at_s), "--json", str(found), *plugins.flags()]
+            self.told[at_s] = Told(next=FIRST)
+            with subprocess.Popen(
+                [sys.executable, "-P", "-m", "skytether", *argv],
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                stderr=said,
+                start_new_session=True,  # Ctrl-C is for the page, which ends this process
+            ) as child:
+                with contextlib.suppress(OSError):  # it has ended
+                    os.setpriority(os.PRIO_PROCESS, child.pid, NICE)
+                while child.poll() is None:
+                    if self._closed.wait(POLL_S):
+                        child.terminate()
+                        child.wait()
+                    self._read(at_s, found)
+            self._read(at_s, found)
+            if child.returncode:
+                said.seek(0)
+                lines = said.read().decode(errors="replace").splitlines()
+                self.told[at_s] = Told(refused=lines[-1] if lines else "it has ended")
+
+    def _read(self, at_s: float | None, found: Path) -> None:
+        # Before the first step it is not there, or empty.
+        with contextlib.suppress(FileNotFoundError, msgspec.DecodeError):
+            self.told[at_s] = msgspec.json.decode(found.read_bytes(), type=Told)
+
+    def _argv(self, at_s: float | None) -> list[str]:
+        return ["explain", str(self._path), *([] if at_s is None else ["--at", f"{at_s:.2f}"])]
+
+    def close(self) -> None:
+        self._closed.set()
+        self._pool.shutdown(cancel_futures=True)
+
+    def controls(self, gui: viser.GuiApi) -> Callable[[], None]:
+        """Add a button for each brake to a browser; the returned function updates what is known."""
+        shown: list[float | None] = []
+
+        async def ask(at_s: float | None, _: Any) -> None:
+            shown[:] = [at_s]
+            self.ask(at_s)
+
+        with gui.add_folder("Why?"):
+            for at_s, text in self._brakes:
+                gui.add_button(text, hint=HINT).on_click(partial(ask, at_s))
+            if self._is_more:
+                gui.add_html(words.note(f"The first {BUTTONS_MAX}; others by the command."))
+            html = gui.add_html("")
+
+        def show() -> None:
+            for at_s in shown:
+                told, command = self.told[at_s], shlex.join(["skytether", *self._argv(at_s)])
+                html.content = words.explained(told.text, told.next, told.refused, command)
+
+        return show
