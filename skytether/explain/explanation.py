@@ -51,8 +51,8 @@ class Explanation:
         next; empty if all is known.
         """
         names = "name", "seed", "moments", "moment", "cause", "rescues", "remedies"
-        known = {name: getattr(self, name) for name in names}
-        return msgspec.json.encode({**known, "text": str(self), "next": following})
+        fields = {name: getattr(self, name) for name in names}
+        return msgspec.json.encode({**fields, "text": str(self), "next": following})
 
 
 def explain(

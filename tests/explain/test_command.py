@@ -63,7 +63,7 @@ def test_the_page_of_a_recording_explains_a_brake_step_by_step(recording: Path) 
         def is_known() -> bool:
             show()
             seen.append(gui.elements[""].content)
-            return not explainer.told[at_s].next
+            return not explainer.findings[at_s].next
 
         until(is_known)
     assert any("Flying it again: what went wrong" in each for each in seen)
@@ -78,7 +78,7 @@ def test_the_page_says_in_a_line_why_there_is_no_explanation(tmp_path: Path) -> 
     with closing(Explainer(tmp_path / "none.mcap", [])) as explainer:
         show = explainer.controls(cast("viser.GuiApi", gui))
         gui.elements["What went wrong?"].use()
-        until(lambda: explainer.told[None].refused)
+        until(lambda: explainer.findings[None].refused)
         show()
     assert "none.mcap: cannot be read: No such file" in gui.elements[""].content
 
@@ -87,9 +87,9 @@ def test_a_page_that_ends_ends_its_explanation(recording: Path) -> None:
     explainer = Explainer(recording, [])
     explainer.ask(None)
     explainer.ask(12.0)
-    until(lambda: explainer.told[None].next == "what went wrong")
+    until(lambda: explainer.findings[None].next == "what went wrong")
     explainer.close()
-    assert explainer.told[12.0].text == ""
+    assert explainer.findings[12.0].text == ""
 
 
 def test_a_report_has_the_command_for_each_brake_and_the_explanation_if_asked(

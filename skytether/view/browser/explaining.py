@@ -37,7 +37,7 @@ HINT = "Flies the same flight again, without its losses, until the cause is foun
 
 
 @dataclass(frozen=True, slots=True)
-class Told:
+class Findings:
     """What is known of a brake."""
 
     text: str = ""
@@ -61,28 +61,28 @@ class Explainer:
             (at_s, f"{at_s:.1f} s: {text}") for at_s, text in brakes[:BUTTONS_MAX]
         ] or [(None, GRAVEST)]
         self._is_more = len(brakes) > BUTTONS_MAX
-        self.told: dict[float | None, Told] = {}
+        self.findings: dict[float | None, Findings] = {}
         """What is known, by the time in the flight that was asked for [s]; None: the gravest."""
         self._pool = ThreadPoolExecutor(1)
         self._closed = threading.Event()
 
     def ask(self, at_s: float | None) -> None:
         """Explain the brake at a time, after those that were asked for before, unless it is."""
-        if at_s not in self.told or self.told[at_s].refused:
-            self.told[at_s] = Told()
+        if at_s not in self.findings or self.findings[at_s].refused:
+            self.findings[at_s] = Findings()
             self._pool.submit(self._explain, at_s)
 
     def _explain(self, at_s: float | None) -> None:
         try:
             self._run(at_s)
         except OSError as error:
-            self.told[at_s] = Told(refused=str(error))
+            self.findings[at_s] = Findings(refused=str(error))
 
     def _run(self, at_s: float | None) -> None:
         with temporary.folder() as folder, (folder / "said").open("w+b") as said:
             found = folder / "explanation.json"
             argv = [*self._argv(at_s), "--json", str(found), *plugins.flags()]
-            self.told[at_s] = Told(next=FIRST)
+            self.findings[at_s] = Findings(next=FIRST)
             with subprocess.Popen(
                 [sys.executable, "-P", "-m", "skytether", *argv],
                 stdin=subprocess.DEVNULL,
@@ -101,12 +101,12 @@ class Explainer:
             if child.returncode:
                 said.seek(0)
                 lines = said.read().decode(errors="replace").splitlines()
-                self.told[at_s] = Told(refused=lines[-1] if lines else "it has ended")
+                self.findings[at_s] = Findings(refused=lines[-1] if lines else "it has ended")
 
     def _read(self, at_s: float | None, found: Path) -> None:
         # Before the first step it is not there, or empty.
         with contextlib.suppress(FileNotFoundError, msgspec.DecodeError):
-            self.told[at_s] = msgspec.json.decode(found.read_bytes(), type=Told)
+            self.findings[at_s] = msgspec.json.decode(found.read_bytes(), type=Findings)
 
     def _argv(self, at_s: float | None) -> list[str]:
         return ["explain", str(self._path), *([] if at_s is None else ["--at", f"{at_s:.2f}"])]
@@ -132,7 +132,7 @@ class Explainer:
 
         def show() -> None:
             for at_s in shown:
-                told, command = self.told[at_s], shlex.join(["skytether", *self._argv(at_s)])
-                html.content = words.explained(told.text, told.next, told.refused, command)
+                found, command = self.findings[at_s], shlex.join(["skytether", *self._argv(at_s)])
+                html.content = words.explained(found.text, found.next, found.refused, command)
 
         return show
