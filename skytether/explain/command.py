@@ -9,19 +9,22 @@ from typing import Annotated
 import numpy as np
 
 from skytether.cli import recordings
-from skytether.explain import picture
+from skytether.explain import mission, picture
 from skytether.explain.cases import Case
 from skytether.explain.explanation import FIRST, STEPS, Explanation, check_same, explain
 from skytether.explain.flying import Outcome, fly, trace
+from skytether.explain.hypotheses import hypotheses
 from skytether.figures import flights as figures
 from skytether.lab.commands.pool import Flags, Interrupted, PoolFlags, crew
+from skytether.shared.missions.mission import Mission
 from skytether.shared.scenario.whole import Scenario
-from skytether.shared.telemetry.record import RECORDING
+from skytether.shared.telemetry.record import PACKET_COLUMNS, RECORDING, FlightEvent, Record
 from skytether.shell.commandline import command
 from skytether.shell.commandline.argument import Argument
 from skytether.shell.commandline.command import CommandError, ScenarioFlags, ScenarioName
 from skytether.shell.commandline.options import read
 from skytether.shell.host import system
+from skytether.view.recordings.recorded import Recorded
 
 
 @dataclass(frozen=True)
@@ -35,8 +38,9 @@ class ExplainOptions:
     """Time in the flight of what is to be explained [s]; by default the gravest moment is."""
     seeds: Annotated[int, Argument(metavar="N")] = 0
     """Number of flights of each remedy with other seeds, which count up from the scenario's."""
-    vehicles: Annotated[int, Argument(metavar="N")] = 1
-    """Number of vehicles, as in `skytether fleet`; not with a recording, which has its own."""
+    vehicles: Annotated[int | None, Argument(metavar="N")] = None
+    """Number of vehicles, as in `skytether fleet`; by default one, or as many as a mission has. Not
+    with a recording, which has its own."""
     json: Path | None = None
     """File for the explanation, written after each step."""
     figure: Path | None = None
@@ -62,11 +66,16 @@ def explain_flight(argv: Sequence[str]) -> None:
         if options.vehicles != ExplainOptions.vehicles:
             message = f"--vehicles: got {options.vehicles} with a recording, which has its own"
             raise CommandError(message, command.CONFIGURATION)
-        name, case, recorded = _recorded(Path(options.scenario))
+        found = recordings.opened(Path(options.scenario))
+        if found.about.began and found.scenario.keeps_apart:
+            _judge(options, found)
+            return
+        name, case, recorded = _recorded(found)
     else:
         options = command.parse(ExplainOptions(), argv, "skytether explain", explain_flight.__doc__)
-        command.check_count("--vehicles", options.vehicles, 255)
-        name, case, recorded = options.scenario, Case(options.config, options.vehicles), ""
+        vehicles = _vehicles(options)
+        command.check_count("--vehicles", vehicles, 255)
+        name, case, recorded = options.scenario, Case(options.config, vehicles), ""
     if options.seeds:
         command.check_count("--seeds", options.seeds, 10_000)
     options.pool.check()
@@ -75,17 +84,46 @@ def explain_flight(argv: Sequence[str]) -> None:
     _explain(options, name, case, recorded)
 
 
-def _recorded(path: Path) -> tuple[str, Case, str]:
+def _vehicles(options: ExplainOptions) -> int:
+    if options.vehicles is not None:
+        return options.vehicles
+    reference = options.config.unallocated_reference()
+    return len(reference.vehicles) if isinstance(reference, Mission) else 1
+
+
+def _judge(options: ExplainOptions, recorded: Recorded) -> None:
+    """Print what the theorem of separation assumes of a mission that cannot be flown again.
+
+    Raises:
+        CommandError: a part of the record is missing, or an option needs more flights.
+    """
+    for name in ("at", "seeds", "json", "figure"):
+        if getattr(options, name) != getattr(ExplainOptions, name):
+            message = f"--{name}: got it with a flight over UDP, which cannot be flown again"
+            raise CommandError(message, command.CONFIGURATION)
+    missing = {"client", "server", "plan"} - recorded.parts.keys()
+    if missing:
+        message = f"{recorded.path}: no rows of {', '.join(sorted(missing))}"
+        raise CommandError(message, command.CONFIGURATION)
+    events = tuple(FlightEvent(*each) for each in recorded.events())
+    client, server, plan = (recorded.parts[name] for name in ("client", "server", "plan"))
+    no_packets = np.empty(0, PACKET_COLUMNS)
+    own = recorded.figures
+    record = Record(client, server, no_packets, figures=own, events=events, plan=plan)
+    print(mission.text(hypotheses(record, recorded.scenario), ()))
+    print("A flight over UDP cannot be flown again: what caused what is not said.")
+
+
+def _recorded(recorded: Recorded) -> tuple[str, Case, str]:
     """Name, case and hash of a recorded flight.
 
     Raises:
         CommandError: the flight cannot be flown again.
     """
-    recorded = recordings.opened(path)
+    path, client = recorded.path, recorded.parts.get("client")
     if recorded.about.began:
         expected = "expected one in virtual time, which can be flown again"
         raise CommandError(f"{path}: got a flight over UDP, {expected}", command.CONFIGURATION)
-    client = recorded.parts.get("client")
     if client is None:
         raise CommandError(f"{path}: no step was flown", command.CONFIGURATION)
     case = Case(

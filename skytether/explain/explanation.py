@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import msgspec
 
-from skytether.explain import causes, remedies, units, words
+from skytether.explain import causes, mission, remedies, units, words
 from skytether.explain.cases import Case
 from skytether.explain.causes import Cause, Rescues
 from skytether.explain.flying import FlyAll, Outcome, fly
@@ -44,14 +44,17 @@ class Explanation:
     """Flights to draw beside it: without a part of the cause, and with a remedy."""
 
     def __str__(self) -> str:
-        return words.text(self.moments, self.moment, self.cause, self.rescues, self.remedies)
+        said = words.text(self.moments, self.moment, self.cause, self.rescues, self.remedies)
+        of_mission = mission.text(self.flown.hypotheses, self.flown.waits)
+        return f"{said}\n\n{of_mission}" if of_mission else said
 
     def to_json(self, following: str = "") -> bytes:
-        """What is known, as JSON: the fields without the flights, the text, and the step that comes
-        next; empty if all is known.
+        """What is known, as JSON: the fields without the flights, those of a mission, the text, and
+        the step that comes next; empty if all is known.
         """
         names = "name", "seed", "moments", "moment", "cause", "rescues", "remedies"
         fields = {name: getattr(self, name) for name in names}
+        fields |= {name: getattr(self.flown, name) for name in ("hypotheses", "waits")}
         return msgspec.json.encode({**fields, "text": str(self), "next": following})
 
 

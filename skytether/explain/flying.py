@@ -4,7 +4,7 @@ A case and its outcome can be sent to another process and back.
 """
 
 import hashlib
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import TypeAlias
@@ -12,10 +12,14 @@ from typing import TypeAlias
 import numpy as np
 
 from skytether.explain.cases import Case, Lane, Stall
+from skytether.explain.hypotheses import Hypothesis, hypotheses
+from skytether.explain.server_ticks import are_plans
+from skytether.explain.waits import Reason, Wait, waits
 from skytether.netem.impairments.draws import SLOT_NS
-from skytether.shared.base.units import SECOND_NS, seconds_to_ns
+from skytether.shared.base.units import SECOND_NS
 from skytether.shared.events.flight import Failure, FlowOpened, Flying
 from skytether.shared.law.model import Array, Flags, Indices
+from skytether.shared.law.motion import SPACING
 from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import DOWNLINK, UPLINK, Record, Rows
 from skytether.shared.telemetry.summary import position_error, separations
@@ -76,6 +80,10 @@ class Outcome:
     packets_per_s: float
     trace: str
     """Hash of the vehicles' rows, see `trace`."""
+    hypotheses: tuple[Hypothesis, ...] = ()
+    """What the theorem of separation assumes, and whether it held; empty unless on a mission."""
+    waits: tuple[Wait, ...] = ()
+    """Waits of a mission's vehicles, the longest first."""
 
 
 FlyAll: TypeAlias = Callable[[Sequence[Case]], list[Outcome]]
@@ -91,16 +99,34 @@ def fly(case: Case) -> Outcome:
         nonlocal reached_s
         reached_s = flown_s
 
-    until_s = case.until_s
+    until_s, reasons = case.until_s, list[Reason]()
+    actions = [action for stall in case.stalls for action in _actions(stall, case)]
+    if scenario.keeps_apart:
+        actions += _questions(scenario, reasons)
     record = flight.fly(
         scenario,
         vehicles=case.vehicles,
         secure=case.secure,
-        actions=[action for stall in case.stalls for action in _actions(stall, case)],
+        actions=actions,
         on_second=on_second,
         stopped=None if until_s is None else lambda: reached_s >= until_s,
     )
-    return outcome(scenario, record)
+    return outcome(scenario, record, reasons)
+
+
+def _questions(
+    scenario: Scenario, reasons: list[Reason]
+) -> Iterator[tuple[float, Callable[[World], None]]]:
+    """Times at which the server says what vehicles wait for: once for each decision."""
+
+    def ask(world: World) -> None:
+        for vehicle, figures in world.endpoint(flight.SERVER[0]).figures()["by_vehicle"].items():
+            time_s = world.now_ns / SECOND_NS
+            reasons.append((time_s, int(vehicle), figures.get("waits") or ""))
+
+    every_s = SPACING * scenario.control.dt
+    for number in range(int((scenario.link.connect_s + scenario.duration) / every_s)):
+        yield number * every_s, ask
 
 
 def _actions(stall: Stall, case: Case) -> Iterable[tuple[float, Callable[[World], None]]]:
@@ -111,8 +137,8 @@ def _actions(stall: Stall, case: Case) -> Iterable[tuple[float, Callable[[World]
         yield stall.at_s + stall.for_s, partial(World.thaw, name=host)
 
 
-def outcome(scenario: Scenario, record: Record) -> Outcome:
-    """Outcome of a recorded flight in virtual time."""
+def outcome(scenario: Scenario, record: Record, reasons: Sequence[Reason] = ()) -> Outcome:
+    """Outcome of a recorded flight in virtual time; `reasons`: see `waits`."""
     began_ns = _lanes_began_ns(record)
     flying_ns = {
         each.event.vehicle: each.time_ns for each in record.events if isinstance(each.event, Flying)
@@ -129,7 +155,7 @@ def outcome(scenario: Scenario, record: Record) -> Outcome:
     times_s, nearest_m = separations(flown, began_s, dt_s, scale)
     return Outcome(
         tuple(tracks),
-        _packets(scenario, record, began_ns, flying_ns),
+        _packets(scenario, record, began_ns),
         {lane: ns / SECOND_NS for lane, ns in began_ns.items()},
         times_s,
         nearest_m if scenario.keeps_apart else np.full(len(times_s), np.nan),
@@ -140,6 +166,8 @@ def outcome(scenario: Scenario, record: Record) -> Outcome:
         ),
         len(record.netem) / max(1.0, float(np.ptp(record.netem["arrived_ns"])) / SECOND_NS),
         trace(record.client),
+        hypotheses(record, scenario) if scenario.keeps_apart else (),
+        waits(record, scenario, reasons) if scenario.keeps_apart else (),
     )
 
 
@@ -170,12 +198,7 @@ def _lanes_began_ns(record: Record) -> dict[Lane, int]:
     return began
 
 
-def _packets(
-    scenario: Scenario,
-    record: Record,
-    began_ns: Mapping[Lane, int],
-    flying_ns: Mapping[int, int],
-) -> Packets:
+def _packets(scenario: Scenario, record: Record, began_ns: Mapping[Lane, int]) -> Packets:
     """Packets by time."""
     rows = record.netem[np.argsort(record.netem["arrived_ns"], kind="stable")]
     names = rows["path"].tolist(), rows["direction"].tolist(), rows["flow"].tolist()
@@ -187,30 +210,5 @@ def _packets(
         since_ns // SLOT_NS,
         rows["delay_ns"] / SECOND_NS,
         rows["lost"].copy(),
-        _are_plans(scenario, record.server, rows, flying_ns),
+        are_plans(record, rows, scenario.dt_ns),
     )
-
-
-def _are_plans(
-    scenario: Scenario, server: Rows, packets: Rows, flying_ns: Mapping[int, int]
-) -> Flags:
-    """Which packets have a plan: those that leave at a tick at which the server sends one.
-
-    The tick's step begins before the tick or after it, by the server's estimate of the vehicle's
-    clock: the number of steps between them is that with which most plans have left.
-    """
-    sent = server[server["event"]]
-    plans = set(zip(sent["vehicle"].tolist(), sent["step"].tolist(), strict=True))
-    vehicles = np.array([*sorted(flying_ns), 0])
-    vehicle = vehicles[np.minimum(packets["flow"], len(flying_ns))]
-    began_ns = np.array([flying_ns.get(each, 0) for each in vehicle.tolist()], dtype=np.int64)
-    compute_ns = seconds_to_ns(scenario.simulation.compute_s)
-    step = (packets["arrived_ns"] - compute_ns - began_ns) // scenario.dt_ns
-    is_up = packets["direction"] == UPLINK
-    matches = [
-        np.array([each in plans for each in zip(vehicle.tolist(), at.tolist(), strict=True)], bool)
-        & is_up
-        for at in (step, step + 1, step + 2)
-    ]
-    most: Flags = max(matches, key=np.count_nonzero)
-    return most

@@ -62,6 +62,11 @@ class World(Hosts):
             and the event, before `on_finished` of that host.
     """
 
+    def endpoint(self, name: str) -> Endpoint:
+        """Endpoint of a host, also while it is down or frozen."""
+        endpoint = self._hosts[name].endpoint
+        return endpoint.inner if isinstance(endpoint, _Still) else endpoint
+
     def stop(self, name: str) -> None:
         """Take a host down: it receives nothing, and the datagrams that it computes are lost."""
         host = self._hosts[name]

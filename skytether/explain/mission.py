@@ -1,0 +1,78 @@
+"""What the explanation says of a mission: what the theorem assumes, and who waited for whom."""
+
+import math
+from collections.abc import Iterator, Sequence
+
+from skytether.explain.hypotheses import Hypothesis
+from skytether.explain.waits import Wait
+
+WAITS_SHOWN = 6
+"""Largest number of waits of a kind that are listed."""
+SHORT_S = 1.0
+"""Waits for acknowledgements that are no longer are usual, if nothing was lost [s]."""
+
+
+def text(found: Sequence[Hypothesis], waited: Sequence[Wait]) -> str:
+    """Both in plain text; empty unless the flight was a mission."""
+    return "\n".join([*_hypotheses(found), *_waits(waited)])
+
+
+def _hypotheses(found: Sequence[Hypothesis]) -> Iterator[str]:
+    if not found:
+        return
+    yield "What the theorem of separation assumes (docs/together-proof.md), and its least margin:"
+    heading = "condition", "", "held", "margin", "of vehicle", "at step", "checked"
+    rows = [heading, *(_row(each) for each in found)]
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    for row in rows:
+        yield ("  " + "  ".join(map(str.ljust, row, widths))).rstrip()
+    if any(0.0 < each.checked < 1.0 for each in found):
+        yield "  A motion is recorded for control.horizon steps; later ones are not checked."
+
+
+def _row(each: Hypothesis) -> Sequence[str]:
+    held = {True: "yes", False: "NO", None: "?"}[each.is_held]
+    margin = f"{each.margin:.3g} {each.unit}" if math.isfinite(each.margin) else "-"
+    vehicles = " and ".join(map(str, each.vehicles))
+    step = "" if each.step is None else str(each.step)
+    number = str(each.condition or "promise")
+    checked = f"{each.checked:.0%}" if each.checked or each.is_held is None else "counts"
+    return number, each.name, held, margin, vehicles, step, checked
+
+
+def _waits(waited: Sequence[Wait]) -> Iterator[str]:
+    begun = [each for each in waited if each.kind == "to begin"]
+    heard = [each for each in waited if each.kind == "acknowledgement"]
+    late = [each for each in heard if each.lost and each.for_s > SHORT_S]
+    ways = [each for each in waited if each.kind == "way"]
+    if not waited:
+        return
+    yield "Who waited for whom:"
+    if begun:
+        yield f"  all for vehicle {begun[0].other} to begin, up to {begun[0].for_s:.2f} s"
+    for each in ways[:WAITS_SHOWN]:
+        whom = f"vehicle {each.other}" if each.other else "a zone"
+        own = f", {_packets(each, 'whose')}" if not math.isnan(each.motion_s) else ""
+        yield f"  vehicle {each.vehicle} for {whom}, {_when(each)}{own}"
+    for each in late[:WAITS_SHOWN]:
+        yield f"  vehicle {each.vehicle}, {_when(each)}: {_packets(each, 'its')}"
+    hidden = len(ways[WAITS_SHOWN:]) + len(late[WAITS_SHOWN:])
+    if hidden:
+        yield f"  and {hidden} shorter waits"
+    if heard:
+        usual = sorted(each.for_s for each in heard)[len(heard) // 2]
+        yield f"  {len(heard)} motions were acknowledged or lost, at the median in {usual:.2f} s"
+
+
+def _when(each: Wait) -> str:
+    return f"{each.start_s:.2f} to {each.end_s:.2f} s"
+
+
+def _packets(each: Wait, whose: str) -> str:
+    """The motion that was not acknowledged, and what was lost of its packets."""
+    lost = [
+        f"{count[1]} of {count[0]} {what}{'s' * (count[0] != 1)} lost"
+        for count, what in ((each.plans, "packet"), (each.reports, "answer"))
+        if count[1]
+    ]
+    return f"{whose} motion of {each.motion_s:.2f} s was not acknowledged: {', '.join(lost)}"

@@ -1,0 +1,67 @@
+"""Ticks of the server in a record, and the packets that left at them."""
+
+from collections import Counter
+
+import numpy as np
+
+from skytether.shared.base.units import MILLISECOND_NS
+from skytether.shared.events.flight import FlowOpened
+from skytether.shared.law.model import Flags, Indices
+from skytether.shared.telemetry.record import UPLINK, Record, Rows
+
+PACKETS, PLANS = 400, 50
+"""Number of packets and of plans of a vehicle that are compared."""
+
+
+def ticks(server: Rows) -> Indices:
+    """Number of the tick of each of the server's rows, from the first row's on: a tick has each
+    vehicle once.
+    """
+    tick, seen, number = np.zeros(len(server), dtype=np.int64), set[int](), 0
+    for at, vehicle in enumerate(server["vehicle"].tolist()):
+        if vehicle in seen:
+            number += 1
+            seen.clear()
+        seen.add(vehicle)
+        tick[at] = number
+    return tick + server["missed"]
+
+
+def flows(record: Record) -> dict[int, int]:
+    """Vehicle of each flow; empty over real UDP, where the hosts have no numbers."""
+    return {
+        each.event.flow: int(each.event.host.rpartition(".")[2])
+        for each in record.events
+        if isinstance(each.event, FlowOpened) and each.event.host.rpartition(".")[2].isdigit()
+    }
+
+
+def begin_ns(record: Record, dt_ns: int) -> int | None:
+    """Time at which the packets of tick 0 leave, in virtual time [ns]: with it, most plans have a
+    packet. None if no plan has one.
+    """
+    own, server = flows(record), record.server
+    sent, times = server[server["event"]], Counter[int]()
+    tick, uplink = ticks(server)[server["event"]], record.netem[record.netem["direction"] == UPLINK]
+    for flow, vehicle in own.items():
+        left_ns = uplink["arrived_ns"][uplink["flow"] == flow][:PACKETS]
+        since_ns = left_ns[:, None] - tick[sent["vehicle"] == vehicle][:PLANS] * dt_ns
+        times.update(since_ns.ravel().tolist())
+    return max(times, key=times.__getitem__) if times else None
+
+
+def are_plans(record: Record, packets: Rows, dt_ns: int) -> Flags:
+    """Which packets have a plan: those that leave at a tick at which the server sends one."""
+    began_ns, own = begin_ns(record, dt_ns), flows(record)
+    if began_ns is None:
+        return np.zeros(len(packets), dtype=np.bool_)
+    event = record.server["event"]
+    vehicles, tick = record.server["vehicle"][event].tolist(), ticks(record.server)[event].tolist()
+    plans = set(zip(vehicles, tick, strict=True))
+    at = np.round((packets["arrived_ns"] - began_ns) / dt_ns).astype(np.int64)
+    off_ns = np.abs(packets["arrived_ns"] - began_ns - at * dt_ns)
+    sent = zip(packets["flow"].tolist(), at.tolist(), strict=True)
+    is_at: Flags = np.array([(own.get(flow, 0), tick) in plans for flow, tick in sent], dtype=bool)
+    is_up = packets["direction"] == UPLINK
+    result: Flags = is_at & is_up & (off_ns < MILLISECOND_NS)
+    return result

@@ -1,0 +1,184 @@
+"""Waits: which vehicle of a mission waited for which, and for which packet.
+
+A vehicle is sent a motion every `motion.SPACING` steps, unless it has arrived. It waits
+
+    to begin          until every vehicle of the mission flies a first motion
+    acknowledgement   until the server has observed whether it flies its newest motion
+    way               because no motion towards its goal keeps away from another vehicle, or a zone
+
+The first two follow from the rows of a record. The third does not: the server says it with each
+decision (`waits` of its figures), which whoever flies a case again reads meanwhile.
+"""
+
+import math
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Literal, TypeAlias
+
+import numpy as np
+
+from skytether.explain.hypotheses import Flown, began_ns, flown
+from skytether.explain.server_ticks import begin_ns, flows, ticks
+from skytether.shared.base.units import SECOND_NS
+from skytether.shared.law.model import Array, Flags, Indices
+from skytether.shared.law.motion import SPACING
+from skytether.shared.scenario.whole import Scenario
+from skytether.shared.telemetry.record import UPLINK, Record, Rows
+
+PLAN_BYTES = 60
+"""Size above which a packet is a motion, not a sign of life [bytes]."""
+AT_ONCE_S = 1e-3
+"""Tolerance of times [s]."""
+OTHER = re.compile(r"vehicle (\d+)( to pass)?|a zone")
+"""What the server says of a vehicle that waits for its way."""
+
+Reason: TypeAlias = tuple[float, int, str]
+"""Time in the flight [s], vehicle, and what it waits for, in the server's words."""
+Kind = Literal["to begin", "acknowledgement", "way"]
+
+
+@dataclass(frozen=True, slots=True)
+class Wait:
+    """Time for which the server sent a vehicle no motion, and why."""
+
+    kind: Kind
+    vehicle: int
+    start_s: float
+    """Time in the flight [s]."""
+    for_s: float
+    other: int = 0
+    """Vehicle that it waited for; 0: itself, or a zone."""
+    motion_s: float = math.nan
+    """Time at which its own or the other's motion was sent that was not acknowledged [s]."""
+    plans: tuple[int, int] = (0, 0)
+    """Packets with that motion, and how many of them were lost."""
+    reports: tuple[int, int] = (0, 0)
+    """Packets from the vehicle since it flew that motion, and how many of them were lost."""
+
+    @property
+    def end_s(self) -> float:
+        return self.start_s + self.for_s
+
+    @property
+    def lost(self) -> int:
+        return self.plans[1] + self.reports[1]
+
+
+@dataclass(frozen=True, slots=True)
+class _Vehicle:
+    """A vehicle, and what the server knew of its motions."""
+
+    flown: Flown
+    time_s: Array
+    """Time in the flight of each of the server's ticks with it [s]."""
+    sent_at: Indices
+    """Number of the tick at which each motion was sent first."""
+    heard_at: Indices
+    """Number of the tick from which on the server knew whether it was accepted, or the last."""
+    is_heard: Flags
+    """Whether it knew at that tick."""
+    accepted: Indices
+    """Step from which on the vehicle flew it; -1 if it never did."""
+
+    @property
+    def begins_s(self) -> float:
+        """Time at which the server first knows that the vehicle flies a motion [s]."""
+        begins_s: float = self.time_s[self.heard_at[np.argmax(self.accepted >= 0)]]
+        return begins_s
+
+
+def waits(record: Record, scenario: Scenario, reasons: Sequence[Reason] = ()) -> tuple[Wait, ...]:
+    """Waits of all vehicles of a mission, the longest first.
+
+    Args:
+        record: flight in virtual time.
+        reasons: what the server said every SPACING steps; without it, no vehicle waits for its way.
+    """
+    vehicles = list(_vehicles(record, scenario))
+    found = [*_to_begin(vehicles)]
+    for each in vehicles:
+        found += _acknowledgements(record, each)
+    found += _ways(reasons, found, SPACING * scenario.control.dt)
+    return tuple(sorted(found, key=lambda wait: -wait.for_s))
+
+
+def _vehicles(record: Record, scenario: Scenario) -> Iterator[_Vehicle]:
+    tick, server, join = ticks(record.server), record.server, scenario.terms().join
+    left_ns = begin_ns(record, scenario.dt_ns)
+    for each in flown(scenario, record):
+        is_own = server["vehicle"] == each.vehicle
+        rows, sent = server[is_own], each.motions.step
+        if not len(rows) or not len(sent) or left_ns is None:
+            continue
+        at = [np.flatnonzero(each.in_force == first) for first in sent.tolist()]
+        accepted = np.array([int(each.step[own[0]]) if len(own) else -1 for own in at])
+        # What was not accepted by then never is.
+        certain = np.where(accepted >= 0, accepted, sent + join + 1)
+        heard_at = np.searchsorted(rows["observed_step"], certain).clip(0, len(rows) - 1)
+        time_s = (left_ns + tick[is_own] * scenario.dt_ns) / SECOND_NS
+        is_heard = rows["observed_step"][heard_at] >= certain
+        yield _Vehicle(each, time_s, _sent_at(rows, sent), heard_at, is_heard, accepted)
+
+
+def _sent_at(rows: Rows, sent: Indices) -> Indices:
+    """First row with each of some steps; the server's count of steps may go back."""
+    first = dict(zip(rows["step"][::-1].tolist(), range(len(rows))[::-1], strict=True))
+    return np.array([first[step] for step in sent.tolist()])
+
+
+def _to_begin(vehicles: Sequence[_Vehicle]) -> Iterator[Wait]:
+    """Each waits for the last that begins."""
+    last = max(vehicles, key=lambda each: each.begins_s, default=None)
+    for each in vehicles:
+        if last is not None and each.begins_s < last.begins_s:
+            for_s = last.begins_s - each.begins_s
+            yield Wait("to begin", each.flown.vehicle, each.begins_s, for_s, last.flown.vehicle)
+
+
+def _acknowledgements(record: Record, each: _Vehicle) -> Iterator[Wait]:
+    """Waits for acknowledgements, with the packets that they were for."""
+    number, began_s = each.flown.vehicle, began_ns(record)[each.flown.vehicle] / SECOND_NS
+    flow = next(flow for flow, vehicle in flows(record).items() if vehicle == number)
+    packets = record.netem[record.netem["flow"] == flow]
+    entered_s, is_up = packets["arrived_ns"] / SECOND_NS, packets["direction"] == UPLINK
+    step_s = float(np.diff(each.time_s[:2]).sum())
+    for motion in each.is_heard.nonzero()[0].tolist():
+        start_s, end_s = each.time_s[[each.sent_at[motion], each.heard_at[motion]]].tolist()
+        is_meanwhile = (entered_s > start_s - AT_ONCE_S) & (entered_s < end_s)
+        plans = packets["lost"][is_meanwhile & is_up & (packets["bytes"] > PLAN_BYTES)]
+        flies_s = began_s + float(each.accepted[motion]) * step_s
+        since = is_meanwhile & ~is_up & (entered_s > flies_s - AT_ONCE_S)
+        reports = packets["lost"][since & (each.accepted[motion] >= 0)]
+        counts = (len(plans), int(plans.sum())), (len(reports), int(reports.sum()))
+        yield Wait("acknowledgement", number, start_s, end_s - start_s, number, start_s, *counts)
+
+
+def _ways(reasons: Sequence[Reason], others: Sequence[Wait], every_s: float) -> Iterator[Wait]:
+    """Waits for the way, with the packets that the other was waiting for meanwhile, if any was
+    lost.
+    """
+    last: dict[int, tuple[str, Wait]] = {}
+    found = []
+    for time_s, vehicle, text in reasons:
+        before, wait = last.pop(vehicle, ("", None))
+        match = OTHER.fullmatch(text)
+        if wait is not None and text == before:
+            last[vehicle] = text, replace(wait, for_s=time_s + every_s - wait.start_s)
+            continue
+        found += [wait] * (wait is not None)
+        if match:
+            other = int(match[1] or 0)
+            last[vehicle] = text, Wait("way", vehicle, time_s, every_s, other)
+    for wait in (*found, *(each for _, each in last.values())):
+        assert wait is not None
+        lost = [
+            each
+            for each in others
+            if each.kind == "acknowledgement" and each.vehicle == wait.other and each.lost
+            if each.start_s < wait.end_s and each.end_s > wait.start_s
+        ]
+        if lost:
+            most = max(lost, key=lambda each: each.for_s)
+            wait = replace(wait, motion_s=most.motion_s, plans=most.plans, reports=most.reports)  # noqa: PLW2901 - completed
+        yield wait
