@@ -20,8 +20,10 @@ In this order, each in a module of its own:
 | `smallest` | delta debugging: the smallest set of units that suffices |
 | `causes` | the cause, single packets that would have averted it, how long an outage must be |
 | `remedies` | other keys, over the same fates and over those of other seeds |
+| `hypotheses` | what the theorem of separation assumes of a mission, with its least margin |
+| `waits`, `server_ticks` | which vehicle of a mission waited for which, and for which packet |
 | `explanation` | all of it, step by step |
-| `words`, `picture` | the explanation as text and as a picture |
+| `words`, `mission`, `picture` | the explanation as text and as a picture |
 | `command` | the command, the only module that knows of processes, files and the terminal |
 
 **Cause.** A set of units *suffices* if the moment comes about with these units alone: within the
@@ -33,7 +35,7 @@ each is needed, and none is half to blame.
 
 **What it cannot say.** It explains this flight, and the flight of the model: wind and vehicle are
 simulated. A remedy that helps in one flight is not proven; `--seeds` flies others. Flights over
-real UDP cannot be flown again.
+real UDP cannot be flown again; of a mission, their recording suffices for the hypotheses.
 
 **Bounds.** Every figure comes from a flight; none is estimated. Every flight goes through `fly`.
 """

@@ -213,12 +213,10 @@ def _beginning(scenario: Scenario, vehicles: Sequence[Flown]) -> Iterator[Hypoth
     steps = {each.vehicle: int(each.step[first[each.vehicle]]) for each in vehicles}
     step = steps[pair[0]] if pair else None
     yield Hypothesis(1, "they begin apart", margin, "m", pair, step)
-    at = {each.vehicle: slice(first[each.vehicle], first[each.vehicle] + 1) for each in vehicles}
-    margins = {
-        each.vehicle: (each.step[here], scenario.mission.tube_m - each.off_m[here])
-        for each in vehicles
-        for here in [at[each.vehicle]]
-    }
+    margins = {}
+    for each in vehicles:
+        here = slice(first[each.vehicle], first[each.vehicle] + 1)
+        margins[each.vehicle] = each.step[here], scenario.mission.tube_m - each.off_m[here]
     yield _least(1, "each begins at its place", "m", margins)
 
 

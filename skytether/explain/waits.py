@@ -19,15 +19,13 @@ from typing import Literal, TypeAlias
 import numpy as np
 
 from skytether.explain.hypotheses import Flown, began_ns, flown
-from skytether.explain.server_ticks import begin_ns, flows, ticks
+from skytether.explain.server_ticks import are_plans, begin_ns, flows, ticks
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.law.model import Array, Flags, Indices
 from skytether.shared.law.motion import SPACING
 from skytether.shared.scenario.whole import Scenario
-from skytether.shared.telemetry.record import UPLINK, Record, Rows
+from skytether.shared.telemetry.record import DOWNLINK, Record, Rows
 
-PLAN_BYTES = 60
-"""Size above which a packet is a motion, not a sign of life [bytes]."""
 AT_ONCE_S = 1e-3
 """Tolerance of times [s]."""
 OTHER = re.compile(r"vehicle (\d+)( to pass)?|a zone")
@@ -84,8 +82,7 @@ class _Vehicle:
     @property
     def begins_s(self) -> float:
         """Time at which the server first knows that the vehicle flies a motion [s]."""
-        begins_s: float = self.time_s[self.heard_at[np.argmax(self.accepted >= 0)]]
-        return begins_s
+        return float(self.time_s[self.heard_at[np.argmax(self.accepted >= 0)]])
 
 
 def waits(record: Record, scenario: Scenario, reasons: Sequence[Reason] = ()) -> tuple[Wait, ...]:
@@ -96,9 +93,9 @@ def waits(record: Record, scenario: Scenario, reasons: Sequence[Reason] = ()) ->
         reasons: what the server said every SPACING steps; without it, no vehicle waits for its way.
     """
     vehicles = list(_vehicles(record, scenario))
-    found = [*_to_begin(vehicles)]
+    found, is_plan = [*_to_begin(vehicles)], are_plans(record, record.netem, scenario.dt_ns)
     for each in vehicles:
-        found += _acknowledgements(record, each)
+        found += _acknowledgements(record, is_plan, each, scenario.control.dt)
     found += _ways(reasons, found, SPACING * scenario.control.dt)
     return tuple(sorted(found, key=lambda wait: -wait.for_s))
 
@@ -136,19 +133,25 @@ def _to_begin(vehicles: Sequence[_Vehicle]) -> Iterator[Wait]:
             yield Wait("to begin", each.flown.vehicle, each.begins_s, for_s, last.flown.vehicle)
 
 
-def _acknowledgements(record: Record, each: _Vehicle) -> Iterator[Wait]:
-    """Waits for acknowledgements, with the packets that they were for."""
+def _acknowledgements(
+    record: Record, is_plan: Flags, each: _Vehicle, dt_s: float
+) -> Iterator[Wait]:
+    """Waits for acknowledgements, with the packets that they were for.
+
+    Args:
+        is_plan: whether each packet of the record has a plan.
+    """
     number, began_s = each.flown.vehicle, began_ns(record)[each.flown.vehicle] / SECOND_NS
     flow = next(flow for flow, vehicle in flows(record).items() if vehicle == number)
-    packets = record.netem[record.netem["flow"] == flow]
-    entered_s, is_up = packets["arrived_ns"] / SECOND_NS, packets["direction"] == UPLINK
-    step_s = float(np.diff(each.time_s[:2]).sum())
+    is_own = record.netem["flow"] == flow
+    packets, carries = record.netem[is_own], is_plan[is_own]
+    entered_s, is_down = packets["arrived_ns"] / SECOND_NS, packets["direction"] == DOWNLINK
     for motion in each.is_heard.nonzero()[0].tolist():
         start_s, end_s = each.time_s[[each.sent_at[motion], each.heard_at[motion]]].tolist()
         is_meanwhile = (entered_s > start_s - AT_ONCE_S) & (entered_s < end_s)
-        plans = packets["lost"][is_meanwhile & is_up & (packets["bytes"] > PLAN_BYTES)]
-        flies_s = began_s + float(each.accepted[motion]) * step_s
-        since = is_meanwhile & ~is_up & (entered_s > flies_s - AT_ONCE_S)
+        plans = packets["lost"][is_meanwhile & carries]
+        flies_s = began_s + float(each.accepted[motion]) * dt_s
+        since = is_meanwhile & is_down & (entered_s > flies_s - AT_ONCE_S)
         reports = packets["lost"][since & (each.accepted[motion] >= 0)]
         counts = (len(plans), int(plans.sum())), (len(reports), int(reports.sum()))
         yield Wait("acknowledgement", number, start_s, end_s - start_s, number, start_s, *counts)

@@ -9,12 +9,15 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from helpers import packaged
+from skytether.__main__ import main
+from skytether.cli import recordings
 from skytether.client.compensator import Compensator
 from skytether.explain import flying, mission
 from skytether.explain.cases import Case
@@ -191,6 +194,7 @@ def test_motions_that_are_lost_are_what_a_vehicle_waits_for() -> None:
     found = waits("acknowledgement", 4, 14.0, network=outage)
     lost = [each for each in found if each.lost]
     assert {each.vehicle for each in lost} == {1, 2, 3, 4}
+    assert all(each.plans[0] for each in found)
     for each in lost:
         assert each.reports[1] == 0
         assert 6.0 < each.start_s < 9.0
@@ -214,6 +218,31 @@ def test_the_server_says_who_is_in_the_way() -> None:
     assert found
     assert all(each.other and each.other != each.vehicle for each in found)
     assert any(each.lost for each in found)
+
+
+def test_the_explanation_of_a_mission_ends_with_both() -> None:
+    known = Flight(FOUR, flight.fly(FOUR, vehicles=4), name="swap").explain()
+    said = str(known)
+    assert "  2          each stays in its tube           yes   " in said
+    assert "  all for vehicle " in said
+    written = msgspec.json.decode(known.to_json())
+    assert len(written["hypotheses"]) == 9
+    assert written["waits"][0]["kind"] in ("to begin", "acknowledgement")
+
+
+def test_a_recorded_mission_over_udp_is_judged_without_another_flight(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "swap.mcap"
+    Flight(EIGHT, eight(), name="swap").save(file)
+    recorded = recordings.opened(file)
+    about = msgspec.structs.replace(recorded.about, began="2026-11-29T22:00:00Z")
+    monkeypatch.setattr(recordings, "opened", lambda _: replace(recorded, about=about))
+    assert main(["explain", str(file)]) == 0
+    said = capsys.readouterr().out
+    assert "each stays in its tube           yes   0.129 m  8           222" in said
+    assert main(["explain", str(file), "--seeds", "3"]) == 2
+    assert "--seeds: got it with a flight over UDP" in capsys.readouterr().err
 
 
 def test_asking_changes_nothing_in_a_flight() -> None:
