@@ -245,5 +245,7 @@ def test_a_recorded_mission_over_udp_is_judged_without_another_flight(
     assert "--seeds: got it with a flight over UDP" in capsys.readouterr().err
 
 
-def test_asking_changes_nothing_in_a_flight() -> None:
-    assert flying.fly(Case(EIGHT, 8)).trace == flying.trace(eight().client)
+def test_asking_changes_nothing_in_a_flight_and_each_plan_has_its_packet() -> None:
+    outcome = flying.fly(Case(EIGHT, 8))
+    assert outcome.trace == flying.trace(eight().client)
+    assert outcome.packets.is_plan.sum() == eight().server["event"].sum()
