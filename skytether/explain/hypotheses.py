@@ -24,6 +24,7 @@ from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
 from skytether.shared.events.flight import ClockContradicted, Flying, SteppedLate
 from skytether.shared.law.model import Array, Flags, Indices
 from skytether.shared.law.motion import SPACING
+from skytether.shared.missions.derived import zones
 from skytether.shared.missions.mission import Mission
 from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import Record, Rows
@@ -166,6 +167,7 @@ def hypotheses(record: Record, scenario: Scenario) -> tuple[Hypothesis, ...]:
         _all_vehicles(scenario, record, vehicles),
         _clocks(record),
         _separation(scenario, record),
+        *_clear(scenario, vehicles),
     )
 
 
@@ -345,6 +347,19 @@ def _separation(scenario: Scenario, record: Record) -> Hypothesis:
     _, pair = _nearest(places)
     step = round((at_s - began[pair[0]] / SECOND_NS) / dt_s)
     return Hypothesis(0, name, margin, "m", pair, step)
+
+
+def _clear(scenario: Scenario, vehicles: Sequence[Flown]) -> Iterator[Hypothesis]:
+    """Distance from the scenario's zones, if it has any; not from those set in flight."""
+    if around := zones(scenario):
+        margins = {}
+        for each in vehicles:
+            flies = each.in_force >= 0
+            margins[each.vehicle] = (
+                each.step[flies],
+                around.clearance(each.position[flies]).min(axis=1),
+            )
+        yield _least(0, "they keep out of zones", "m", margins)
 
 
 def began_ns(record: Record) -> dict[int, int]:

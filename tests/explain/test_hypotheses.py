@@ -178,6 +178,20 @@ def test_vehicles_that_are_too_near_are_found() -> None:
     assert broken(hypotheses(eight(), wide)) == ["they keep apart"]
 
 
+def test_a_vehicle_in_a_zone_is_found() -> None:
+    """A zone of which the server did not know."""
+    walled = packaged(
+        "swap",
+        duration=20.0,
+        reference={"shape": "swap(8)"},
+        mission={"zones": "cylinder(0, 0, 1.5)"},
+    )
+    assert "they keep out of zones" not in by_name(eight(), EIGHT)
+    assert broken(hypotheses(eight(), walled)) == ["they keep out of zones"]
+    found = by_name(eight(), walled)["they keep out of zones"]
+    assert -1.5 <= found.margin < -0.5
+
+
 # -- waits -----------------------------------------------------------------------------------------
 
 
