@@ -268,6 +268,8 @@ class WatchedLife(Recorder):
         """Number of steps flown by a horizon, and along a trajectory."""
         self.row_ns = -1
         """Virtual time of the newest step [ns], or -1."""
+        self.clock_set = False
+        """Whether the vehicle's clock has been set since its newest step."""
 
     # -- the links ---------------------------------------------------------------------------
 
@@ -324,7 +326,7 @@ class WatchedLife(Recorder):
             raise Violation("recovers", f"{mode}, though all faults ended long ago")
         self.step, self.missed, self.mode, self.input = step, int(missed), mode, flown
         self.steps += 1
-        self.row_ns = now_ns
+        self.row_ns, self.clock_set = now_ns, False
 
     def _listen(self) -> None:
         self._silent = 0 if self._heard else self._silent + 1
@@ -352,9 +354,11 @@ class WatchedLife(Recorder):
             raise Violation("table", "in fault, with a state and an input that are finite")
         if covered != (mode in FLYING):
             raise Violation("table", f"{mode}, and a horizon is {'' if covered else 'not '}flown")
-        # By virtual time: the vehicle's own clock may have been set, or have stood still.
+        # By virtual time, for the vehicle's own clock may have stood still. A freeze together with
+        # a clock that is set is one jump for the vehicle (`Steady`), which cannot tell them apart.
         late_ns = now_ns - self.row_ns - self._dt_ns
-        if self.row_ns >= 0 and late_ns > STALL_NS + MILLISECOND_NS and mode in FLYING:
+        noticeable = self.row_ns >= 0 and not self.clock_set
+        if noticeable and late_ns > STALL_NS + MILLISECOND_NS and mode in FLYING:
             raise Violation("asleep", f"{mode} on waking {late_ns / SECOND_NS:.2f} s late")
 
     def check_change(self, before: str, after: str) -> None:

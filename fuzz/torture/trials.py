@@ -387,6 +387,11 @@ class Torture:
         self.counts[f"lives of {name.partition(' ')[0]}"] += 1
         self._processes[name].start(self.world)
 
+    def set_clock(self, name: str, step_ns: int) -> None:
+        self.world.set_clock(name, step_ns=step_ns)
+        if life := self._lives.get(name):
+            life.clock_set = True
+
     def _count(self, life: WatchedLife) -> None:
         self.counts["steps"] += life.steps
         self.counts["steps by inputs"] += life.planned
@@ -513,7 +518,7 @@ def act(  # noqa: PLR0912 - a branch for each kind of fault
     match fault.kind:
         case FaultKind.STEP if begins:
             for name in names:
-                world.set_clock(name, step_ns=seconds_to_ns(fault.amount))
+                torture.set_clock(name, seconds_to_ns(fault.amount))
         case FaultKind.STEP:
             pass
         case FaultKind.SKEW:

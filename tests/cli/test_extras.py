@@ -23,7 +23,7 @@ ALL = (
 )
 LAB = (
     *("sweep", "margins", "identify", "reproduce"),
-    *("compare", "calibrate"),
+    *("compare", "calibrate", "explain"),
 )
 BARE = ("client", "netem", "keygen", "set", "probe", "completion", "list")
 NEEDS: dict[str, tuple[str, ...]] = {

@@ -43,6 +43,8 @@ LINES = {
     "compare --out": "compare --quick --weights WEIGHTS OUT/report.html",
     "calibrate --out": "calibrate SCENARIO --objective rmse OUT/best.toml",
     "report --html": "report RECORDING OUT",
+    "explain --json": "explain SCENARIO OUT",
+    "explain --figure": "explain SCENARIO OUT.png",
     "export --csv": "export RECORDING OUT/client.csv",
     "export --parquet": "export RECORDING OUT/client.parquet",
     "export --traces": "export RECORDING OUT/uplink-0.csv",

@@ -15,6 +15,7 @@ ALLOWED = {
     "skytether/shell/driving/inside.py": "files of the kernel in a program's own namespaces",
     "skytether/shell/host/compiling.py": "an empty lock beside machine code",
     "skytether/shell/driving/program.py": "what another program says, in a temporary folder",
+    "skytether/view/browser/explaining.py": "the same of a process of its own",
     "skytether/shell/driving/stream.py": "the line to an autopilot",
     "skytether/shell/host/temporary.py": "marks in folders that it has made",
 }
