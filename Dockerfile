@@ -55,8 +55,8 @@ COPY --from=wheel /wheel /wheel
 RUN $INSTALL --no-deps --no-index /wheel/*.whl
 # The server's kernels; a machine of another kind compiles it anew when it starts.
 RUN NUMBA_CACHE_DIR=/opt/skytether/kernels /opt/skytether/bin/python -P -c \
-    "import skytether.server.endpoint; from skytether.server.schemes import table; \
-    from skytether.shared.base import kernel; table.load_all(); kernel.load()"
+    "import skytether.server.endpoint; from skytether.server.schemes import loading; \
+    from skytether.shared.base import kernel; loading.load_all(); kernel.load()"
 
 
 FROM ${BASE_IMAGE} AS bare

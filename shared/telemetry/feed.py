@@ -70,7 +70,7 @@ Frame = Opened | Rows | Said | Figures
 
 _ENCODER = msgspec.msgpack.Encoder()
 _DECODER = msgspec.msgpack.Decoder(Frame)
-_UNDECODABLE = msgspec.DecodeError, UnicodeDecodeError, RecursionError
+_UNDECODABLE = msgspec.DecodeError, UnicodeDecodeError, RecursionError, TypeError
 
 
 def pack(frame: Frame) -> bytes:
@@ -80,7 +80,10 @@ def pack(frame: Frame) -> bytes:
 def unpack(body: bytes | bytearray) -> Frame:
     """Frame from the bytes of `pack`; raises FeedError if they are not a frame."""
     try:
-        return _DECODER.decode(body)
+        frame: Frame = _DECODER.decode(body)
+        if isinstance(frame, Figures):  # msgpack has values and keys that JSON and recordings lack
+            msgspec.json.encode(frame.figures)
+        return frame
     except _UNDECODABLE as error:
         raise FeedError(f"got no frame: {error}") from None
 

@@ -43,6 +43,7 @@ from skytether.shared.telemetry.feed import (
     described,
     encode,
     table,
+    unpack,
 )
 from skytether.shared.telemetry.parts import parse
 from skytether.shared.telemetry.record import PACKET_COLUMNS, Recorder, plan_columns
@@ -696,3 +697,11 @@ def test_events_are_of_the_log_and_limited() -> None:
             log.hear(Degraded(degraded=True))
         log.each_second(last=True)
     assert [type(event).__name__ for event in events] == ["Degraded"] * 5 + ["Omitted"]
+
+
+@pytest.mark.parametrize("key", [None, True, (1, 2), msgspec.msgpack.Ext(20, b"1234")])
+def test_figures_that_no_recording_can_have_are_refused(key: Any) -> None:
+    figures = {"of": {"x": key} if isinstance(key, msgspec.msgpack.Ext) else {key: 1}}
+    frame = {"type": "Figures", "time_ns": 1, "figures": figures}
+    with pytest.raises(FeedError, match="got no frame"):
+        unpack(msgspec.msgpack.encode(frame))

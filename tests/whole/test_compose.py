@@ -1,7 +1,9 @@
 """Services of docker-compose.yml, as far as they can be checked without an engine."""
 
+import ast
 import re
 import shutil
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -99,3 +101,19 @@ def test_the_robot_and_its_router_are_reached_by_the_computer_aboard_alone() -> 
     assert options.config.vehicle.kind == "ros2"
     assert options.config.vehicle.address == "tcp:127.0.0.1:7447"
     compile((ROOT / "deploy" / "ros2" / "robot.py").read_text(), "robot.py", "exec")
+
+
+def test_what_an_image_compiles_names_what_exists() -> None:
+    """Without an engine, nothing else runs the Python in the image's file."""
+    codes = re.findall(r'python -P -c +"([^"]+)"', DOCKERFILE.replace("\\\n", ""))
+    assert codes
+    for code in codes:
+        tree, modules = ast.parse(re.sub(r" {2,}", " ", code)), {}
+        for node in ast.walk(tree):
+            if isinstance(node, ast.ImportFrom):
+                for each in node.names:
+                    modules[each.name] = import_module(f"{node.module}.{each.name}")
+        for node in ast.walk(tree):
+            match node:
+                case ast.Attribute(value=ast.Name(id=name), attr=attribute) if name in modules:
+                    assert hasattr(modules[name], attribute)
