@@ -23,7 +23,7 @@ LAG_S = 0.3
 FOLLOWED_NS = 5 * SECOND_NS
 """Time for which a slide is measured after it was noticed."""
 STEP_NS, STEP_M = SECOND_NS, 0.3
-"""Least time, and least displacement [m], between two results of that."""
+"""Least time, and least displacement [m], between two `Slide`s of one slide."""
 FIX_GAP_NS = SECOND_NS
 """Longest time between two fixes over which the receiver's velocity is integrated."""
 OFFSETS_MAX = 128

@@ -171,7 +171,7 @@ class Relay(Emulator):
         return objection(scenario)
 
     def change(self, scenario: Scenario, keys: frozenset[str], *, now_ns: int) -> None:
-        """See `Endpoint`; what is held up is tried again at once."""
+        """See `Endpoint`; streams that are held up are tried again at once."""
         super().change(scenario, keys, now_ns=now_ns)
         for stream in self._holding.values():
             stream.retry_ns = now_ns

@@ -266,7 +266,7 @@ def _nearest_on_paths(
 ) -> tuple[int, int, float, float] | None:
     """First two vehicles of a show nearer than `apart_m` to each other, see `Mission.nearest`.
 
-    Between two consecutive times of any vehicles, every vehicle moves along a straight line.
+    Between two successive times at which any goal is reached, every vehicle flies straight.
     """
     numbers = list(goals)
     times_s = np.unique(np.concatenate([own_s for own_s, _ in goals.values()]))

@@ -41,7 +41,7 @@ class Histogram:
         return self.largest_ns / MILLISECOND_NS
 
     def within(self, edges_ms: Sequence[float]) -> dict[str, int]:
-        """Number of durations below each ascending edge [ms], keyed as in `20`, and of all, `inf`.
+        """Number of durations below each ascending edge [ms], by its text, and all by "inf".
 
         A bin that contains an edge is counted above it.
         """

@@ -20,7 +20,7 @@ CURVES_MAX = 2
 STEPS = 6
 """Number of steps of an explanation, without those of other seeds."""
 FIRST = "what went wrong"
-"""Word for the first step."""
+"""Name of the first step, as the progress bar shows it."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -37,8 +37,8 @@ def flows(record: Record) -> dict[int, int]:
 
 
 def begin_ns(record: Record, dt_ns: int) -> int | None:
-    """Time at which the packets of tick 0 leave, in virtual time [ns]: with it, most plans have a
-    packet. None if no plan has one.
+    """Time at which the packets of tick 0 leave, in virtual time [ns]: the one at which the largest
+    number of plans coincide with a packet. None if no plan does.
     """
     own, server = flows(record), record.server
     sent, times = server[server["event"]], Counter[int]()

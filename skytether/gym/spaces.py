@@ -57,7 +57,7 @@ def to_rows(space: Space, given: Any, name: str) -> NDArray[Any]:
         given: action of the space, or the same with one axis more in front.
 
     Raises:
-        ValueError: something is of another shape, or a number that the space does not have.
+        ValueError: the action has a wrong shape, or a number outside the space.
     """
     if isinstance(space, Dict | Tuple):
         every = {

@@ -219,8 +219,8 @@ def trace(delays: Delays, within_s: tuple[float, float] | None = None) -> str:
     """Packets of a direction as CSV text for `trace`, one row per packet.
 
     Args:
-        within_s: time at which the trace begins, and at which it ends, by default those of the
-            first and the last packet; the packets next to these are moved there [s].
+        within_s: begin and end of the trace [s], by default the times of the first and the last
+            packet; the last packet before the begin and the first after the end are moved to them.
     """
     lines, last = ["time_s,delay_s,lost"], -np.inf
     times_s, delays_s = delays.time_s, delays.delay_s

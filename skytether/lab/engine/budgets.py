@@ -198,10 +198,11 @@ class Plan:
         return best
 
     def halfway(self) -> list[FlownContender]:
-        """Points to scout next: thresholds between one that exceeds a budget and the next one
-        within.
+        """Points to scout next: a threshold between each two neighbours of which one exceeds a
+        budget and the other keeps it.
 
-        A pair is skipped if the point over the budget has no smaller error than the best within.
+        They are skipped if the one that exceeds it has no smaller error than the best that keeps
+        it.
         """
         best, points_between = self._best(), {}
         ways: dict[tuple[str, str], list[Scouted]] = {}
