@@ -13,7 +13,7 @@ class Argument:
     """Annotation of a field: its form on the command line."""
 
     name: str | None = None
-    """Name of the flag, if different from the field's; "": none, the fields of its value have one."""
+    """Name of the flag, if different from the field's; "": none, its value's fields have."""
     metavar: str | None = None
     help: str | None = None
     """Text of the help, if different from the field's docstring."""
