@@ -37,7 +37,6 @@ from skytether.shared.wire import protocol
 from skytether.shell.commandline import command, terminal
 from skytether.shell.commandline.argument import Argument
 from skytether.shell.commandline.command import CommandError, ScenarioName
-from skytether.shell.driving.memory import MemoryFile, folder
 from skytether.shell.host.paths import NetworkPath
 from skytether.shell.processes import process
 from skytether.shell.processes.process import ProcessOptions
@@ -45,6 +44,7 @@ from skytether.shell.processes.process import ProcessOptions
 if TYPE_CHECKING:
     from skytether.client.memory import SavedState
     from skytether.shared.wire.keys import Keyring
+    from skytether.shell.driving.memory import MemoryFile
 
 NONE = "none"
 """Value of --standby for no standby server."""
@@ -267,7 +267,7 @@ def _servers(paths: Sequence[NetworkPath], standby: Sequence[NetworkPath]) -> st
 @contextmanager
 def _memory(
     options: ClientOptions, flying: Sequence[Vehicle], keyring: "Keyring | None"
-) -> Iterator[MemoryFile | None]:
+) -> "Iterator[MemoryFile | None]":
     """File that keeps the client's state for its next run; None with `vehicle.memory = "none"`.
 
     Raises:
@@ -279,6 +279,8 @@ def _memory(
         return
     if len(flying) > 1:
         raise CommandError("vehicle.memory: got a folder, expected none with --vehicles", 2)
+    from skytether.shell.driving.memory import MemoryFile, folder
+
     key = keyring.of(number, options.key_id) if keyring else None
     identity = {
         "vehicle": str(number),
@@ -299,7 +301,7 @@ def _memory(
 
 
 def _before(
-    memory: MemoryFile, scenario: Scenario, number: int, warnings: list[Event]
+    memory: "MemoryFile", scenario: Scenario, number: int, warnings: list[Event]
 ) -> "SavedState | None":
     """State saved by an earlier run. A warning for the log is added to `warnings`."""
     room = load("skytether.client.memory", "vehicle.memory")

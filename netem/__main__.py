@@ -14,12 +14,11 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from socket import AF_INET
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from skytether.netem import relay
 from skytether.netem.proxy import FLOWS_MAX, Proxy
 from skytether.netem.relay import Relay
-from skytether.netem.tunnel import Tunnel
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.endpoints.directions import FLIGHT, Directions
 from skytether.shared.endpoints.endpoint import Address
@@ -31,11 +30,13 @@ from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import PACKET_COLUMNS
 from skytether.shell.commandline import command
 from skytether.shell.commandline.argument import Argument
-from skytether.shell.driving.program import Program, ProgramError, program
 from skytether.shell.host import system
 from skytether.shell.host.udp import leads_back, look_up, sockets_max
 from skytether.shell.processes import process
 from skytether.shell.processes.process import ProcessOptions
+
+if TYPE_CHECKING:
+    from skytether.shell.driving.program import Program
 
 NETWORK = "transparent"
 """Scenario of a relay that belongs to no flight."""
@@ -157,6 +158,9 @@ def emulate_for(argv: Sequence[str]) -> None:
     SIGUSR1 prints the counters so far to stderr; with --control, `skytether set` changes the
     impairments meanwhile. All other signals are the program's.
     """
+    from skytether.netem.tunnel import Tunnel
+    from skytether.shell.driving.program import ProgramError, program
+
     gc.set_threshold(COLLECT_AFTER)
     end = argv.index("--") if "--" in argv else len(argv)
     options = command.parse(
@@ -179,7 +183,7 @@ def emulate_for(argv: Sequence[str]) -> None:
             with program(argv[end + 1 :], mtu, path_mtu=passing, exposed=exposed) as run_:
                 signal.signal(signal.SIGINT, lambda *_: None)  # also while all is taken down
                 endpoint = Tunnel(running.scenario, mtu=passing, recorder=running.recorder)
-                running.drive(endpoint, bind=None, waiting_for="", line=run_)
+                running.drive(endpoint, bind=None, waiting_for="", line=run_, on_signal=run_.signal)
         except ProgramError as error:
             raise command.CommandError(str(error)) from None
     _end_like(run_)
@@ -204,7 +208,7 @@ def _exposed(text: str) -> Address:
         raise command.CommandError(message, command.CONFIGURATION) from None
 
 
-def _end_like(program: Program) -> None:
+def _end_like(program: "Program") -> None:
     """End this process as the program has ended."""
     if program.fault or program.status is None:
         raise command.CommandError(program.fault or "the program was killed with its namespaces")

@@ -45,14 +45,12 @@ class Loop(HandLoop):
 def asked(folder: Path, *requests: dict[str, Any]) -> tuple[list[Answer], list[Event]]:
     """Answers of a netem to requests, one after the other, and its events."""
     taken_up, answers = begun(folder), list[Answer]()
-    assert taken_up.journal
     endpoint, loop = Proxy(taken_up.scenario, server=("127.0.0.1", 1)), Loop()
     running = taken_up.journal.running(endpoint)
     with (
         controlled(folder / "netem", running, taken_up.journal) as it,
         closing(Caller(folder / "netem")) as caller,
     ):
-        assert it is not None
         it.begin(loop, lambda: None)  # type: ignore[arg-type]
         for request in requests:
             caller._socket.send(msgspec.json.encode(request))
@@ -115,10 +113,6 @@ def test_a_person_begins_a_new_flight_without_it(tmp_path: Path) -> None:
     asked(tmp_path, {"network.uplink.loss": 0.25})
     assert begun(tmp_path, new_flight=True).scenario == DEMO
     assert not kept(tmp_path).exists()
-
-
-def test_without_a_control_socket_there_is_none() -> None:
-    assert take_up(None, DEMO, new_flight=False) == (None, DEMO, [])
 
 
 def test_a_zone_that_was_set_in_flight_is_in_force_in_the_next_life_of_a_server(

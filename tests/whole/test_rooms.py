@@ -15,6 +15,8 @@ LINES = 17_500
 """Largest number of lines that a flight of `demo` loads; each step towards the kernel lowers it."""
 CALLS = 150
 """Largest number of Python calls that a step of a vehicle of `demo` takes in virtual time."""
+LIVE_LINES = 2000
+"""Largest number of lines of the shell's driver and sockets that a live process loads."""
 FLIES = "fly demo --virtual"
 ROOMS: dict[str, tuple[str, str]] = {
     # places in the package, and a command that needs them
@@ -138,6 +140,30 @@ def test_a_flight_of_one_vehicle_loads_no_room_and_few_lines() -> None:
     beside = tuple(f"{room}." for room in rooms)
     assert {each for each in lines if each in rooms or each.startswith(beside)} <= read
     assert sum(lines.values()) <= LINES
+
+
+LIVE = """
+import sys
+import skytether.{name}.__main__
+
+for name, module in sorted(sys.modules.items()):
+    if name.startswith("skytether.shell.") and module.__file__:
+        print(name, len(open(module.__file__).read().splitlines()))
+"""
+
+
+BESIDE = {"program", "inside", "connections", "stream", "graph", "control", "journal", "feed"}
+BESIDE |= {"memory", "recorder_process", "preloading", "time_of_day"}
+
+
+@pytest.mark.parametrize("name", ["client", "netem"])
+def test_a_live_process_loads_a_driver_and_sockets_and_what_its_options_call_for(name: str) -> None:
+    ran_it = ran(sys.executable, "-P", "-c", LIVE.format(name=name))
+    assert ran_it.returncode == 0, ran_it.stderr
+    lines = {module: int(count) for module, count in map(str.split, ran_it.stdout.splitlines())}
+    assert not {each for each in lines if each.rpartition(".")[2] in BESIDE}
+    drives = ("skytether.shell.driving.", "skytether.shell.host.")
+    assert sum(lines[each] for each in lines if each.startswith(drives)) <= LIVE_LINES
 
 
 COUNT = """

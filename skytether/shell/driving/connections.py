@@ -95,7 +95,7 @@ class Connections:
             at = address_text(host, port)
             raise AddressError(f"cannot listen on {at}: {error.strerror or error}") from None
         self._socket.setblocking(False)
-        self.address = from_kernel(self._socket.getsockname())
+        self.address: Address = from_kernel(self._socket.getsockname())
 
     def send(self, payload: bytes, peer: Address) -> bool:
         if way := self._ways.get(peer):  # else it was broken off meanwhile
@@ -165,3 +165,7 @@ class Connections:
         for way, each in ((down, client), (up, server)):
             each.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, BREAKS_OFF)
             way.end()
+
+
+open_line = Connections
+"""See `shell.driving.driver.OpenLine`."""

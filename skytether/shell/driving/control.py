@@ -219,17 +219,12 @@ def answer_of(text: bytes) -> Answer:
 
 
 @contextmanager
-def controlled(
-    path: Path | None, running: Running, journal: Journal | None = None
-) -> Iterator[Control | None]:
-    """Control socket that exists during the block; None without a path.
+def controlled(path: Path, running: Running, journal: Journal | None = None) -> Iterator[Control]:
+    """Control socket that exists during the block.
 
     Raises:
         LocalError: the socket cannot be created.
     """
-    if path is None:
-        yield None
-        return
     control = Control(path, running, journal)
     try:
         yield control

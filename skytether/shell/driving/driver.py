@@ -15,24 +15,19 @@ import traceback
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+from importlib import import_module
 from itertools import groupby
 from operator import itemgetter
 from socket import socket
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
 
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.endpoints.endpoint import Address, Datagram, Endpoint, Form, make_datagram
-from skytether.shared.endpoints.line import LINE, Line, Listen
+from skytether.shared.endpoints.line import Line
 from skytether.shared.endpoints.stopwatch import Stopwatch
 from skytether.shared.events.flight import Event, Fault
 from skytether.shared.events.processes import HostFound, HostMissing, PathFound, PathMissing
-from skytether.shell.driving.connections import Connections
-from skytether.shell.driving.control import Control
-from skytether.shell.driving.feed import Feed
-from skytether.shell.driving.memory import MemoryFile
-from skytether.shell.driving.program import Program, ProgramLine
-from skytether.shell.driving.stream import ByteStream
 from skytether.shell.host import system
 from skytether.shell.host.batch import BATCH_MAX, DatagramBatch, Segments
 from skytether.shell.host.paths import NetworkPath, PathSockets
@@ -52,10 +47,16 @@ from skytether.shell.host.udp import (
 
 if TYPE_CHECKING:
     from skytether.ros2.graph import Node
-    from skytether.shell.driving.graph import GraphSession
+    from skytether.shared.endpoints.line import Listen
+    from skytether.shell.driving.control import Control
+    from skytether.shell.driving.feed import Feed
+    from skytether.shell.driving.memory import MemoryFile
+    from skytether.shell.driving.program import Program
 
-    AnyLine = Line | Node | Program | Listen
+    AnyLine: TypeAlias = Line | Node | Program | Listen
 
+LINES = {"Line": "stream", "Listen": "connections", "Node": "graph", "Program": "program"}
+"""Module of `shell.driving` that opens a line, by the line's class."""
 BURST_MAX = BATCH_MAX
 """Largest number of datagrams read from one socket before timers and other sockets have their
 turn."""
@@ -76,6 +77,25 @@ RESOLVE_EVERY_S = 2.0
 CHECK_PATHS_EVERY_S = 1.0
 Numbers = dict[Address, Address]
 """Numeric addresses by the peers' names."""
+
+
+class OpenLine(Protocol):
+    """Connection beside the UDP sockets.
+
+    The module in LINES has `open_line(line, hear, refused) -> OpenLine`: `hear` is called with the
+    datagrams that arrive at once, `refused` with the reason why something sent cannot arrive.
+    """
+
+    address: Address | None
+    """Address that is listened on; None if nobody can connect."""
+
+    def send(self, payload: bytes, peer: Address) -> bool:
+        """Send bytes to a peer; False if they cannot be sent now."""
+        ...
+
+    async def run(self) -> None:
+        """Receive until the task is cancelled."""
+        ...
 
 
 @dataclass(slots=True)
@@ -124,13 +144,13 @@ class Shell:
         peers: Sequence[Address] = (),
         stopwatch: Stopwatch | None = None,
         forms: Sequence[Form] = (),
-        control: Control | None = None,
-        feed: Feed | None = None,
+        control: "Control | None" = None,
+        feed: "Feed | None" = None,
         line: "AnyLine | None" = None,
         *,
         paths: Mapping[int, NetworkPath] = MappingProxyType({}),
         is_patient: bool = False,
-        memory: MemoryFile | None = None,
+        memory: "MemoryFile | None" = None,
     ) -> None:
         self.endpoint = endpoint
         self._memory = memory
@@ -148,7 +168,7 @@ class Shell:
         self._sockets: dict[int, socket] = {}
         self.addresses: dict[int, Address] = {}
         """Addresses of the bound sockets and of the paths' by number."""
-        self._line: ByteStream | GraphSession | ProgramLine | Connections | None = None
+        self._line: OpenLine | None = None
         bound = bind if isinstance(bind, list) else [bind] if bind else []
         excused = (AddressError,) if len(paths) > 1 else ()
         with contextlib.ExitStack() as failed:
@@ -202,17 +222,11 @@ class Shell:
         return path.names if path else self._names
 
     def _add(self, line: "AnyLine") -> None:
-        if isinstance(line, Program):
-            self._line = ProgramLine(line, self._hear_line)
-        elif isinstance(line, Listen):
-            self._line = Connections(line, self._hear_line, self._hear_refusal)
-            self.addresses[0] = self._line.address
-        elif not isinstance(line, Line):
-            from skytether.shell.driving.graph import GraphSession  # a room
-
-            self._line = GraphSession(line, self._hear_line)
-        elif line.kind in ("tcp", "serial"):
-            self._line = ByteStream(line, lambda piece: self._hear_line(Datagram(piece, LINE, 1)))
+        if not isinstance(line, Line) or line.kind in ("tcp", "serial"):
+            opens = import_module(f"skytether.shell.driving.{LINES[type(line).__name__]}")
+            self._line = opened = opens.open_line(line, self._hear_line, self._hear_refusal)
+            if opened.address:
+                self.addresses[0] = opened.address
         elif line.kind == "udp":
             self._sockets[1] = open_socket(line.address)
         else:

@@ -33,6 +33,7 @@ class GraphSession:
         AddressError: Zenoh refuses the address.
     """
 
+    address = None
     _is_open, _form = False, 0
 
     def __init__(self, node: Node, hear: Callable[[Datagram], None]) -> None:
@@ -139,3 +140,8 @@ class GraphSession:
         except self._zenoh.ZError:
             return False
         return True
+
+
+def open_line(node: Node, hear: Callable[[Datagram], None], _: object) -> GraphSession:
+    """See `shell.driving.driver.OpenLine`."""
+    return GraphSession(node, hear)

@@ -114,22 +114,20 @@ class Journal:
 class TakenUp(NamedTuple):
     """Scenario of a process that starts, with the values set in an earlier run."""
 
-    journal: Journal | None
-    """Journal beside the control socket; None without a control socket."""
+    journal: Journal
+    """Journal beside the control socket."""
     scenario: Scenario
     news: list[Event]
 
 
-def take_up(control: Path | None, scenario: Scenario, *, new_flight: bool) -> TakenUp:
+def take_up(control: Path, scenario: Scenario, *, new_flight: bool) -> TakenUp:
     """Restore values that were set in an earlier run, from the journal beside a control socket.
 
     Args:
-        control: path of the control socket; None without one.
+        control: path of the control socket.
         scenario: scenario that the process is started with.
         new_flight: whether to discard values that were set before.
     """
-    if control is None:
-        return TakenUp(None, scenario, [])
     journal = Journal(control.with_name(control.name + SUFFIX), scenario)
     if new_flight:
         journal.forget()

@@ -241,6 +241,8 @@ class ProgramLine:
         hear: called with the packets that have come at once, see `netem.tunnel.Tunnel`.
     """
 
+    address = None
+
     def __init__(self, program: Program, hear: Callable[..., None]) -> None:
         self._program, self._hear = program, hear
         self._waiting: deque[bytes] = deque()
@@ -353,3 +355,8 @@ class ProgramLine:
             self._loop.remove_reader(parent)
         self._program.signal(signal.SIGHUP)
         self._loop.call_later(GRACE_S, self._end, "the process that started it has ended")
+
+
+def open_line(program: Program, hear: Callable[..., None], _: object) -> ProgramLine:
+    """See `shell.driving.driver.OpenLine`."""
+    return ProgramLine(program, hear)

@@ -10,8 +10,8 @@ import os
 import socket
 from collections.abc import Callable
 
-from skytether.shared.endpoints.endpoint import Address
-from skytether.shared.endpoints.line import Line
+from skytether.shared.endpoints.endpoint import Address, Datagram
+from skytether.shared.endpoints.line import LINE, Line
 from skytether.shell.host import system
 from skytether.shell.host.udp import AddressError
 
@@ -24,13 +24,15 @@ class ByteStream:
     """Byte stream to an autopilot, over TCP or a serial port.
 
     Args:
-        hear: called with each piece of bytes.
+        hear: called with each piece of bytes, from the peer `LINE`.
 
     Raises:
         AddressError: the system has no serial ports of this rate.
     """
 
-    def __init__(self, line: Line, hear: Callable[[bytes], None]) -> None:
+    address = None
+
+    def __init__(self, line: Line, hear: Callable[[Datagram], None]) -> None:
         if line.kind == "serial" and system.termios is None:
             raise AddressError(f"{line.host}: this system has no termios, which serial ports need")
         if line.kind == "serial" and not hasattr(system.termios, f"B{line.number}"):
@@ -65,7 +67,7 @@ class ByteStream:
             except OSError:  # the device was unplugged
                 piece = b""
             if piece:
-                self._hear(piece)
+                self._hear(Datagram(piece, LINE, 1))
             elif not ended.done():
                 ended.set_result(None)
 
@@ -116,3 +118,8 @@ def prepare(port: int, baud: int) -> None:
     settings[2] |= termios.CLOCAL | termios.CREAD
     settings[4] = settings[5] = rate
     termios.tcsetattr(port, termios.TCSANOW, settings)
+
+
+def open_line(line: Line, hear: Callable[[Datagram], None], _: object) -> ByteStream:
+    """See `shell.driving.driver.OpenLine`."""
+    return ByteStream(line, hear)

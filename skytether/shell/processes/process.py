@@ -22,7 +22,6 @@ from skytether.shared.events.flight import Event, address_text
 from skytether.shared.events.processes import Counted, Listening, Measured, Plaintext
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.whole import Scenario
-from skytether.shared.telemetry.feed import Opened
 from skytether.shared.telemetry.record import RECORDING, Recorder
 from skytether.shell.commandline import command
 from skytether.shell.commandline.command import (
@@ -32,24 +31,21 @@ from skytether.shell.commandline.command import (
     unsealed,
     write,
 )
-from skytether.shell.driving.control import controlled
 from skytether.shell.driving.driver import Shell, run
-from skytether.shell.driving.feed import Feed
-from skytether.shell.driving.journal import Journal, take_up
-from skytether.shell.driving.memory import MemoryFile
-from skytether.shell.driving.program import Program
 from skytether.shell.driving.recording import RecordFile
-from skytether.shell.host.local import LocalError
 from skytether.shell.host.paths import NetworkPath
-from skytether.shell.host.time_of_day import TimeTeller
 from skytether.shell.host.udp import AddressError, is_loopback
-from skytether.shell.processes import recorder_process
 from skytether.shell.processes.log import Log, LogFormat
-from skytether.shell.processes.preloading import preload
 
 # for type checking only: slow to import, and not needed in flight
 if TYPE_CHECKING:
+    from skytether.shared.telemetry.feed import Opened
+    from skytether.shell.driving.control import Control
     from skytether.shell.driving.driver import AnyLine
+    from skytether.shell.driving.feed import Feed
+    from skytether.shell.driving.journal import Journal
+    from skytether.shell.driving.memory import MemoryFile
+    from skytether.shell.host.time_of_day import TimeTeller
     from skytether.shell.processes.exporter import Metrics
 
 
@@ -116,11 +112,11 @@ class Process:
     secure: bool | None
     """Whether the endpoint has keys; None for netem, which only forwards datagrams."""
     scenario: Scenario
-    journal: Journal | None
+    journal: "Journal | None"
     warnings: list[Event]
     recording: RecordFile | None
     """File of the endpoint's rows; the process waits at the end until they are written."""
-    feed: Feed | None
+    feed: "Feed | None"
     recorder: Recorder | None
     """Recorder of the endpoint's rows, for a file, a feed or both; None for neither."""
 
@@ -128,16 +124,18 @@ class Process:
         """Recorder of a further part of the record, for the feed only; None without a feed."""
         return _followed(Recorder(columns), self.feed, part, columns) if self.feed else None
 
-    def _log(self, line: "AnyLine | None") -> Log:
+    def _log(self, *, to_stderr: bool) -> Log:
         beside: Callable[[Event], None] = self.feed.say if self.feed else lambda _: None
-        to_stderr = isinstance(line, Program)
         return Log(self.name, self.options.log, beside, to_stderr=to_stderr)
 
     def _running(self, endpoint: Endpoint) -> Running:
         """The endpoint with its scenario, ready for changes in flight."""
-        preload(endpoint.changeable)
-        journal = self.journal
-        return journal.running(endpoint) if journal else Running(endpoint, self.options.config)
+        if journal := self.journal:
+            from skytether.shell.processes.preloading import preload
+
+            preload(endpoint.changeable)
+            return journal.running(endpoint)
+        return Running(endpoint, self.options.config)
 
     def drive(
         self,
@@ -152,8 +150,9 @@ class Process:
         stopwatch: Stopwatch | None = None,
         line: "AnyLine | None" = None,
         is_patient: bool = False,
-        memory: MemoryFile | None = None,
+        memory: "MemoryFile | None" = None,
         ready: Callable[[], None] = lambda: None,
+        on_signal: Callable[[int], None] | None = None,
     ) -> None:
         """Run an endpoint until it has finished or is stopped.
 
@@ -163,18 +162,18 @@ class Process:
             insecure: whether it may run without keys where other machines can reach it.
             ready: called once all checks have passed, before the first datagram is received.
 
-        If the line is of a program's packets, stdout and signals are the program's: events go to
-        stderr, and the last counters to the feed and the file alone.
+            on_signal: called at signals for another program, to which stdout belongs, too: events
+                then go to stderr, and the last counters to the feed and the file alone.
         """
         options, feed, journal = self.options, self.feed, self.journal
-        clocks = [TimeTeller(endpoint)] if options.config.link.time_of_day == "host" else []
+        clocks = [_clock(endpoint)] if options.config.link.time_of_day == "host" else []
         running = self._running(endpoint)
         if feed:
             feed.open(opened(self.name, options.scenario, running, feed))
         with ExitStack() as stack:
             served = stack.enter_context(_served(self.name, options))
             try:
-                heeds = stack.enter_context(controlled(options.control, running, journal))
+                heeds = stack.enter_context(_controlled(options.control, running, journal))
                 shell = Shell(
                     endpoint,
                     bind,
@@ -188,8 +187,6 @@ class Process:
                     is_patient=is_patient,
                     memory=memory,
                 )
-            except LocalError as error:
-                raise CommandError(f"--control: {error}", CONFIGURATION) from None
             except AddressError as error:
                 raise CommandError(str(error)) from None
             if self.secure is False and not (shell.is_local or insecure):
@@ -228,21 +225,24 @@ class Process:
                 if served:
                     served.take(snapshot)
 
-            with _handling_signals() as ignore_signals, closing(self._log(line)) as out:
+            with (
+                _handling_signals() as ignore_signals,
+                closing(self._log(to_stderr=bool(on_signal))) as out,
+            ):
                 run(
                     [shell],
                     on_start=start,
                     on_event=out.hear,
                     on_usr1=lambda: out.say(Counted(figures=figures())),
                     on_second=each_second,
-                    on_signal=line.signal if isinstance(line, Program) else None,
+                    on_signal=on_signal,
                 )
                 ignore_signals()
                 if self.recording:
                     self.recording.end()
                 each_second(last=True)
                 last = figures()
-                (out.note if isinstance(line, Program) else out.say)(Counted(figures=last))
+                (out.note if on_signal else out.say)(Counted(figures=last))
                 if options.json:
                     write(options.json, msgspec.json.encode(last))
 
@@ -269,7 +269,7 @@ def begin(
     Raises:
         CommandError: a file or a socket cannot be created; at the end, the record is incomplete.
     """
-    taken_up = take_up(options.control, options.config, new_flight=options.new_flight)
+    journal, scenario, recalled = _journal(options)
     file = None if options.record and options.record.suffix == RECORDING else options.record
     with ExitStack() as stack:
         recording = None
@@ -282,21 +282,53 @@ def begin(
         if feed:
             part = name.partition(" ")[0]
             recorder = _followed(recorder or Recorder(columns), feed, part, columns)
-        news = [*warnings, *taken_up.news]
         yield Process(
             f"{name}.{number}" if number else name,
             options,
             secure,
-            taken_up.scenario,
-            taken_up.journal,
-            news,
+            scenario,
+            journal,
+            [*warnings, *recalled],
             recording,
             feed,
             recorder,
         )
 
 
-def _followed(recorder: Recorder, feed: Feed, part: str, columns: np.dtype[np.void]) -> Recorder:
+def _journal(options: ProcessOptions) -> "tuple[Journal | None, Scenario, Sequence[Event]]":
+    """Journal beside the control socket, and the scenario with the values restored from it."""
+    if options.control is None:
+        return None, options.config, []
+    from skytether.shell.driving.journal import take_up
+
+    return take_up(options.control, options.config, new_flight=options.new_flight)
+
+
+@contextmanager
+def _controlled(
+    path: Path | None, running: Running, journal: "Journal | None"
+) -> "Iterator[Control | None]":
+    if path is None:
+        yield None
+        return
+    from skytether.shell.driving.control import controlled
+    from skytether.shell.host.local import LocalError
+
+    with ExitStack() as stack:
+        try:
+            control = stack.enter_context(controlled(path, running, journal))
+        except LocalError as error:
+            raise CommandError(f"--control: {error}", CONFIGURATION) from None
+        yield control
+
+
+def _clock(endpoint: Endpoint) -> "TimeTeller":
+    from skytether.shell.host.time_of_day import TimeTeller
+
+    return TimeTeller(endpoint)
+
+
+def _followed(recorder: Recorder, feed: "Feed", part: str, columns: np.dtype[np.void]) -> Recorder:
     recorder.follow(feed.part(part, columns))
     return recorder
 
@@ -320,7 +352,9 @@ def _served(process: str, options: ProcessOptions) -> Iterator["Metrics | None"]
         yield metrics
 
 
-def opened(process: str, name: str, running: Running, feed: Feed) -> Callable[[], Opened]:
+def opened(process: str, name: str, running: Running, feed: "Feed") -> "Callable[[], Opened]":
+    from skytether.shared.telemetry.feed import Opened
+
     wall_ns, time_ns = time.time_ns(), time.monotonic_ns()
     return lambda: Opened(
         process=process,
@@ -334,7 +368,7 @@ def opened(process: str, name: str, running: Running, feed: Feed) -> Callable[[]
 
 
 @contextmanager
-def _fed(process: str, options: ProcessOptions, *, secure: bool) -> Iterator[Feed | None]:
+def _fed(process: str, options: ProcessOptions, *, secure: bool) -> "Iterator[Feed | None]":
     """Open a feed during the block; None if neither a feed nor a recording is requested.
 
     A recording (.mcap) is written from the feed by another process.
@@ -343,6 +377,10 @@ def _fed(process: str, options: ProcessOptions, *, secure: bool) -> Iterator[Fee
     if not (options.feed or record):
         yield None
         return
+    from skytether.shell.driving.feed import Feed
+    from skytether.shell.host.local import LocalError
+    from skytether.shell.processes import recorder_process
+
     if record:
         extras.need("record")
     with ExitStack() as stack:
