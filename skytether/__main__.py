@@ -1,4 +1,4 @@
-"""The `skytether` command: it passes each subcommand to the module that implements it."""
+"""The `skytether` command: runs the function that implements each subcommand."""
 
 import sys
 from collections.abc import Sequence

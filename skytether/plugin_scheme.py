@@ -1,7 +1,7 @@
 """Names that a plug-in with a scheme imports, beside those of `skytether.plugin`.
 
-A module of their own, because they import the server's packages, which no other plug-in needs.
-docs/schemes.md has such a plug-in.
+They have a module of their own, because they import the server's packages, which other plug-ins do
+not need. docs/schemes.md shows such a plug-in.
 """
 
 from skytether.server.planning.scheme import Batch, Fleet, Foresight, Header, Scheme, SentPlans

@@ -112,8 +112,8 @@ COMMANDS_IN_GROUPS = {
         ),
     },
 }
-"""What each command does, and its function, imported when called, so that netem does not import
-the kernels of a server; by its usage, in groups.
+"""Groups of commands: usage, description and function. A function is imported when it is called, so
+that `skytether netem` does not import the server's kernels.
 """
 COMMANDS = {
     usage.partition(" ")[0]: place
@@ -125,7 +125,7 @@ KINDS = (
     *("scenarios", "triggers", "reports", "schemes"),
     *("planners", "references", "impairments", "vehicles"),
 )
-"""What `skytether list` lists; written here, since a shell's start is to import no table."""
+"""Kinds that `skytether list` accepts; written out, because importing the tables is slow."""
 ELSEWHERE = {
     **{kind: f"skytether list {kind}" for kind in KINDS},
     "torture": "python -m fuzz.torture, in a checkout",
@@ -134,7 +134,7 @@ ELSEWHERE = {
     "crowd": "python -m bench.crowd, in a checkout",
     "envelope": "skytether sweep",
 }
-"""What does it now, by a word that was a command."""
+"""Replacement of each former command, by its name."""
 
 
 def usage() -> str:

@@ -17,7 +17,7 @@ OPTIONS = (
     '(skytether "$asked" --help; skytether "$asked" --help-keys) 2>/dev/null'
     " | grep -oE -e '--[a-z][a-z0-9.-]*[a-z0-9]' | sort -u"
 )
-"""What finds the options of a command: its help names them all."""
+"""Shell command that extracts the options of a command from its help."""
 SCENARIOS = "skytether list scenarios 2>/dev/null | cut -d ' ' -f 1"
 BASH = f"""\
 _skytether_asked=

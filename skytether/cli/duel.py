@@ -87,7 +87,7 @@ def together(options: DuelOptions) -> list[Scenario]:
 
 
 def checked(scenario: Scenario, name: str) -> Scenario:
-    """The scenario itself; raises ConfigError if it cannot be flown."""
+    """Return the scenario unchanged; raises ConfigError if it cannot be flown."""
     return reading.check(reading.to_table(scenario), name)
 
 

@@ -38,7 +38,7 @@ from skytether.shell.commandline.command import CommandError, ScenarioName, Scen
 from skytether.sim import flight as sim
 
 VEHICLES = 20
-"""Ends of the names of files with timed points."""
+"""Suffixes of files with timed points."""
 AFTER_S = 30.0
 """Time flown after the last goal of a mission's table [s]."""
 STAGES = ("receive", "open", "decode", "observe", "estimate", "plan", "trigger", "encode", "send")
@@ -53,8 +53,8 @@ class FleetOptions(ScenarioOptions):
     """Mission in place of a scenario: swap, sphere, rings, corridor, warehouse, or a file of timed
     goals: CSV with the columns vehicle, t, x, y (and z), or a .plan of QGroundControl."""
     show: Annotated[Path | None, Argument(metavar="FILE")] = None
-    """Show in place of a scenario: timed paths in a CSV file, or one file a vehicle in a folder or
-    zip, as of Skybrush, Crazyswarm or MAVSDK."""
+    """Show in place of a scenario: timed paths in a CSV file, or a folder or zip with one file for
+    each vehicle, as written by Skybrush, Crazyswarm or MAVSDK."""
     vehicles: Annotated[int | None, Argument(metavar="N")] = None
     """Number of vehicles; by default 20, or as many as the mission has."""
     workers: Annotated[int, Argument(metavar="N")] = 1
@@ -66,7 +66,7 @@ class FleetOptions(ScenarioOptions):
     """Fly in virtual time: everything in one process, as fast as possible."""
     page: Annotated[str | None, Argument(metavar="HOST:PORT")] = None
     """HOST:PORT of a page with all vehicles, as in `skytether fly`; by default none, because
-    `fleet` measures CPU time and a page costs some. Not in virtual time.
+    `fleet` measures CPU time, and a page uses CPU time. Not in virtual time.
     """
     json: Path | None = None
     """File for the summary of the flight."""
@@ -89,9 +89,9 @@ class FleetSummary(msgspec.Struct, frozen=True, kw_only=True):
     """Steps that the server planned."""
     event_ratio: float
     uplink_above: int | None
-    """Plans to all vehicles that the trigger's figure sent, see `SentBy`; in virtual time only."""
+    """Plans sent because the trigger's figure was above its threshold; in virtual time only."""
     uplink_due: int | None
-    """Plans to all vehicles that were due; in virtual time only."""
+    """Plans sent below the threshold, see `SentBy`; in virtual time only."""
     rmse_xy: tuple[float, float, float] | None
     """Smallest, median and largest RMSE of the vehicles [m]."""
     separation_m: float | None
@@ -123,7 +123,7 @@ class FleetSummary(msgspec.Struct, frozen=True, kw_only=True):
     client_late_ms_max: float
     """Longest delay with which a vehicle's step began [ms]."""
     machine_missed: int | None
-    """Steps that a thread which only sleeps missed in the same time: the machine's share."""
+    """Steps missed in the same time by a thread that only sleeps: the machine's share."""
     machine_late_ms_max: float | None
     """Longest delay with which the sleeping thread woke [ms]."""
     server_cpu_us: dict[str, float]
@@ -283,7 +283,7 @@ def _really(
 
 @dataclass(slots=True)
 class Lateness:
-    """Count of how late the machine woke a thread that only sleeps."""
+    """Delays with which the machine woke a thread that only sleeps."""
 
     missed: int = 0
     max_s: float = 0.0

@@ -50,7 +50,7 @@ PRINTED = (
 )
 """Events that are printed during the flight."""
 PRINTED_OF_ROOMS = ("LeaderChanged",)
-"""Names of further ones, of rooms that need not be installed."""
+"""Names of further printed events, whose packages need not be installed."""
 POLL_S = 0.2
 """Interval at which Ctrl-C is checked while the page stays open."""
 Flown = tuple[Scenario, "Future[Record]"]
@@ -65,22 +65,21 @@ class FlyOptions(ScenarioOptions):
     """Encrypt and authenticate the link, with keys made for this flight. Without --secure, packets
     on loopback are plaintext."""
     standby: bool = False
-    """Fly with a standby server, which leads the vehicle when the first is silent: processes
-    `server 2` and one more netem, that to it. The flight goes on if a server's process ends.
+    """Fly with a standby server, which takes over when the first server is silent: starts two more
+    processes, `server 2` and its netem. The flight goes on if one server ends.
     """
     virtual: bool = False
     """Fly in virtual time: the same code in one process, reproducible, many times faster."""
     set_parameters: bool = False
-    """Set unsafe parameters of the autopilot for the case that set-points stop. Without
+    """Make the parameters of the autopilot safe for the case that set-points stop. Without
     --set-parameters, unsafe values are only reported, and the vehicle is not armed.
     """
     control: Path | None = None
-    """Folder for sockets called server, netem and client (of --standby also `server 2`, `netem 2`),
-    through which keys change in flight, see `skytether set`; created if necessary. Not in virtual
-    time.
+    """Folder for the control sockets server, netem and client (with --standby also `server 2` and
+    `netem 2`), for `skytether set`; created if necessary. Not in virtual time.
     """
     page: str | None = None
-    """HOST:PORT of the page that shows the flight and changes it, by default SKYTETHER_PAGE or
+    """HOST:PORT of the page that shows and controls the flight, by default SKYTETHER_PAGE or
     127.0.0.1:8080; if the port is taken, the next free one. Visitors from other machines need the
     printed token to change anything. Not in virtual time: see `skytether replay`.
     """
@@ -98,7 +97,7 @@ class FlyOptions(ScenarioOptions):
     show the file.
     """
     beside: Annotated[tuple[str, ...], Argument(metavar="SCENARIO", append=True)] = ()
-    """Scenario to compare with, flown in virtual time with same duration and seed; may be
+    """Scenario to compare with, flown in virtual time with the same duration and seed; may be
     repeated.
     """
 
@@ -132,7 +131,7 @@ def fly(argv: Sequence[str]) -> None:
             page_process.say(warning)
     vehicles.make(
         scenario, 0
-    )  # compiles the vehicle's kernels, and fails here if it cannot be made
+    )  # compiles the vehicle's kernels; fails here if the vehicle cannot be made
     at = options.page or os.environ.get(page_process.VARIABLE, HOST_PORT)
     page = None if options.virtual or options.no_page else at
     with page_process.paged(page, options.control) as sockets:
@@ -157,13 +156,13 @@ def fly(argv: Sequence[str]) -> None:
 
 @contextmanager
 def _flying(scenarios: Collection[Scenario]) -> Iterator[list[Flown]]:
-    """Fly scenarios in virtual time by a process that runs during the block."""
+    """Fly scenarios in virtual time, in a process that runs during the block."""
     if not scenarios:
         yield []
         return
     with pool.processes(1, polite=True) as worker:
         plugged = plugins.loaded()
-        with system.blocked(signal.SIGINT):  # this process ends the worker
+        with system.blocked(signal.SIGINT):  # not Ctrl-C but this process ends the worker
             flying = [(each, worker.submit(_fly_beside, plugged, each)) for each in scenarios]
         try:
             yield flying
@@ -245,7 +244,7 @@ def _summarise(scenario: Scenario, name: str, flown: Record, *, secure: bool = F
 def _virtually(
     options: FlyOptions, on_second: Callable[[float], None], interrupted: Callable[[], bool]
 ) -> tuple[Record, str | None]:
-    """Fly in virtual time; returns the flight, and the fault of its recording, if any."""
+    """Fly in virtual time; returns the flight, and the error of its recording or None."""
     scenario, secure = options.config, options.secure
     flown = flight.fly(
         scenario,
@@ -272,7 +271,7 @@ def _really(
     on_second: Callable[[float], None],
     interrupted: Callable[[], bool],
 ) -> tuple[Record, str | None]:
-    """Fly over UDP; returns the flight, and the fault of its recording, if any."""
+    """Fly over UDP; returns the flight, and the error of its recording or None."""
     scenario, name, secure = options.config, options.scenario, options.secure
     with ExitStack() as stack:
         live = None

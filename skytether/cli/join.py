@@ -18,8 +18,8 @@ from skytether.view.recordings.joining import join as joined
 @dataclass(frozen=True)
 class JoinOptions:
     files: Annotated[tuple[Path, ...], Argument(positional=True, metavar="FILE")]
-    """Recordings (.mcap), one from each process; or a single one of a killed flight, which then
-    gets the end that other programs expect.
+    """Recordings (.mcap), one from each process; or a single recording of a killed flight, to add
+    the missing end that other programs expect.
     """
     record: Path
     """File for the recording of the flight (.mcap)."""
@@ -30,7 +30,7 @@ def join(argv: Sequence[str]) -> None:
     """Merge the recordings of a server, netem and client that were started by hand.
 
     Messages are ordered by the time of day, so the clocks of different computers must agree. The
-    summary is that of the first vehicle.
+    summary describes the first vehicle.
     """
     options = read(JoinOptions((), tyro.MISSING), argv, "skytether join", join.__doc__)
     recorder.check(options.record, "--record")

@@ -29,7 +29,7 @@ class KeygenOptions:
     number: Annotated[int, Argument(name="id", metavar="ID")] = 1
     """Number of the first vehicle (0 to 65535); the others follow."""
     key_id: Annotated[int | None, Argument(metavar="K")] = None
-    """Number of the new keys (0 to 255); by default one more than the vehicle's highest, and 1 for
+    """Number of the new keys (0 to 255); by default the vehicle's highest number plus 1, and 1 for
     its first key.
     """
     add: bool = False
@@ -41,7 +41,7 @@ class KeygenOptions:
 def keygen(argv: Sequence[str]) -> None:
     """Make one key per vehicle, in a new file that only its owner can read.
 
-    The server needs the keys of all vehicles, a vehicle only its own line. A vehicle uses its key
+    The server needs the keys of all vehicles; a vehicle needs only its own line, and uses its key
     with the highest number. docs/security.md describes how keys are copied, exchanged and revoked.
     """
     options = read(KeygenOptions(tyro.MISSING), argv, "skytether keygen", keygen.__doc__)
@@ -71,11 +71,11 @@ def make(
     """Make one key per vehicle, in a new file or at the end of an existing one.
 
     Args:
-        number: number of the new keys; by default the next of each vehicle.
+        number: number of the new keys; by default each vehicle's next number.
 
     Raises:
         CommandError: a vehicle cannot have another key, or the file cannot be written.
-        ConfigError: the existing file holds no keys.
+        ConfigError: the existing file is not a file of keys.
     """
     try:
         lock = files.held(file) if add and file.exists() else nullcontext()

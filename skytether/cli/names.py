@@ -1,4 +1,4 @@
-"""`skytether list KIND`: the scenarios, or the names that one of their keys accepts."""
+"""`skytether list KIND`: names of scenarios, or names that a key of a scenario accepts."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -33,7 +33,7 @@ class ListOptions:
 
 
 def list_names(argv: Sequence[str]) -> None:
-    """List what a scenario can name, a sentence each.
+    """List scenarios, or names that a scenario can use, with a sentence about each.
 
     The kinds are
 

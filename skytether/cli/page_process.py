@@ -83,6 +83,6 @@ def beside(folders: Sequence[Path], at: str) -> Iterator[None]:
 
 def say(line: object) -> None:
     """Print lines on stderr, ignoring errors."""
-    # The flight goes on without a terminal.
+    # The flight goes on if the terminal has closed.
     with contextlib.suppress(OSError):
         print("\n".join(map(printable, str(line).splitlines())), file=sys.stderr)

@@ -70,14 +70,14 @@ class ProbeOptions:
             metavar="LOCAL=HOST:PORT",
             append=True,
             help="Path to the other end, in place of HOST:PORT, as in `skytether client`; may be "
-            "repeated, to measure up to four paths at once, and how often all are out together.",
+            "repeated, to measure up to four paths at once, and how often all fail together.",
         ),
     ] = ()
     listen: Annotated[str | None, Argument(metavar="HOST:PORT")] = None
     """Run as the listening end: answer probes at this address until Ctrl-C."""
     files: Annotated[tuple[Path, ...], Argument(name="from", metavar="FILE", append=True)] = ()
-    """Read a log instead of measuring: of ping, fping or irtt, or a table; or up to four, of paths
-    at the same time.
+    """Log of ping, fping or irtt, or a table, to read instead of measuring; repeated for up to four
+    paths that were measured at the same time.
     """
     duration: float = 60.0
     """Length of the measurement [s]."""
@@ -86,17 +86,17 @@ class ProbeOptions:
     bytes: int = 400
     """UDP payload of each packet [B]."""
     keys: Path | None = None
-    """File with the vehicle's key, or at the listener those of all vehicles, made by `skytether
-    keygen`: packets are encrypted. Without keys they are plaintext, which is refused beyond this
+    """File by `skytether keygen` with the vehicle's key, or for --listen with the keys of all
+    vehicles: packets are encrypted. Without keys they are plaintext, which is refused beyond this
     machine.
     """
     number: Annotated[int, Argument(name="id")] = 1
-    """Number of the vehicle whose key is used; each further --path uses the next one's."""
+    """Number of the vehicle whose key is used; each further --path uses the next vehicle's."""
     insecure: bool = False
     """Allow plaintext beyond this machine: anybody on the path can alter the measurement."""
     out: Path = Path("probed")
-    """Folder for the traces, uplink.csv and downlink.csv; of several paths also uplink-path-2.csv
-    and so on, and a scenario over all, paths.toml.
+    """Folder for the traces, uplink.csv and downlink.csv. For several paths it also gets
+    uplink-path-2.csv and so on, and paths.toml, a scenario over all of them.
     """
     json: Path | None = None
     """File for all figures, as JSON."""
@@ -107,13 +107,13 @@ class ProbeOptions:
 
 
 def probe(argv: Sequence[str]) -> None:
-    """Measure a path over UDP: delays each way, loss, bursts, reordering, rate, and models of them.
+    """Measure a path over UDP: delays each way, loss, bursts, reordering, rate; fit models.
 
-    One end listens; the other sends numbered packets, which are answered, and prints the results.
-    Run it at the vehicle's place, and the listener at the server's: then its packets take the
+    One end listens and answers; the other sends numbered packets and prints the results. Run the
+    listener at the server's place and the sender at the vehicle's: then the packets measure the
     downlink, and the answers the uplink. Ctrl-C ends the measurement and prints the results so far.
-    With --from it analyses logs of other programs. Of several paths it also tells how
-    often they were out, and how often all at once.
+    With --from, probe analyses logs of other programs. For several paths it also prints how often
+    each failed, and how often all failed at once.
     """
     options = read(ProbeOptions(), argv, "skytether probe", probe.__doc__)
     listens = options.listen is not None
@@ -238,8 +238,8 @@ def _probe(options: ProbeOptions, names: Sequence[str], paths: Sequence[NetworkP
 
 
 def _links(options: ProbeOptions, count: int) -> Sequence[ClientLink]:
-    """Links of the paths, each with the key of another vehicle: the gate keeps one channel of
-    each.
+    """Links of the paths. Each path uses another vehicle's key, because the gate keeps one channel
+    per vehicle.
     """
     if not options.keys:
         return [PlainLink() for _ in range(count)]
@@ -443,7 +443,7 @@ def _missing(delays: Delays) -> int:
 
 
 def _of_log(path: PathFigures) -> str:
-    """Sentences about data that a log lacks, and the assumptions instead."""
+    """Sentences about data that a log lacks, and what is assumed instead."""
     if path.log == "one way":
         return "Clocks: unknown. The file has the delays of one direction, which are used for both."
     return (

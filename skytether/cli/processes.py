@@ -52,19 +52,19 @@ STANDBY = "server 2"
 """Name of the standby server."""
 
 START_S = 120.0
-"""Longest time until a process listens [s]; it may have to compile first."""
+"""Longest time until a process listens [s]; long, because it may have to compile kernels."""
 GRACE_S = 30.0
 """Longest time that a flight may take beyond its duration and the time to connect [s]."""
 ASKED_S, STOP_S = 3.0, 5.0
-"""Longest time for a process to end after SIGTERM, before another is sent, and after that [s]."""
+"""Longest time for a process to end after the first SIGTERM, and after the second [s]."""
 POLL_S = 0.2
 """Interval at which Ctrl-C is checked."""
 LINES_MAX = 20
 """Number of a process's last lines that are kept, to be printed if it fails."""
 
 Chain = Sequence[Sequence[Sequence[str]]]
-"""Stages of processes, each with its name and arguments. An argument that ends with the name of a
-process of an earlier stage in braces, as in `--server={server}`, gets its address there."""
+"""Stages of processes, each with its name and arguments. At the end of an argument, `{server}` is
+replaced by the address of the process `server` of an earlier stage."""
 OnEvent = Callable[[LogLine], None]
 Shortfall = RecordIncomplete | NotFlown
 """Events after which a flight goes on, and which its command reports at the end."""
@@ -83,7 +83,7 @@ class Child:
     failed: bool = False
     """Whether the process has reported an event after which it could not fly."""
     fell_short: bool = False
-    """Whether the process has reported a shortfall, for which its exit code is 1."""
+    """Whether the process has reported a shortfall; its exit code is then 1."""
 
     async def end(self) -> int:
         """Exit code, once the process has ended and all its output was read."""
@@ -159,7 +159,7 @@ async def started(
         child.address = listening.result()
         yield child
     finally:
-        # Asked twice, an endpoint does not wait for its vehicles, which are simulated here.
+        # After a second SIGTERM an endpoint does not wait for its vehicles.
         for stop, most_s in (
             (process.terminate, ASKED_S),
             (process.terminate, STOP_S),
@@ -186,7 +186,7 @@ async def _read(child: Child, stream: asyncio.StreamReader, on_event: OnEvent) -
             child.said.append(line.decode(errors="replace").rstrip())
             continue
         kind = child.name.partition(" ")[0]
-        if logged.process.partition(".")[0] == kind:  # the standby calls itself "server", too
+        if logged.process.partition(".")[0] == kind:  # the standby server's log says "server", too
             process = child.name + logged.process.removeprefix(kind)
             logged = msgspec.structs.replace(logged, process=process)
         if not isinstance(logged.event, Counted):  # counters do not say why a process ended
@@ -219,7 +219,7 @@ def run(
     sockets: Path | None = None,
     standby: bool = False,
 ) -> list[Shortfall]:
-    """Fly a scenario until its end, or Ctrl-C; the record of the flight is left in a folder.
+    """Fly a scenario until its end, or Ctrl-C; the processes write their records to a folder.
 
     The caller must handle Ctrl-C and SIGTERM (`command.interruptible`). Returns the shortfalls of
     the flight or its record that the processes reported; empty for a good flight.
@@ -249,7 +249,7 @@ def run(
     except OSError as error:
         raise CommandError(f"{file}: cannot be written: {error.strerror}") from None
     if secure:
-        from skytether.cli import keygen  # imported here, because it imports tyro: 0.05 s
+        from skytether.cli import keygen  # imported here: importing tyro takes 0.05 s
 
         keygen.make(parts / "keys", range(1, vehicles + 1))
     keys = ["--keys", str(parts / "keys")] if secure else []
@@ -338,7 +338,7 @@ def record_of(
     counted = {
         path.name.replace(".json", ""): path.read_bytes()
         for path in parts.glob("*.json*")
-        if ".part" not in path.name  # of a process killed while it wrote
+        if ".part" not in path.name  # a partial file of a process that was killed while writing
     }
     figures = {name: json.loads(text) for name, text in counted.items() if text}
     server = _rows(parts / "server", server_columns(axes, scenario.control.scheme))
@@ -385,7 +385,7 @@ async def _fly(
     """Run processes, each connected to those before, until the flight of the client ends.
 
     Args:
-        spares: names of processes of which all but one may end during the flight.
+        spares: names of processes; all but one of them may end during the flight.
         timeout_s: longest time that they run [s].
         on_second, on_event: see `run`.
 

@@ -32,14 +32,14 @@ PATIENCE_S = 3.0
 
 
 def check(path: Path, flag: str = "--record") -> None:
-    """Refuse a file without a recording's suffix before anything is flown."""
+    """Refuse a file name without the suffix of a recording, before anything is flown."""
     if path.suffix != RECORDING:
         message = f"{flag}: got {path}, expected a file that ends in {RECORDING}"
         raise CommandError(message, command.CONFIGURATION)
 
 
 def write(path: Path, scenario: Scenario, name: str, flown: Record, summary: Summary) -> str | None:
-    """Record a flight in virtual time after its end; returns the recording's fault, or None."""
+    """Record a flight in virtual time after its end; returns why the recording failed, or None."""
     about = _about(scenario, name, began=None, offset_ns=0, secure=summary.secure)
     try:
         with files.replacing(path) as file:
@@ -66,7 +66,7 @@ def _about(
 
 
 def beside() -> int:
-    """Record the feed of a process as ordered on stdin (`RecorderOrder`), until stdin ends."""
+    """Record a process's feed until stdin ends; stdin begins with a `RecorderOrder`."""
     order = msgspec.json.decode(sys.stdin.buffer.readline(), type=RecorderOrder)
     plugins.load(order.plugins)
     scenario = checked(toml.loads(order.scenario), any_network=True)
@@ -91,7 +91,7 @@ class _Source:
     newest: list[Frame] = field(default_factory=list)
 
     def is_new(self, frame: Frame) -> bool:
-        """Whether a frame is new: a feed that is opened again repeats its last frames."""
+        """Whether a frame is new; a feed that is opened again repeats its last frames."""
         if frame.time_ns < self.last_ns or frame in self.newest:
             return False
         if frame.time_ns > self.last_ns:
@@ -112,7 +112,7 @@ class Live:
         feeds: socket of each process's feed, by process name.
         name: name of the scenario.
         secure: whether the link is encrypted.
-        tell: called once, in any thread, when something is missing.
+        tell: called once, in any thread, when the recording becomes incomplete.
     """
 
     def __init__(

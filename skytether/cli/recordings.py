@@ -8,7 +8,7 @@ from skytether.view.recordings.recorded import Recorded, read
 
 
 def opened(path: Path) -> Recorded:
-    """Read a recording; if something of it is missing, print a line on stderr.
+    """Read a recording; if the recording is incomplete, print a line on stderr.
 
     Raises:
         CommandError: the file cannot be read.

@@ -27,7 +27,7 @@ class ReportOptions:
     html: Path = Path("report.html")
     """File for the HTML page."""
     explain: bool = False
-    """Begin with an explanation, as `skytether explain` prints it; of a flight in virtual time."""
+    """Begin with the output of `skytether explain`; only for flights in virtual time."""
     plugin: command.Plugins = ()
 
 
@@ -50,7 +50,7 @@ def report(argv: Sequence[str]) -> None:
 
 
 def _explanation(file: Path) -> str:
-    """What `skytether explain` prints of a recording; raises what it raises."""
+    """Explanation of a recording as `skytether explain` prints it; same errors."""
     module, _, name = COMMANDS["explain"].partition(":")
     explain = getattr(import_module(module), name)
     with redirect_stdout(StringIO()) as printed:

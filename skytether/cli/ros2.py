@@ -1,8 +1,8 @@
 """`skytether ros2`: plans and goals of a flight, for RViz and other tools of ROS 2.
 
-It reads the server's feed, publishes plans as nav_msgs/Path, and asks at the server's control
-socket for the goals that arrive as geometry_msgs/PoseStamped. So a goal passes the checks of every
-change in flight, and the server itself speaks no ROS.
+It reads the server's feed, publishes plans as nav_msgs/Path, and sends each goal that arrives as
+geometry_msgs/PoseStamped to the server's control socket. So a goal is checked like any other change
+in flight, and the server needs no ROS.
 """
 
 import asyncio
@@ -52,18 +52,18 @@ class Ros2Options:
     address: str = "tcp:127.0.0.1:7447"
     """tcp:HOST:PORT of a Zenoh router."""
     domain: int = 0
-    """Domain of the tools (ROS_DOMAIN_ID)."""
+    """Domain id of the ROS tools (ROS_DOMAIN_ID)."""
     frame: str = "map"
     """Name of the scenario's frame in ROS; goals in another frame are refused."""
 
 
 def connect(argv: Sequence[str]) -> None:
-    """Show the plans of a flight in ROS 2, and take goals from there, until SIGINT or SIGTERM.
+    """Publish the plans of a flight in ROS 2, and accept goals from ROS 2, until SIGINT or SIGTERM.
 
-    For each vehicle N it publishes nav_msgs/Path on /skytether_N/plan, and takes
-    geometry_msgs/PoseStamped on /skytether_N/goal_pose: a goal of a mission, or the place of a live
-    point. The flight's folder is the one given to `fly --control`, or one in which the server has
-    --feed FOLDER/server.feed and --control FOLDER/server. The flight may begin, or begin again,
+    For each vehicle N it publishes nav_msgs/Path on /skytether_N/plan, and subscribes to
+    geometry_msgs/PoseStamped on /skytether_N/goal_pose: a goal of a mission, or the position of a
+    live point. The flight's folder is the one given to `fly --control`, or one in which the server
+    has --feed FOLDER/server.feed and --control FOLDER/server. The flight may start, or restart,
     later.
     """
     options = read(Ros2Options(tyro.MISSING), argv, "skytether ros2", connect.__doc__)
@@ -99,7 +99,7 @@ class Bridge:
         self._paths: dict[int, Sequence[Vector]] = {}
         """Newest path of each node's vehicle [m]."""
         self._wanted: dict[int, Vector] = {}
-        """Newest goals [m] that the server has not been asked for, by vehicle."""
+        """Newest goals [m] that were not sent to the server yet, by vehicle."""
 
     async def run(self) -> None:
         self._loop, self._asked = asyncio.get_running_loop(), asyncio.Event()

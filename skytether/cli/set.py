@@ -24,7 +24,7 @@ class SetOptions:
 
 
 def set_keys(argv: Sequence[str]) -> None:
-    """Change keys of a scenario in flight: all of them at once, or none.
+    """Change keys of a scenario in flight; if one change is refused, none is made.
 
     Without arguments, list the keys that may change, and their present values. The exit code is 2
     if the change was refused, and 1 if no process answers.

@@ -1,5 +1,5 @@
-"""Flights of one scenario with many seeds, which share a server: see `sim.flight` for what makes
-their records equal to those of single flights.
+"""Flights of one scenario with many seeds, which share a server. Their records equal those of
+single flights; `sim.flight` explains why.
 """
 
 from collections import Counter, defaultdict
@@ -17,8 +17,8 @@ from skytether.shared.wire.drop import Drop
 from skytether.sim.flight import fly_runs
 
 COMPANY_MAX = 100
-"""Largest number of runs that share a server. More would be no faster, and vehicle numbers must fit
-one byte.
+"""Largest number of runs that share a server. A larger batch is no faster, and vehicle numbers must
+fit one byte.
 """
 
 
@@ -55,7 +55,7 @@ def fly_batch(
 
     Each flight equals that of `fly` with the same seed, to the last bit, except that the server's
     `figures` contain only the drops. If the server's computing time exceeds a step, the runs are
-    flown one by one: which ticks the server misses depends on when it began.
+    flown one by one, because which ticks the server misses depends on its start.
 
     Args:
         seeds: different seeds that replace the scenario's.
@@ -66,7 +66,7 @@ def fly_batch(
         ConfigError: a plug-in raised an exception.
     """
     in_time = seconds_to_ns(scenario.simulation.compute_s) <= scenario.dt_ns
-    # Vehicles of one server share a budget, and on a mission keep clear of each other.
+    # Vehicles of one server share its budget of bytes, and on a mission avoid each other.
     alone = not in_time or scenario.keeps_apart or scenario.control.shared_bytes_per_s
     company = 1 if alone else COMPANY_MAX
     shared: dict[str, Any] = {"make_server": SharedServer, "figures_of": _dropped}

@@ -1,7 +1,7 @@
-"""Flights in virtual time: a scenario and a seed give a record and events.
+"""Flights in virtual time: a scenario and a seed determine a record and events.
 
 **A run in a batch equals the same run alone, bit for bit.** The runs of a batch share only a
-server, which solves for all of them at once. Each run has its own network, winds and clocks, from
+server, which plans for all of them at once. Each run has its own network, winds and clocks, from
 its seed. Three rules make the records equal. The server's ticks lie on the grid of its own clock,
 and a random phase from the seed shifts the start of the vehicles instead. The server's computing
 time delays the packets that it sends, not those that it receives, and at one instant the server is
@@ -48,15 +48,15 @@ from skytether.shared.telemetry.record import (
 )
 from skytether.sim.hosts import Clock, Hosts
 
-# Aboard the client's code is plain Python; thousands of clients in one process need it compiled.
-# Loaded now, so that its functions are compiled, too, and before anything flies.
+# On a vehicle the client runs as plain Python; thousands of clients in one process need compiled
+# code. The simulated vehicle is loaded here, so that its functions are compiled before a flight.
 load("skytether.client.simulated.vehicle", "simulated")
 compile_all()
 Flown = tuple[Endpoint, Scenario]
 MIDNIGHT_NS = 86_400 * SECOND_NS
 """Time on the server's clock at the start [ns]; so large that no timestamp is negative."""
 BOOT_ID = 2**63 + 2**31
-"""Boot id of every endpoint. It takes as many bytes as a random one, and so do session numbers."""
+"""Boot id of every endpoint: large, so that it takes as many bytes as a random boot id."""
 SERVER: Address = ("server", 0)
 STANDBY: Address = ("standby", 0)
 ASK_NS = 100 * MILLISECOND_NS
@@ -66,7 +66,7 @@ EVENTS_MAX = 65_536
 
 
 class Plain:
-    """Ends of links without keys; `sealed.Sealed` has those with keys."""
+    """Ends of links without encryption; `sealed.Sealed` makes encrypted ones."""
 
     def link(self, seed: int, vehicle: int, purpose: str = "") -> ClientLink | None:  # noqa: ARG002
         """Link of a client."""
@@ -97,13 +97,13 @@ def fly(
     """Fly a scenario in virtual time.
 
     The vehicles start at a random phase of the server's grid, drawn from the seed, because in a
-    real flight too the server's ticks fall anywhere within the vehicles' steps.
+    real flight the server's ticks are not aligned with the vehicles' steps either.
 
     Args:
-        vehicles: number of vehicles, from 1 on, all with the same reference, each with its own
+        vehicles: number of vehicles, at least 1; all have the same reference, each has its own
             winds.
         secure: whether the link is encrypted, with keys from the seed.
-        server: endpoint in place of `Server`; it is not recorded.
+        server: endpoint in place of `Server`; its steps are not recorded.
         standby: whether there is a second server, on the host `standby`, behind a network of its
             own; or an endpoint in its place, which is not recorded.
         beside: endpoints of further hosts by name, such as an autopilot at `vehicle.address`.
@@ -228,8 +228,8 @@ class Run:
         """Figures of each process when the last vehicle finished."""
 
     def hear(self, time_ns: int, host: str, event: Event) -> None:
-        """Keep an event until the last vehicle of the run has finished; vehicles are numbered from
-        1.
+        """Keep an event, unless the last vehicle of the run has finished; vehicles are numbered
+        from 1.
         """
         if not self.flying:
             return
@@ -353,7 +353,7 @@ def fly_runs(
     run_of = {host: run for run in runs for host in run.flown} | dict.fromkeys(beside, runs[0])
     for name, endpoint in beside.items():
         world.add(name, endpoint)
-    # Added last, the server is woken last at an instant, when all datagrams due have arrived.
+    # The server is added last, so that at one instant it is woken last, after all arrivals.
     compute_ns = seconds_to_ns(scenario.simulation.compute_s)
     for number, (name, endpoint) in enumerate(servers.items(), start=1):
         world.add(name, endpoint, clock=Clock(number * MIDNIGHT_NS), compute_ns=compute_ns)
@@ -383,7 +383,7 @@ def fly_runs(
 
 
 def _tell_time(world: Hosts, hosts: Mapping[str, Endpoint], error_ns: int) -> None:
-    """Tell each host the time of day, wrong by `error_ns` one way or the other; 0 tells nothing."""
+    """Give the hosts the time of day, alternately early and late by `error_ns`; no effect if 0."""
     for number, (host, each) in enumerate(hosts.items() if error_ns else ()):
         wrong_ns = error_ns if number % 2 else -error_ns
         world.act(host, partial(each.learn_time, world.now_ns + wrong_ns, error_ns))

@@ -51,10 +51,10 @@ class Host:
     endpoint: Endpoint
     clock: Clock
     turn: int
-    """Rank among hosts that are woken at one instant, from 1 in the order of `Hosts.add`."""
+    """Rank among hosts that are woken at one instant: 1, 2, … in the order of `Hosts.add`."""
     compute_ns: int
     busy_until_ns: int
-    """Time of the world until which the host computes, and cannot be woken."""
+    """Time of the world until which the host computes; it cannot be woken before."""
     on_finished: Callable[[], None] | None
     """Callback for the end of the endpoint; None once called."""
     armed_ns: int | None = None
@@ -62,7 +62,7 @@ class Host:
     due_ns: int | None = None
     """Time on the host's clock from which `armed_ns` was computed; None to compute it again."""
     memory: tuple[bytes, int] | None = None
-    """State that an endpoint of the host saved last, and when [ns; host's clock]."""
+    """Newest state that an endpoint of the host saved, and its time [ns; host's clock]."""
 
 
 ACTION, ARRIVAL = -1, 0
@@ -79,7 +79,7 @@ class Act(Protocol):
 
 
 class Hosts:
-    """Hosts, and the agenda of their future events.
+    """Hosts, and the queue of their future events.
 
     Args:
         on_event: called for each event of an endpoint with the time of the world, the host's name
@@ -99,7 +99,7 @@ class Hosts:
         """
         self._scheduled = 0
         self._look_ns = 0
-        """Time before which `run` does not look at its condition."""
+        """Time before which `run` does not check its condition."""
         self._arriving: deque[tuple[Host, Datagram]] = deque()
         """Datagrams that arrive at the present time, in the order in which they were sent."""
 
@@ -149,8 +149,8 @@ class Hosts:
         """Run the world until a condition holds, or until a time.
 
         Args:
-            every_ns: least time between two looks at the condition; the end of an endpoint is a
-                reason to look at once.
+            every_ns: least time between two checks of the condition, which is also checked when an
+                endpoint finishes.
         """
         agenda, arriving = self._agenda, self._arriving
         self._look_ns = self.now_ns
@@ -159,7 +159,7 @@ class Hosts:
                 if until():
                     return
                 self._look_ns = self.now_ns + every_ns
-            # Datagrams sent at an earlier time are on the agenda, and arrive first.
+            # Datagrams sent at an earlier time are in the agenda, and arrive first.
             if arriving and not (agenda and agenda[0][:2] <= (self.now_ns, ARRIVAL)):
                 self._receive(*arriving.popleft())
                 continue
@@ -171,7 +171,7 @@ class Hosts:
                 entry[4]()
             elif entry[4] is not None:
                 self._receive(entry[3], entry[4])
-            elif entry[3].armed_ns == self.now_ns:  # else its next wake has changed since
+            elif entry[3].armed_ns == self.now_ns:  # otherwise its next wake has been changed
                 host = entry[3]
                 host.armed_ns = None
                 host.endpoint.wake(now_ns=host.clock.local(self.now_ns))
@@ -188,7 +188,7 @@ class Hosts:
             host.armed_ns = None
             return
         if due_ns == host.due_ns and host.armed_ns is not None:
-            return  # armed for this time already
+            return  # already set for this time
         host.due_ns = due_ns
         time_ns = host.clock.world(due_ns)
         time_ns = max(time_ns, host.busy_until_ns)

@@ -1,6 +1,6 @@
-"""Processes in virtual time: they stop, end in order, and start again on their host.
+"""Processes in virtual time, which can be killed, ended in order, and restarted on their host.
 
-Each run is an endpoint of its own. The host keeps address, clock and saved state (`World.memory`).
+Each run is a new endpoint. The host keeps its address, clock and saved state (`World.memory`).
 """
 
 from collections.abc import Callable
@@ -13,13 +13,13 @@ Run = TypeVar("Run", bound=Endpoint)
 
 
 class Process(Generic[Run]):
-    """Process of a host; `endpoint` is its newest run, and the first one is added to the world.
+    """Process of a host; `endpoint` is its newest run. The caller adds the first run to the world.
 
     Its methods take the world first, so that they can be `actions` of `sim.flight.fly`.
 
     Args:
         host: name of the host.
-        make: makes a run, from the number of runs before it and the arguments of `start`.
+        make: makes a run; gets the number of earlier runs and the arguments of `start`.
     """
 
     def __init__(self, host: str, make: Callable[..., Run]) -> None:
@@ -27,7 +27,7 @@ class Process(Generic[Run]):
         self.endpoint, self.runs, self.is_up = make(0), 1, True
 
     def start(self, world: World, *args: Any) -> None:
-        """Start the next run, in place of one that is up."""
+        """Start the next run; it replaces a run that is up."""
         self.endpoint = self._make(self.runs, *args)
         self.runs, self.is_up = self.runs + 1, True
         world.restart(self.host, self.endpoint)
@@ -46,8 +46,8 @@ class Process(Generic[Run]):
         """Let a run that is up end in order, as SIGTERM does.
 
         Args:
-            look_ns: time between two looks at whether it has finished [ns].
-            ended: called at the end, unless the run is stopped before.
+            look_ns: time between two checks whether it has finished [ns].
+            ended: called when the run has ended, unless it is killed before.
         """
         run, latest_ns = self.endpoint, 0
 

@@ -19,7 +19,7 @@ def make_keys(seed: int, vehicles: int) -> Keyring:
 
 
 class Sealed:
-    """Ends of sealed links, see `flight.Plain`."""
+    """Ends of encrypted links, see `flight.Plain`."""
 
     def __init__(self, seed: int, vehicles: int) -> None:
         self._keyring = make_keys(seed, vehicles)

@@ -12,8 +12,7 @@ from skytether.shared.endpoints.endpoint import Datagram, Endpoint
 from skytether.sim.hosts import Clock, Hosts
 
 FROZEN_MAX = 6_500
-"""Largest number of datagrams queued for a frozen host: the number of 600 B that fit a socket's
-buffer.
+"""Largest number of datagrams queued for a frozen host: a socket's buffer holds as many of 600 B.
 """
 
 
@@ -55,7 +54,7 @@ class _Still(Endpoint):
 
 
 class World(Hosts):
-    """Hosts, and the agenda of their future events.
+    """Hosts that can be stopped, restarted and frozen, and the queue of their future events.
 
     Args:
         on_event: called for each event of an endpoint with the time of the world, the host's name
@@ -68,7 +67,7 @@ class World(Hosts):
         return endpoint.inner if isinstance(endpoint, _Still) else endpoint
 
     def stop(self, name: str) -> None:
-        """Take a host down: it receives nothing, and the datagrams that it computes are lost."""
+        """Take a host down: it receives nothing, and datagrams not yet sent are lost."""
         host = self._hosts[name]
         host.endpoint, host.armed_ns = _Still(host.endpoint, 0), None
         self._agenda[:] = [
@@ -82,7 +81,7 @@ class World(Hosts):
     def restart(self, name: str, endpoint: Endpoint) -> None:
         """Start a new endpoint on a host, which may be up, down or frozen; address and clock stay.
 
-        The end of the new endpoint is reported, unless the end of an earlier one was.
+        `on_finished` is called when the new endpoint finishes, unless it was called already.
         """
         self.stop(name)
         host = self._hosts[name]
@@ -90,7 +89,7 @@ class World(Hosts):
         self._arm(host)
 
     def memory(self, name: str) -> tuple[bytes, int] | None:
-        """State that an endpoint of a host saved last, and when [ns; host's clock]."""
+        """Newest state that an endpoint of a host saved, and its time [ns; host's clock]."""
         return self._hosts[name].memory
 
     def freeze(self, name: str) -> None:
@@ -104,8 +103,8 @@ class World(Hosts):
             host.armed_ns = None
 
     def thaw(self, name: str) -> None:
-        """Let a frozen host run again: it receives the queued datagrams, and is then woken if one
-        is due.
+        """Let a frozen host run again: it receives the queued datagrams, and then a wake that is
+        due.
 
         No effect on a host that is not frozen.
         """
@@ -138,5 +137,5 @@ class World(Hosts):
         self._hosts[name].compute_ns = compute_ns
 
     def rearm(self, name: str) -> None:
-        """Ask a host for its next wake, after an action has given it something to do."""
+        """Recompute a host's next wake after an action has changed its state."""
         self._arm(self._hosts[name])
