@@ -1,14 +1,14 @@
-"""Simulated autopilot: a vehicle that speaks MAVLink as ArduCopter or PX4 do, around a quadrotor.
+"""Simulated autopilot: a simulated quadrotor that speaks MAVLink as ArduCopter or PX4 does.
 
-    endpoint   MAVLink in datagrams, and a quadrotor that flies meanwhile
+    endpoint   MAVLink in datagrams, and the quadrotor's flight
     flight     arming, modes, the motion in each mode, failsafes
     flavours   differences between `ardupilot` and `px4`, as tables
     telemetry  messages made from a flight
     faults     faults at times counted from arming
 
-It serves tests, and users without an autopilot, as `skytether autopilot`. Its response to
+`skytether autopilot` runs it, for tests and for users without an autopilot. Its response to
 velocities, lost set-points, refused commands and landings was measured on both autopilots in
 simulation; behaviour that Skytether does not depend on is left out. Nothing is registered. The
-package imports `skytether.mavlink`, `quadrotor` and `shared`, and only `__main__` the shell; the
-client never imports it.
+package imports `skytether.mavlink`, `quadrotor` and `shared`; only `__main__` imports the shell.
+The client never imports the package.
 """

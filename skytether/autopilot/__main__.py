@@ -4,7 +4,7 @@ import sys
 
 from skytether.shell.commandline.start import run
 
-if __name__ == "__main__":  # called before the slow imports below
+if __name__ == "__main__":  # called first, because the imports below are slow
     sys.exit(run("skytether.autopilot.__main__:pilot", "autopilot"))
 
 from collections.abc import Sequence
@@ -35,8 +35,8 @@ class AutopilotOptions(ProcessOptions):
     flavour: FlavourName = "ardupilot"
     """Autopilot to simulate: ArduCopter 4.5 or PX4 1.17."""
     bind: str | None = None
-    """HOST:PORT to receive MAVLink at; by default 127.0.0.1:14550, or a free port with --to. Each
-    sender of MAVLink to it is answered.
+    """HOST:PORT to receive MAVLink at; by default 127.0.0.1:14550, or a free port with --to. The
+    autopilot answers each sender.
     """
     to: str | None = None
     """HOST:PORT to send heartbeats to from the start, for a companion computer that waits for the

@@ -16,7 +16,7 @@ from skytether.shared.base.units import SECOND_NS
 LEAST = 0.1
 """Lower bound of every gain and limit, also if the parameter is smaller."""
 LANDED_S = 2.0
-"""Time on the ground after which a landing ends [s], as measured."""
+"""Time on the ground after which a landing counts as finished [s], as measured."""
 STATION_ACTIONS = {
     1: FlightMode.RETURN,
     3: FlightMode.RETURN,
@@ -24,7 +24,7 @@ STATION_ACTIONS = {
     5: FlightMode.LAND,
     7: FlightMode.HOLD,
 }
-"""Modes by the value of FS_GCS_ENABLE; without a path to return on, SmartRTL is RTL."""
+"""Modes by the value of FS_GCS_ENABLE; SmartRTL counts as RTL, because no return path is stored."""
 BATTERY_ACTIONS = {
     1: FlightMode.LAND,
     2: FlightMode.RETURN,
@@ -61,7 +61,7 @@ class ArduPilot(PilotedVehicle):
         return self.mode is FlightMode.GUIDED
 
     def altitude_of(self, altitude: float) -> float | None:
-        """Altitude above home, as commanded."""
+        """Return the commanded altitude, which is above home."""
         return altitude
 
     def enter_takeoff(self) -> bool:
@@ -96,7 +96,7 @@ class ArduPilot(PilotedVehicle):
         return system == self.parameters["SYSID_MYGCS"]
 
     def return_altitude(self, distance: float) -> float:
-        """Altitude for the flight home: RTL_ALT, or lower near home."""
+        """Altitude of the flight home: RTL_ALT, or lower near home."""
         cone = self.parameters["RTL_CONE_SLOPE"] * distance
         return min(self.parameters["RTL_ALT"] / 100.0, max(cone, 2.0))
 

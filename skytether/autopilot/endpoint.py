@@ -1,7 +1,7 @@
-"""Autopilot as an endpoint: MAVLink in datagrams, and a quadrotor that flies meanwhile.
+"""Autopilot as an endpoint: MAVLink in datagrams, and the simulated flight of a quadrotor.
 
-Each sender of a MAVLink message becomes a peer, to which the autopilot sends; peers given at the
-start are sent to at once. Each peer has its own streams, as each link of a real autopilot has.
+The autopilot sends to its peers: addresses given at the start, and each address from which a
+MAVLink message has come. Each peer has its own streams, as each link of a real autopilot has.
 """
 
 from collections import Counter
@@ -50,7 +50,7 @@ TRUTH_COLUMNS: np.dtype[np.void] = np.dtype(
         ("state", "<f8", (3, 2)),  # true position [m] and velocity [m/s]
     ]
 )
-"""Columns of a simulated autopilot's part: one row for each of its ticks."""
+"""Columns of a simulated autopilot's recording: one row per tick."""
 
 PILOTS: dict[FlavourName, type[PilotedVehicle]] = {"ardupilot": ArduPilot, "px4": PX4}
 POSITION_IGNORED, VELOCITY_IGNORED = 0b111, 0b111000
@@ -62,7 +62,7 @@ class Peer:
     """Peer to which the autopilot sends.
 
     Args:
-        pinned: whether the peer is never replaced, however long it is silent.
+        pinned: whether the peer is kept even if it is silent for long.
         rates: initial rates of its streams [Hz], by message id.
         now_ns: time now, on the autopilot's clock.
     """
@@ -80,7 +80,7 @@ class Peer:
             self.streams[number] = round(SECOND_NS / rate), now_ns
 
     def every(self, number: int, interval_ns: int, now_ns: int) -> None:
-        """Send a message at an interval from now on, at most once per tick."""
+        """Start a stream: send a message at an interval, at most once per tick."""
         interval_ns = max(interval_ns, TICK_NS)
         self.streams[number] = interval_ns, now_ns + interval_ns
 
@@ -99,7 +99,7 @@ class Autopilot(Endpoint):
     Args:
         scenario: scenario, of which frame, battery, wind and seed are used.
         peers: addresses that it sends to from the start.
-        ready_s: time until it may be armed; None for its flavour's.
+        ready_s: time until the vehicle may be armed; None for the flavour's default.
         recorder: takes the true state at each tick, as rows of TRUTH_COLUMNS.
     """
 
@@ -244,7 +244,7 @@ class Autopilot(Endpoint):
             self.send(peer.codec.encode(message), peer.address)
 
     def _tell(self, peer: Peer, number: int) -> bool:
-        """Send a peer a message of the vehicle's state; returns whether that message exists."""
+        """Send a peer the message of a type; returns whether the autopilot has this type."""
         make = STREAMS.get(number)
         message = make(self._telemetry) if make else None
         if message is not None:
@@ -360,7 +360,7 @@ class Autopilot(Endpoint):
         return result
 
     def _set_interval(self, number: int, interval_us: float, peer: Peer) -> Result:
-        """Set the interval of a message to a peer; 0 restores the default, below 0 stops it."""
+        """Set the interval of a peer's stream; 0 restores the default, a negative one stops it."""
         if number not in STREAMS or not isfinite(interval_us):
             return Result.DENIED
         if number == HEARTBEAT and self._flavour.fixed_heartbeats:
@@ -393,5 +393,5 @@ def _is_ours(message: Message) -> bool:
 
 
 def _whole(value: float) -> int:
-    """Integer in a command's float parameter; -1 if it is not an integer."""
+    """Integer value of a command's float parameter; -1 if the value is not an integer."""
     return int(value) if isfinite(value) and value == int(value) else -1

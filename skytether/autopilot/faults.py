@@ -25,7 +25,7 @@ FaultName = Literal[
 NAMES: tuple[str, ...] = get_args(FaultName)
 LASTING = ("silence", "estimate", "drift", "leap", "shift", "fix", "commander")
 DRIFT: Vector = (3.5, 0.0, 0.0)
-"""True velocity of the fault `drift`, which the estimate does not show [m/s]."""
+"""True velocity minus estimated velocity with the fault `drift` [m/s]."""
 COMMANDED: Vector = (3.0, 0.0, 0.0)
 """Velocity that a second commander sends with the fault `commander` [m/s]."""
 COMMANDED_NS = 20 * MILLISECOND_NS
@@ -49,7 +49,7 @@ def parse(text: str) -> ScriptedFault:
     """Scripted fault from NAME@SECONDS, or NAME@SECONDS-SECONDS for one that ends.
 
     Raises:
-        ConfigError: the text is not a fault.
+        ConfigError: the text does not describe a fault.
     """
     number = r"(\d+(?:\.\d+)?)"
     match = re.fullmatch(rf"(\w+)@{number}(?:-{number})?", text)

@@ -1,7 +1,7 @@
-"""Flavours: the differences between ArduCopter and PX4, as tables.
+"""Flavours: tables of the differences between ArduCopter and PX4.
 
 Parameters have the names, types and defaults of ArduCopter 4.5 and PX4 1.17. The tables contain the
-parameters that affect `flight.py`, and those that a companion should read.
+parameters that `flight.py` uses, and parameters that a companion reads.
 """
 
 from dataclasses import dataclass
@@ -20,17 +20,17 @@ class FlightMode(Enum):
     """Mode of the vehicle, under a name common to both autopilots."""
 
     PILOT = auto()
-    """Flown by a pilot; with sticks centred, the vehicle stays where it is."""
+    """Flown by a pilot; with centred sticks the vehicle holds its position."""
     HOLD = auto()
-    """Brakes, and holds the position."""
+    """The vehicle brakes, then holds its position."""
     GUIDED = auto()
-    """Follows a companion computer: GUIDED, OFFBOARD."""
+    """The vehicle follows a companion computer: GUIDED of ArduCopter, OFFBOARD of PX4."""
     TAKEOFF = auto()
-    """Climbs to a commanded altitude."""
+    """The vehicle climbs to a commanded altitude."""
     RETURN = auto()
-    """Flies home, and lands."""
+    """The vehicle flies home and lands."""
     LAND = auto()
-    """Lands at the present position."""
+    """The vehicle lands at its present position."""
 
 
 @dataclass(frozen=True)
@@ -42,30 +42,30 @@ class SimulatedFlavour:
     """Version on which the behaviour was measured."""
     autopilot: int
     bytewise: bool
-    """Whether integer parameters are sent as bits, see `mavlink.parameters`."""
+    """Whether integer parameters are sent as the bits of a float, see `mavlink.parameters`."""
     gains: Gains
     frame: str
     """Airframe of the autopilot's own simulator, or the nearest one in FRAMES."""
     ready_s: float
-    """Time from the start until arming is allowed, in which position and filters settle."""
+    """Time from the start until arming is allowed, because filters must settle first."""
     words_for_stations: bool
-    """Whether texts go only to ground stations, as PX4's do."""
+    """Whether status texts are sent only to ground stations, as by PX4."""
     fixed_heartbeats: bool
-    """Whether the rate of its heartbeats cannot be set."""
+    """Whether the rate of the autopilot's heartbeats is fixed."""
     stamps_fixes: bool
-    """Whether fixes of its receiver have a time: PX4 sends 0 where the receiver knows no date."""
+    """Whether GPS fixes have a timestamp; PX4 sends 0 while its receiver has no date."""
     forwards: bool
-    """Whether heartbeats of each peer go to the others."""
+    """Whether the autopilot forwards each peer's heartbeats to the other peers."""
     spool_s: float
     """Time from the take-off command until the vehicle climbs."""
     wander_mps: float
-    """Standard deviation, along each axis, of the error of the velocity that the loops use."""
+    """Standard deviation of the velocity estimate's error along each axis."""
     blind_s: float
-    """Time after the last fix from which the estimate counts as lost, and the vehicle lands."""
+    """Time after the last GPS fix at which the estimate counts as lost and the vehicle lands."""
     home: tuple[float, float, float]
-    """Latitude and longitude [°], and altitude above the sea [m], of the start."""
+    """Latitude [°], longitude [°] and altitude above the sea [m] of the start."""
     modes: dict[int, tuple[str, FlightMode]]
-    """Name and meaning of each mode, by the number in the heartbeat."""
+    """Name and meaning of each mode, by its number in the heartbeat."""
     first: int
     streams: dict[int, float]
     parameters: Parameters
@@ -82,7 +82,7 @@ def _px4(main: int, sub: int = 0) -> int:
 
 LOCAL_POSITION = int(dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED)
 CURRENT_MODE = 436
-"""Number of a message that PX4 sends and the dialect does not have."""
+"""Number of CURRENT_MODE, which PX4 sends and the dialect lacks."""
 FLAVOURS: dict[FlavourName, SimulatedFlavour] = {
     "ardupilot": SimulatedFlavour(
         title="ArduCopter",

@@ -21,7 +21,7 @@ from skytether.shared.base.units import SECOND_NS, seconds_to_ns
 from skytether.shared.law.model import Array
 
 TICK_NS = 5_000_000
-"""Time between two rounds of all loops [ns]."""
+"""Period of the control loops [ns]."""
 LANDED_NS = SECOND_NS
 """Time at rest after which the vehicle counts as landed [ns]."""
 THERE_M = 0.1
@@ -32,13 +32,13 @@ STILL_MPS = 0.1
 WANDER_NS = 3 * SECOND_NS
 """Correlation time of the error of the velocity estimate [ns]."""
 WANDER_TIME_S = 0.6
-"""Ratio of the error of the position estimate to the error of the velocity estimate [s]."""
+"""Position estimate's error divided by the velocity estimate's error [s]."""
 FIX_TICKS = 40
 """Age of a fix of the receiver when it is reported, in ticks."""
 PULL, PULL_MPS, PULL_FADES = 0.45, 0.35, 0.8
-"""Rates at which the estimate follows a shift of the receiver's position: that of the position
-[1/s], of the velocity [1/s²], and at which the receiver's velocity corrects that error [1/s].
-Fitted to ArduCopter 4.5.6 after a shift of 3 m."""
+"""Gains of the estimate after a shift of the receiver's position: from position error to position
+rate [1/s] and velocity rate [1/s²], and decay of the velocity error [1/s]. Fitted to ArduCopter
+4.5.6 after a shift of 3 m."""
 BLIND_MPS2 = 0.03
 """Error of the acceleration on each axis, which moves the estimate while there is no fix [m/s²]."""
 
@@ -69,14 +69,14 @@ class Landed(Enum):
 
 class CompanionSetpoint(NamedTuple):
     velocity: Vector
-    """Velocity, or with a position the feed-forward velocity [m/s]."""
+    """Velocity; the feed-forward velocity if there is a position [m/s]."""
     position: Vector | None
     """Position [m]; None if only the velocity is set."""
     came_ns: int
 
 
 class OwnSpeeds(NamedTuple):
-    """Limits and gains of the autopilot's own flight, in modes that follow no set-points."""
+    """Limits and gains in modes that follow no set-points."""
 
     speed: float
     up: float
@@ -118,7 +118,7 @@ class PilotedVehicle(ABC):
         self.armed_ns: int | None = None
         self.flying = False
         self.estimates = True
-        """Whether the position estimate is valid, apart from the wait after the start."""
+        """Whether the position estimate works; it is not yet valid during `ready_s`."""
         self.drift: Vector = REST
         """True velocity minus the estimated one, as after a failure of the accelerometers [m/s]."""
         self._wander, self._noise = np.zeros(3), noise
@@ -127,29 +127,29 @@ class PilotedVehicle(ABC):
         self.fixes = True
         """Whether the receiver has a fix."""
         self.shift: Vector = REST
-        """Error of the receiver's position, as before and after a correction arrives [m]."""
+        """Error of the GPS receiver's position, for example until a correction arrives [m]."""
         self._pulled, self._pull = np.zeros(3), np.zeros(3)
-        """Errors of the position and velocity estimates by the receiver [m], [m/s]."""
+        """Errors of the position [m] and velocity estimates [m/s] caused by the receiver."""
         self._blind_ns: int | None = None
-        """Time of the last fix; None while there is one."""
+        """Time of the last fix; None while the receiver has a fix."""
         self._past: deque[tuple[Array, Array]] = deque(maxlen=FIX_TICKS)
         """True positions and velocities of the newest ticks."""
         self.said: list[tuple[Severity, str]] = []
         self.now_ns = 0
         self.station_ns: int | None = None
-        """Time of the ground station's newest heartbeat; None before any: no failsafe then."""
+        """Time of the station's newest heartbeat; None, and no failsafe, before the first."""
         self._ready_ns = seconds_to_ns(ready_s)
         self._setpoint: CompanionSetpoint | None = None
         self._climb: float | None = None
         """Altitude to climb to [m]; None while not climbing."""
         self._climb_ns = 0
         self._held: Vector | None = None
-        """Point that is held after coming to rest."""
+        """Point that the vehicle holds after coming to rest."""
         self._stood_ns = 0
         self._landing = False
         """Whether a return has become a landing."""
         self._announced: set[str] = set()
-        """Failsafes that have acted in this flight."""
+        """Failsafes that were triggered in this flight."""
         quadrotor.on = False
 
     @property
@@ -267,7 +267,7 @@ class PilotedVehicle(ABC):
     refusal: Result
     """Result of a command that cannot be executed now."""
     arming_word: str
-    """Word before "motors" in the text sent at arming; empty if the flavour has another text."""
+    """Word before "motors" in the text sent at arming; empty if the text has no such word."""
 
     @abstractmethod
     def why_not_armed(self) -> str:
@@ -279,7 +279,7 @@ class PilotedVehicle(ABC):
 
     @abstractmethod
     def mode_number(self, main: int, sub: int) -> int:
-        """Number of the mode that a command names in two parts."""
+        """Number of the mode from a command's main mode and sub mode."""
 
     @abstractmethod
     def takes_setpoints(self) -> bool:
@@ -305,11 +305,11 @@ class PilotedVehicle(ABC):
 
     @abstractmethod
     def return_altitude(self, distance: float) -> float:
-        """Altitude for the flight home from a distance [m]."""
+        """Altitude of the flight home from a distance [m]."""
 
     @abstractmethod
     def silence(self, setpoint: CompanionSetpoint) -> bool:
-        """Check whether set-points have stopped, and act as the parameters say."""
+        """If set-points have stopped, trigger the failsafe that the parameters choose."""
 
     @abstractmethod
     def watch(self) -> None:
@@ -341,7 +341,7 @@ class PilotedVehicle(ABC):
             self._settle(velocity)
 
     def once(self, failsafe: str) -> bool:
-        """Whether a failsafe acts for the first time in this flight."""
+        """Whether a failsafe is triggered for the first time in this flight."""
         new = failsafe not in self._announced
         self._announced.add(failsafe)
         return new
@@ -354,7 +354,7 @@ class PilotedVehicle(ABC):
             self.flying = True
 
     lifts_off_by_setpoint: bool
-    """Whether a set-point with an upward velocity suffices to leave the ground."""
+    """Whether a set-point with an upward velocity makes the vehicle take off."""
 
     def _settle(self, velocity: Vector) -> None:
         """Detect the landing, and disarm after a time on the ground."""
@@ -401,8 +401,7 @@ class PilotedVehicle(ABC):
         if self.silence(setpoint):
             if self.mode is not FlightMode.GUIDED:
                 return self._guide()
-            # A velocity expires with its stream; a position is flown to even if the companion is
-            # gone.
+            # A velocity expires when set-points stop; a position is still approached.
             return REST if setpoint.position is None else self._toward(setpoint.position)
         if setpoint.position is None:
             return setpoint.velocity
@@ -500,7 +499,7 @@ class PilotedVehicle(ABC):
         return (x, y, z), (north, east, up)
 
     def quadrotor_wants(self) -> Vector:
-        """Position that the control loops track [m]: the true one, or that of the shaped motion."""
+        """Position that the control loops track [m]: the true one or that of the shaped motion."""
         x, y, z = self.quadrotor.wanted_position().tolist()
         return x, y, z
 

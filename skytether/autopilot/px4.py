@@ -1,8 +1,8 @@
-"""PX4 1.17, as measured: it leaves OFFBOARD when set-points stop, and flies home.
+"""PX4 1.17, as measured: when set-points stop, it leaves OFFBOARD and flies home.
 
-A failsafe only covers the requested mode: when set-points come again, PX4 returns to OFFBOARD by
-itself. After disarming it is in the newest requested mode that may be armed, such as OFFBOARD after
-a landing.
+A failsafe replaces the requested mode only temporarily: when set-points come again, PX4 returns to
+OFFBOARD by itself. After disarming it is in the newest requested mode that allows arming, such as
+OFFBOARD after a landing.
 """
 
 from math import hypot, isfinite, radians, tan
@@ -28,7 +28,7 @@ LEAST = 0.1
 SILENCE_LAG_S = 0.2
 """Time from the end of COM_OF_LOSS_T until PX4 acts [s], as measured."""
 OFFBOARD_ACTIONS = {4: FlightMode.LAND, 5: FlightMode.HOLD}
-"""Modes by the value of COM_OBL_RC_ACT; all others mean RETURN, as there is no remote control."""
+"""Modes by the value of COM_OBL_RC_ACT; all others mean RETURN without a remote control."""
 STATION_ACTIONS = {1: FlightMode.HOLD, 2: FlightMode.RETURN, 3: FlightMode.LAND}
 """Modes by the value of NAV_DLL_ACT."""
 BATTERY_ACTIONS = {2: FlightMode.LAND, 3: FlightMode.RETURN}
@@ -53,7 +53,7 @@ class PX4(PilotedVehicle):
     ) -> None:
         super().__init__(flavour, quadrotor, ready_s, noise)
         self._covered = False
-        """Whether a failsafe covers OFFBOARD until set-points come again."""
+        """Whether a failsafe replaces OFFBOARD until set-points come again."""
         self._after_disarming = flavour.first
 
     def switch(self, number: int) -> Result:
@@ -78,7 +78,7 @@ class PX4(PilotedVehicle):
             self.enter(self.flavour.number(FlightMode.GUIDED))
 
     def why_not_armed(self) -> str:
-        """Reason why arming is refused, in the texts that PX4 sends; some end with a tabulator."""
+        """Reason why arming is refused, in PX4's words; some texts end with a tab."""
         unguided = self.mode is FlightMode.GUIDED and self.why_not_guided()
         if unguided or not self.ready:
             return "Arming denied: Resolve system health failures first\t"
@@ -96,7 +96,7 @@ class PX4(PilotedVehicle):
         return ""
 
     def forget(self) -> None:
-        """Keep and fly the stream of set-points with which OFFBOARD was allowed."""
+        """Do nothing: PX4 keeps the set-points that arrived before it entered OFFBOARD."""
 
     def mode_number(self, main: int, sub: int) -> int:
         return main << 16 | max(sub, 0) << 24
@@ -105,7 +105,7 @@ class PX4(PilotedVehicle):
         return True
 
     def altitude_of(self, altitude: float) -> float | None:
-        """Altitude above home; commanded altitudes are above the sea, or missing."""
+        """Altitude above home, from a commanded altitude above the sea, which may be missing."""
         if isfinite(altitude):
             return altitude - self.flavour.home[2]
         return self.parameters["MIS_TAKEOFF_ALT"]
@@ -142,7 +142,7 @@ class PX4(PilotedVehicle):
         return kind == dialect.MAV_TYPE_GCS
 
     def return_altitude(self, distance: float) -> float:
-        """Altitude for the flight home: RTL_RETURN_ALT, or lower near home."""
+        """Altitude of the flight home: RTL_RETURN_ALT, or lower near home."""
         cone = distance * tan(radians(self.parameters["RTL_CONE_ANG"]))
         return min(self.parameters["RTL_RETURN_ALT"], cone)
 

@@ -22,11 +22,11 @@ SENSORS = int(
 )
 """Sensors whose health SYS_STATUS reports."""
 KNOWS_ALL, KNOWS_ATTITUDE = 831, 167
-"""Flags of an estimate with position, and of one without, as sent by ArduPilot and PX4."""
+"""Flags of an estimate with a position, and without, as sent by ArduPilot and PX4."""
 UNKNOWN_MV = 65535
 """Voltage sent for a missing cell [mV]."""
 CURRENT_MODE_EXTRA = 193
-"""Byte that the checksum of CURRENT_MODE includes."""
+"""Byte of the type CURRENT_MODE that enters its checksum (CRC_EXTRA)."""
 
 
 class CurrentMode:
@@ -88,7 +88,7 @@ class Telemetry:
         )
 
     def gps(self) -> Message:
-        """Fix of the receiver: none before the estimate is ready."""
+        """GPS fix; reports no fix until the estimate is ready."""
         flight = self._flight
         has_fix = flight.ready and flight.fixes
         fix = dialect.GPS_FIX_TYPE_3D_FIX if has_fix else dialect.GPS_FIX_TYPE_NO_FIX
@@ -144,7 +144,7 @@ class Telemetry:
         )
 
     def battery_status(self) -> Message:
-        """Battery state, as of one cell."""
+        """Battery state, sent as that of one cell."""
         battery = self._flight.quadrotor.battery()
         voltages = [round(1000.0 * battery.voltage)] + [UNKNOWN_MV] * 9
         return dialect.MAVLink_battery_status_message(

@@ -1,4 +1,4 @@
-"""Film of a fleet's flight as an animated GIF: positions, and the smallest distance of two
+"""Film of a fleet's flight as an animated GIF: positions and the smallest distance between
 vehicles.
 """
 
@@ -101,7 +101,7 @@ def _frames(
         nearest.axhline(asked_m, color="tab:red", linestyle="--", label=f"asked for: {asked_m:g} m")
         (line,) = nearest.plot([], [], "k-", linewidth=0.8, label="nearest two vehicles")
         nearest.set_xlim(0.0, float(np.ptp(times_s)))
-        # Distances at the beginning and the end are so large that they would compress the scale.
+        # Large distances at the start and the end would compress the scale.
         nearest.set_ylim(0.0, 1.5 * float(np.nanquantile(nearest_m, 0.9)))
         nearest.set_xlabel("time [s]")
         nearest.set_ylabel("distance [m]")

@@ -25,13 +25,13 @@ FORMATS = (".png", ".pdf", ".svg")
 
 
 def check(path: Path, *others: str) -> None:
-    """Refuse a file without the suffix of a picture, before anything is flown.
+    """Refuse a file name without the suffix of a picture, before anything is flown.
 
     Args:
         others: suffixes accepted beside FORMATS.
 
     Raises:
-        ConfigError: names the accepted suffixes.
+        ConfigError: the suffix is not accepted; the message names the accepted ones.
         ModuleNotFoundError: matplotlib is not installed.
     """
     accepted = (*FORMATS, *others)
@@ -56,7 +56,7 @@ def save(figure: "Figure", path: Path, *, dpi: int) -> None:
 
 
 def drawn(flown: Mapping[str, tuple[Scenario, Record]]) -> "Figure":
-    """Flights side by side: the path over the reference, and below it the packets in each second.
+    """Draw flights side by side: the path over the reference, and below the packets in each second.
 
     Args:
         flown: scenario and record of each flight, by title.
@@ -117,9 +117,9 @@ def draw_packets(
 def draw_reference(
     plane: Any, scenario: Scenario, client: Rows, server: Rows | None = None
 ) -> None:
-    """Draw the reference, red and dashed, over the steps of a vehicle.
+    """Draw the reference, red and dashed, for the steps that a vehicle has flown.
 
-    A closed curve is drawn for one round only, because the dashes of a second would fill the gaps.
+    A closed curve is drawn for one round only: dashes of a second round would fill the gaps.
 
     Args:
         client: rows of the vehicle.
@@ -142,7 +142,7 @@ def fleet(
 ) -> None:
     """Draw a fleet: all paths over the reference, and the spread of the tracking error.
 
-    For a mission: paths among zones, and the smallest distance of two vehicles over time.
+    For a mission it draws paths, zones, and the smallest distance between two vehicles over time.
 
     Args:
         path: file to write, in one of FORMATS.
@@ -158,7 +158,7 @@ def fleet(
         faint = 0.5 if separations else max(0.05, 1 / len(flights))
         plane.plot(x, y, "k-", linewidth=0.6, alpha=faint)
     if separations:
-        from skytether.shared.missions.derived import zones  # a room
+        from skytether.shared.missions.derived import zones  # may be absent
 
         for number, zone in enumerate(zones(scenario).zones):
             label = "" if number else "zones"

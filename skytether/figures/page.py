@@ -1,4 +1,4 @@
-"""Page of a report: tables, figures and facts in one file that opens offline; and empty figures."""
+"""Page of a report: tables, figures and facts in one HTML file that opens offline."""
 
 import base64
 import io
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """Table of a report: its numbers as CSV, and as shown."""
+    """Table of a report: its numbers as CSV, and the cells that the page shows."""
 
     name: str
     title: str
@@ -29,12 +29,12 @@ class Table:
     bold: Collection[tuple[int, int]] = ()
     """Rows and columns of cells in bold type."""
     own: Collection[int] = ()
-    """Rows of what the reader has brought."""
+    """Rows of the reader's own contenders."""
     is_grouped: bool = True
 
     @property
     def groups(self) -> dict[str, list[int]]:
-        """Rows by the first column, if that repeats itself; else all of them under no name."""
+        """Rows grouped by the first column if a value repeats; otherwise one unnamed group."""
         groups: dict[str, list[int]] = {}
         for at, (first, *_) in enumerate(self.rows):
             groups.setdefault(first if self.is_grouped else "", []).append(at)
@@ -58,7 +58,7 @@ class Facts:
 
 @dataclass(frozen=True, slots=True)
 class Folded:
-    """Part of a page that can be closed; if not open, it shows its title alone."""
+    """Part of a page that can be folded; while folded, only its title is shown."""
 
     title: str
     parts: Sequence["Part"] = ()
@@ -72,7 +72,7 @@ Part = Table | Picture | Facts | Folded
 
 def blank(width: float, height: float) -> "Figure":
     """Empty figure of a size [inch]."""
-    from matplotlib.figure import Figure  # imported here, because it takes half a second
+    from matplotlib.figure import Figure  # imported here, because the import takes 0.5 s
 
     return Figure(figsize=(width, height), layout="constrained")
 
@@ -95,12 +95,12 @@ def as_png(figure: "Figure", dpi: int) -> bytes:
 
 
 def as_text(value: Any, spec: str) -> str:
-    """Number as shown in a table, with a dash for None."""
+    """Text of a number in a table; a dash for None."""
     return "–" if value is None else format(value, spec)
 
 
 Row = Mapping[str, Any]
-"""Numbers of a row, by the name of their column."""
+"""Numbers of a row, by column name."""
 Cell = tuple[str, str] | Callable[[Row], str]
 """Content of a cell: name and format of a number, or a function of the row."""
 
@@ -113,11 +113,11 @@ def table_of(
     shown: Mapping[str, Cell],
     own: Collection[int] = (),
 ) -> Table:
-    """Table of some numbers.
+    """Table made from rows of numbers.
 
     Args:
         name, title, says: see `Table`.
-        rows: all numbers; they go into the CSV.
+        rows: all numbers, which are written to the CSV.
         shown: content of each column's cells, by heading.
         own: see `Table`.
     """
@@ -130,7 +130,7 @@ def table_of(
 
 
 def rendered(title: str, about: str, parts: Sequence[Part]) -> str:
-    """Page as HTML, with everything in it."""
+    """Page as HTML, with all figures embedded."""
     from jinja2 import Environment, StrictUndefined  # takes a tenth of a second to import
 
     environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True)

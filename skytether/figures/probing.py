@@ -18,8 +18,8 @@ DOTS_MAX = 20_000
 
 
 def drawn(*outcomes: ProbeOutcome) -> "Figure":
-    """Delays of both directions over time, lost packets marked, and their distributions, path by
-    path.
+    """Draw for each path the delays of both directions over time, with lost packets marked, and
+    their distributions.
 
     The best model is drawn over each distribution.
     """

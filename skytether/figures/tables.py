@@ -8,13 +8,13 @@ from typing import Any
 from skytether.shared.base.printable import printable
 
 FORMULA = ("=", "+", "-", "@")
-"""First characters of a cell that make spreadsheets compute it."""
+"""First characters that make spreadsheets treat a cell as a formula."""
 
 
 def _plain(value: Any) -> Any:
-    """Value for a CSV cell: true and false as in TOML, nothing for None, texts made safe.
+    """Value for a CSV cell: `true` or `false`, nothing for None, and safe text.
 
-    A text that a spreadsheet would take for a formula gets an apostrophe in front. Control
+    A text that a spreadsheet would treat as a formula gets an apostrophe in front. Control
     characters are escaped by `printable`, so that they cannot affect a terminal.
     """
     if isinstance(value, bool):

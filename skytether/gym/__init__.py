@@ -1,11 +1,11 @@
-"""Gymnasium environments behind a bad network, with the price of every packet; see docs/gym.md.
+"""Gymnasium environments behind a bad network, with a price for every packet; see docs/gym.md.
 
     from skytether.gym import Networked
 
     env = Networked(gymnasium.make("Pendulum-v1"), uplink="constant(50ms) & loss(10%)")
 
-    networked  `Networked`, and `NetworkedVector` for many; `remote` is the network between
-    players    what the robot does with chunks of actions that are late
+    networked  `Networked`, and `NetworkedVector` for many robots; `remote` has the network
+    players    rules by which the robot plays chunks of actions that arrive late
     spaces     actions as rows, and the size of observations, for any of Gymnasium's spaces
     flights    Skytether's own flights, in which the agent is the trigger
 

@@ -1,12 +1,12 @@
-"""Skytether's own flights as environments: the agent is the trigger, which decides when to send.
+"""Skytether's flights as environments: the agent is the trigger, which decides when to send.
 
-`gymnasium.make("skytether/Target-v0")` is one vehicle after a target, and `crowd` is PettingZoo's
-parallel environment of many vehicles on one shared link. All else flies as in `skytether fly`:
-planner, wire, netem, vehicle and failsafe, in virtual time.
+`gymnasium.make("skytether/Target-v0")` is one vehicle that follows a target, and `crowd` is a
+parallel environment of PettingZoo with many vehicles on one shared link. Planner, wire format,
+netem, vehicle and failsafe are those of `skytether fly`, in virtual time.
 
-A step is a control step. An action decides at the server's next tick, and the observation is what
-the server knew at its last one. The reward is minus the squared distance from the target [m²], by
-the truth, minus `price` for each packet to the vehicle.
+A step is a control step. An action takes effect at the server's next tick; the observation is the
+server's knowledge at its last tick. The reward is minus the true squared distance from the target
+[m²], minus `price` for each packet to the vehicle.
 """
 
 import math
@@ -39,19 +39,19 @@ from skytether.sim.world import World
 
 SINCE_MAX_S = 60.0
 OBSERVED = ("expected_gap", "error_x_m", "error_y_m", "since_sent_s", "heartbeat_due")
-"""What an observation consists of: the cost that flying on without a new packet is expected to add,
-the distance that the server believes the vehicle to be from its target, the time since the last
-packet to it, and whether a heartbeat is due. All 0 before the first plan."""
+"""Elements of an observation: expected additional cost of flying on without a new packet, estimated
+distance from the target, time since the last packet to the vehicle, and whether a heartbeat is due.
+All are 0 before the first plan."""
 _SPACE = Box(-1e9, 1e9, (len(OBSERVED),), np.float32)
 
 
 class Decided(Trigger):
-    """Trigger that does what an agent has decided for each vehicle.
+    """Trigger with a threshold for each vehicle that an agent sets.
 
     Args:
         vehicle: number of the vehicle in each row; shape (capacity,).
-        thresholds: threshold of `expected_gap` of each vehicle from 0 on; infinite: do not send,
-            below 0: send.
+        thresholds: threshold of `expected_gap` by vehicle; infinite: never send, below 0: always
+            send.
     """
 
     doubts = True
@@ -78,7 +78,7 @@ class Decided(Trigger):
 
 
 class Flight:
-    """A flight in virtual time that waits for decisions, step by step."""
+    """Flight in virtual time that pauses after each step for the agent's decision."""
 
     def __init__(self, scenario: Scenario, vehicles: int) -> None:
         self._scenario, self._vehicles = scenario, vehicles
@@ -113,13 +113,13 @@ class Flight:
         return self._step_ns / SECOND_NS
 
     def go(self) -> bool:
-        """Fly one control step; whether every vehicle still flies."""
+        """Fly one control step; returns whether every vehicle still flies."""
         self._step_ns += self._scenario.dt_ns
         self.world.run(lambda: not self.run.flying, limit_ns=self._step_ns)
         return self.run.flying == self._vehicles
 
     def squares_m2(self) -> NDArray[np.float64]:
-        """Squared distance of each vehicle from its target by the truth [m²]; 0 before it flies."""
+        """True squared distance of each vehicle from its target [m²]; 0 before it flies."""
         found = np.zeros(self._vehicles)
         for row in self.run.steps.rows(-2 * self._vehicles):
             vehicle = int(row["vehicle"]) - 1
@@ -136,11 +136,11 @@ def _scenario(name: str, keys: Mapping[str, Any], seed: int) -> Scenario:
 
 
 class Target(gymnasium.Env[NDArray[np.float32], Any]):
-    """One vehicle after a target that only the server sees.
+    """Environment with one vehicle that follows a target, which only the server sees.
 
     Args:
         action: "send": 1 sends a plan, 0 does not; "threshold": a plan is sent if the expected cost
-            of none exceeds it.
+            of not sending exceeds the action.
         price: cost of a packet to the vehicle [m²].
         scenario: name of a scenario with a trigger that computes `expected_gap`.
         keys: keys of the scenario, as in `skytether.load`.
@@ -195,12 +195,12 @@ class Target(gymnasium.Env[NDArray[np.float32], Any]):
 
 
 class Crowd(ParallelEnv):  # type: ignore[misc]  # it ships no types
-    """Many vehicles on one shared link, each with an agent that decides whether to send to it.
+    """Environment with many vehicles on one shared link; an agent per vehicle decides when to send.
 
     Args:
         vehicles: number of vehicles.
         price: cost of a packet to a vehicle [m²].
-        scenario: name of a scenario, with a finite rate if the link is to be scarce.
+        scenario: name of a scenario; its network needs a finite rate for vehicles to compete.
         keys: keys of the scenario, as in `skytether.load`.
     """
 
@@ -225,7 +225,7 @@ class Crowd(ParallelEnv):  # type: ignore[misc]  # it ships no types
     def observation_space(self, agent: str) -> Box:
         return self._seen[agent]
 
-    def action_space(self, agent: str) -> "Discrete[Any]":  # generic since gymnasium 1.3
+    def action_space(self, agent: str) -> "Discrete[Any]":  # a generic type since gymnasium 1.3
         return self._spaces[agent]
 
     def reset(

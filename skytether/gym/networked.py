@@ -1,12 +1,12 @@
 """Gymnasium environments behind a bad network: `Networked`, and `NetworkedVector` for many.
 
 Robot and environment are at one end, the agent at the other. Time is virtual: step k of the
-environment begins k · `step_s` after the episode's start, and nothing sleeps. At its time a robot
-hears what has arrived, plays the row of the step, and reports the next observation. A call of
-`step` is one answer of the agent: it leaves after the agent's thinking time, and the world goes on
-until then, for at least one step.
+environment begins k · `step_s` after the episode's start, and nothing sleeps. At each step a robot
+receives the packets that have arrived, plays the step's action, and reports the next observation. A
+call of `step` is one answer of the agent: it is sent after the agent's thinking time, and the call
+simulates that time, at least one step.
 
-With `thinking = "measured"` the time between two calls is charged. That is the only clock that is
+With `thinking = "measured"` the thinking time is the real time between two calls. No other clock is
 read here.
 """
 
@@ -41,20 +41,20 @@ from skytether.shared.scenario.grammar import GrammarError
 if TYPE_CHECKING:
     _VectorWrapper = VectorWrapper[Any, Any, Any, Any, Any]
 else:
-    _VectorWrapper = VectorWrapper  # generic since gymnasium 1.4 alone
+    _VectorWrapper = VectorWrapper  # a generic type only since gymnasium 1.4
 
 MTU = 1472
 """Largest UDP payload of a datagram that fits into 1500 B with headers [B]."""
 KEY = "network"
-"""Key of `info` under which everything of the network stands."""
+"""Key of `info` with all entries about the network."""
 Answer = Any
-"""An action, actions for successive steps from that of the observation shown on (as the action, but
-with one axis more in front of each array), a `Chunk` of them, or None: nothing."""
+"""An action; actions for successive steps, the first for the step of the newest observation, as
+arrays with one more axis in front; a `Chunk` of actions; or None to send nothing."""
 Exhausted = Literal["hold", "zero"] | Callable[[Any, Any], Any]
-"""Rule when rows have run out: the last action again, the action `idle`, or a function of the
-robot's present observation and its last action (None before the first), which returns an action."""
+"""Rule after the last received action: repeat it ("hold"), play `idle` ("zero"), or call a function
+that returns an action from the robot's observation and last action (None before the first)."""
 Compress = Callable[[Any], bytes | int]
-"""What an observation is sent as, or the size of that [B]."""
+"""Function that returns an observation's compressed bytes, or their number."""
 
 
 class Options(TypedDict, total=False):
@@ -65,28 +65,28 @@ class Options(TypedDict, total=False):
     downlink: str
     """Impairments from robot to agent."""
     thinking: float | str
-    """Time that an answer takes [s], a distribution of it such as "gamma(20ms, 80ms, 30ms)", or
-    "measured": the time that passes until `step` is called."""
+    """Thinking time of an answer [s], its distribution such as "gamma(20ms, 80ms, 30ms)", or
+    "measured": the real time until `step` is called."""
     price: float
     """Cost of each datagram with an answer, subtracted from the reward."""
     seed: int
-    """Seed of the network. `reset(seed=…)` starts its random numbers anew, from both seeds.
-    Each further `reset` draws those of the next episode."""
+    """Seed of the network. `reset(seed=…)` restarts the network's random numbers from both seeds; a
+    `reset` without seed goes on to the next episode's random numbers."""
     exhausted: Exhausted
-    """What the robot plays when rows have run out: "hold" (the last action), "zero" (`idle`), or a
-    function."""
+    """What the robot plays after the last received action: "hold" (that action), "zero" (`idle`),
+    or a function."""
     idle: Any
-    """Action before the first has arrived, and that of "zero"; by default zeros, or what in the
-    action space is closest to them."""
+    """Action before the first one has arrived, and for "zero"; by default zeros, or the nearest
+    action in the action space."""
     player: Callable[[], Player]
-    """Makes the robot's rule for the row to play, for each episode."""
+    """Function that makes a `Player`, the robot's rule for choosing actions, for each episode."""
     step_s: float | None
-    """Length of a step [s]; None: by the environment's `render_fps`."""
+    """Length of a step [s]; None: 1 / `render_fps` of the environment."""
     clock_ns: Callable[[], int]
     """Clock for "measured" [ns]."""
     mtu: int
-    """Largest UDP payload of a datagram [B], to which 28 B of headers are added. An observation or
-    an answer that is longer takes several, and has arrived when all have."""
+    """Largest UDP payload of a datagram [B], without 28 B of headers. A longer observation or
+    answer is sent in several datagrams, and has arrived when all of them have."""
     compress: Compress | None
     """Function that gives an observation's compressed bytes, or their number. The agent sees the
     observation itself."""
@@ -95,13 +95,13 @@ class Options(TypedDict, total=False):
 
 
 ORACLE: Options = {"uplink": "none", "downlink": "none", "thinking": 0.0, "price": 0.0}
-"""Upper bound for a policy: no network at all."""
+"""Options for an upper bound of a policy's return: no network."""
 NOTHING_SENT: Options = {"uplink": "loss(1)", "price": 0.0}
-"""Lower bound: no answer arrives."""
+"""Options for a lower bound of a policy's return: no answer arrives."""
 
 
 class _Far:
-    """What `Networked` and `NetworkedVector` share: an agent that is far from `count` robots."""
+    """Common part of `Networked` and `NetworkedVector`: an agent and `count` robots far from it."""
 
     def __init__(
         self,
@@ -161,7 +161,7 @@ class _Far:
         self._thoughts: Fates
 
     def restart(self, seed: int | None, observations: Sequence[Any]) -> None:
-        """Begin an episode of all robots; with a seed, that of a first episode."""
+        """Begin an episode of all robots; with a seed, the first episode of that seed."""
         self._episode += 1
         if seed is not None:
             self._network_seed = int(stream(self.seed, "network", seed).integers(2**32))
@@ -189,10 +189,10 @@ class _Far:
         self.begun().begin(seen, robots)
 
     def chunk(self, answer: Answer, thought_ns: int) -> Chunk:
-        """Answer as rows of the action's dtype, with the time that it took.
+        """Convert an answer to rows of the action's dtype, with its thinking time.
 
         Raises:
-            ValueError: the rows are no actions of the space, or too many, or a number is none.
+            ValueError: rows are not actions of the space, or too many, or a number is invalid.
         """
         first, given = None, answer
         if isinstance(answer, Chunk):
@@ -206,11 +206,11 @@ class _Far:
         rows = to_rows(self.space, given, "action")
         if len(rows) > ROWS_MAX:
             raise ValueError(f"action: got {len(rows)} rows, expected at most {ROWS_MAX}")
-        rows.setflags(write=False)  # the robot plays these very rows
+        rows.setflags(write=False)  # the robot plays these rows without a copy
         return Chunk(rows, first, thought_ns)
 
     def thought_ns(self, *, is_nothing: bool) -> int:
-        """Time that an answer took [ns]: as measured, or as drawn, 0 for nothing."""
+        """Thinking time of an answer [ns], measured or drawn; 0 if drawn and nothing is sent."""
         if self.thinking is None:
             return self._clock_ns() - self._returned_ns
         if is_nothing:
@@ -226,14 +226,14 @@ class _Far:
         ]
 
     def _row(self, played: Row) -> Row:
-        """Row of a player; raises ValueError if it is none."""
+        """Check the row that a player returned; raises ValueError if it is not one action."""
         kind = np.shape(played), getattr(played, "dtype", None)
         if kind == (self._idle.shape, self._idle.dtype):
             return played
         return self._one(played, "row of the player")
 
     def _one(self, given: Any, name: str) -> Row:
-        """Row of one action; raises ValueError if it is none."""
+        """Row of one action; raises ValueError if it is not one action."""
         (row, *others) = to_rows(self.space, given, name)
         if others:
             raise ValueError(f"{name}: got {1 + len(others)} actions, expected one")
@@ -258,7 +258,7 @@ class _Far:
         self.begun().advance(self._present, [self._size(each) for each in self._present])
 
     def _size(self, observation: Any) -> int:
-        """Size of an observation as it is sent [B]."""
+        """Size of an observation as sent, compressed if so configured [B]."""
         if self._compress is None:
             return size_of(observation)
         sent = self._compress(observation)
@@ -266,22 +266,22 @@ class _Far:
         return _whole("compress", size, 0, QUEUE_BYTES_MAX)
 
     def returns(self) -> None:
-        """Note that the agent is asked now."""
+        """Record the time at which the agent gets control."""
         if self.thinking is None:
             self._returned_ns = self._clock_ns()
 
 
 class Networked(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
-    """Environment whose agent is at the far end of a network, and pays for its packets.
+    """Environment whose agent is at the other end of a network, and pays for its packets.
 
         env = Networked(gymnasium.make("Pendulum-v1"), uplink="constant(50ms) & loss(10%)")
 
-    `reset` gives the first observation at once. Then the agent sees the newest observation that
-    has arrived. It answers with an action, with actions for successive steps from that observation
-    on, with a `Chunk`, or with None: nothing is sent. `info["network"]` says what arrived, what the
-    robot holds, and what was sent, see docs/gym.md; the rest of `info` is the environment's own.
-    The reward is the sum over the steps that have passed, minus `price` for each datagram. The end
-    of an episode is known at once.
+    `reset` returns the first observation without delay. Later the agent sees the newest observation
+    that has arrived. It answers with an action, with actions for successive steps from that
+    observation on, with a `Chunk`, or with None, which sends nothing. `info["network"]` lists what
+    arrived, what the robot holds, and what was sent, see docs/gym.md; the rest of `info` is the
+    environment's. The reward is the sum over the simulated steps, minus `price` for each datagram.
+    The end of an episode is reported without delay.
 
     Args:
         env: environment whose actions are of Box, Discrete, MultiBinary, MultiDiscrete or Text,
@@ -289,7 +289,7 @@ class Networked(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         options: see `Options`.
 
     Raises:
-        ConfigError: an argument is impossible.
+        ConfigError: an argument is invalid.
     """
 
     def __init__(self, env: gymnasium.Env[Any, Any], **options: Unpack[Options]) -> None:
@@ -330,15 +330,15 @@ class Networked(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
 
 
 class NetworkedVector(_VectorWrapper):
-    """`Networked` for a vector environment, whose robots share both directions of the network.
+    """`Networked` for a vector environment; its robots share both directions of the network.
 
-    One agent answers all robots at once, so its thinking time is that of all answers together.
-    `step` takes a list of one answer for each robot, or actions of the environment's own
-    `action_space`; it returns early at the step at which an episode ends, and the next call starts
-    that robot's next one, as the environment does.
+    One agent answers all robots at once, with one thinking time for all answers. `step` takes a
+    list of one answer for each robot, or actions of the environment's own `action_space`. It
+    returns at the step at which an episode ends; the next call starts that robot's next episode, as
+    the environment does.
 
     Args:
-        env: vector environment that starts an episode in the step after an end (gymnasium's
+        env: vector environment that starts a new episode in the step after an end (gymnasium's
             default).
         options: see `Options`.
     """
@@ -410,13 +410,13 @@ class NetworkedVector(_VectorWrapper):
         return list(iterate(self.observation_space, observations))
 
     def _infos(self) -> dict[str, Any]:
-        """Entries of all robots as arrays with a row for each."""
+        """Entries of `info` for all robots, as arrays with one row per robot."""
         each = [self._far.begun().info(index) for index in range(self.num_envs)]
         return {name: np.array([one[name] for one in each]) for name in each[0]}
 
 
 def _batch(space: Space, each: Sequence[Any]) -> Any:
-    """Actions or observations of a vector environment."""
+    """Stack actions or observations for a vector environment."""
     empty: Any = create_empty_array(space, len(each))
     return concatenate(space, each, empty)
 
@@ -428,7 +428,7 @@ def _joined(info: dict[str, Any], own: dict[str, Any]) -> dict[str, Any]:
 
 
 def number(key: str, value: Any, low: float, high: float) -> float:
-    """Number that a user gave; raises ConfigError if it is none between these."""
+    """Check a user's number; raises ConfigError if it is not between `low` and `high`."""
     if not isinstance(value, Real) or not low <= float(value) <= high or value == math.inf:
         expected = f"a finite number from {low:g}" + (f" to {high:g}" if high < math.inf else "")
         raise ConfigError(f"{key}: got {value!r}, expected {expected}")
@@ -451,7 +451,7 @@ def _path(key: str, text: str) -> Impairments:
 
 
 def _thinking(given: float | str) -> Impairments:
-    """Delays of answers; raises ConfigError if it loses answers or is no delay."""
+    """Delays of answers; raises ConfigError if the text loses answers or is not a delay."""
     text = given if isinstance(given, str) else f"constant({float(given)!r})"
     delays = _path("thinking", text)
     if delays.queue or any(each.kind != "delay" for _, each in delays.parts) or delays.loss:

@@ -1,10 +1,10 @@
-"""Players: the robot's end of a link, which decides what is played at each step of the environment.
+"""Players: rules at the robot's end of the link that choose the action of each step.
 
 An agent sends chunks: rows of actions for coming steps. Packets are late, lost and overtaken, so
 the robot needs a rule for the row of the present step. `Clocked` is Skytether's. `Newest`, `Queue`
-and `Freshest` are what is common elsewhere, from public descriptions, to compare with.
+and `Freshest`, for comparison, are common rules of other projects, from public descriptions.
 
-A player stores tuples only: a copy of one is a snapshot of what the robot holds.
+A player stores only tuples, so that a shallow copy is a snapshot of what the robot holds.
 """
 
 from abc import ABC, abstractmethod
@@ -15,14 +15,14 @@ from numpy.typing import NDArray
 from skytether.shared.base.errors import ConfigError
 
 Row = NDArray[Any]
-"""Action of one step; of a Dict or a Tuple a record, see `gym.spaces`."""
+"""Action of one step; a record for a Dict or Tuple space, see `gym.spaces`."""
 
 HELD_MAX = 16
 """Largest number of chunks that a player holds; the oldest are dropped."""
 ROWS_HELD_MAX = 4096
 """Largest number of rows that `Freshest` holds; the last are dropped."""
 NEWER_WEIGHT = 0.7
-"""Weight of the newer row in an average, as LeRobot's default."""
+"""Weight of the newer row in an average: LeRobot's default."""
 
 
 class Chunk(NamedTuple):
@@ -31,9 +31,9 @@ class Chunk(NamedTuple):
     rows: NDArray[Any]
     """Actions of successive steps; shape (n, *row). With n = 0 nothing is sent."""
     first: int | None = None
-    """Step of the first row, as the player counts steps; None: that of the observation shown."""
+    """Step of the first row, as the player counts steps; None: the newest observation's step."""
     thought_ns: int | None = None
-    """Time that the answer took [ns], to replay a run; None: by the wrapper's `thinking`."""
+    """Thinking time of the answer [ns], to replay a run; None: from the wrapper's `thinking`."""
 
 
 class Held(NamedTuple):
@@ -50,10 +50,10 @@ class Player(ABC):
         self.held: tuple[Held, ...] = ()
         """Chunks with rows that may still be played, the newest generation first."""
         self.last: Row | None = None
-        """Row to hold when rows have run out; None before the first."""
+        """Row to repeat when rows have run out; None before the first."""
 
     def __copy__(self) -> "Player":
-        # Three copies a step: the general way of `copy` takes ten times as long.
+        # Called three times per step; the default `copy` takes ten times as long.
         made = object.__new__(type(self))
         made.__dict__.update(self.__dict__)
         return made
@@ -72,14 +72,14 @@ class Player(ABC):
 
 
 class Clocked(Player):
-    """Plays the row of the present step, of the newest generation that has one."""
+    """Player of the present step's row, from the newest chunk that has this row."""
 
     def accept(self, chunk: Held, step: int) -> None:
         if any(each.generation == chunk.generation for each in self.held):
-            return  # a copy
+            return  # a duplicate
         left = [each for each in self.held if each.first + len(each.rows) > step]
         if self.held and not left:
-            left = [self.held[0]]  # its last row may be held
+            left = [self.held[0]]  # its last row may be repeated
         newest_first = sorted([*left, chunk], key=lambda each: -each.generation)
         self.held = tuple(newest_first[:HELD_MAX])
 
@@ -97,7 +97,7 @@ class Clocked(Player):
 
 
 class Newest(Player):
-    """Holds the first row of the newest chunk until a newer one arrives."""
+    """Player that repeats the first row of the newest chunk until a newer chunk arrives."""
 
     def accept(self, chunk: Held, step: int) -> None:  # noqa: ARG002
         if not self.held or chunk.generation > self.held[0].generation:
@@ -110,17 +110,17 @@ class Newest(Player):
 
 
 class Queue(Player):
-    """Queue of rows, played one after the other, as LeRobot's asynchronous inference has it.
+    """Player that plays a queue of rows in order, as in LeRobot's asynchronous inference.
 
-    Steps are counted by rows played, not by the clock: while the queue is empty, the count stands
-    still. Of a chunk that arrives, rows up to the count are skipped, the others take the place of
-    the queue; where both have a row, the newer replaces the older, or they are averaged.
+    Steps are counted by rows played, not by the clock: the count stops while the queue is empty.
+    When a chunk arrives, its rows up to the count are skipped, and the others replace the queue; if
+    both have a row for a step, the newer one is played, or an average.
 
     Args:
-        merge: what happens where both have a row.
+        merge: rule for steps with an older and a newer row.
 
     Raises:
-        ConfigError: rows that are no real numbers, as of a Discrete, are to be averaged.
+        ConfigError: rows are to be averaged, but are not real numbers, as in a Discrete space.
     """
 
     def __init__(self, merge: Literal["replace", "average"] = "replace") -> None:
@@ -159,11 +159,11 @@ class Queue(Player):
 
 
 class Freshest(Player):
-    """Schedule of rows, of each step the freshest, as DRTC (distributed real-time chunking) has it.
+    """Player with the newest row for each step, as in DRTC (distributed real-time chunking).
 
-    Steps are counted by rows played, as in `Queue`. A chunk that is not newer than the newest so
-    far is ignored. Of a newer one, rows that were played are skipped; the others replace those of
-    the same steps, and rows of other steps stay.
+    Steps are counted by rows played, as in `Queue`. A chunk older than the newest so far is
+    ignored. Rows of a newer chunk replace rows of the same steps, except steps that were played;
+    rows of other steps stay.
     """
 
     def __init__(self) -> None:

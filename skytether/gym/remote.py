@@ -1,12 +1,12 @@
-"""Robots and the agents far from them, over one network in virtual time.
+"""Robots and remote agents, connected by one network in virtual time.
 
 At each step a robot reports what it observes (downlink), and the agent may answer with a chunk of
-actions (uplink). Each of these messages is a datagram, or several if it is longer than one may be;
-it has arrived when all of them have. Their fates are netem's. All robots share the two directions,
-so also their finite rates.
+actions (uplink). Each of these messages is one datagram, or several if it is too long; it has
+arrived when all of them have. Netem decides their loss and delay. All robots share the two
+directions and their finite rates.
 
-Only the size of a datagram matters to a network, so its bytes are zeros, and the message rides
-along. A datagram with a flipped bit is dropped, as by a checksum.
+The network depends only on a datagram's size, so its bytes are zeros, and an attribute has the
+message. A datagram with a flipped bit is dropped, as by a checksum.
 """
 
 from collections import OrderedDict
@@ -41,14 +41,14 @@ REPORT_BYTES = 36
 """Size of a report without its observation [B]: session, step (8 B), the player's number of the
 step (8 B), newest generation held, the step at which it came (8 B), checksum."""
 PART_BYTES = 12
-"""Size of what each datagram of several has of its own [B]: message, number and count, as RTP."""
+"""Size of the header of each datagram of a split message [B]: message, number and count, as RTP."""
 
 
 class Network(NamedTuple):
     uplink: Impairments
-    """From agent to robot."""
+    """Impairments from agent to robot."""
     downlink: Impairments
-    """From robot to agent."""
+    """Impairments from robot to agent."""
     seed: int
     mtu: int
     """Largest UDP payload of a datagram [B]."""
@@ -59,11 +59,11 @@ class ObservationReport(NamedTuple):
 
     step: int
     number: int
-    """The player's number of the step, which is the default of `Chunk.first`."""
+    """Number that the player gives to the step; default of `Chunk.first`."""
     acknowledged: int
-    """Newest generation that the robot held; 0 for none."""
+    """Newest generation of chunks that the robot held; 0 for none."""
     since: int
-    """Step at which that generation came."""
+    """Step at which the generation `acknowledged` arrived."""
     observation: Any
 
 
@@ -76,7 +76,7 @@ class Message:
 
 
 class Part(bytes):
-    """Datagram of a message. A copy with a flipped bit is bytes, and no `Part`."""
+    """Datagram of a message. A copy with a flipped bit is plain bytes, not a `Part`."""
 
     message: Message
     number: int
@@ -90,9 +90,9 @@ class Robot:
     uplink: Lane
     downlink: Lane
     sent: OrderedDict[int, tuple[int, Held]]
-    """Answers under way, by generation, with the step of the observation of each."""
+    """Answers under way, by generation, each with the step of its observation."""
     snapshots: OrderedDict[int, Player]
-    """What the robot held at the steps of reports under way."""
+    """Snapshots of the robot's player, by the steps of reports under way."""
     session: int = 0
     generation: int = 0
     acknowledged: int = 0
@@ -108,15 +108,15 @@ def learn(bound: DelayBound, row: int, delay: int) -> None:
 
 
 class Remote:
-    """Robots, their agents, and the network between.
+    """Robots, their agents, and the network between them.
 
     Args:
         make_player: called for each robot and episode.
         step_ns: length of a step of the environment [ns].
         none: no rows of actions; shape (0, *row).
         shown: number of rows in `coming` and `committed`.
-        fill: row that a robot plays without one of its own, from the last row (None before the
-            first); None if the agent cannot know.
+        fill: returns the row that a robot plays after rows have run out, from its last row (None
+            before the first); None if the agent cannot know it.
     """
 
     def __init__(
@@ -146,7 +146,7 @@ class Remote:
         return self.step * self._step_ns
 
     def begin(self, observations: Sequence[Any], robots: Sequence[int]) -> None:
-        """Begin an episode of some robots; each agent is given the first observation at once."""
+        """Begin an episode of some robots; each agent gets the first observation without delay."""
         for index, observation in zip(robots, observations, strict=True):
             flow = self._flows
             self._flows += 1
@@ -166,7 +166,7 @@ class Remote:
         return Lane(flow, Fates(getattr(network, way), network.seed, way, flow), self.now_ns)
 
     def answer(self, index: int, chunk: Chunk, at_ns: int) -> int:
-        """Send rows to a robot at a time from now on [ns]; the number of datagrams."""
+        """Send rows to a robot at a time, now or later [ns]; returns the number of datagrams."""
         robot, rows = self._robots[index], chunk.rows
         robot.generation += 1
         first = robot.report.number if chunk.first is None else chunk.first
@@ -191,11 +191,11 @@ class Remote:
         return played
 
     def last(self, index: int) -> Row | None:
-        """Row that a robot holds when rows have run out."""
+        """Row that a robot repeats when rows have run out."""
         return self._robots[index].player.last
 
     def advance(self, observations: Sequence[Any], sizes: Sequence[int]) -> None:
-        """Go to the next step, at which the robots observe this, of these sizes [B]."""
+        """Advance to the next step; `observations` are the robots' there, of `sizes` [B]."""
         self.step += 1
         self._hear_agents()
         for index, (robot, observation, size) in enumerate(
@@ -266,7 +266,7 @@ class Remote:
         """Entries of `info` for the agent of a robot, as docs/gym.md lists them."""
         robot, report = self._robots[index], self._robots[index].report
         age_steps = self.step - report.step
-        # Until an answer was acknowledged, the way there is taken to be as long as the way back.
+        # Before the first acknowledgement, both directions count as equally slow.
         delay_steps = int(self._bound.steps[index]) or 2 * age_steps
         held, every, settled, until = self._coming(robot, delay_steps)
         up, down = self.uplink.counts, self.downlink.counts
@@ -290,18 +290,18 @@ class Remote:
         }
 
     def _padded(self, rows: NDArray[Any]) -> NDArray[Any]:
-        """Rows in the shape that they have at each step; vector environments stack them."""
+        """Rows padded with zeros to `shown` rows, so that vector environments can stack them."""
         padded = np.zeros((self._shown, *rows.shape[1:]), rows.dtype)
         padded[: len(rows)] = rows
         return padded
 
     def _coming(self, robot: Robot, delay_steps: int) -> tuple[int, NDArray[Any], int, int]:
-        """Rows that a robot plays from the observation's step on, at most `shown`, as the agent can
-        tell: it knows what it sent, the report says what has arrived, and each answer under way is
-        expected `delay_steps` after its observation.
+        """Predict from the agent's knowledge the rows that a robot plays from the observation's
+        step on, at most `shown`: from the newest report, and the answers under way, each expected
+        to arrive `delay_steps` after its observation.
 
-        Returns: number of rows that the robot held at that step, the rows, how many of them are
-        within `delay_steps`, and how many come before rows run out.
+        Returns: number of rows that the robot held at that step, the predicted rows, number of them
+        within `delay_steps`, and number before rows run out.
         """
         step, rows = robot.report.step, list[Row]()
         if step not in robot.snapshots:

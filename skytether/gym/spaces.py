@@ -1,8 +1,8 @@
 """Actions as rows of arrays, and observations with their size, for any of Gymnasium's spaces.
 
-The row of an action is an array of the space's shape and dtype. That of a Dict or a Tuple is a
-record, with a field for each part; the fields of a Tuple are "0", "1" and so on. So rows for
-successive steps are one array in every space: cut, stacked, compared and copied alike.
+The row of an action is an array of the space's shape and dtype. For a Dict or Tuple space it is a
+record with a field for each part; the fields of a Tuple are "0", "1" and so on. So in every space,
+rows for successive steps are one array that can be sliced, stacked, compared and copied.
 """
 
 from collections.abc import Mapping
@@ -18,7 +18,7 @@ from skytether.shared.base.errors import ConfigError
 
 Space = gymnasium.Space[Any]
 NUMBER_BYTES = 8
-"""Size of a number that is no array [B]."""
+"""Size of a number outside an array [B]."""
 
 
 def _parts(space: Space) -> Mapping[str, Space]:
@@ -30,10 +30,10 @@ def _parts(space: Space) -> Mapping[str, Space]:
 
 
 def no_rows(space: Space, name: str = "action space") -> NDArray[Any]:
-    """No row of a space's actions, in the shape and dtype of many; shape (0, *row).
+    """Empty array for rows of a space's actions; shape (0, *row).
 
     Raises:
-        ConfigError: the space has no rows.
+        ConfigError: actions of the space cannot be rows.
     """
     match space:
         case Dict() | Tuple():
@@ -54,7 +54,7 @@ def to_rows(space: Space, given: Any, name: str) -> NDArray[Any]:
     """Rows of one action, or of actions for successive steps, as a copy; shape (n, *row).
 
     Args:
-        given: action of the space, or the same with one axis more in front.
+        given: action of the space, or actions with one more axis in front.
 
     Raises:
         ValueError: the action has a wrong shape, or a number outside the space.
@@ -107,7 +107,7 @@ def _given(space: Space, given: Any, name: str) -> list[tuple[str, Space, Any]]:
 
 
 def _cast(space: Space, array: NDArray[Any], name: str) -> NDArray[Any]:
-    """Copy of numbers in the dtype of their space, none of which changes its value."""
+    """Copy of numbers in the dtype of their space; raises ValueError if a value would change."""
     dtype = np.dtype(space.dtype)
     if array.dtype.kind not in "biuf":
         raise ValueError(f"{name}: got {array.dtype}, expected numbers")
@@ -119,7 +119,7 @@ def _cast(space: Space, array: NDArray[Any], name: str) -> NDArray[Any]:
             raise ValueError(f"{name}: got {wrong}, expected finite numbers of {dtype}")
         return made
     low, high = _bounds(space, dtype)
-    # A uint8 of 300 would be 44, and an index of 1.5 would be 1.
+    # A cast would turn a uint8 of 300 into 44, and an index of 1.5 into 1.
     right = (array >= low) & (array <= high) & (array == np.floor(array))
     if not right.all():
         wrong, low, high = (
@@ -142,7 +142,7 @@ def _bounds(space: Space, dtype: np.dtype[Any]) -> tuple[Any, Any]:
 
 
 def to_action(space: Space, row: Any) -> Any:
-    """Action of a space, from its row in an array of actions."""
+    """Action of a space, from a row of an array of actions."""
     if isinstance(space, Dict | Tuple):
         made = {key: to_action(part, row[key]) for key, part in _parts(space).items()}
         return made if isinstance(space, Dict) else tuple(made.values())
@@ -150,7 +150,7 @@ def to_action(space: Space, row: Any) -> Any:
 
 
 def idle_of(space: Space) -> Any:
-    """Action of zeros, or of what in the space is closest to them."""
+    """Action of zeros, or the action in the space that is closest to zeros."""
     if isinstance(space, Dict | Tuple):
         made = {key: idle_of(part) for key, part in _parts(space).items()}
         return made if isinstance(space, Dict) else tuple(made.values())
@@ -166,7 +166,7 @@ def observed(space: Space, given: Any, name: str = "observation") -> Any:
     """Copy of an observation, with arrays of the dtype of their space.
 
     Raises:
-        ValueError: an array is of another shape, or has whole numbers that its dtype has not.
+        ValueError: an array has another shape, or integers that do not fit its dtype.
     """
     if isinstance(space, Dict | Tuple):
         made = {

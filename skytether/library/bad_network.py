@@ -22,7 +22,7 @@ from skytether.shell.commandline import plugins
 from skytether.shell.driving.driver import Shell, new_event_loop
 
 LOG = logging.getLogger("skytether.netem")
-"""Says what `skytether netem` prints, such as a server that cannot be reached."""
+"""Logger of what `skytether netem` prints, for example that a server is unreachable."""
 T = TypeVar("T")
 
 
@@ -32,18 +32,18 @@ class bad_network:  # noqa: N801 - read as a function, like `contextlib.closing`
         with skytether.bad_network("loss(0.1) & constant(0.05)", to=("127.0.0.1", 5000)) as net:
             client.sendto(b"hello", net.address)
 
-    In a plain `with` block it runs in a thread, in an `async with` block as a task of that loop.
+    In a `with` block it runs in a thread, in an `async with` block as a task of the event loop.
 
     Args:
         network: impairments of both directions, as in "constant(50ms) & loss(10%)".
         to: address of the server.
         to_server: impairments of packets to the server, in place of `network`.
-        to_client: the same of packets to the client.
-        seed: seed of all fates: the packet with the same number in its flow meets the same one in
-            each run, and outages begin with the flow's first packet.
+        to_client: impairments of packets to the client, in place of `network`.
+        seed: seed of losses, delays and outages: in each run the packet with the same number in its
+            flow gets the same loss and delay, and outages are timed from the flow's first packet.
         bind: address to listen on; port 0 takes a free one.
-        tcp: whether it relays TCP connections in place of UDP: latency, a rate and cuts, and no
-            packet loss.
+        tcp: whether to relay TCP connections in place of UDP: with latency, a rate and cuts,
+            without packet loss.
 
     Attributes:
         address: address that clients send to, in place of the server's.
@@ -93,10 +93,10 @@ class bad_network:  # noqa: N801 - read as a function, like `contextlib.closing`
         to_server: str | None = None,
         to_client: str | None = None,
     ) -> None:
-        """Change the impairments; packets on their way keep their fate.
+        """Change the impairments; packets already under way are not affected.
 
         Raises:
-            ConfigError: a network is invalid; nothing was changed.
+            ConfigError: an impairment is invalid; nothing was changed.
         """
         values = _directions(network, to_server, to_client)
 

@@ -1,4 +1,4 @@
-"""Comparisons from Python: `compare` flies contenders of one's own beside the built-in ones."""
+"""Comparisons from Python: `compare` compares your contenders with the built-in ones."""
 
 from collections.abc import Iterable
 from itertools import product
@@ -35,21 +35,21 @@ def compare(
 
     Args:
         contenders: files of contenders, see docs/compare.md.
-        cases: names of the cases; all unless given.
+        cases: names of the cases; by default all.
         runs: number of flights of each contender per case and budget.
-        quick: whether to fly only a first look.
+        quick: whether to fly only a short preliminary comparison.
         weights: file of the weights of the built-in contenders.
         out: folder for the report; stored flights are not flown again.
         workers: see `skytether.sweep`.
 
     Returns:
-        For each case, contender and budget of packets, the flights of the best point, without the
-        reference aboard. Its keys are `case`, `contender`, `budget` [1/s], `threshold`, `report`.
+        For each case, contender and packet budget, the flights at the best threshold; no flights
+        with the reference aboard. Keys: `case`, `contender`, `budget` [1/s], `threshold`, `report`.
 
     Raises:
-        ConfigError: a contender or an argument is impossible, or `out` has another comparison.
+        ConfigError: a contender or an argument is invalid, or `out` contains another comparison.
         FlightError: the flights were interrupted, or a file could not be written.
-        TypeError: an argument is of another type.
+        TypeError: an argument has a wrong type.
     """
     for argument, value in (("runs", runs), ("workers", workers)):
         if not isinstance(value, int) or value < 1:
@@ -65,7 +65,7 @@ def compare(
         contender=tuple(map(Path, contenders)),
         pool=Flags(workers=0 if workers == 1 else workers),
     )
-    plugins.load()  # plug-ins of installed packages, once per process
+    plugins.load()  # loads the plug-ins of installed packages, once per process
     call = CommandCall.now("compare", [f"--contender={path}" for path in options.contender])
     try:
         with files.apart(), writing(options.out):

@@ -1,4 +1,4 @@
-"""Flight from Python: its arrays, summary and events, its picture and its file."""
+"""Flight for Python: its arrays, summary, events, picture and recording."""
 
 import time
 from collections.abc import Iterable
@@ -45,7 +45,7 @@ if TYPE_CHECKING:
 PARTS = ("client", "server", "netem", "plan")
 """Parts of a record: rows of the vehicle's and the server's steps, of packets, and of plans."""
 QUIET_S = 2.0
-"""Time from which on a progress bar is shown [s]."""
+"""Time after which a progress bar is shown [s]."""
 UNITS = MappingProxyType({"m": "m", "mps": "m/s", "s": "s", "ns": "ns", "bytes": "B"})
 """Unit of an array by the last word of its name; other arrays have none."""
 
@@ -60,7 +60,7 @@ class Column(NamedTuple):
 
 
 class Flight:
-    """Flight that was flown, or loaded from a recording.
+    """Result of a flight, flown just now or loaded from a recording.
 
     `flight["position_m"]` is an array with a row for each step of the vehicle; a vector has the
     shape (steps, axes). Names of arrays of the server, netem and the plans begin with that part, as
@@ -77,7 +77,7 @@ class Flight:
         """Name of the scenario."""
         self.secure = secure
         """Whether the link was encrypted."""
-        # A part without rows gets this scenario's columns, so that its arrays exist.
+        # A part without rows gets empty columns, so that its arrays exist.
         parts: dict[str, Any] = {**_no_rows(scenario)}
         parts |= {part: rows for part in PARTS if len(rows := getattr(record, part))}
         events = tuple(each._replace(host=each.process) for each in record.events)
@@ -138,18 +138,17 @@ class Flight:
 
     @extras.named()
     def explain(self, at: float | None = None, *, seeds: int = 0) -> "Explanation":
-        """Why the flight braked, or was far off: its moments, a cause, rescues and remedies.
+        """Explain why the vehicle braked or was far off: moments, cause, rescues and remedies.
 
-        The flight, in virtual time, is flown again up to a hundred times: see docs/explain.md. A
-        progress bar on stderr, if that is a terminal, shows how far it is.
+        The flight, which must be in virtual time, is flown again up to a hundred times, see
+        docs/explain.md. If stderr is a terminal, it shows a progress bar.
 
         Args:
-            at: time in the flight of the moment to explain, as that of events [s]; by default the
-                gravest is explained.
-            seeds: number of flights of each remedy with other seeds.
+            at: time of the moment to explain, counted as in `events` [s]; by default the gravest.
+            seeds: number of other seeds with which each remedy is flown.
 
         Raises:
-            ConfigError: the flight does not come about again, or there is no moment at that time.
+            ConfigError: the flight cannot be reproduced, or has no moment at that time.
         """
         from skytether.explain.cases import Case
         from skytether.explain.explanation import STEPS, explained
@@ -293,7 +292,7 @@ def table(flights: Iterable[Flight]) -> "pandas.DataFrame":
 
 
 def values(summary: Summary) -> dict[str, Any]:
-    """Single-valued fields of a summary: all except the tables `modes` and `drops`."""
+    """Single-valued fields of a summary: all but the tables `modes` and `drops`."""
     fields = msgspec.structs.asdict(summary)
     return {name: value for name, value in fields.items() if name not in ("modes", "drops")}
 
@@ -309,7 +308,7 @@ def _no_rows(scenario: Scenario) -> dict[str, Table]:
 
 
 def _failure(events: list[FlightEvent]) -> Failure | None:
-    """Last event of the first vehicle that failed."""
+    """Failure of the first vehicle that failed: its last such event."""
     last: dict[int, Event] = {
         each.event.vehicle: each.event
         for each in events

@@ -27,24 +27,24 @@ Given = str | PathLike[str] | Scenario
 
 
 def load(scenario: Given, /, **keys: Any) -> Scenario:
-    """Scenario, with keys replaced as flags on the command line do.
+    """Load a scenario, and replace keys as flags on the command line do.
 
         skytether.load("demo", duration=20, **{"control.trigger": "always"})
 
     Args:
         scenario: name of a scenario, path of a .toml file, or a scenario.
-        keys: keys of the scenario and their values. A dot leads into a table, as in TOML. A mapping
-            as a value replaces the keys that it has in that table.
+        keys: keys of the scenario and their values. A dot separates table and key, as in TOML. A
+            mapping replaces the keys that it contains.
 
     Raises:
-        ConfigError: there is no such scenario or key, or a value that cannot be flown.
+        ConfigError: the scenario or a key does not exist, or a value cannot be flown.
         TypeError: `scenario` is of another type.
     """
     return named(scenario, keys)[1]
 
 
 def check(scenario: Scenario | Mapping[str, Any], /, **keys: Any) -> Scenario:
-    """Scenario made by hand, with every value checked.
+    """Check every value of a scenario made by hand, and return the scenario.
 
     Args:
         scenario: a `Scenario`, or its tables as mappings, as in a TOML file.
@@ -78,8 +78,8 @@ def fly(
         scenario: name of a scenario, path of a .toml file, or a scenario.
         udp: whether server, netem and client fly as three processes on loopback, in real time.
         secure: whether the link is encrypted, with keys made for this flight.
-        server: endpoint that plans in place of Skytether's server, only in virtual time; each
-            flight needs a new one.
+        server: endpoint in place of Skytether's server, only in virtual time; each flight needs a
+            new one.
         planner: class that plans in place of the MPC, see `skytether.plugin.Planner`, only in
             virtual time; the same as `control.planner` with the name of a class that `@planner`
             decorates.
@@ -156,8 +156,8 @@ def named(scenario: Given, keys: Mapping[str, Any]) -> tuple[str, Scenario]:
 
 
 def prepare(*scenarios: Scenario) -> None:
-    """Compile the kernels that these scenarios call, or those of every scheme if there are none,
-    unless this machine has them already, with a note on stderr.
+    """Compile the kernels that these scenarios call, or without scenarios those of all schemes,
+    with a note on stderr. Kernels that this machine has are not compiled again.
     """
     import skytether.sim.flight  # noqa: F401 - its kernels are those of every flight
     from skytether.server.schemes import loading
@@ -181,15 +181,15 @@ def _laid(keys: Mapping[str, Any], table: dict[str, Any]) -> dict[str, Any]:
 
 
 def _plain(value: Any) -> Any:
-    """Plain value of a numpy number or array; of anything else, such as a path, its text."""
+    """Python value of a numpy number or array; text of anything else, such as a path."""
     return value.tolist() if hasattr(value, "tolist") else str(value)
 
 
 def _check_server(server: Endpoint, *, udp: bool, secure: bool) -> None:
-    """Refuse an endpoint of the user that cannot be the server.
+    """Refuse a user's endpoint that cannot be the server.
 
     Raises:
-        ConfigError: the kind of flight needs Skytether's server.
+        ConfigError: a flight over UDP or with encryption needs Skytether's server.
         TypeError: the server is not an endpoint.
     """
     if not isinstance(server, Endpoint):
@@ -202,10 +202,10 @@ def _check_server(server: Endpoint, *, udp: bool, secure: bool) -> None:
 
 
 def _planner(planner: Callable[..., Planner], *, udp: bool) -> str:
-    """Name of a planner in scenarios, added to the table unless it is there.
+    """Name of a planner in scenarios; adds the planner to the table if it is missing.
 
     Raises:
-        ConfigError: the flight is over UDP, or another planner has the name.
+        ConfigError: the flight is over UDP, or another planner has this name.
         TypeError: the planner is not a class.
     """
     if not callable(planner):
@@ -236,7 +236,7 @@ def _over_udp(scenario: Scenario, *, secure: bool) -> Record:
         ThreadPoolExecutor(1) as pool,
         ExitStack() as stack,
     ):
-        # After Ctrl-C the processes are ended in order before the exception is raised again.
+        # After Ctrl-C the processes end in order before the exception is raised again.
         stack.callback(stopped.set)
         flying = pool.submit(
             processes.run,

@@ -1,4 +1,4 @@
-"""Fixture `bad_network` of pytest, by the entry point `pytest11`."""
+"""Pytest fixture `bad_network`, registered by the entry point `pytest11`."""
 
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
@@ -11,7 +11,7 @@ import skytether
 
 @pytest.fixture(name="bad_network")
 def _bad_network() -> "Iterator[Callable[..., skytether.bad_network]]":
-    """Network in front of a server until the test ends; arguments of `skytether.bad_network`."""
+    """Function that starts a `skytether.bad_network`, same arguments, until the test ends."""
     with ExitStack() as networks:
 
         def opened(*network: str, **options: Any) -> "skytether.bad_network":

@@ -27,7 +27,7 @@ class Swept:
     """One combination of a sweep's values, or one point of a comparison, and its flights."""
 
     keys: Mapping[str, Any]
-    """Value of each key of the grid; of a comparison, see `skytether.compare`."""
+    """Value of each key of the grid; for a comparison see `skytether.compare`."""
     scenario: Scenario
     """Scenario that was flown, with the first of the seeds."""
     runs: tuple[Summary, ...]
@@ -77,8 +77,8 @@ def sweep(
         grid: values of each key that is swept; the last key changes fastest.
         runs: number of flights of each combination, with seeds that count up from the scenario's.
         workers: number of processes that fly; with 1, the calling process flies. With more, a
-            script needs `if __name__ == "__main__":`, as with `multiprocessing`. Results are the
-            same.
+            script needs `if __name__ == "__main__":`, as with `multiprocessing`. The number does
+            not affect results.
         keys: see `skytether.load`.
 
     Raises:

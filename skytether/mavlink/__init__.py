@@ -1,5 +1,5 @@
-"""MAVLink for both ends, autopilot and companion: bytes, axes, parameters.
+"""MAVLink for autopilot and companion: encoding, axes, parameters.
 
-`client.mavlink` and the simulated autopilot import it. It imports nothing of ours, and no module
-has a socket: pymavlink only encodes and decodes messages.
+`client.mavlink` and the simulated autopilot import this package, which imports no other package of
+Skytether and opens no socket: pymavlink only encodes and decodes messages.
 """

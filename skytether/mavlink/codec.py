@@ -3,9 +3,9 @@
 A frame begins with 0xFD (MAVLink 2) or 0xFE (MAVLink 1), and has its length and a checksum. Bytes
 that fit no frame are skipped one at a time, so a truncated frame does not lose the frames after it.
 
-The checksum includes a byte that depends on the type of the message. A frame of a type that the
-dialect does not have, as PX4 sends several a second, counts as such a frame if one value of this
-byte fits; of damaged frames that happens to one in 256.
+The checksum includes a byte that depends on the type of the message. PX4 sends several frames a
+second of types that the dialect lacks. A frame of such a type is accepted if some value of this
+byte fits, which is so for one damaged frame in 256.
 """
 
 from typing import Any
@@ -33,9 +33,9 @@ class Codec:
         self._stream = stream
         self._rest = bytearray()
         self.garbage_bytes = 0
-        """Bytes so far that belong to no frame."""
+        """Number of bytes so far that belong to no frame."""
         self.unknown = 0
-        """Frames so far of types that the dialect does not have."""
+        """Number of frames so far of types that the dialect lacks."""
 
     def encode(self, message: Message) -> bytes:
         """Frame of a message, with the next sequence number."""
@@ -51,7 +51,7 @@ class Codec:
         while at < end:
             length = _length(waiting, at)
             if length and at + length > end and self._stream:
-                break  # the rest is still to come
+                break  # the rest of the frame has not arrived yet
             frame = waiting[at : at + length] if length <= end - at else b""
             message = self._one(frame)
             if message is not None:
@@ -91,12 +91,12 @@ def _length(data: bytearray, at: int) -> int:
 
 
 def _number(frame: bytes | bytearray) -> int:
-    """Number of the type of a frame's message."""
+    """Number of a frame's message type."""
     return int.from_bytes(frame[7:10], "little") if frame[0] == 0xFD else frame[5]
 
 
 def _is_unknown(frame: bytes | bytearray) -> bool:
-    """Whether this is a frame of a type that the dialect does not have."""
+    """Whether this is a frame of a type that the dialect lacks."""
     if not frame or _number(frame) in dialect.mavlink_map:
         return False
     ends = (10 if frame[0] == 0xFD else 6) + frame[1]

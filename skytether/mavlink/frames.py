@@ -1,6 +1,6 @@
-"""Axes: MAVLink's are north, east, down; those of Skytether are x north, y east, altitude up.
+"""Conversion of axes: MAVLink has north, east, down; Skytether has x north, y east, altitude up.
 
-The conversion is its own inverse. It is used only here.
+The conversion is its own inverse. No other module converts axes.
 """
 
 from collections.abc import Sequence

@@ -1,7 +1,7 @@
 """Parameter values on the wire: a float, whatever the parameter's type.
 
-ArduPilot converts an integer into a float, PX4 puts its bits into one (`MAV_PROTOCOL_CAPABILITY_
-PARAM_ENCODE_C_CAST`, `…_BYTEWISE`).
+ArduPilot converts an integer to a float; PX4 sends its bits as those of a float
+(`MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_C_CAST`, `…_BYTEWISE`).
 """
 
 import math
@@ -42,7 +42,7 @@ def to_wire(value: float, *, bytewise: bool) -> float:
 
 
 def from_wire(value: float, kind: int, *, bytewise: bool) -> float | None:
-    """Value of a parameter from the wire, an int for integer types; None if it is invalid."""
+    """Value of a received parameter, an int for integer types; None if it is invalid."""
     if kind not in INTEGERS:
         return value if kind == FLOAT and math.isfinite(value) else None
     if bytewise:

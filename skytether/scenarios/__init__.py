@@ -1,1 +1,1 @@
-"""The scenarios that come with Skytether, a TOML file each; `compare.toml` holds many in tables."""
+"""Built-in scenarios, one TOML file each; only `compare.toml` contains several, in tables."""
