@@ -135,8 +135,8 @@ class Remote:
         self.downlink = Link(DOWNLINK, QUEUE_BYTES_MAX, None, network.downlink)
         self._bound = delay_bound(count, step_ns / SECOND_NS, DELAY_STEPS_MAX, None)
         self._leaving: list[tuple[int, int, Message, int]] = []
-        """Answers that agents still think about: time of sending [ns], robot, message, its size. A
-        call of `step` adds at most one for each robot, and mostly lasts until they have left."""
+        """Answers whose thinking time has not ended: time of sending [ns], robot, message, size. A
+        call of `step` adds at most one per robot, and normally lasts until they are sent."""
         self._robots: list[Robot] = []
         self.step = 0
         self._flows = 0

@@ -1,4 +1,4 @@
-"""`skytether calibrate`: search for parameters that the paper does not print, or the best ones."""
+"""`skytether calibrate`: search for the paper's unpublished parameters, or for optimal ones."""
 
 import math
 from collections.abc import Sequence
@@ -36,15 +36,15 @@ class CalibrateOptions:
     packets: float = 0.1
     """Largest event ratio, for the objective rmse with a trigger that uses the state."""
     effort: Annotated[float, Argument(metavar="MPS")] = math.inf
-    """Largest effort with the objective rmse, the RMS change of the command from step to step
-    [m/s]; no limit unless given."""
+    """Largest effort (RMS change of the command from step to step) with the objective rmse [m/s];
+    by default no limit."""
     free: Annotated[tuple[str, ...], Argument(metavar="KEY=LOW:HIGH")] = ()
-    """Keys that may change, each within its bounds, on a logarithmic scale. Unless given, table1
-    changes weights and plant, and rmse the weights (except the position's, as only ratios matter)
-    and the keys of scheme and trigger."""
+    """Keys that may change, each within its bounds, on a logarithmic scale. By default table1
+    changes weights and plant; rmse changes the keys of scheme and trigger, and the weights except
+    the position's, as only ratios matter."""
     runs: int = 10
-    """Number of flights of each point, or with the objective table1 of each column of each point;
-    seeds count up from --seed."""
+    """Number of flights of each point, with table1 of each column of each point; seeds count up
+    from --seed."""
     generations: int = 40
     """Number of generations; a search in OUT continues up to this number."""
     population: int = 10

@@ -1,4 +1,4 @@
-"""`skytether compare`: schemes and triggers on the same seeds, each at its own best weights."""
+"""`skytether compare`: schemes and triggers on the same seeds, each with its own best weights."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -36,19 +36,18 @@ class CompareOptions:
     runs: Annotated[int, Argument(metavar="N")] = 100
     """Number of flights of each contender per case and budget, with seeds from 1 on."""
     out: Path = Path("compare")
-    """Folder for the report, and for weights and their searches; the same command continues
-    there."""
+    """Folder for report, weights and searches; the same command continues an interrupted run."""
     quick: bool = False
-    """Fly only a first look: few flights, cases and thresholds."""
+    """Fly a short version: few flights, cases and thresholds."""
     cases: Annotated[tuple[str, ...], Argument(metavar="CASE")] = ()
-    """Cases to fly; all unless given."""
+    """Cases to fly; by default all."""
     tune: bool = False
     """Only search for the weights of every contender in every case, each with the same effort, and
     write them to OUT/weights.toml."""
     generations: Annotated[int, Argument(metavar="N")] = 16
     """Number of generations of each of these searches."""
     weights: Annotated[str, Argument(metavar="FILE")] = reading.COMPARED
-    """File of the weights, as written by --tune; the included ones unless given."""
+    """File of weights, as written by --tune; by default the included file."""
     contender: Annotated[tuple[Path, ...], Argument(metavar="FILE", append=True)] = ()
     """File with the keys of a contender of your own (see docs/compare.md), flown beside the
     built-in ones; may be repeated."""
@@ -92,7 +91,7 @@ def size(options: CompareOptions) -> ComparisonSize:
 def run(
     options: CompareOptions, scale: ComparisonSize, call: CommandCall
 ) -> tuple[list[ComparedCase], Drawn, int]:
-    """Results of all cases, their report, which it writes, and the number of flights flown now."""
+    """Fly all cases and write the report; returns results, report and number of new flights."""
     plans = [Plan(case, options.weights, scale) for case in scale.cases]
     command.claim_folder("--out", options.out, report_folder.PAGE)
     runs = sum(_scout(options, plans, number) for number in range(1 + scale.rounds))
@@ -111,7 +110,7 @@ def run(
 
 
 def _scout(options: CompareOptions, plans: Sequence[Plan], number: int) -> int:
-    """Fly the scouting flights of a round: all points first, later points near the budgets.
+    """Fly the scouting flights of a round: in the first all points, later points near the budgets.
 
     Returns the number of flights flown by this call.
     """
@@ -128,7 +127,7 @@ def _scout(options: CompareOptions, plans: Sequence[Plan], number: int) -> int:
 
 
 def _beside(flyers: Crew, plan: Plan, folder: Path) -> Baselines:
-    """Baselines of a case; none in a case that has its own weights."""
+    """Baselines of a case; empty for a case with its own weights."""
     if plan.case.weights:
         return Baselines()
     work, no_work = Work(plan), lambda _: 0.0

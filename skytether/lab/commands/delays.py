@@ -22,13 +22,11 @@ EVERY_S = 0.002
 BYTES = 350
 """Size of a packet [B], about that of a horizon."""
 LAST_S = 1.0
-"""Waiting time for the last packets, in addition to the mean delay [s]."""
+"""Time to wait for the last packets after the mean delay [s]."""
 
 
 class _End(asyncio.DatagramProtocol):
-    """Endpoint of the path: records the delays of the numbered, timestamped packets that it
-    receives.
-    """
+    """End of the path; records the delays of received packets by number and timestamp."""
 
     def __init__(self, answers: bool) -> None:
         self._answers = answers

@@ -61,21 +61,20 @@ class IdentifyOptions:
     """Scenario to be flown later: a name (`skytether list scenarios`) or a .toml file. The
     written scenario extends it."""
     speed: Annotated[tuple[float, ...], Argument(metavar="MPS")] = ()
-    """Size of step [m/s], one for all axes or one for each. Unless given, the largest speed of the
+    """Size of step [m/s], one for all axes or one for each. By default the largest speed of the
     desired trajectory on the axis, but at least half of its largest speed on any axis."""
     also: Annotated[tuple[float, ...], Argument(metavar="MPS")] = ()
-    """Further sizes of step to fly [m/s], to see the error of a model identified at another
+    """Further sizes of step to fly [m/s], to measure the error of a model identified at another
     size."""
     hold: float | None = None
-    """Time after each step [s]; unless given, four time constants of the scenario's model, but 3 to
+    """Time after each step [s]; by default four time constants of the scenario's model, within 3 to
     6 s."""
     repeats: int = 3
-    """Number of repetitions on each axis. Each is four steps: out, back, out to the other side,
+    """Number of repetitions on each axis, of four steps each: out, back, to the other side,
     back."""
     set_parameters: bool = False
-    """Set the autopilot's parameters for the case that set-points stop, where their values are
-    unsafe. Without --set-parameters, unsafe values are only reported, and the vehicle is not
-    armed."""
+    """Make the parameters of the autopilot safe for the case that set-points stop. Without
+    --set-parameters, unsafe values are only reported, and the vehicle is not armed."""
     out: Path = Path("identified")
     """Folder for the scenario (scenario.toml), the picture (steps.png), the measurements
     (measured.csv) and the results for programs (identified.json)."""
@@ -121,7 +120,7 @@ def identify(argv: Sequence[str]) -> None:
     scenario, plans = _asked(options)
     flies = vehicles.make(scenario, NUMBER)
     if len(plans) > 1 and flies.port:
-        raise CommandError("--also: got a vehicle of real hardware, expected one computed", 2)
+        raise CommandError("--also: got a vehicle with hardware, expected a simulated one", 2)
     if options.set_parameters and not flies.set_parameters():
         kind = f"got vehicle.kind = {scenario.vehicle.kind!r}, expected one with parameters"
         raise CommandError(f"--set-parameters: {kind}", command.CONFIGURATION)

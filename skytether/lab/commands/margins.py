@@ -1,4 +1,4 @@
-"""`skytether margins`: stability of a scenario's loop, and the vehicles for which it holds."""
+"""`skytether margins`: stability of a scenario's loop, and for which vehicles it is stable."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -25,7 +25,7 @@ class MarginsOptions:
     scenario: ScenarioName = "demo"
     """Name of a scenario (`skytether list scenarios`) or path of a .toml file."""
     runs: Annotated[int, Argument(metavar="N")] = 16
-    """Number of seeds that each vehicle is flown with, which count up from the scenario's."""
+    """Number of flights of each vehicle; seeds count up from the scenario's."""
     json: Path | None = None
     """File for the figures."""
     pool: PoolFlags = Flags()
@@ -35,20 +35,20 @@ class MarginsOptions:
 def margins(argv: Sequence[str]) -> None:
     """Fly a scenario's loop, and find for which vehicles it is stable.
 
-    Flown in virtual time, hovering, over the scenario's network. After a weak push:
+    The vehicle hovers in virtual time, over the scenario's network. After a weak push:
 
       growth   of the mean square of the deviation per step; below 1 it is stable
 
-    In the scenario's white wind and noise alone, where the loop is stable:
+    In the scenario's white wind and noise, if the loop is stable:
 
       RMS      of the position's deviation
       bound    share of the steps with an input at its bound
 
     The server plans with the scenario's model. The first row has the scenario's own vehicle; in the
     other rows the vehicle differs as stated. The second table has limits, found by bisection: how
-    far one quantity may differ, relative to the model, before the loop is no longer stable. With a
-    trigger that uses the state, pushes are flown with a periodic one at the same mean rate, because
-    a weak push stays below every threshold.
+    far one quantity may differ, relative to the model, before the loop is no longer stable. A
+    trigger that uses the state is replaced by a periodic one with the same mean rate for pushes,
+    because a weak push stays below every threshold.
     """
     options = command.parse(MarginsOptions(), argv, "skytether margins", margins.__doc__)
     command.check_count("--runs", options.runs, 1000)

@@ -1,9 +1,9 @@
 """Parallel studies: worker processes fly the cells of a study, and a journal stores the results.
 
 A study is a list of cells and a function that flies and evaluates one cell (`Crew.study`). Stored
-results are not flown again, Ctrl-C stops cleanly, and a bar shows the progress. A sweep is a study
-of its tasks, a search a study of its points, generation by generation. The workers are processes on
-this machine, or of a Dask cluster.
+results are not flown again, Ctrl-C stops cleanly, and a bar shows the progress. The cells of a
+sweep are its tasks; the cells of a search are the points of a generation. The workers are processes
+on this machine, or of a Dask cluster.
 """
 
 import signal
@@ -43,7 +43,7 @@ from skytether.shell.host import system
 from skytether.shell.processes.pool import processes
 
 UNDER_WAY_MAX = 256
-"""Largest number of tasks submitted at once; more than the cores of any machine."""
+"""Largest number of submitted tasks; larger than the number of cores of any machine."""
 POLL_S = 0.2
 CONNECT_S = 10.0
 
@@ -57,13 +57,13 @@ class Flags:
     """Options of every command that has a pool."""
 
     workers: Annotated[int | None, Argument(metavar="N")] = None
-    """Number of worker processes; one per core unless given."""
+    """Number of worker processes; by default one per core."""
     scheduler: Annotated[str | None, Argument(metavar="tcp://HOST:PORT")] = None
     """Address of a Dask scheduler, whose workers fly instead of processes of this machine."""
     plugin: command.Plugins = ()
 
     def check(self) -> None:
-        """Raise CommandError if the options are impossible, with the values that are accepted."""
+        """Raise CommandError, with the accepted values, if the options are invalid."""
         if self.workers is not None:
             command.check_count("--workers", self.workers, 1024)
             if self.scheduler:
@@ -80,7 +80,7 @@ class Interrupted(CommandError):
         message = f"interrupted with {done:.0f} of {total:.0f} {unit} done"
         super().__init__(f"{message}; the same command goes on from here", command.INTERRUPTED)
         self.results: Mapping[Any, Any] = {}
-        """Results that the study had when it was interrupted."""
+        """Results of the study before the interruption."""
 
 
 @dataclass(slots=True)
@@ -93,9 +93,9 @@ class Crew:
     done: float = 0.0
     cpu_s: float = 0.0
     runs: int = 0
-    """Number of flights of sweeps flown by this command, without stored ones."""
+    """Number of flights that this command has flown for sweeps, without stored ones."""
     fresh: list[Any] = field(default_factory=list)
-    """Results of this command, without stored ones."""
+    """New results of this command, without stored ones."""
 
     def advance(self, amount: float, text: str = "") -> None:
         self.done += amount
@@ -112,7 +112,7 @@ class Crew:
         size: Callable[[T], float] = lambda _: 1.0,
         tell: Callable[[Collection[R]], str] = lambda _: "",
     ) -> dict[K, R]:
-        """Results of all cells of a study, in order, after flying the missing ones.
+        """Fly the missing cells of a study; returns the results of all cells, in order.
 
         Args:
             fly: flies a cell, and evaluates the flight; called in a worker.
@@ -120,8 +120,8 @@ class Crew:
             kind: type of a result, for decoding the journal; only needed with a folder.
             settings: all settings that determine the results, besides the cells.
             out: folder of the journal; None: results are not stored.
-            size: amount of work of a cell, in the unit of the bar.
-            tell: returns the text of the bar, from all results so far.
+            size: amount of work of a cell, in the progress bar's unit.
+            tell: returns the text of the progress bar, from all results so far.
 
         Raises:
             CommandError: interrupted (with the results so far), or a worker has died.
@@ -244,10 +244,10 @@ def study(
     title: str = "flying",
     unit: str = "flights",
 ) -> list[R]:
-    """Results of all cells of a study that is a whole command, in order; see `Crew.study`.
+    """Fly a study that is a whole command; returns the results in order, see `Crew.study`.
 
     Args:
-        cells: items to fly, each its own key in the journal; a later call may have more.
+        cells: items to fly, which are also their keys in the journal; later calls may have more.
 
     Raises:
         CommandError: interrupted, a worker has died, or the folder cannot be written.
@@ -293,7 +293,7 @@ def _executor(flags: Flags) -> AbstractContextManager[Executor]:
 
 @contextmanager
 def _thread() -> Iterator[Executor]:
-    """A thread of this process, which has all that the user's program has registered."""
+    """Run tasks in a thread of this process, which has the plug-ins that the user registered."""
     pool = ThreadPoolExecutor(1)
     try:
         yield pool

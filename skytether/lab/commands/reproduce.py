@@ -1,4 +1,4 @@
-"""`skytether reproduce`: fly the paper's table and figures, and more, and write a report."""
+"""`skytether reproduce`: reproduce the paper's table and figures, and write a report."""
 
 import io
 import json
@@ -43,18 +43,18 @@ class ReproduceOptions:
     """Number of flights of each column of Table 1; each point of a curve has half as many, each
     cell of Fig. 5 a quarter."""
     out: Path = Path("results")
-    """Folder for the report; the same command continues there."""
+    """Folder for the report; the same command continues an interrupted run."""
     quick: bool = False
-    """Fly only a first look, in under a minute: few flights, coarse grids."""
+    """Fly a short version, in under a minute: few flights, coarse grids."""
     pool: PoolFlags = Flags()
 
 
 def reproduce(argv: Sequence[str]) -> None:
-    """Reproduce the paper's Table 1 and Figures 2 to 5, and further studies that are usual.
+    """Reproduce the paper's Table 1 and Figures 2 to 5, and fly further usual studies.
 
     OUT/report.html has all results, and opens offline; every figure is in OUT as PNG, PDF and CSV.
-    Flights over real UDP stand beside those in virtual time. All flights are kept: after Ctrl-C or
-    a crash, the same command continues; after the last flight, it only draws the report again.
+    It shows flights over real UDP beside those in virtual time. All flights are kept: after Ctrl-C
+    or a crash, the same command continues; after the last flight, it only draws the report again.
     """
     options = read(ReproduceOptions(), argv, "skytether reproduce", reproduce.__doc__)
     command.check_count("--runs", options.runs, 100_000)
@@ -79,7 +79,7 @@ def reproduce(argv: Sequence[str]) -> None:
 def _measure(
     options: ReproduceOptions, scenario: Scenario, scale: ReproductionSize
 ) -> tuple[Reproduction, int]:
-    """All flights, stored ones included, and the number of flights flown by this call."""
+    """Fly what is missing; returns all flights, and the number of flights flown by this call."""
     table = studies.table_study(scenario, scale)
     curves = studies.curve_studies(scenario, scale)
     maps, periods = studies.map_sweep(scenario, scale), studies.period_sweep(scenario, scale)

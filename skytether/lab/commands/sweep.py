@@ -33,12 +33,12 @@ class SweepOptions:
     """Options of `skytether sweep`."""
 
     out: Path
-    """Folder for the results; the same command continues there."""
+    """Folder for the results; the same command continues an interrupted run."""
     scenario: ScenarioName = "paper"
     """Name of a scenario (`skytether list scenarios`) or path of a .toml file."""
     grid: Annotated[tuple[str, ...], Argument(append=True, metavar="KEY=VALUES")] = ()
     """Key of the scenario and its values: KEY=START:STOP:COUNT, evenly spaced, or KEY=A,B,C.
-    Several grids give all combinations of their values."""
+    With several grids, all combinations of their values are flown."""
     runs: Annotated[int, Argument(metavar="N")] = 50
     """Number of flights of each combination, with seeds that count up from the scenario's."""
     pool: PoolFlags = Flags()
@@ -49,9 +49,9 @@ def sweep(argv: Sequence[str]) -> None:
     """Fly a scenario many times in virtual time, for every combination of some keys' values.
 
     OUT/runs.csv has a row for each flight, OUT/cells.csv one for each combination, with means and
-    95 % intervals; for one key or two there are pictures as well. All flights are kept: after
-    Ctrl-C or a crash, the same command continues. The resulting tables are equal, byte for byte,
-    for any number of workers.
+    95 % intervals; for one or two keys it also has pictures. All flights are kept: after Ctrl-C or
+    a crash, the same command continues. The resulting tables are equal, byte for byte, for any
+    number of workers.
     """
     options = command.parse(
         SweepOptions(tyro.MISSING), argv, "skytether sweep", sweep.__doc__, is_final=False

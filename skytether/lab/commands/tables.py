@@ -15,9 +15,9 @@ Cells = Sequence[Sequence[str]]
 
 
 def show(title: str, headings: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
-    """Print a table: the first column flush left, the others right, and nothing cut off.
+    """Print a table: first column left-aligned, others right-aligned, no cell truncated.
 
-    On a terminal that is too narrow several tables stand below each other. Without headings the
+    On a narrow terminal it is split into several tables, one below the other. Without headings the
     table is a list of names and values.
     """
     cells = [
@@ -43,10 +43,10 @@ def show(title: str, headings: Sequence[str], rows: Iterable[Sequence[object]]) 
 def fitted(
     title: str, headings: Sequence[str], rows: Cells, width: int
 ) -> list[tuple[str, Sequence[str], Cells]]:
-    """Tables no wider than `width` with all of a table's cells, where its cells allow it.
+    """Split a table into tables no wider than `width`, if the width of its cells allows it.
 
-    A first column that repeats itself becomes a part of the titles; what is still too wide is cut
-    between columns, and each piece has the first one.
+    If values of the first column repeat, there is a table for each value, with the value in its
+    title. Tables still too wide are split by columns, and each part has the first column.
     """
     widths = [AROUND + max(map(len, column)) for column in zip(headings, *rows, strict=True)]
     if not headings or len(headings) < 3 or 1 + sum(widths) <= width:
@@ -67,7 +67,7 @@ def fitted(
 
 
 def _pieces(widths: Sequence[int], width: int) -> Iterator[list[int]]:
-    """Columns of each piece of a table, the first column in each."""
+    """Column numbers of each part of a split table; each part has the first column."""
     piece, used = [0], 1 + widths[0]
     for at, wide in enumerate(widths[1:], start=1):
         if used + wide > width and len(piece) > 1:

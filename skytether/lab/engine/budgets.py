@@ -1,9 +1,9 @@
 """Choice of thresholds and reporting policies for contenders, within budgets of packets.
 
 Each contender first flies scouting flights at several thresholds and reporting policies, with its
-weights (`contenders`), on the seeds of the search. Near each budget of packets more thresholds
-are tried, until the budget is almost used up. The choice with the smallest error within each budget
-then flies in the comparison.
+weights (`contenders`), on the seeds of the search. More thresholds are tried near each budget,
+until the budget is almost used up. The comparison then flies the threshold and policy with the
+smallest error within each budget.
 """
 
 import math
@@ -31,11 +31,11 @@ from skytether.shared.scenario.whole import Scenario
 BUDGETS = (1.0, 2.0, 5.0, 10.0, 20.0, 40.0)
 """Budgets: largest numbers of packets per second, both directions together, with heartbeats."""
 SOUGHT = tuple(sorted((*BUDGETS, 4.5)))
-"""Budgets for which points are chosen: BUDGETS, and 4.5 per second, slightly less than 0.12 of the
-packets of the paper's scheme at every step, for the claimed ratios (`comparison.CLAIMS`).
+"""Budgets for which points are chosen: BUDGETS, and 4.5 per second for the claimed ratios
+(`comparison.CLAIMS`): slightly less than 0.12 of the packets of the paper's scheme at every step.
 """
 CLOSE = 1.05
-"""Ratio of neighbouring thresholds below which no threshold between them is tried."""
+"""Smallest ratio of neighbouring thresholds at which a threshold between them is tried."""
 EFFORT_RATIO_MAX = 1.05
 """Largest ratio of a chosen point's effort to the effort limit of its case."""
 REPORTS: Mapping[str, Mapping[str, Any]] = {
@@ -55,11 +55,11 @@ REPORTS: Mapping[str, Mapping[str, Any]] = {
         "link.age_max_s": 30.0,
     },
 }
-"""Policies by which the vehicle reports its state, and the keys that each changes."""
+"""Policies for the vehicle's reports, and the keys that each policy changes."""
 EVERY = "every step"
-"""Reporting policy with which weights are searched for."""
+"""Reporting policy of the searches for weights."""
 ITS_OWN = "its own"
-"""Reporting policy of a user's contender that sets it."""
+"""Name of the reporting policy that a user's contender sets itself."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,7 +74,7 @@ class FlownContender:
     tuned: bool
     """Whether the threshold is the result of the search for weights."""
     keys: Mapping[str, Any]
-    """Keys that differ from the plant's scenario, with dots, and their values."""
+    """Dotted keys that differ from the plant's scenario, and their values."""
 
     @property
     def name(self) -> tuple[str, float | None, str]:
@@ -86,7 +86,7 @@ class FlownContender:
 
 
 def flying(contender: Contender, case: Case, tuned: Scenario) -> list[FlownContender]:
-    """Contender with every reporting policy at all its thresholds, in rising order."""
+    """Points of a contender: each reporting policy at all thresholds, in rising order."""
     keys, key = differences(tuned, case.plant), contender.threshold
     keys = {path: value for path, value in keys.items() if path not in case.keys}
     keys |= contender.keys
@@ -144,7 +144,7 @@ class Plan:
     """Flights of all contenders in one case.
 
     Args:
-        weights: COMPARED, or the path of a file made by `to_file`.
+        weights: COMPARED, or the path of a file written by `to_file`.
 
     Raises:
         ConfigError: the file cannot be read, or a contender is missing, unknown or invalid in it.
@@ -156,7 +156,7 @@ class Plan:
         for contender in scale.who(case):
             self.points += flying(contender, case, tuned(contender, case, weights))
         self.runs = -(-scale.runs // 2) if case.weights else scale.runs
-        """Number of flights of each chosen point; half in a case with its own weights."""
+        """Number of flights of each chosen point; half as many in a case with its own weights."""
         self._scenario = scale.scenario(case)
         self._scouting = scale.scouts, replace(self._scenario, seed=SEARCH_SEED)
         self._scouted: list[Scouted] = []
@@ -175,7 +175,7 @@ class Plan:
         return self._sweep(self._scenario, list(each.values()), self.runs)
 
     def scouted(self, points: Sequence[FlownContender], sweep: Sweep, done: Results) -> None:
-        """Store the results of scouting flights, which `scouts` made of the same points."""
+        """Store the results of the sweep that `scouts` returned for the same points."""
         for cell, point in enumerate(points):
             runs = sweep.of_cell(done, cell)
             packets, effort = (
@@ -198,11 +198,11 @@ class Plan:
         return best
 
     def halfway(self) -> list[FlownContender]:
-        """Points to scout next: a threshold between each two neighbours of which one exceeds a
-        budget and the other keeps it.
+        """Points to scout next: thresholds between neighbouring points if one exceeds a budget and
+        the other does not.
 
-        They are skipped if the one that exceeds it has no smaller error than the best that keeps
-        it.
+        A pair is skipped unless the point above the budget has a smaller error than the best point
+        within it.
         """
         best, points_between = self._best(), {}
         ways: dict[tuple[str, str], list[Scouted]] = {}
@@ -232,7 +232,7 @@ class Plan:
         return {name: each.point for name, each in best if name[1] in self._budgets}
 
     def tuned(self, name: str) -> Scenario:
-        """Scenario of a contender that reports at every step, at the threshold of the search."""
+        """Scenario of a contender with reports at every step, at the threshold from the search."""
         (point,) = (
             each
             for each in self.points

@@ -1,4 +1,4 @@
-"""Objectives of searches: reproduction of the paper's Table 1, or the smallest error within limits.
+"""Objectives of searches: to reproduce the paper's Table 1, or the smallest error within limits.
 
 An objective (`search.Objective`) flies every point of a search, which is a scenario, with the
 same seeds, and scores the flights. A smaller score is better.
@@ -24,7 +24,7 @@ COLUMNS: Mapping[str, Mapping[str, str]] = {
     "compensation": {"trigger": "always"},
     "compensation and trigger": {},
 }
-"""Keys of `control` that each column of Table 1 changes; all others are equal."""
+"""Keys of `control` that each column of Table 1 changes; other keys are equal in all columns."""
 
 TABLE_1: Mapping[str, Mapping[str, float]] = {
     "no compensation": {"rmse_x": 0.3724, "rmse_y": 0.3719, "rmse_xy": 0.5263},
@@ -41,7 +41,7 @@ TABLE_1: Mapping[str, Mapping[str, float]] = {
 TOLERANCE = 0.1
 """Largest relative deviation of an entry that counts as reproduced; twice this for event ratios."""
 UNFLYABLE = 1e9
-"""Score of a point of which a flight failed."""
+"""Score of a point if one of its flights failed."""
 
 
 FREE = (
@@ -55,7 +55,7 @@ FREE = (
     Free("model.u_max.0", 0.8, 5.0),
     Free("reference.radius_m", 0.5, 5.0),
 )
-"""Default keys of a search for Table 1 (E4)."""
+"""Default free keys of a search for Table 1."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,7 +76,7 @@ class Table1:
         return values
 
     def score(self, values: Values) -> float:
-        """Sum of squared deviations; those out of tolerance weigh ten times as much."""
+        """Sum of squared deviations; deviations out of tolerance weigh ten times as much."""
         off = deviations(values)
         if not np.isfinite(list(off.values())).all():
             return UNFLYABLE
@@ -112,11 +112,11 @@ WEIGHTS = (
     Free("control.input_weight", 1e-4, 1e4),
     Free("control.change_weight", 1e-4, 1e4),
 )
-"""Weights that are searched for; only their ratios matter, so the position's is fixed."""
+"""Weights that the search varies; the position's is fixed, because only ratios matter."""
 REGULATOR = (WEIGHTS[0], *WEIGHTS[3:])
-"""Weights that determine the regulator along a trajectory, and the trajectory itself."""
+"""Weights that determine a trajectory, and the regulator along it."""
 SPLINE_KEYS = (Free("control.spline_error_m", 1e-3, 1e-1),)
-"""Key of a trajectory scheme whose server knows the reference in advance."""
+"""Key of a trajectory scheme, if the server knows the reference in advance."""
 TRIGGER_KEYS: Mapping[str, Sequence[Free]] = {
     "state_gap": (
         Free("control.trigger.state_gap.epsilon", 1e-4, 1e8),
@@ -160,7 +160,7 @@ class Rmse:
         return {"objective": "rmse", **asdict(self.limits)}
 
     def free(self) -> Sequence[Free]:
-        """Weights, and the keys of scheme and trigger. A key whose value is 0, for "off", is left
+        """Weights, and keys of scheme and trigger; a key with the value 0, which means off, is left
         out.
         """
         control, table = self.scenario.control, plain(self.scenario)
@@ -194,7 +194,7 @@ class Rmse:
         return rmse * math.prod(max(1.0, each) ** 3 for each in over)
 
     def _binds(self) -> bool:
-        """Whether the trigger uses the state, so that the event ratio depends on the flight."""
+        """Whether the limit of the event ratio applies: only to triggers that use the state."""
         named = leaves(TRIGGERS.parse(self.scenario.control.trigger))
         return any(each.name in TRIGGER_KEYS for each in named)
 

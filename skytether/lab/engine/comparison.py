@@ -44,18 +44,18 @@ FIGURES = (
 
 @dataclass(frozen=True, slots=True)
 class Claim:
-    """Claim that one contender's RMSE xy is at most a given multiple of another's."""
+    """Claim: one contender's RMSE xy is at most a given multiple of another's."""
 
     ours: str
     theirs: str
     share: float = 1.0
-    """Largest share of the other contender's packets in both directions that ours may send."""
+    """Largest allowed number of packets both ways, as a share of the other contender's."""
     at_most: Mapping[str, float] = field(default_factory=dict)
-    """Largest ratio by case; in other cases the ratio is only reported."""
+    """Largest claimed ratio by case; in other cases the ratio is only reported."""
 
 
 OURS = "trajectory-expected"
-"""Contender for which most ratios are claimed."""
+"""Contender of most claims."""
 CLAIMS = (
     Claim(OURS, "paper-every-step", 0.12, {"target": 0.95, "turns": 0.8}),
     Claim(OURS, "feedback-gap", 0.5),
@@ -95,11 +95,10 @@ class ContenderRuns:
 class ComparedCase:
     case: Case
     bought: Mapping[tuple[str, float], ContenderRuns]
-    """Runs of each contender's chosen point within each budget, by the contender's name and the
-    budget [1/s].
+    """Runs of the point chosen for each contender and budget, by contender's name and budget [1/s].
     """
     tuned: Sequence[FlownContender] = ()
-    """Each contender at the threshold that the search found."""
+    """Each contender's point at the threshold from the search."""
     floor: Sequence[Floor] = ()
 
     @property
@@ -110,7 +109,7 @@ class ComparedCase:
         return [found[name] for name in dict.fromkeys([*first, *found])]
 
     def curve(self, contender: str) -> list[ContenderRuns]:
-        """Chosen points of a contender with rising budget; each point once."""
+        """Chosen points of a contender, by rising budget, without repetitions."""
         points = (self.bought.get((contender, budget)) for budget in SOUGHT)
         return list({id(each): each for each in points if each is not None}.values())
 
@@ -122,7 +121,7 @@ def compared(
     done: Results,
     beside: Baselines,
 ) -> ComparedCase:
-    """Results of a case: flights of the chosen points, and the baselines."""
+    """Collect the results of a case: flights of the chosen points, and the baselines."""
     cells = {name: cell for cell, (name,) in enumerate(sweep.cells)}
     flown = {
         point.name: ContenderRuns(point, sweep.of_cell(done, cells[point.name]))
@@ -140,7 +139,7 @@ def ratio(ours: ContenderRuns, theirs: ContenderRuns) -> tuple[float, float, flo
     """Ratio of the mean RMSE xy of our contender to that of the other, and its 95 % interval, see
     `jackknife`; computed for the logarithm, because a ratio is positive.
 
-    None if fewer than two seeds have flown in both.
+    None if fewer than two seeds succeeded with both contenders.
     """
     errors = [
         (one.rmse_xy, other.rmse_xy)
@@ -160,7 +159,7 @@ class Judged:
     claim: Claim
     case: Case
     ours: ContenderRuns
-    """Runs within the largest budget in which our contender sends no more than the claim allows."""
+    """Runs of our contender within the largest budget that the claim allows."""
     theirs: ContenderRuns
     """Runs of the other contender within the largest budget."""
     ratio: tuple[float, float, float] | None
@@ -176,7 +175,7 @@ class Judged:
 
     @property
     def at_most(self) -> float | None:
-        """Largest claimed ratio; None if the claim says nothing about the case."""
+        """Largest claimed ratio; None if there is no claim for the case."""
         return self.claim.at_most.get(self.case.name)
 
     @property

@@ -1,6 +1,6 @@
 """Contenders and cases of `skytether compare`, and the file of each contender's weights.
 
-The best weights of each contender in each case stand in that file. A search finds them
+The file contains the best weights of each contender in each case. A search finds them
 (`search_start`, `calibration.Rmse`), on seeds that the comparison does not fly. `budgets` then
 chooses a threshold for each budget of packets. Some cases are flown with the weights of another
 case, to show how well weights transfer.
@@ -31,12 +31,12 @@ ROUNDS = 4
 """Number of rounds in which thresholds are bisected near each budget.
 
 In the case `target`, at 1 packet/s, 5 % more packets reduce the error by a fifth. With coarse
-thresholds, contenders that left much of a budget unused would look too bad.
+thresholds, contenders would leave much of a budget unused and seem too bad.
 """
 NEAR = (0.1, 0.3, 1, 3, 10, 30, 100)
-"""Factors on a threshold, each of which is flown."""
+"""Factors by which thresholds are multiplied for scouting flights."""
 PERIODS = (0.1, 0.2, 0.5, 1, 2, 4, 8)
-"""Factors on a period of ten steps, each of which is flown."""
+"""Factors by which a period of ten steps is multiplied for scouting flights."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,13 +46,13 @@ class Contender:
     scheme: str
     trigger: str
     control: Mapping[str, Any]
-    """Keys of `control` that define the contender, with the initial weights of its search."""
+    """Keys of `control` that define the contender, and the initial weights of its search."""
     threshold: str = ""
     """Key of `control` that determines the number of packets; empty if there is none."""
     keys: Mapping[str, Any] = field(default_factory=dict)
-    """Keys of a user's contender, with dots, and their values; empty for a built-in one."""
+    """Dotted keys and values of a user's contender; empty for a built-in one."""
     base: "Contender | None" = None
-    """Built-in contender with whose weights a user's contender flies; None: those of the case."""
+    """Built-in contender whose weights a user's contender uses; None: the case's weights."""
 
     @property
     def title(self) -> str:
@@ -60,9 +60,7 @@ class Contender:
 
     @property
     def factors(self) -> Sequence[float]:
-        """Factors on the threshold that the search found; each gives a point of the contender's
-        curve.
-        """
+        """Factors for the threshold from the search; each gives a point of a curve."""
         if not self.threshold:
             return ()
         return PERIODS if self.threshold == "trigger.periodic" else NEAR
@@ -74,14 +72,14 @@ LOOSE = {
     "input_weight": 5.0,
     "change_weight": 200.0,
 }
-"""Initial weights of a search with the paper's scheme: successive plans should differ little."""
+"""Initial weights of a search with the paper's scheme, which keep successive plans similar."""
 TIGHT = {
     "state_weight": [7.1, 1.0],
     "terminal_weight": [50.0, 20.0],
     "input_weight": 0.3,
     "change_weight": 0.01,
 }
-"""Initial weights of a search with committed inputs, which need no S-term."""
+"""Initial weights of a search with committed inputs, without a weight on changes of the plan."""
 
 PAPER = {"scheme": "predictive", "feedback": False, "observer_s": 0.0, "horizon": 40} | LOOSE
 """The paper's scheme, with the horizon that reproduces its Table 1."""
@@ -91,8 +89,8 @@ COMMITTED = {
     "observer_s": 4.0,
     "horizon": 60,
 } | TIGHT
-"""Scheme with committed inputs. The time constant of its observer is searched for, and may come out
-so long that the observer has no effect.
+"""Scheme with committed inputs. The search varies the time constant of its observer; if long, the
+observer has no effect.
 """
 FEEDBACK = COMMITTED | {"feedback": True}
 TRAJECTORY = {
@@ -104,7 +102,7 @@ TRAJECTORY = {
     "input_weight": 0.1,
     "change_weight": 0.5,
 }
-"""Scheme that sends a trajectory, which a regulator aboard follows."""
+"""Scheme that sends a trajectory; a regulator on the vehicle follows it."""
 
 ALWAYS = {"trigger": "always"}
 PERIODIC = {"trigger": "periodic(10)"}
@@ -113,7 +111,7 @@ COST_GAP = {"trigger": "cost_gap(300.0)"}
 EXPECTED_GAP = {"trigger": "expected_gap(300.0)"}
 SILENT = {"trigger": "cost_gap(3.0) | silence(1)"}
 ACKNOWLEDGED = {"trigger": "expected_gap(3.0) | heartbeat"}
-"""Triggers for trajectories. Their threshold is smaller: it is the cost of one step, not of a
+"""Trigger for trajectories. Its threshold is smaller, because it is the cost of one step, not of a
 horizon.
 """
 
@@ -154,7 +152,7 @@ CONTENDERS = _contenders()
 BESIDE = "feedback-gap"
 """Contender whose weights are used for the floor."""
 REGULATED = "trajectory-expected"
-"""Contender whose weights are used for the reference aboard."""
+"""Contender whose weights are used for flights with the reference aboard."""
 ABOARD = Contender("aboard", "reference aboard", "no packets", {})
 """Baseline for cases in which the reference is known before the flight."""
 
@@ -167,9 +165,9 @@ class Case:
     plant: str
     """Name of the scenario with the vehicle, reference and network of all contenders."""
     keys: Mapping[str, Any]
-    """Keys of the scenario, with dots, that differ from the plant."""
+    """Dotted keys that differ from the plant's scenario, and their values."""
     effort_mps: float = math.inf
-    """Largest effort in a search, the RMS change of the command from step to step [m/s]."""
+    """Largest effort in a search: RMS change of the command from step to step [m/s]."""
     weights: str = ""
     """Name of the case whose weights are used; empty if the case has its own."""
     contenders: Sequence[str] = ()
@@ -183,12 +181,12 @@ TARGET = {
     "vehicle.report": "always",
     "duration": 35.0,
 }
-"""Keys of every case with a target: as few heartbeats as in the paper's scenario, and plans
-weighted around the target's velocity (`control.input_reference`).
+"""Keys of every case with a target: heartbeats as rare as in the paper's scenario, and costs of
+inputs relative to the target's velocity (`control.input_reference`).
 """
 CIRCLE = ("paper-every-step", "paper-event", "committed-gap", "feedback-gap", "trajectory-expected")
-"""Contenders on the circle. The reference is known in advance, so a vehicle could fly it without a
-network.
+"""Contenders on the circle, where the reference is known in advance: a vehicle could follow it
+without a network.
 """
 
 
@@ -197,14 +195,14 @@ def _unsearched(name: str, title: str, keys: Mapping[str, Any]) -> Case:
 
 
 def _circle(name: str, title: str, keys: Mapping[str, Any], effort_mps: float) -> Case:
-    """Case on the paper's circle, with costs and hence thresholds hundreds of times smaller."""
+    """Case on the paper's circle; costs and thresholds are hundreds of times smaller there."""
     small = {"trigger.cost_gap": 1.0, "trigger.expected_gap": 1.0, "trigger.state_gap": 300.0}
     round_ = {**keys, "duration": 32.5}  # one full circle after the time that RMSE leaves out
     return Case(name, title, "paper", round_, effort_mps, contenders=CIRCLE, start=small)
 
 
 def _network(argument: str, value: Any) -> Mapping[str, Any]:
-    """Keys that set an argument, or with "" the whole text, of both directions of the network."""
+    """Keys that set an argument of both directions of the network, or their whole text with ""."""
     at = f".{argument}" if argument else ""
     return {f"network.{way}{at}": value for way in ("uplink", "downlink")}
 
@@ -289,12 +287,12 @@ class ComparisonSize:
     search_duration: float = 30.0
     cases: Sequence[Case] = CASES
     contenders: Sequence[Contender] = CONTENDERS
-    """Contenders of the comparison; a case may restrict them."""
+    """Contenders of the comparison; a case may leave some out."""
     scouts: int = SCOUTS
     rounds: int = ROUNDS
     """Number of rounds in which more thresholds are tried near the budgets."""
     budgets: Sequence[float] = ()
-    """Budgets for which points are chosen and flown; all unless given."""
+    """Budgets for which points are chosen and flown; by default all."""
     duration: float = math.inf
     """Largest length of a flight [s]."""
 
@@ -346,15 +344,14 @@ def quick(scale: ComparisonSize) -> ComparisonSize:
 # -- contenders of a user ------------------------------------------------------------------------
 
 SETTABLE = ("control", "link", "vehicle.report")
-"""Sections and keys that a user's contender may set, without `control.dt`; the case has others."""
+"""Sections and keys that a user's contender may set, except `control.dt`; cases set the rest."""
 
 
 def of_user(files: Sequence[Path]) -> list[Contender]:
-    """Contenders of a user, each named as its file.
+    """User's contenders, each with the name of its file.
 
     Raises:
-        ConfigError: a file cannot be read, sets a key of the case, or has the name of another
-            contender.
+        ConfigError: a file cannot be read, sets a key of the case, or has another contender's name.
     """
     found = {each.name: each for each in (*CONTENDERS, ABOARD)}
     built_in = len(found)
@@ -400,7 +397,7 @@ def _of_user(file: Path) -> Contender:
 
 
 def tuned(contender: Contender, case: Case, weights: str) -> Scenario:
-    """Scenario of a contender in a case, with its weights from a file and a user's keys.
+    """Scenario of a contender in a case, with weights from a file and a user's own keys.
 
     Raises:
         ConfigError: the file lacks the contender, or has unknown ones, or the keys cannot be flown.
@@ -467,12 +464,12 @@ class TunedWeights:
     case: Case
     scenario: Scenario
     says: str
-    """Line that summarises the result on the seeds of the search."""
+    """Summary of the result on the search's seeds, in one line."""
 
 
 def to_file(found: Sequence[TunedWeights], scale: ComparisonSize) -> str:
-    """Text of the file of weights: a table per contender and case, with the keys that differ from
-    the plant.
+    """Text of the file of weights: for each contender and case a table of keys that differ from the
+    plant.
 
     A comment in the file states the size of the searches, `scale`.
     """

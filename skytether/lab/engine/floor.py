@@ -1,15 +1,15 @@
 """Floors: lower bounds of the tracking error over a network, and flights without any packets.
 
 An input depends on an observation and on a plan, and both have an age when the input takes effect.
-Disturbances since then are uncompensated. For white accelerations their variance is known in closed
-form, and the record contains the ages. So each flight has a floor: no planner, solver or weight can
-have a smaller error with the same packet timing.
+Disturbances during this age are not compensated. For white accelerations their variance is known in
+closed form, and the record contains the ages. So each flight has a floor: no planner, solver or
+weight can have a smaller error with the same packet timing.
 
 The floor holds for packets sent at every step, periodically, or at fixed times. It does not hold
 for event triggers: they send when the error is large, so age and error are correlated, and some
-flights come below the floor.
+flights are below the floor.
 
-The opposite baseline is a flight without a network, with reference and regulator aboard. It is
+The other baseline is a flight without a network, with reference and regulator aboard, which is
 possible if the reference is known before the flight.
 """
 
@@ -80,7 +80,7 @@ def target_floor_m(scenario: Scenario, client: Rows) -> float:
 
 
 def _inputs(scenario: Scenario, client: Rows) -> Rows:
-    """Rows of the steps whose inputs have led to the states from `settle` on."""
+    """Rows of the steps whose inputs determine the states from `settle` on."""
     return client[:-1][client["step"][1:] * scenario.control.dt >= scenario.settled_s]
 
 
@@ -159,7 +159,7 @@ class Floor(msgspec.Struct, frozen=True):
 
 @dataclass(frozen=True, slots=True)
 class Baselines:
-    """Lower bounds that a comparison shows with the contenders of a case."""
+    """Baselines that a comparison shows beside the contenders of a case."""
 
     floor: Sequence[Floor] = ()
     """Lower bound of the RMSE at several packet rates: for all contenders if only the server sees
@@ -199,7 +199,7 @@ def _is_unknown(scenario: Scenario) -> bool:
 
 
 def floor_of(scenario: Scenario) -> Floor:
-    """Floor of a scenario, from the ages in a few flights; called in a worker."""
+    """Floor of a scenario, computed from the ages in a few flights; called in a worker."""
     flights = fly_batch(scenario, range(scenario.seed, scenario.seed + RUNS))
     floor_m = target_floor_m if _is_unknown(scenario) else wind_floor_m
     packets = sum(int((flight.netem["direction"] == UPLINK).sum()) for flight in flights)

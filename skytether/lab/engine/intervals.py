@@ -1,9 +1,9 @@
 """Confidence intervals of the laboratory's figures, at 95 %.
 
-A mean over independent flights has Student's interval. Any other statistic of a sample of flights
-(a ratio of means, a rate of growth) has the jackknife's interval, computed from the changes of the
-statistic when one flight is left out. The fit of `identify` has the robust interval of least
-squares, see `lab.identify.fit`.
+A mean over independent flights has a Student's t interval. Any other statistic of a sample of
+flights (a ratio of means, a rate of growth) has a jackknife interval, computed from the changes of
+the statistic when one flight is left out. The fit of `identify` has a robust least-squares
+interval, see `lab.identify.fit`.
 """
 
 import math
@@ -20,7 +20,7 @@ Estimate = tuple[float | None, float | None]
 
 def students(freedom: int) -> float:
     """Half-width of a 95 % interval in standard errors, for a number of degrees of freedom."""
-    # scipy.stats has the same number, and takes a second to import in each worker.
+    # scipy.stats gives the same number, but takes a second to import in each worker.
     return float(special.stdtrit(freedom, 0.975))
 
 

@@ -3,8 +3,8 @@
 A journal is a folder. `settings.toml` holds all settings that determine the results,
 `journal.jsonl` one line per result: a checksum (CRC-32), the name of the cell, and the result. Each
 line is on disk before the next one is written. An incomplete last line, left by a killed writer, is
-overwritten; an altered line is an error. Files that the results depend on are in the settings by
-their digests.
+overwritten; an altered line is an error. The settings contain digests of the files that the results
+depend on.
 """
 
 import hashlib

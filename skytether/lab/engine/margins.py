@@ -46,7 +46,7 @@ PUSH = 1e-4
 above the rounding errors of messages with a noise of some centimetres.
 """
 FLOOR = 1e-9
-"""Share of its largest value below which a mean square counts as rounding error."""
+"""Share of the largest mean square below which a mean square counts as rounding error."""
 SETTLE_S, ROUND_TRIPS = 5.0, 4.0
 """Time before a push: seconds, plus a number of mean round trips. By then sessions are open and the
 delay bound is stationary.
@@ -58,7 +58,7 @@ SMALL = 0.05
 STEPS_MIN = 10
 """Smallest number of steps from which a growth can be estimated."""
 WIND_ALONE = 0.1
-"""Wind if the scenario has neither wind nor noise [m/s per √s]."""
+"""Wind used if the scenario has neither wind nor noise [m/s per √s]."""
 CLOCK_ONLY = ("always", "periodic", "silence", "budget")
 """Triggers that do not use the state."""
 RATE_RUNS, LIMIT_RUNS = 4, 4
@@ -91,7 +91,7 @@ class Differing(NamedTuple):
     """Delay added to the network's, each way [s]."""
 
     def is_of(self, scenario: Scenario) -> bool:
-        """Whether the vehicle is possible: its dead time must not be negative."""
+        """Whether the vehicle can be simulated: its dead time must not be negative."""
         return min(scenario.terms().dead_time_s) + self.dead_time_s >= 0.0
 
     def of(self, scenario: Scenario) -> Scenario:
@@ -121,7 +121,7 @@ VEHICLES: dict[str, Differing] = {
     "dead time 0.2 s more": Differing(dead_time_s=0.2),
     "dead time 0.3 s more": Differing(dead_time_s=0.3),
 }
-"""Vehicles that are flown besides the scenario's own, if they are possible."""
+"""Vehicles that are flown besides the scenario's own, if they can be simulated."""
 LIMITS: dict[str, tuple[str, float, float]] = {
     "time constant, least": ("tau", 1.0, 0.1),
     "time constant, most": ("tau", 1.0, 10.0),
@@ -151,7 +151,7 @@ class Margin(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class MarginLimit(msgspec.Struct, frozen=True, kw_only=True):
-    """Limit of one quantity up to which the loop is stable, with all other quantities unchanged."""
+    """Largest value of a quantity for which the loop is stable, other quantities unchanged."""
 
     quantity: str
     """Name of the quantity in a table."""
@@ -222,7 +222,7 @@ def growth_of(scenario: Scenario, trigger: str, runs: int) -> tuple[float, float
 
 
 def _responses(scenario: Scenario, trigger: str, runs: int) -> Array:
-    """Mean of p² over the axes at each step after a push; shape (runs, steps)."""
+    """Mean squared deviation p² at each step after a push [m²]; shape (runs, steps)."""
     dt, begin_s = scenario.control.dt, settled_s(scenario)
     flown = hovering(scenario, begin_s + FOLLOWED_S)
     flown = replace(
@@ -235,7 +235,7 @@ def _responses(scenario: Scenario, trigger: str, runs: int) -> Array:
     if flown.sensor != SensorConfig():
         calm_p, calm_u = _positions_and_inputs(_flown(flown, runs))
         p, u = p - calm_p, u - calm_u
-    if not p.any(axis=(1, 2)).all():  # a vehicle had no session when the push came
+    if not p.any(axis=(1, 2)).all():  # a vehicle had no session at the time of the push
         return np.zeros((runs, 0))
     begins = np.argmax(p.any(axis=2), axis=1) + round(PUSH_S / dt)
     steps = min(round((FOLLOWED_S - 2.0) / dt), p.shape[1] - int(begins.max()))

@@ -108,7 +108,7 @@ class Optimiser:
         low, high = np.log([key.low for key in free]), np.log([key.high for key in free])
         self._low, self._range = low, high - low
         start_point = (np.log([key.of(plain(start)) for key in free]) - low) / self._range
-        # numpy's global generator would be shared with other code
+        # numpy's global generator could be used by other code
         rng = np.random.default_rng(seed)
         options = {
             "bounds": [0, 1],
@@ -133,7 +133,7 @@ class Optimiser:
 
     def _scenario(self, point: Any) -> Scenario:
         values = np.exp(self._low + self._range * point)
-        # Rounded before the flight, so that the file is readable and exact.
+        # Rounded before the flight, so that the file has short numbers that are exact.
         return put(
             self._start,
             {key: float(f"{value:.4g}") for key, value in zip(self._free, values, strict=True)},
@@ -170,7 +170,7 @@ class SearchPoint:
 
 
 Point = tuple[float, ...]
-"""Values of the free keys, in order: the name of a point in the journal."""
+"""Values of the free keys, in order; they identify a point in the journal."""
 FlyAll = Callable[[Mapping[Point, Scenario]], Mapping[Point, Values]]
 """Function that returns the figures of scenarios, after flying those without stored figures."""
 

@@ -1,4 +1,4 @@
-"""Studies of `skytether reproduce`: the paper's Table 1 and Fig. 5, and usual further studies.
+"""Studies of `skytether reproduce`: the paper's Table 1 and Fig. 5, and further usual studies.
 
 A study flies all methods over the values of one parameter. For a fair comparison, a second sweep
 flies periodic sending at each value, with the period nearest to the event trigger's rate in the
@@ -52,7 +52,7 @@ class ReproductionSize:
     real_settle_s: float
     """Initial part of a flight over UDP that RMSE leaves out [s]."""
     sample_runs: int
-    """Number of flights of each method whose complete records are drawn."""
+    """Number of flights of each method whose complete records are kept, for figures."""
     delay_packets: int
     """Number of packets sent through netem in each direction, to measure their delay."""
 
@@ -96,7 +96,7 @@ class Study:
     label: str
     """Label of the axis, with its unit."""
     scenario: Scenario
-    """Scenario to fly; the parameter is replaced."""
+    """Scenario to fly, whose parameter is replaced."""
     axis: GridAxis
     """Values of the parameter, and the keys that each changes."""
     runs: int
@@ -138,9 +138,7 @@ def table_study(scenario: Scenario, scale: ReproductionSize) -> Study:
 
 
 def curve_studies(scenario: Scenario, scale: ReproductionSize) -> list[Study]:
-    """Studies of loss, delay, jitter, a wrong model and clock offset, which are usual in the
-    literature.
-    """
+    """Studies of loss, delay, jitter, model error and clock offset, usual in the literature."""
     up, n = scenario.uplink, scale.points
     (paper, _) = IMPAIRMENTS.calls(scenario.network.uplink)
     _, slot_s, slots_mean, _ = map(float, paper.values)
@@ -162,7 +160,7 @@ def curve_studies(scenario: Scenario, scale: ReproductionSize) -> list[Study]:
         return {f"network.{way}.{key}": keys[key] for way in directions for key in keys}
 
     def jitter(std_ms: float) -> Mapping[str, Any]:
-        # The variance of a Poisson number equals its mean; the mean delay is kept.
+        # A Poisson variable's variance equals its mean; the offset keeps the mean delay.
         slots = (std_ms / 1e3 / slot_s) ** 2
         least_s = round(up.mean_s - slot_s * slots, 9)
         return both_ways({"paper.slots_mean": slots, "paper.minimum_s": least_s})
@@ -245,7 +243,7 @@ class MethodFlights:
 
 
 def periodic_wins(event: MethodFlights, periodic: MethodFlights) -> int:
-    """Comparison of RMSE xy: 1 if periodic sending is better, -1 if it is worse.
+    """Compare RMSE xy: 1 if periodic sending is better, -1 if it is worse.
 
     0 if the 95 % intervals overlap, or a method has no successful flight.
     """

@@ -35,7 +35,7 @@ SEED_MAX = 2**32 - 1
 
 @dataclass(frozen=True, slots=True)
 class GridAxis:
-    """Key of the scenario with its values; or a label, with the keys that each value changes."""
+    """Key of the scenario and its values; or a label, and the keys that each value changes."""
 
     key: str
     values: tuple[Any, ...]
@@ -44,7 +44,7 @@ class GridAxis:
     """Keys that each value changes, and their values; empty if each changes only `key`."""
 
     def __str__(self) -> str:
-        """KEY=VALUE,VALUE,... as in `parse_axis`, or with the changes in place of values."""
+        """Text KEY=VALUE,VALUE,... as in `parse_axis`, or with changes in place of values."""
         values = self.changes or self.values
         return f"{self.key}={','.join(msgspec.json.encode(value).decode() for value in values)}"
 
@@ -100,7 +100,7 @@ def _value(text: str) -> Any:
     try:
         return toml.loads(f"value = {text}")["value"]
     except ValueError:
-        # A string without quotes: a name, or a path.
+        # A string without quotes, such as a name or a path.
         if not text or {*text} & {*"\"'[]{}=:"}:
             raise
         return text

@@ -3,7 +3,7 @@
     v(t) = g Σ Δu (1 - exp(-(t - t_u - θ) / τ)) + w       over the changes Δu at times t_u < t - θ
 
 Gain g, time constant τ and dead time θ are the least-squares solution over all steps of an axis.
-The offset w, constant within a step, comes from wind or sensor error; subtracting each step's mean
+The offset w, constant within a step, is due to wind or sensor error; subtracting each step's mean
 from both sides removes it. Residuals are correlated within a step, so the intervals treat steps as
 clusters (the sandwich estimator; Liang and Zeger, Biometrika 73, 1986). They are never narrower
 than those for white noise.
@@ -40,8 +40,8 @@ class StepResponse(NamedTuple):
     before: float
     after: float
     changes: Array
-    """Earlier changes of the input that still have an effect: time relative to the step [s], and
-    amount [m/s]; shape (n, 2)."""
+    """Changes of the input that affect the response: time relative to the step [s], and amount
+    [m/s]; shape (n, 2)."""
     times: Array
     """Times of the measurements relative to the step, some of them before it [s]; shape (m,)."""
     velocity: Array
@@ -58,7 +58,7 @@ class StepResponse(NamedTuple):
 
 
 class Numbers(NamedTuple):
-    """Parameters of a first-order model with dead time, or half-widths of their intervals."""
+    """Gain, time constant and dead time of a model, or half-widths of their intervals."""
 
     gain: float
     tau_s: float
@@ -70,7 +70,7 @@ class Misfit(NamedTuple):
 
     rms: float
     largest: float
-    """Largest difference at any time, in the mean of all starting or of all ending steps."""
+    """Largest difference over time in the mean of all starting steps, or of all ending steps."""
     at_s: float
     """Time of the largest difference, relative to the step [s]."""
     certain: float
@@ -80,12 +80,12 @@ class Misfit(NamedTuple):
 class Fit(NamedTuple):
     numbers: Numbers
     within: Numbers
-    """Half-widths of their 95 % intervals; infinite if the steps do not determine them."""
+    """Half-widths of the 95 % intervals of `numbers`; infinite if the steps do not suffice."""
     misfit: Misfit
 
 
 def fit(responses: Sequence[StepResponse]) -> Fit | None:
-    """Best model for the responses of an axis; None if there are too few."""
+    """Fit a model to the responses of an axis; None if there are too few responses."""
     if len(responses) < STEPS_MIN:
         return None
     numbers = _best(responses)
@@ -93,7 +93,7 @@ def fit(responses: Sequence[StepResponse]) -> Fit | None:
 
 
 def unit_response(times: Array, numbers: Numbers) -> Array:
-    """Velocity after a unit step of the input, divided by the gain; shape of `times` [s]."""
+    """Velocity after a unit step of the input, divided by the gain, at `times` [s]; same shape."""
     return -np.expm1(-np.maximum(times - numbers.dead_time_s, 0.0) / numbers.tau_s)
 
 
@@ -215,7 +215,7 @@ def differences(response: StepResponse, numbers: Numbers) -> Array:
 
 
 def misfit(responses: Sequence[StepResponse], numbers: Numbers) -> Misfit:
-    """Residual of a model for responses, which may differ from those that it was fitted to."""
+    """Residual of a model for responses, which need not be those of its fit."""
     shares = [differences(each, numbers) for each in responses]
     rms = float(np.sqrt(np.mean(np.concatenate(shares) ** 2)))
     worst = Misfit(rms, 0.0, 0.0, 0.0)
@@ -233,8 +233,8 @@ def misfit(responses: Sequence[StepResponse], numbers: Numbers) -> Misfit:
 
 
 def binned(curves: Sequence[tuple[Array, Array]]) -> tuple[Array, Array, Array]:
-    """Mean of curves over time, and its standard error, at times at which at least half have
-    values.
+    """Mean of curves over time, and its standard error, at times at which at least half of the
+    curves have values.
 
     Args:
         curves: times from the step [s] and values of each curve.
@@ -264,7 +264,7 @@ def binned(curves: Sequence[tuple[Array, Array]]) -> tuple[Array, Array, Array]:
 
 
 def verdict(found: Fit) -> str:
-    """Sentence on whether a first-order model with dead time is adequate."""
+    """Sentence that says whether a first-order model with dead time is adequate."""
     off = found.misfit
     where = f"{off.largest:.0%} of the step's height {off.at_s:.2f} s after it"
     if off.largest <= GOOD:

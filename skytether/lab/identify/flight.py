@@ -1,4 +1,4 @@
-"""Flight of an experiment: an endpoint around a vehicle, without a server.
+"""Flight of an experiment: an endpoint that flies a vehicle without a server.
 
 The vehicle takes off, flies the experiment, and lands. Any event that keeps it from following a
 plan ends the flight at once; if a pilot takes over, the pilot keeps the vehicle.
@@ -19,7 +19,7 @@ from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import Reason
 
 BLIND_NS = SECOND_NS
-"""Longest time without a known state of the vehicle, before the flight ends [ns]."""
+"""Longest time without the vehicle's state, after which the flight ends [ns]."""
 FLOWN_MAX_NS = 3600 * SECOND_NS
 """Longest flight [ns]; it bounds the memory for measurements."""
 
@@ -49,7 +49,7 @@ class Identifying(Endpoint):
 
     @property
     def why(self) -> str:
-        """Reason why the flight ended early; empty if it did not."""
+        """Reason why the flight ended early; empty otherwise."""
         return "" if self.experiment.is_over or self._ends is None else str(self._ends)
 
     @property
@@ -62,7 +62,7 @@ class Identifying(Endpoint):
 
     @property
     def finished(self) -> bool:
-        """Whether the flight is over with the vehicle on the ground, or cannot begin."""
+        """Whether the flight has ended on the ground, or cannot begin."""
         if self._ends is Reason.TAKEN:
             return True
         return (self._ends is not None or self.failure is not None) and self._flies.is_down

@@ -1,4 +1,4 @@
-"""Results of an identification: each axis in words, and a scenario with the identified model.
+"""Results of an identification: sentences on each axis, and a scenario with the identified model.
 
 The scenario also contains the keys changed on the command line.
 """
@@ -18,23 +18,23 @@ from skytether.shared.scenario.whole import Scenario
 
 AXES = "xyz"
 BEYOND = 1.5
-"""Largest allowed input over the largest step; larger inputs were not measured."""
+"""Largest allowed input, divided by the largest step; larger inputs were not measured."""
 FASTER = 1.25
-"""Required speed relative to the desired trajectory's, to catch up, and to the fence's wind."""
+"""Required speed, divided by that of the desired trajectory or of the fence's wind."""
 DIGITS = 4
 
 
 class AxisOutcome(NamedTuple):
     speed: float
     cut: int
-    """Number of steps that the fence cut short, or for which the fence left no space."""
+    """Number of steps that the fence shortened or left no space for."""
     responses: Sequence[StepResponse]
     fit: Fit | None
     """Fitted model; None with too few steps."""
 
     @property
     def steps(self) -> str:
-        """Sentence on how many steps are usable."""
+        """Sentence that says how many steps are usable."""
         return f"{len(self.responses)}{f', {self.cut} cut' if self.cut else ''}"
 
 
@@ -124,8 +124,8 @@ def _rounded(number: float) -> float:
 
 
 def _u_max(flown: Scenario, axes: Sequence[AxisOutcome], numbers: Sequence[Numbers]) -> list[float]:
-    """Bounds of the input [m/s]: sufficient for the desired trajectory and against the fence's
-    wind, and otherwise no more than was measured.
+    """Bounds of the input [m/s]: sufficient for the desired trajectory and the fence's wind,
+    otherwise within the measured range.
     """
     wind_mps = flown.fence.wind_mps if flown.fence.is_there else 0.0
     wanted = [max(speed, wind_mps) for speed in reference_speeds(flown)]

@@ -28,10 +28,10 @@ HOMEWARD_S = 15.0
 """Longest time for the way home [s]; steady wind may keep a vehicle away."""
 HOLD_MIN_S, HOLD_MAX_S = 3.0, 6.0
 STEP_MPS = 0.5
-"""Size of step if the desired trajectory stands still [m/s]."""
+"""Size of step if the desired trajectory is at rest [m/s]."""
 STEP_MIN_MPS = 0.05
 FAST = 1.3
-"""Safety factor on the distance that the input of a step predicts."""
+"""Safety factor on the predicted distance of a step."""
 
 
 class ExperimentPlan(NamedTuple):
@@ -61,7 +61,7 @@ def reference_speeds(scenario: Scenario) -> list[float]:
 
 
 def default_speeds(scenario: Scenario) -> tuple[float, ...]:
-    """Default size of step on each axis, similar to the later flight [m/s].
+    """Default size of step on each axis [m/s], similar to the speeds of the later flight.
 
     The largest speed of the desired trajectory on the axis, but at least half of its largest speed
     on any axis: on an axis without motion, feedback still causes inputs.
@@ -74,7 +74,7 @@ def default_speeds(scenario: Scenario) -> tuple[float, ...]:
 
 
 def default_hold_s(scenario: Scenario) -> float:
-    """Time after a step in which a vehicle similar to the model settles [s]."""
+    """Default time after a step, in which a vehicle similar to the model settles [s]."""
     terms = scenario.terms()
     slowest = max(4.0 * t + late for t, late in zip(terms.tau_s, terms.dead_time_s, strict=True))
     return round(min(max(slowest, HOLD_MIN_S), HOLD_MAX_S), 2)
@@ -110,7 +110,7 @@ class Experiment:
         self._input = [0.0] * len(plan.speeds)
         self.steps: list[FlownStep] = []
         self.cut = [0] * len(plan.speeds)
-        """Number of steps of each axis that the fence cut short, or for which it left no space."""
+        """Number of steps of each axis that the fence shortened or left no space for."""
         self.is_over = False
 
     def choose(self, state: Sequence[tuple[float, float]], *, now_ns: int) -> list[float]:

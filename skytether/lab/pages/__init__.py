@@ -1,4 +1,4 @@
-"""Pages of the laboratory: what a study's results look like.
+"""Pages of the laboratory: tables, pictures and HTML for the results of a study.
 
     plates         figures for print, with their numbers and captions
     figures        pictures of sweeps
@@ -6,6 +6,6 @@
     comparison     the contents of `skytether compare`
     keys_document  docs/keys.md, made from the keys of a scenario
 
-Summaries and records of `lab.engine` go in, tables, pictures and HTML come out. The commands write
-them to files, but for pictures of sweeps, which `figures` writes itself.
+They are made from summaries and records of `lab.engine`. The commands write them to files, except
+the pictures of sweeps, which `figures` writes itself.
 """

@@ -57,7 +57,7 @@ def draw(results: Sequence[ComparedCase]) -> Drawn:
 
 
 FLIGHTS_MIN = 10
-"""Number of flights from which on claimed ratios are judged."""
+"""Smallest number of flights for which claimed ratios are judged."""
 TITLES = {each.name: each.title for each in CONTENDERS}
 CASE_TITLES = {each.name: each.title for each in CASES}
 TITLE = "Schemes and triggers compared"
@@ -72,7 +72,7 @@ ABOUT = (
 
 UNDECIDED = "too few flights to tell"
 SIMILAR = 2 / 3
-"""Share of the contenders within a budget that may be as good as the best; of more, none is marked.
+"""Largest share of the contenders that may equal the best; if it is larger, none is marked.
 """
 
 
@@ -127,7 +127,7 @@ def budgets_table(results: Sequence[ComparedCase]) -> Table:
 
 
 def _is_distinct(compared: ComparedCase, budget: float) -> bool:
-    """Whether the flights tell which contenders are best within a budget."""
+    """Whether the flights suffice to distinguish the best contenders within a budget."""
     flown = sum(not math.isnan(each.mean(RMSE)) for each in ranked(compared, budget))
     return flown < 2 or len(leading(compared, budget)) <= SIMILAR * flown
 
@@ -255,7 +255,7 @@ def weights_table(results: Sequence[ComparedCase]) -> Table:
 
 
 def _weights(value: Any) -> str:
-    """Number as text, or several with commas between; empty for None."""
+    """Text of a number, or of several with commas; empty for None."""
     parts = () if value is None else np.atleast_1d(value)
     return ", ".join(f"{part:.4g}" for part in parts)
 
@@ -273,7 +273,7 @@ USER_MARKERS = "Xhdp>"
 
 
 def _style(contender: Contender, users: Sequence[Contender]) -> tuple[str, str]:
-    """Colour and marker of a contender, the same in every figure; `users` are those of a user."""
+    """Colour and marker of a contender in all figures; `users` are the user's contenders."""
     if contender is ABOARD:
         return "0.3", ""
     if contender.keys:

@@ -1,6 +1,6 @@
 """Text of docs/keys.md, made from the sections of a scenario; `make keys` writes it.
 
-A key's meaning is its docstring there, as in `--help`; its unit stands in the docstring's brackets.
+A key's meaning is its docstring in the section, as in `--help`, with the unit in brackets.
 """
 
 import inspect
@@ -87,7 +87,7 @@ def values(kind: Any) -> str:
 
 
 def _either(kinds: list[str]) -> str:
-    """Allowed values of a union, words first; "number or list of numbers" shares one range."""
+    """Allowed values of a union type, words first; "number or list of numbers" has one range."""
     if kinds[1] == f"list of numbers, {kinds[0]}":
         return f"number or {kinds[1]}"
     return " or ".join(sorted(kinds, key=lambda each: not each.startswith("`")))

@@ -1,7 +1,7 @@
-"""Figures of a report for print, each with its numbers and a caption.
+"""Figures of a report for print, each with a caption and its numbers as CSV.
 
-Widths are those of a journal's columns, and letters have 8 points. The reference is red and dashed,
-the vehicle black, as in the paper.
+Figures are as wide as a journal's column or page, with text of 8 points. The reference is red and
+dashed, the vehicle black, as in the paper.
 """
 
 import io
@@ -47,7 +47,7 @@ STYLES: Mapping[str, Mapping[str, Any]] = {
 }
 """Line style of each method; methods can be told apart without colour."""
 RATIO_LOG = 20.0
-"""Ratio of largest to smallest value above which an axis is logarithmic."""
+"""Ratio of the largest to the smallest value above which an axis is logarithmic."""
 
 Samples = Mapping[str, tuple[Scenario, Sequence[Record]]]
 
@@ -83,7 +83,7 @@ def delay(direction: str, delay_ms: Array) -> Plate:
     count = int(stats.poisson.ppf(0.9999, slots_mean)) + 2
     slots = np.arange(count)
     lattice_ms, pdf = first_ms + slot_ms * slots, stats.poisson.pmf(slots, slots_mean)
-    # A packet is never early: an excess of up to a slot belongs to the drawn slot.
+    # Packets are late, never early: up to one slot late counts as the drawn slot.
     nearest = np.floor((took_ms - first_ms) / slot_ms + 0.1)
     share = np.array([np.mean(nearest == slot) for slot in slots])
     fine_ms = np.arange(first_ms - slot_ms, lattice_ms[-1] + 1.0)
@@ -186,7 +186,7 @@ DECAY, EPSILON = "decay rate λ [1/s]", "tolerance ε"
 def maps(flown: CellSummaries, here: ControlConfig) -> Plate:
     """Fig. 5: RMSE and event ratio over the decay rate λ and the tolerance ε.
 
-    A cross marks the λ and ε of `here`, the paper's own.
+    A cross marks the λ and ε of `here`, which are the paper's.
     """
     from scipy import stats  # takes a second to import
 
@@ -329,8 +329,8 @@ def curve(study: Study, cells: Cells) -> Plate:
 
 
 def against_periodic(study: Study, cells: Cells) -> tuple[int, int]:
-    """Number of values at which periodic sending is better than the event trigger, and at which it
-    is worse.
+    """Number of values of the parameter at which periodic sending is better than the event trigger,
+    and number at which it is worse.
     """
     signs = [
         periodic_wins(cells[value, EVENT], cells[value, PERIODIC]) for value in study.axis.values

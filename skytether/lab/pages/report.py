@@ -1,5 +1,5 @@
-"""Report: a page of tables and figures that opens offline; and the contents of `reproduce`'s
-report.
+"""Report: a page of tables and figures that opens offline, and the contents for `skytether
+reproduce`.
 """
 
 from collections.abc import Mapping, Sequence
@@ -45,7 +45,7 @@ class Real:
     scenario: Scenario
     flight: Record
     netem: Mapping[str, Any]
-    """Counters of netem, and its lateness."""
+    """Counters and lateness of netem."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,7 +57,7 @@ class Reproduction:
     periods: CellSummaries
     """Summaries of periodic sending, for Fig. 5 as curves, by period."""
     delay_ms: Array
-    """Measured delay of each packet over UDP, and drawn delay [ms]; shape (packets, 2)."""
+    """Delay of each packet over UDP, measured and drawn by netem [ms]; shape (packets, 2)."""
     real: Mapping[str, Real]
     """Flights over UDP, by method."""
     samples: Samples
@@ -73,7 +73,7 @@ class Drawn:
     pictures: Sequence[Plate]
     verdict: str
     figures_first: bool = False
-    """Whether the figures stand before the tables."""
+    """Whether the page shows figures before tables."""
 
 
 def draw(measured: Reproduction) -> Drawn:
@@ -231,7 +231,7 @@ def as_interval(estimate: Estimate, spec: str) -> str:
 def html(drawn: Drawn, scenario: Scenario, calls: Sequence[Mapping[str, Any]]) -> str:
     """Page of a report.
 
-    `calls` are facts about each call of the command that made the report, in order.
+    `calls` has facts about each call of the command that made the report, in order.
     """
     call = calls[-1]
     versions = {"Python": call["python"], **call["versions"]}
