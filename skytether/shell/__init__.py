@@ -1,1 +1,1 @@
-"""Drivers of endpoints: sockets, the clock, signals, processes and the command line."""
+"""Drivers of endpoints: sockets, clock, signals, processes and command line."""

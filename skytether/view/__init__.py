@@ -1,13 +1,13 @@
-"""Views of a flight: its live page, and its recordings.
+"""Views of a flight: live page and recordings.
 
     rows        rows of the record as plain columns, for tables, messages and arrays
     frames      a virtual flight as the frames that its processes would send
-    recordings  files: written, read, joined, exported, reported
-    page        what a page shows: state, scene, plots, words, sliders
+    recordings  recordings: write, read, join, export, report
+    page        contents of a page: state, scene, plots, texts, sliders
     browser     the page's server: sockets, threads, clocks and panels
 
 The input is frames (`shared.telemetry.feed`), from a feed, a recording or a flight in virtual time.
-Recordings and the page do not import each other, and either may be deleted; `make check` proves
-that `browser` imports `page`, `page` and `recordings` import `rows` and `frames`, and not back.
-Below stand `figures`, `sim` and all that they import.
+Recordings and the page do not import each other, and either may be deleted. `make check` tests that
+`browser` imports `page`, and `page` and `recordings` import `rows` and `frames`, never the reverse.
+They may import `figures`, `sim` and what these import.
 """

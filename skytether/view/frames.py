@@ -1,4 +1,4 @@
-"""Frames of a virtual flight, equal to those that its processes would make."""
+"""Frames of a flight in virtual time, as its processes would send them over UDP."""
 
 from collections.abc import Iterator
 from heapq import merge
@@ -14,13 +14,13 @@ from skytether.shared.telemetry.feed import Rows as RowsFrame
 from skytether.shared.telemetry.record import Record, Rows
 
 Timed = tuple[int, str, Frame]
-"""Time of a frame [ns], its process, and the frame."""
+"""Time [ns], process name and frame."""
 PROCESSES = {"client": "client", "server": "server", "plan": "server", "netem": "netem"}
-"""Process that makes each part of the record."""
+"""Process that records each part of the record."""
 
 
 def of_flight(scenario: Scenario, name: str, flight: Record) -> Iterator[Timed]:
-    """Frames of a flight in virtual time, in order of time; time begins at 0.
+    """Frames of a flight in virtual time, ordered by time, which begins at 0.
 
     Args:
         name: name of the scenario.
@@ -69,7 +69,7 @@ def _times_ns(scenario: Scenario, part: str, rows: Rows, begins: Indices) -> Ind
 
 
 def _rows(part: str, rows: Rows, times_ns: Indices) -> Iterator[Timed]:
-    """Frames of a part, one for all rows with the same time."""
+    """Frames of a part; rows with the same time are in one frame."""
     starts = np.flatnonzero(np.diff(times_ns, prepend=-1))
     ends = np.append(starts[1:], len(rows))[: len(starts)]
     for begin, end in zip(starts, ends, strict=True):

@@ -1,7 +1,7 @@
 """Rows of the record as plain columns: one number each, with axis and unit in its name.
 
-Exported tables have plain columns, and messages of recordings for other programs have them as keys.
-An array of the library has all axes of one quantity.
+Exported tables have these columns, and messages for other programs have them as keys. An array of
+the Python library has all axes of one quantity.
 """
 
 from collections.abc import Mapping
@@ -31,7 +31,7 @@ from skytether.shared.wire.protocol import Mode
 
 AXES = "xyz"
 SHORT = {"inputs": "input"}
-"""Column names of velocities that become other names here."""
+"""Names of columns of velocities that are replaced in plain columns."""
 WORDS: Mapping[str, Mapping[int, str]] = {
     "mode": {mode: str(mode) for mode in Mode},
     "reason": {reason: str(reason) for reason in Reason},
@@ -39,7 +39,7 @@ WORDS: Mapping[str, Mapping[int, str]] = {
     "direction": {UPLINK: FLIGHT[0], DOWNLINK: FLIGHT[1]},
 }
 FLOWN_S_MAX = 2 * 86_400.0
-"""Latest time of a step [s]: a scenario lasts for a day at most."""
+"""Latest accepted time of a step [s]; a scenario lasts for a day at most."""
 DELAY_NS_MAX = 86_400 * SECOND_NS
 """Longest delay of a packet that is accepted [ns]."""
 NUMBER_MAX = 1e100
@@ -84,9 +84,9 @@ def plain(columns: np.dtype[np.void]) -> np.dtype[np.void]:
 
 
 class RowTable:
-    """Converter of a part's rows to messages of JSON, with a key for each plain column.
+    """Converter of a part's rows to JSON messages with a key for each plain column.
 
-    JSON has no numbers that are not finite; they are left out.
+    Numbers that are not finite are left out, because JSON has no notation for them.
 
     Raises:
         ValueError: see `plain`.
@@ -122,7 +122,7 @@ def check_columns(part: str, columns: np.dtype[np.void], scenario: Scenario) -> 
     Additional columns are accepted. Plans may have any number of inputs.
 
     Raises:
-        ValueError: names the part and the column.
+        ValueError: a column is missing or wrong; the message names it and the part.
     """
     axes = scenario.model.axes
     match part:
@@ -150,7 +150,7 @@ def check_values(part: str, rows: Rows, scenario: Scenario) -> None:
     """Refuse rows with impossible values for a flight of a scenario.
 
     Raises:
-        ValueError: names the part, the column, the value and the range.
+        ValueError: a value is out of range; the message names part, column, value and range.
     """
     most = {
         "step": int(FLOWN_S_MAX / scenario.control.dt),
@@ -202,7 +202,7 @@ def readable(rows: Rows, ways: Directions = FLIGHT) -> Columns:
 
 
 def arrays(rows: Rows) -> Columns:
-    """Plain columns of rows, those of all axes joined to one array.
+    """Plain columns of rows, with columns of all axes joined to one array.
 
     `position_x_m` and `position_y_m` become `position_m`, of shape (rows, axes); inputs of plans
     have the shape (rows, axes, steps).

@@ -509,7 +509,7 @@ def test_what_was_measured_until_ctrl_c_is_kept(
         (["mavlink", "--vehicle.address", "here"], "vehicle.address: got 'here', expected udp:"),
         (
             ["mavlink", "--also", "1", "--vehicle.address", "udp:127.0.0.1:0"],
-            "--also: got a vehicle of real hardware",
+            "--also: got a vehicle with hardware",
         ),
     ],
 )

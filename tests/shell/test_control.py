@@ -180,7 +180,7 @@ def test_an_answer_of_something_else_is_a_control_error(said: bytes, tmp_path: P
         with closing(Caller(path)) as caller:
             other.sendto(said, caller._socket.getsockname())
             with pytest.raises(
-                ControlError, match=f"{path}: got an answer that is no answer of skytether"
+                ControlError, match=f"{path}: got an answer that is not from skytether"
             ):
                 caller.ask({})
 

@@ -140,7 +140,7 @@ def test_a_journal_that_is_cut_or_flipped_anywhere_is_refused_or_exact(tmp_path:
 
 @pytest.mark.parametrize(
     ("scenario", "later_s", "said"),
-    [(SWAP, 0.0, "while another scenario was flown"), (DEMO, 90_000.0, "it was set 1.0 days ago")],
+    [(SWAP, 0.0, "in a flight of another scenario"), (DEMO, 90_000.0, "it was set 1.0 days ago")],
 )
 def test_one_of_another_flight_is_refused_in_words(
     scenario: Scenario,

@@ -1,1 +1,1 @@
-"""What a command line is: options, help, plug-ins, output, and the line that reports an error."""
+"""Command line: options, help, plug-ins, output, and the one-line report of an error."""

@@ -13,13 +13,13 @@ class Argument:
     """Annotation of a field: its form on the command line."""
 
     name: str | None = None
-    """Name of the flag, if different from the field's; "": none, its value's fields have."""
+    """Name of the flag, if different from the field's; "": each field of the value has a flag."""
     metavar: str | None = None
     help: str | None = None
     """Text of the help, if different from the field's docstring."""
     positional: bool = False
     append: bool = False
-    """Whether the flag may be repeated, with a value each."""
+    """Whether the flag may be repeated, with one value each time."""
 
 
 def argument_of(hint: Any) -> Argument:

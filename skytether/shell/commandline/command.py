@@ -1,4 +1,4 @@
-"""Parts that all commands share, from parsing arguments to the one line that reports an error.
+"""Common parts of all commands, from parsing arguments to reporting an error in one line.
 
 A command's options are a dataclass with a field `scenario` for the scenario's name and a field
 `config` for the scenario itself. Every key of the scenario is a flag; flags override the file.
@@ -43,7 +43,7 @@ from skytether.shell.host.udp import (
 )
 
 CONFIGURATION, RUN, INTERRUPTED = 2, 1, 128 + signal.SIGINT
-"""Exit codes: 2 the request is impossible, 1 something failed on the way, 130 ended by Ctrl-C."""
+"""Exit codes: 2 invalid request, 1 failure during the run, 130 ended by Ctrl-C."""
 OUTPUTS = ("json", "figure", "record")
 
 ScenarioName = Annotated[str, Argument(metavar="SCENARIO", positional=True)]
@@ -96,24 +96,24 @@ def parse(
     leads: bool = True,
     is_final: bool = True,
 ) -> O:
-    """Parse a command line; returns its options, laid over the scenario that it names.
+    """Parse a command line; returns the options, with the named scenario and its changed keys.
 
-    The scenario is checked once, with its final values: a flag may repair a contradiction in the
-    file.
+    The scenario is checked once, with its final values, because a flag may correct a contradiction
+    in the file.
 
     Args:
-        leads: whether a first argument without a flag is the scenario's name.
+        leads: whether a positional first argument is the scenario's name.
         is_final: whether to check the scenario; False for a command that changes further keys and
             checks the scenario itself.
 
     Raises:
         CommandError: an output file cannot be written, is an input, or is locked.
         ConfigError: the scenario cannot be flown, or a plug-in cannot be imported.
-        SystemExit: the help or an error in a flag has been printed.
+        SystemExit: the help or an error in a flag was printed.
     """
     plugins.load(plugins.named(argv))
     argv, values = key_values(argv, type(defaults))
-    if HELP_KEYS in argv:  # the help shows the keys' values in the scenario
+    if HELP_KEYS in argv:  # the help shows the scenario's values of the keys
         named = leads and argv and not argv[0].startswith("-")
         base = reading.load_base(argv[0] if named else defaults.scenario)
         defaults = replace(defaults, config=base)  # type: ignore[type-var]
@@ -236,7 +236,7 @@ def refuse_errors(plugin_errors: Mapping[str, int] | None) -> None:
 
 @contextmanager
 def interruptible() -> Iterator[Callable[[], bool]]:
-    """Handle Ctrl-C and SIGTERM inside the block; yields a function that says if one has come."""
+    """Handle Ctrl-C and SIGTERM in the block; yields a function that returns whether one came."""
     interrupted = threading.Event()
     numbers = (signal.SIGINT, signal.SIGTERM)
     before = [signal.signal(number, lambda *_: interrupted.set()) for number in numbers]
@@ -261,9 +261,9 @@ def main(command: Callable[[Sequence[str]], None], argv: Sequence[str] | None, p
         return _refuse(prog, str(error), CONFIGURATION)
     except KeyboardInterrupt:  # Ctrl-C before `interruptible` was entered
         return INTERRUPTED
-    # a fault of the machine: a full disk, too few open files, a broken pipe
+    # caused by the machine: a full disk, too few open files, a broken pipe
     except OSError as error:
-        # the reader of our output has closed it, as `head` does
+        # the reader of our output has closed the pipe, as `head` does
         is_closed = isinstance(error, BrokenPipeError)
         with suppress(OSError):
             sys.stdout.flush()

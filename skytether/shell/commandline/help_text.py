@@ -38,7 +38,7 @@ class OptionText(NamedTuple):
 
 
 def help_text(default: Any, prog: str, about: str) -> str:
-    """Help of a command with these default options."""
+    """Help of a command, with `default` as the default options."""
     groups: dict[str, list[OptionText]] = {title: [] for title in (ARGUMENTS, OPTIONS, *GROUPS)}
     group_of = {flag: title for title, flags in GROUPS.items() for flag in flags}
     flies, arguments = hasattr(default, "config"), []
@@ -89,7 +89,7 @@ def keys_text(scenario: Scenario, prog: str) -> str:
 
 
 def _fields(options: Any) -> Iterator[tuple[Any, str, str, Any, bool]]:
-    """Annotation, flag, text, default and whether it is required, of each option."""
+    """Annotation, flag, text and default of each option, and whether it is required."""
     kind: Any = type(options)
     texts, hints, empty = meanings(kind), hints_of(kind), dataclasses.MISSING
     for field in dataclasses.fields(options):
@@ -104,7 +104,7 @@ def _fields(options: Any) -> Iterator[tuple[Any, str, str, Any, bool]]:
 
 
 def _metavar(hint: Any, text: str) -> str:
-    """Name of a value, by its type and by how the option's text begins."""
+    """Placeholder for an option's value, from its type and the beginning of the option's text."""
     origin, parts = get_origin(hint), get_args(hint)
     if origin is Annotated:
         argument = argument_of(hint)
@@ -124,7 +124,7 @@ def _metavar(hint: Any, text: str) -> str:
 
 
 def _with_default(text: str, value: Any, *, required: bool = False) -> str:
-    """Text of an option with its default, if it has one that a person would write."""
+    """Text of an option, with its default if a user could type it."""
     if required:
         return f"{text} (required)"
     if value is None or value is False or value in ("", (), math.inf):
@@ -151,7 +151,7 @@ def _grouped(groups: Mapping[str, Sequence[OptionText]]) -> str:
 
 
 def _paragraphs(text: str) -> list[str]:
-    """Paragraphs of a docstring at the terminal's width; indented ones stay as they are."""
+    """Paragraphs of a docstring, wrapped to the terminal's width; indented ones are unchanged."""
     parts = cleandoc(text).split("\n\n")
     return [part if part.startswith(" ") else _filled(part) for part in parts if part]
 

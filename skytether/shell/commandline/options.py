@@ -2,7 +2,7 @@
 
 Flags of keys, as in `--control.trigger always`, are parsed here and checked with the scenario. tyro
 parses the other options and reports wrong flags. Importing tyro takes 0.2 s and 9 MB at each start
-of a process; so simple flags, which commands pass to processes, are parsed here.
+of a process, so simple flags, which commands pass to processes, are also parsed here.
 """
 
 import dataclasses
@@ -28,11 +28,11 @@ T = TypeVar("T")
 
 
 def read(default: T, argv: Sequence[str], prog: str, help_: str | None) -> T:
-    """Options of a command line, laid over defaults; `help_` describes the command.
+    """Options of a command line, defaults where it has none; `help_` describes the command.
 
     Raises:
         ConfigError: a flag is wrong, or a plug-in cannot be imported.
-        SystemExit: the help has been printed.
+        SystemExit: the help was printed.
     """
     plugins.load(plugins.named(argv))
     options = plain(default, argv)
@@ -61,7 +61,7 @@ def read(default: T, argv: Sequence[str], prog: str, help_: str | None) -> T:
 
 
 def refusal(frame: str, options: type, prog: str) -> str:
-    """Sentence about a wrong command line, from what tyro prints in a frame about it."""
+    """Sentence about a wrong command line, made from the box of text that tyro prints."""
     lines = (line.strip("│ ") for line in frame.splitlines() if line.startswith("│"))
     said = " ".join(takewhile(lambda line: not line.startswith("─"), lines))
     if unknown := re.match(r"Unrecognized options: (.*?)(?:, |$)", said):
@@ -73,7 +73,7 @@ def refusal(frame: str, options: type, prog: str) -> str:
 
 
 def _unknown(word: str, options: type, see: str) -> str:
-    import difflib  # slow to import, and needed only after a typing error
+    import difflib  # slow to import, and needed only for a misspelt flag
 
     if not word.startswith("-"):
         return f"got {word!r} as well, expected no further argument; {see}"
@@ -93,7 +93,7 @@ REFUSALS = (
     (r"Error parsing (\S+): .* from \[(.*?)\].*'int'", r"\1: got \2, expected a whole number"),
     (r"Error parsing (\S+): .* from \[(.*?)\].*'float'", r"\1: got \2, expected a number"),
 )
-"""What tyro says, and the sentence in its place."""
+"""Patterns of tyro's messages, and sentences that replace them."""
 
 
 def key_values(argv: Sequence[str], options: type) -> tuple[list[str], dict[str, Any]]:
@@ -132,7 +132,7 @@ def key_values(argv: Sequence[str], options: type) -> tuple[list[str], dict[str,
 
 
 def _slipped(flag: str) -> bool:
-    import difflib  # slow to import, and needed only after a typing error
+    import difflib  # slow to import, and needed only for a misspelt flag
 
     keys = (key for key in Scenario.__struct_fields__ if _kinds(key) != {str})
     return bool(difflib.get_close_matches(flag, keys, 1, 0.8))
@@ -149,7 +149,7 @@ def _key_value(key: str, words: Sequence[str]) -> Any:
 
 
 def _number_or_other(word: str) -> Any:
-    """Value of a text as TOML, or as a number in Python's notation: `1.`, `.5`."""
+    """Value of a text in TOML, or of a number in Python's notation: `1.`, `.5`."""
     value = toml_value(word)
     with suppress(ValueError):
         return float(word) if isinstance(value, str) else value
@@ -170,7 +170,7 @@ def _kinds(key: str) -> frozenset[Any]:
 
 
 def toml_value(text: str) -> Any:
-    """Value of a text as TOML if JSON can express it too; otherwise the text itself."""
+    """Value of a text in TOML if JSON has this value, too; otherwise the text itself."""
     try:
         table = toml.loads(f"value = {text}")
         return json.loads(json.dumps(table["value"], allow_nan=False)) if len(table) == 1 else text
@@ -179,7 +179,7 @@ def toml_value(text: str) -> Any:
 
 
 def plain(default: T, argv: Sequence[str]) -> T | None:
-    """Options of a line of simple flags, as tyro would read them; None if tyro has to read it.
+    """Options of a command line of simple flags, parsed as by tyro; None if tyro must parse it.
 
     Simple flags are `--flag VALUE`, `--flag=VALUE` and the bare `--flag` of a boolean, after at
     most one positional value. A value is a text, a path, a number or a literal, without a leading
@@ -230,10 +230,10 @@ def _flags(options: type) -> tuple[Mapping[str, str], Sequence[str]]:
 
 
 def _value(hint: Any, text: str, *, given: bool) -> Any:
-    """Value of a text for a field with this annotation; `given` for `--flag=VALUE`.
+    """Convert a text to a value of the type `hint`; `given` for `--flag=VALUE`.
 
     Raises:
-        ValueError: only tyro can read the value.
+        ValueError: only tyro can parse the value.
     """
     kinds = get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
     (kind,) = (kind for kind in kinds if kind is not NoneType)

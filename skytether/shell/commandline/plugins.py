@@ -52,12 +52,12 @@ _loaded: dict[str, Plugin] = {}
 
 
 def named(argv: Sequence[str]) -> list[str]:
-    """Files that a command line names as plug-ins, found before anything else of it is parsed."""
+    """Plug-in files on a command line, found before the other arguments are parsed."""
     return flag_values(argv, FLAG)[0]
 
 
 def flag_values(argv: Sequence[str], flag: str) -> tuple[list[str], list[str]]:
-    """Values of a flag on a command line, and the line without them; a flag without value stays."""
+    """Split a command line into values of a flag and other words; a flag without value is kept."""
     words, values, rest = deque(argv), list[str](), list[str]()
     while words:
         word = words.popleft()
@@ -88,7 +88,7 @@ def load(paths: Iterable[str] = ()) -> None:
 
 
 def loaded() -> tuple[Plugin, ...]:
-    """Files that this process has imported, as arguments for `use` in another process."""
+    """Plug-in files that this process has imported, as arguments of `use` in another process."""
     return tuple(_loaded.values())
 
 
@@ -97,7 +97,7 @@ def flags() -> list[str]:
 
 
 def use(plugins: Iterable[Plugin]) -> None:
-    """Import installed plug-ins, and files read already, perhaps by another process."""
+    """Import installed plug-ins, and plug-in files that this or another process has read."""
     _load_installed()
     for plugin in plugins:
         if _loaded.get(plugin.path) != plugin:
@@ -134,7 +134,7 @@ def _import(plugin: Plugin) -> None:
 def _load_installed() -> None:
     if not any(_mention_groups(Path(folder)) for folder in sys.path):
         return
-    from importlib import metadata  # takes 0.1 s to import
+    from importlib import metadata  # the import takes 0.1 s
 
     for group, table in GROUPS.items():
         for point in sorted(metadata.entry_points(group=group)):

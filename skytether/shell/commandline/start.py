@@ -15,7 +15,7 @@ from importlib import import_module
 from skytether.shell.host import system
 
 PARENT = os.getppid()
-"""Process that started this one, asked for before the slow imports: it may end meanwhile."""
+"""Id of the parent process, read before the slow imports, during which the parent may end."""
 
 
 def run(command: str, prog: str, argv: Sequence[str] | None = None) -> int:
@@ -45,8 +45,8 @@ def run(command: str, prog: str, argv: Sequence[str] | None = None) -> int:
 def begin() -> None:
     """Open missing standard streams, and ignore SIGUSR1 until there are figures to print.
 
-    A closed stream becomes /dev/null, for children as well: otherwise the next socket would get its
-    number, and be printed to. Characters that a stream cannot encode are written as escapes.
+    A closed stream becomes /dev/null, also for children: otherwise the next socket would get its
+    number, and output would go to the socket. Characters that a stream cannot encode are escaped.
     SIGUSR1 is ignored, also by children, until a handler is set.
     """
     for number, name in enumerate(("stdin", "stdout", "stderr")):
@@ -67,7 +67,7 @@ def begin() -> None:
 
 @contextlib.contextmanager
 def _mortal() -> Iterator[None]:
-    """Let Ctrl-C end the process at once: an import could swallow KeyboardInterrupt."""
+    """Let Ctrl-C end the process at once, because an import could ignore KeyboardInterrupt."""
     before = signal.getsignal(signal.SIGINT)
     if before is signal.default_int_handler:
         signal.signal(signal.SIGINT, signal.SIG_DFL)

@@ -28,8 +28,8 @@ class Bar(Protocol):
 def progress(title: str, total: float, unit: str = "s") -> Iterator[Bar]:
     """Progress bar on stderr: title, progress and the time remaining.
 
-    The bar vanishes at the end. It is not shown where stderr is no terminal, or a terminal that
-    cannot move its cursor. Lines printed on stderr meanwhile appear above it.
+    The bar disappears at the end. It is shown only if stderr is a terminal that can move its
+    cursor. Lines printed on stderr meanwhile appear above it.
     """
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
@@ -58,7 +58,7 @@ def prepare(kernels: Sequence["Missing"], folder: Path | None = None) -> None:
     """Compile the kernels that are not compiled on this machine yet, with a note on stderr.
 
     Args:
-        folder: folder of the flight's sockets, in which its page finds how far this is.
+        folder: folder of the flight's sockets, where the flight's page reads the progress.
     """
     if not kernels:
         return
@@ -96,7 +96,7 @@ def counted(number: int, noun: str) -> str:
 
 
 def show(table: "Table") -> None:
-    """Print a table in full width: a number cut off would be worse than a long line."""
+    """Print a table in full width: long lines are better than truncated numbers."""
     from rich.console import Console
 
     Console(width=max(Console().width, Console(width=1000).measure(table).maximum)).print(table)
@@ -110,7 +110,7 @@ COMPARED = (
     ("bytes/s with headers, both ways", "bytes_per_s", ".0f"),
     ("age p99 [ms]", "age_ms_p99", ".0f"),
 )
-"""Name, field and format of what is shown where flights are compared."""
+"""Name, field and format of the figures that compare flights."""
 
 
 def finish(
@@ -119,8 +119,8 @@ def finish(
     """Print a summary as a table, and write it to a file.
 
     Args:
-        beside: summaries to compare with: the table has a column for each flight, named by its
-            scenario, and fewer rows.
+        beside: summaries to compare with; the table then has a column for each flight, with its
+            scenario's name, and fewer rows.
 
     Raises:
         CommandError: the file cannot be written.

@@ -1,1 +1,1 @@
-"""What drives an endpoint in real time: datagrams, streams, changes, and files beside it."""
+"""Drivers of an endpoint in real time: datagrams, streams, changes, and files."""

@@ -1,9 +1,9 @@
 """TCP connections that an endpoint relays, beside the sockets of a `Shell`.
 
-Each client that connects gets a connection of its own to the server. Pieces of both go to the
-endpoint as datagrams; their peers are `(CLIENT, number)` and `(SERVER, number)`, and an empty piece
-says that an end sends no more. An end with HELD_MAX pieces on their way is not read from, so that
-TCP slows its sender down. A connection that one end breaks off is broken off at the other at once.
+Each connected client gets its own connection to the server. Pieces of data from both go to the
+endpoint as datagrams with the peers `(CLIENT, number)` and `(SERVER, number)`; an empty piece means
+that an end sends no more. An end with HELD_MAX pieces under way is not read, so that TCP slows down
+its sender. If one end resets a connection, the other end is reset at once.
 """
 
 import asyncio
@@ -18,17 +18,17 @@ from skytether.shared.events.flight import address_text
 from skytether.shell.host.udp import AddressError, from_kernel, to_kernel
 
 HELD_MAX = 200
-"""Number of pieces of an end on their way, above which it is not read from. With what one read
-brings, all connections together stay below the bounds of a link's queue."""
+"""Number of pieces of an end under way, above which it is not read. Even with the data of one more
+read, all connections together stay below the bounds of a link's queue."""
 READ_BYTES = 32 * PIECE_BYTES
 BREAKS_OFF = struct.pack("ii", 1, 0)
-"""SO_LINGER of a socket that is closed by a reset."""
+"""Value of SO_LINGER with which closing a socket sends a reset."""
 
 Hear = Callable[[bytes, Address], None]
 
 
 class SocketHalf:
-    """One direction of a connection, from a source, whose peer is `peer`, to a target."""
+    """One direction of a connection, from a source to a target; `peer` is the source's peer."""
 
     def __init__(
         self, source: socket.socket, target: socket.socket, peer: Address, hear: Hear
@@ -68,10 +68,10 @@ class SocketHalf:
 
 
 class Connections:
-    """Listens for clients, and leads each to the server.
+    """Listens for clients, and connects each to the server.
 
     Args:
-        hear: called with each piece.
+        hear: called with each piece of data.
         refused: called with the reason if the server cannot be reached.
 
     Raises:
@@ -84,7 +84,7 @@ class Connections:
         self._server, self._most, self._refused = listen.server, listen.most, refused
         self._hear: Hear = lambda piece, peer: hear(Datagram(piece, peer, 1))
         self._ways: dict[Address, SocketHalf] = {}
-        """Ways by the peer to which they lead."""
+        """Directions of connections, by the peer to which they send."""
         self._running: set[asyncio.Task[None]] = set()
         self._opened = 0
         host, port = listen.bind
@@ -98,7 +98,7 @@ class Connections:
         self.address: Address = from_kernel(self._socket.getsockname())
 
     def send(self, payload: bytes, peer: Address) -> bool:
-        if way := self._ways.get(peer):  # else it was broken off meanwhile
+        if way := self._ways.get(peer):  # otherwise the connection was reset meanwhile
             way.pieces.put_nowait(payload)
         return True
 
@@ -155,7 +155,7 @@ class Connections:
         )
         self._ways |= {there: down, here: up}
         try:
-            with contextlib.suppress(ExceptionGroup):  # an end has broken off
+            with contextlib.suppress(ExceptionGroup):  # an end has reset the connection
                 async with asyncio.TaskGroup() as group:
                     for work in (down.read(), down.write(), up.read(), up.write()):
                         group.create_task(work)

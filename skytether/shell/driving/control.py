@@ -1,7 +1,7 @@
-"""Control socket: a Unix socket, for its owner alone, through which keys are changed in flight.
+"""Control socket: a Unix socket, usable only by its owner, through which keys change in flight.
 
 A datagram is a request (`shared.endpoints.change`); the answer goes back to the sender. The socket
-pauses after each request, so that a flood of requests delays the sender and not the endpoint. An
+pauses after each request, so that a flood of requests delays the sender, not the endpoint. An
 answer that cannot be delivered is dropped.
 """
 
@@ -25,14 +25,14 @@ from skytether.shell.host import system
 from skytether.shell.host.local import Local
 
 NETEMS = ("netem", *(f"netem {number}" for number in range(2, PATHS_MAX + 2)))
-"""Names of the netems of a session's paths, and of the one to a standby server."""
+"""Names of the netems of a session's paths, and of the netem to a standby server."""
 PROCESSES = ("server", "server 2", *NETEMS, "client")
 """Names of the processes, and of their sockets in a flight's folder."""
 
 REST_S = 0.01
 """Shortest pause after a request."""
 RESTS = 20
-"""Ratio of the pause to the time of the request: requests take at most 1/21 of all time."""
+"""Pause after a request, as a multiple of its duration: requests take at most 1/21 of the time."""
 PATIENCE_S = 5.0
 """Longest time to wait for an answer."""
 ANSWER_BYTES_MAX = 65_536
@@ -84,7 +84,7 @@ class Control:
                 threading.Thread(target=self._keep, args=(answer, sender), daemon=True).start()
             else:
                 self._answer(answer, sender)
-        except OSError:  # no datagram after all
+        except OSError:  # no datagram was there
             pass
         finally:
             if not is_writing:
@@ -158,10 +158,10 @@ class Caller:
             raise self._failed(error) from None
 
     def ask(self, values: Mapping[str, Any]) -> Answer:
-        """Ask for new values; without values, for the list of keys that may change.
+        """Request new values; without values, request the list of keys that may change.
 
         Raises:
-            ControlError: no answer has come.
+            ControlError: no answer arrived.
         """
         try:
             self._socket.send(msgspec.json.encode(values))
@@ -190,8 +190,8 @@ class Caller:
 def _answers(sock: socket.socket, path: Path) -> "tempfile.TemporaryDirectory[str]":
     """Bind a socket to a new address for answers; returns its folder.
 
-    The address lies beside the control socket, because a process in another container may see no
-    other folder of this one. If nothing can be created there, a temporary folder is used.
+    The address is beside the control socket, because a process in another container may have no
+    access to other folders. If it cannot be created there, a temporary folder is used.
 
     Raises:
         OSError: the address cannot be created anywhere.
@@ -215,7 +215,7 @@ def answer_of(text: bytes) -> Answer:
     try:
         return _DECODER.decode(text)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
-        raise ControlError("got an answer that is no answer of skytether") from None
+        raise ControlError("got an answer that is not from skytether") from None
 
 
 @contextmanager

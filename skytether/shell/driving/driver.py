@@ -1,8 +1,8 @@
-"""The shell: one driver that runs any endpoint on real UDP sockets and the real clock.
+"""Shell: driver that runs any endpoint on real UDP sockets and the real clock.
 
 asyncio and signals are used only here and in `shell.host.timer`, sockets only in `shell.host.udp`
-and `shell.host.batch`. The shell knows neither control nor protocol: datagrams and time go in,
-datagrams and events come out.
+and `shell.host.batch`. The shell has no knowledge of control or protocol: it passes datagrams and
+time to the endpoint, and sends the endpoint's datagrams and events.
 """
 
 import asyncio
@@ -61,9 +61,9 @@ BURST_MAX = BATCH_MAX
 """Largest number of datagrams read from one socket before timers and other sockets have their
 turn."""
 TOGETHER_MIN = 4
-"""Smallest number of datagrams worth a batch call: fewer are faster one by one."""
+"""Smallest number of datagrams for a batch call: fewer are faster one by one."""
 CROWD_MIN = 2 * TOGETHER_MIN
-"""Number of datagrams within `patience_ns` from which on a socket is read in batches."""
+"""Number of datagrams within `patience_ns` above which a socket is read in batches."""
 BATCHES_MAX = 4
 """Largest number of batches read from one socket before timers and other sockets have their
 turn."""
@@ -76,7 +76,7 @@ RESOLVE_EVERY_S = 2.0
 """Interval at which names are looked up again [s]: a restarted host may have a new address."""
 CHECK_PATHS_EVERY_S = 1.0
 Numbers = dict[Address, Address]
-"""Numeric addresses by the peers' names."""
+"""Numeric addresses by peers' names."""
 
 
 class OpenLine(Protocol):
@@ -87,7 +87,7 @@ class OpenLine(Protocol):
     """
 
     address: Address | None
-    """Address that is listened on; None if nobody can connect."""
+    """Address for incoming connections; None without any."""
 
     def send(self, payload: bytes, peer: Address) -> bool:
         """Send bytes to a peer; False if they cannot be sent now."""
@@ -109,28 +109,28 @@ def new_event_loop() -> asyncio.AbstractEventLoop:
     try:
         import uvloop
     except ImportError:
-        return asyncio.SelectorEventLoop()  # the only one of Windows that watches sockets
+        return asyncio.SelectorEventLoop()  # on Windows, only this loop watches sockets
     return uvloop.new_event_loop()
 
 
 class Shell:
-    """Drives one endpoint.
+    """Driver of one endpoint.
 
     Args:
-        bind: address of socket 0, where port 0 takes a free one, or a bound socket; a list is of
-            sockets 0, 1 and so on. Further sockets open when the endpoint sends from them.
-        peers: addresses the endpoint will send to, names or numbers; the endpoint sees them as
-            written here and not in the kernel's form.
+        bind: address of socket 0 (port 0 takes a free one), or a bound socket; or a list for
+            sockets 0, 1 and so on. Further sockets are opened when the endpoint sends from them.
+        peers: addresses that the endpoint will send to, names or numbers; the endpoint sees them as
+            written here, not in the kernel's form.
         stopwatch: measures receiving and sending.
         forms: forms of the datagrams accepted at the bound sockets; empty accepts all.
         control: control socket for changes of keys in flight.
         feed: socket that sends rows and events to readers.
         line: connection to an autopilot, a robot, a program's packets or relayed clients, which
             becomes socket 1.
-        paths: paths to the endpoint's peers, by the number of their socket. Of several, any may be
-            unusable; it is then opened later.
-        is_patient: whether to start although the name of a path's peer cannot be resolved yet; the
-            lookup is then repeated.
+        paths: paths to the endpoint's peers, by socket number. If there are several, a path that is
+            unusable now is opened later.
+        is_patient: whether to start if the name of a path's peer cannot be resolved yet; the lookup
+            is then repeated.
         memory: file for the state that the endpoint keeps for the next run of its process.
 
     Raises:
@@ -158,7 +158,7 @@ class Shell:
         self._control, self._feed = control, feed
         self.send_errors = 0
         self._drops = 0
-        """Datagrams that the kernel dropped at sockets closed since."""
+        """Number of datagrams that the kernel dropped at sockets that are closed now."""
         self._names = Names(peers)
         self._elsewhere = within_reach_of(self._names.numbers())
         self._paths = {
@@ -167,7 +167,7 @@ class Shell:
         self._watches_paths = any(path.local for path in paths.values()) or len(paths) > 1
         self._sockets: dict[int, socket] = {}
         self.addresses: dict[int, Address] = {}
-        """Addresses of the bound sockets and of the paths' by number."""
+        """Addresses of the bound sockets and of the paths' sockets, by socket number."""
         self._line: OpenLine | None = None
         bound = bind if isinstance(bind, list) else [bind] if bind else []
         excused = (AddressError,) if len(paths) > 1 else ()
@@ -185,12 +185,12 @@ class Shell:
                 self._add(line)
             failed.pop_all()
         self._buffer = memoryview(bytearray(DATAGRAM_BYTES_MAX))
-        """One buffer for all datagrams: copying out of it is faster than allocating many."""
+        """Buffer for all datagrams: copying from it is faster than allocating one per datagram."""
         self._batches: dict[int, DatagramBatch | None] = {}
         self._patience_ns = endpoint.patience_ns
         self._arrivals: dict[int, Arrivals] = {}
         self._crowded: dict[int, DatagramBatch] = {}
-        """Arrays by the number of each socket that is read in batches."""
+        """Arrays of the sockets that are read in batches, by socket number."""
         self._heard_ns = 0
         """Newest time passed to the endpoint [ns]; times must not decrease."""
         self._woken_ns = 0
@@ -296,7 +296,7 @@ class Shell:
         self._loop.add_reader(self._sockets[number], self._hear, number)
 
     def _hear(self, number: int) -> None:
-        """Hand the datagrams at a socket to the endpoint, one by one, at most BURST_MAX."""
+        """Pass the datagrams at a socket to the endpoint, one by one, at most BURST_MAX."""
         receive, name = self._sockets[number].recvfrom_into, self._names_at(number).name
         buffer, hear, clock_ns = self._buffer, self.endpoint.receive, time.monotonic_ns
         stopwatch, is_refused = self._stopwatch, False
@@ -322,7 +322,7 @@ class Shell:
                     self._listen(number)
             if self._patience_ns:
                 self._count(number, count)
-        finally:  # an exception goes to the loop's handler, and the flight goes on
+        finally:  # the event loop handles an exception, and the flight goes on
             if self._patience_ns:
                 self._heard_ns = clock_ns()
             self._after()
@@ -341,7 +341,7 @@ class Shell:
             self._crowd(number, now_ns)
 
     def _crowd(self, number: int, now_ns: int) -> None:
-        """Read a socket in batches from now on, if the system has such a call."""
+        """From now on read a socket in batches, if the system has a call for it."""
         sock = self._sockets[number]
         batch = self._batch(sock)
         if batch is None or self._slices is None:
@@ -361,8 +361,8 @@ class Shell:
         """Read the datagrams at crowded sockets since the last slice, at most BATCHES_MAX calls
         each.
 
-        Handling datagrams in a row takes half the time of waking the process for each, with cold
-        caches. The kernel's timestamps give the arrival time of each.
+        Handling many datagrams in a row takes half the time of waking the process for each, when
+        caches are cold. The kernel's timestamps give their arrival times.
         """
         is_left, nothing_came = False, list[int]()
         came: list[tuple[int, Datagram]] = []
@@ -378,7 +378,7 @@ class Shell:
                 if count < BURST_MAX:
                     break
             is_left |= count == BURST_MAX
-        came.sort(key=CAME)  # by time of arrival
+        came.sort(key=CAME)  # by arrival time
         hear = self.endpoint.receive
         for came_ns, datagram in came:
             self._heard_ns = came_ns
@@ -413,8 +413,8 @@ class Shell:
         if not payloads:
             return []
         self._count(number, len(payloads))
-        # Timestamps are of CLOCK_REALTIME, which may have been set, and a socket's first datagrams
-        # have that of their reading; but a socket's datagrams are read as they came.
+        # Timestamps may be wrong: CLOCK_REALTIME may be set, and a socket's first datagrams have
+        # the time of reading. But datagrams are read in the order of arrival.
         now_ns = time.monotonic_ns()
         stamps_ns = [last_ns := min(max(stamp_ns, last_ns), now_ns) for stamp_ns in came_ns]
         try:
@@ -434,7 +434,7 @@ class Shell:
         raws: Sequence[bytes],
         stamps_ns: Sequence[int],
     ) -> tuple[list[bytes], list[Address], list[int]]:
-        """Datagrams that came over an interface which still exists."""
+        """Keep the datagrams from interfaces that still exist."""
         received: list[bytes] = []
         peers: list[Address] = []
         kept_ns: list[int] = []
@@ -448,7 +448,7 @@ class Shell:
     def _wake(self) -> None:
         self._armed = None
         try:
-            if self._crowded:  # datagrams that have arrived come before due work
+            if self._crowded:  # datagrams that have arrived are read before due work
                 self._read_slice()
             now_ns, due_ns = time.monotonic_ns(), self.endpoint.next_wake_ns()
             if due_ns is not None and due_ns <= now_ns:
@@ -458,13 +458,13 @@ class Shell:
             self._after()
 
     def leave(self) -> int:
-        """Let the endpoint begin to end; returns the time to end it at the latest [ns]."""
+        """Ask the endpoint to end; returns the latest time at which to end it by force [ns]."""
         latest_ns = self.endpoint.leave(now_ns=time.monotonic_ns())
         self._after()
         return latest_ns
 
     def changed(self) -> None:
-        """To be called after the endpoint was changed, by whoever changed it."""
+        """Process the effects of a change; to be called by the code that changed the endpoint."""
         self._heard_ns = time.monotonic_ns()
         self._after()
 
@@ -500,8 +500,8 @@ class Shell:
             for first in range(0, len(same), BURST_MAX):
                 row = same[first : first + BURST_MAX]
                 sent = self._send_together(row) if len(row) > 1 else 0
-                # The rest is sent one by one; a datagram that failed in the batch raises its error
-                # there.
+                # The rest is sent one by one; here a datagram that failed in the batch raises its
+                # error.
                 for datagram in row[sent:]:
                     self._send(datagram)
 
@@ -546,7 +546,7 @@ class Shell:
         while any(names.may_change for names in all_names):
             await asyncio.sleep(RESOLVE_EVERY_S)
             addresses: asyncio.Future[list[Numbers]] = self._loop.create_future()
-            # A thread and no executor: the loop waits for executors at its end, and a lookup may
+            # A thread, not an executor: at its end the loop waits for executors, and a lookup may
             # take 20 s.
             work = all_names, addresses
             threading.Thread(target=self._look_up, args=work, daemon=True).start()
@@ -567,8 +567,8 @@ class Shell:
                 self._open_again(number)
 
     def _open_again(self, number: int) -> None:
-        """Open the socket of a path, in place of the one before."""
-        with contextlib.suppress(OSError):  # it is down again
+        """Open a new socket for a path, in place of the old one."""
+        with contextlib.suppress(OSError):  # the path is down again
             before = self._sockets.get(number)
             self._put(number, self._paths[number].open())
             if before:
@@ -619,9 +619,9 @@ def run(
         on_event: called with each event of an endpoint, and with each exception of its code.
         on_usr1: called at SIGUSR1.
         on_second: called about once a second.
-        on_signal: called at signals for another process, instead of what they do to this one.
+        on_signal: called at signals for another process, in place of this process's handling.
     """
-    # Imported objects live as long as the process; without `freeze`, collecting them takes 13 ms.
+    # Without `freeze`, garbage collection would scan all imported objects, which takes 13 ms.
     gc.collect()
     gc.freeze()
 

@@ -1,4 +1,4 @@
-"""The feed's socket, through which a process sends rows and events to readers without waiting.
+"""Feed: socket through which a process sends rows and events to readers without waiting.
 
 The feed runs in the process's own event loop and never blocks: bytes for a slow reader are queued,
 up to a bound, and a reader whose queue is full is dropped. `shared.telemetry.feed` defines the
@@ -39,7 +39,7 @@ WAITING_BYTES_MAX = 4 * 1024 * 1024
 BACKLOG_BYTES_MAX = 1024 * 1024
 """Largest number of bytes of sent frames that are kept for readers that connect later."""
 ROWS_BYTES_MAX = 256 * 1024
-"""Size of rows after which a frame is full."""
+"""Size of rows at which a frame is full [B]."""
 SEND_BYTES_MAX = 64 * 1024
 """Largest number of bytes sent to a reader in one turn of the loop."""
 GATHER_S = 0.01
@@ -51,13 +51,13 @@ PATIENCE_S = 0.5
 
 READ_BYTES = 256 * 1024
 AGAIN_S = 1.0
-"""Time between two attempts to connect to a process, or two searches for further ones."""
+"""Time between two attempts to connect to a process, or two searches for new feeds."""
 FOLLOWED_MAX = 128
 """Largest number of feeds that a subscriber follows."""
 
 
 class _Part:
-    """Rows of one part of the record that are in no frame yet."""
+    """Rows of one part of the record that are not in a frame yet."""
 
     def __init__(self, name: str) -> None:
         self.name = name
@@ -87,14 +87,14 @@ class _Reader:
         """Send what the socket accepts, at most SEND_BYTES_MAX.
 
         Raises:
-            OSError: the reader is gone.
+            OSError: the reader has closed the connection.
         """
         with suppress(BlockingIOError):
             del self.waiting[: self.connection.send(self.waiting[:SEND_BYTES_MAX])]
 
 
 class Feed:
-    """The feed of a process; for the thread that drives the endpoint only.
+    """Feed of a process; only the thread that drives the endpoint may use it.
 
     Args:
         path: path of the socket, see `Local`.
@@ -110,7 +110,7 @@ class Feed:
         self._parts: list[_Part] = []
         self._fresh: list[bytes] = []
         self._backlog: deque[bytes] = deque()
-        """Newest frames that were sent; each item is one frame, or several."""
+        """Newest frames that were sent; each item has one frame or several."""
         self._backlog_bytes = 0
         self._readers: list[_Reader] = []
         self._behind: set[_Reader] = set()
@@ -131,7 +131,7 @@ class Feed:
         return described(self._columns)
 
     def open(self, opened: Callable[[], Opened]) -> None:
-        """Accept readers once the loop runs; `opened` makes the first frame for each."""
+        """Accept readers once the event loop runs; `opened` makes the first frame for each."""
         self._opened = opened
 
     def begin(self, loop: AbstractEventLoop) -> None:
@@ -172,7 +172,7 @@ class Feed:
         self._loop = None
 
     def close(self) -> None:
-        """Send readers the rest, within PATIENCE_S, and remove the socket."""
+        """Send remaining bytes to readers, within PATIENCE_S, and remove the socket."""
         self.end()
         self.take()
         self._send()
@@ -243,7 +243,7 @@ class Feed:
         self._loop.call_later(REST_S, self._listen)
         try:
             connection, _ = self._local.socket.accept()
-        except OSError:  # the reader is gone already, or too many files are open
+        except OSError:  # the reader has closed already, or too many files are open
             return
         if len(self._readers) == READERS_MAX:
             self._refused += 1
@@ -256,14 +256,14 @@ class Feed:
 
 
 class Subscriber:
-    """Reader of processes' feeds in a thread of its own; reconnects after a feed ends.
+    """Reader of processes' feeds, in its own thread; reconnects after a feed ends.
 
     Args:
         paths: feeds' sockets by process name; the processes need not run yet.
         take: called in the thread with the process name and each frame; a feed begins with
             `Opened`.
         lost: called in the thread with the process name when a feed has ended.
-        further: returns the sockets of further feeds that exist; called again and again.
+        further: returns the sockets of new feeds; called at intervals.
     """
 
     def __init__(
@@ -281,7 +281,7 @@ class Subscriber:
         self._thread.start()
 
     def close(self) -> None:
-        """Stop reading; no callback runs any more when this returns."""
+        """Stop reading; no callback runs after this returns."""
         self._closed = True
         with suppress(RuntimeError):  # the thread has ended already
             self._loop.call_soon_threadsafe(self._reading.cancel)
@@ -308,7 +308,7 @@ class Subscriber:
     async def _follow(self, name: str, path: Path) -> None:
         """Read the feed of a process, and of each process that listens at the same path later."""
         while not self._closed:
-            with suppress(OSError):  # no process listens, or its queue of connections is full
+            with suppress(OSError):  # no process listens, or its connection queue is full
                 stream, connection = await asyncio.open_unix_connection(path, limit=READ_BYTES)
                 with closing(connection), suppress(OSError, FeedError):
                     await self._read(name, stream)

@@ -1,8 +1,8 @@
-"""A node of the ROS graph on a Zenoh network, beside the sockets of a `Shell`.
+"""Node of the ROS graph on a Zenoh network, beside the sockets of a `Shell`.
 
-Zenoh has sockets and threads of its own. Its threads only put what has arrived into a queue; the
-endpoint hears it from the loop, as datagrams whose peers are topics. Zenoh itself finds a lost
-router again.
+Zenoh has its own sockets and threads. Its threads only put received messages into a queue; the
+event loop passes them to the endpoint, as datagrams whose peers are topics. Zenoh itself reconnects
+to a lost router.
 """
 
 import asyncio
@@ -18,7 +18,7 @@ from skytether.shared.endpoints.endpoint import Address, Datagram
 from skytether.shell.host.udp import AddressError
 
 QUEUE_MAX = 256
-"""Number of messages that wait for the loop; the oldest are dropped."""
+"""Largest number of messages waiting for the event loop; the oldest are dropped."""
 MESSAGE_BYTES_MAX = 65_535
 """Size above which a message is ignored [B]: no datagram is larger."""
 
@@ -37,7 +37,7 @@ class GraphSession:
     _is_open, _form = False, 0
 
     def __init__(self, node: Node, hear: Callable[[Datagram], None]) -> None:
-        import zenoh  # takes 0.1 s, and is an extra
+        import zenoh  # the import takes 0.1 s, and needs an extra
 
         self._zenoh, self._node, self._hear = zenoh, node, hear
         config = zenoh.Config()
@@ -51,7 +51,7 @@ class GraphSession:
         self._publisher: Any = None
         self._queue: deque[tuple[str, bytes]] = deque(maxlen=QUEUE_MAX)
         self._is_called = False
-        """Whether the loop has been told that something is in the queue."""
+        """Whether a call of the event loop for the queue is pending."""
 
     async def run(self) -> None:
         self._loop = asyncio.get_running_loop()
@@ -63,7 +63,7 @@ class GraphSession:
             self._session.close()
 
     def _declare(self) -> list[Any]:
-        """Subscribers and tokens, which end when they are no longer referred to."""
+        """Subscribers and tokens, which end when they are garbage-collected."""
         zenoh, node, session = self._zenoh, self._node, self._session
         out, into, zid = node.publishes, node.subscribes, str(session.zid())
         liveliness, (alive, publisher, subscriber) = session.liveliness(), node.tokens(zid)
@@ -83,7 +83,7 @@ class GraphSession:
         remote = zenoh.Locality.REMOTE
         return [
             session.declare_subscriber(into.key(node.domain), put(into.name)),
-            # Any type, and nothing of our own: what comes is of another commander.
+            # Any type, but not our own messages: a message is from another commander.
             session.declare_subscriber(
                 f"{node.domain}/{out.name.strip('/')}/*/*", put(out.name), allowed_origin=remote
             ),
@@ -92,9 +92,9 @@ class GraphSession:
         ]
 
     def _publish(self, form: int) -> None:
-        """Be a publisher of the topic with one of its types, in place of another."""
+        """Publish the topic with one of its types, in place of the earlier type."""
         node, session = self._node, self._session
-        # A command that waits for a connection would be stale: it is dropped.
+        # Commands are dropped without a connection, because later they would be stale.
         self._publisher = session.declare_publisher(
             node.forms[form].key(node.domain),
             congestion_control=self._zenoh.CongestionControl.DROP,
@@ -121,7 +121,7 @@ class GraphSession:
             self._hear(Datagram(payload, (topic, 0), 1))
 
     def send(self, payload: bytes, peer: Address) -> bool:
-        """Publish a message; False if Zenoh refuses it, or the peer is no topic of ours.
+        """Publish a message; False if Zenoh refuses it, or the node does not publish this topic.
 
         Args:
             peer: name of the topic, and index of its type in the node's `forms`.

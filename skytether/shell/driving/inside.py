@@ -1,12 +1,12 @@
 """Process inside the namespaces of a program: `python -m skytether.shell.driving.inside FD MTU CMD
 ARG…`.
 
-It makes the namespaces, of network, mounts and processes, and within them a first process with
-number 1. That one opens the only network device, sends it to netem through the socket FD, and runs
-the program. The kernel ends all processes of the namespaces, and with them network and device, when
-process 1 ends: which it does with the socket, whatever is killed.
+It makes namespaces of network, mounts and processes, and in them a first process with number 1.
+Process 1 opens the only network device, sends it to netem through the socket FD, and runs the
+program. When process 1 ends, the kernel ends all processes of the namespaces, network and device.
+Process 1 ends when the socket closes, even if a process was killed.
 
-Of the package it imports only what it needs: it starts with each program.
+It imports few modules of the package, because it is started with each program.
 """
 
 import ctypes
@@ -28,21 +28,21 @@ from skytether.shared.base.packets import ADDRESS, ADDRESS6, RESOLVER
 from skytether.shell.host import system
 
 READY, START, ENDED, ALL_ENDED = b"ready", b"start", b"ended", b"all ended"
-"""Messages: ready, with the device; start the program; it has ended, with its wait status; so has
-each process that it left. All other messages to netem are errors, those from it a signal's number.
+"""Messages: ready, with the device; start the program; the program has ended, with its wait status;
+all its processes have ended. Other messages to netem are errors, and from netem numbers of signals.
 """
 LINGER_S = 10.0
-"""Longest time for which connections that the program has closed may send what it wrote [s]."""
+"""Longest time for connections closed by the program to send their remaining data [s]."""
 LOOK_EVERY_S = 0.02
 CLOSING = ("04", "09", "0B")
-"""States in /proc/net/tcp of a connection with data or its end under way: FIN_WAIT1, LAST_ACK,
+"""States in /proc/net/tcp of a connection with data or a FIN under way: FIN_WAIT1, LAST_ACK,
 CLOSING."""
 QUEUE = 10_000
-"""Number of packets that the device queues for netem: a burst must not be lost here."""
+"""Number of packets that the device queues for netem; large, so that no burst is lost here."""
 RESOLVERS = ("/run/nscd", "/run/systemd/resolve")
-"""Folders of sockets at which this machine resolves names for its programs."""
+"""Folders of sockets through which this machine resolves names for programs."""
 FORBIDDEN = (EACCES, EPERM, ENOSPC)
-"""Errors of namespaces that the system, or a container, does not allow; ENOSPC: none is left."""
+"""Errors if the system or a container does not allow namespaces; ENOSPC: too many exist."""
 ADMIN = ":/usr/local/sbin:/usr/sbin:/sbin"
 """Folders that are missing in the PATH of ordinary users."""
 
@@ -59,7 +59,7 @@ def main(argv: Sequence[str]) -> int:
     control, mtu, command = socket.socket(fileno=int(argv[0])), int(argv[1]), argv[2:]
     control.set_inheritable(False)
     _end_with_parent()
-    # Process 1 passes on signals that only netem has received; see `_pass_on`.
+    # Process 1 passes on signals that only netem has received, see `_pass_on`.
     mask = signal.pthread_sigmask(signal.SIG_BLOCK, signal.valid_signals())
     try:
         _enter()
@@ -93,7 +93,7 @@ def main(argv: Sequence[str]) -> int:
 
 
 def _end_with_parent() -> None:
-    """Be killed when the parent ends; a change of credentials makes the kernel forget it."""
+    """Let the kernel kill this process when its parent ends, until credentials change."""
     _call(_libc.prctl, _PR_SET_PDEATHSIG, signal.SIGKILL)
 
 
@@ -103,7 +103,7 @@ def _fail(control: socket.socket, message: str) -> int:
 
 
 def _how(error: OSError) -> str:
-    """How to get what is missing; empty if it is not known."""
+    """Advice on how to avoid an error; empty if there is none."""
     if not Path("/dev/net/tun").exists():
         return "; there is no /dev/net/tun (modprobe tun; in a container --device /dev/net/tun)"
     if error.errno not in FORBIDDEN:
@@ -138,7 +138,7 @@ def _open_device() -> int:
 
 
 def _configure(mtu: int) -> None:
-    """Bring the device up. Without a link-local address the kernel sends no packet of its own."""
+    """Bring the device up, without a link-local address, so that the kernel sends no packet."""
     with _handing_down():
         _ip(
             "link set lo up",
@@ -149,7 +149,7 @@ def _configure(mtu: int) -> None:
         )
         with suppress(subprocess.CalledProcessError):  # a kernel without IPv6
             _ip(f"addr add {ADDRESS6}/64 dev netem nodad", "route add ::/0 dev netem")
-    # Here file capabilities have no effect, by which `ping` or a web server would do the same.
+    # File capabilities, which `ping` or a web server use for the same, have no effect here.
     group = os.getegid()
     for name, value in (
         ("ping_group_range", f"{group} {group}"),
@@ -161,7 +161,7 @@ def _configure(mtu: int) -> None:
 
 @contextmanager
 def _handing_down() -> Iterator[None]:
-    """Let `ip` administer the network, which no program of an ordinary user may by itself."""
+    """Let `ip` administer the network, which programs of ordinary users may not do."""
     header, own = struct.pack("Ii", _CAPABILITY_VERSION_3, 0), ctypes.create_string_buffer(24)
     _call(_libc.capget, header, own)
     effective, permitted, inheritable, *others = struct.unpack("6I", own.raw)
@@ -182,9 +182,9 @@ def _ip(*lines: str) -> None:
 
 
 def _mount() -> None:
-    """Show the program its own processes, and the resolver beyond netem alone."""
+    """Mount a /proc of the program's processes, and a resolv.conf with slirp's resolver."""
     _call(_libc.mount, b"none", b"/", None, _MS_REC | _MS_PRIVATE, None)
-    with suppress(OSError):  # a container may hide a part of /proc: then it stays as it is
+    with suppress(OSError):  # a container may hide parts of /proc, which then stays unchanged
         _call(_libc.mount, b"proc", b"/proc", b"proc", 0, None)
     path = Path("/etc/resolv.conf")
     before = path.read_text() if path.exists() else ""
@@ -194,12 +194,12 @@ def _mount() -> None:
         _call(_libc.mount, b"tmpfs", folder.encode(), b"tmpfs", 0, None)
     real = path.resolve()
     if not real.exists():  # a machine without this file resolves no names
-        if str(real.parent) in RESOLVERS:  # hidden by now, and nobody else's
+        if str(real.parent) in RESOLVERS:  # a private folder since the mount above
             real.write_text(text)
         return
-    if text == before:  # in another `run`, whose file has lost its name and takes no mount
+    if text == before:  # inside another `run`, whose deleted file cannot be mounted over
         return
-    with tempfile.NamedTemporaryFile("w") as file:  # its name goes, the mount stays
+    with tempfile.NamedTemporaryFile("w") as file:  # the file is deleted, its mount remains
         file.write(text)
         file.flush()
         Path(file.name).chmod(0o644)
@@ -207,7 +207,7 @@ def _mount() -> None:
 
 
 def _run(command: Sequence[str], mask: Iterable[int]) -> None:
-    """Become the program, with signals as netem found them."""
+    """Replace this process by the program, with the signal mask that netem started with."""
     for number in (signal.SIGPIPE, signal.SIGXFSZ, signal.SIGUSR1):
         signal.signal(number, signal.SIG_DFL)
     signal.pthread_sigmask(signal.SIG_SETMASK, mask)
@@ -215,11 +215,11 @@ def _run(command: Sequence[str], mask: Iterable[int]) -> None:
         os.execvp(command[0], list(command))
     except OSError as error:
         print(f"netem run: {command[0]}: {error.strerror}", file=sys.stderr, flush=True)
-        os._exit(127 if isinstance(error, FileNotFoundError) else 126)  # as a shell does
+        os._exit(127 if isinstance(error, FileNotFoundError) else 126)  # exit codes of a shell
 
 
 def _wait(control: socket.socket, program: int) -> None:
-    """Wait for the program and all processes that it leaves, and report both."""
+    """Wait for the program and all processes that it leaves behind, and report both ends."""
     woken, wake = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
     signal.set_wakeup_fd(wake)
     signal.signal(signal.SIGCHLD, lambda *_: None)
@@ -254,10 +254,10 @@ def _wait(control: socket.socket, program: int) -> None:
 
 
 def _pass_on(number: int, program: int) -> None:
-    """Send the program a signal that netem received, unless the program received it, too.
+    """Send the program a signal that netem received, unless the program has received it itself.
 
-    A terminal, or `kill` of a process group, sends it to both, and to this process, where it is
-    blocked and waits.
+    A terminal, or `kill` of a process group, sends a signal to both, and to this process, where it
+    is blocked and pending.
     """
     if signal.sigtimedwait([number], 0) is None:
         os.kill(program, number)
@@ -276,7 +276,7 @@ def _call(function: "ctypes._FuncPointer", *arguments: object) -> None:
     """Call libc.
 
     Raises:
-        OSError: the call has failed.
+        OSError: the call failed.
     """
     if function(*arguments) < 0:
         number = ctypes.get_errno()

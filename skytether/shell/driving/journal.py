@@ -2,8 +2,8 @@
 
 Values set by `skytether set` or on the page (zones, goals, whether a vehicle is armed) survive a
 restart of the process. A value is written before it is acknowledged, and read when the process
-starts again. If the journal is damaged, belongs to another scenario or is older than a day, the
-process refuses to start: a server that has lost a zone must not plan.
+restarts. If the journal is damaged, belongs to another scenario or is older than a day, the process
+refuses to start: a server must not plan without a zone that was set.
 """
 
 import time
@@ -27,7 +27,7 @@ from skytether.shell.commandline.command import CONFIGURATION, CommandError
 SUFFIX = ".set"
 BYTES_MAX = 1_000_000
 DAY_S = 86_400.0
-"""Age above which a journal belongs to another flight [s]."""
+"""Age above which a journal counts as that of another flight [s]."""
 
 
 class _Entry(msgspec.Struct, frozen=True, kw_only=True):
@@ -84,7 +84,7 @@ class Journal:
         if entry != entry.sealed():
             raise ConfigError("it is damaged")
         if entry.scenario != self._name:
-            raise ConfigError("it was set while another scenario was flown")
+            raise ConfigError("it was set in a flight of another scenario")
         age_s = time.time() - entry.time_s
         if not -DAY_S < age_s < DAY_S:
             raise ConfigError(f"it was set {abs(age_s) / DAY_S:.1f} days ago")
@@ -94,7 +94,7 @@ class Journal:
         return CommandError(f"{message}; --new-flight starts without them", CONFIGURATION)
 
     def write(self, values: Mapping[str, Any]) -> None:
-        """Write all values set so far; returns when they are on the disk.
+        """Write all values set so far; returns once they are on disk.
 
         Raises:
             OSError: the file cannot be written.
@@ -112,7 +112,7 @@ class Journal:
 
 
 class TakenUp(NamedTuple):
-    """Scenario of a process that starts, with the values set in an earlier run."""
+    """Scenario of a starting process, with values that were set in an earlier run."""
 
     journal: Journal
     """Journal beside the control socket."""

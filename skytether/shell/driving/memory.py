@@ -1,12 +1,12 @@
-"""File in which a client keeps its memory for the next run of the process.
+"""File in which a client saves its state for the next run of the process.
 
     MAGIC | digest of the rest, with the vehicle's key | host, time and identity | content
 
-A thread writes a new file beside it and renames that, so that no step waits for a disk and the file
-is always whole. Where it cannot be written and the endpoint waits for that, it is removed: the next
-run must not follow what is long past, and the endpoint goes on. A file that can be neither written
-nor removed, on a disk that is read-only, is refused by the next run, as is one that is damaged, or
-of another vehicle, key or flight. The file need not survive a reboot, which outlasts any motion.
+A thread writes a new file and renames it, so that no step waits for a disk and the file is always
+complete. If writing fails while the endpoint waits for it, the file is removed: the next run must
+not use old state, and the endpoint goes on. If it cannot be removed either, on a read-only disk,
+the next run refuses it. It also refuses a damaged file, or one of another vehicle, key or flight.
+The file need not survive a reboot, which takes longer than any motion.
 """
 
 import asyncio
@@ -32,9 +32,9 @@ FILE_BYTES_MAX = 65_536
 BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
 """File with the host's boot id, on Linux; the monotonic clock restarts at each boot."""
 DISK_FAILED = {EROFS, EIO}
-"""Errors of a disk that has failed; one that was full has had room for the lock file."""
+"""Errors of a failed disk; a full disk counts as usable, because the lock file fits."""
 AGAIN_S = 1.0
-"""Time after which a failed write is tried again."""
+"""Time after which a failed write is repeated."""
 
 
 class MemoryRefused(ValueError):
@@ -68,16 +68,16 @@ def folder(given: str) -> Path:
 
 
 class MemoryFile:
-    """File in which one client keeps its memory.
+    """File with the saved state of one client.
 
     Args:
         path: path of the file; a missing folder is created.
-        identity: names and values that a file must have in order to be used: vehicle, flight.
+        identity: names and values that the file must contain: vehicle, flight.
         secret: key of the vehicle, which authenticates the file; empty without keys.
 
     Raises:
-        OSError: the folder cannot be created, or another process uses this file. On a disk that
-            has failed neither is an error: the flight goes on, and `news` says what is not kept.
+        OSError: the folder cannot be created, or another process uses this file. On a failed disk
+            neither is an error: the flight goes on, and `news` reports what is not saved.
     """
 
     def __init__(self, path: Path, identity: Mapping[str, str], secret: bytes = b"") -> None:
@@ -94,22 +94,21 @@ class MemoryFile:
         self._ends = False
         self._thread: threading.Thread | None = None
         self._failure = self._reported = ""
-        """Reason why the newest content could not be written, and reason reported last."""
+        """Reason why the newest content was not written, and the newest reported reason."""
         self._is_removed = False
         """Whether the file was removed, because it could not be written."""
         self._kept_nothing = False
-        """Whether the endpoint was told last that the next run finds nothing."""
+        """Whether the endpoint's newest information is that no state is saved."""
 
     @property
     def path(self) -> Path:
         return self._path
 
     def read(self) -> tuple[bytes, int | None] | None:
-        """Content that the previous run has kept, and the time of writing; None without a file.
+        """Content saved by the previous run, and the time of writing; None without a file.
 
-        The time is of the monotonic clock [ns]; None if the host was rebooted since. The file is
-        written again with the same content: one that cannot be replaced may be older than the
-        flight.
+        The time is of the monotonic clock [ns]; None if the host was rebooted since. The content is
+        written again, as a test: a file that cannot be replaced may be older than the flight.
 
         Raises:
             MemoryRefused: the file must not be used.
@@ -171,7 +170,7 @@ class MemoryFile:
                 self._changed.notify()
 
     def news(self) -> NotKept | None:
-        """Event that says why the file cannot be written; None if it can, or that was reported."""
+        """Event with the reason why the file cannot be written; None if it can, or if reported."""
         failure, reported = self._failure, self._reported
         self._reported = failure
         if not failure or failure == reported:
@@ -179,7 +178,7 @@ class MemoryFile:
         return NotKept(reason=failure, removed=self._is_removed)
 
     def close(self) -> None:
-        """Write the rest, within a bounded time, and release the file's lock."""
+        """Write the newest content, within a bounded time, and release the file's lock."""
         with self._changed:
             self._ends = True
             self._changed.notify()
@@ -223,7 +222,7 @@ class MemoryFile:
             file.write(content)
 
     def _remove(self) -> None:
-        with contextlib.suppress(OSError):  # of a disk that is read-only
+        with contextlib.suppress(OSError):  # on a read-only disk
             self._path.unlink(missing_ok=True)
             self._is_removed, self._reported, self._kept_nothing = True, "", True
             with contextlib.suppress(RuntimeError):  # the loop has closed meanwhile
@@ -236,7 +235,7 @@ class MemoryFile:
 
 
 def _locked(path: Path) -> BinaryIO | None:
-    """Lock of a memory file; None on a disk that has failed and holds no readable lock file."""
+    """Lock of a memory file; None on a failed disk without a readable lock file."""
     lock = path.with_name(path.name + ".lock")
     try:
         path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)

@@ -1,9 +1,9 @@
 """Planners of plug-ins in real time: each call in a thread, with a time limit.
 
-A planner that takes too long is not waited for: its plan is dropped when it is ready, and until
-then it is not called again. So one that hangs delays the plans of other vehicles once, by the
-limit, and costs them no tick. Threads cannot be ended; they end with the process. So once
-HANGING_MAX calls hang, whether or not their vehicles are still there, none is begun.
+If a planner takes too long, the tick continues without it: its plan is dropped when it is ready,
+and it is not called before. So a planner that hangs delays other vehicles' plans once, by the
+limit, and no tick is missed. Threads cannot be ended; they end with the process. So once
+HANGING_MAX calls hang, also of vehicles that have left, no further call is started.
 """
 
 import time
@@ -13,9 +13,9 @@ from threading import Thread
 from typing import Any
 
 SHARE = 0.5
-"""Share of a step for which a tick waits for planners, so that the next tick is in time."""
+"""Share of a step for which a tick waits for planners; the next tick must be in time."""
 HANGING_MAX = 64
-"""Number of calls of earlier ticks that may be under way while others are begun."""
+"""Largest number of unfinished calls of earlier ticks with which new calls are started."""
 
 Call = Callable[[], Any]
 Calls = SimpleQueue[tuple[int, int, Call]]
@@ -23,23 +23,23 @@ Calls = SimpleQueue[tuple[int, int, Call]]
 
 
 class Planners:
-    """Calls planners, at most `limit_s` for all vehicles together at a tick."""
+    """Runs planners in threads, for at most `limit_s` per tick for all vehicles together."""
 
     def __init__(self, limit_s: float) -> None:
         self._limit_s = limit_s
         self._idle: list[Calls] = []
-        """Threads without a call."""
+        """Queues of idle threads."""
         self._busy: dict[int, Calls] = {}
-        """Threads by the planners that are called there."""
+        """Queues of busy threads, by number of the planner that runs there."""
         self._answers: SimpleQueue[tuple[int, int, Any]] = SimpleQueue()
-        """Planner, number of the tick, and what the planner returned or raised."""
+        """Number of planner, number of tick, and the planner's result or exception."""
         self._tick = 0
 
     def __call__(self, calls: Sequence[tuple[int, Call]]) -> list[Any]:
         """See `server.planning.scheme.Planning`."""
         self._tick += 1
         until_s = time.monotonic() + self._limit_s
-        while not self._answers.empty():  # of planners that took too long
+        while not self._answers.empty():  # drop plans of planners that took too long
             self._finish()
         late: Exception = TimeoutError(f"got no plan after {self._limit_s:g} s, half a step")
         answers: dict[int, Any] = {planner: late for planner, _ in calls}
@@ -69,7 +69,7 @@ class Planners:
         queue.put((planner, self._tick, call))
 
     def _finish(self, timeout_s: float | None = None) -> tuple[int, int, Any]:
-        """Wait for an answer, and note that its thread is idle; raises Empty at the time-out."""
+        """Wait for an answer, and mark its thread as idle; raises Empty at the time-out."""
         answer = self._answers.get(timeout=timeout_s)
         self._idle.append(self._busy.pop(answer[0]))
         return answer
@@ -81,6 +81,6 @@ class Planners:
                 answer = call()
             except Exception as error:
                 answer = error
-            except BaseException as error:  # a thread that ends would count as late for ever
+            except BaseException as error:  # a thread that ended would count as late for ever
                 answer = RuntimeError(f"got {type(error).__name__}: {error}")
             self._answers.put((planner, tick, answer))

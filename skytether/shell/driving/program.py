@@ -1,10 +1,10 @@
-"""A program in namespaces of its own, and the two ends of its network: device and slirp4netns.
+"""Program in its own namespaces, and both ends of its network: device and slirp4netns.
 
     program ── TUN device ── netem ── slirp4netns ── this machine's sockets
 
-slirp4netns makes sockets of this machine from packets, as for a virtual machine: for User Mode
-Linux it takes Ethernet frames at a Unix socket, so that it needs no namespace. See
-`shell.driving.inside` for the program.
+slirp4netns translates packets to sockets of this machine, as for a virtual machine. It gets
+Ethernet frames through a Unix socket, in its mode for User Mode Linux, and so needs no namespace.
+See `shell.driving.inside` for the program.
 """
 
 import asyncio
@@ -46,30 +46,30 @@ exec 9<&0 </dev/null
 (read -r _ <&9; kill -9 0) &
 exec "$@" 9<&-
 """
-"""Shell script that becomes slirp4netns, with a file for each flow, beside a guard that kills it
-when netem ends. netem and the guard alone have the two ends of the script's standard input, so each
-knows when the other has ended. `--exit-fd` has no effect before netem is connected."""
+"""Shell script that becomes slirp4netns, with a limit of one file per flow, and starts a guard that
+kills it when netem ends. Only netem and the guard have the two ends of the script's standard input,
+so each sees when the other has ended. `--exit-fd` would have no effect before netem connects."""
 FRAME_BYTES_MAX = 65_536
 WAITING_MAX = 16_384
-"""Largest number of packets that wait for slirp4netns; further ones are send errors."""
+"""Largest number of packets waiting for slirp4netns; further packets are send errors."""
 PATIENCE_S = 30.0
 """Longest time for slirp4netns to start."""
 GRACE_S = 1.0
-"""Time after SIGHUP at which the program is killed, if netem's parent has ended [s]."""
+"""Time from SIGHUP until the program is killed, after netem's parent has ended [s]."""
 FLUSH_S = 1.0
 """Longest time at the end for slirp4netns to read the last packets [s]."""
 
 
 class ProgramError(Exception):
-    """The program cannot be started, or has lost its network: one line that says why."""
+    """The program cannot be started, or has lost its network; the message is one line."""
 
 
 @dataclass(slots=True)
 class Program:
     device: int
-    """The program's TUN device."""
+    """File descriptor of the program's TUN device."""
     outside: socket.socket
-    """Connection to slirp4netns, a frame a packet."""
+    """Connection to slirp4netns, with one frame per packet."""
     guard: socket.socket
     """Connection to the guard of slirp4netns, see `GUARDED`: readable once it has ended."""
     control: socket.socket
@@ -77,15 +77,15 @@ class Program:
     status: int | None = None
     """Status of `os.waitpid`; None until the program has ended."""
     fault: str = ""
-    """Why the program has lost its network, or empty."""
+    """Reason why the program has lost its network; empty otherwise."""
     outlives_parent: bool = False
-    """Whether it goes on when the process that started netem has ended, as under `nohup`."""
+    """Whether the program goes on after the end of netem's parent process, as under `nohup`."""
 
     def start(self) -> None:
         self.control.send(START)
 
     def signal(self, number: int) -> None:
-        """Pass a signal on to the program; if it has ended, end what it left."""
+        """Pass a signal on to the program; if it has ended, end its other processes."""
         with suppress(OSError):
             self.control.send(bytes([number]))
         if number == signal.SIGTSTP:  # the shell waits until netem has stopped, too
@@ -96,12 +96,12 @@ class Program:
 def program(
     command: Sequence[str], mtu: int, *, path_mtu: int, exposed: Sequence[Address]
 ) -> Iterator[Program]:
-    """Namespaces for a program, which starts with `Program.start` and ends with the block.
+    """Create namespaces for a program, which starts with `Program.start` and ends with the block.
 
     Args:
         mtu: MTU of its device [B].
         path_mtu: largest packet that slirp4netns sends to it [B].
-        exposed: addresses on this machine whose TCP and UDP lead to the same port of the program.
+        exposed: addresses on this machine; TCP and UDP to them go to the program's same port.
 
     Raises:
         ProgramError: something is missing, or an address cannot be exposed.
@@ -114,7 +114,7 @@ def program(
         outside, guard = stack.enter_context(_slirp(path_mtu, exposed))
         control, inner = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         inner.set_inheritable(True)
-        # With the descriptors that a shell has opened for the program, as in `<(command)`.
+        # Passes on file descriptors that a shell has opened for the program, as in `<(command)`.
         start = [sys.executable, "-P", "-m", "skytether.shell.driving.inside"]
         start += [str(inner.fileno()), str(mtu), *command]
         inside = subprocess.Popen(start, close_fds=False)
@@ -166,7 +166,7 @@ def _slirp(mtu: int, exposed: Sequence[Address]) -> Iterator[tuple[socket.socket
                     sock.shutdown(socket.SHUT_WR)
                     return "return" in json.loads(sock.recv(4096) or b"{}")
 
-            order("list_hostfwd")  # it needs the folder until it can answer
+            order("list_hostfwd")  # slirp4netns needs the folder until it can answer
             for address in exposed:
                 _expose(order, address)
         for each in announcements():
@@ -178,7 +178,7 @@ def _slirp(mtu: int, exposed: Sequence[Address]) -> Iterator[tuple[socket.socket
 
 
 def _end_group(process: "subprocess.Popen[bytes]") -> None:
-    """Kill a process that leads a group, and what else is in it."""
+    """Kill a process that leads a process group, and the rest of the group."""
     with suppress(ProcessLookupError):
         os.killpg(process.pid, signal.SIGKILL)
     process.wait()
@@ -187,7 +187,7 @@ def _end_group(process: "subprocess.Popen[bytes]") -> None:
 def _connect(
     sock: socket.socket, path: Path, slirp: "subprocess.Popen[bytes]", said: IO[bytes]
 ) -> None:
-    """Connect to a socket of slirp4netns as soon as it is there."""
+    """Connect to a socket of slirp4netns as soon as it exists."""
     until_s = time.monotonic() + PATIENCE_S
     while slirp.poll() is None and time.monotonic() < until_s:
         try:
@@ -216,7 +216,7 @@ def _expose(order: Callable[..., bool], address: Address) -> None:
 
 
 def _why_not(kind: socket.SocketKind, address: Address) -> str:
-    """Why an address cannot be listened on, which slirp4netns does not tell."""
+    """Reason why listening on an address fails, which slirp4netns does not report."""
     try:
         with socket.socket(socket.AF_INET, kind) as sock:
             sock.bind(address)
@@ -235,10 +235,10 @@ def _flush(outside: socket.socket) -> None:
 
 
 class ProgramLine:
-    """Packets of a program, beside the sockets of a `Shell`.
+    """Connection for a program's packets, beside the sockets of a `Shell`.
 
     Args:
-        hear: called with the packets that have come at once, see `netem.tunnel.Tunnel`.
+        hear: called with packets that have arrived together, see `netem.tunnel.Tunnel`.
     """
 
     address = None
@@ -294,7 +294,7 @@ class ProgramLine:
                 os.close(parent)
 
     def _read_device(self) -> int:
-        """Hear packets of the program; returns how many."""
+        """Read packets of the program and pass them on; returns how many."""
         buffer, packets = self._buffer, list[Datagram]()
         with suppress(OSError):
             while len(packets) < BATCH_MAX:
@@ -343,7 +343,7 @@ class ProgramLine:
             return None
         try:
             parent = os.pidfd_open(PARENT)
-        except (AttributeError, OSError) as error:  # Linux before 5.3, or it has ended
+        except (AttributeError, OSError) as error:  # Linux before 5.3, or the parent has ended
             if isinstance(error, ProcessLookupError):
                 self._loop.call_soon(self._orphan)
             return None

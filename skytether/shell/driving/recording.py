@@ -1,4 +1,4 @@
-"""File of a part of the record, written in a thread: a slow or full disk disturbs no flight."""
+"""File of a part of the record, written in a thread: a slow or full disk delays no flight."""
 
 import os
 from typing import BinaryIO
@@ -11,13 +11,13 @@ from skytether.shared.telemetry.record import Recorder, Rows
 from skytether.shell.host.writer import Writer
 
 ROOM_BYTES = 32 * 1024 * 1024
-"""Largest number of bytes of rows that wait for the disk: 8 s of 1000 vehicles at 20 Hz; rows as
-short as netem's take three times as much memory.
+"""Largest number of bytes of rows waiting for the disk: 8 s of 1000 vehicles at 20 Hz. Short rows,
+such as netem's, take three times as much memory.
 """
 TOGETHER_BYTES = 256 * 1024
 """Largest number of bytes of rows in one write."""
 PAUSE_S = 0.02
-"""Time for which rows are collected before a write [s], and lost if the process is killed."""
+"""Time for which rows are collected before a write [s]; a killed process loses these rows."""
 PATIENCE_S = 3.0
 """Longest time to wait at the end until all rows are written."""
 
@@ -29,12 +29,11 @@ class RecordFile:
 
     Args:
         name: name of the file, for messages.
-        file: the file, open for reading and writing without a buffer; or the error that opening it
-            raised.
+        file: the file, open for reading and writing without a buffer; or the error from opening it.
     """
 
     def __init__(self, name: str, columns: np.dtype[np.void], file: BinaryIO | OSError) -> None:
-        self._name = name.encode(errors="replace").decode()  # a file's name need not be Unicode
+        self._name = name.encode(errors="replace").decode()  # a file's name may be invalid Unicode
         self._file = file
         self._writer = Writer(file, capacity=ROOM_BYTES, together=TOGETHER_BYTES, pause_s=PAUSE_S)
         self.recorder = Recorder(columns, self._writer)
@@ -56,7 +55,7 @@ class RecordFile:
         self._ended = True
 
     def fault(self) -> str | None:
-        """Sentence about missing rows, or None; valid after `end`."""
+        """Sentence about missing rows; None if complete; valid after `end`."""
         reason = self._reason()
         if reason is None:
             return None
@@ -72,10 +71,10 @@ class RecordFile:
         return self._writer.written <= self._header_bytes
 
     def rows(self) -> Rows:
-        """Whole rows in the file; valid after `end`."""
+        """Complete rows in the file; valid after `end`."""
         part = bytearray()
         while not isinstance(self._file, OSError) and len(part) < self._writer.written:
-            # Not `read`, which would move the position of a late write.
+            # Not `read`, which would move the file position of a late write.
             count = min(self._writer.written - len(part), TOGETHER_BYTES)
             piece = os.pread(self._file.fileno(), count, len(part))
             if not piece:

@@ -1,7 +1,7 @@
 """Byte streams, TCP and serial, driven by asyncio beside the sockets of a `Shell`.
 
-A stream that has ended, or cannot be opened yet, is opened again each second while its endpoint
-runs, so a cable may be plugged in again.
+A stream that has ended or cannot be opened yet is opened again every second while its endpoint
+runs, for example after a cable was unplugged.
 """
 
 import asyncio
@@ -16,7 +16,7 @@ from skytether.shell.host import system
 from skytether.shell.host.udp import AddressError
 
 AGAIN_S = 1.0
-"""Time after which a stream that has ended is opened again [s]."""
+"""Time from the end of a stream until it is opened again [s]."""
 PIECE_BYTES = 4096
 
 
@@ -27,7 +27,7 @@ class ByteStream:
         hear: called with each piece of bytes, from the peer `LINE`.
 
     Raises:
-        AddressError: the system has no serial ports of this rate.
+        AddressError: the system has no serial ports, or not this rate.
     """
 
     address = None

@@ -1,1 +1,1 @@
-"""What the machine gives: sockets, timers, files, and what not every system has."""
+"""Functions of the operating system: sockets, timers, files, and optional features."""

@@ -1,9 +1,9 @@
 """Batches of datagrams: one system call receives or sends many of them, on Linux.
 
 `recvmmsg` and `sendmmsg` take an array of message headers, which is allocated once. `recvmmsg` also
-returns the kernel's arrival time of each datagram, so that one that is read late does not count as
-delayed. UDP segmentation offload sends datagrams of one size to one peer as one long datagram,
-which the kernel splits late.
+returns the kernel's arrival time of each datagram, so that reading late does not count as network
+delay. UDP segmentation offload sends datagrams of one size to one peer as one long datagram, which
+the kernel splits late.
 
 None of these calls says which datagram failed, or why. If a call sends or receives fewer than
 asked, the caller tries the next datagram by the socket's plain call, which raises its error.
@@ -26,7 +26,7 @@ from skytether.shared.base.units import SECOND_NS
 
 BATCH_MAX = 128
 NEAR_NS, READINGS = 5_000, 4
-"""Longest time between two readings that count as simultaneous [ns], and number of attempts."""
+"""Longest time between two readings of clocks that count as simultaneous [ns], and attempts."""
 SIZE_MAX = 2048
 """Largest payload that `DatagramBatch.send` takes [B]; packets of a flight have at most 1200."""
 SEGMENTS_MAX = 64
@@ -37,8 +37,8 @@ SEGMENT_BYTES_MAX = SEGMENTED_BYTES_MAX // 2
 """Largest payload of a datagram that is sent together with another as one [B]."""
 
 _STRIDE = 65_536 + 4096 + 64
-"""Distance of two receive buffers [B]: the longest datagram, and an odd number of cache lines, so
-that the datagrams' first bytes do not all map to the same cache set.
+"""Distance of two receive buffers [B]: the longest datagram plus an odd number of cache lines, so
+that the first bytes of datagrams do not all map to the same cache set.
 """
 _STARTS = range(0, _STRIDE * BATCH_MAX, _STRIDE)
 _SOL_UDP, _UDP_SEGMENT = 17, 103
@@ -54,7 +54,7 @@ _STAMP = struct.Struct("@Qiiqq")
 _IPV4, _IPV6 = struct.Struct("=HH4s8x"), struct.Struct("=HHI16sI")
 """Layouts of `struct sockaddr_in` and `sockaddr_in6`; ports are in network order."""
 _WHOLE = memoryview(array("Q", [_STAMP.size] * BATCH_MAX))
-"""Size of the space for control data, for each datagram [B]."""
+"""Size of the space for each datagram's control data [B]."""
 
 RawAddress = bytes
 """Address of a peer in the kernel's own form, `struct sockaddr_in` or `sockaddr_in6`."""
@@ -64,11 +64,11 @@ def pack_address(address: tuple[str, int] | tuple[str, int, int, int]) -> RawAdd
     """Address in the kernel's form.
 
     Args:
-        address: (host, port) for IPv4, and for IPv6 without a scope; else (host, port, flow,
+        address: (host, port) for IPv4, and for IPv6 without a scope; otherwise (host, port, flow,
             scope).
 
     Raises:
-        OSError: the host is no numeric address.
+        OSError: the host is not a numeric address.
         OverflowError: the port is not between 0 and 65535.
     """
     host, port, flow, scope = address if len(address) == 4 else (*address, 0, 0)
@@ -123,14 +123,14 @@ class _Headers:
         self.done = memoryview(headers).cast("I")[_HEADER.size // 4 - 2 :: _HEADER.size // 4]
         """Sizes of received payloads; shape (BATCH_MAX,) [B]."""
         self.stamp_sizes = memoryview(headers).cast("Q")[5 :: _HEADER.size // 8]
-        """Sizes of the control data [B]; the kernel lowers each to the size that it has written."""
+        """Sizes of the control data [B]; the kernel sets each to the size that it has written."""
         words = memoryview(stamps).cast("q")
         self.stamps_s, self.stamps_ns = words[2 :: _STAMP.size // 8], words[3 :: _STAMP.size // 8]
         """Arrival times by CLOCK_REALTIME: seconds, and the rest [ns]; shape (BATCH_MAX,)."""
 
 
 def _address(memory: bytearray | mmap.mmap) -> int:
-    """Address of memory; a bytearray can no longer be resized after this."""
+    """Address of a memory block; a bytearray cannot be resized any more after this."""
     return ctypes.addressof(ctypes.c_char.from_buffer(memory))
 
 
@@ -138,14 +138,14 @@ class DatagramBatch:
     """Preallocated arrays with which all sockets of one family receive and send.
 
     Raises:
-        OSError: this system has no such calls.
+        OSError: this system has no recvmmsg.
     """
 
     def __init__(self, family: int) -> None:
         if sys.platform != "linux" or _HEADER.size != 64:
-            raise OSError(errno.ENOSYS, "recvmmsg and sendmmsg are used on 64-bit Linux alone")
-        # `PyDLL` keeps the interpreter's lock: neither call ever waits, and another thread that
-        # took the lock could hold it for 5 ms.
+            raise OSError(errno.ENOSYS, "recvmmsg and sendmmsg are used on 64-bit Linux only")
+        # `PyDLL` keeps the interpreter's lock, because the calls never wait, and another thread
+        # could hold the lock for 5 ms.
         libc = ctypes.PyDLL(None)
         try:
             self._receive, self._send = libc.recvmmsg, libc.sendmmsg
@@ -159,8 +159,8 @@ class DatagramBatch:
     def stamp(sock: socket.socket) -> None:
         """Let the kernel stamp datagrams on arrival.
 
-        Linux starts to stamp some milliseconds later, unless another socket of the machine has
-        asked before; until then it stamps a datagram when it is read.
+        Linux starts to stamp some milliseconds later, unless another socket of the machine uses
+        stamps already; until then a datagram has the time at which it is read.
         """
         sock.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
 
@@ -200,7 +200,7 @@ class DatagramBatch:
     ) -> int:
         """Send datagrams in order; returns how many were sent, from the first on.
 
-        Nothing is sent if a payload is longer than SIZE_MAX, or a peer of another family.
+        Nothing is sent if a payload is longer than SIZE_MAX, or a peer has another address family.
 
         Args:
             payloads: at most BATCH_MAX.
@@ -219,7 +219,7 @@ class DatagramBatch:
 
 
 class Segments:
-    """UDP segmentation offload: datagrams of one size to one peer leave in one call."""
+    """UDP segmentation offload: sends datagrams of one size to one peer in one call."""
 
     def __init__(self) -> None:
         self.size_max = SEGMENT_BYTES_MAX if sys.platform == "linux" else 0
@@ -228,11 +228,11 @@ class Segments:
         """
 
     def suits(self, payloads: Sequence[bytes]) -> bool:
-        """Whether segmentation sends payloads, in this order, in fewer calls."""
+        """Whether segmentation needs fewer calls for payloads in this order."""
         sizes = list(map(len, payloads))
         if not 0 < min(sizes) <= max(sizes) <= self.size_max:
             return False
-        # A call for segments takes as long as two datagrams.
+        # A call with segments takes as long as sending two datagrams.
         changes = sum(map(ne, sizes, sizes[1:]))
         return 2 * (changes + 1) <= len(sizes)
 
@@ -256,7 +256,7 @@ class Segments:
             try:
                 sock.sendmsg(payloads[first:last], control, 0, peer)
             except BlockingIOError:
-                break  # the send buffer cannot take all of them, but perhaps one
+                break  # the send buffer has no space for all of them, but perhaps for one
             except OSError:
                 self.size_max = min(self.size_max, size - 1)
                 break
@@ -267,8 +267,8 @@ class Segments:
 def _clocks() -> tuple[int, int]:
     """Lead of CLOCK_REALTIME over CLOCK_MONOTONIC, and the time of the latter [ns].
 
-    The process may lose its core between the two readings: on a busy machine that moved arrival
-    times by 20 ms. So both clocks are read again unless the readings lie within NEAR_NS.
+    The process may be preempted between the two readings, which shifted arrival times by 20 ms on a
+    busy machine. So both clocks are read again unless the readings are within NEAR_NS.
     """
     nearest: tuple[int, int, int] | None = None
     for _ in range(READINGS):

@@ -1,9 +1,9 @@
-"""Compilation of kernels, by as many processes as there are cores.
+"""Compilation of kernels, with one process per core.
 
 Numba compiles one function at a time in a process. So other processes compile beside this one,
 which then reads the machine code that they stored on disk. Each takes the next kernel from a
 queue, because compile times are not known beforehand. A second command waits for the first, which
-compiles what it needs, too.
+also compiles kernels for the second.
 """
 
 import subprocess
@@ -19,26 +19,26 @@ from typing import TYPE_CHECKING
 from skytether.shared.base import files, input_files
 from skytether.shell.host import system
 
-# for type checking only: the client aboard is installed without numba
+# for type checking only: on a vehicle the client is installed without numba
 if TYPE_CHECKING:
     from skytether.shared.base.machine_code import Missing
 
 LOCK = "compiling.lock"
 POLL_S = 0.1
-"""Time between two tries for the lock."""
+"""Time between two attempts to get the lock."""
 
 
 @contextmanager
 def alone(folder: Path | None, on_wait: Callable[[], None]) -> Iterator[None]:
-    """Let no other command that stores machine code in a folder compile during the block.
+    """During the block, keep other commands from compiling machine code for the same folder.
 
     Args:
-        folder: None where machine code is not stored.
-        on_wait: called once if another command compiles.
+        folder: None if machine code is not stored.
+        on_wait: called once if another command is compiling.
     """
     try:
         lock = folder and (folder / LOCK).open("ab")
-    except OSError:  # read-only
+    except OSError:  # the folder is read-only
         lock = None
     if not lock:
         yield
@@ -58,18 +58,18 @@ def _locked(descriptor: int) -> bool:
         files.lock(descriptor)
     except BlockingIOError:
         return False
-    except OSError:  # no locks on this system: each command compiles
+    except OSError:  # no locks on this system: each command compiles for itself
         pass
     return True
 
 
 PROGRESS = "compiling"
-"""Name of the file in a flight's folder that says how far compiling is, for the page."""
+"""Name of the file in a flight's folder with the progress of compilation, for the page."""
 PROGRESS_BYTES = 200
 
 
 def tell(folder: Path | None, text: str) -> None:
-    """Leave a text for `progress` in a flight's folder, if it has one; without a text, none."""
+    """Write a text for `progress` to a flight's folder, if any; an empty text removes it."""
     if folder is None:
         return
     with suppress(OSError):
@@ -81,7 +81,7 @@ def tell(folder: Path | None, text: str) -> None:
 
 
 def progress(folder: Path | None) -> str:
-    """What a command says of its compiling; empty if nothing, or once it is over."""
+    """Text about a command's compilation; empty if there is none, or once it has ended."""
     with suppress(OSError, ValueError):
         return input_files.read(folder / PROGRESS, PROGRESS_BYTES).decode() if folder else ""
     return ""
@@ -103,14 +103,14 @@ def compile_kernels(kernels: Sequence["Missing"], on_done: Callable[[], None]) -
             each.compile()
             on_done()
     for each in kernels:
-        # Loads code that other processes have compiled, and compiles kernels for which they failed.
+        # Loads code that other processes have compiled, and compiles kernels that failed there.
         each.compile()
         if not each.is_stored:
             on_done()
 
 
 def _next(kernels: "deque[Missing]") -> "Missing | None":
-    """Kernel at the front of a queue that several threads empty; None at its end."""
+    """Take a kernel from the front of a queue shared by several threads; None if it is empty."""
     try:
         return kernels.popleft()
     except IndexError:
@@ -118,7 +118,7 @@ def _next(kernels: "deque[Missing]") -> "Missing | None":
 
 
 def _have_compiled(kernels: "deque[Missing]", on_done: Callable[[], None]) -> None:
-    """Let another process compile kernels from the front of a queue, until the queue is empty."""
+    """Let another process compile kernels from a queue, until the queue is empty."""
     with subprocess.Popen(
         [sys.executable, "-P", "-m", __name__],
         stdin=subprocess.PIPE,
@@ -136,7 +136,7 @@ def _have_compiled(kernels: "deque[Missing]", on_done: Callable[[], None]) -> No
 
 
 def _help() -> None:
-    """Compile the kernels named on stdin, one a line; answer each with a line on stdout."""
+    """Compile the kernels named on stdin, one per line; answer each with a line on stdout."""
     from skytether.shared.base.machine_code import compile_named
 
     for line in sys.stdin:

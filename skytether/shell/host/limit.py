@@ -20,7 +20,7 @@ class _Second:
 class Limit:
     """Limiter of log events: the first few of each kind in a second are logged.
 
-    The limit is per kind, not per kind and vehicle: an attacker may claim any vehicle's number.
+    The limit is per kind, not per vehicle, because an attacker can use any vehicle's number.
     """
 
     def __init__(self) -> None:
@@ -29,7 +29,7 @@ class Limit:
     def admit(self, event: Event, *, now_ns: int) -> Sequence[Event]:
         """Events to log now: `Omitted` counts of past seconds, and this event if within the limit.
 
-        An `Omitted` event adds its count to that of its kind.
+        An `Omitted` event is not returned; its count is added to that of its kind.
         """
         kind = event.kind if isinstance(event, Omitted) else type(event).__name__
         over = self.omitted(kind, now_ns=now_ns)
@@ -44,10 +44,10 @@ class Limit:
         return over
 
     def omitted(self, *kinds: str, now_ns: int | None) -> list[Omitted]:
-        """Counts of events omitted in the seconds that are over, each returned once.
+        """Counts of events omitted in past seconds; each count is returned once.
 
         Args:
-            kinds: if empty, all.
+            kinds: kinds of events; empty for all.
             now_ns: None ends every second.
         """
         events = []

@@ -1,8 +1,8 @@
-"""Paths: the ways of a client to its server, each from a local interface or address.
+"""Paths: connections of a client to its server, each from a local interface or address.
 
 The socket of a path works again when its address, or its interface, is up again. After an interface
-was removed and added again, which a modem that restarts does, the socket is still bound to the old
-one and must be opened anew: only the interface's index tells.
+was removed and added again, as by a modem that restarts, the socket is still bound to the old
+interface and must be opened again; only the interface's index shows this.
 """
 
 import re
@@ -54,13 +54,13 @@ def parse_path(text: str) -> NetworkPath | None:
 
 
 class PathSockets:
-    """Opens the sockets of one path, one after the other.
+    """Opener of one path's sockets, one after the other.
 
     Args:
         is_patient: see `Names`.
 
     Raises:
-        AddressError: the peer's name cannot be resolved, or is of another family than LOCAL.
+        AddressError: the peer's name cannot be resolved, or has another address family than LOCAL.
     """
 
     def __init__(self, path: NetworkPath, *, is_patient: bool) -> None:
@@ -71,22 +71,22 @@ class PathSockets:
             family = socket.AF_INET6 if ":" in path.local else socket.AF_INET
         self.names = Names([path.peer], is_patient=is_patient, family=family)
         self.problem = ""
-        """Reason why nothing could be sent when it was checked last; empty if there was none."""
+        """Reason why nothing could be sent at the last check; empty if sending was possible."""
         self._index: int | None = None
         self._bind: Address = ("", 0)
         self.choose_address()
 
     @property
     def is_local(self) -> bool:
-        """Whether both ends are on this machine, as far as is known."""
+        """Whether both ends are on this machine, so far as addresses are known."""
         addresses = [self._bind, *self.names.numbers()]
         return not self.names.missing and all(map(is_loopback, addresses))
 
     def choose_address(self) -> bool:
         """Choose the address that sockets are bound to; returns whether it has changed.
 
-        Only at the start, and when the peer's name is found late: else a name that moves from this
-        machine to another would make a plaintext link, which was allowed as local, a remote one.
+        Called only at the start, and when the peer's name is resolved late: otherwise a plaintext
+        link, allowed because it is local, could become remote when a name moves to another machine.
         """
         before, is_address = self._bind, self.path.local and not self._interface
         self._bind = (self.path.local, 0) if is_address else within_reach_of(self.names.numbers())

@@ -1,7 +1,7 @@
-"""What not every operating system has, asked for in this one place.
+"""Features that not every operating system has; only this module checks for them.
 
 Flights in virtual time, the environments of `skytether.gym`, netem's relay and its pytest fixture
-run wherever Python and numba do; what needs more asks here whether it can, and says so if not.
+run on every system with Python and numba. Other code checks here for what it needs.
 """
 
 import ctypes
@@ -20,7 +20,7 @@ if TYPE_CHECKING:  # `start` imports this before anything slow
 
 
 def _module(name: str) -> Any:
-    """Module of the standard library; None if this system has none."""
+    """Module of the standard library; None if this system lacks it."""
     try:
         return import_module(name)
     except ImportError:
@@ -29,11 +29,11 @@ def _module(name: str) -> Any:
 
 fcntl, resource, termios, tty = map(_module, ("fcntl", "resource", "termios", "tty"))
 LIBC: Any = None if sys.platform == "win32" else ctypes.CDLL(None, use_errno=True)
-"""C library; a function that this system's has not is missing in it. None on Windows."""
+"""C library of this system; None on Windows."""
 SERIAL_ERROR: type[Exception] = OSError if termios is None else termios.error
-"""Error of a file that is not a serial port."""
+"""Type of the error raised for a file that is not a serial port."""
 FORKS = hasattr(os, "fork")
-"""Whether a process can continue as two; if not, flights over UDP are not started."""
+"""Whether this system has `fork`; without it, flights over UDP are not started."""
 
 
 def cores() -> int:
@@ -51,8 +51,8 @@ def signals(*names: str) -> tuple[signal.Signals, ...]:
 def passable() -> tuple[int, ...]:
     """Signals that a process can pass on to another.
 
-    Not those that cannot be handled, that tell a process of itself (its faults, children, files and
-    terminal), and SIGUSR1, which asks for counters.
+    Excluded are signals that cannot be handled, that report on the process itself (faults,
+    children, files and terminal), and SIGUSR1, which asks for counters.
     """
     own = ("SIGKILL", "SIGSTOP", "SIGUSR1", "SIGCHLD", "SIGPIPE", "SIGXFSZ", "SIGTTIN", "SIGTTOU")
     faults = ("SIGABRT", "SIGBUS", "SIGFPE", "SIGILL", "SIGSEGV", "SIGSYS", "SIGTRAP")
@@ -60,7 +60,7 @@ def passable() -> tuple[int, ...]:
 
 
 def user() -> int:
-    """Number of the user as the owner of files; 0 on a system without."""
+    """Number of the user as the owner of files; 0 on a system without user numbers."""
     return os.geteuid() if hasattr(os, "geteuid") else 0
 
 
@@ -74,7 +74,7 @@ def handle(loop: "asyncio.AbstractEventLoop", number: int, action: Callable[[], 
 
 @contextmanager
 def blocked(*numbers: signal.Signals) -> Iterator[None]:
-    """Block signals during the block, also in the processes that it starts."""
+    """Block signals during the `with` block, also in processes that it starts."""
     if hasattr(signal, "pthread_sigmask"):
         signal.pthread_sigmask(signal.SIG_BLOCK, numbers)
     try:
@@ -88,7 +88,7 @@ def local_socket(kind: socket.SocketKind) -> socket.socket:
     """Unix socket.
 
     Raises:
-        OSError: this system has none.
+        OSError: this system has no Unix sockets.
     """
     if not hasattr(socket, "AF_UNIX"):
         raise OSError(EAFNOSUPPORT, f"needs Unix sockets, which this system ({sys.platform}) lacks")
@@ -96,13 +96,13 @@ def local_socket(kind: socket.SocketKind) -> socket.socket:
 
 
 def on_usr1(handler: Callable[[int, Any], Any] | signal.Handlers) -> None:
-    """Handle SIGUSR1 in this way, on systems that have it."""
+    """Set the handler of SIGUSR1, on systems with this signal."""
     for number in signals("SIGUSR1"):
         signal.signal(number, handler)
 
 
 def files_max() -> int:
-    """Largest number of open files that this process may allow itself."""
+    """Largest number of open files to which this process may raise its limit."""
     if resource is None:
         return sys.maxsize
     _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
@@ -119,12 +119,12 @@ def allow_files(count: int) -> None:
 
 
 def dump_no_core() -> None:
-    """Let this process end by a signal without a core dump."""
+    """Turn off core dumps for this process."""
     if resource is not None:
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
 
 
 def be_nice(by: int) -> None:
-    """Let other processes go first, where the system knows this."""
+    """Lower this process's priority, on systems with `nice`."""
     if hasattr(os, "nice"):
         os.nice(by)

@@ -1,7 +1,7 @@
-"""Temporary folders; those that a killed process has left are removed by the next process.
+"""Temporary folders; the next process removes folders that a killed process has left.
 
-A folder contains a mark: a file that its owner keeps locked until it ends, however it ends. Only a
-folder of this user whose mark is not locked is removed. The mark is removed last, so that the next
+A folder contains a mark: a file that its owner keeps locked until it ends or is killed. Only
+folders of this user with an unlocked mark are removed. The mark is removed last, so that the next
 process completes an interrupted removal.
 """
 
@@ -36,7 +36,7 @@ def folder() -> Iterator[Path]:
 def _marked(made: Path) -> Iterator[None]:
     """Create and lock a folder's mark.
 
-    The mark gets its name once it is locked, so that no other process removes the folder.
+    The mark gets its name after it is locked, so that no other process removes the folder.
     """
     new_mark = made / f"{MARK}.new"
     with new_mark.open("x") as mark:

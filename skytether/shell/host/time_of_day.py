@@ -2,8 +2,8 @@
 
 The time daemon sets that bound. chrony and ntpd include half of the round-trip time to their
 source, so it holds whatever the network delay. systemd-timesyncd sets it to 0, which is not an
-estimate: such a clock counts as unknown. So does the clock under chrony without `rtcsync`, which
-leaves it marked as not synchronised.
+estimate: such a clock counts as unknown. Chrony without `rtcsync` leaves the clock marked as not
+synchronised, which also counts as unknown.
 """
 
 import ctypes
@@ -17,7 +17,7 @@ from skytether.shared.events.processes import TimeUnknown
 from skytether.shell.host import system
 
 UNSYNCHRONISED, CLOCK_ERROR = 0x40, 5
-"""Status bit, and return value of `adjtimex`, of a clock that is not synchronised."""
+"""Status bit, and return value of `adjtimex`, for a clock that is not synchronised."""
 
 
 class _Timex(ctypes.Structure):
@@ -49,7 +49,7 @@ def _adjtimex() -> "ctypes._FuncPointer | None":
 
 
 def stated(answer: int, status: int, maxerror_us: int, esterror_us: int) -> int | None:
-    """Largest error of the host's clock by the answer of `adjtimex` [ns]; None if it is unknown."""
+    """Largest error of the host's clock according to `adjtimex` [ns]; None if unknown."""
     if answer in (-1, CLOCK_ERROR) or status & UNSYNCHRONISED or esterror_us <= 0:
         return None
     return maxerror_us * MICROSECOND_NS if maxerror_us > 0 else None
@@ -71,14 +71,14 @@ def host_time() -> HostTime | None:
 
 
 class TimeTeller:
-    """Gives an endpoint the time of day of this host while its error is known."""
+    """Passes the time of day of this host to an endpoint while its error is known."""
 
     def __init__(self, endpoint: Endpoint) -> None:
         self._endpoint = endpoint
         self._is_known = True
 
     def news(self) -> TimeUnknown | None:
-        """Give the endpoint the time of day; returns an event when the time has become unknown."""
+        """Pass the time of day to the endpoint; returns an event when it becomes unknown."""
         time_of_day, was_known = host_time(), self._is_known
         self._is_known = time_of_day is not None
         if time_of_day is None:

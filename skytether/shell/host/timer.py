@@ -1,7 +1,7 @@
-"""One absolute timer on an asyncio loop, as exact as the machine allows.
+"""Absolute timer on an asyncio loop, as exact as the machine allows.
 
-A `timerfd` wakes within 0.1 ms on either loop. The loop's own timer is the fallback: uvloop rounds
-it to 1 ms and may fire early, so the callback must check the clock itself.
+A `timerfd` wakes within 0.1 ms with asyncio's and uvloop's loop. The loop's own timer is the
+fallback: uvloop rounds it to 1 ms and may fire early, so the callback must check the clock itself.
 """
 
 import asyncio
@@ -60,7 +60,7 @@ class KernelTimer:
         try:
             os.read(self._fd, 8)
         except BlockingIOError:
-            return  # re-armed between the poll and this call
+            return  # set again between the poll and this call
         self._callback()
 
     def set(self, due_ns: int | None) -> None:

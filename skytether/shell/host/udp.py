@@ -1,7 +1,7 @@
-"""UDP sockets, and addresses of peers; all blocking calls about addresses are in this module.
+"""UDP sockets and peers' addresses; all blocking calls about addresses are in this module.
 
-An address is `(host, port)` everywhere else. The kernel's form for IPv6 has four values; the scope
-among them (the interface of a link-local address) is written into the host, as in `fe80::1%eth0`.
+Other modules use `(host, port)`. The kernel's form for IPv6 has four values; one of them, the scope
+(interface of a link-local address), becomes a part of the host, as in `fe80::1%eth0`.
 """
 
 import contextlib
@@ -26,14 +26,14 @@ FLOODED_BYTES = 16 * 1024 * 1024
 """Receive buffer of a socket that may be flooded [B]: half a second of 50 000 packets/s."""
 
 ADDRESSES_MAX = 4096
-"""Largest number of addresses whose other forms are cached, 360 B each: a flood of HELLOs may fill
-the cache."""
+"""Largest number of addresses whose other forms are cached, with 360 B each; bounded, because a
+flood of HELLO packets may fill the cache."""
 
 SPARE_FILES = 48
-"""Open files that a process may need beside its sockets: readers of its feed, metrics."""
+"""Number of open files that a process may need beside its sockets, for feed and metrics."""
 
 FIND_S = 2.0
-"""Longest time for which the start of a patient process waits for a name's address [s]."""
+"""Longest wait for a name's address at the start of a process with `is_patient` [s]."""
 
 _SO_BINDTODEVICE = 25
 _SO_SNDBUFFORCE, _SO_RCVBUFFORCE, _SO_MEMINFO, _MEMINFO_DROPS = 32, 33, 55, 8
@@ -46,11 +46,11 @@ jump if at least, accept this number of bytes.
 
 
 class AddressError(OSError):
-    """An address that the user gave cannot be used; the message says which and why."""
+    """An address given by the user cannot be used; the message says which and why."""
 
 
 def within_reach_of(peers: Iterable[Address]) -> Address:
-    """Address to bind a socket to: a free port, on loopback if all peers are.
+    """Address for binding a socket: a free port, on loopback if all peers are on loopback.
 
     Args:
         peers: numeric addresses of one family; without any, IPv4 is assumed.
@@ -97,16 +97,16 @@ def _is_own(host: str) -> bool:
 
 
 def open_socket(address: Address, *, shared: bool = False, interface: str = "") -> socket.socket:
-    """Non-blocking UDP socket with large buffers; an IPv6 socket receives IPv6 only.
+    """Open a non-blocking UDP socket with large buffers; an IPv6 socket receives only IPv6.
 
     Args:
         address: a name or a number, of either family.
-        shared: whether several sockets may have this address; the kernel then distributes the
-            peers.
+        shared: whether several sockets may have this address; the kernel then distributes peers
+            over them.
         interface: network interface for all its datagrams; empty for any.
 
     Raises:
-        AddressError: the address cannot be bound, or the interface not used.
+        AddressError: the address or the interface cannot be used.
     """
     try:
         if not is_numeric(address[0]):
@@ -183,15 +183,15 @@ def allow_sockets(count: int) -> None:
 
 
 def admit_only(sock: socket.socket, forms: Sequence[Form]) -> None:
-    """Let the kernel drop datagrams of other forms than these; on Linux only.
+    """Let the kernel drop datagrams that have none of these forms; on Linux only.
 
     A dropped datagram takes no space in the receive buffer and no time of the process. The receive
     buffer is enlarged as well.
 
     Args:
         sock: a UDP socket.
-        forms: forms that pass, the most frequent first; a datagram that is shorter than the head of
-            a form before its own is dropped.
+        forms: accepted forms, the most frequent first; a datagram shorter than the head of a form
+            before its own is dropped.
     """
     _make_room(sock, socket.SO_RCVBUF, _SO_RCVBUFFORCE, FLOODED_BYTES)
     if sys.platform != "linux":
@@ -209,7 +209,7 @@ def admit_only(sock: socket.socket, forms: Sequence[Form]) -> None:
         program += instruction.pack(_IF_AT_LEAST, 1, 0, most + _UDP_HEADER_BYTES + 1)
         program += instruction.pack(_RETURN, 0, 0, 2**32 - 1)
     program += instruction.pack(_RETURN, 0, 0, 0)
-    import ctypes  # needed by a server only
+    import ctypes  # needed only by a server
 
     code = ctypes.create_string_buffer(program, len(program))
     filter_ = struct.pack("@HP", len(program) // instruction.size, ctypes.addressof(code))
@@ -217,7 +217,7 @@ def admit_only(sock: socket.socket, forms: Sequence[Form]) -> None:
 
 
 def heed_refusals(sock: socket.socket) -> None:
-    """Let the kernel keep the ICMP errors about datagrams from a socket; on Linux only."""
+    """Let the kernel store ICMP errors about datagrams from a socket; on Linux only."""
     if sys.platform == "linux":
         six = sock.family == socket.AF_INET6
         level, option = (socket.IPPROTO_IPV6, _IPV6_RECVERR) if six else (0, _IP_RECVERR)
@@ -225,7 +225,7 @@ def heed_refusals(sock: socket.socket) -> None:
 
 
 def refusals(sock: socket.socket) -> Iterator[str]:
-    """Reasons from ICMP errors about datagrams from a socket, one for each error."""
+    """Reasons in stored ICMP errors about datagrams from a socket, one for each error."""
     while True:
         try:
             _, news, _, _ = sock.recvmsg(0, 512, _MSG_ERRQUEUE)
@@ -240,7 +240,7 @@ def refusals(sock: socket.socket) -> Iterator[str]:
 def kernel_drops(sock: socket.socket) -> int:
     """Number of datagrams that the kernel dropped; 0 if the system does not report it.
 
-    The receive buffer was full, or the datagrams had none of the admitted forms.
+    It drops datagrams if the receive buffer is full, or if they have none of the admitted forms.
     """
     try:
         info = sock.getsockopt(socket.SOL_SOCKET, _SO_MEMINFO, 4 * (_MEMINFO_DROPS + 1))
@@ -250,12 +250,12 @@ def kernel_drops(sock: socket.socket) -> int:
 
 
 class Names:
-    """Numeric addresses of peers, by the names that the user has written.
+    """Numeric addresses of peers, by the names that the user gave.
 
     Args:
         peers: names or numbers.
-        is_patient: whether a name that cannot be resolved now may be resolved by `look_up` later;
-            until then nothing can be sent there.
+        is_patient: whether a name that cannot be resolved now may be resolved later by `look_up`;
+            before that, nothing can be sent to it.
         family: address family of all numbers.
 
     Raises:
@@ -294,8 +294,7 @@ class Names:
             except OSError as error:
                 self.missing[peer] = error.strerror or str(error)
 
-        # A thread: where the network is down, a lookup may take 20 s, and the vehicle may be in the
-        # air.
+        # A thread: without a network a lookup may take 20 s, and the vehicle may be in the air.
         thread = threading.Thread(target=find, daemon=True)
         thread.start()
         thread.join(FIND_S)
@@ -325,11 +324,11 @@ class Names:
         return self._numbers.get(peer, peer)
 
     def name(self, number: Address) -> Address:
-        """Peer with a numeric address, as the user has written it."""
+        """Peer's address as the user gave it, from a numeric address."""
         return self._by_number.get(number, number)
 
     def heard(self, raw: RawAddress) -> Address:
-        """Peer with an address in the kernel's form, as the user has written it.
+        """Peer's address as the user gave it, from an address in the kernel's form.
 
         Raises:
             OSError: the interface of its scope does not exist.
@@ -338,7 +337,7 @@ class Names:
         if peer is None:
             number = from_kernel(unpack_address(raw))
             peer = self.name(number)
-            # An interface that was unplugged may come back with another index.
+            # An interface may have another index after it was unplugged.
             if "%" not in number[0]:
                 if len(self._heard) >= ADDRESSES_MAX:
                     self._heard.clear()
@@ -346,8 +345,8 @@ class Names:
         return peer
 
     def heard_all(self, raws: Sequence[RawAddress]) -> list[Address]:
-        """Peers with addresses in the kernel's form, as the user has written them; raises as
-        `heard` does.
+        """Peers' addresses as the user gave them, from addresses in the kernel's form; raises the
+        errors of `heard`.
         """
         peers = list(map(self._heard.get, raws))
         if None not in peers:
@@ -376,7 +375,7 @@ class Names:
             if peer in self.missing:
                 raise OSError(f"cannot find {peer[0]}")
             address, raw = to_kernel(self.number(peer)), b""
-            # For an address that cannot be packed, the socket's plain call raises the error.
+            # If an address cannot be packed, the later plain call of the socket raises the error.
             with contextlib.suppress(OSError, OverflowError):
                 raw = pack_address(address)
             reached = address, raw

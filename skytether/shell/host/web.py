@@ -1,8 +1,8 @@
 """Rules for HTTP servers: the page and the metrics.
 
-Any website can make a browser on this machine connect here: in an invisible frame, or by pointing a
-domain of its own at this machine (DNS rebinding). So no answer may be shown in a frame, and the
-Host header is checked.
+Any website can make a browser on this machine connect to these servers: in an invisible frame, or
+by pointing its own domain at this machine (DNS rebinding). So answers must not be shown in frames,
+and the Host header is checked.
 """
 
 import ipaddress
@@ -14,7 +14,7 @@ HEADERS = {
     "Content-Security-Policy": "frame-ancestors 'none'",
     "X-Frame-Options": "DENY",
 }
-"""Headers of every answer: no website may show it in a frame and catch clicks."""
+"""Headers of every answer: a website must not show it in a frame and catch clicks."""
 
 
 def host_name(host: str) -> str:
@@ -34,5 +34,5 @@ def numeric(name: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
 
 
 def is_ours(name: str) -> bool:
-    """Whether a host is a number or localhost, so no website's owner can point it here."""
+    """Whether a host is an IP address or localhost, which no website's owner can redirect."""
     return name == "localhost" or numeric(name) is not None

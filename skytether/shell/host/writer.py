@@ -1,4 +1,4 @@
-"""Background writer to a file, so that a process never waits for a full pipe or a slow disk."""
+"""Background writer of a file, so that a process never waits for a full pipe or a slow disk."""
 
 import contextlib
 import os
@@ -9,16 +9,16 @@ from typing import IO, Any
 
 
 class Writer:
-    """Writer to a file in a thread of its own; pieces beyond its bound are dropped.
+    """Writer of a file, in its own thread; drops pieces when more than `room` bytes wait.
 
     The thread starts at once, so a process that forks must create writers in its children. A
-    blocked thread does not keep the process from ending. A killed process loses the pieces of the
-    last pause.
+    blocked thread does not keep the process from ending. A killed process loses pieces not yet
+    written.
 
     Args:
-        file: unbuffered file to write to; or the error that opening it raised.
-        room: most bytes that wait to be written.
-        together: most bytes of several pieces in one write; a piece is never split.
+        file: unbuffered file to write to; or the error from opening it.
+        room: largest number of bytes waiting to be written.
+        together: largest number of bytes in one write of several pieces; a piece is never split.
         pause_s: time for which pieces are collected before they are written [s].
     """
 
@@ -29,7 +29,7 @@ class Writer:
         self._capacity = capacity
         self._together = together
         self._pause_s = pause_s
-        # Each counter is changed by one thread only: `offered` and `refused` by the caller's.
+        # One thread changes each counter; the caller's changes `offered` and `refused`.
         self.offered = 0
         self.refused = 0
         """Bytes that were dropped because too many were waiting."""

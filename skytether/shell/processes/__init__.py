@@ -1,1 +1,1 @@
-"""What a process around an endpoint is: its log, metrics and record, from start to end."""
+"""Process of an endpoint: its log, metrics and record, from start to end."""

@@ -5,8 +5,8 @@
 
 The event loop hands over its figures once a second; threads render them and answer requests, and
 never touch the endpoint. Connections are bounded in time and in number (the oldest is closed), so
-that no client locks others out; at most 50 are accepted per second. A request whose Host header is
-a website's name is refused: its owner may have pointed that name at this machine (DNS rebinding).
+that no client blocks others; at most 50 are accepted per second. A request is refused if its Host
+header is a website's name, which may have been pointed at this machine (DNS rebinding).
 """
 
 import io
@@ -35,19 +35,19 @@ from skytether.shell.processes.metrics import OWN, families, trouble
 CONNECTIONS_MAX = 8
 """Largest number of connections at once; a new connection closes the oldest."""
 PATIENCE_S = 5.0
-"""Longest time for a request and its answer."""
+"""Longest time from connecting to the end of the answer."""
 REQUEST_BYTES_MAX = 8192
 POLL_S = 0.1
 """Interval at which connections that take too long are closed."""
 REST_S = 0.02
 """Pause between two accepted connections."""
 FRESH_S = 3.0
-"""Age from which figures count as stale, and the process as stuck [s]."""
+"""Age above which figures count as stale, and the process as stuck [s]."""
 BY_NAME = b"Host: expected a number, localhost, a name without a dot or that of --metrics\n"
 
 
 class MetricsError(OSError):
-    """The metrics' address cannot be listened at; the message says which and why."""
+    """Listening at the metrics' address failed; the message says which address and why."""
 
 
 class Collected(Collector):
@@ -110,7 +110,7 @@ class _Bounded(io.BufferedReader):
 
 
 class _Handler(WSGIRequestHandler):
-    """Handler of a request, whose error answers have the common headers, too."""
+    """Handler of a request; its error answers have the common headers, too."""
 
     def setup(self) -> None:
         super().setup()
@@ -132,7 +132,7 @@ class Metrics(ThreadingMixIn, WSGIServer):
         address: address to listen at; port 0 takes a free one.
 
     Raises:
-        MetricsError: the address cannot be listened at.
+        MetricsError: listening at the address failed.
     """
 
     daemon_threads = True
@@ -143,7 +143,7 @@ class Metrics(ThreadingMixIn, WSGIServer):
         self.socket.close()
         self.socket = listening
         self.address = from_kernel(listening.getsockname())
-        # set here, because `server_bind` would look the name up in the DNS
+        # set here, because `server_bind` would look up the name in the DNS
         self.server_name, self.server_port = self.address
         self.setup_environ()
         self.set_app(self._answer)
@@ -152,7 +152,7 @@ class Metrics(ThreadingMixIn, WSGIServer):
         self._registry = CollectorRegistry(auto_describe=False)
         self._registry.register(collected)
         self._connections: dict[socket.socket, float] = {}
-        """Times at which connections are closed, answered or not [s]; the oldest first."""
+        """Time at which each connection is closed, even if unanswered [s]; the oldest first."""
         self._thread = threading.Thread(target=self.serve_forever, args=(POLL_S,), daemon=True)
         self._thread.start()
 
@@ -190,7 +190,7 @@ class Metrics(ThreadingMixIn, WSGIServer):
         super().shutdown_request(request)
 
     def handle_error(self, *_: object) -> None:
-        """Ignore the error: the client is gone, or too slow."""
+        """Ignore the error: the client has disconnected, or is too slow."""
 
     def _answer(self, environ: WSGIEnvironment, start_response: StartResponse) -> Iterable[bytes]:
         status, kind, body = "404 Not Found", "text/plain; charset=utf-8", b"/metrics or /healthz\n"
@@ -209,7 +209,7 @@ class Metrics(ThreadingMixIn, WSGIServer):
         return [body]
 
     def _is_ours(self, host: str | None) -> bool:
-        """Whether a Host header names this machine in a way that no website's owner can imitate."""
+        """Whether a Host header names this machine by a name that no website can have."""
         if host is None or "," in host:  # no Host header, or several
             return host is None
         name = host_name(host)

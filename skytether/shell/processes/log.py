@@ -1,8 +1,8 @@
 """The log of a process: its events on stdout, as text for an operator or as JSON for a program.
 
-A line of text begins with the local time and the name of the process. Lines wait in a bounded queue
-and are written by a thread, so that logging never blocks the process; if stdout is closed or full,
-lines are lost without an error.
+A line of text begins with the local time and the name of the process. A thread writes lines from a
+bounded queue, so that logging never blocks the process; if stdout is closed or full, lines are lost
+without an error.
 """
 
 import errno
@@ -22,10 +22,10 @@ from skytether.shell.host.limit import Limit
 from skytether.shell.host.writer import Writer
 
 ROOM_BYTES = 256 * 1024
-"""Largest number of bytes of lines that wait to be written."""
+"""Largest number of bytes of lines waiting to be written."""
 TOGETHER_BYTES = 4096
-"""Largest number of bytes in one write: PIPE_BUF, which a pipe takes whole even with several
-writers."""
+"""Largest number of bytes in one write: PIPE_BUF, up to which a write to a pipe is atomic, also
+with several writers."""
 PATIENCE_S = 0.5
 """Longest time to wait at the end until all lines are written."""
 
@@ -60,7 +60,7 @@ class Log:
     Args:
         form: text or JSON.
         beside: called with each event that is logged.
-        to_stderr: whether lines go to stderr, since stdout is another program's.
+        to_stderr: whether lines go to stderr, because another program uses stdout.
     """
 
     def __init__(
@@ -86,7 +86,7 @@ class Log:
             self.say(admitted)
 
     def say(self, event: Event) -> None:
-        """Log an event in one write of whole lines: several workers may share the output."""
+        """Log an event in one write of whole lines, because workers may share the output."""
         self._beside(event)
         for line in self._lines(event):
             if not self._writer.write(line):
@@ -104,7 +104,7 @@ class Log:
         if self._unread:
             before, self._unread = self._unread, 0
             self.say(Omitted(kind="lines", count=before))
-            if self._unread:  # the output is still full
+            if self._unread:  # the output still accepts nothing
                 self._unread = before
 
     def close(self) -> None:
@@ -118,7 +118,7 @@ class Log:
         if isinstance(event, Counted):
             lines += rendered(_for_people(event.figures), indent=2)
         now = f"{datetime.now():%Y-%m-%d %H:%M:%S.%f}"[:-3]  # noqa: DTZ005 - the operator's own
-        # `printable` and not `encode` alone: a file's name need not be valid Unicode.
+        # `printable`, because a file's name may be invalid Unicode.
         shown = (f"{now} {self._process}: {printable(line)}\n" for line in lines)
         return [line.encode(errors="replace") for line in shown]
 
@@ -126,7 +126,7 @@ class Log:
 def rendered(figures: Mapping[str, Any], *, indent: int = 0) -> list[str]:
     """Figures as lines: names and numbers in two columns, nested groups indented.
 
-    Two groups with the same names, such as the two directions, share their lines, a column each.
+    Two groups with the same names, such as both directions, share lines, with a column each.
     """
     groups = {name: value for name, value in figures.items() if isinstance(value, Mapping)}
     if len(groups) == 2 and len({frozenset(group) for group in groups.values()} - {()}) == 1:

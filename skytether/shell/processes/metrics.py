@@ -1,7 +1,7 @@
 """Metrics of a process for Prometheus: tables of names, units and labels, and its health.
 
-Each figure of an endpoint (`Endpoint.figures`) is in a table, or in LEFT_OUT; a figure that is in
-neither is counted, and fails a test. Names follow Prometheus: base units, `_total` for counters.
+Each figure of an endpoint (`Endpoint.figures`) is in a table or in LEFT_OUT; other figures are
+counted, and fail a test. Names follow Prometheus: base units, `_total` for counters.
 """
 
 from collections.abc import Iterator, Mapping
@@ -16,7 +16,7 @@ UNITS = {"_ms": 1e-3, "_ns": 1e-9}
 
 
 class Metric(NamedTuple):
-    """Metric, and the figure that it exports."""
+    """Metric and the figure that it exports."""
 
     figure: str
     """Path of the figure: names of its groups and its own, with slashes between them. `{label}`
@@ -44,8 +44,8 @@ class Metric(NamedTuple):
         return Exposed((PREFIX + self.name).removesuffix("_total"), self.help, self.kind)
 
     def add(self, exposed: Exposed, labels: Mapping[str, str], value: Any) -> None:
-        """Add a figure; a mode becomes one sample for each mode, 1 for the present one, else 0, and
-        another text a label of a sample of 1.
+        """Add a figure. A mode becomes one sample per mode, 1 for the present mode, otherwise 0;
+        another text becomes the label of a sample with value 1.
         """
         name, labels = PREFIX + self.name, {**labels, **self.labels}
         if isinstance(value, str) and not self.figure.endswith("mode"):
@@ -273,7 +273,7 @@ OWN = _table("""
 - unmapped_figures
     Figures of the process that no metric exports; more than 0 is a bug in Skytether.
 """)
-"""Metrics of the exporter itself, which export no figure."""
+"""Metrics of the exporter itself, not of an endpoint's figures."""
 LEFT_OUT = {
     "server": (
         "tick_ms_p50",
@@ -296,10 +296,10 @@ LEFT_OUT = {
 
 
 def families(process: str, figures: Mapping[str, Any]) -> tuple[list[Exposed], list[str]]:
-    """Metrics of figures, and the paths of figures that are in no table.
+    """Convert figures to metrics; also returns the paths of figures in no table.
 
     Args:
-        process: server, netem or client; other processes have only the common metrics.
+        process: server, netem or client; other processes have only common metrics.
         figures: from `Endpoint.figures`, and those that the process adds.
     """
     metrics: dict[str, Exposed] = {}
@@ -320,7 +320,7 @@ def families(process: str, figures: Mapping[str, Any]) -> tuple[list[Exposed], l
 
 
 def trouble(process: str, figures: Mapping[str, Any]) -> str:
-    """Reason why a process is unhealthy, by its figures; empty for a healthy one.
+    """Reason why a process is unhealthy, from its figures; empty if it is healthy.
 
     A server is unhealthy if it misses too many ticks, a client if a vehicle neither flies nor is
     ready.
@@ -335,14 +335,14 @@ def trouble(process: str, figures: Mapping[str, Any]) -> str:
 
 
 HEALTHY = {str(mode) for mode in (Mode.READY, Mode.TRACK, Mode.COAST)}
-"""Modes of a vehicle that has a session and flies, or is ready to."""
+"""Modes of a vehicle that has a session and flies, or is ready to fly."""
 
 
 def flat(
     figures: Mapping[str, Any], groups: tuple[str, ...] = ()
 ) -> Iterator[tuple[tuple[str, ...], Any]]:
-    """Figures, each with the names of its groups and its own; items of a list are groups that are
-    numbered from 1, and None is no figure.
+    """Figures with their paths: names of groups, then the figure's name. Items of a list are groups
+    numbered from 1; None values are left out.
     """
     for name, value in figures.items():
         if isinstance(value, list):

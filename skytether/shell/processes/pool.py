@@ -1,4 +1,4 @@
-"""Processes that compute beside this one, and end with it."""
+"""Worker processes that end with this process."""
 
 import multiprocessing
 import os
@@ -14,7 +14,7 @@ def processes(count: int, *, polite: bool = False) -> Iterator[Executor]:
     """Pool of processes, which are terminated at the end of the block.
 
     Args:
-        polite: whether they yield the cores to everything else.
+        polite: whether the processes have a low priority.
     """
     for library in ("OMP", "OPENBLAS", "MKL", "NUMBA"):
         os.environ[f"{library}_NUM_THREADS"] = "1"
@@ -30,7 +30,7 @@ def processes(count: int, *, polite: bool = False) -> Iterator[Executor]:
 
 
 def _start(parent: int, polite: bool) -> None:
-    """Initialise a worker, which ends with the process that started it."""
+    """Initialise a worker, which ends when its parent process ends."""
     die_with_parent()
     if os.getppid() != parent:  # the command had already ended
         os._exit(1)

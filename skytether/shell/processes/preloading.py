@@ -1,4 +1,4 @@
-"""What a live process imports before its first packet, because a change in flight may name it."""
+"""Imports before a live process's first packet, of modules that a change in flight may need."""
 
 from collections.abc import Collection
 from contextlib import suppress
@@ -10,8 +10,8 @@ from skytether.shared.scenario.registry import IMPAIRMENTS, TRIGGERS, load
 
 
 def preload(changeable: Collection[str]) -> None:
-    """Import what a change of these keys in flight may name, before the first packet: a step or a
-    packet would have to wait for it.
+    """Before the first packet, import modules that a change of these keys may need: in flight, an
+    import would delay a step or a packet.
     """
     modules: list[str] = []
     for key, table, guarded in (
@@ -20,7 +20,7 @@ def preload(changeable: Collection[str]) -> None:
         ("network.uplink", IMPAIRMENTS, "skytether.netem.impairments.guarded"),
     ):
         for name in table if key in changeable else ():
-            with suppress(ConfigError):  # a room that is not installed
+            with suppress(ConfigError):  # a package that is not installed
                 modules += [] if table[name].is_ours else [guarded]
     if "network.uplink" in changeable:
         modules += ["skytether.netem.bottleneck", "skytether.shared.base.folders"]

@@ -1,4 +1,4 @@
-"""One endpoint as a process, with its record, its feed and its counters, from start to end."""
+"""Process of one endpoint, with record, feed and counters, from start to end."""
 
 import signal
 import tempfile
@@ -62,8 +62,8 @@ class ProcessOptions(ScenarioOptions):
     control: Path | None = None
     """Unix socket to create, through which keys change in flight, see `skytether set`."""
     new_flight: bool = False
-    """Begin a new flight: discard values that were set in an earlier run, which are kept beside the
-    socket of --control. To be given by a person; never put it into the command of a service.
+    """Begin a new flight: discard values that were set in an earlier run, which are stored beside
+    the socket of --control. Give it by hand; never put it into the command of a service.
     """
     feed: Path | None = None
     """Unix socket to create, at which other programs read the rows and events of this process."""
@@ -73,7 +73,7 @@ class ProcessOptions(ScenarioOptions):
 
 @contextmanager
 def recorded(path: Path, columns: np.dtype[np.void]) -> Iterator[RecordFile]:
-    """Record into a file; if the disk fails in flight, the flight goes on and the command fails."""
+    """Record to a file; if the disk fails in flight, the flight goes on and the command fails."""
     try:
         growing = files.Growing(path, buffering=0)
     except OSError as error:
@@ -87,7 +87,7 @@ def recorded(path: Path, columns: np.dtype[np.void]) -> Iterator[RecordFile]:
 
 @contextmanager
 def recorded_meanwhile(columns: np.dtype[np.void]) -> Iterator[RecordFile]:
-    """Record into a temporary file; if none can be created, nothing is recorded."""
+    """Record to a temporary file; if it cannot be created, nothing is recorded."""
     file: BinaryIO | OSError
     try:
         temporary = tempfile.TemporaryFile(buffering=0)  # noqa: SIM115 - the recording closes it
@@ -115,7 +115,7 @@ class Process:
     journal: "Journal | None"
     warnings: list[Event]
     recording: RecordFile | None
-    """File of the endpoint's rows; the process waits at the end until they are written."""
+    """File of the endpoint's rows; at its end the process waits until they are written."""
     feed: "Feed | None"
     recorder: Recorder | None
     """Recorder of the endpoint's rows, for a file, a feed or both; None for neither."""
@@ -159,11 +159,11 @@ class Process:
         Args:
             bind, paths, peers, forms, stopwatch, line, is_patient, memory: see `Shell`.
             waiting_for: name of the peer whose datagrams the endpoint waits for, for the operator.
-            insecure: whether it may run without keys where other machines can reach it.
-            ready: called once all checks have passed, before the first datagram is received.
+            insecure: whether to run without keys at an address that other machines can reach.
+            ready: called after all checks, before the first datagram is received.
 
-            on_signal: called at signals for another program, to which stdout belongs, too: events
-                then go to stderr, and the last counters to the feed and the file alone.
+            on_signal: called at signals for another program, which also uses stdout: events then go
+                to stderr, and the final counters only to the feed and the file.
         """
         options, feed, journal = self.options, self.feed, self.journal
         clocks = [_clock(endpoint)] if options.config.link.time_of_day == "host" else []
@@ -263,7 +263,7 @@ def begin(
     Args:
         name, options, secure, warnings: see `Process`.
         columns: columns of its rows.
-        number: number of a worker, which is added to its name; 0 for a single process.
+        number: number of a worker, which is appended to its name; 0 for a single process.
         keeps_rows: whether rows go to a temporary file if no record is asked for.
 
     Raises:

@@ -1,4 +1,4 @@
-"""Recording of a single process: another process reads its feed and writes an MCAP file.
+"""Recording of a single process: a recorder process reads its feed and writes an MCAP file.
 
 The flying process does not wait for the disk, and imports no MCAP library. When it ends, or is
 killed, the recorder's standard input ends, and the recorder completes its file.
@@ -22,7 +22,7 @@ PATIENCE_S = 30.0
 
 
 class RecorderOrder(msgspec.Struct, frozen=True, kw_only=True):
-    """Order to a recorder, sent as one line of JSON on its standard input."""
+    """Instruction to a recorder, sent as one line of JSON to its standard input."""
 
     path: str
     feed: str
@@ -39,7 +39,7 @@ class RecorderError(Exception):
 
 @contextmanager
 def socket_of(feed: Path | None) -> Iterator[Path]:
-    """Socket of a feed: the given path, else one in a private temporary folder."""
+    """Socket of a feed: the given path, or a socket in a private temporary folder."""
     if feed:
         yield feed
         return

@@ -1,4 +1,4 @@
-"""One address served by several processes, so that a server may use several cores.
+"""Several processes that serve one address, so that a server uses several cores.
 
 Each process has its own socket at the address (SO_REUSEPORT): the kernel assigns peers to the
 processes by a hash of their address, so a peer always reaches the same process while all of them
@@ -19,17 +19,17 @@ from skytether.shell.host import system
 from skytether.shell.host.udp import from_kernel, open_socket
 
 FORK = multiprocessing.get_context("fork" if system.FORKS else None)
-"""Start method of workers: fork shares imported and compiled code, in memory and start-up time."""
+"""Start method of workers: fork shares imported and compiled code, which saves memory and time."""
 ENDING = (signal.SIGINT, signal.SIGTERM)
 PASSED_ON = (*ENDING, *system.signals("SIGUSR1"))
-"""Signals passed on to every worker, SIGINT as SIGTERM, and each of these two only once."""
+"""Signals that are passed on to every worker; SIGINT is sent as SIGTERM, and SIGTERM only once."""
 
 
 def run(count: int, bind: Address, work: Callable[[int, socket], None]) -> int:
     """Run `count` processes until the first of them ends; returns the worst exit code.
 
     Args:
-        bind: address of all of them; port 0 takes a free one.
+        bind: address of all processes; port 0 takes a free one.
         work: called in each process with its number, from 1, and its socket.
 
     Raises:
@@ -42,7 +42,7 @@ def run(count: int, bind: Address, work: Callable[[int, socket], None]) -> int:
         FORK.Process(target=_work, args=(work, number, sockets, os.getpid()))
         for number in range(1, count + 1)
     ]
-    # Blocked until children have set handlers of their own; otherwise they would inherit this
+    # Blocked until children have set their own handlers; otherwise they would inherit this
     # process's.
     signal.pthread_sigmask(signal.SIG_BLOCK, PASSED_ON)
     for child in children:
@@ -55,7 +55,7 @@ def run(count: int, bind: Address, work: Callable[[int, socket], None]) -> int:
     def pass_on(number: int, _: object) -> None:
         nonlocal ending
         if number in ENDING:
-            if ending:  # a second SIGTERM would interrupt a worker's orderly end
+            if ending:  # a second SIGTERM would interrupt the orderly end of a worker
                 return
             number, ending = signal.SIGTERM, True
         terminated.add(-number)
@@ -98,7 +98,7 @@ def _work(
 
 
 def die_with_parent() -> None:
-    """Ask the kernel to send this process SIGTERM once its parent is gone; runs in a child."""
+    """Ask the kernel to send this process SIGTERM when its parent ends; runs in a child."""
     pr_set_pdeathsig = 1
     with contextlib.suppress(OSError, AttributeError):
         system.LIBC.prctl(pr_set_pdeathsig, signal.SIGTERM)

@@ -26,7 +26,7 @@ from skytether.shell.processes.log import LogFormat
 from skytether.view.browser.serve import followed, serve_until_interrupted
 
 NICE = 5
-"""Niceness of the page's process, so that it yields to the processes that fly."""
+"""Niceness of the page's process, so that the processes that fly come first."""
 
 
 @dataclass(frozen=True)
@@ -35,10 +35,10 @@ class PageOptions:
     """Folders of flights, each with the feeds and control sockets of its processes."""
     page: str = HOST_PORT
     """HOST:PORT to serve the page on; if the port is taken, the next free one. Visitors from other
-    machines may only look, unless they have the printed token.
+    machines may only watch, unless they have the printed token.
     """
     log: LogFormat = "text"
-    """Form of printed events: sentences, or lines of JSON for a program."""
+    """Format of printed events: sentences, or JSON lines for programs."""
     plugin: command.Plugins = ()
 
 
@@ -46,9 +46,8 @@ def show(argv: Sequence[str]) -> None:
     """Show flights in a browser while they fly, until SIGINT or SIGTERM.
 
     A flight's folder is the one given to `fly --control`, or one in which server, netem and client
-    have their sockets: `--feed FOLDER/server.feed --control FOLDER/server` and so on; several
-    clients each under a name of its own, such as `client-2`. Flights may begin, or begin again,
-    later.
+    have their sockets: `--feed FOLDER/server.feed --control FOLDER/server` and so on. Several
+    clients need different names, such as `client-2`. Flights may start, or restart, later.
     """
     options = read(PageOptions(tyro.MISSING), argv, "skytether page", show.__doc__)
     if not options.folders:

@@ -1,9 +1,9 @@
-"""Access rules of a page: which visitors may look, and which may change the flight.
+"""Access rules of a page: which visitors may watch, and which may change the flight.
 
-Any website that the user's browser loads can make it connect to this machine. So a connection from
-this machine is not enough: the page must be ours (`Origin`), and loaded under a name that nobody
-else can point at this machine (`Host`); otherwise any website could read the flight, or fly it. A
-visitor with the token passes without these checks.
+Any website in the user's browser can make the browser connect to this machine. So a connection from
+this machine is not sufficient: the request must come from our page (`Origin`), loaded under a name
+that nobody else can point at this machine (`Host`). Otherwise any website could read the flight, or
+fly it. A visitor with the token needs no checks.
 """
 
 import hmac
@@ -42,7 +42,7 @@ class Visitor:
 
 
 def is_loopback(host: str) -> bool:
-    """Whether a name or address always means this machine."""
+    """Whether a name or address always refers to this machine."""
     if host == "localhost":
         return True
     address = numeric(host)
@@ -51,7 +51,7 @@ def is_loopback(host: str) -> bool:
 
 
 def knows(token: str, given: str) -> bool:
-    """Whether a visitor's token is right; False if the page has none."""
+    """Whether a visitor's token is right; False if the page has no token."""
     return bool(token) and hmac.compare_digest(token.encode(), given.encode())
 
 
@@ -66,7 +66,7 @@ def _named(visitor: Visitor) -> tuple[str, str, str]:
 
 
 def refusal(visitor: Visitor, token: str) -> TurnedAway | None:
-    """Reason why a browser may not even look; None if it may.
+    """Reason why a browser may not watch; None if it may.
 
     A numeric address is accepted, because it cannot be rebound to this machine as a name can.
     """

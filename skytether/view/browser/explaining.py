@@ -1,7 +1,7 @@
-"""Explanations on the page of a recording, each by a process of `skytether explain`.
+"""Explanations on the page of a recording, each computed by a process `skytether explain`.
 
-The process flies for up to a minute, with less priority than the page. What it has found so far is
-read from the file that it writes after each step.
+The process flies for up to a minute, with less priority than the page. After each step it writes
+its results so far to a file, which this module reads.
 """
 
 import contextlib
@@ -25,26 +25,26 @@ from skytether.shell.host import temporary
 from skytether.view.page import words
 
 NICE = 10
-"""Niceness of the processes that fly, so that they yield to those that draw."""
+"""Niceness of the explaining processes, so that the page's process comes first."""
 POLL_S = 0.2
 BUTTONS_MAX = 12
-"""Largest number of brakes that have a button."""
+"""Largest number of brake events with a button."""
 FIRST = "what went wrong"
-"""Step that the process has not written yet."""
+"""Step of the explanation shown before the process has written any."""
 GRAVEST = "What went wrong?"
-"""Button of a flight without a brake."""
+"""Label of the button of a flight without brake events."""
 HINT = "Flies the same flight again, without its losses, until the cause is found"
 
 
 @dataclass(frozen=True, slots=True)
 class Findings:
-    """What is known of a brake."""
+    """Explanation of a brake event so far."""
 
     text: str = ""
     next: str = "another explanation"
-    """What is waited for; empty if all is known."""
+    """Step in progress; empty if the explanation is complete."""
     refused: str = ""
-    """Why it is not explained."""
+    """Reason why there is no explanation; empty otherwise."""
 
 
 class Explainer:
@@ -52,7 +52,7 @@ class Explainer:
 
     Args:
         path: the recording.
-        brakes: time in the flight of each brake [s], and its event as a sentence.
+        brakes: time of flight [s] of each brake event, and the event as a sentence.
     """
 
     def __init__(self, path: Path, brakes: Sequence[tuple[float, str]]) -> None:
@@ -62,12 +62,12 @@ class Explainer:
         ] or [(None, GRAVEST)]
         self._is_more = len(brakes) > BUTTONS_MAX
         self.findings: dict[float | None, Findings] = {}
-        """What is known, by the time in the flight that was asked for [s]; None: the gravest."""
+        """Explanations by the requested time of flight [s]; None: the gravest event."""
         self._pool = ThreadPoolExecutor(1)
         self._closed = threading.Event()
 
     def ask(self, at_s: float | None) -> None:
-        """Explain the brake at a time, after those that were asked for before, unless it is."""
+        """Queue the explanation of the brake event at a time, unless it was requested before."""
         if at_s not in self.findings or self.findings[at_s].refused:
             self.findings[at_s] = Findings()
             self._pool.submit(self._explain, at_s)
@@ -90,7 +90,7 @@ class Explainer:
                 stderr=said,
                 start_new_session=True,  # Ctrl-C is for the page, which ends this process
             ) as child:
-                with contextlib.suppress(OSError):  # it has ended
+                with contextlib.suppress(OSError):  # the process has ended
                     os.setpriority(os.PRIO_PROCESS, child.pid, NICE)
                 while child.poll() is None:
                     if self._closed.wait(POLL_S):
@@ -104,7 +104,7 @@ class Explainer:
                 self.findings[at_s] = Findings(refused=lines[-1] if lines else "it has ended")
 
     def _read(self, at_s: float | None, found: Path) -> None:
-        # Before the first step it is not there, or empty.
+        # Before the first step the file is missing or empty.
         with contextlib.suppress(FileNotFoundError, msgspec.DecodeError):
             self.findings[at_s] = msgspec.json.decode(found.read_bytes(), type=Findings)
 
@@ -116,7 +116,7 @@ class Explainer:
         self._pool.shutdown(cancel_futures=True)
 
     def controls(self, gui: viser.GuiApi) -> Callable[[], None]:
-        """Add a button for each brake to a browser; the returned function updates what is known."""
+        """Add a button per brake event to a browser; the returned function updates the texts."""
         shown: list[float | None] = []
 
         async def ask(at_s: float | None, _: Any) -> None:

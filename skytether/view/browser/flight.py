@@ -19,11 +19,11 @@ from skytether.view.page.changes import Mark, mark, together
 from skytether.view.page.state import LIVE_POINT, State
 
 FINAL = {*ONCE, "armed"}
-"""Keys whose changes are not taken back: decisions for once, and what may end a flight."""
+"""Keys whose changes cannot be undone: single decisions, and `armed`, which may end a flight."""
 
 
 class PageFlight:
-    """Flight on a page.
+    """Flight on a page: its state, and requests to its processes.
 
     Args:
         title: empty for a single flight.
@@ -35,15 +35,15 @@ class PageFlight:
         self.state = State()
         self.lock = threading.Lock()
         self.values: dict[str, dict[str, Any]] = {}
-        """Keys that may change and their known values, by process."""
+        """Keys that may change and their newest values, by process."""
         self.answer = ""
         self.refused = False
         self.asked: frozenset[str] = frozenset()
-        """Keys of the request that was answered last."""
+        """Keys of the newest answered request."""
         self._opened_ns: dict[str, int] = {}
-        """Start of each process on its clock [ns]: another start is another process."""
+        """Start time of each process on its clock [ns]; a new start time means a new process."""
         self._before: dict[str, dict[str, Any]] = {}
-        """Values to restore when a link is healed, by its netem."""
+        """Values to restore when a cut link is restored, by netem."""
         self.operator = Operator(folder, self._answered) if folder else None
 
     def take(self, process: str, frame: Frame) -> None:
@@ -57,7 +57,7 @@ class PageFlight:
         )
         if isinstance(frame, Opened) and self._opened_ns.get(process) != frame.time_ns:
             self._opened_ns[process] = frame.time_ns
-            # Of the process before: they would change the new one's keys to what was once asked.
+            # Values of the earlier process would be sent to the new one.
             self.values.pop(process, None)
             self._before.pop(process, None)
         is_asked = process in PROCESSES or self.state.role(process) == "client"
@@ -71,7 +71,7 @@ class PageFlight:
 
     @property
     def waits(self) -> str:
-        """What a flight that has not begun waits for."""
+        """Text that says what a flight waits for before it begins."""
         return progress(self._folder) or f"{self.title} No process of the flight is heard yet."
 
     # -- changes -----------------------------------------------------------------------------
@@ -95,7 +95,7 @@ class PageFlight:
 
     @property
     def undoable(self) -> dict[tuple[str, str], Changed]:
-        """Newest change, by process and key, if it can be taken back from here."""
+        """Newest change, by process and key, if this page can undo it."""
         changed = {
             place: event
             for place, event in self.state.changed.items()
@@ -105,11 +105,11 @@ class PageFlight:
 
     @property
     def undo_cuts(self) -> bool:
-        """Whether taking back the newest change cuts the link."""
+        """Whether undoing the newest change cuts the link."""
         return any(mark(event) is Mark.HEALED for event in self.undoable.values())
 
     def undo(self) -> None:
-        """Take back the newest change."""
+        """Undo the newest change."""
         before: dict[str, dict[str, Any]] = {}
         for (process, key), event in self.undoable.items():
             before.setdefault(process, {})[key] = msgspec.json.decode(event.before)
@@ -117,7 +117,7 @@ class PageFlight:
             self.ask(process, values)
 
     def processes(self, role: str) -> list[str]:
-        """Processes of a role that have answered; its own name if none has."""
+        """Processes of a role that have answered; the role's name if none has."""
         return [each for each in list(self.values) if self._role(each) == role] or [role]
 
     def of_role(self, role: str) -> dict[str, Any]:
@@ -125,7 +125,7 @@ class PageFlight:
         return self.values.get(self.processes(role)[0], {})
 
     def client(self, vehicle: int) -> str:
-        """Client that flies a vehicle."""
+        """Name of the client process that flies a vehicle."""
         track = self.state.vehicles.get(vehicle)
         return (track.client if track else "") or self.processes("client")[0]
 

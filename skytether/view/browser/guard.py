@@ -1,15 +1,15 @@
-"""Guard of the page's websocket: it limits connections, messages and their rate.
+"""Guard of the page's websocket, which limits connections, messages and their rate.
 
 viser itself accepts any connection and any message: uploads of any size, requests to put the page
 on the internet, values of any attribute. `Guard.served` makes it listen with these rules:
 
 - no answer may be shown in a website's frame; the page itself gets our style and script (`DRESS`);
 - a websocket is opened only for browsers that may look (`access.refusal`), up to BROWSERS_MAX;
-- connections that have sent no message yet make room for newcomers, the longest silent first;
+- if there are too many connections, the one that was silent longest is closed;
 - only messages that our page sends (`MESSAGES`) are accepted, of at most 64 KiB in 64 pieces;
 - at most `RATE_HZ` messages a second are read; more of them wait in the browser's kernel;
-- a browser that does not read gets nothing more; it is disconnected after 40 s, because it does not
-  answer pings, or at once if it sends pings itself.
+- a browser that does not read gets nothing more, and is disconnected after 40 s, because it does
+  not answer pings, or at once if it sends pings itself.
 
 A misbehaving browser loses its own connection, and affects no other.
 """
@@ -39,13 +39,13 @@ from skytether.view.browser.access import TurnedAway, Visitor, refusal
 
 BROWSERS_MAX = 16
 CONNECTIONS_MAX = 32
-"""Largest number of connections at once, including those that only load the page or have sent no
+"""Largest number of connections at once, including those that load the page or have not sent a
 request yet."""
 MESSAGE_BYTES_MAX = 64 * 1024
 PIECES_MAX = 64
 FRAMES_MAX = 1024
 UNREAD_BYTES = 128 * 1024
-"""Size of the kernel's send buffer for a browser that does not read [B]; the kernel doubles it."""
+"""Size of the kernel's send buffer of a connection [B]; the kernel doubles this value."""
 RATE_HZ = 200.0
 """Messages per second that are read from one browser; dragging a slider sends 60."""
 BURST_S = 2.0
@@ -60,12 +60,12 @@ MESSAGES = frozenset(
         "ViewerCameraMessage",
     }
 )
-"""Types of viser's messages that the page's elements send."""
+"""Types of viser messages that elements of the page send."""
 VALUE = "value"
 """The only attribute of an element that a browser may set."""
 PROTOCOL = f"viser-v{viser.__version__}"
 DRESS = Path(__file__).with_name("dress.html")
-"""Style and script that viser's page gets from us."""
+"""Style and script that this module adds to viser's page."""
 
 _QUIET = logging.getLogger(__name__)
 _QUIET.disabled = True  # invalid bytes from the network must not print a traceback
@@ -109,7 +109,7 @@ class Guard:
     def count(self, why: TurnedAway) -> None:
         with self._lock:
             self.counts[why] += 1
-            if str(self.counts[why]).strip("0") == "1":  # report the first, tenth, hundredth
+            if str(self.counts[why]).strip("0") == "1":  # report the 1st, 10th, 100th …
                 self._news.add(why)
 
     def events(self) -> list[BrowserRefused]:
@@ -140,14 +140,14 @@ class Guard:
             }
             return serve(partial(self._handle, handler), *at, **(own | rules))
 
-        # viser offers no hook for this, but looks this name up when it starts to listen.
+        # viser has no hook for this, but looks up this name when it starts to listen.
         sockets.serve = guarded  # type: ignore[assignment, misc]
         try:
             yield
         finally:
             sockets.serve = serve  # type: ignore[misc]
         if not used.is_set():
-            raise RuntimeError(f"viser {viser.__version__} listens in a way that is not known")
+            raise RuntimeError(f"this version of viser, {viser.__version__}, is unsupported")
 
     def _opened(
         self,
@@ -190,17 +190,17 @@ class Guard:
                 self.browsers -= 1
 
     def arrive(self, newcomer: "_Connection") -> None:
-        """Count a connection; if there are too many, end the longest silent one, or this one."""
+        """Count a connection; if there are too many, end the one silent longest, or this one."""
         self.connections += 1
         self.idle[newcomer] = None
         if self.connections > CONNECTIONS_MAX and not self._make_room(newcomer):
             newcomer.cut(TurnedAway.FULL)
 
     def _make_room(self, newcomer: sockets.ServerConnection, *, opened: bool = False) -> bool:
-        """End the longest silent connection but the newcomer; returns whether there is one.
+        """End the connection silent longest, except the newcomer; returns whether there is one.
 
         Args:
-            opened: whether it must be a websocket.
+            opened: whether the ended connection must be a websocket.
         """
         for each in self.idle:
             if each is not newcomer and (each.subprotocol or not opened):
@@ -218,7 +218,7 @@ class _Connection(sockets.ServerConnection):
         super().__init__(*protocol, **limits)
         self._guard = guard
         self._due_s = 0.0
-        """Time at which the messages so far would have been sent at RATE_HZ [s]."""
+        """Time at which the messages so far would end if sent at RATE_HZ [s]."""
         self._is_cut = False
         """Whether this guard has ended the connection."""
 
@@ -237,7 +237,7 @@ class _Connection(sockets.ServerConnection):
         super().data_received(data)
         if self in self._guard.idle:
             del self._guard.idle[self]
-            self._guard.idle[self] = None  # at the end
+            self._guard.idle[self] = None  # moves the connection to the end
         if len(self.recv_messages.frames) > FRAMES_MAX:
             self.cut(TurnedAway.ROOM)
 
@@ -248,7 +248,7 @@ class _Connection(sockets.ServerConnection):
         super().process_event(event)
 
     async def recv(self, decode: bool | None = None) -> Any:  # noqa: ARG002 - viser's are bytes
-        """Next message that the page accepts; others are dropped.
+        """Next message that the page accepts; drops all others.
 
         Raises:
             ConnectionClosed: the connection has ended.
@@ -264,7 +264,7 @@ class _Connection(sockets.ServerConnection):
                 self._guard.idle.pop(self, None)
                 return message
             self._guard.count(TurnedAway.MESSAGE)
-        # Reading the rest of a flood would take minutes, and keep another browser out.
+        # Reading the rest of a flood would take minutes, and block the place of another browser.
         await self.wait_closed()
         raise self.protocol.close_exc
 
@@ -285,7 +285,7 @@ class _Connection(sockets.ServerConnection):
 
 
 def _dress(response: Response) -> None:
-    """Add DRESS to a page, before its end."""
+    """Insert DRESS before the end of a page."""
     zipped = response.headers.get("Content-Encoding") == "gzip"
     response.body = _dressed(bytes(response.body), zipped=zipped)
     del response.headers["Content-Length"]

@@ -1,4 +1,4 @@
-"""Page that shows flights in a browser, live, by viser.
+"""Page that shows flights in a browser, drawn with viser.
 
 One thread draws for all browsers, 25 times a second, and only while a browser is open.
 """
@@ -22,7 +22,7 @@ from skytether.view.page.scene import Scene
 
 MOVES_HZ = 25
 MOVES_TO_A_DRAWING = 5
-"""Number of marker updates per redraw of lines, plots and words."""
+"""Number of marker updates per redraw of lines, plots and texts."""
 
 
 STOPPED_S = 30.0
@@ -33,14 +33,14 @@ warnings.filterwarnings("ignore", "Queued a .* on a closed connection", UserWarn
 
 
 def _silence() -> contextlib.redirect_stdout[io.StringIO]:
-    """Keep viser's prints off standard output; it prints even when asked not to."""
+    """Hide viser's output on standard output, which its options cannot turn off."""
     return contextlib.redirect_stdout(io.StringIO())
 
 
 def stop(server: viser.ViserServer) -> None:
-    """Stop a viser server, and wait until its thread has printed its last line.
+    """Stop a viser server, and wait for the end of its thread.
 
-    viser itself waits only for a second, and could print into another output later.
+    viser waits only for a second; its thread could print later, in the middle of other output.
     """
     thread = server._websock_server._server_thread
     with _silence():
@@ -55,8 +55,8 @@ class Page:
     Args:
         host, port: address that it listens at.
         now_ns: function that returns the time of the frames [ns]; by default this machine's clock.
-        token: secret that lets a visitor look and change the flight from any machine; empty if
-            there is none.
+        token: secret that lets a visitor watch and change the flight from any machine; empty for
+            none.
         more: adds further controls to a browser.
     """
 
@@ -79,10 +79,10 @@ class Page:
         self._server.gui.set_panel_label("Skytether")
         self._panels: dict[int, Panel] = {}
         self._waiting: viser.GuiMarkdownHandle | None = None
-        """What the flights wait for, shown until they begin."""
+        """Text that says what flights wait for, shown until they begin."""
         self._scene: Scene | None = None
         self._shown: tuple[object, ...] = ()
-        """State from which the scene was last built."""
+        """State for which the scene was built."""
         self._closed = threading.Event()
         self._thread = threading.Thread(target=self._work, daemon=True)
         self._thread.start()
@@ -130,7 +130,7 @@ class Page:
                 with self._alone(number):
                     self._panels[number] = self._panel(client)
                 draws = True
-                break  # one at a time, which bounds the cost of a browser that keeps reconnecting
+                break  # one per redraw, which bounds the cost of a browser that keeps reconnecting
         with self._server.atomic():
             self._scene.move(states)
             if draws:
@@ -143,7 +143,7 @@ class Page:
                         panel.show(now_ns)
 
     def _wait(self) -> None:
-        """Show what the flights that have not begun wait for."""
+        """Show what flights wait for that have not begun."""
         waits = [flight.waits for flight in self._flights if not flight.state.name]
         text = "\n\n".join(waits)
         if self._waiting is None:
@@ -158,9 +158,9 @@ class Page:
 
     @contextlib.contextmanager
     def _alone(self, number: int) -> Iterator[None]:
-        """Close only this browser's connection when its panel raises an error.
+        """If the panel raises an error in this block, close only this browser's connection.
 
-        viser sets values as browsers send them: texts for numbers, lists of any length.
+        viser accepts any value from a browser: texts for numbers, lists of any length.
         """
         try:
             yield

@@ -1,6 +1,6 @@
-"""Panel of one browser beside the scene: words, plots and, if allowed, controls.
+"""Panel of one browser beside the scene: texts, plots and, if allowed, controls.
 
-Each browser has a panel of its own; one that may only look gets no controls.
+Each browser has its own panel; a browser that may only watch gets no controls.
 """
 
 import time
@@ -34,7 +34,7 @@ from skytether.view.page.scene import GROUND_RGB, WIDE, Scene, in_space
 from skytether.view.page.state import GUIDED, LIVE_POINT, ZONED, VehicleTrack
 
 HELD_S = 1.5
-"""Time for which a slider stays where the user has put it [s]."""
+"""Time for which a slider keeps the position that the user has set [s]."""
 IMPAIRMENTS = 'Impairments joined by &, as in "constant(0.05) & loss(0.1)", see docs/network.md'
 ZONES = "Zones joined by &, as in 'box(-1, 1, 2, 3) & cylinder(0, -2, 0.5)', see docs/together.md"
 GUIDES, DRAWS = "sends the vehicle", "draws a zone"
@@ -45,9 +45,9 @@ MAY_END = (
 )
 ALL_IS_LOST = "Every packet is lost then, both ways."
 GOAL_S = 60.0
-"""Age up to which a desired position is shown as known [s]."""
+"""Largest age of a desired position that is shown [s]."""
 LEAD_S = 5.0
-"""Age up to which the position of a draggable target is shown as known [s]."""
+"""Largest age of a draggable target's position that is shown [s]."""
 AFTER_LEAP = (
     "After its position has leapt: fly on in the old frame (the leap is subtracted), in the new "
     "one (figure and fence move with it), or stay, see docs/failsafe.md"
@@ -57,9 +57,9 @@ FIXED = (
     "they cannot be changed in flight. Start a new flight with --control.scheme or --control.dt."
 )
 WIDE_PLOTS = 760
-"""Width of plots that have no scene beside them [pixels]."""
+"""Width of plots on a page without a scene [pixels]."""
 NARROW = 800
-"""Window width up to which panels lie over the scene, not beside it [pixels]."""
+"""Largest window width at which panels cover the scene instead of standing beside it [pixels]."""
 MOVED_M = 0.05
 """Distance of the target from its handle above which the handle follows [m]."""
 LIGHT = "Light page"
@@ -68,7 +68,7 @@ const label = [...document.querySelectorAll('label')].find(each => each.textCont
 const prefers = matchMedia('(prefers-color-scheme: light)').matches;
 if (prefers && !label.control.checked) label.control.click();
 ">"""
-"""HTML that makes the page light if the browser prefers that; the server cannot tell."""
+"""HTML that makes the page light if the browser prefers that, which the server does not know."""
 
 More = Callable[[viser.GuiApi], Callable[[], None]]
 
@@ -77,7 +77,7 @@ class Panel:
     """Panel of one browser.
 
     Args:
-        flights: flights on the page, all with known scenarios.
+        flights: flights on the page whose scenarios have arrived.
         unlock: checks a token and returns whether it is right; None if the page has no token.
         more: adds further controls for a browser that may change the flight; the function that it
             returns is called at each redraw.
@@ -98,7 +98,7 @@ class Panel:
         gui = client.gui
         self._dress(light=False)
         gui.set_panel_label("Skytether")
-        # On a narrow window a second panel would lie closed below everything in this one.
+        # In a narrow window, a second panel would be hidden below this one.
         tabs = gui.add_tab_group() if client.camera.image_width <= NARROW else None
         if tabs is None:
             gui.main_panel.dock_right()
@@ -134,7 +134,7 @@ class Panel:
         light = gui.add_checkbox(LIGHT, initial_value=False)
         gui.add_html(AS_PREFERRED)
 
-        # viser's own grid takes a computer without a GPU 1 s to draw, lines nearly nothing.
+        # Without a GPU, viser's own grid takes 1 s to draw; lines are fast.
         ground = self._client.scene.add_line_segments(
             "/ground",
             self._scene.ground,
@@ -175,7 +175,7 @@ class Panel:
         )
 
     def _let_look(self) -> None:
-        """Explain why this browser cannot change anything, and how it could."""
+        """Explain why this browser cannot change anything, and how to unlock it."""
         with self._play:
             text = "This page is read-only here: changes can be made on the machine itself"
             self._client.gui.add_html(
@@ -235,12 +235,12 @@ class Panel:
 
 
 def assign(handle: Any, value: Any) -> None:
-    """Set a handle's value; mypy takes viser's property for read-only."""
+    """Set a handle's value; a function, because mypy treats viser's property as read-only."""
     handle.value = value
 
 
 class _Note:
-    """Refusal in words, under the field that it is about."""
+    """Text of a refusal, under the field of the refused value."""
 
     def __init__(self, gui: viser.GuiApi) -> None:
         self._html = gui.add_html("", visible=False)
@@ -248,15 +248,15 @@ class _Note:
         self._own = ""
 
     def asks(self, keys: Iterable[str]) -> None:
-        """Show a refusal of these keys from now on."""
+        """From now on show refusals of these keys."""
         self._keys, self._own = frozenset(keys), ""
 
     def refuse(self, why: str) -> None:
-        """Show a refusal by the page itself, until the field asks again."""
+        """Show a refusal by the page itself, until the field's next request."""
         self._keys, self._own = frozenset(), why
 
     def show(self, flights: Sequence[PageFlight]) -> bool:
-        """Redraw; returns whether the newest answer is shown here."""
+        """Redraw; returns whether this note shows the newest answer."""
         refused = [each.answer for each in flights if each.refused and each.asked == self._keys]
         why = "; ".join(dict.fromkeys(refused)) or self._own
         self._html.content = words.refused(why)
@@ -267,11 +267,11 @@ class _Note:
 class _Slider:
     """Slider for a number that the browser can change.
 
-    Callbacks are coroutines, here and below: viser runs coroutines in order, and plain functions in
+    Callbacks in this module are coroutines: viser runs coroutines in order, and plain functions in
     any order.
 
     Args:
-        ask: asks the flights for a number, and returns the keys asked for.
+        ask: requests a number from the flights, and returns the requested keys.
     """
 
     def __init__(
@@ -310,7 +310,7 @@ class _Slider:
 
 
 class _Question:
-    """Question that confirms a change which may end the flight; one at a time.
+    """Question that asks to confirm a change which may end the flight; one at a time.
 
     Args:
         warning: consequence of the change.
@@ -332,7 +332,7 @@ class _Question:
         Args:
             yes: text of the button that confirms.
             change: called if the user confirms.
-            leave: called if not.
+            leave: called if the user does not confirm.
         """
         if self._shown is not None:
             leave()
@@ -353,7 +353,7 @@ class _Question:
 
 
 class _Network:
-    """Impairments of one path, which may be cut alone if there are several.
+    """Controls of one path's impairments; one of several paths can be cut alone.
 
     Args:
         number: number of the path, from 1.
@@ -548,12 +548,12 @@ class Controls:
             flight.ask(netem, values)
 
     def _chosen(self, values: dict[str, Any]) -> None:
-        """Ask the client of the chosen vehicle."""
+        """Request values from the client of the chosen vehicle."""
         for flight in self._flights:
             flight.ask(flight.client(self._vehicle()), values)
 
     def _ask(self, knob: Knob, number: float) -> Collection[str]:
-        """Ask for a number; returns the keys asked for."""
+        """Request a number; returns the requested keys."""
         keys: set[str] = set()
         for flight in self._flights:
             for process in flight.processes(knob.process):
@@ -614,7 +614,7 @@ class Controls:
 
 
 class _Mission:
-    """Controls of a mission: zones, as a text or drawn, and the chosen vehicle's goal."""
+    """Controls of a mission: zones, typed or drawn, and the chosen vehicle's goal."""
 
     def __init__(
         self,
@@ -724,7 +724,7 @@ class _Handle:
         return np.asarray(self._handle.position)
 
     def stay(self) -> None:
-        """Ignore positions for HELD_S, until the answer to a change has come."""
+        """Ignore positions for HELD_S, in which the answer to a change arrives."""
         self._free_s = time.monotonic() + HELD_S
 
     def put(self, place: NDArray[Any]) -> None:
@@ -740,7 +740,7 @@ class _Handle:
 
 
 class _Lead:
-    """Target that the user can drag, or place by a click."""
+    """Control of a target, which the user can drag, or place by a click."""
 
     def __init__(self, client: viser.ClientHandle, flights: Sequence[PageFlight]) -> None:
         self._flights = flights

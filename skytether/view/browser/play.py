@@ -1,8 +1,8 @@
-"""Sender of changes requested on the page to the flight's processes.
+"""Sender of changes from the page to the flight's processes.
 
-A dragged slider makes many requests per second, and processes may answer slowly: of the requests
-waiting for a key only the newest is sent. All go through the control sockets
-(`shell.driving.control`), and so through the checks of a scenario.
+A dragged slider makes many requests per second, and processes may answer slowly, so only the newest
+waiting request for a key is sent. Requests go through the control sockets
+(`shell.driving.control`), where they are checked like a scenario.
 """
 
 import threading
@@ -21,8 +21,8 @@ class Operator:
 
     Args:
         folder: folder of their control sockets.
-        answered: called in the thread with the name of a process, the requested values, and its
-            answer, or None for no answer.
+        answered: called in the thread with a process's name, the requested values, and the answer,
+            or None without an answer.
     """
 
     def __init__(self, folder: Path, answered: Answered) -> None:
@@ -36,7 +36,7 @@ class Operator:
         self._thread.start()
 
     def ask(self, process: str, values: Mapping[str, Any]) -> None:
-        """Queue a request for new values; without values, for the present ones."""
+        """Queue a request to change values; without values, a request for the present values."""
         with self._changed:
             self._wanted.setdefault(process, {}).update(values)
             self._changed.notify()
@@ -63,7 +63,7 @@ class Operator:
             try:
                 answer = caller.ask(values)
             except ControlError:
-                caller.close()  # a late answer must not be taken for the next request's
+                caller.close()  # a late answer must not be taken for the answer to the next request
                 raise
         except ControlError:
             return None

@@ -45,7 +45,7 @@ class Player:
         self._begin_ns = begin[0] if begin else 0
         self._times_ns = [each[0] for each in self._frames]
         self.end_ns = self._times_ns[-1] if self._times_ns else 0
-        """Time of the last frame since the first."""
+        """Time from the first frame to the last [ns]."""
         self._lock = threading.Lock()
         self._at_ns = 0
         self._next = 0
@@ -86,7 +86,7 @@ class Player:
         for _, place, process, frame in self._frames[self._next : until]:
             self._flights[place].take(process, frame)
         self._next = max(self._next, until)
-        self._at_ns = at_ns  # last: a page drawn in between would show the link as cut
+        self._at_ns = at_ns  # set last: a page drawn in between would show the link as cut
 
     def _work(self) -> None:
         before_s = time.monotonic()

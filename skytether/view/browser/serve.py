@@ -24,9 +24,9 @@ TOKEN_BYTES = 16
 POLL_S = 0.1
 """Interval at which Ctrl-C is checked."""
 PORTS, PORTS_TRIED = 65536, 100
-"""Number of ports that exist, and of those that are tried, from the requested one on."""
+"""Number of existing ports, and number of ports tried, from the requested one on."""
 ANYWHERE = ("0.0.0.0", "::")
-"""Wildcard addresses: they mean every interface, and nobody can connect to them."""
+"""Wildcard addresses, which mean every interface; a browser cannot connect to them."""
 
 
 @contextmanager
@@ -40,7 +40,7 @@ def followed(folder: Path, title: str = "") -> Iterator[PageFlight]:
 
 
 def feeds(folder: Path) -> dict[str, Path]:
-    """Feeds in a folder by their processes' names: of several clients, workers and servers."""
+    """Sockets of feeds in a folder, by process name; there may be several clients and workers."""
     found = sorted({*folder.glob("*.feed"), *folder.glob("*.feed.*")})
     return {each.name.replace(".feed", "", 1): each for each in found}
 
@@ -88,7 +88,7 @@ def next_free(host: str, port: int) -> int:
         return candidate
     else:
         why = f"it is taken, and so are the {PORTS_TRIED - 1} ports after it"
-    raise CommandError(f"--page: {address_text(host, port)}: cannot be listened on: {why}", RUN)
+    raise CommandError(f"--page: {address_text(host, port)}: cannot listen: {why}", RUN)
 
 
 def serve_until_interrupted(

@@ -1,7 +1,7 @@
-"""Changes in flight in words, such as "Loss 10 → 30 %".
+"""Descriptions of changes in flight, such as "Loss 10 → 30 %".
 
-A process reports a change as two values of a key (`Changed`), for impairments and triggers as whole
-texts. Here only what differs is said, in the names and units of the page's sliders.
+A process reports a change as two values of a key (`Changed`), which are whole texts for impairments
+and triggers. Descriptions have only the difference, in names and units of the sliders.
 """
 
 from collections.abc import Mapping, Sequence
@@ -21,7 +21,7 @@ NOTHING = "nothing"
 
 
 class Mark(Enum):
-    """What a change did to the link, as marked in plots."""
+    """Effect of a change on the link, as marked in plots."""
 
     CUT = "link cut"
     HEALED = "link healed"
@@ -37,7 +37,7 @@ def mark(event: Changed) -> Mark:
 
 
 def together(changed: Mapping[tuple[str, str], Changed], netems: int) -> str:
-    """Words for changes that were made at once, such as those of both directions.
+    """Description of changes made at once, such as those of both directions.
 
     Args:
         changed: changes by process and key.
@@ -50,7 +50,7 @@ def together(changed: Mapping[tuple[str, str], Changed], netems: int) -> str:
 
 
 def _where(changes: Sequence[tuple[str, Changed]], netems: int) -> str:
-    """Direction and path of changes of the network; empty for all of them."""
+    """Direction and path of changes of the network; empty if they apply to all."""
     ways = {
         event.name.replace("_", " ") or DIRECTIONS[event.key]
         for _, event in changes
@@ -76,7 +76,7 @@ def in_words(event: Changed) -> str:
 
 
 def _turned(key: str, before: Any, after: Any) -> str:
-    """Words for the sliders that explain a whole change; empty if they do not."""
+    """Description of a change by sliders; empty if sliders do not describe all of it."""
     said, values = [], {key: before}
     try:
         for knob in KNOBS:
@@ -85,13 +85,13 @@ def _turned(key: str, before: Any, after: Any) -> str:
                 said.append(f"{knob.name} {was:.6g} → {now:.6g} {knob.unit}".rstrip())
                 values = applied(values, knob.write(values, now))
         is_all = key not in TEXTS or TEXTS[key].parse(values[key]) == TEXTS[key].parse(after)
-    except (GrammarError, LookupError, TypeError, ValueError):  # of another version
+    except (GrammarError, LookupError, TypeError, ValueError):  # a value of another version
         return ""
     return ", ".join(said) if is_all else ""
 
 
 def _differing(before: str, after: str) -> tuple[str, str]:
-    """Calls of two texts that are not in both; the whole texts if they are not joined by &."""
+    """Calls that are not in both texts; the whole texts if calls are not joined by &."""
     try:
         was, now = ([each.text for each in calls(text, "")] for text in (before, after))
     except GrammarError:

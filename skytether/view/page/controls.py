@@ -1,8 +1,7 @@
 """Numbers that may be changed in flight, described as sliders of a page.
 
-Each has a name, a range, and functions that read it from, and write it to, the keys that a process
-lets change (docs/operating.md). Nothing is checked here: the processes check changes as they check
-a scenario.
+Each has a name, a range, and functions that read and write the keys of a process that may change
+(docs/operating.md). Values are not checked here: the processes check changes like a scenario.
 """
 
 from collections.abc import Callable, Mapping
@@ -41,8 +40,8 @@ class Knob:
     read: Read
     """Function that reads the number from the process's values; None if there is no such number."""
     write: Write
-    """Function that returns the changed keys and values, given the present values. A key is as
-    narrow as can be, such as `network.uplink.loss`: the process keeps the rest of its text.
+    """Function that returns the changed keys and values, given the present values. A key names only
+    the changed argument, such as `network.uplink.loss`: the process keeps the rest of the text.
     """
 
     @property
@@ -114,7 +113,7 @@ def _ways(names: tuple[str, ...], scale: float) -> tuple[Read, Write]:
     """Slider for the first argument of an impairment in both directions, in another unit.
 
     Args:
-        names: impairments; the one that a direction has is changed.
+        names: names of impairments; the one in a direction's text is changed.
         scale: factor from the argument to the slider's number.
     """
 
@@ -134,7 +133,7 @@ def _ways(names: tuple[str, ...], scale: float) -> tuple[Read, Write]:
 
 
 def _component(key: str, axis: int, axes: int) -> tuple[Read, Write]:
-    """Component of a list with one number per axis, or of an empty list."""
+    """Slider for a component of a list with one number per axis, or of an empty list."""
 
     def write(values: Values, number: float) -> dict[str, Any]:
         numbers = list(values[key]) or [0.0] * axes
@@ -153,7 +152,7 @@ def _component(key: str, axis: int, axes: int) -> tuple[Read, Write]:
 def _argument(
     name: str, unit: str, hint: str, at: str, low: float, high: float, step: float
 ) -> Knob:
-    """Slider for an argument of the trigger; a whole number if the step is."""
+    """Slider for an argument of the trigger; integers only if the step is an integer."""
     key = f"control.trigger.{at}"
 
     def write(_: Values, number: float) -> dict[str, Any]:
@@ -225,7 +224,7 @@ THRESHOLDS = (
         1.0,
     ),
 )
-"""Sliders for the thresholds of triggers, each shown if the present trigger compares it."""
+"""Sliders for thresholds; each is shown if the present trigger has this threshold."""
 
 TRIGGERS = (
     "always",

@@ -11,7 +11,7 @@ from skytether.shared.telemetry.record import DOWNLINK, UPLINK
 from skytether.shared.telemetry.record import Rows as Table
 
 SPAN_S = 60.0
-"""Time that is kept."""
+"""Length of the stored history."""
 BIN_NS = 250 * MILLISECOND_NS
 BINS = int(SPAN_S * SECOND_NS) // BIN_NS
 DELAY_BIN_NS = 20 * MILLISECOND_NS
@@ -23,7 +23,7 @@ DIRECTIONS = {UPLINK: "up", DOWNLINK: "down"}
 
 @dataclass(frozen=True, slots=True)
 class Traffic:
-    """One direction of the network in the last seconds."""
+    """Statistics of one direction of the network over the last seconds."""
 
     packets_per_s: float
     bytes_per_s: float
@@ -51,11 +51,11 @@ class Network:
         """Sum of the delays of packets that arrived [ns]."""
         self._delays = np.zeros((*shape, DELAY_BINS), np.int64)
         self._waiting = np.zeros(shape)
-        """Packets that netem was delaying at the end of each bin."""
+        """Number of packets in netem at the end of each bin."""
         self._horizons = np.zeros((BINS, 2), np.int64)
         """Uplink packets that carry a horizon: their number, and their bytes."""
         self.heard_ns: dict[int, int] = {}
-        """Time at which a packet last arrived, by direction [ns]."""
+        """Arrival time of the newest packet, by direction [ns]."""
 
     def take(self, rows: Table, *, time_ns: int) -> None:
         at = self._at(time_ns)
@@ -153,7 +153,7 @@ class Network:
         return np.where(count > 0, total_ns / np.maximum(count, 1), np.nan) / SECOND_NS
 
     def bins(self, direction: int, now_ns: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Packets, and lost ones, in each bin until now, oldest first; shape (BINS,)."""
+        """Numbers of packets and of lost packets in each bin, oldest first; shape (BINS,)."""
         numbers = now_ns // BIN_NS - np.arange(BINS)[::-1]
         is_kept = self._bin[numbers % BINS] == numbers
         packets, lost = (

@@ -1,4 +1,4 @@
-"""Plots of a page: the last minute of one vehicle of each flight, and of their networks."""
+"""Plots of a page: the last minute of one vehicle per flight, and of the networks."""
 
 import math
 from collections.abc import Callable, Iterable, Sequence
@@ -20,13 +20,13 @@ from skytether.view.page.state import Curves, State
 
 POINTS = 400
 SEEN = 4.0
-"""Upper limit of the trigger's plot, in thresholds."""
+"""Upper limit of the trigger's plot, as a multiple of the threshold."""
 SPARE = 6
 """Number of zeros left at the end of a cropped plot."""
 HEIGHT, BANDS_HEIGHT, AXIS = 115, 75, 35
-"""Heights of a plot and one of bands without a horizontal axis, and that of the axis [pixels]."""
+"""Heights of a plot and a plot of bands without horizontal axis, and of the axis [pixels]."""
 BAND_MODE, BAND_LINK, BAND_ENDS = 2.0, 1.0, (0.0, 3.0)
-"""Heights of the bands of `STATE`, and of its range."""
+"""Vertical positions of the bands of `STATE`, and its vertical range."""
 GREY = "#868e96"
 UP, DOWN = "#12b886", "#e64980"
 """Colours of the two directions, in plots of one flight or of data that all flights share."""
@@ -38,7 +38,7 @@ MARKS: dict[Mark, str] = {
 }
 """Colours of the vertical lines at changes."""
 BANDS = {GREEN: "TRACK", AMBER: "COAST", RED: "BRAKE", BLUE: "HOVER", VIOLET: "LAND"}
-"""Modes, one for each colour of a mode that matters."""
+"""Mode shown for each colour."""
 LINKS = {GREEN: "link good", AMBER: "degraded", RED: "cut"}
 UNSEEN: uplot.Series = {"label": "\u00a0", "stroke": "transparent", "points": {"show": False}}
 """Invisible series that widens a plot's range: changing the range itself would redraw all."""
@@ -64,7 +64,7 @@ class PlotLine:
     label: str
     values: Values
     rgb: str = ""
-    """Colour; the flight's if empty, or if several flights have this line."""
+    """Colour; the flight's colour if empty, or if several flights have this line."""
     dash: tuple[int, ...] = ()
     width: float = 1.5
     once: bool = False
@@ -100,7 +100,7 @@ def _axis(axis: int) -> tuple[PlotLine, ...]:
 
 
 def _seconds(look: Look) -> Array:
-    """Seconds of flight shown [s], one each."""
+    """Times of flight shown [s], one per second."""
     ages_s = np.arange(-SPAN_S, 0.0) + 0.5
     return look.state.time_s(look.now_ns) + ages_s
 
@@ -219,7 +219,7 @@ STATE = Plot(
 
 
 def of_flight(*, mission: bool = False) -> tuple[Plot, ...]:
-    """Plots that an operator decides by; the state is that of the first flight."""
+    """Plots for an operator's decisions; the state is that of the first flight."""
     return (
         ERROR,
         *((APART,) if mission else ()),
@@ -386,7 +386,7 @@ class Plots:
 
 
 def on_one_axis(plots: Sequence[Sequence[Array]]) -> list[list[Array]]:
-    """Data of plots over time on one grid, the finest, from the first time at which any is known.
+    """Data of plots on one time grid, the finest, from the first time with a value in any plot.
 
     Args:
         plots: times of each plot, and its values at them.
@@ -405,7 +405,7 @@ def on_one_axis(plots: Sequence[Sequence[Array]]) -> list[list[Array]]:
 
 
 def marked(data: Sequence[Array], marks: Iterable[tuple[float, Mark]]) -> list[Array]:
-    """A line for each of MARKS: from the least value of a plot to the largest at each change."""
+    """Vertical lines at changes, for each of MARKS, between a plot's extreme values."""
     time_s, *lines = data
     finite = np.concatenate([line[~np.isnan(line)] for line in lines])
     low, high = (finite.min(), finite.max()) if len(finite) else (0.0, 1.0)
@@ -418,7 +418,7 @@ def marked(data: Sequence[Array], marks: Iterable[tuple[float, Mark]]) -> list[A
 
 
 def spans(plots: Sequence[Sequence[Array]]) -> list[tuple[float, float]]:
-    """Ranges of the same width that contain the values of each plot, around their middles."""
+    """Vertical ranges, equally wide in all plots, centred on the values of each plot."""
     together = [np.concatenate(lines) for lines in plots]
     finite = [values[~np.isnan(values)] for values in together]
     finite = [values if len(values) else np.zeros(1) for values in finite]

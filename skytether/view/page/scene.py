@@ -1,6 +1,6 @@
 """Scene of a page: vehicles, their trails, their plans, and their desired positions.
 
-Metres, third axis up. A flight in the plane is seen from above.
+Units are metres, the third axis points up. A planar flight is seen from above.
 """
 
 from collections.abc import Sequence
@@ -37,7 +37,7 @@ TRAIL_POINTS_ALL = 2000
 ROUND_S = 600.0
 """Longest part of the desired trajectory that is drawn."""
 SHADE = 0.45
-"""Share of a flight's colour that its vehicles have: the scene's lights make them pale."""
+"""Brightness of vehicles, as a share of the flight's colour: the scene's lights brighten them."""
 SIZE = 0.05
 """Size of a vehicle, relative to the extent of the flight."""
 WIDE, NARROW = 1.5, 0.6
@@ -82,7 +82,7 @@ def extent(scenarios: Sequence[Scenario]) -> tuple[Array, float]:
 
 
 def _desired(scenario: Scenario) -> Array:
-    """Points of the desired trajectory, or corners of its bounding box [m]; shape (n, axes)."""
+    """Points of the desired trajectory, or corners of its bounds [m]; shape (n, axes)."""
     shape, axes = scenario.reference.shape, scenario.model.axes
     if shape == "target":
         corner = np.zeros(axes)
@@ -97,7 +97,7 @@ def _desired(scenario: Scenario) -> Array:
         return np.array([middle - corner, middle + corner])
     try:
         reference = scenario.unallocated_reference()
-    except (ConfigError, ValueError):  # the trajectory's table is on another machine
+    except (ConfigError, ValueError):  # the file of the trajectory is on another machine
         return np.zeros((2, axes))
     if isinstance(reference, Mission):
         return reference.places
@@ -319,7 +319,7 @@ class Scene:
     """Scene with the flights of a page.
 
     Args:
-        states: states of flights, all with known scenarios.
+        states: states of flights whose scenarios have arrived.
         titles: titles of the flights; empty for a single flight.
     """
 
@@ -343,7 +343,7 @@ class Scene:
     def camera(self, aspect: float) -> tuple[Array, Array]:
         """Position and target of a camera that sees everything, in a window of this aspect ratio.
 
-        In a narrow window the flight is in the upper half, because words cover the lower half.
+        In a narrow window the flight is in the upper half, because texts cover the lower half.
         """
         away_m = self.reach_m / np.tan(FOV_RAD / 2) / min(1.0, aspect)
         down_m = 0.5 * self.reach_m / aspect if aspect < NARROW else 0.0

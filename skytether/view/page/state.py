@@ -51,18 +51,18 @@ from skytether.view.page.network import BIN_NS, BINS, DIRECTIONS, SPAN_S, Networ
 from skytether.view.rows import check_columns, check_values, planned
 
 SLOTS_MAX = 1200
-"""Largest number of steps that are kept of a vehicle; with more steps per minute, only every n-th
-is kept."""
+"""Largest number of stored steps of a vehicle; with more steps per minute, only every n-th is
+stored."""
 VEHICLES_MAX = 64
 ZONED, GUIDED = "mission.zones", "mission.goals"
 """Keys of a mission's zones, and of its goals changed in flight."""
 PLANS_MAX = 8
-"""Number of plans of a vehicle that are kept, retransmissions included."""
+"""Number of stored plans of a vehicle, including retransmissions."""
 SAID_MAX = 50
 FOLDED_S = 10.0
-"""Age of an event up to which one with the same words is counted, not repeated [s]."""
+"""Time within which an event with the same text is counted, not shown again [s]."""
 AT_ONCE_S = 2.0
-"""Time within which changes of one key, as a slider is dragged, are one change [s]."""
+"""Time within which changes of one key, as by a dragged slider, count as one change [s]."""
 LIVE_POINT = "reference.points_m"
 """Key that changes many times a second while a target is dragged; its changes are not logged."""
 LOSS_S = 10.0
@@ -70,7 +70,7 @@ LOSS_S = 10.0
 LOSS_HIGH = 0.3
 """Loss above which a link is called degraded."""
 TRAJECTORY_BYTES = 32
-"""Size between that of a heartbeat and that of the shortest trajectory [B], without encryption."""
+"""Size without encryption between a heartbeat's and the shortest trajectory's [B]."""
 
 NO_SESSION = "there is no session yet"
 ONLY_SERVER = "only the server tells of this vehicle"
@@ -101,7 +101,7 @@ class Curves:
     figure: Array
     """Figure that the trigger compares; shape (n,)."""
     threshold: Array
-    """Threshold that the figure is compared with; shape (n,)."""
+    """Threshold of the figure; shape (n,)."""
     age_s: Array
     """Age of the observation from which the input in force was computed [s]; shape (n,)."""
     solve_ms: Array
@@ -118,10 +118,10 @@ class Curves:
 
 @dataclass(frozen=True, slots=True)
 class Heard:
-    """Event of a flight, or several with the same words."""
+    """Event of a flight, or several with the same text."""
 
     time_s: float
-    """Time of flight of the newest [s]."""
+    """Time of flight of the newest of these events [s]."""
     text: str
     count: int = 1
 
@@ -132,11 +132,11 @@ class VehicleTrack:
     def __init__(self, number: int, scenario: Scenario) -> None:
         self.number = number
         self.client = self.server = ""
-        """Processes of the newest rows of either end; empty before any."""
+        """Processes of the newest rows from client and server; empty before any."""
         self._scenario = scenario
         steps = max(1, round(SPAN_S / scenario.control.dt))
         self._stride = -(-steps // SLOTS_MAX)
-        """Number of steps between two that are kept."""
+        """Number of steps from one stored step to the next."""
         self._slot_s = self._stride * scenario.control.dt
         self._slots = -(-steps // self._stride)
         axes = scenario.model.axes
@@ -158,14 +158,14 @@ class VehicleTrack:
             self._empty[name] = np.nan
         self._ring["slot"] = -1
         self.row: np.void | None = None
-        """Newest row of the client's part; None without any."""
+        """Newest row of the client's part; None before any."""
         self.planned = 0
         self.sent = SentBy(0, 0)
-        """Plans that the server sent at the steps seen."""
+        """Number of plans that the server sent at the steps received so far."""
         self._plans: deque[np.void] = deque(maxlen=PLANS_MAX)
         """Newest plans sent to the vehicle, the newest last."""
         self._seen: np.void | None = None
-        """Newest row of the server's part; None without any."""
+        """Newest row of the server's part; None before any."""
 
     # -- incoming frames ---------------------------------------------------------------------
 
@@ -241,7 +241,7 @@ class VehicleTrack:
 
     @property
     def known_s(self) -> float:
-        """Age of the server's newest observation when it planned last [s]; NaN if there is none."""
+        """Age of the newest observation at the server's last planning [s]; NaN if there is none."""
         if self._seen is None or self._seen["observed_step"] < 0:
             return np.nan
         behind = int(self._seen["step"] - self._seen["observed_step"])
@@ -274,7 +274,7 @@ class VehicleTrack:
         return self._along(self._plans[-1])
 
     def motions(self) -> list[Array]:
-        """Positions along each plan that may be flown, see `ahead`.
+        """Positions along each plan that the vehicle may fly, see `ahead`.
 
         On a mission: the plan in force and those that may still be accepted.
         """
@@ -347,7 +347,7 @@ def group(figures: dict[str, Any], *names: str) -> dict[str, Any]:
 
 
 def _groups(value: Any) -> list[dict[str, Any]]:
-    """Groups of a list of figures; none if it is no list."""
+    """Groups in a list of figures; empty if the value is not a list."""
     return [each for each in value if isinstance(each, dict)] if isinstance(value, list) else []
 
 
@@ -358,18 +358,18 @@ def figure(figures: dict[str, Any], *names: str) -> float:
 
 
 ENDS = "server", "client"
-"""Roles of processes that each flight has; a netem it may be without."""
+"""Roles of processes that each flight has; a netem is optional."""
 
 
 @dataclass(slots=True)
 class _Process:
     opened: Opened
     role: str
-    """What it is: server, netem or client; several processes may be the same."""
+    """Role: server, netem or client; several processes may have the same role."""
     columns: dict[str, np.dtype[np.void]]
     newest_ns: int = 0
     seen_ns: int = -1
-    """Time up to which incoming frames are repetitions [ns]."""
+    """Time up to which frames were received before a reconnection [ns]."""
     figures: dict[str, Any] = field(default_factory=dict)
 
 
@@ -385,10 +385,10 @@ class State:
         self.scenario = Scenario()
         """Scenario of the first process that sent frames; the client's once it sends any."""
         self.duration_s = 0.0
-        """Length of the flight [s]: the client's, if a client sends frames."""
+        """Length of the flight [s], from the client if it sends frames."""
         self.vehicles: dict[int, VehicleTrack] = {}
         self.omitted = 0
-        """Number of dropped rows, of vehicles beyond VEHICLES_MAX."""
+        """Number of rows dropped because of more than VEHICLES_MAX vehicles."""
         self._zones: str | None = None
         """Zones as changed in flight; None before a change."""
         self.network = Network(0)
@@ -397,7 +397,7 @@ class State:
         self.marks: deque[tuple[float, Mark]] = deque(maxlen=SAID_MAX)
         """Newest changes, oldest first, with their times of flight [s]."""
         self.changed: dict[tuple[str, str], Changed] = {}
-        """Newest change, by process and key: several keys if they were changed at once."""
+        """Newest change, by process and key; has several keys if they were changed at once."""
         self.newest_ns = 0
         self.begin_ns: int | None = None
         """Start of the flight's step 0 [ns]; None before any step."""
@@ -439,7 +439,7 @@ class State:
         self._lost.discard(process)
         process_state = self._processes.get(process)
         if process_state and process_state.opened.time_ns == opened.time_ns:
-            # after a reconnection, the feed repeats the frames that it keeps for new readers
+            # after a reconnection the feed repeats its newest frames
             process_state.seen_ns = process_state.newest_ns
             return
         try:
@@ -469,7 +469,7 @@ class State:
         self._processes[process] = _Process(opened, role, columns)
 
     def _others_fly(self, client: str) -> bool:
-        """Whether another client than this process is heard: then the flight goes on."""
+        """Whether another client sends frames, so that the flight goes on without this one."""
         return any(
             each.role == "client" and name != client and name not in self._lost
             for name, each in self._processes.items()
@@ -526,7 +526,7 @@ class State:
         self.said.append(Heard(time_s, text, count))
 
     def _change(self, process: str, event: Changed, time_s: float) -> None:
-        """Hear of a change; it may continue the newest one, or be its other direction or path."""
+        """Record a change; it may be merged with the newest one, also of the other direction."""
         if event.key == ZONED:
             self._zones = msgspec.json.decode(event.after)
         marked, before = mark(event), self.changed.get((process, event.key))
@@ -537,7 +537,7 @@ class State:
             and time_s - self.said[-1].time_s < AT_ONCE_S
             and all(key == event.key or {key, event.key} <= {*WAYS} for _, key in self.changed)
             and marked is self.marks[-1][1]
-            and (before is None or before.before != event.after)  # else it is undone
+            and (before is None or before.before != event.after)  # otherwise it undoes the change
         ):
             self.said.pop()
             if before:
@@ -552,7 +552,7 @@ class State:
 
     @property
     def flies(self) -> bool:
-        """Whether a vehicle or a server is known; netem alone may carry any protocol."""
+        """Whether a vehicle or server has sent frames; netem alone may carry any protocol."""
         return any(each.role != "netem" for each in self._processes.values())
 
     @property
@@ -569,7 +569,7 @@ class State:
         return {way: name.replace("_", " ") for way, name in enumerate(self.ways)}
 
     def time_s(self, time_ns: int) -> float:
-        """Time of flight [s] at a time [ns], 0 before it; of netem alone, its running time."""
+        """Time of flight [s] at a time [ns], 0 before the flight; without one, running time."""
         begin_ns = self.begin_ns
         if begin_ns is None and not self.flies:
             begin_ns = min((each.opened.time_ns for each in self._processes.values()), default=None)
@@ -586,7 +586,7 @@ class State:
 
     @property
     def has_zones(self) -> bool:
-        """Whether the vehicle has a fence, or zones to avoid."""
+        """Whether the flight has a fence or zones to avoid."""
         return self.scenario.fence.is_there or self.scenario.is_mission
 
     @property
@@ -643,7 +643,7 @@ class State:
 
     @property
     def missing(self) -> tuple[str, ...]:
-        """What a flight has and nobody tells of: roles, and vehicles that only a server knows."""
+        """Missing processes: roles without one, and clients of vehicles only a server reports."""
         if not self.flies:
             return ()
         roles = {each.role for each in self._processes.values()}
@@ -654,18 +654,18 @@ class State:
         return tuple(absent)
 
     def role(self, process: str) -> str:
-        """What a process is: server, netem or client; empty before its feed has begun."""
+        """Role of a process: server, netem or client; empty before its first frame."""
         heard = self._processes.get(process)
         return heard.role if heard else ""
 
     def figures(self, role: str) -> dict[str, Any]:
-        """Figures of the first process of a role that has any; empty without one."""
+        """Figures of the first process of a role that has sent any; otherwise empty."""
         all_figures = (each.figures for each in self._processes.values() if each.role == role)
         return next(filter(None, all_figures), {})
 
     def of_vehicle(self, role: str, number: int) -> dict[str, Any]:
-        """Figures of a vehicle by its client, or by the server that plans for it; or else by any
-        process of the role that has them.
+        """Figures of a vehicle from its client or from the server that plans for it, otherwise from
+        any process of the role that has them.
         """
         track = self.vehicles.get(number)
         own = {"client": track.client, "server": track.server}.get(role) if track else None
@@ -678,7 +678,7 @@ class State:
 
     @property
     def every_step(self) -> float:
-        """Packets per second if all vehicles got one at every step."""
+        """Packet rate if every vehicle received a packet at every step [1/s]."""
         return max(1, len(self.vehicles)) / self.scenario.control.dt
 
     @property
@@ -705,7 +705,7 @@ class State:
         return np.select([~is_flown, cut, degraded], ["", RED, AMBER], GREEN)
 
     def link(self, number: int, now_ns: int) -> Word:
-        """State of a vehicle's link, in words."""
+        """Text for the state of a vehicle's link."""
         track = self.vehicles.get(number)
         if track is None or track.row is None or track.mode is Mode.INIT:
             is_seen = track is not None and track.server and not track.client

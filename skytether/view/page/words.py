@@ -1,4 +1,4 @@
-"""Status of a flight on a page, in words, as HTML."""
+"""Texts of a flight's status on a page, as HTML."""
 
 from collections.abc import Iterable, Sequence
 from html import escape
@@ -30,7 +30,7 @@ FATES = ("packets", "lost", "dropped", "reordered", "duplicated", "corrupted")
 """Counters of netem for a direction, and their titles."""
 
 SILENT = 0.5
-"""Probability that a packet does not arrive above which a path counts as silent."""
+"""Probability of loss above which a path counts as silent."""
 PATH = (
     "",
     "state",
@@ -40,7 +40,7 @@ PATH = (
     "packets up, down",
     "came first up, down",
 )
-"""Names of what is shown of each path."""
+"""Names of the rows that are shown for each path."""
 
 FLOWN_S = "data-flown-s"
 """HTML attribute with the time of flight [s], for programs."""
@@ -65,7 +65,7 @@ def number(value: float, form: str, unit: str = "") -> str:
 
 
 def status(state: State, vehicle: int, now_ns: int, title: str = "") -> str:
-    """What an operator decides by: state, link, error, losses and the newest events."""
+    """Figures for an operator's decisions: state, link, error, losses and the newest events."""
     if not state.name:
         return f'<div style="{_BODY}">{escape(title)} No flight yet.</div>'
     if not state.flies:
@@ -121,7 +121,7 @@ def figures(state: State, vehicle: int, now_ns: int, title: str = "") -> str:
 
 
 def _carried(state: State, now_ns: int, title: str) -> str:
-    """Counters of netem where it carries other programs' packets."""
+    """Counters of netem, if it carries other programs' packets."""
     counted = state.figures("netem")
     rows = [("flows", number(figure(counted, "flows"), ".0f")), *_rates(state, now_ns)]
     rows += [(f"lost, last {LOSS_S:.0f} s", _lost(state, now_ns)), _delays(state, now_ns)]
@@ -139,7 +139,7 @@ def _carried(state: State, now_ns: int, title: str) -> str:
 
 
 def _table(rows: Sequence[Sequence[str]]) -> str:
-    """Table with a name at the left of each row; empty without rows."""
+    """HTML table whose rows begin with a name; empty without rows."""
     style = f"{_DIM};padding-right:0.8em;vertical-align:top;white-space:nowrap"
     lines = "".join(
         f'<tr><td style="{style}">{escape(name)}</td>'
@@ -206,7 +206,7 @@ def _mission(state: State, vehicle: int) -> list[tuple[str, str]]:
 
 def _autopilot(state: State, vehicle: int) -> list[tuple[str, str]]:
     says = group(state.of_vehicle("client", vehicle), "autopilot")
-    if "mode" not in says:  # a robot has none of these
+    if "mode" not in says:  # a flight without modes has none of these figures
         return []
     armed = "armed" if says.get("armed") else "disarmed"
     charge, volts = 100.0 * figure(says, "battery"), figure(says, "voltage_v")
@@ -298,13 +298,13 @@ def refused(why: str) -> str:
 
 
 def explained(text: str, following: str, refused_: str, command: str) -> str:
-    """Explanation of a brake, as far as it is known.
+    """HTML of the explanation of a brake event, so far as it is known.
 
     Args:
-        text: as plain text; its tables are the indented lines.
-        following: what it waits for; empty if it is complete.
-        refused_: why there is none.
-        command: command that explains the same.
+        text: explanation as plain text; indented lines are tables.
+        following: step in progress; empty if the explanation is complete.
+        refused_: reason why there is no explanation.
+        command: command that makes the same explanation.
     """
     lines = ""
     for is_table, some in groupby(text.splitlines(), _is_tabular):
@@ -326,10 +326,10 @@ def _is_tabular(line: str) -> bool:
 
 
 def answers(given: Sequence[tuple[str, bool]]) -> str:
-    """Answers to the newest request; one of a line does not move the page.
+    """HTML of the answers to the newest request; an answer of one line does not move the page.
 
     Args:
-        given: answer of each flight, and whether it is a refusal.
+        given: each flight's answer, and whether it is a refusal.
     """
     lines = "".join(
         f'<div style="color:{CSS["red" if refused else "green"]}">{escape(text)}</div>'

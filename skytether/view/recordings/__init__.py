@@ -1,12 +1,12 @@
-"""Recordings: flights in MCAP files, which other programs such as Foxglove read too.
+"""Recordings: flights in MCAP files, which other programs such as Foxglove can read.
 
-    recording  writes a file; `container` bounds what reading one may cost
-    recorded   reads a file: its frames, and their rows, bit for bit
-    joining    recordings of the processes of one flight, as one
+    recording  writes a file; `container` limits the memory for reading one
+    recorded   reads a file: frames and rows, equal to the last bit
+    joining    merges recordings of one flight's processes
     export     tables, CSV or Parquet
-    traffic    netem's packets as delay traces, and as a capture
+    traffic    netem's packets as delay traces and as a pcap capture
     foxglove   messages that Foxglove draws
-    outcome    what happened, in words
+    outcome    sentences about what happened
     report     an HTML page with figures
 
 Nothing is registered: `skytether fly --record`, `replay`, `report`, `export` and `join`, and

@@ -2,8 +2,8 @@
 
 A file of a few kilobytes may claim to hold gigabytes, and the library `mcap` allocates them. So the
 library gets records that end within the file, and chunks whose size is known before they are
-decompressed. The file is read once, from its beginning, so that one without an index, whose writer
-was killed, can be read as well. After a damaged record reading goes on at the next chunk.
+decompressed. The file is read once, from its beginning, so that a file without an index, whose
+writer was killed, can be read as well. After a damaged record, reading continues at the next chunk.
 """
 
 import os
@@ -43,11 +43,11 @@ MAGIC = b"\x89MCAP0\r\n"
 ENCODING = "msgpack"
 """Encoding of the messages that are read back; others are written for other programs."""
 COPY, COPY_OF = "/copy", "copy_of"
-"""Of a channel with a copy of another's first message: the prefix of its topic, and its metadata
-with the other's number.
+"""Topic prefix of a channel that copies another channel's first message, and metadata key for the
+number of the other channel.
 """
 HEAD = struct.Struct("<BQ")
-"""Head of a record: its kind and the size of the rest [B]."""
+"""Head of a record: kind, and size of the rest [B]."""
 KINDS: Mapping[int, Any] = {
     Opcode.HEADER: Header,
     Opcode.CHUNK: Chunk,
@@ -56,23 +56,23 @@ KINDS: Mapping[int, Any] = {
     Opcode.METADATA: Metadata,
     Opcode.DATA_END: DataEnd,
 }
-"""Records of a recording outside of chunks, up to the end of its data."""
+"""Types of records outside of chunks, up to the end of a recording's data."""
 CHUNK = re.compile(rb"\x06.{36}\x04\0\0\0zstd.{8}\x28\xb5\x2f\xfd", re.DOTALL)
-"""Beginning of a chunk, by which the next one is found after a damaged record."""
+"""Pattern of a chunk's beginning, to find the next chunk after a damaged record."""
 CHUNK_HEAD_BYTES = 57
 DAMAGES_MAX = 100
-"""Largest number of damaged places after which reading goes on; it bounds the time it takes."""
+"""Largest number of damaged places after which reading continues; it bounds the reading time."""
 
 CHUNK_BYTES_MAX = 5 * 1024 * 1024
 """Largest size of a decompressed chunk [B]; Skytether writes 256 KiB and a message."""
 SPARE_BYTES = 16 * 1024 * 1024
-"""Total decompressed size of chunks that any file may have, however small it is [B]."""
+"""Total decompressed size of chunks that even a small file may have [B]."""
 RATIO_MAX = 50
-"""Largest total decompressed size of the chunks over the file's size; flights have 3 to 5, because
-the index of messages is not compressed.
+"""Largest ratio of the chunks' total decompressed size to the file's size; flights have 3 to 5,
+because the index of messages is not compressed.
 """
 SPARE_MESSAGES = 10_000
-"""Number of messages that any file may have: those of a chunk whose index was not written yet."""
+"""Number of messages allowed without an index, in the last chunk of a killed writer."""
 INDEXED_BYTES = 16
 """Size of a message's entry in the index [B]; it bounds the number of messages in a file."""
 
@@ -98,9 +98,9 @@ def reading(path: Path) -> Iterator[None]:
         yield
     except RecordingError:
         raise
-    except ConfigError as error:  # of another version, or its trajectory's file is missing here
+    except ConfigError as error:  # of another version, or the trajectory's file is missing here
         raise RecordingError(f"{path}: {error}") from None
-    except FeedError as error:  # the checksum of its chunk was right
+    except FeedError as error:  # the checksum of the chunk was right
         raise RecordingError(f"{path}: it is of another version, or damaged: {error}") from None
     except BROKEN as error:
         what = (str(error).splitlines() or [type(error).__name__])[0]
@@ -125,9 +125,9 @@ class Container:
             raise RecordingError(f"{path}: {what}, expected a recording ({RECORDING})") from None
         self._size = os.fstat(self._file.fileno()).st_size
         self.lost_bytes = 0
-        """Bytes lost at the end of a file that was not completed; valid after `messages`."""
+        """Number of bytes lost at the end of an incomplete file; valid after `messages`."""
         self.damaged_bytes = 0
-        """Bytes of damaged records, which are left out; valid after `messages`."""
+        """Number of bytes of damaged records, which are skipped; valid after `messages`."""
         try:
             if self._file.read(len(MAGIC)) != MAGIC:
                 what = "it is not an MCAP file" if self._size else "it is empty"
@@ -145,11 +145,11 @@ class Container:
     def messages(self) -> Iterator[tuple[str, bytes]]:
         """Topics and contents of messages in the encoding that is read back, in file order.
 
-        Damaged records are left out, and so is what comes before the next chunk. A copy of a
-        message stands for it if that is lost.
+        Damaged records are skipped, and everything before the next chunk. The copy of a message is
+        returned if the message is lost.
 
         Raises:
-            BROKEN: the file holds what no flight writes.
+            BROKEN: the file has contents that no flight writes.
         """
         topics: dict[int, str] = {}
         has_copies = False
@@ -166,7 +166,7 @@ class Container:
                 case Message(channel_id=number) if number not in topics:
                     if not self.damaged_bytes:
                         raise ValueError(f"a message before its channel {number}")
-                    # With copies a channel that is still unknown has nothing to be read back.
+                    # With copies, a channel that is still unknown is only for other programs.
                     self.damaged_bytes += 0 if has_copies else len(record.data)
                 case Message(channel_id=number) if topic := topics[number]:
                     messages_left -= 1
@@ -180,7 +180,7 @@ class Container:
         for record in self._chunks():
             size = record.uncompressed_size
             if fault := _fault(record):
-                if not record.uncompressed_crc:  # which all of ours have
+                if not record.uncompressed_crc:  # Skytether always writes it
                     raise ValueError(fault)
                 self.damaged_bytes += len(record.data)
                 continue
@@ -217,7 +217,7 @@ class Container:
             self.lost_bytes = self._size - at
 
     def _framed(self, at: int) -> bytes:
-        """Record at a place in the file; empty if the file is too short for it."""
+        """Record at an offset in the file; empty if the file is too short."""
         self._file.seek(at)
         head = self._file.read(HEAD.size)
         if len(head) < HEAD.size:
@@ -226,7 +226,7 @@ class Container:
         return head + self._file.read(size) if at + len(head) + size <= self._size else b""
 
     def _next_chunk(self, at: int) -> int | None:
-        """Place of the first chunk from there on; None if there is none."""
+        """Offset of the first chunk from `at` on; None if there is none."""
         self._file.seek(at)
         rest = b""
         while piece := self._file.read(CHUNK_BYTES_MAX):
@@ -239,7 +239,7 @@ class Container:
 
 
 def _parsed(content: bytes) -> McapRecord | None:
-    """Record of these bytes, if a recording has such outside of chunks, and it fills them."""
+    """Record in these bytes; None if it is not of a type allowed outside chunks, or too short."""
     stream = ReadDataStream(BytesIO(content[HEAD.size :]))
     try:
         record: McapRecord = KINDS[content[0]].read(stream)

@@ -23,13 +23,13 @@ from skytether.view.recordings.recorded import Recorded
 from skytether.view.rows import Columns, readable
 
 PASSES_NS = ("age_ns", "solve_ns", "delay_ns")
-"""Columns of durations [ns]; negative where none was measured."""
+"""Columns of durations [ns]; a negative value is a missing measurement."""
 STEPS = ("in_force", "observed_step")
-"""Columns of steps; a negative value stands for a missing step."""
+"""Columns of steps; a negative value is a missing step."""
 
 
 def tables(recorded: Recorded) -> dict[str, Columns]:
-    """Tables of a recording, by name; `time_s` counts from the first message."""
+    """Tables of a recording, by name; `time_s` is the time since the first message."""
     parts = recorded.parts
     result = {
         part: {"time_s": recorded.times_ns[part] / SECOND_NS}
@@ -51,7 +51,7 @@ def tables(recorded: Recorded) -> dict[str, Columns]:
 
 
 def _in_ms(name: str, column: NDArray[Any]) -> tuple[str, NDArray[Any]]:
-    """Column and its name, durations converted to ms; NaN where none was measured."""
+    """Name and values of a column, durations converted to ms; NaN for a missing measurement."""
     if name not in PASSES_NS:
         return name, column
     return name.replace("_ns", "_ms"), np.where(column < 0, np.nan, column / MILLISECOND_NS)
@@ -93,7 +93,7 @@ def parquet() -> Callable[[Columns], bytes]:
 
 
 def _values(name: str, column: NDArray[Any]) -> list[Any]:
-    """Values of a column; None for an unknown one: NaN, or -1 for a step."""
+    """Values of a column; None for unknown values, which are NaN, or -1 for a step."""
     values: list[Any] = column.tolist()
     if name in STEPS:
         return [None if value < 0 else value for value in values]

@@ -1,7 +1,7 @@
-"""Messages that Foxglove and Lichtblick draw, and their JSON schemas, by their documented names.
+"""Messages for drawings in Foxglove and Lichtblick, and their JSON schemas.
 
 All positions are in the frame WORLD: metres, third axis up. The schemas use only objects, lists and
-single types, and no list within a list, because both programs understand no more.
+single types, and no nested lists, because both programs support no more.
 """
 
 import math
@@ -84,7 +84,7 @@ SCHEMAS: Mapping[str, Json] = {
 }
 
 VEHICLE_M, POINT_M, LINE_M = 0.12, 0.09, 0.015
-"""Sizes of a vehicle, of a point, and of a line's thickness [m]."""
+"""Sizes of a vehicle and a point, and thickness of a line [m]."""
 BLUE, RED, GREY, GREEN = (
     {"r": red, "g": green, "b": blue, "a": 1.0}
     for red, green, blue in ((0.1, 0.5, 0.9), (0.85, 0.2, 0.2), (0.55, 0.55, 0.55), (0.2, 0.7, 0.3))
@@ -113,7 +113,7 @@ def pose_in_frame(time_ns: int, state: Array) -> Json:
 
 
 def transform(time_ns: int, vehicle: str, state: Array) -> Json:
-    """Message foxglove.FrameTransform: the frame of a vehicle, which a view may follow."""
+    """Message foxglove.FrameTransform: the frame of a vehicle, which a 3D view can follow."""
     pose = _pose(state)
     return {
         "timestamp": _time(time_ns),

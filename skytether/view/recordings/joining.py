@@ -3,8 +3,8 @@
     frames of each, by the time of day → one file → summary of the first client's flight
 
 Each process has recorded its own part, with its own scenario. A key's value is taken from the
-process that owns the key; keys with which both ends predict must be equal. Times are converted to
-the clock of the first client, by the difference of the times of day.
+process that owns the key; keys that both ends use for prediction must be equal. Times are converted
+to the clock of the first client, by the difference of the times of day.
 """
 
 from collections import Counter
@@ -56,8 +56,8 @@ def join(recordings: Sequence[Recorded], file: BinaryIO) -> None:
 
 
 def _names(recordings: Sequence[Recorded]) -> list[dict[str, str]]:
-    """New names of each recording's processes: the second that calls itself `server` is `server 2`,
-    as it is where one command starts both.
+    """New names of each recording's processes: the second process with the name `server` becomes
+    `server 2`, as in `skytether fly --standby`.
     """
     found, counts = [], Counter[str]()
     for recorded in recordings:
@@ -71,7 +71,7 @@ def _names(recordings: Sequence[Recorded]) -> list[dict[str, str]]:
 
 def _scenario(first: Recorded, recordings: Sequence[Recorded]) -> Scenario:
     table = to_table(first.scenario)
-    # The netem of one path has the network of that path alone.
+    # The netem of a path has only this path's network.
     impaired = keys_of(InFlight.IMPAIRMENT) if first.scenario.network.paths else ()
     for recorded in recordings:
         terms = first.scenario.terms(), recorded.scenario.terms()
@@ -88,8 +88,8 @@ def _scenario(first: Recorded, recordings: Sequence[Recorded]) -> Scenario:
 def _moved(
     recorded: Recorded, offset_ns: int, named: Mapping[str, str]
 ) -> Iterator[tuple[str, Frame]]:
-    """Frames of a recording by their process's new name, with times on the clock whose offset is
-    given.
+    """Frames of a recording, with their processes' new names, and times on the clock with the given
+    offset.
     """
     late_ns = recorded.about.offset_ns - offset_ns
     for _, process, frame in recorded.frames:

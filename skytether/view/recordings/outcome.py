@@ -1,4 +1,4 @@
-"""Outcome of a recorded flight: which vehicles arrived, how near they came, and what failed."""
+"""Outcome of a recorded flight: which vehicles arrived, smallest separations, and what failed."""
 
 import re
 from collections.abc import Iterator
@@ -56,12 +56,12 @@ SHOWN = (
     *(ClockContradicted, TimeUnknown, BegunAnew, Recalled, NotRecalled, NotFlown),
     *(Fault, Degraded, RecordIncomplete, Changed, ChangeRefused),
 )
-"""Events that say what failed, and what took over."""
+"""Events of failures and takeovers."""
 GROUND = {str(mode) for mode in (Mode.INIT, Mode.SYNC, Mode.READY)}
 WITHIN_S = 2.0
 """Time within which the same event of several vehicles is shown once."""
 AT_ONCE_S = 0.1
-"""Time within which vehicles brake at once: `explain --at` cannot tell them apart."""
+"""Time within which brake events count as one: `explain --at` cannot distinguish them."""
 BRIEF_S = 1.0
 """Length of a path's outage below which it is not shown."""
 VEHICLES_MAX = 64
@@ -70,12 +70,12 @@ VEHICLES_MAX = 64
 
 @dataclass(frozen=True, slots=True)
 class Ended:
-    """A vehicle at the end of its flight, and the worst of it; None if unknown."""
+    """Vehicle at the end of its flight, and worst figures of the flight; None if unknown."""
 
     vehicle: int
     mode: Mode
     off_m: float | None
-    """Distance from where it should be [m]."""
+    """Distance from the desired position [m]."""
     error_max_m: float | None
     braked_s: float
     nearest_m: float | None
@@ -88,8 +88,8 @@ class Outcome:
     """Outcome of a flight, by its recording.
 
     Args:
-        recorded: recording in which a vehicle has flown a step.
-        epoch_ns: time of step 0 of the first vehicle, from the first frame on [ns].
+        recorded: recording with at least one flown step.
+        epoch_ns: time of step 0 of the first vehicle since the first frame [ns].
     """
 
     def __init__(self, recorded: Recorded, epoch_ns: int) -> None:
@@ -114,7 +114,7 @@ class Outcome:
         return (time_ns - self._epoch_ns) / SECOND_NS
 
     def modes(self, number: int) -> Iterator[tuple[Mode, float, float]]:
-        """Modes of a vehicle in succession, and when each begins and ends [s]."""
+        """Modes of a vehicle in order, each with its beginning and end [s]."""
         rows, began_s = self.rows[number], self.began_s[number]
         for mode, span in spans(rows):
             first, last = rows["step"][span][[0, -1]]
@@ -197,10 +197,10 @@ class Outcome:
 
     @cached_property
     def happened(self) -> list[tuple[float, tuple[int, ...], str]]:
-        """What failed and took over: time [s], vehicles and sentence, in order of time.
+        """Failures and takeovers: time [s], vehicles and sentence, in order of time.
 
-        The same event of several vehicles is shown once, and outages of a path below BRIEF_S not at
-        all.
+        The same event of several vehicles is shown once; outages of a path below BRIEF_S are
+        omitted.
         """
         found: list[tuple[float, list[int], str]] = []
         newest: dict[str, list[int]] = {}
@@ -229,7 +229,7 @@ class Outcome:
 
     @cached_property
     def dead_paths(self) -> dict[int, list[tuple[int, float, float]]]:
-        """Times without packets on each path: vehicle, begin and end [s]; by the path's number."""
+        """Outages of each path: vehicle, begin and end [s]; by path number."""
         begun_s: dict[tuple[int, int], float] = {}
         outages: list[tuple[int, int, float, float]] = []
         for time_ns, _, event in self._recorded.events():
@@ -251,7 +251,7 @@ class Outcome:
         return found
 
     def new_leaders(self) -> list[tuple[int, float]]:
-        """Vehicles and times [s] at which another server came to lead them."""
+        """Vehicles, and times [s] at which another server took them over."""
         return [
             (event.vehicle, self.time_s(time_ns))
             for time_ns, _, event in self._recorded.events()
@@ -260,8 +260,8 @@ class Outcome:
 
 
 def brakes(recorded: Recorded) -> list[tuple[float, str]]:
-    """Times in the flight at which a vehicle brakes, lands or has a fault [s], and the event as a
-    sentence; of several vehicles at once, that of the first.
+    """Times of flight at which a vehicle brakes, lands or has a fault [s], and the event as a
+    sentence; if several vehicles brake at once, the first vehicle's.
     """
     worse, stopped = ([str(mode) for mode in modes] for modes in (WORSE, STOPPED))
     found: list[tuple[float, str]] = []
@@ -280,19 +280,19 @@ def brakes(recorded: Recorded) -> list[tuple[float, str]]:
 
 
 def spans(rows: Rows) -> Iterator[tuple[Mode, slice]]:
-    """Modes in succession, each with the slice of its rows and the first row after it."""
+    """Modes in order, each with the slice of its rows and the first row after them."""
     begins = np.flatnonzero(np.diff(rows["mode"], prepend=-1))
     for begin, end in zip(begins, [*begins[1:], len(rows)], strict=True):
         yield Mode(rows["mode"][begin]), slice(begin, end + 1)
 
 
 def _is_ordinary(event: Event) -> bool:
-    """Whether a vehicle only begins its flight."""
+    """Whether an event belongs to the normal start of a flight."""
     return isinstance(event, ModeChanged) and event.before in GROUND
 
 
 def listed(numbers: list[int] | tuple[int, ...]) -> str:
-    """Numbers in words, ranges of three or more as such: 1, 3 to 6, 9."""
+    """Text of numbers, with ranges of three or more: "1, 3 to 6, 9"."""
     runs: list[list[int]] = []
     for number in sorted(numbers):
         if runs and number == runs[-1][-1] + 1:

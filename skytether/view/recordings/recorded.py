@@ -1,7 +1,7 @@
-"""Reader of recordings: a flight's frames, and their rows, bit for bit.
+"""Reader of recordings: a flight's frames and rows, equal to the last bit.
 
-A file is not trusted: `container` bounds time and memory, and frames that no flight of the scenario
-can have are refused.
+A file is not trusted: `container` bounds time and memory, and frames that are impossible in a
+flight of the scenario are refused.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -47,13 +47,13 @@ class Recorded:
     frames: Sequence[Timed]
     """Frames in order of time; times count from the first frame [ns]."""
     parts: Mapping[str, Table]
-    """Rows of each part of the record that has any, by its name, in the order of recording."""
+    """Rows of each part of the record with any rows, by its name, in the order of recording."""
     times_ns: Mapping[str, Indices]
     """Time of each row of `parts`, counted from the first frame [ns]."""
     lost_bytes: int | None
-    """Bytes lost at the end of a file that was not completed; None for a completed one."""
+    """Number of bytes lost at the end of an incomplete file; None for a complete file."""
     damaged_bytes: int = 0
-    """Bytes of damaged records of a completed file, which are left out."""
+    """Number of bytes of damaged records in a complete file, which are skipped."""
 
     @cached_property
     def summary(self) -> Summary | None:
@@ -80,7 +80,7 @@ class Recorded:
         return self.frames[0][2].time_ns if self.frames else 0
 
     def events(self) -> Iterator[tuple[int, str, Event]]:
-        """Events except `Counted`: time [ns], process and event."""
+        """Time [ns], process and event of all events except `Counted`."""
         for time_ns, process, frame in self.frames:
             if isinstance(frame, Said) and not isinstance(frame.event, Counted):
                 yield time_ns, process, frame.event
@@ -102,8 +102,8 @@ def summary_of(
 
 
 def read(path: Path) -> Recorded:
-    """Recording in a file; if its writer was killed, everything up to the last whole record, and of
-    a damaged one everything but the damaged records.
+    """Read a recording. If its writer was killed, the result ends with the last complete record;
+    damaged records are skipped.
 
     Raises:
         OSError: the file cannot be read.
@@ -133,7 +133,7 @@ def read(path: Path) -> Recorded:
 
 
 class _Frames:
-    """Frames of a recording, each of which is checked.
+    """Frames of a recording; checks each frame.
 
     Args:
         scenario: scenario of the flight.
@@ -145,17 +145,17 @@ class _Frames:
         self._columns: dict[tuple[str, str], np.dtype[np.void]] = {}
         self._begun_ns: dict[str, int] = {}
         self._rows: dict[str, list[tuple[int, Table]]] = {}
-        """Time [ns] and rows of each frame with rows of a part, by the part's name."""
+        """Time [ns] and rows of each frame with rows, by name of the part."""
 
     def knows(self, process: str, frame: Frame) -> bool:
-        """Whether the columns of a frame's rows have come."""
+        """Whether the columns of a frame's rows were announced."""
         return not isinstance(frame, Rows) or (process, frame.part) in self._columns
 
     def add(self, process: str, frame: Frame) -> None:
         """Add a frame.
 
         Raises:
-            ValueError: flights of this scenario have no such frame.
+            ValueError: the frame is impossible in flights of this scenario.
         """
         if abs(frame.time_ns) > TIME_NS_MAX:
             raise ValueError(f"a frame at {frame.time_ns} ns")
@@ -181,10 +181,10 @@ class _Frames:
         self._frames.append((process, frame))
 
     def together(self) -> tuple[list[Timed], dict[str, Table], dict[str, Indices]]:
-        """All frames in order of time; the rows of each part, and their times.
+        """All frames in order of time; rows of each part, and times of the rows.
 
         Raises:
-            ValueError: no flight takes so long, or has such rows.
+            ValueError: the recording is too long for a flight, or has impossible rows.
         """
         ordered = sorted(self._frames, key=lambda each: each[1].time_ns)
         begin_ns = ordered[0][1].time_ns if ordered else 0
@@ -207,5 +207,5 @@ def _columns(described: str) -> np.dtype[np.void]:
 
 @lru_cache(8)
 def _check_begun(scenario: str) -> None:
-    """Check the scenario of a process; equal texts, of which there may be many, only once."""
+    """Check the scenario of a process; cached, because many processes may have the same."""
     check(toml.loads(scenario), "the scenario of a process", any_network=True)

@@ -1,11 +1,11 @@
 """Recordings: a flight as an MCAP file, for Skytether and for other programs.
 
-The frames of the flight's processes are written as they come from their feeds, encoded as msgpack
-(`shared.telemetry.feed`); only they are read back, by `recorded`:
+Frames are written as they come from the processes' feeds, encoded as msgpack
+(`shared.telemetry.feed`). `recorded` reads only these topics:
 
     /recording           facts about the recording, a `Begun`; the first message
     /feed/PROCESS        frames of a process
-    /copy/…              copy of the first message of each of these
+    /copy/…              copy of the first message of each topic above
 
 Other programs get a channel of JSON for each topic:
 
@@ -19,8 +19,8 @@ Other programs get a channel of JSON for each topic:
 Foxglove and Lichtblick draw /events, and for each of the first VEHICLES_MAX vehicles
 /vehicle/N/pose, /vehicle/N/transform and, below /vehicle/N/scene, the vehicle, its plan, its
 desired position and its trajectory. The scenario and, at the end, the summary are attachments. A
-chunk is complete as soon as it is written. The first message of each topic that is read back has
-a chunk of its own, and its copy the next one: the rest can be read without one of them.
+chunk is complete as soon as it is written. The first message of each topic that `recorded` reads
+has its own chunk, and its copy the next chunk: the rest can be read if one of them is lost.
 """
 
 from collections.abc import Mapping
@@ -52,10 +52,10 @@ from skytether.view.recordings.container import COPY, COPY_OF, ENCODING
 BEGUN, FEED = "/recording", "/feed/"
 """Topic of the first message, and the prefix of the topics of frames."""
 OURS = "skytether"
-"""Name of the metadata, and of the writing library."""
+"""Name of the metadata record and of the writing library in the file."""
 SCENARIO, SUMMARY = "scenario.toml", "summary.json"
 VEHICLES_MAX = 64
-"""Largest number of vehicles that are drawn; of further vehicles only rows are recorded."""
+"""Largest number of vehicles with drawn messages; for further vehicles only rows are recorded."""
 CHUNK_BYTES = 256 * 1024
 POINTS_MAX = 400
 WARNINGS = RecordIncomplete, Fault, Degraded, ChangeRefused, Failure
@@ -77,7 +77,7 @@ class About(msgspec.Struct, frozen=True, kw_only=True):
     seed: int
     version: str
     began: str
-    """Time of day at the beginning, ISO 8601; empty in virtual time."""
+    """Time of day at the start of the recording, ISO 8601; empty in virtual time."""
     offset_ns: int
     """Time of a message minus time of its frame [ns]."""
     secure: bool
@@ -145,7 +145,7 @@ class Recording:
                 self._put_rows(frame.part, table, made)
 
     def flush(self) -> None:
-        """Write everything added so far, which then survives a kill of the process."""
+        """Write everything added so far, so that it survives a kill of the process."""
         self._writer.flush()
 
     def finish(self, summary: Summary | None) -> None:
@@ -159,11 +159,11 @@ class Recording:
         self._writer.add_attachment(0, self._now_ns, name, kind, content)
 
     def _add_frame(self, process: str, frame: Frame) -> None:
-        """Add a frame unchanged, to be read back by Skytether."""
+        """Add a frame unchanged, for `recorded`."""
         self._add(f"{FEED}{process}", ENCODING, 0, feed.pack(frame))
 
     def _add_twice(self, topic: str, content: bytes) -> None:
-        """Add a topic's first message, without which the others cannot be read, and its copy."""
+        """Add a topic's first message and its copy; other messages cannot be read without it."""
         self.flush()
         self._add(topic, ENCODING, 0, content)
         self.flush()
@@ -178,7 +178,7 @@ class Recording:
         self._draw("/events", "Log", foxglove.log(self._now_ns, process, str(event), level))
 
     def _put_rows(self, part: str, table: rows.RowTable, made: Table) -> None:
-        """Add rows for other programs, a message for each, and their drawn messages."""
+        """Add a message for each row, for other programs, and messages that draw it."""
         for row, message in zip(made, table.messages(made), strict=True):
             number = int(row["vehicle"]) if "vehicle" in table.names else 0
             at = f"/vehicle/{number}/{_TOPICS.get(part, part)}" if number else f"/{part}/packets"
@@ -227,7 +227,7 @@ class Recording:
         self._add(topic, "json", number, msgspec.json.encode(message))
 
     def _add(self, topic: str, encoding: str, schema: int, content: bytes) -> None:
-        """Add a message; its channel is written before the first message of a topic."""
+        """Add a message; writes the topic's channel before its first message."""
         if topic not in self._channels:
             channel = self._writer.register_channel(topic, encoding, schema)
             self._channels[topic] = channel
@@ -235,7 +235,7 @@ class Recording:
 
 
 def _text(value: str | int) -> str:
-    """Metadata value as text, the only type there; numbers and flags as in JSON."""
+    """Metadata value as text, because MCAP metadata has only texts; numbers as in JSON."""
     return value if isinstance(value, str) else msgspec.json.encode(value).decode()
 
 

@@ -71,8 +71,8 @@ def page(recorded: Recorded, figures: Sequence[tuple[str, str]], explanation: st
     """Page of a recording, as HTML.
 
     Args:
-        figures: names and values of its summary.
-        explanation: why the flight went as it did, as text; empty if nobody has asked.
+        figures: names and values of the summary.
+        explanation: text of `skytether explain`; empty for none.
 
     Raises:
         RecordingError: no vehicle has flown a step.
@@ -148,7 +148,7 @@ def _verdict(summary: Summary) -> str:
 
 
 def _first(outcome: Outcome) -> list[Table]:
-    """Tables that come first: the vehicles, and what failed and took over."""
+    """First tables of the page: vehicles, and failures and takeovers."""
     found = []
     if len(outcome.ended) > 1:
         is_mission = outcome.scenario.is_mission
@@ -185,7 +185,7 @@ def _first(outcome: Outcome) -> list[Table]:
 
 
 def _why(recorded: Recorded, outcome: Outcome, explanation: str) -> list[Part]:
-    """The explanation, and the command for each brake, which a flight over UDP has none for."""
+    """The explanation, and a command that explains each brake event; none for flights over UDP."""
     parts: list[Part] = []
     if explanation:
         parts.append(Folded("Why", text=explanation, is_open=True))
@@ -208,7 +208,7 @@ def _why(recorded: Recorded, outcome: Outcome, explanation: str) -> list[Part]:
 
 
 def course(outcome: Outcome) -> Picture:
-    """Lanes over time: each vehicle's mode, new leaders, and dead paths; and the separation."""
+    """Draw over time each vehicle's mode, new leaders, path outages, and the separation."""
     numbers, paths, is_apart = list(outcome.rows), outcome.dead_paths, bool(outcome.least)
     lanes = len(numbers) + len(paths)
     heights = [0.3 + 0.18 * lanes, *[1.8] * is_apart]
@@ -336,7 +336,7 @@ def _trigger(below: "Axes", flown: ReportedFlight) -> None:
     style: Any = {"color": "#0072b2", "linewidth": 0.8, "transform": bottom, "label": "sent"}
     below.vlines(sent, 0.0, 0.12, **style)
     threshold = server["threshold"][np.isfinite(server["threshold"])]
-    # The compared figure spans decades while nothing can be sent; only the threshold matters.
+    # The figure grows by decades while nothing can be sent; only the threshold matters.
     below.set_yscale("symlog", linthresh=max(threshold.max(initial=0.0), 1e-6))
     below.set_ylim(bottom=0.0)
 
@@ -356,7 +356,7 @@ def _packets(below: "Axes", flown: ReportedFlight) -> None:
     below.set_ylabel("packets per s")
     if not len(flown.netem):
         return
-    # In seconds: a damaged file may have an epoch that fits no 64-bit integer.
+    # In seconds, because the epoch in a damaged file may exceed a 64-bit integer.
     arrived_s = flown.netem["arrived_ns"] / SECOND_NS - flown.epoch_ns / SECOND_NS
     flying = arrived_s < flown.time_s[-1] + 1.0
     draw_packets(below, flown.scenario, flown.netem["direction"][flying], arrived_s[flying])

@@ -1,8 +1,8 @@
-"""Packets that passed netem, for other programs: delay traces, and a capture in pcap format.
+"""Packets through netem, for other programs: delay traces, and a capture in pcap format.
 
-A recording of netem has each packet's time of entry, delay, size and fate, but not its content. So
-the capture has made-up headers (clients are 10.path.x.y, the server is 10.255.255.254) and true
-lengths: enough to see rates, bursts and gaps.
+A recording of netem has each packet's time of entry, delay, size and whether it was lost, but not
+its content. So the capture has made-up headers (clients are 10.path.x.y, the server is
+10.255.255.254) and true lengths, which show rates, bursts and gaps.
 """
 
 import struct
@@ -23,7 +23,7 @@ _UDP = 17
 
 
 def traces(packets: Rows, ways: Directions = FLIGHT) -> Mapping[str, str]:
-    """Delay traces that the impairment `trace` replays, as CSV, by direction, flow and path."""
+    """Delay traces for the impairment `trace`, as CSV, by direction, flow and path."""
     csv = {}
     for way, direction in zip(ways, (UPLINK, DOWNLINK), strict=True):
         for path, flow in np.unique(packets[["path", "flow"]]).tolist():
@@ -46,13 +46,13 @@ def pcap(packets: Rows, began_ns: int = 0, *, header_bytes: int = HEADER_BYTES) 
     """Capture of the packets that netem sent, without lost ones.
 
     Args:
-        began_ns: zero of the packets' clock [ns since 1970].
-        header_bytes: headers that the recorded sizes are without [B]; 0 for packets of IP.
+        began_ns: time of day at time 0 of the packets [ns since 1970].
+        header_bytes: size of headers not included in recorded sizes [B]; 0 for IP packets.
     """
     rows = packets[~packets["lost"]]
     left_ns = rows["arrived_ns"] + rows["delay_ns"] + began_ns
     order = np.argsort(left_ns, kind="stable")
-    # Magic number for nanosecond times; version 2.4; packets are cut after the headers.
+    # Magic number for nanosecond times; version 2.4; packets are truncated after the headers.
     pieces = [struct.pack("<IHHiIII", 0xA1B23C4D, 2, 4, 0, 0, HEADER_BYTES, RAW_IP)]
     for row, time_ns in zip(rows[order], left_ns[order].tolist(), strict=True):
         size = int(row["bytes"]) + header_bytes
