@@ -1,4 +1,4 @@
-"""Measurement of a real path: probes both ways, and their analysis.
+"""Measurement of a real path: probes in both directions, and their analysis.
 
     prober, listener  the two endpoints, which exchange the numbered packets of `wire`
     analysis, fits    functions of arrays: figures, and models of delay and loss
@@ -7,5 +7,5 @@
     outcome           results as figures and as text for a scenario
 
 The command is `skytether.cli.probe`; nothing is registered. The package imports `shared`, the
-client's address of a link, and the server's gate, which answers only proven addresses.
+client's `ClientLink`, and the server's gate, which answers only verified addresses.
 """

@@ -1,20 +1,20 @@
-"""Analysis of packets that went both ways, as functions of arrays.
+"""Analysis of packets in both directions, with functions of arrays.
 
-Clocks: an apparent delay is the true delay plus the offset of the clocks one way, t_receiver -
-t_sender = d + o(t), and d - o(t) the other way. With o(t) = o + s t, a line through the smallest
+Clocks: in one direction an apparent delay is the true delay plus the clocks' offset, t_receiver -
+t_sender = d + o(t); in the other it is d - o(t). With o(t) = o + s t, a line through the smallest
 delays of a direction has the slope s, or -s. Following Moon, Skelly and Towsley (1999), the line is
 the one with the highest mean among all lines below the points; both directions share one slope. The
-height of a point above the line is its delay beyond the least delay. Of the two least delays only
-the sum can be measured, in which the offset cancels: half of it is assumed for each direction.
+height of a point above the line is its delay beyond the least delay. Only the sum of the two least
+delays can be measured, because the offset cancels in it; each direction is assumed to have half.
 
 Loss: the confidence interval is Wilson's, for the effective number of independent packets.
 
-Rate: packets of a train that are sent at once leave a bottleneck one behind the other, size / rate
-apart (packet dispersion). So the i-th packet of a train has the delay of a packet sent alone, plus
-i size / rate. The time size / rate is estimated in two ways, and the estimate with the smaller
-error is used. One is the common slope of lines through delay over place in the train: slowly
-varying delays hardly affect it. The other is the maximum-likelihood time, given the measured
-distribution of the delays of packets sent alone: it is the better one for delays that vary fast.
+Rate: packets of a train are sent at once and leave a bottleneck at intervals of size / rate (packet
+dispersion). So the i-th packet of a train has the delay of a packet sent alone, plus i size / rate.
+The time size / rate is estimated in two ways, and the estimate with the smaller error is used. One
+is the common slope of lines through delay over place in the train, which slowly varying delays
+hardly affect. The other is the maximum-likelihood time, given the measured distribution of delays
+of packets sent alone, which is better for delays that vary fast.
 """
 
 from collections.abc import Callable
@@ -31,24 +31,24 @@ from skytether.shared.law.model import Array, Flags
 DRIFT_MAX = 500e-6
 """Largest plausible drift between two clocks: the fastest rate at which clocks are slewed."""
 WINDOWS = 12
-"""Number of parts of a measurement whose least delays give the drift's uncertainty."""
+"""Number of parts of a measurement; their least delays give the drift's uncertainty."""
 CERTAIN = 5.0
 """Number of standard errors above which a drift is significant; large, because of few WINDOWS."""
 Z95 = 1.959963984540054
 """Two-sided 95 % quantile of the standard normal distribution."""
 ALIKE_S = 50e-6
-"""Standard deviation up to which values count as all equal [s]."""
+"""Standard deviation below which values count as equal [s]."""
 LAGS = 20
 TOGETHER_NS = 2 * MILLISECOND_NS
-"""Longest time within which the packets of a train are sent [ns]."""
+"""Longest time for sending the packets of a train [ns]."""
 SPREAD_MIN_S = 1e-3
-"""Spread of a train above which it shows a finite rate, and not a busy machine [s]."""
+"""Spread of a train above which it indicates a finite rate, not a busy machine [s]."""
 ARRIVED_MIN = 4
 """Smallest number of received packets for a train to count."""
 GROUPS_MIN, GROUPS_MAX = 4, 10
 """Number of groups of trains for the jackknife error of the time per packet."""
 ALONE_MIN, KERNELS = 100, 500
-"""Smallest number of packets for a distribution, and largest number of its kernels."""
+"""Smallest number of packets for a density estimate, and largest number of its kernels."""
 QUANTILES = (0.0, 0.05, 0.25, 0.5, 0.75, 0.95, 0.99, 0.999, 1.0)
 
 
@@ -57,14 +57,14 @@ class Clocks:
     """Listener's clock relative to the prober's."""
 
     offset_s: float
-    """Offset at the first probe, if both directions have half of the least round-trip time."""
+    """Offset at the first probe, assuming equal least delays in both directions."""
     drift: float
     """Rate by which the listener's clock runs faster; 0 if no drift is significant."""
     drift_doubt: float
     least_sum_s: float
     """Sum of the two least delays."""
     doubt_s: float
-    """Largest error of all one-way delays: half of the least delays, less known fixed times."""
+    """Largest error of one-way delays: half of `least_sum_s`, minus known fixed times."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,7 +72,7 @@ class BottleneckRate:
     """Rate of a path's bottleneck, in one direction."""
 
     bytes_per_s: float
-    """Rate, headers of IP and UDP included."""
+    """Rate, including headers of IP and UDP."""
     low: float
     high: float
     """Bounds of the 95 % interval [B/s]."""
@@ -81,7 +81,7 @@ class BottleneckRate:
 
 @dataclass(frozen=True, slots=True)
 class Delays:
-    """Packets of one direction that were sent alone, in order of sending."""
+    """Packets of one direction that were sent alone, not in a train, in order of sending."""
 
     time_s: Array
     """Time of sending on the prober's clock, from the first probe; shape (n,)."""
@@ -122,7 +122,7 @@ def delays(measured: MeasuredPath) -> tuple[Clocks, Delays, Delays]:
     half = max(least_sum_s - service_down - service_up, 0.0) / 2.0
     offset_s = floor_down - half - service_down
     clocks = Clocks((far_ns - near_ns) / SECOND_NS + offset_s, drift, doubt, least_sum_s, half)
-    # A lost answer has no arrival time; it was sent when its probe arrived at the listener.
+    # A lost answer has no sending time; its probe's arrival time at the listener is used.
     x_up = (up.sent_ns - far_ns) / SECOND_NS - offset_s
     return (
         clocks,
@@ -156,7 +156,7 @@ def _alone(way: Way, time_s: Array, delay_s: Array, found: BottleneckRate | None
 
 
 def _drift(x_down: Array, y_down: Array, x_up: Array, y_up: Array) -> tuple[float, float]:
-    """Slope of both lines, and its standard error; the slope is 0 if it is not significant."""
+    """Slope of both lines, and its standard error; an insignificant slope is set to 0."""
     if x_down[-1] - x_down[0] <= 0.0:
         return 0.0, DRIFT_MAX
     down, up = lower_hull(x_down, y_down), lower_hull(x_up, y_up)
@@ -257,7 +257,7 @@ def autocorrelation(time_s: Array, values: Array, lags: int = LAGS) -> tuple[Arr
 
 
 def effective(count: int, correlations: Array) -> float:
-    """Effective sample size: number of independent values that determine a mean equally well.
+    """Effective sample size: number of independent values that would determine a mean equally well.
 
     The sum over lags ends where the correlation no longer differs significantly from 0.
     """
@@ -316,8 +316,8 @@ def rate(way: Way, delay_s: Array, size: int) -> BottleneckRate | None:
     """Rate of the bottleneck of a path; None if the packet trains give no finite rate.
 
     Args:
-        delay_s: delays of all packets, with any constant offset; those of lost ones are ignored;
-            shape (n,).
+        delay_s: delays of all packets, with any constant offset; delays of lost packets are
+            ignored; shape (n,).
         size: UDP payload of each packet [B].
     """
     trains = []
@@ -397,7 +397,7 @@ def _likeliest(trains: Trains, alone: Array, first: float, doubt: float) -> tupl
     ]
     spread = np.array(without) - np.mean(without)
     error = sqrt((groups - 1) / groups * float(spread @ spread))
-    # A time that is hardly more likely than zero is uncertain, however small its scatter.
+    # A time that is hardly more likely than zero is uncertain, even if its scatter is small.
     gain = likelihood(time_s, trains) - likelihood(0.0, trains)
     error = max(error, time_s / sqrt(2.0 * max(gain, 1e-9)))
     # factor by which Student's t is wider than the normal distribution

@@ -1,9 +1,9 @@
-"""Models of delay and loss, those of `skytether list impairments`, fitted to a measurement.
+"""Models of delay and loss, as in `skytether list impairments`, fitted to a measurement.
 
-Each is fitted by maximum likelihood. They are compared by BIC, k ln n - 2 ln L with k parameters,
-where n is the effective sample size, see `analysis.effective`. Likelihoods are densities, with a
-time resolution of RESOLUTION_S: the normal error of the paper's lattice of slots is at least that,
-and delays keep that distance from a distribution's lower bound. Delays that hardly vary are called
+Models are fitted by maximum likelihood and compared by BIC, k ln n - 2 ln L with k parameters,
+where n is the effective sample size, see `analysis.effective`. Likelihoods are densities with a
+time resolution of RESOLUTION_S: the normal error of the paper's slots is at least RESOLUTION_S, and
+so is the distance of delays from a distribution's lower bound. Delays that hardly vary are called
 constant.
 """
 
@@ -29,7 +29,7 @@ COLUMNS = 50
 PAIRS_MIN = 20
 """Smallest number of packets for a fit."""
 BURST_MIN, BURST_MAX_S = 0.1, 3600.0
-"""Bounds of a channel's redraw time: in mean times between packets, and in seconds."""
+"""Lower bound of a channel's redraw time, in mean times between packets, and upper bound [s]."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,7 +39,7 @@ class FittedImpairment:
     name: str
     numbers: tuple[float, ...]
     bic: float
-    """Bayesian information criterion: the smaller, the better."""
+    """Bayesian information criterion; smaller is better."""
 
     def text(self, correlation_s: float = 0.0) -> str:
         arguments = [f"{number:.5g}" for number in self.numbers]
@@ -52,7 +52,7 @@ class FittedImpairment:
 
 
 def fit_delays(delay_s: Array, independent: float) -> list[FittedImpairment]:
-    """Models of delays, the best first.
+    """Fit models of delays; the best is first.
 
     Args:
         delay_s: delays of the received packets; shape (n,).
@@ -107,7 +107,7 @@ def _with_least(delay_s: Array, name: str) -> Found:
 
 
 def _lognormal(delay_s: Array, least_s: float) -> tuple[float, float, float]:
-    """Log-likelihood, mean and standard deviation of the best lognormal law over `least_s`."""
+    """Log-likelihood, mean and standard deviation of the best lognormal above `least_s`."""
     over = np.maximum(delay_s - least_s, RESOLUTION_S)
     logs = np.log(over)
     mu, sigma = float(np.mean(logs)), max(float(np.std(logs)), 1e-6)
@@ -117,7 +117,7 @@ def _lognormal(delay_s: Array, least_s: float) -> tuple[float, float, float]:
 
 
 def _gamma(delay_s: Array, least_s: float) -> tuple[float, float, float]:
-    """Log-likelihood, mean and standard deviation of the best gamma distribution over `least_s`."""
+    """Log-likelihood, mean and standard deviation of the best gamma law above `least_s`."""
     over = np.maximum(delay_s - least_s, RESOLUTION_S)
     count, mean, mean_log = len(over), float(np.mean(over)), float(np.mean(np.log(over)))
 
@@ -141,17 +141,17 @@ def _paper(delay_s: Array) -> Found | None:
     def concentration(slot_s: float) -> float:
         return abs(complex(np.mean(np.exp(2j * pi * sample / slot_s))))
 
-    # Slots at equal distances of 1/slot: a peak is as wide as 1/span.
+    # The grid of 1/slot is uniform, because a peak over 1/slot is as wide as 1/span.
     inverse = np.linspace(1.0 / span, min(SLOTS / (4.0 * span), 1e3), SLOTS)
-    # concentration(1 / inverse), whose exponential is a product of one of each row and one of each
-    # column: a thirtieth of the exponentials.
+    # Computes concentration(1 / inverse). Each exponential is the product of one for its row and
+    # one for its column, so that a thirtieth of the exponentials suffices.
     rows, columns = inverse[::COLUMNS], inverse[:COLUMNS] - inverse[0]
     waves = [np.exp(2j * pi * np.outer(each, sample)) for each in (rows, columns)]
     scores = np.abs(waves[0] @ waves[1].T).ravel() / len(sample)
     good = np.flatnonzero(scores > max(0.9 * float(scores.max()), 0.8))
     if not len(good):
         return None
-    # Every fraction of a slot scores as well: take the longest one.
+    # A fraction of the slot has the same score: take the longest slot.
     run = good[: int(np.argmax(np.diff(good, append=10**9) > 1)) + 1]
     peak = inverse[run[np.argmax(scores[run])]]
     step = inverse[1] - inverse[0]
@@ -165,7 +165,7 @@ def _paper(delay_s: Array) -> Found | None:
     begin = float(np.mean(delay_s - slot * places))
 
     def likelihood(before: int) -> float:
-        """Log-likelihood of the Poisson law if `before` slots below the least delay are empty."""
+        """Log-likelihood of a Poisson law with `before` empty slots below the least delay."""
         counts, times = np.unique(places + before, return_counts=True)
         mean = float(np.mean(places)) + before
         logs = [count * log(mean) - mean - lgamma(count + 1.0) for count in counts.tolist()]
@@ -183,7 +183,7 @@ def _paper(delay_s: Array) -> Found | None:
 
 
 def fit_losses(time_s: Array, lost: Flags) -> list[FittedImpairment]:
-    """Models of losses, the best first; empty if nothing was lost, or everything.
+    """Fit models of losses; the best is first; empty if nothing or everything was lost.
 
     The channel of `gilbert_elliott` is redrawn at random moments, bad with probability `share`, and
     loses every packet while it is bad. Its state is not redrawn between two packets with
@@ -233,10 +233,10 @@ _TURNS = ((True, True), (True, False), (False, True), (False, False))
 
 
 def _gilbert(groups: list[Array], share: float, cell_s: float) -> float:
-    """Log-likelihood of each packet's fate, given that of the previous one.
+    """Log-likelihood of the packets' losses, each given whether the previous packet was lost.
 
     Args:
-        groups: times between two packets, by the four pairs of fates in `_TURNS` [s].
+        groups: times between two packets, by the four cases in `_TURNS` [s].
     """
     total = 0.0
     for (before, after), between in zip(_TURNS, groups, strict=True):

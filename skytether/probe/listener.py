@@ -1,13 +1,13 @@
-"""Far end of a measurement: answers each probe with one packet, no longer than the probe.
+"""Listening end of a measurement: answers each probe with one packet, at most as long as the probe.
 
-An answer has the listener's time, and lists the arrivals that the prober has not acknowledged, the
-oldest first, so that a lost answer loses no arrival. The probes of a train are answered together
+An answer has the listener's time and a list of arrivals that the prober has not acknowledged, the
+oldest first, so that no arrival is lost with an answer. The probes of a train are answered together
 once all have arrived, so that the answers form a train as well.
 
-A HELLO leaves no state: its session id is derived from a secret and the sender's address. State is
-kept from the first PROBE on, which only a sender that receives packets at that address can send.
-Without keys a session is answered at that address only: otherwise anybody who has seen the session
-id could direct answers at a third party. With keys a sender may change its address.
+A HELLO creates no state: its session id is derived from a secret and the sender's address. The
+first PROBE creates state; only a sender that receives packets at its address can send it. Without
+keys, answers go only to that address: otherwise anybody who has seen the session id could direct
+answers at a third party. With keys a sender may change its address.
 """
 
 import hashlib
@@ -36,11 +36,11 @@ from skytether.shared.wire.drop import Drop, ProtocolError
 from skytether.shared.wire.protocol import PAYLOAD_BYTES_MAX
 
 SESSIONS_MAX = 16
-"""Largest number of measurements at once; see `Listener._gives_way` for a further one."""
+"""Largest number of measurements at once; `Listener._gives_way` chooses one to end for another."""
 IDLE_NS = 60 * SECOND_NS
 """Time without a probe after which a measurement may be replaced by another [ns]."""
 HISTORY_MAX = 65_536
-"""Largest number of arrivals kept until the prober has acknowledged them; older ones are
+"""Largest number of stored arrivals that the prober has not acknowledged; older ones are
 dropped."""
 HOLD_NS = 200 * MILLISECOND_NS
 """Time to wait for the rest of a train after each of its packets [ns]."""
@@ -68,7 +68,7 @@ class ProbeSession:
     log: deque[tuple[int, int]] = field(default_factory=lambda: deque(maxlen=HISTORY_MAX))
     """Newest arrivals not yet acknowledged by the prober: number and time [ns]."""
     train: list[HeldPacket] = field(default_factory=list)
-    """Packets of a train that wait for the rest."""
+    """Received packets of a train, answered once the rest has arrived."""
     train_ns: int = 0
     """Time of the newest packet in `train`."""
 
@@ -121,7 +121,7 @@ class Listener(Endpoint):
         """Measurement of a session, begun if it is new.
 
         Raises:
-            ProtocolError: the session id is not this listener's for the sender, or SESSIONS_MAX are
+            ProtocolError: the session id is wrong for this sender, or SESSIONS_MAX sessions are
                 open.
         """
         session = self._sessions.get(name)
@@ -141,10 +141,10 @@ class Listener(Endpoint):
         return session
 
     def _gives_way(self, peer: Address, now_ns: int) -> bytes | None:
-        """Session to end so that a sender can have a new one; None if none may be ended.
+        """Session to end in favour of a sender's new session; None if none may be ended.
 
-        A host with many sessions cannot keep others out: the oldest session of the host with the
-        most is ended for a host with fewer.
+        A host with many sessions cannot block others: for a host with fewer sessions, the oldest
+        session of the host with the most is ended.
         """
         name, session = next(iter(self._sessions.items()), (None, None))
         if session is None or now_ns - session.heard_ns > IDLE_NS:
@@ -188,7 +188,7 @@ class Listener(Endpoint):
         answer = ProbeAnswer(name, held.number, now_ns, first, session.logged, arrivals)
         size = held.size - (OVERHEAD_BYTES if self._gate.secure else 0)
         packet = line.seal(encode(answer, size))
-        if len(packet) <= held.size:  # a probe shorter than any prober's cannot be answered
+        if len(packet) <= held.size:  # probes that are too short for any prober get no answer
             self.send(packet, held.peer)
             self._answered += 1
 

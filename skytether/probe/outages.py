@@ -1,14 +1,14 @@
-"""Outages of paths that were measured at the same time, and how many of them they have in common.
+"""Outages of paths that were measured at the same time, and outages that they have in common.
 
 T is OUTAGE_S, or SPARSE times the typical time between two probes if that is longer. A path is out
-from the first of consecutive probes that have no answer within T until the next probe that has one,
-if these probes cover at least T. A probe covers the time until the next one, but no more than
-SPARSE typical times: what happens while a train is sent instead is unknown.
+from the first of consecutive probes without an answer within T until the next probe with one, if
+these probes cover at least T. A probe covers the time until the next probe, but at most SPARSE
+typical times, because no probes are sent during a train.
 
     share_k = |out_k and covered| / |covered|        covered: by a probe of every path
     common  = |out_1 and out_2 and ... and covered| / |covered|
 
-Of independent paths the common share is the product of the shares.
+If paths are independent, the common share is the product of their shares.
 """
 
 from collections.abc import Sequence
@@ -30,10 +30,10 @@ Intervals = Array
 
 @dataclass(frozen=True, slots=True)
 class RoundTrips:
-    """Probes of a path that were sent alone, in order of sending."""
+    """Probes of a path that were sent alone, not in a train, in order of sending."""
 
     sent_s: Array
-    """Time of sending, on a clock that all paths have in common [s]; shape (n,)."""
+    """Time of sending, on a common clock of all paths [s]; shape (n,)."""
     trip_s: Array
     """Round-trip time [s]; NaN without an answer; shape (n,)."""
 
@@ -44,27 +44,27 @@ class RoundTrips:
 
 class OutageFigures(msgspec.Struct, frozen=True):
     share: float
-    """Share of the time."""
+    """Share of the covered time."""
     count: int
     longest_s: float
 
 
 class CommonOutages(msgspec.Struct, frozen=True, kw_only=True):
-    """Outages of paths, and those of all at once."""
+    """Outages of each path, and common outages of all paths."""
 
     threshold_s: float
-    """Time T without an answer from which on a path is out."""
+    """Time T without an answer after which a path counts as out."""
     seconds: float
     """Time covered by probes of all paths."""
     paths: list[OutageFigures]
     common: OutageFigures
-    """Times at which all paths were out."""
+    """Outages of all paths at once."""
     product: float
     """Product of the paths' shares."""
 
 
 def compare(paths: Sequence[RoundTrips]) -> CommonOutages:
-    """Outages of paths.
+    """Compute the outages of paths, and their common outages.
 
     Raises:
         ValueError: the paths were not measured at the same time.
@@ -73,7 +73,7 @@ def compare(paths: Sequence[RoundTrips]) -> CommonOutages:
     found = [outages(path, threshold_s) for path in paths]
     covered = overlap([each for _, each in found], len(paths))
     if not len(covered):
-        raise ValueError("got paths without a time in common, expected some of the same time")
+        raise ValueError("got paths measured at different times, expected the same time")
     together = np.array([[covered[0, 0], covered[-1, 1]]])
     out = [overlap([each, together], 2) for each, _ in found]
     figures = [_figures(each, covered) for each in out]
@@ -87,7 +87,7 @@ def compare(paths: Sequence[RoundTrips]) -> CommonOutages:
 
 
 def common_time(paths: Sequence[RoundTrips]) -> Sequence[tuple[float, float]]:
-    """Begin and end of the time in which all paths were measured, each since a path's first probe
+    """Beginning and end of the common time of all measurements, for each path since its first probe
     [s].
     """
     begin_s = max(float(path.sent_s[0]) for path in paths)
@@ -101,24 +101,24 @@ def _figures(out: Intervals, covered: Intervals) -> OutageFigures:
 
 
 def outages(path: RoundTrips, threshold_s: float) -> tuple[Intervals, Intervals]:
-    """Outages of one path, and the times that its probes cover."""
+    """Outages of one path, and the times covered by its probes."""
     sent_s, most_s = path.sent_s, SPARSE * path.every_s
     ends_s = np.minimum(np.append(sent_s[1:], np.inf), sent_s + most_s)
-    failed = ~(path.trip_s <= threshold_s)  # NaN fails too
+    failed = ~(path.trip_s <= threshold_s)  # NaN, no answer, counts as failed
     edges = np.diff(failed.astype(np.int8), prepend=0, append=0)
     first, last = np.flatnonzero(edges == 1), np.flatnonzero(edges == -1) - 1
     covered_s = np.append(0.0, np.cumsum(ends_s - sent_s))
-    # Probes before and after a train, lost by chance, are no outage however far apart they are.
+    # Two lost probes around a train are not an outage, although they are far apart.
     lasting = covered_s[last + 1] - covered_s[first] >= threshold_s - 1e-6
     out = np.column_stack((sent_s[first], ends_s[last]))[lasting]
     return out, overlap([np.column_stack((sent_s, ends_s))], 1)
 
 
 def overlap(sets: Sequence[Intervals], least: int) -> Intervals:
-    """Times that lie in at least this many of the sets of intervals."""
+    """Times that are in at least `least` of the sets of intervals."""
     at_s = np.concatenate(sets).T.ravel()
     step = np.repeat((1, -1), len(at_s) // 2)
-    order = np.lexsort((-step, at_s))  # beginnings first: intervals that touch are one
+    order = np.lexsort((-step, at_s))  # beginnings first, so that touching intervals are joined
     inside = np.cumsum(step[order]) >= least
     edges = np.diff(inside.astype(np.int8), prepend=0)
     found: Intervals = np.column_stack((at_s[order][edges == 1], at_s[order][edges == -1]))

@@ -17,9 +17,9 @@ from skytether.shared.law.model import Array
 from skytether.shared.telemetry.record import DOWNLINK, PACKET_COLUMNS, UPLINK, Rows
 
 TEXT_CORRELATION_MIN = 0.5
-"""Shortest correlation time in the text, in times between two packets."""
+"""Shortest correlation time written in the text, in times between two packets."""
 ORDERED_SHARE = 0.01
-"""Predicted share of reordered packets above which a path without any is called ordered."""
+"""Predicted share of reordered packets above which a path without reordering is called ordered."""
 
 
 class ModelFigures(msgspec.Struct, frozen=True):
@@ -29,12 +29,12 @@ class ModelFigures(msgspec.Struct, frozen=True):
 
 
 class DirectionFigures(msgspec.Struct, frozen=True, kw_only=True):
-    """Figures of one direction. Delays and losses are those of packets that were sent alone."""
+    """Figures of one direction. Delays and losses exclude packets of trains."""
 
     sent: int
     came: int
     copies: int
-    """Duplicate arrivals, including packets of trains."""
+    """Number of duplicate arrivals, including packets of trains."""
     loss: float
     loss_low: float
     loss_high: float
@@ -49,16 +49,16 @@ class DirectionFigures(msgspec.Struct, frozen=True, kw_only=True):
     quantiles_s: dict[str, float]
     """Quantiles of the delay, by probability."""
     correlation: list[tuple[float, float]]
-    """Time between two packets [s] and the correlation of their delays, by lag."""
+    """For each lag, time between two packets [s] and correlation of their delays."""
     correlation_s: float
     """Time in which the correlation falls to 1/e; 0 without significant correlation."""
     rate_bytes_per_s: float | None
-    """Rate of the bottleneck, with headers; None if trains give none."""
+    """Rate of the bottleneck, with headers; None if trains give no finite rate."""
     rate_low: float | None
     rate_high: float | None
     """Bounds of the 95 % interval of the rate [B/s]."""
     trains: int
-    """Number of trains of which enough packets arrived."""
+    """Number of trains with enough received packets."""
     train_wait_s: float
     """Time for which the last packet of a train waits in the bottleneck's queue."""
     delay_models: list[ModelFigures]
@@ -72,25 +72,25 @@ class PathFigures(msgspec.Struct, frozen=True, kw_only=True):
     """Figures of a path, as written with --json."""
 
     listener: str
-    """Address of the other end, or LOCAL=HOST:PORT, or the files that were read."""
+    """Address of the other end, or LOCAL=HOST:PORT, or names of the files that were read."""
     secure: bool
     log: Literal["", "round trips", "one way"]
     """Content of a log, "" for a measurement; round-trip times are halved for each direction."""
     seconds: float
     bytes: int
-    """UDP payload of a packet [B]; 0 if a log does not have it."""
+    """UDP payload of a packet [B]; 0 if a log does not contain it."""
     every_s: float
     offset_s: float
     """Offset of the listener's clock at the first probe."""
     offset_doubt_s: float
-    """Largest error of that offset, and of all one-way delays, with opposite signs."""
+    """Largest error of the offset, and of one-way delays (opposite in both directions)."""
     drift_ppm: float
     """Drift of the listener's clock; 0 if none is significant."""
     drift_doubt_ppm: float
     round_trip_mean_s: float
-    """Mean round-trip time, which depends on no clock offset."""
+    """Mean round-trip time, which is independent of the clocks' offset."""
     round_trip_least_s: float
-    """Sum of both least delays."""
+    """Sum of both directions' least delays."""
     unreported: int
     """Number of arrivals that the listener dropped before reporting them."""
     uplink: DirectionFigures
@@ -219,8 +219,8 @@ def trace(delays: Delays, within_s: tuple[float, float] | None = None) -> str:
     """Packets of a direction as CSV text for `trace`, one row per packet.
 
     Args:
-        within_s: begin and end of the trace [s], by default the times of the first and the last
-            packet; the last packet before the begin and the first after the end are moved to them.
+        within_s: beginning and end of the trace [s], by default the first and the last packet's
+            time; the packets next outside this interval are moved to its ends.
     """
     lines, last = ["time_s,delay_s,lost"], -np.inf
     times_s, delays_s = delays.time_s, delays.delay_s
@@ -232,7 +232,7 @@ def trace(delays: Delays, within_s: tuple[float, float] | None = None) -> str:
     begin = float(times_s[0])
     for time_s, delay_s in zip(times_s.tolist(), delays_s.tolist(), strict=True):
         at = round(time_s - begin, 6)
-        if at > last:  # a trace has at most one packet per time: the first
+        if at > last:  # a trace has one packet per time: keep the first
             last = at
             lines.append(
                 f"{at:.6f},,1" if isnan(delay_s) else f"{at:.6f},{max(delay_s, 0.0):.6f},0"
@@ -241,7 +241,7 @@ def trace(delays: Delays, within_s: tuple[float, float] | None = None) -> str:
 
 
 def rows(measured: MeasuredPath, clocks: Clocks, path: int = 0) -> Rows:
-    """Packets in netem's format, one row each, those of trains included.
+    """Packets in netem's format, one row each, including packets of trains.
 
     Times are on the prober's clock; `delay_ns` of a lost packet is 0. `path` counts from 0.
     """

@@ -1,11 +1,11 @@
-"""Near end of a measurement: sends probes on a time grid, and records the fate of each.
+"""Probing end of a measurement: sends probes on a time grid, and records their answers.
 
     HELLO until WELCOME → probes for the requested time → polls until all arrivals are known, and
-    until the last answers have had time to come
+    the wait for the last answers is over
 
-Sometimes a train of packets is sent at once, to measure the rate of the path. The train takes the
-place of twice as many probes as it has packets: a path that can carry the probes has then emptied
-its queues both ways before the next probe, so delays are measured on an idle path.
+Sometimes a train of packets is sent at once, to measure the rate of the path. A train replaces
+twice as many probes as it has packets, so that a path fast enough for the probes empties its queues
+before the next probe, and delays are measured on an idle path.
 """
 
 from array import array
@@ -47,12 +47,12 @@ TRAIN_SLOTS = 2 * TRAIN
 TRAIN_EVERY_NS, TRAIN_EVERY_SLOTS = 10 * SECOND_NS, 10 * TRAIN
 """Shortest time [ns], and smallest number of probes, from one train to the next."""
 HELLO_BYTES = 64
-"""Size of a HELLO without keys: its WELCOME is shorter [B]."""
+"""Size of a HELLO without keys, longer than its WELCOME [B]."""
 PATIENCE_NS = 10 * SECOND_NS
-"""Longest wait for a first answer."""
+"""Longest wait for the first answer."""
 POLL_NS = 100 * MILLISECOND_NS
 LAST_MIN_NS, LAST_MAX_NS = 1 * SECOND_NS, 60 * SECOND_NS
-"""Bounds of the wait for the last answers [ns]: twice the longest round-trip time in between."""
+"""Bounds of the wait for the last answers, which is twice the longest round-trip time [ns]."""
 
 Longs = NDArray[np.int64]
 
@@ -61,7 +61,7 @@ Longs = NDArray[np.int64]
 class Way:
     """Packets of one direction, in order of sending.
 
-    Times are those of the sender's and the receiver's monotonic clocks, which have no common zero.
+    Times are those of the sender's and receiver's monotonic clocks, with different zeros.
     """
 
     sent_ns: Longs
@@ -87,14 +87,14 @@ class MeasuredPath:
 
 
 class Prober(Endpoint):
-    """Sender of probes; keeps their times of sending, arrival and answer.
+    """Sender of probes; stores their times of sending, arrival and answer.
 
     Args:
         link: encrypts outgoing packets, and opens incoming ones.
         listener: address of the other end.
         nonce: NONCE_BYTES, different for each measurement.
-        probes: number of places on the grid, at most PROBES_MAX.
-        period_ns: time between two places.
+        probes: number of grid points, at most PROBES_MAX.
+        period_ns: time between two grid points.
         size: UDP payload of a probe, BYTES_MIN to PAYLOAD_BYTES_MAX [B].
     """
 
@@ -123,12 +123,12 @@ class Prober(Endpoint):
         self._began_ns: int | None = None
         self._zero_ns = 0
         self._slot = 0
-        """Place on the grid of the next probe."""
+        """Grid point of the next probe."""
         self._over_ns: int | None = None
         """Time at which the last probe was sent; None before."""
         self._longest_ns = 0
         self.refused = False
-        """Whether the listener has refused, because it serves SESSIONS_MAX."""
+        """Whether the listener has refused, because SESSIONS_MAX measurements are open."""
         self.failed = False
         self._done = False
         self._sent_ns, self._train = array("q"), array("q")
@@ -178,7 +178,7 @@ class Prober(Endpoint):
             raise ProtocolError(Drop.NOT_FOR_A_CLIENT)
 
     def _learn(self, answer: ProbeAnswer, now_ns: int) -> None:
-        # Without keys, an attacker may claim anything: more than twice the probes is impossible.
+        # Without keys an attacker may send any number; more than twice the probes is impossible.
         if answer.logged > 2 * len(self._sent_ns) or len(self._answer_number) > 2 * PROBES_MAX:
             raise ProtocolError(Drop.FIELD)
         if any(number >= len(self._sent_ns) for number, _ in answer.arrivals):
@@ -229,9 +229,9 @@ class Prober(Endpoint):
         self.send(self._link.hello(self._hello, now_ns=now_ns), self._listener)
 
     def _probe(self, now_ns: int) -> None:
-        """Send the probe, or the train, at this place on the grid.
+        """Send the probe, or the train, of this grid point.
 
-        Places missed by waking too late are left out.
+        Grid points missed by a late wake are skipped.
         """
         slot = max(self._slot, (now_ns - self._zero_ns) // self._period_ns)
         if now_ns < self._zero_ns + slot * self._period_ns:
@@ -257,7 +257,7 @@ class Prober(Endpoint):
         self._train.append(number)
 
     def _poll(self, now_ns: int, over_ns: int) -> None:
-        """Ask for arrivals until all are known, or until a time limit."""
+        """Request arrivals until all are known, or until a time limit."""
         waited_ns = now_ns - over_ns
         least_ns = min(max(LAST_MIN_NS, 2 * self._longest_ns), LAST_MAX_NS)
         if waited_ns >= LAST_MAX_NS or (waited_ns >= least_ns and self._logged >= self._total):
@@ -280,7 +280,7 @@ class Prober(Endpoint):
         return self._done
 
     def stop(self) -> None:
-        """End the measurement at the next wake, as another path's has failed."""
+        """End the measurement at the next wake, because that of another path has failed."""
         self._done = True
 
     # -- results -------------------------------------------------------------------------------
@@ -301,8 +301,8 @@ class Prober(Endpoint):
     def measured(self) -> MeasuredPath:
         """Packets so far.
 
-        If the measurement was ended early, packets that may still be under way are left out: those
-        after the newest one with a known fate.
+        If the measurement was ended early, packets that may still be under way are left out:
+        packets after the newest one that is known to be received or lost.
         """
         number = np.array(self._logged_number, np.int64)
         logged_ns = np.array(self._logged_ns, np.int64)
@@ -320,7 +320,7 @@ class Prober(Endpoint):
         downlink = self.measured().downlink
         number, answered = np.array(self._logged_number), np.array(self._answer_number)
         at = np.flatnonzero(answered < len(number))
-        at = at[number[answered[at]] >= 0][::-1]  # the first of several answers is written last
+        at = at[number[answered[at]] >= 0][::-1]  # of several answers, keep the first: written last
         probe = number[answered[at]]
         trip_s = np.full(len(self._sent_ns), np.nan)
         came_ns, sent_ns = np.array(self._answer_came_ns)[at], np.array(self._sent_ns)[probe]
@@ -339,7 +339,7 @@ class Prober(Endpoint):
         return Way(sent_ns[:end], came_ns[:end], came[:end], train[:end], copies)
 
     def _uplink(self, number: Longs, logged_ns: Longs) -> Way:
-        """Answers to probes; a lost answer was sent when its probe arrived."""
+        """Answers to probes; a lost answer's sending time is its probe's arrival time."""
         answered = np.array(self._answer_number, np.int64)
         first, at = np.unique(answered[answered < len(number)], return_index=True)
         end = len(number) if self._settled else int(first.max(initial=-1)) + 1

@@ -3,15 +3,15 @@
     [version, type, ...]
 
 | type | message | sent by  | fields                                              |
-|------|---------|----------|-----------------------------------------------------| | 1    | HELLO
-| prober   | nonce, padding                                      | | 2    | WELCOME | listener |
-nonce, cookie, room                                 | | 3    | PROBE   | prober   | session, number,
-train, held, padding               | | 4    | ANSWER  | listener | session, number, sent_ns, first,
-logged, arrivals,  | |      |         |          | padding
-|
+|------|---------|----------|-----------------------------------------------------|
+| 1    | HELLO   | prober   | nonce, padding                                      |
+| 2    | WELCOME | listener | nonce, cookie, is_granted                           |
+| 3    | PROBE   | prober   | session, number, train, held, padding               |
+| 4    | ANSWER  | listener | session, number, sent_ns, first, logged, arrivals,  |
+|      |         |          | padding                                             |
 
 HELLO and WELCOME have the types that a handshake of `shared.wire.handshake` may carry. The session
-is nonce and cookie together. A PROBE is padded to the requested size, and its ANSWER is no longer.
+is nonce and cookie together. A PROBE is padded to the requested size; its ANSWER is no longer.
 """
 
 from struct import Struct
@@ -23,14 +23,14 @@ from skytether.shared.wire.drop import Drop, ProtocolError
 from skytether.shared.wire.protocol import PAYLOAD_BYTES_MAX
 
 VERSION = 64
-"""Protocol version; endpoints of a flight reject it, so that none accepts a probe."""
+"""Protocol version; different from a flight's, so that endpoints of a flight reject probes."""
 NONCE_BYTES = COOKIE_BYTES = 8
 SESSION_BYTES = NONCE_BYTES + COOKIE_BYTES
 MESSAGE_BYTES_MIN = 96
-"""Smallest size of a PROBE [B]: its ANSWER then has space for two arrivals."""
+"""Smallest size of a PROBE [B], with which its ANSWER has space for two arrivals."""
 TRAIN_MAX = 64
 NO_NUMBER = 2**32 - 1
-"""Number in a PROBE that only asks for arrivals, and in its ANSWER."""
+"""Number in a PROBE that only requests arrivals, and in its ANSWER."""
 
 _ARRIVAL = Struct("<IQ")
 _PADDING = bytes(PAYLOAD_BYTES_MAX)
@@ -60,7 +60,7 @@ class Probe(NamedTuple):
     train: int
     """Number of packets of its train; 0 for a packet sent alone."""
     held: int
-    """Number of arrivals of which the prober has received reports."""
+    """Number of arrivals whose reports the prober has received."""
 
 
 class ProbeAnswer(NamedTuple):
@@ -68,7 +68,7 @@ class ProbeAnswer(NamedTuple):
 
     session: bytes
     number: int
-    """Number of the arrival that is answered, from 0; or NO_NUMBER."""
+    """Number of the answered arrival, from 0; or NO_NUMBER."""
     sent_ns: int
     """Time of sending, on the listener's clock."""
     first: int
@@ -160,7 +160,7 @@ def _check(session: bytes, numbers: tuple[int, ...]) -> None:
     """Refuse a session id of wrong length, and numbers out of range.
 
     Raises:
-        ProtocolError: names the field.
+        ProtocolError: a field is wrong; the message names it.
     """
     wrong = any(isinstance(each, bool) or not 0 <= each <= NO_NUMBER for each in numbers)
     if wrong or len(session) != SESSION_BYTES:

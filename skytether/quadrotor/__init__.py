@@ -1,4 +1,4 @@
-"""Quadrotor: a rigid body with four rotors, and control loops that track a velocity.
+"""Quadrotor: rigid body with four rotors, and control loops that track a velocity.
 
     velocity → acceleration → attitude → rates → rotors → forces
 

@@ -3,8 +3,8 @@
     u: σ √(2T) / (1 + T s)      v, w: σ √T (1 + √3 T s) / (1 + T s)²      T = L / V
 
 Filters of white noise give the velocity of the air along the wind (u), across (v) and upwards (w).
-V is the speed at which the air carries its eddies past the vehicle: that of the wind 6 m above
-ground. Lengths L and strengths σ at low height are those of MIL-F-8785C:
+V is the speed at which turbulence moves past the vehicle, here the wind speed 6 m above ground.
+Lengths L and standard deviations σ at low height are those of MIL-F-8785C:
 
     σ_w = 0.1 V      σ_u = σ_v = σ_w / c^0.4      L_w = h      L_u = L_v = h / c^1.2
     c = 0.177 + 0.000823 h                        h: height [ft], 10 to 1000
@@ -66,7 +66,7 @@ def blow(air: Air, drawn: F1, height: float, out: F1) -> None:
 
 @part
 def _second_order(state: F1, keep: float, strength: float, drawn: float) -> None:
-    """Two first-order lags in series, driven so that the output has the standard deviation σ."""
+    """Advance two first-order lags in series; `strength` is the output's standard deviation."""
     spread = strength / np.sqrt(2.0) * np.sqrt(1.0 - keep * keep)
     state[1] = keep * state[1] + (1.0 - keep) * state[0]
     state[0] = keep * state[0] + spread * drawn

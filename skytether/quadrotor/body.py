@@ -1,7 +1,7 @@
 """Equations of motion of the rigid body and its rotors, compiled.
 
-    ṗ = v      v̇ = g + R F / m      q̇ = q ⊗ (0, Ω) / 2      J Ω̇ = M - Ω × J Ω      ω̇ = (ω* - ω)
-    / τ
+    ṗ = v      v̇ = g + R F / m      q̇ = q ⊗ (0, Ω) / 2
+    J Ω̇ = M - Ω × J Ω      ω̇ = (ω* - ω) / τ
 
 In this package, world vectors are north, east, down, and body vectors forward, right, down. R, the
 rotation matrix of the quaternion q, turns body vectors into world vectors.
@@ -24,7 +24,7 @@ STEP_S = 0.002
 
 
 class Signs(NamedTuple):
-    """Signs of the rotors' positions: 1 front right, 2 back left, 3 front left, 4 back right."""
+    """Signs of position and torque of rotors front right, back left, front left, back right."""
 
     front: tuple[float, ...] = (1.0, -1.0, 1.0, -1.0)
     """Position of each rotor along the forward axis: 1 in front, -1 behind."""
@@ -124,6 +124,6 @@ def advance(frame: Frame, x: F1, command: F1, wind: F1) -> None:
 
 @making_kernel
 def drive(frame: Frame, x: F1, command: F1, wind: F1, steps: int) -> None:
-    """Advance the states by some steps with constant rotor commands, without control loops."""
+    """Advance the states by `steps` steps with constant rotor commands, without control loops."""
     for _ in range(steps):
         advance(frame, x, command, wind)

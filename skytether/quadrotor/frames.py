@@ -1,9 +1,9 @@
 """Frames: physical parameters of quadrotors, with the source of each number.
 
-Rotor k turns with the speed ω_k [rad/s], pushes with k_T ω_k² along the body's axis and turns the
-body with k_M ω_k² about it. In the air each rotor drags with ω_k diag(k_d, k_d, k_z) times its own
-airspeed, and the whole body with c |v| v. That is the model of rotorpy (Folk, Paulos, Kumar,
-"RotorPy: A Python-based Multirotor Simulator with Aerodynamics for Education and Research", 2023).
+Rotor k turns with the speed ω_k [rad/s]; its thrust along the body's axis is k_T ω_k², its torque
+k_M ω_k². The drag of each rotor is ω_k diag(k_d, k_d, k_z) times its own airspeed, that of the body
+c |v| v. This is the model of rotorpy (Folk, Paulos, Kumar, "RotorPy: A Python-based Multirotor
+Simulator with Aerodynamics for Education and Research", 2023).
 """
 
 from typing import NamedTuple
@@ -24,15 +24,15 @@ class Frame(NamedTuple):
     arm_y_m: float
     """Distance of each rotor from the centre, to the right or left [m]."""
     thrust: float
-    """Thrust k_T of a rotor over its speed squared [N s²]."""
+    """Coefficient k_T: thrust of a rotor, divided by its speed squared [N s²]."""
     torque: float
-    """Torque k_M of a rotor over its speed squared [N m s²]."""
+    """Coefficient k_M: torque of a rotor, divided by its speed squared [N m s²]."""
     rotor_drag: float
-    """Drag k_d of a rotor in its plane, over its speed and its airspeed [N s²/m]."""
+    """Coefficient k_d: drag of a rotor in its plane, divided by speed and airspeed [N s²/m]."""
     inflow_drag: float
-    """Drag k_z of a rotor along its axis, over its speed and its airspeed [N s²/m]."""
+    """Coefficient k_z: drag of a rotor along its axis, divided by speed and airspeed [N s²/m]."""
     body_drag: float
-    """Drag c of the body over its airspeed squared [N s²/m²]."""
+    """Coefficient c: drag of the body, divided by its airspeed squared [N s²/m²]."""
     rotor_lag_s: float
     rotor_max: float
     """Largest speed of a rotor with a full battery [rad/s]."""
@@ -47,7 +47,7 @@ class Frame(NamedTuple):
     rate_gain: float
     """Gain from rate error to angular acceleration [1/s]."""
     rate_damping: float
-    """Gain on measured angular acceleration, subtracted to reduce the rotors' lag."""
+    """Gain of the measured angular acceleration, subtracted to compensate the rotors' lag."""
 
     @property
     def hover(self) -> float:
@@ -110,9 +110,9 @@ KG15 = Frame(
 )
 """3DR Iris, 1.5 kg: body, rotors and drag as in PX4's model for Gazebo (`models/iris/iris.sdf`).
 
-Means are used where that model has two values: rotors 0.22 m (front) and 0.20 m (back) to the side,
-lags of 0.0125 s upwards and 0.025 s downwards. Battery: the Iris' 5.1 Ah in three cells, for 16 to
-22 minutes; the resistance is assumed, typical of a battery of that size.
+Means are used where that model has two values: lateral rotor distances of 0.22 m (front) and 0.20 m
+(back), lags of 0.0125 s (speeding up) and 0.025 s (slowing down). Battery: the Iris' 5.1 Ah in
+three cells, for 16 to 22 minutes; the resistance is assumed, typical of a battery of that size.
 """
 
 SIH = Frame(
@@ -139,7 +139,7 @@ SIH = Frame(
 )
 """PX4's simulation in hardware: `sih_params.c` of PX4 1.17, rotors of 1000 rad/s as in rotorpy.
 
-Its drag of 1 N for each m/s is applied here as rotor drag in hover. It has no battery; that of the
+Its drag of 1 N per m/s is used here as rotor drag in hover. It has no battery model; that of the
 1.5 kg frame is used.
 """
 

@@ -39,7 +39,7 @@ class Gains(NamedTuple):
     i: float
     """Gain from the integral of the horizontal velocity error to acceleration [1/s²]."""
     d: float
-    """Gain on the measured acceleration, subtracted from the command."""
+    """Gain of the measured acceleration, which is subtracted from the command."""
     p_up: float
     """Gain from vertical velocity error to acceleration [1/s]."""
     i_up: float
@@ -100,13 +100,13 @@ CRAZYFLIE = Gains(
 )
 """Crazyflie's firmware: its defaults of `position_controller_pid.c`, velocity to tilt with 25° and
 1° for each m/s, at most 20°, and to thrust 25 000 and 15 000 of 65 535, as accelerations of a
-Crazyflie. Its integrals do not reach their limits; 5 m/s² is assumed here."""
+Crazyflie. Its integrals do not reach their limits; 5 m/s² is assumed."""
 
 AHEAD_MAX_M = 2.0
-"""Largest position error that K acts on [m]."""
+"""Upper limit of the position error in the term with K [m]."""
 CELL_V = (0.0, 3.3, 3.6, 3.68, 3.75, 3.82, 3.95, 4.2)
 CELL_CHARGE = (-0.05, 0.0, 0.1, 0.2, 0.4, 0.6, 0.8, 1.0)
-"""Open-circuit voltage of a lithium polymer cell over its charge [V]; typical, not measured. The
+"""Charges at the open-circuit voltages CELL_V of a lithium polymer cell; typical, not measured. The
 first entry extends the curve below charge 0.
 """
 CELL_FULL_V = 4.2
@@ -175,7 +175,7 @@ def shape(gains: Gains, wanted: F1, target: F1) -> None:
 
 @making_part
 def accelerate(gains: Gains, quad: Quad, out: F1) -> None:
-    """Specific force a - g commanded by the velocity loop [m/s²]; shape (3,)."""
+    """Compute the specific force a - g commanded by the velocity loop [m/s²]; shape (3,)."""
     x, wanted, integral = quad.x, quad.wanted, quad.integral
     for i in range(3):
         p, i_, d = (gains.p, gains.i, gains.d) if i < 2 else (gains.p_up, gains.i_up, 0.0)
@@ -185,7 +185,7 @@ def accelerate(gains: Gains, quad: Quad, out: F1) -> None:
         integral[i] = clipped(integral[i] + i_ * error * STEP_S, gains.integral_max)
         lead = wanted[3 + i]
         out[i] = lead + p * error + integral[i] - d * (quad.acceleration[i] - lead)
-    # Height has priority over horizontal motion, which is limited by the largest tilt.
+    # Altitude has priority over horizontal motion, which the largest tilt limits.
     out[2] = clipped(out[2], 0.9 * GRAVITY) - GRAVITY
     aside = np.sqrt(out[0] * out[0] + out[1] * out[1])
     most = np.tan(gains.tilt_max) * -out[2]
@@ -280,7 +280,7 @@ def drain(frame: Frame, x: F1, battery: F1) -> None:
 
 @making_part
 def stand(quad: Quad, ground: float) -> None:
-    """Keep the body above the ground: a landed body stands level."""
+    """Keep the body above the ground; a body on the ground stands level."""
     x = quad.x
     if x[2] < ground:
         return
@@ -298,7 +298,7 @@ def stand(quad: Quad, ground: float) -> None:
 def fly(
     frame: Frame, gains: Gains, quad: Quad, air: Air, drawn: F2, target: F1, ground: float, on: bool
 ) -> None:
-    """Fly some steps with a velocity command.
+    """Fly one step per row of `drawn` with a velocity command.
 
     Args:
         drawn: random numbers of the gusts, one row per step; shape (steps, 3).

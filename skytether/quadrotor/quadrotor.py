@@ -1,6 +1,6 @@
 """Quadrotor that flies a commanded velocity, in steps of 2 ms.
 
-Outside this package: x north, y east, altitude up.
+The interface has x north, y east, altitude up.
 """
 
 from collections.abc import Sequence
@@ -16,7 +16,7 @@ from skytether.shared.base.kernel import plain
 from skytether.shared.law.model import Array
 
 UP = np.array([1.0, 1.0, -1.0])
-"""Signs that convert between down and altitude."""
+"""Signs that convert between north, east, down and x north, y east, altitude up."""
 
 
 class Attitude(NamedTuple):
@@ -43,7 +43,7 @@ class Quadrotor:
     """Quadrotor and the air around it.
 
     Args:
-        rng: random generator of its gusts, for this vehicle only.
+        rng: random generator of the gusts, for this vehicle only.
         position: initial position, at rest [m]; shape (3,).
         ground_m: altitude of the ground; None for no ground.
         charge: charge of its battery, from 0 to 1; infinite for a battery that never discharges.
@@ -91,7 +91,7 @@ class Quadrotor:
         self._air.turbulence[0] = turbulence_mps
 
     def advance(self, velocity: Array, duration_ns: int) -> None:
-        """Fly for some time; a remainder of less than a step is carried over to the next call.
+        """Fly for a duration; a remainder of less than a step is added to the next call.
 
         Args:
             velocity: commanded velocity [m/s]; shape (3,).

@@ -1,6 +1,6 @@
-"""ROS 2 as it is on a Zenoh network: messages in CDR, and the names that rmw_zenoh gives them.
+"""ROS 2 on a Zenoh network: messages in CDR, and names of topics and nodes as in rmw_zenoh.
 
-Nothing of ROS is imported, and no module of this package has a socket: rosbags only encodes and
-decodes messages. `skytether.shell.driving.graph` puts a `graph.Node` on a Zenoh network.
-`client.ros2` and `skytether ros2` import the package; it imports `shared.base`.
+The package imports no part of ROS, and opens no socket: rosbags only encodes and decodes messages.
+`skytether.shell.driving.graph` puts a `graph.Node` on a Zenoh network. `client.ros2` and `skytether
+ros2` import the package; it imports `shared.base`.
 """

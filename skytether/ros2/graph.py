@@ -1,13 +1,13 @@
-"""Names of topics and nodes on a Zenoh network, as rmw_zenoh has them (its docs/design.md).
+"""Names of topics and nodes on a Zenoh network, as in rmw_zenoh (docs/design.md there).
 
     topic       <domain>/<topic>/<type>/<type hash>
     token       @ros2_lv/<domain>/<session>/<node>/<entity>/<kind>/<enclave>/<namespace>/<name>
                 and, of a publisher or a subscriber, /<topic>/<type>/<type hash>/<quality>
     attachment  sequence number (8 B), time stamp (8 B), 16 (1 B), identity (16 B)
 
-In a token each `/` of a name is `%`; the enclave and the namespace of our nodes are empty. Tokens
-are Zenoh's liveliness tokens: they vanish with their session, and `ros2 topic list` shows whoever
-has one. Numbers are little-endian.
+In a token each `/` of a name is `%`; enclave and namespace of our nodes are empty. Tokens are
+Zenoh's liveliness tokens: they end with their session, and `ros2 topic list` shows topics with a
+token. Numbers are little-endian.
 """
 
 import struct
@@ -23,7 +23,7 @@ QUALITY = "::,1:,:,:,,"
 depth of 1."""
 NODE, PUBLISHER, SUBSCRIBER = "NN", "MP", "MS"
 NAME_AT, PARTS = 8, 13
-"""Index of a node's name in a token, and the number of a publisher's parts."""
+"""Index of a node's name in a token, and number of parts of a publisher's token."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,13 +31,13 @@ class Topic:
     name: str
     """Name with its namespace, as in `/cmd_vel`."""
     kind: str
-    """Type of its messages, as in `geometry_msgs/msg/Twist`."""
+    """Type of the topic's messages, as in `geometry_msgs/msg/Twist`."""
     type_hash: str
     """Hash of the type's definition (REP 2016), as in `RIHS01_…`."""
 
     @property
     def dds_kind(self) -> str:
-        """Type as it is named on the network: `geometry_msgs::msg::dds_::Twist_`."""
+        """Name of the type on the network: `geometry_msgs::msg::dds_::Twist_`."""
         package, folder, name = self.kind.split("/")
         return f"{package}::{folder}::dds_::{name}_"
 
@@ -47,22 +47,22 @@ class Topic:
 
 @dataclass(frozen=True, slots=True)
 class Node:
-    """A node of the ROS graph that we put on a Zenoh network."""
+    """Node of the ROS graph that Skytether adds to a Zenoh network."""
 
     host: str
-    """Host of a Zenoh router or peer that speaks TCP."""
+    """Host of a Zenoh router or peer that uses TCP."""
     port: int
     domain: int
     name: str
     publishes: Topic
     subscribes: Topic
     alternatives: tuple[Topic, ...] = ()
-    """The published topic with other types; with any, the first message decides on one."""
+    """The published topic with alternative types; if any, the first message determines the type."""
 
     @property
     def forms(self) -> tuple[Topic, ...]:
-        """The published topic, once for each type that it may have. The address of a message to be
-        published has the index in this list.
+        """The published topic, once for each possible type. The address of a message to publish
+        contains an index of this list.
         """
         return self.publishes, *self.alternatives
 
@@ -82,8 +82,8 @@ class Node:
 
     @property
     def others(self) -> list[str]:
-        """Patterns of the tokens of whoever publishes or takes the topic that we publish, or
-        publishes the one that we take.
+        """Patterns for tokens of other publishers and subscribers of the topic that we publish, and
+        of publishers of the topic that we subscribe to.
         """
         out, into = mangled(self.publishes.name), mangled(self.subscribes.name)
         pairs = ((PUBLISHER, out), (SUBSCRIBER, out), (PUBLISHER, into))
@@ -102,7 +102,7 @@ class Entity(NamedTuple):
     type_hash: str
 
     def takes(self, topic: Topic) -> bool:
-        """Whether its messages are those of a topic: same type, same hash."""
+        """Whether it has the type and the type hash of a topic."""
         return (self.dds_kind, self.type_hash) == (topic.dds_kind, topic.type_hash)
 
     def __str__(self) -> str:
@@ -115,7 +115,7 @@ def mangled(name: str) -> str:
 
 
 def entity_of(token: str) -> Entity | None:
-    """Publisher or subscriber of a token; None for any other text."""
+    """Publisher or subscriber that a token describes; None for any other text."""
     parts = token.split("/")
     if len(parts) != PARTS or parts[0] != TOKENS or parts[5] not in (PUBLISHER, SUBSCRIBER):
         return None
@@ -141,8 +141,8 @@ def attachment(number: int, stamp_ns: int, publisher: bytes) -> bytes:
 
 
 def session_settings(node: Node) -> dict[str, object]:
-    """Settings of a Zenoh session as rmw_zenoh has them: no multicast, and peers find each other
-    by gossip, so that they go on without the router.
+    """Settings of a Zenoh session, as in rmw_zenoh: no multicast; peers find each other by gossip,
+    so that they continue without the router.
     """
     host = f"[{node.host}]" if ":" in node.host else node.host
     return {

@@ -1,4 +1,4 @@
-"""Messages of ROS 2 in CDR: the few types that are used here, by rosbags."""
+"""Messages of ROS 2 in CDR, encoded by rosbags: only the types used here."""
 
 import math
 from collections.abc import Sequence
@@ -21,7 +21,7 @@ PARTS = (
     *(f"geometry_msgs/msg/{name}" for name in ("PoseWithCovariance", "TwistWithCovariance")),
 )
 STORE = Typestore()
-# Loading only these takes a tenth of the time, and of the memory, of all types of a distribution.
+# Loading only these types takes a tenth of the time and memory for a distribution's types.
 USED = (*PARTS, TWIST, TWIST_STAMPED, ODOMETRY, POSE_STAMPED, PATH)
 STORE.register({kind: FIELDDEFS[kind] for kind in USED})
 POSE_PARTS = "Point", "Pose", "PoseStamped"
@@ -30,20 +30,20 @@ UNIT = 0.01
 
 Vector = tuple[float, float, float]
 Rotation = tuple[Vector, Vector, Vector]
-"""Matrix by rows, from the axes of a robot to those of its fixed frame; shape (3, 3)."""
+"""Rotation matrix by rows, from a robot's axes to those of its fixed frame; shape (3, 3)."""
 
 
 class MessageError(ValueError):
-    """Bytes are no message of the expected type, or its numbers make no sense."""
+    """Bytes are not a message of the expected type, or its numbers are invalid."""
 
 
 class Odometry(NamedTuple):
     stamp_ns: int
-    """Time of measurement by the robot's clock [ns]."""
+    """Time of measurement on the robot's clock [ns]."""
     frame: str
     """Fixed frame of position and rotation."""
     child: str
-    """Frame of the velocities: that of the robot."""
+    """Frame of the velocities, which is the robot's."""
     position: Vector
     """Position of the robot in the fixed frame [m]."""
     rotation: Rotation
@@ -56,7 +56,7 @@ class Odometry(NamedTuple):
 class Goal(NamedTuple):
     frame: str
     position: Vector
-    """Position in that frame [m]."""
+    """Position in the frame `frame` [m]."""
 
 
 def topic(name: str, kind: str) -> Topic:
@@ -67,7 +67,7 @@ def odometry(payload: bytes) -> Odometry:
     """Decode nav_msgs/Odometry.
 
     Raises:
-        MessageError: the bytes are no such message, or its orientation is no rotation.
+        MessageError: the bytes are not such a message, or its orientation is not a rotation.
     """
     message = _decoded(payload, ODOMETRY)
     header, pose, twist = message.header, message.pose.pose, message.twist.twist
@@ -86,7 +86,7 @@ def goal(payload: bytes) -> Goal:
     """Decode geometry_msgs/PoseStamped, without its orientation.
 
     Raises:
-        MessageError: the bytes are no such message, or its position is not finite.
+        MessageError: the bytes are not such a message, or its position is not finite.
     """
     message = _decoded(payload, POSE_STAMPED)
     position = _vector(message.pose.position)
@@ -103,9 +103,9 @@ def _decoded(payload: bytes, kind: str) -> Any:
 
 
 def rotation(w: float, x: float, y: float, z: float) -> Rotation:
-    """Rotation of a unit quaternion; raises MessageError for any other one."""
+    """Rotation of a unit quaternion; raises MessageError for other quaternions."""
     if not abs(math.hypot(w, x, y, z) - 1.0) <= UNIT:
-        raise MessageError("the orientation is no unit quaternion")
+        raise MessageError("the orientation is not a unit quaternion")
     return (
         (1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)),
         (2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)),
@@ -114,19 +114,19 @@ def rotation(w: float, x: float, y: float, z: float) -> Rotation:
 
 
 def twist(linear: Vector, turn: float) -> bytes:
-    """Encode geometry_msgs/Twist, with a turn about the vertical axis [rad/s]."""
+    """Encode geometry_msgs/Twist, with an angular velocity about the vertical axis [rad/s]."""
     return bytes(STORE.serialize_cdr(_twist(linear, turn), TWIST))
 
 
 def twist_stamped(stamp_ns: int, frame: str, linear: Vector, turn: float) -> bytes:
-    """Encode geometry_msgs/TwistStamped; `stamp_ns` is by the robot's clock."""
+    """Encode geometry_msgs/TwistStamped; `stamp_ns` is a time on the robot's clock."""
     types: Any = STORE.types
     message = types[TWIST_STAMPED](_header(stamp_ns, frame), _twist(linear, turn))
     return bytes(STORE.serialize_cdr(message, TWIST_STAMPED))
 
 
 def path(stamp_ns: int, frame: str, positions: Sequence[Vector]) -> bytes:
-    """Encode nav_msgs/Path: positions in a frame [m], all with one stamp and without rotation."""
+    """Encode nav_msgs/Path: positions in a frame [m], with equal stamps, without rotation."""
     types: Any = STORE.types
     point, pose, stamped = (types[f"geometry_msgs/msg/{name}"] for name in POSE_PARTS)
     level = types["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0)

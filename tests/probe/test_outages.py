@@ -151,7 +151,7 @@ def test_an_overlap_is_that_of_every_moment(sets: list[Array], least: int) -> No
 
 
 def test_paths_that_were_never_measured_together_are_refused() -> None:
-    with pytest.raises(ValueError, match="without a time in common"):
+    with pytest.raises(ValueError, match="measured at different times"):
         compare([trips(row("........")), trips(row("........"), begin_s=60.0)])
 
 

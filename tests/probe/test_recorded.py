@@ -123,7 +123,7 @@ def test_logs_of_two_modems_are_compared_at_the_same_times(
         (5 * "--from it.log ", "got 5 files, expected logs of up to 4 paths"),
         ("--from near.pcap", "--from: near.pcap: got a capture of packets"),
         ("--from it.log --from it.log", "got it.log and it.log, expected each file once"),
-        ("--from it.log --from tomorrow.log", "got paths without a time in common"),
+        ("--from it.log --from tomorrow.log", "got paths measured at different times"),
         ("--from bad.log", "--from: bad.log: got no answer to a ping"),
         ("--from it.log --listen 127.0.0.1:1", "got both, expected"),
     ],

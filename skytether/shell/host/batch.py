@@ -172,12 +172,9 @@ class DatagramBatch:
 
         Returns:
             payloads, senders, and arrival times [ns; CLOCK_MONOTONIC], in the order of arrival; all
-            empty
-            if there was no datagram, or an error. Arrival times are converted from the kernel's
-            time of
-            day, so they are wrong by the step when that clock is set; a datagram without one gets
-            the
-            present time.
+            empty if there was no datagram, or an error. Arrival times are converted from the
+            kernel's time of day, so they are wrong by the step when that clock is set; a datagram
+            without an arrival time gets the present time.
         """
         rows, size = self._in, self._name_bytes
         rows.stamp_sizes[:] = _WHOLE
