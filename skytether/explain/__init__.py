@@ -1,15 +1,15 @@
 """Explain: why a flight in virtual time braked, was far off, came too close, or sent too much.
 
-A flight in virtual time is the same to the last bit each time, and the fate of a packet follows
-from seed, direction, flow and time. So the same flight can be flown again with one outage healed,
-one packet delivered, no wind, or another key, and the moment comes about again, or does not.
+A flight in virtual time is the same to the last bit each time, and the loss and delay of a packet
+follow from seed, direction, flow and time. So the same flight can be flown again without one
+outage, one loss, the wind, or with another key, to see whether the moment occurs again.
 
     skytether explain demo-two-links --seed 9314
 
     flight = skytether.fly("demo-two-links", seed=9314)
     print(flight.explain())
 
-In this order, each in a module of its own:
+The modules, in the order of their use:
 
 | module | what is in it |
 |---|---|
@@ -20,7 +20,7 @@ In this order, each in a module of its own:
 | `smallest` | delta debugging: the smallest set of units that suffices |
 | `causes` | the cause, single packets that would have averted it, how long an outage must be |
 | `remedies` | other keys, over the same fates and over those of other seeds |
-| `hypotheses` | what the theorem of separation assumes of a mission, with its least margin |
+| `hypotheses` | assumptions of a mission's theorem of separation, with their smallest margins |
 | `waits`, `server_ticks` | which vehicle of a mission waited for which, and for which packet |
 | `explanation` | all of it, step by step |
 | `words`, `mission`, `picture` | the explanation as text and as a picture |

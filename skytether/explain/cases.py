@@ -1,7 +1,7 @@
-"""Cases: flights that can be flown again, and what can be taken out of them.
+"""Cases: flights that can be flown again, and units that can be removed from them.
 
-The network is changed by its own impairment `delivered`, and wind by keys: what is flown is a
-scenario that anybody can fly.
+The impairment `delivered` changes the network, and keys change the wind: so a case is an ordinary
+scenario that any user can fly.
 """
 
 from collections import defaultdict
@@ -30,28 +30,28 @@ class Stretch:
     lane: Lane
     first: int
     end: int
-    """Slot after the last."""
+    """Slot after the last slot."""
 
 
 @dataclass(frozen=True, slots=True)
 class Bad(Stretch):
-    """Stretch in which the network loses, or delays beyond use, whatever enters it."""
+    """Stretch in which the network loses all packets, or delays them too long."""
 
     is_late: bool = False
     is_packet: bool = False
-    """Whether it is the fate of a single packet."""
+    """Whether it affects a single packet only."""
 
 
 @dataclass(frozen=True, slots=True)
 class UsualDelay:
-    """The delay that every packet of a direction has."""
+    """Usual delay of packets in a direction of a path, which every packet has at least."""
 
     direction: int
 
 
 @dataclass(frozen=True, slots=True)
 class Setting:
-    """Property, such as wind, that other values of some keys take away."""
+    """Property of the scenario, such as wind, that other values of keys remove."""
 
     name: str
     keys: Keys
@@ -59,21 +59,21 @@ class Setting:
 
 @dataclass(frozen=True, slots=True)
 class Stall:
-    """Time for which a process stands still: it gets no packets and is not woken."""
+    """Time for which a process is stopped: it receives no packets and is not woken."""
 
     process: Literal["server", "client"]
     at_s: float
-    """Time in the flight at which it begins [s]."""
+    """Time of flight at the beginning [s]."""
     for_s: float
 
 
 Unit: TypeAlias = Bad | UsualDelay | Setting | Stall
-"""What can be taken out of a flight."""
+"""Unit that can be removed from a flight."""
 
 
 @dataclass(frozen=True, slots=True)
 class Delivered:
-    """Stretch in which every packet arrives, `most_s` after it was sent at the latest [s]."""
+    """Stretch in which every packet arrives within `most_s` after sending [s]."""
 
     where: Stretch
     most_s: float
@@ -81,7 +81,7 @@ class Delivered:
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """Flight to be flown: a scenario, and what differs from it."""
+    """Flight to be flown: a scenario, and changes to it."""
 
     scenario: Scenario
     vehicles: int = 1
@@ -90,16 +90,16 @@ class Case:
     keys: Keys = ()
     delivered: tuple[Delivered, ...] = ()
     until_s: float | None = None
-    """Time in the flight after which the rest is not needed [s]; None: all of it is."""
+    """Time of flight at which the flight may end [s]; None: at its regular end."""
 
     def fates(self, lane: Lane) -> Fates:
-        """What the packets of a lane meet."""
+        """Losses and delays of the packets of a lane."""
         path, direction, flow = lane
         own, name = self.scenario.on_path(path), _name(direction)
         return Fates(getattr(own, name), own.seed, name, flow)
 
     def flown(self) -> Scenario:
-        """Scenario with what differs from it; raises ConfigError if it cannot be flown."""
+        """Scenario with the changes; raises ConfigError if it cannot be flown."""
         scenario = self.scenario
         if self.keys:
             table = reading.to_table(scenario)

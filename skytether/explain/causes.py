@@ -1,9 +1,8 @@
-"""Cause of a moment: the smallest set of units that suffices, and what each of them does.
+"""Cause of a moment: the smallest set of units that suffices, and the effect of each.
 
-It is searched among ever more circumstances: first among what happened shortly before the moment,
-then from the flight's beginning on, then with the usual delay as a unit as well. The cause is among
-the first without all of which the moment does not come about; if there are none, it is the
-scenario.
+It is searched among more and more units: first units shortly before the moment, then from the
+flight's beginning on, then also the usual delay. The search uses the first of these groups without
+which the moment does not occur; without such a group, the cause is the scenario.
 """
 
 from collections.abc import Iterable
@@ -19,34 +18,34 @@ from skytether.explain.smallest import smallest
 from skytether.explain.units import Circumstances
 
 BEFORE_S = 8.0
-"""Time before a moment in which its cause is searched first [s]: longer than two time-outs, a
+"""Time before a moment in which its cause is searched first [s]; longer than two time-outs, a
 horizon and the delays."""
 SHORTEST_MS = 20
-"""Accuracy to which the shortest outage that suffices is found [ms]."""
+"""Accuracy of the length of the shortest outage that suffices [ms]."""
 SETS_MAX = 3
-"""Largest number of sets that are searched, if each of them suffices."""
+"""Largest number of searched sets of which each suffices."""
 PACKETS_MAX = 64
-"""Largest number of packets each of which is delivered alone, the newest before the moment."""
+"""Largest number of packets, the newest before the moment, whose single delivery is tested."""
 
 
 @dataclass(frozen=True, slots=True)
 class Part:
-    """Unit of a cause, and what it does."""
+    """Unit of a cause, and its effect."""
 
     unit: Unit
     start_s: float
-    """Time in the flight at which it begins [s]; 0 for what is always there."""
+    """Time of flight at its beginning [s]; 0 for permanent units."""
     end_s: float
     is_needed: bool
-    """Whether the moment does not come about without it."""
+    """Whether the moment does not occur without this unit."""
     error_m: float
-    """Largest error without it [m]."""
+    """Largest error without this unit [m]."""
     packets: int = 0
-    """Number of packets that it lost or delayed."""
+    """Number of packets that the unit lost or delayed."""
     plans: int = 0
-    """Number of plans among them."""
+    """Number of plans among these packets."""
     shortest_s: tuple[float, float] | None = None
-    """Shortest outage that suffices, beginning or ending when this one does [s], smaller first."""
+    """Lengths of the shortest sufficient outages with this one's beginning or end [s], sorted."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,21 +53,21 @@ class Cause:
     """Smallest set of units that suffices for a moment."""
 
     parts: tuple[Part, ...]
-    """Empty if it comes about without all of them: then it is the scenario itself."""
+    """Units of the cause; empty if the scenario itself is the cause."""
     since_s: float
-    """Time in the flight from which on units were looked for [s]."""
+    """Time of flight at which the search for units began [s]."""
     among: int
-    """Number of units that were looked at."""
+    """Number of units that were examined."""
     error_m: float
     """Largest error with this cause alone [m]."""
     also: tuple[tuple[Part, ...], ...] = ()
-    """Further smallest sets, without units of those before, each of which suffices as well."""
+    """Further smallest sets, each of which suffices and has no unit of the earlier sets."""
     others: tuple[Part, ...] = ()
-    """Losses and late packets that were looked at and are in none of the sets."""
+    """Losses and late packets that were examined and are in none of the sets."""
     innocent: tuple[tuple[str, float], ...] = ()
-    """What else happened, by group, and by how much the error would differ without [m]."""
+    """Other groups of units, and change of the error without each group [m]."""
     is_all: bool = True
-    """Whether the moment does not come about without all of the sets together."""
+    """Whether the moment does not occur without all sets together."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,7 +75,7 @@ class Packet:
     """Packet that the network lost or delayed."""
 
     time_s: float
-    """Time in the flight at which it was sent [s]."""
+    """Time of flight at which the packet was sent [s]."""
     path: int
     direction: int
     is_plan: bool
@@ -84,7 +83,7 @@ class Packet:
 
 @dataclass(frozen=True, slots=True)
 class Rescues:
-    """Packets of a cause that alone would have averted the moment, had they arrived in time."""
+    """Packets of a cause whose timely arrival, each alone, would have averted the moment."""
 
     packets: tuple[Packet, ...]
     tried: int
@@ -93,7 +92,7 @@ class Rescues:
 def cause(
     case: Case, moment: Moment, flown: Outcome, fly_all: FlyAll, at_once: int
 ) -> tuple[Cause, Circumstances]:
-    """Cause of a moment, without what its parts do, and the circumstances it was found among."""
+    """Cause of a moment, without the effects of its parts, and the circumstances of the search."""
     case = replace(case, until_s=moment.end_s + AFTER_S + 1.0)
 
     def suffice(cases: Iterable[Case]) -> list[bool]:
@@ -116,7 +115,7 @@ def cause(
         sets.append(found)
         rest = tuple(each for each in rest if each not in found)
         taken = [each for each in here.units if each not in rest]
-        # What remains suffices, with every other packet delivered: then it has a set as well.
+        # The rest suffices with every other packet delivered, so it contains another set.
         still = all(suffice([here.without(*taken), here.only(rest)]))
     (alone,) = fly_all([here.only(sets[0])])
     first, *also = (tuple(_part(each, flown) for each in found) for found in sets)
@@ -137,7 +136,7 @@ def _part(unit: Unit, flown: Outcome) -> Part:
 
 
 def _met(unit: Bad, flown: Outcome) -> list[int]:
-    """Numbers of the packets that met a unit."""
+    """Numbers of the packets that a unit lost or delayed."""
     packets = flown.packets
     within = np.flatnonzero((packets.slot >= unit.first) & (packets.slot < unit.end))
     return [number for number in within.tolist() if packets.lane[number] == unit.lane]
@@ -146,8 +145,8 @@ def _met(unit: Bad, flown: Outcome) -> list[int]:
 def needed(
     found: Cause, here: Circumstances, moment: Moment, fly_all: FlyAll
 ) -> tuple[Cause, list[Outcome]]:
-    """Cause with what the flight would have been without each of its parts, and without what else
-    happened; and the flight without each part.
+    """Cause with the results of flights without each of its parts and without each other group, and
+    the flight without each part.
     """
     parts, others = found.parts, _groups(found, here)
     cases = [here.without(part.unit) for part in parts]
@@ -164,7 +163,7 @@ def needed(
 
 
 def _groups(found: Cause, here: Circumstances) -> dict[str, list[Unit]]:
-    """Units that are not of the cause, by what they are."""
+    """Units that are not in the cause, by kind."""
     groups: dict[str, list[Unit]] = {}
     for unit in here.units:
         if all(unit != part.unit for parts in (found.parts, *found.also) for part in parts):
@@ -188,7 +187,7 @@ WHAT = {
     (True, False): "time of late packets",
     (True, True): "late packet",
 }
-"""Nouns for bad stretches, by whether they are late and of a single packet."""
+"""Nouns for bad stretches: by late or lost, and by single packet or longer."""
 
 
 def named(unit: Unit) -> str:
@@ -212,7 +211,7 @@ def lane_name(lane: Lane) -> str:
 def rescues(
     found: Cause, here: Circumstances, moment: Moment, flown: Outcome, fly_all: FlyAll
 ) -> Rescues:
-    """Packets of the cause that alone avert the moment, among those sent before it."""
+    """Packets of the cause, sent before the moment, that each avert it if delivered."""
     met = {
         number: part.unit
         for part in found.parts
@@ -238,10 +237,9 @@ def rescues(
 
 
 def lengths(found: Cause, here: Circumstances, moment: Moment, fly_all: FlyAll) -> Cause:
-    """Cause with the shortest length of each outage that is needed, by bisection from either end.
+    """Cause with the shortest sufficient length of each needed outage, by bisection from both ends.
 
-    It is the length at which the moment begins to come about, if it comes about for all longer
-    ones.
+    The moment occurs from this length on, provided that it occurs for all longer outages.
     """
     tasks = [
         (number, from_end, part.unit)

@@ -35,22 +35,22 @@ class ExplainOptions:
     """A scenario's name (`skytether list scenarios`), a .toml file, or a recording (.mcap) of a
     flight in virtual time."""
     at: Annotated[float | None, Argument(metavar="T")] = None
-    """Time in the flight of what is to be explained [s]; by default the gravest moment is."""
+    """Time of flight of the moment to explain [s]; by default that of the gravest."""
     seeds: Annotated[int, Argument(metavar="N")] = 0
     """Number of flights of each remedy with other seeds, which count up from the scenario's."""
     vehicles: Annotated[int | None, Argument(metavar="N")] = None
     """Number of vehicles, as in `skytether fleet`; by default one, or as many as a mission has. Not
-    with a recording, which has its own."""
+    with a recording."""
     json: Path | None = None
     """File for the explanation, written after each step."""
     figure: Path | None = None
-    """File for a picture of it (.png, .pdf or .svg)."""
+    """File for a picture of the explanation (.png, .pdf or .svg)."""
     pool: PoolFlags = Flags()
     config: ScenarioFlags = Scenario()
 
 
 def explain_flight(argv: Sequence[str]) -> None:
-    """Fly a scenario in virtual time, and say why something went wrong.
+    """Fly a scenario in virtual time, and explain why something went wrong.
 
     The same flight is flown again without its outages, its lost and late packets, its wind and
     noise, until the smallest set is found that suffices. Then: whether each of it is needed,
@@ -92,7 +92,7 @@ def _vehicles(options: ExplainOptions) -> int:
 
 
 def _judge(options: ExplainOptions, recorded: Recorded) -> None:
-    """Print what the theorem of separation assumes of a mission that cannot be flown again.
+    """Print the checked assumptions of the separation theorem, for a mission flown over UDP.
 
     Raises:
         CommandError: a part of the record is missing, or an option needs more flights.
@@ -135,7 +135,7 @@ def _recorded(recorded: Recorded) -> tuple[str, Case, str]:
 
 
 def _explain(options: ExplainOptions, name: str, case: Case, recorded: str) -> None:
-    """Explain a flight and show what is known, also if that is not all.
+    """Explain a flight, and show the explanation even if it is incomplete.
 
     Raises:
         CommandError: interrupted, or a file cannot be written.
@@ -157,7 +157,7 @@ def _explain(options: ExplainOptions, name: str, case: Case, recorded: str) -> N
             for step, known in steps:
                 check_same(known.flown, recorded or known.flown.trace, options.scenario)
                 flyers.advance(1, step)
-                if options.json is not None:  # at once, for who watches
+                if options.json is not None:  # at once, for programs that show the progress
                     command.write(options.json, known.to_json(step))
         except Interrupted as error:
             interrupted = error

@@ -1,4 +1,4 @@
-"""Explanation of a flight, ever more complete: whoever interrupts it keeps what is there."""
+"""Explanation of a flight, step by step; after an interruption the finished steps remain."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -14,34 +14,34 @@ from skytether.explain.remedies import Remedy
 from skytether.shared.base.errors import ConfigError
 
 AT_MAX_S = 2.0
-"""Largest distance of a moment from the time that is asked for [s]."""
+"""Largest distance of a moment from the requested time [s]."""
 CURVES_MAX = 2
-"""Largest number of flights without a part that are drawn."""
+"""Largest number of drawn flights without a part of the cause."""
 STEPS = 6
-"""Number of steps of an explanation, without those of other seeds."""
+"""Number of steps of an explanation, not counting flights of other seeds."""
 FIRST = "what went wrong"
 """Name of the first step, as the progress bar shows it."""
 
 
 @dataclass(frozen=True, slots=True)
 class Explanation:
-    """What is known of why a flight went as it did; None for what is not known yet."""
+    """Explanation of a flight so far; None for results of later steps."""
 
     name: str
     """Name of the scenario."""
     seed: int
     moments: tuple[Moment, ...]
-    """What went wrong, in order of time."""
+    """Moments at which something went wrong, in order of time."""
     moment: Moment | None
-    """The one that is explained; None if there is none."""
+    """Moment that is explained; None if nothing went wrong."""
     flown: Outcome
     """The flight as it was."""
     cause: Cause | None = None
     rescues: Rescues | None = None
     remedies: tuple[Remedy, ...] | None = None
-    """Other keys; the first is the flight as it was."""
+    """Flights with other keys; the first is the flight as it was."""
     curves: tuple[tuple[str, Outcome], ...] = ()
-    """Flights to draw beside it: without a part of the cause, and with a remedy."""
+    """Flights drawn for comparison: without a part of the cause, and with a remedy."""
 
     def __str__(self) -> str:
         said = words.text(self.moments, self.moment, self.cause, self.rescues, self.remedies)
@@ -49,8 +49,8 @@ class Explanation:
         return f"{said}\n\n{of_mission}" if of_mission else said
 
     def to_json(self, following: str = "") -> bytes:
-        """What is known, as JSON: the fields without the flights, those of a mission, the text, and
-        the step that comes next; empty if all is known.
+        """The explanation so far, as JSON: fields without flights, figures of a mission, text, and
+        name of the next step, which is empty at the end.
         """
         names = "name", "seed", "moments", "moment", "cause", "rescues", "remedies"
         fields = {name: getattr(self, name) for name in names}
@@ -67,12 +67,12 @@ def explain(
     seeds: int = 0,
     at_once: int = 1,
 ) -> Iterator[tuple[str, Explanation]]:
-    """Explanation of a flight after each step, and a word for the step that comes next.
+    """Yield the explanation of a flight after each step, and the name of the next step.
 
     Args:
         name: name of the scenario.
-        at_s: time in the flight of the moment to explain [s]; None: the gravest.
-        seeds: number of flights of other seeds with each remedy.
+        at_s: time of flight of the moment to explain [s]; None: the gravest moment.
+        seeds: number of flights of each remedy with other seeds.
         at_once: number of flights that `fly_all` flies side by side.
 
     Raises:
@@ -109,7 +109,7 @@ def explain(
 
 
 def _chosen(found: Sequence[Moment], at_s: float | None) -> Moment | None:
-    """Moment to explain; raises ConfigError if there is none at the time that is asked for."""
+    """Moment to explain; raises ConfigError if there is none at the requested time."""
     if at_s is None:
         return worst(found) if found else None
 
@@ -124,15 +124,15 @@ def _chosen(found: Sequence[Moment], at_s: float | None) -> Moment | None:
         raise ConfigError(f"at: got {at_s:g}, expected {expected}{because}")
 
     def order(each: Moment) -> tuple[float, float, int]:
-        # Times are printed with a tenth of a second; of several moments at once, the one that
-        # begins then is meant.
+        # Times are printed in tenths of a second; of several moments then, take the one that
+        # begins.
         return round(distance_s(each), 1), round(abs(each.start_s - at_s), 1), -WEIGHTS[each.kind]
 
     return min(near, key=order)
 
 
 def _curves(cause: Cause, without: Sequence[Outcome]) -> tuple[tuple[str, Outcome], ...]:
-    """The flight without each of the first parts of a cause that are needed."""
+    """Flights without the needed parts of a cause, one each, for the first CURVES_MAX."""
     needed = [
         (f"without the {causes.named(part.unit)}", each)
         for part, each in zip(cause.parts, without, strict=True)
@@ -150,15 +150,15 @@ def explained(
     trace: str = "",
     on_flight: Callable[[int, str], None] = lambda *_: None,
 ) -> Explanation:
-    """Whole explanation, flown in this process; arguments as of `explain`.
+    """Complete explanation, flown in this process; other arguments as for `explain`.
 
     Args:
-        trace: see `check_same`; empty: whatever comes of the case is explained.
-        on_flight: called before each flight with the number of steps done, and a word for the one
-            under way.
+        trace: see `check_same`; empty to skip this check.
+        on_flight: called before each flight with the number of finished steps and the present
+            step's name.
 
     Raises:
-        ConfigError: the flight of the case is another one than that of the record.
+        ConfigError: the flight of the case differs from the recorded one.
     """
     done, step = 0, FIRST
 
@@ -178,10 +178,10 @@ def explained(
 
 
 def check_same(flown: Outcome, trace: str, name: str) -> None:
-    """Refuse a record, by the hash of its vehicles' rows, that does not come about again.
+    """Refuse a recorded flight that cannot be reproduced: the hash of its vehicles' rows differs.
 
     Raises:
-        ConfigError: names the flight.
+        ConfigError: the hashes differ; the message names the flight.
     """
     if flown.trace != trace:
         expected = "one in virtual time by this version, without changes or faults"

@@ -1,4 +1,4 @@
-"""`fly`: a case is flown in virtual time, and becomes an outcome. Nothing else here flies.
+"""`fly` flies a case in virtual time, and returns the outcome. No other module here flies.
 
 A case and its outcome can be sent to another process and back.
 """
@@ -30,27 +30,27 @@ from skytether.sim.world import World
 
 @dataclass(frozen=True, slots=True)
 class Track:
-    """Steps of a vehicle, from its first plan on; all arrays have a row for each step."""
+    """Steps of a vehicle, from its first plan on; each array has a row per step."""
 
     vehicle: int
     began_s: float
-    """Time in the flight of step 0 [s]."""
+    """Time of flight at step 0 [s]."""
     step_s: Array
     """Time since step 0 [s]."""
     error_m: Array
-    """Distance from the reference [m]; on a mission, where the goal is none, 0."""
+    """Distance from the reference [m]; 0 on a mission, which has goals and no reference."""
     mode: Indices
     reason: Indices
 
     @property
     def time_s(self) -> Array:
-        """Time in the flight, as that of events [s]."""
+        """Time of flight, counted as in events [s]."""
         return self.began_s + self.step_s
 
 
 @dataclass(frozen=True, slots=True)
 class Packets:
-    """Packets that entered the network; all arrays have a row for each packet."""
+    """Packets that entered the network; each array has a row per packet."""
 
     time_s: Array
     """Time in the flight at which the packet entered [s]."""
@@ -64,7 +64,7 @@ class Packets:
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What came of a case."""
+    """Result of flying a case."""
 
     tracks: tuple[Track, ...]
     packets: Packets
@@ -74,20 +74,20 @@ class Outcome:
     separation_m: Array
     """Smallest distance between two vehicles of a mission at those times [m]."""
     failure: str
-    """Why a vehicle could not fly; empty if all did."""
+    """Reason why a vehicle could not fly; empty if all flew."""
     failed_s: float
-    """Time in the flight at which that was certain [s]; 0 if all flew."""
+    """Time of flight of the failure [s]; 0 if there was none."""
     packets_per_s: float
     trace: str
     """Hash of the vehicles' rows, see `trace`."""
     hypotheses: tuple[Hypothesis, ...] = ()
-    """What the theorem of separation assumes, and whether it held; empty unless on a mission."""
+    """Assumptions of the theorem of separation, and whether they held; empty without a mission."""
     waits: tuple[Wait, ...] = ()
     """Waits of a mission's vehicles, the longest first."""
 
 
 FlyAll: TypeAlias = Callable[[Sequence[Case]], list[Outcome]]
-"""Outcomes of cases, in their order; raises `Interrupted` when asked to end."""
+"""Function that flies cases, and returns their outcomes in order; may raise `Interrupted`."""
 
 
 def fly(case: Case) -> Outcome:
@@ -117,7 +117,7 @@ def fly(case: Case) -> Outcome:
 def _questions(
     scenario: Scenario, reasons: list[Reason]
 ) -> Iterator[tuple[float, Callable[[World], None]]]:
-    """Times at which the server says what vehicles wait for: once for each decision."""
+    """Times at which the server's reasons for waiting are read, one for each decision."""
 
     def ask(world: World) -> None:
         for vehicle, figures in world.endpoint(flight.SERVER[0]).figures()["by_vehicle"].items():
@@ -172,13 +172,13 @@ def outcome(scenario: Scenario, record: Record, reasons: Sequence[Reason] = ()) 
 
 
 def trace(client: Rows) -> str:
-    """Hash of the vehicles' rows, equal if they flew alike to the last bit."""
+    """Hash of the vehicles' rows, equal if the flights were equal to the last bit."""
     return hashlib.sha256(client.tobytes()).hexdigest()
 
 
 def _track(scenario: Scenario, rows: Rows, server: Rows, vehicle: int, began_s: float) -> Track:
     flown = rows[np.argmax(rows["mode"] == Mode.TRACK) :]
-    if scenario.keeps_apart:  # its reference is its next goal, from which it is far by right
+    if scenario.keeps_apart:  # on a mission the reference is the next goal, which is far away
         error_m = np.zeros(len(flown))
     else:
         error_m = np.linalg.norm(position_error(scenario, flown, server), axis=1)

@@ -1,14 +1,14 @@
-"""Hypotheses: whether what the theorem of separation assumes held in a flight, and how nearly.
+"""Hypotheses: whether the theorem of separation's assumptions held in a flight, with margins.
 
-docs/together-proof.md has the theorem and its five conditions. They are checked here from the
-record of a flight alone, at each step of each vehicle: its position and the motion in force are in
-its rows, and the motions are those that the server recorded when it sent them. The server itself
-watches the same conditions in flight, but sees only what observations report.
+docs/together-proof.md has the theorem and its five conditions. This module checks them from the
+record of a flight, at each step of each vehicle: the vehicle's rows have its position and the
+motion in force, the server's rows have the motions. In flight the server checks the same
+conditions, but only knows what observations report.
 
-A motion is recorded as its first state and the inputs of `control.horizon` steps. It may last up
-to 140: what is flown later is not checked, unless the vehicle rests by then. With a horizon of 131
-steps or more all is recorded. The clocks, and their bounds at each step, are in no column: of them
-the server's counts are all there is.
+A motion is recorded as its first state and the inputs of `control.horizon` steps. It may last up to
+140 steps: later steps are not checked, unless the vehicle rests by then. With a horizon of 131
+steps or more, everything is recorded. Clocks and their bounds at each step are not recorded: only
+the server's counts of violations are.
 """
 
 import math
@@ -33,31 +33,31 @@ from skytether.shared.telemetry.summary import nearest, track
 RESTS_MPS = 1e-3
 """Speed below which a motion has come to rest [m/s]."""
 UNCHECKED = math.nan
-"""Margin of a hypothesis of which the record says nothing."""
+"""Margin of a hypothesis that the record does not determine."""
 
 
 @dataclass(frozen=True, slots=True)
 class Hypothesis:
-    """One assumption of the theorem, or its promise, in a flight."""
+    """Assumption or conclusion of the theorem, checked in a flight."""
 
     condition: int
-    """Number of the theorem's condition; 0 for what it promises."""
+    """Number of the theorem's condition; 0 for its conclusion."""
     name: str
     margin: float
-    """Least distance from the bound; negative: it is broken; infinite: nothing came near it; NaN:
-    not checked."""
+    """Smallest distance from the bound; negative: violated; infinite: the condition never applied;
+    NaN: not checked."""
     unit: str
     vehicles: tuple[int, ...] = ()
-    """Vehicle of the least margin, or the two vehicles."""
+    """Vehicle or pair of vehicles with the smallest margin."""
     step: int | None = None
-    """The first one's own step of the least margin."""
+    """Step of the smallest margin, as counted by the first of `vehicles`."""
     checked: float = 1.0
-    """Share of the steps, or of the motions, that the record suffices to check; 0 for figures of
-    the processes, which no row has."""
+    """Share of the steps or motions that can be checked from the record; 0 for counters, which are
+    in no row."""
 
     @property
     def is_held(self) -> bool | None:
-        """Whether it held wherever it was checked; None if it was not."""
+        """Whether the hypothesis held wherever it was checked; None if it was not checked."""
         return None if math.isnan(self.margin) else self.margin >= 0.0
 
 
@@ -66,26 +66,26 @@ class Motions:
     """Recorded motions of a vehicle, in order of their steps."""
 
     step: Indices
-    """First step of each; shape (n,)."""
+    """First step of each motion; shape (n,)."""
     position: Array
-    """Positions at each step from the first on [m]; shape (n, H + 1, axes)."""
+    """Positions of each motion at its steps [m]; shape (n, H + 1, axes)."""
     moves: Indices
-    """Steps for which each moves; H + 1 if longer than it is recorded."""
+    """Number of steps until each motion rests; H + 1 if that is not recorded."""
 
     @property
     def recorded(self) -> int:
-        """Steps H for which a motion is recorded."""
+        """Number H of recorded steps of a motion."""
         return self.position.shape[1] - 1
 
     @property
     def is_whole(self) -> Flags:
-        """Whether each rests within the steps that are recorded."""
+        """Whether each motion comes to rest within its recorded steps."""
         whole: Flags = self.moves <= self.recorded
         return whole
 
 
 def motions(scenario: Scenario, plan: Rows) -> Motions:
-    """Motions of a vehicle, by the rows of its plans."""
+    """Motions of a vehicle, from the rows of its plans."""
     step, first = np.unique(plan["step"], return_index=True)
     plan, model, dt_s = plan[first], scenario.terms().model, scenario.control.dt
     inputs = plan["inputs"].astype(np.float64)
@@ -93,7 +93,7 @@ def motions(scenario: Scenario, plan: Rows) -> Motions:
     velocity[:, 0] = plan["state"][:, :, 1]
     for k in range(inputs.shape[2]):
         velocity[:, k + 1] = model.a11 * velocity[:, k] + model.b1 * inputs[:, :, k]
-    for _ in range(-inputs.shape[2] % SPACING):  # to the next knot
+    for _ in range(-inputs.shape[2] % SPACING):  # continue to the next knot
         velocity = np.append(velocity, 2.0 * velocity[:, -1:] - velocity[:, -2:-1], axis=1)
     # Between knots, and so between steps, a motion's acceleration is constant.
     moved = np.cumsum(0.5 * dt_s * (velocity[:, :-1] + velocity[:, 1:]), axis=1)
@@ -106,12 +106,12 @@ def motions(scenario: Scenario, plan: Rows) -> Motions:
 
 @dataclass(frozen=True, slots=True)
 class Flown:
-    """Steps of a vehicle, and the motion in force at each; arrays have a row for each step."""
+    """Steps of a vehicle, and the motion in force at each; each array has a row per step."""
 
     vehicle: int
     step: Indices
     position: Array
-    """[m]; shape (n, axes)."""
+    """Position at each step [m]; shape (n, axes)."""
     in_force: Indices
     motions: Motions
     motion: Indices
@@ -119,7 +119,7 @@ class Flown:
 
     @property
     def off_m(self) -> Array:
-        """Distance from the motion in force [m]; NaN where there is none, or not recorded."""
+        """Distance from the motion in force [m]; NaN if there is none or it is not recorded."""
         if not len(self.motions.step):
             return np.full(len(self.step), np.nan)
         stage = self.step - self.in_force
@@ -130,7 +130,7 @@ class Flown:
 
     @property
     def changed(self) -> Indices:
-        """Rows with another motion in force than the row before, of the same run of the client."""
+        """Rows whose motion in force differs from the previous row's, in one run of the client."""
         same_run = np.diff(self.step) > 0
         return 1 + np.flatnonzero((np.diff(self.in_force) != 0) & same_run)
 
@@ -150,10 +150,10 @@ def flown(scenario: Scenario, record: Record) -> list[Flown]:
 
 
 def hypotheses(record: Record, scenario: Scenario) -> tuple[Hypothesis, ...]:
-    """What the theorem assumes, and what it promises, with the least margin in a flight.
+    """Assumptions and conclusions of the theorem, with their smallest margins in a flight.
 
     Args:
-        record: flight of a mission; over real UDP, as its recording restores it.
+        record: record of a mission's flight, also from a recording of a flight over UDP.
     """
     vehicles = flown(scenario, record)
     if not vehicles:
@@ -183,10 +183,10 @@ def _least(
     margins: Mapping[int, tuple[Indices, Array]],
     at_most: float = UNCHECKED,
 ) -> Hypothesis:
-    """Hypothesis with the least of some margins.
+    """Hypothesis with the smallest of some margins.
 
     Args:
-        margins: steps, and the margin at each or NaN where it is not checked, by vehicle.
+        margins: for each vehicle, steps and their margins, NaN if not checked.
         at_most: margin if there are none.
     """
     count = sum(len(steps) for steps, _ in margins.values())
@@ -205,7 +205,7 @@ def _least(
 
 
 def _beginning(scenario: Scenario, vehicles: Sequence[Flown]) -> Iterator[Hypothesis]:
-    """Condition 1, where each vehicle takes its first motion."""
+    """Condition 1, checked at the first motion of each vehicle."""
     first = {each.vehicle: int(np.argmax(each.in_force >= 0)) for each in vehicles}
     places = {
         each.vehicle: _scaled(scenario, each.position[first[each.vehicle]]) for each in vehicles
@@ -231,7 +231,7 @@ def _tube(scenario: Scenario, vehicles: Sequence[Flown]) -> Hypothesis:
 
 
 def _steps_in_time(scenario: Scenario, record: Record) -> Hypothesis:
-    """By the vehicle's own figure; the step is in the event, which is there if it is broken."""
+    """Check the largest delay of a step, from the vehicle's figures; an event tells the step."""
     name, most_s = "each step begins in time", STALL_NS / SECOND_NS
     figures = record.figures.get("client", {}).get("by_vehicle", {})
     late_s = {
@@ -253,7 +253,7 @@ def _steps_in_time(scenario: Scenario, record: Record) -> Hypothesis:
 
 
 def _acceptance(scenario: Scenario, vehicles: Sequence[Flown]) -> Hypothesis:
-    """From a motion's first knot on, and at most `link.join_s` later."""
+    """Check that a motion is accepted from its first knot until `link.join_s` later."""
     margins, join = {}, scenario.terms().join
     for each in vehicles:
         taken = each.changed[each.in_force[each.changed] >= 0]
@@ -264,7 +264,7 @@ def _acceptance(scenario: Scenario, vehicles: Sequence[Flown]) -> Hypothesis:
 
 
 def _flown_to_the_end(scenario: Scenario, vehicles: Sequence[Flown]) -> Hypothesis:
-    """Time from the end of a motion until the vehicle is on none, which is the margin."""
+    """Check that motions are flown to their end; margin: time from the end to no motion."""
     margins = {}
     for each in vehicles:
         left = each.changed[each.in_force[each.changed] < 0]
@@ -272,7 +272,7 @@ def _flown_to_the_end(scenario: Scenario, vehicles: Sequence[Flown]) -> Hypothes
         margin = np.full(len(left), np.nan)
         if len(each.motions.step):
             ends, recorded = each.motions.moves[motion], each.motions.recorded
-            # Of a motion that is not recorded to its end, only an early end is certain.
+            # If a motion is not recorded to its end, only leaving it early can be detected.
             is_checked = (motion >= 0) & (each.motions.is_whole[motion] | (since <= recorded))
             margin[is_checked] = (since - ends)[is_checked] * scenario.control.dt
         margins[each.vehicle] = each.step[left], margin
@@ -280,7 +280,7 @@ def _flown_to_the_end(scenario: Scenario, vehicles: Sequence[Flown]) -> Hypothes
 
 
 def _all_vehicles(scenario: Scenario, record: Record, vehicles: Sequence[Flown]) -> Hypothesis:
-    """Time from the first observation of the last vehicle to the first motion that moves."""
+    """Margin: time from the last vehicle's first observation to the first moving motion."""
     name, mission = "the server observes all first", scenario.make_reference()
     assert isinstance(mission, Mission)
     server = record.server
@@ -312,8 +312,8 @@ def _all_vehicles(scenario: Scenario, record: Record, vehicles: Sequence[Flown])
 
 
 def _clocks(record: Record) -> Hypothesis:
-    """Samples of a clock that contradict its bounds, as the server counted them: no row has the
-    clocks themselves.
+    """Clock samples that contradict the clock's bounds, counted by the server, because clocks are
+    in no row.
     """
     name = "no clock contradicts its bounds"
     if "server" not in record.figures:
@@ -327,7 +327,7 @@ def _clocks(record: Record) -> Hypothesis:
 
 
 def _separation(scenario: Scenario, record: Record) -> Hypothesis:
-    """What the theorem promises."""
+    """Check the conclusion of the theorem: the separation of vehicles."""
     name, began, dt_s = "they keep apart", began_ns(record), scenario.control.dt
     tracks = {
         vehicle: track(rows, began[vehicle] / SECOND_NS, dt_s, scenario.mission.height_scale)
@@ -350,7 +350,7 @@ def _separation(scenario: Scenario, record: Record) -> Hypothesis:
 
 
 def _clear(scenario: Scenario, vehicles: Sequence[Flown]) -> Iterator[Hypothesis]:
-    """Distance from the scenario's zones, if it has any; not from those set in flight."""
+    """Distance from the scenario's zones, if any; zones set in flight are not checked."""
     if around := zones(scenario):
         margins = {}
         for each in vehicles:
@@ -363,21 +363,21 @@ def _clear(scenario: Scenario, vehicles: Sequence[Flown]) -> Iterator[Hypothesis
 
 
 def began_ns(record: Record) -> dict[int, int]:
-    """Time in the flight of step 0 of each vehicle [ns]."""
+    """Time of flight at step 0 of each vehicle [ns]."""
     return {
         each.event.vehicle: each.time_ns for each in record.events if isinstance(each.event, Flying)
     }
 
 
 def _scaled(scenario: Scenario, place: Array) -> Array:
-    """Place with its height as it counts in distances [m]."""
+    """Position with the height scaled as for distances between vehicles [m]."""
     scale = np.ones(len(place))
     scale[2:] = scenario.mission.height_scale
     return place * scale
 
 
 def _nearest(places: Mapping[int, Array]) -> tuple[float, tuple[int, ...]]:
-    """Smallest distance between two places [m], and whose they are; NaN for fewer than two."""
+    """Smallest distance between two positions [m], and their vehicles; NaN for fewer than two."""
     apart = {
         pair: float(np.linalg.norm(places[pair[0]] - places[pair[1]]))
         for pair in combinations(places, 2)

@@ -1,4 +1,4 @@
-"""What the explanation says of a mission: what the theorem assumes, and who waited for whom."""
+"""Text of the explanation of a mission: the theorem's assumptions, and waits of vehicles."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -9,11 +9,11 @@ from skytether.explain.waits import Wait
 WAITS_SHOWN = 6
 """Largest number of waits of a kind that are listed."""
 SHORT_S = 1.0
-"""Waits for acknowledgements that are no longer are usual, if nothing was lost [s]."""
+"""Length of waits for acknowledgements that are usual if nothing was lost [s]."""
 
 
 def text(found: Sequence[Hypothesis], waited: Sequence[Wait]) -> str:
-    """Both in plain text; empty unless the flight was a mission."""
+    """Assumptions and waits in plain text; empty without a mission."""
     return "\n".join([*_hypotheses(found), *_waits(waited)])
 
 
@@ -69,7 +69,7 @@ def _when(each: Wait) -> str:
 
 
 def _packets(each: Wait, whose: str) -> str:
-    """The motion that was not acknowledged, and what was lost of its packets."""
+    """Text on the motion that was not acknowledged, and its lost packets."""
     lost = [
         f"{count[1]} of {count[0]} {what}{'s' * (count[0] != 1)} lost"
         for count, what in ((each.plans, "packet"), (each.reports, "answer"))

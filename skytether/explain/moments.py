@@ -1,4 +1,4 @@
-"""Moments: what went wrong in a flight, found beside a perfect one.
+"""Moments: what went wrong in a flight, in comparison with a perfect one.
 
     failure      a vehicle could not fly, or not to the end
     brake        a vehicle brakes, lands or stands still, until it follows a plan again
@@ -25,22 +25,22 @@ from skytether.shared.telemetry.summary import STOPPED, WORSE
 from skytether.shared.wire.protocol import Mode
 
 FAR_TIMES = 3.0
-"""An error is far above the usual one from this multiple of it on, ..."""
+"""An error is large above this multiple of the usual error, plus `FAR_STEPS`."""
 FAR_STEPS = 2.0
-"""... and by this many steps at full speed: less is repaired within a step or two."""
+"""Second part of that bound, in steps at full speed: less is corrected in a step or two."""
 AROUND_S = 1.0
-"""Time before and after, in which the perfect flight's largest error is the usual one [s]."""
+"""Time before and after a step in which the usual error is the perfect flight's largest [s]."""
 AFTER_S = 5.0
-"""Time after a moment within which the error that it left behind has its largest value [s]."""
+"""Time after a moment within which the resulting error is largest [s]."""
 PAUSE_S = 1.0
-"""Time before and after a large error for which it counts as going on [s]."""
+"""Time before and after a large error for which the moment goes on [s]."""
 NEAR = 1.05
 """Distances below this multiple of the separation are near it."""
 WASTED_TIMES, WASTED_PER_S = 3.0, 10.0
-"""Packets are wasted above this multiple of the perfect flight's rate, and by this much [1/s]."""
+"""Packets are wasted above this multiple of the perfect flight's rate, and this excess [1/s]."""
 
 WARM_S = 5.0
-"""Time in the flight before which many plans are no waste: a vehicle that has just begun to fly."""
+"""Time of flight before which many plans are normal, because vehicles have just started [s]."""
 
 Kind = Literal["failure", "brake", "error", "separation", "packets"]
 
@@ -53,23 +53,23 @@ class Moment:
     vehicle: int
     """Vehicle, from 1; 0 for all of them together."""
     start_s: float
-    """Time in the flight at which it begins, as that of events [s]."""
+    """Time of flight at the beginning, counted as in events [s]."""
     end_s: float
     says: str
-    """What happened, as a sentence without its subject."""
+    """Description of the moment: a sentence without subject."""
     figure: float
     """Largest error meanwhile [m]; separation: smallest distance [m]; packets: rate [1/s]."""
     usual: float
     """The same figure of the perfect flight."""
     level: float
-    """What `measured` reaches if the moment comes about."""
+    """Value of `measured` from which the moment occurs in another flight."""
     calm: float
-    """What it does not exceed if the moment is averted for good: of what is above the usual, a
-    quarter, where the level is at the half."""
+    """Value of `measured` below which the moment is clearly averted: a quarter of the excess over
+    `usual`; `level` is half of it."""
 
 
 def moments(flown: Outcome, perfect: Outcome, scenario: Scenario) -> list[Moment]:
-    """Moments of a flight in order of time, but for an error that a brake left behind."""
+    """Moments of a flight in order of time, without errors that result from a brake."""
     usual = {track.vehicle: track for track in perfect.tracks}
     found = [
         moment
@@ -85,7 +85,7 @@ def moments(flown: Outcome, perfect: Outcome, scenario: Scenario) -> list[Moment
 
 
 def worst(found: Sequence[Moment]) -> Moment:
-    """Moment to explain if none is named: the gravest kind, then the furthest from usual."""
+    """Default moment to explain: the gravest kind, then the largest deviation from usual."""
 
     def weight(each: Moment) -> tuple[int, float]:
         return WEIGHTS[each.kind], abs(each.figure - each.usual)
@@ -97,13 +97,13 @@ WEIGHTS: Mapping[Kind, int] = {"failure": 3, "separation": 2, "brake": 2, "error
 
 
 def measured(moment: Moment, outcome: Outcome) -> float:
-    """How much of a moment there is in another flight; from `moment.level` on it comes about."""
+    """Size of a moment in another flight; from `moment.level` on, it occurs there."""
     match moment.kind:
         case "failure":
             return float(bool(outcome.failure))
         case "brake":
             track = _track(outcome, moment.vehicle)
-            if track is None:  # it never flew
+            if track is None:  # the vehicle never flew
                 return 1.0
             near = _within(track.time_s, moment.start_s - AROUND_S, moment.end_s + AROUND_S)
             return float(np.isin(track.mode[near], WORSE).sum())
@@ -121,13 +121,13 @@ def comes_about(moment: Moment, outcome: Outcome) -> bool:
 
 
 def is_averted(moment: Moment, outcome: Outcome) -> bool:
-    """Whether a flight is far from the moment, not only just below it."""
+    """Whether the moment is clearly averted in a flight, not just below `moment.level`."""
     return measured(moment, outcome) <= moment.calm
 
 
 def error_m(moment: Moment, outcome: Outcome) -> float:
-    """Largest error of the moment's vehicle, meanwhile and shortly after [m]; with vehicle 0, of
-    any of them.
+    """Largest error of the moment's vehicle during and shortly after it [m]; of all vehicles if the
+    moment has vehicle 0.
     """
     errors = [
         track.error_m[_within(track.time_s, moment.start_s - AROUND_S, moment.end_s + AFTER_S)]
@@ -224,7 +224,7 @@ def _rate(outcome: Outcome, start_s: float, end_s: float) -> float:
 
 
 def _runs(begin: Flags, goes_on: Flags) -> list[tuple[int, int]]:
-    """First index and end of each stretch that begins with one flag, and lasts with the other."""
+    """First index and end of each stretch, which begins at `begin` and lasts while `goes_on`."""
     runs, at = [], 0
     while at < len(begin) and begin[at:].any():
         first = at + int(np.argmax(begin[at:]))

@@ -1,4 +1,4 @@
-"""The explanation as a picture: errors above, packets and outages of each lane below."""
+"""Picture of an explanation: errors above, packets and outages of each lane below."""
 
 from typing import TYPE_CHECKING
 
@@ -18,12 +18,12 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 LINES = (("#8fb4d9", 4.0, "-"), ("#1f7a3a", 1.6, "-"), ("#7b2d8b", 1.4, "--"))
-"""Colour, width and style of the flights beside the one that is explained."""
+"""Colour, width and style of the flights drawn for comparison."""
 RED, DARK, GREY, PALE = "#b2182b", "#8c1a1a", "#dadada", "#faeef0"
 
 
 def drawn(known: Explanation) -> "Figure":
-    """Picture of what is known; raises ConfigError if nothing went wrong."""
+    """Draw an explanation, also an incomplete one; raises ConfigError if nothing went wrong."""
     moment = known.moment
     if moment is None:
         raise ConfigError(f"{known.name}: nothing went wrong in this flight, there is no picture")
@@ -56,13 +56,13 @@ def _draw_errors(axes: "Axes", known: Explanation, moment: Moment) -> None:
 
 
 def _errors(outcome: Outcome, moment: Moment) -> tuple[Array, Array]:
-    """Times and errors of the moment's vehicle, or of the first."""
+    """Times and errors of the moment's vehicle, or of the first vehicle."""
     tracks = [each for each in outcome.tracks if each.vehicle == moment.vehicle] or outcome.tracks
     return (tracks[0].time_s, tracks[0].error_m) if tracks else (np.zeros(0), np.zeros(0))
 
 
 def _lanes(known: Explanation, moment: Moment) -> list[Lane]:
-    """Lanes to draw, uplinks first: those of the moment's vehicle, and others of the cause."""
+    """Lanes to draw, uplinks first: lanes of the moment's vehicle, and other lanes of the cause."""
     flow = max(0, moment.vehicle - 1)
     named = {part.unit.lane for part in _stretches(known)[0] if isinstance(part.unit, Bad)}
     lanes = {each for each in known.flown.began_s if each[2] == flow} | named
@@ -70,7 +70,7 @@ def _lanes(known: Explanation, moment: Moment) -> list[Lane]:
 
 
 def _stretches(known: Explanation) -> tuple[list[Part], list[Part]]:
-    """Stretches of the cause, and others that were looked at."""
+    """Stretches of the cause, and other examined stretches."""
     cause = known.cause
     if cause is None:
         return [], []

@@ -1,9 +1,8 @@
-"""Remedies: the same flight with other keys, over the same fates, and flights of other seeds.
+"""Remedies: the same flight with other keys over the same network, and flights of other seeds.
 
-The list follows from the cause: keys that say what is sent, how often, over which paths, how long
-the vehicle waits and how far a plan reaches, if the network is part of it; keys of the estimate,
-the filter and the model, if those are. Each costs packets, and an averted brake may be a larger
-error: both are shown.
+The list depends on the cause. If the network is part of it: keys of what is sent, how often and
+over which paths, of time-outs and of the horizon. If estimate, filter or model are: their keys. A
+remedy costs packets, and averting a brake may increase the error: both are shown.
 """
 
 from collections.abc import Iterator, Sequence
@@ -27,37 +26,37 @@ AS_FLOWN = "as flown"
 
 @dataclass(frozen=True, slots=True)
 class Elsewhere:
-    """Means over the flights of other seeds."""
+    """Means over flights of other seeds."""
 
     flights: int
     brakes: float
-    """Brakes, landings and faults in a flight."""
+    """Number of brakes, landings and faults per flight."""
     error_m: float
-    """Largest error of a flight, once it has settled [m]."""
+    """Largest error of a flight after `settle` [m]."""
     packets_per_s: float
 
 
 @dataclass(frozen=True, slots=True)
 class Remedy:
-    """Other keys, and what comes of the flight with them."""
+    """Other keys, and results of the flight with them."""
 
     name: str
     keys: Keys
     averts: bool
-    """Whether the moment does not come about."""
+    """Whether the moment does not occur."""
     brakes: int
     """Number of brakes, landings and faults in the whole flight."""
     error_m: float
     """Largest error during the moment and shortly after [m]."""
     packets_per_s: float
-    """Packets of both directions [1/s]."""
+    """Packet rate of both directions [1/s]."""
     elsewhere: Elsewhere | None = None
 
 
 def remedies(
     found: Cause, case: Case, moment: Moment, fly_all: FlyAll
 ) -> tuple[list[Remedy], list[Outcome]]:
-    """The flight with each remedy; the first is the flight as it was."""
+    """Fly each remedy; the first result is the flight as it was."""
     tried = [(AS_FLOWN, Keys()), *possible(found, case)]
     outcomes = fly_all([replace(case, keys=keys, until_s=None) for _, keys in tried])
     flown = [
@@ -75,7 +74,7 @@ def remedies(
 
 
 def with_others(each: Remedy, case: Case, seeds: Sequence[int], fly_all: FlyAll) -> Remedy:
-    """Remedy with what comes of the flights of other seeds."""
+    """Add the means over flights of other seeds to a remedy."""
     scenario = case.scenario
     cases = [
         replace(case, keys=each.keys, scenario=msgspec.structs.replace(scenario, seed=seed))
@@ -114,7 +113,7 @@ def possible(found: Cause, case: Case) -> Iterator[tuple[str, Keys]]:
 def _listed(units: Sequence[Unit], scenario: Scenario) -> Iterator[tuple[str, Keys]]:
     ways = {each.lane[1] for each in units if isinstance(each, Bad)}
     ways |= {each.direction for each in units if isinstance(each, UsualDelay)}
-    if not units:  # it is the scenario itself
+    if not units:  # the cause is the scenario itself
         ways = {UPLINK, DOWNLINK}
     names = [each.name for each in units if isinstance(each, Setting)]
     control, link, paths = scenario.control, scenario.link, scenario.network.paths
@@ -161,7 +160,7 @@ def _key(key: str, value: object) -> tuple[str, Keys]:
 
 
 def _identified(scenario: Scenario) -> Keys:
-    """The model as the vehicle is."""
+    """Keys that make the model equal to the vehicle."""
     true = {
         "tau_s": scenario.true_tau_s,
         "gain": scenario.true_gain,

@@ -14,9 +14,7 @@ PACKETS, PLANS = 400, 50
 
 
 def ticks(server: Rows) -> Indices:
-    """Number of the tick of each of the server's rows, from the first row's on: a tick has each
-    vehicle once.
-    """
+    """Tick number of each of the server's rows, from 0; a vehicle has one row per tick."""
     tick, seen, number = np.zeros(len(server), dtype=np.int64), set[int](), 0
     for at, vehicle in enumerate(server["vehicle"].tolist()):
         if vehicle in seen:
@@ -28,7 +26,7 @@ def ticks(server: Rows) -> Indices:
 
 
 def flows(record: Record) -> dict[int, int]:
-    """Vehicle of each flow; empty over real UDP, where the hosts have no numbers."""
+    """Vehicle of each flow; empty for flights over UDP, in which hosts have no numbers."""
     return {
         each.event.flow: int(each.event.host.rpartition(".")[2])
         for each in record.events
@@ -37,8 +35,8 @@ def flows(record: Record) -> dict[int, int]:
 
 
 def begin_ns(record: Record, dt_ns: int) -> int | None:
-    """Time at which the packets of tick 0 leave, in virtual time [ns]: the one at which the largest
-    number of plans coincide with a packet. None if no plan does.
+    """Time at which the packets of tick 0 leave, in virtual time [ns]: chosen so that most plans
+    coincide with a packet. None if no plan does.
     """
     own, server = flows(record), record.server
     sent, times = server[server["event"]], Counter[int]()
@@ -51,7 +49,7 @@ def begin_ns(record: Record, dt_ns: int) -> int | None:
 
 
 def are_plans(record: Record, packets: Rows, dt_ns: int) -> Flags:
-    """Which packets have a plan: those that leave at a tick at which the server sends one."""
+    """Whether each packet has a plan: it leaves at a tick at which the server sends one."""
     began_ns, own = begin_ns(record, dt_ns), flows(record)
     if began_ns is None:
         return np.zeros(len(packets), dtype=np.bool_)

@@ -2,7 +2,7 @@
 
 Units are left out, first many at a time and finally one by one, until none can be left out any
 more. The result suffices, and no single unit of it can be left out; another such set may be
-smaller. Units beside each other are left out together, so what belongs together stands together.
+smaller. Neighbouring units are left out together, so related units should be neighbours.
 """
 
 from collections.abc import Callable, Sequence
@@ -17,7 +17,7 @@ def smallest(
     suffice: Callable[[Sequence[tuple[U, ...]]], Sequence[bool]],
     at_once: int = 1,
 ) -> tuple[U, ...]:
-    """Smallest set of units that suffices, in their order; all of them are known to suffice.
+    """Smallest set of units that suffices, in order; the complete set is assumed to suffice.
 
     Args:
         suffice: whether each of several sets suffices; called often, never with all units.

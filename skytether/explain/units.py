@@ -1,8 +1,8 @@
-"""Units of a cause: what can be taken out of a flight, and the flight without or with some of them.
+"""Units of a cause, which can be removed from a flight; flights with or without some of them.
 
-The network is a function of time: a lane's fates are asked every millisecond, so that an outage is
-there whether or not a packet was sent in it. Losses and delays that last for less than OUTAGE_MS
-are units for each packet that met them.
+The network is a function of time, which is evaluated every millisecond for each lane, so that
+outages without packets are found, too. For losses and delays shorter than OUTAGE_MS, each affected
+packet is a unit.
 """
 
 from collections.abc import Collection, Iterator, Sequence
@@ -29,7 +29,7 @@ OUTAGE_MS = 50
 """Shortest stretch without a good slot that is an outage [ms]: by chance, independent losses of
 0.6 last that long once in 10¹¹ slots."""
 STRIDE_MS = OUTAGE_MS // 2
-"""Distance of the slots in which outages are searched [ms]."""
+"""Interval between slots that are tested for outages [ms]."""
 SPREAD = 3.0
 """A packet is late beyond the median delay by this multiple of the distance to the upper quartile.
 """
@@ -62,12 +62,12 @@ SETTINGS: Sequence[tuple[str, Keys]] = (
     ),
     ("the server's computing time", (("simulation.compute_s", 0.001),)),
 )
-"""Properties of vehicle, wind and server, and the values of keys that take them away."""
+"""Properties of vehicle, wind and server, and values of keys that remove them."""
 
 
 def perfect(case: Case) -> Case:
-    """Case in which every packet arrives at once and nothing else is wrong; the wind is the same,
-    but for gusts.
+    """Case in which every packet arrives at once and nothing else is wrong; it has the same wind,
+    without gusts.
     """
     network, none = case.scenario.network, {"uplink": "none", "downlink": "none"}
     paths = tuple(msgspec.structs.replace(each, **none) for each in network.paths)
@@ -83,18 +83,18 @@ def perfect(case: Case) -> Case:
 
 @dataclass(frozen=True, slots=True)
 class Circumstances:
-    """A flight as it was, and the units that may be taken out of it."""
+    """Flight as it was, and the units that may be removed from it."""
 
     case: Case
     units: tuple[Unit, ...]
-    """Units in an order in which those that belong together stand together."""
+    """Units in an order in which related units are neighbours."""
     window: tuple[Stretch, ...]
-    """Stretch of each lane in which packets may be delivered: what lies outside stays as it was."""
+    """Stretch of each lane in which packets may be delivered; outside, nothing is changed."""
     usual_s: dict[tuple[int, int], float]
     """Longest usual delay of a path and direction [s]."""
 
     def without(self, *taken: Unit) -> Case:
-        """The flight as it was, without these units."""
+        """Case of the flight without these units."""
         delivered = [
             Delivered(each, self._most_s(each.lane, taken))
             for each in taken
@@ -111,7 +111,7 @@ class Circumstances:
         return self._with(delivered, taken)
 
     def only(self, kept: Collection[Unit]) -> Case:
-        """The flight with these units alone: every other packet in the window is delivered."""
+        """Case of the flight with these units only; other packets in the window are delivered."""
         taken = [each for each in self.units if each not in kept]
         bad = [each for each in kept if isinstance(each, Bad)]
         delivered = [
@@ -164,7 +164,7 @@ def circumstances(
 
 
 def _order(lane: Lane) -> tuple[int, int, int]:
-    """Downlinks first, which matter less, then the uplinks side by side."""
+    """Sort key of lanes: downlinks first, which matter less, then uplinks."""
     path, direction, flow = lane
     return -direction, flow, path
 
@@ -191,7 +191,7 @@ def _is_there(scenario: Scenario, keys: Keys) -> bool:
 
 
 def _bad(case: Case, flown: Outcome, within: Stretch, usual_s: float) -> Iterator[Bad]:
-    """Outages within a stretch, and the fates of single packets outside them, in order of time."""
+    """Outages within a stretch, and single lost or late packets outside them, sorted by time."""
     fates, usual_ns = case.fates(within.lane), round(usual_s * 1e9)
 
     def is_bad(slot: int) -> bool:

@@ -1,13 +1,13 @@
 """Waits: which vehicle of a mission waited for which, and for which packet.
 
-A vehicle is sent a motion every `motion.SPACING` steps, unless it has arrived. It waits
+The server sends a vehicle a motion every `motion.SPACING` steps, unless it has arrived. It waits
 
     to begin          until every vehicle of the mission flies a first motion
     acknowledgement   until the server has observed whether it flies its newest motion
     way               because no motion towards its goal keeps away from another vehicle, or a zone
 
-The first two follow from the rows of a record. The third does not: the server says it with each
-decision (`waits` of its figures), which whoever flies a case again reads meanwhile.
+The first two follow from the rows of a record. The third does not: the server's figures contain it
+for each decision (`waits`), and are read while the case is flown again.
 """
 
 import math
@@ -29,10 +29,10 @@ from skytether.shared.telemetry.record import DOWNLINK, Record, Rows
 AT_ONCE_S = 1e-3
 """Tolerance of times [s]."""
 OTHER = re.compile(r"vehicle (\d+)( to pass)?|a zone")
-"""What the server says of a vehicle that waits for its way."""
+"""Pattern of the server's text on a vehicle that waits for a free way."""
 
 Reason: TypeAlias = tuple[float, int, str]
-"""Time in the flight [s], vehicle, and what it waits for, in the server's words."""
+"""Time of flight [s], vehicle, and what it waits for, as the server's text."""
 Kind = Literal["to begin", "acknowledgement", "way"]
 
 
@@ -43,16 +43,16 @@ class Wait:
     kind: Kind
     vehicle: int
     start_s: float
-    """Time in the flight [s]."""
+    """Time of flight at the beginning [s]."""
     for_s: float
     other: int = 0
-    """Vehicle that it waited for; 0: itself, or a zone."""
+    """Vehicle for which it waited; 0: itself, or a zone."""
     motion_s: float = math.nan
-    """Time at which its own or the other's motion was sent that was not acknowledged [s]."""
+    """Time of sending of the unacknowledged motion, its own or the other vehicle's [s]."""
     plans: tuple[int, int] = (0, 0)
-    """Packets with that motion, and how many of them were lost."""
+    """Number of packets with that motion, and number lost."""
     reports: tuple[int, int] = (0, 0)
-    """Packets from the vehicle since it flew that motion, and how many of them were lost."""
+    """Number of packets from the vehicle since it flew that motion, and number lost."""
 
     @property
     def end_s(self) -> float:
@@ -65,19 +65,19 @@ class Wait:
 
 @dataclass(frozen=True, slots=True)
 class _Vehicle:
-    """A vehicle, and what the server knew of its motions."""
+    """Vehicle, and the server's knowledge of its motions."""
 
     flown: Flown
     time_s: Array
-    """Time in the flight of each of the server's ticks with it [s]."""
+    """Time of flight of each server tick with this vehicle [s]."""
     sent_at: Indices
     """Number of the tick at which each motion was sent first."""
     heard_at: Indices
-    """Number of the tick from which on the server knew whether it was accepted, or the last."""
+    """Number of the tick at which the server knew of each motion's acceptance, or the last."""
     is_heard: Flags
-    """Whether it knew at that tick."""
+    """Whether the server knew it at the tick in `heard_at`."""
     accepted: Indices
-    """Step from which on the vehicle flew it; -1 if it never did."""
+    """Step from which the vehicle flew each motion; -1 if it never did."""
 
     @property
     def begins_s(self) -> float:
@@ -90,7 +90,7 @@ def waits(record: Record, scenario: Scenario, reasons: Sequence[Reason] = ()) ->
 
     Args:
         record: flight in virtual time.
-        reasons: what the server said every SPACING steps; without it, no vehicle waits for its way.
+        reasons: what the server reported every SPACING steps; if empty, no waits for a way.
     """
     vehicles = list(_vehicles(record, scenario))
     found, is_plan = [*_to_begin(vehicles)], are_plans(record, record.netem, scenario.dt_ns)
@@ -110,7 +110,7 @@ def _vehicles(record: Record, scenario: Scenario) -> Iterator[_Vehicle]:
             continue
         at = [np.flatnonzero(each.in_force == first) for first in sent.tolist()]
         accepted = np.array([int(each.step[own[0]]) if len(own) else -1 for own in at])
-        # What was not accepted by then never is.
+        # A motion not accepted by then is never accepted.
         certain = np.where(accepted >= 0, accepted, sent + join + 1)
         heard_at = np.searchsorted(rows["observed_step"], certain).clip(0, len(rows) - 1)
         time_s = (left_ns + tick[is_own] * scenario.dt_ns) / SECOND_NS
@@ -125,7 +125,7 @@ def _sent_at(rows: Rows, sent: Indices) -> Indices:
 
 
 def _to_begin(vehicles: Sequence[_Vehicle]) -> Iterator[Wait]:
-    """Each waits for the last that begins."""
+    """Waits to begin: each vehicle waits for the last one."""
     last = max(vehicles, key=lambda each: each.begins_s, default=None)
     for each in vehicles:
         if last is not None and each.begins_s < last.begins_s:
@@ -136,7 +136,7 @@ def _to_begin(vehicles: Sequence[_Vehicle]) -> Iterator[Wait]:
 def _acknowledgements(
     record: Record, is_plan: Flags, each: _Vehicle, dt_s: float
 ) -> Iterator[Wait]:
-    """Waits for acknowledgements, with the packets that they were for.
+    """Waits for acknowledgements, with the packets that were waited for.
 
     Args:
         is_plan: whether each packet of the record has a plan.
@@ -158,9 +158,7 @@ def _acknowledgements(
 
 
 def _ways(reasons: Sequence[Reason], others: Sequence[Wait], every_s: float) -> Iterator[Wait]:
-    """Waits for the way, with the packets that the other was waiting for meanwhile, if any was
-    lost.
-    """
+    """Waits for a way, with the packets that the other vehicle waited for, if any was lost."""
     last: dict[int, tuple[str, Wait]] = {}
     found = []
     for time_s, vehicle, text in reasons:

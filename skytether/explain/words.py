@@ -1,4 +1,4 @@
-"""The explanation as text."""
+"""Text of an explanation."""
 
 import math
 from collections import Counter
@@ -22,7 +22,7 @@ def text(
     rescues: Rescues | None,
     remedies: Sequence[Remedy] | None,
 ) -> str:
-    """What is known of a moment, one of those found, in plain text; see `Explanation`."""
+    """Explanation so far of one of the found moments, in plain text; see `Explanation`."""
     if moment is None:
         return "Nothing went wrong, compared with a flight in the same wind over a perfect network."
     lines = [f"{_when(moment)}: {_subject(moment)}{moment.says}{_figures(moment)}."]
@@ -96,7 +96,7 @@ def _units(count: int, other: str = "") -> str:
 
 
 def _counted(parts: Iterable[Part]) -> list[str]:
-    """Nouns of parts with their number, such as 2 outages of the uplink."""
+    """Nouns of parts with their number, such as "2 outages of the uplink"."""
     nouns = Counter(
         f"{WHAT[part.unit.is_late, part.unit.is_packet]}|of the {_way(part.unit)}"
         if isinstance(part.unit, Bad)
@@ -116,7 +116,7 @@ def _way(unit: Bad) -> str:
 
 
 def _kind(part: Part) -> object:
-    """Parts with the same kind beside each other have one row: packets lost one after another."""
+    """Kind of a part; neighbouring parts of one kind, such as lost packets, share a row."""
     unit = part.unit
     return (unit.lane, unit.is_late) if isinstance(unit, Bad) and unit.is_packet else part
 
