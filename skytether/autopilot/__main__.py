@@ -98,6 +98,6 @@ def pilot(argv: Sequence[str]) -> None:
 
 
 def _ready() -> None:
-    """Import and compile everything that flies before a peer waits for it."""
+    """Import and compile the code of a flight at the start, so that no peer has to wait for it."""
     terminal.prepare(machine_code.missing())
     kernel.load()

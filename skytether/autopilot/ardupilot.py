@@ -54,7 +54,7 @@ class ArduPilot(PilotedVehicle):
         return ""
 
     def mode_number(self, main: int, sub: int) -> int:  # noqa: ARG002
-        """Number of the mode: the first of the command's two parts."""
+        """Number of the mode, which is the command's main mode."""
         return main
 
     def takes_setpoints(self) -> bool:

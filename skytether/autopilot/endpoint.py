@@ -40,7 +40,7 @@ PEERS_MAX = 8
 PATIENCE_NS = SECOND_NS
 """Silence after which a peer may be replaced [ns]."""
 BEHIND_MAX_NS = SECOND_NS
-"""Longest time that is simulated at once after a late wake [ns]; the flight skips the rest."""
+"""Longest time that is simulated at once after a late wake [ns]; more is skipped."""
 FORCE = 21196.0
 """Magic number that forces arming or disarming."""
 
@@ -184,7 +184,7 @@ class Autopilot(Endpoint):
         return 0 if self._began_ns is None else self._began_ns + self.flight.now_ns + TICK_NS
 
     def change(self, scenario: Scenario, keys: frozenset[str], *, now_ns: int) -> None:  # noqa: ARG002
-        """Adopt the changed wind, the only key that may change."""
+        """Set a new wind; no other key may change in flight."""
         vehicle = scenario.vehicle
         self.flight.quadrotor.blow(vehicle.steady_wind_mps, vehicle.turbulence_mps)
 

@@ -35,7 +35,7 @@ LEAP: Vector = (-12.0, 0.0, 0.0)
 SHIFT: Vector = (3.0, 0.0, 0.0)
 """Shift of the receiver's position with the fault `shift` [m]."""
 LOW_CHARGE = 0.05
-"""Remaining charge after the fault `battery`."""
+"""Remaining charge from 0 to 1 after the fault `battery`."""
 
 
 class ScriptedFault(NamedTuple):
@@ -46,7 +46,7 @@ class ScriptedFault(NamedTuple):
 
 
 def parse(text: str) -> ScriptedFault:
-    """Scripted fault from NAME@SECONDS, or NAME@SECONDS-SECONDS for one that ends.
+    """Parse a scripted fault: NAME@SECONDS, or NAME@SECONDS-SECONDS for a fault that ends.
 
     Raises:
         ConfigError: the text does not describe a fault.

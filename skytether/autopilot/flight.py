@@ -1,8 +1,8 @@
 """Flight of a simulated autopilot: arming, modes, the motion in each mode, and failsafes.
 
 Both flavours share this module; their differences are in `ardupilot.py` and `px4.py`. Positions are
-x north, y east, altitude up, from the start. Times are those of its own clock [ns], which begins at
-0.
+x north, y east, altitude up, relative to the start. Times are those of the autopilot's own clock
+[ns], which begins at 0.
 """
 
 from abc import ABC, abstractmethod
@@ -34,7 +34,7 @@ WANDER_NS = 3 * SECOND_NS
 WANDER_TIME_S = 0.6
 """Position estimate's error divided by the velocity estimate's error [s]."""
 FIX_TICKS = 40
-"""Age of a fix of the receiver when it is reported, in ticks."""
+"""Age of a GPS fix when it is reported, in ticks."""
 PULL, PULL_MPS, PULL_FADES = 0.45, 0.35, 0.8
 """Gains of the estimate after a shift of the receiver's position: from position error to position
 rate [1/s] and velocity rate [1/s²], and decay of the velocity error [1/s]. Fitted to ArduCopter
@@ -97,7 +97,7 @@ class PilotedVehicle(ABC):
 
     Args:
         quadrotor: body of the vehicle, standing on the ground at the origin.
-        ready_s: time from the start until it may be armed.
+        ready_s: time from the start until the vehicle may be armed.
         noise: random generator of estimation errors.
     """
 
@@ -133,7 +133,7 @@ class PilotedVehicle(ABC):
         self._blind_ns: int | None = None
         """Time of the last fix; None while the receiver has a fix."""
         self._past: deque[tuple[Array, Array]] = deque(maxlen=FIX_TICKS)
-        """True positions and velocities of the newest ticks."""
+        """True positions [m] and velocities [m/s] at the newest ticks."""
         self.said: list[tuple[Severity, str]] = []
         self.now_ns = 0
         self.station_ns: int | None = None
@@ -141,13 +141,13 @@ class PilotedVehicle(ABC):
         self._ready_ns = seconds_to_ns(ready_s)
         self._setpoint: CompanionSetpoint | None = None
         self._climb: float | None = None
-        """Altitude to climb to [m]; None while not climbing."""
+        """Target altitude of a climb [m]; None while not climbing."""
         self._climb_ns = 0
         self._held: Vector | None = None
         """Point that the vehicle holds after coming to rest."""
         self._stood_ns = 0
         self._landing = False
-        """Whether a return has become a landing."""
+        """Whether a flight home has reached its landing phase."""
         self._announced: set[str] = set()
         """Failsafes that were triggered in this flight."""
         quadrotor.on = False
@@ -357,7 +357,7 @@ class PilotedVehicle(ABC):
     """Whether a set-point with an upward velocity makes the vehicle take off."""
 
     def _settle(self, velocity: Vector) -> None:
-        """Detect the landing, and disarm after a time on the ground."""
+        """Detect a landing, and disarm after `idle_s` on the ground."""
         if not self.quadrotor.stands() or velocity[2] > 0.0 or self._climb is not None:
             self._stood_ns = self.now_ns
         elif self.flying and self.now_ns - self._stood_ns >= LANDED_NS:
@@ -474,7 +474,7 @@ class PilotedVehicle(ABC):
             self._wander[:] = 0.0
 
     def _follow_receiver(self) -> None:
-        """Advance the errors of the estimate that come from the receiver by a tick."""
+        """Advance by a tick the errors of the estimate that the receiver causes."""
         self._past.append((self.quadrotor.position(), self.quadrotor.velocity()))
         dt = TICK_NS / SECOND_NS
         if not self.fixes:
@@ -505,7 +505,7 @@ class PilotedVehicle(ABC):
 
 
 def _approach(distance: float, p: float, acceleration: float) -> float:
-    """Speed towards a target: proportional to the distance near it, to its square root far away."""
+    """Speed towards a target: proportional to a small distance, or to the root of a large one."""
     near = acceleration / (p * p)
     if distance <= near:
         return p * distance

@@ -1,1 +1,1 @@
-"""Commands that fly, show and repair flights; `skytether.lab` has commands of its own."""
+"""Commands that fly, show and convert flights; `skytether.lab` has further commands."""

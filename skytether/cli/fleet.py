@@ -148,8 +148,8 @@ def fleet(argv: Sequence[str]) -> None:
     """Fly many vehicles on one server, each over a network of its own.
 
     Server, netem and all vehicles run as three processes on loopback, or in virtual time in one
-    process. The cost of the server's work is shown per vehicle and step. Ctrl-C ends the flight and
-    still shows the results so far.
+    process. It shows the server's CPU time per vehicle and step. Ctrl-C ends the flight and still
+    shows the results so far.
     """
     argv = _with_mission(argv)
     options = command.parse(FleetOptions(), argv, "skytether fleet", fleet.__doc__)
@@ -291,8 +291,8 @@ class Lateness:
 
 @contextmanager
 def metronome(dt_s: float) -> Iterator[Lateness]:
-    """Run a thread during the block that sleeps from step to step; a step that it misses is due to
-    the machine.
+    """Run a thread that sleeps from step to step during the block; steps that it misses are the
+    machine's fault.
     """
     late, over = Lateness(), threading.Event()
 
@@ -329,7 +329,7 @@ def _vehicles(options: FleetOptions) -> int:
 
 
 def _separations(scenario: Scenario, flown: Record) -> tuple[Array, Array] | None:
-    """Distances between a mission's vehicles over time, see `separations`; None where unknown."""
+    """Distances between a mission's vehicles over time, see `separations`; None if unknown."""
     client, vehicles = flown.client, flown.figures["client"].get("by_vehicle", {})
     numbers = np.unique(client["vehicle"]).tolist()
     if not scenario.is_mission or any("began_s" not in vehicles.get(str(n), {}) for n in numbers):

@@ -56,7 +56,7 @@ POLL_S = 0.2
 Flown = tuple[Scenario, "Future[Record]"]
 """Scenario that another process flies, and its flight."""
 ON_THE_GROUND = {str(mode) for mode in (Mode.INIT, Mode.SYNC, Mode.READY)}
-"""Modes before the first plan is flown, which are not printed."""
+"""Modes before the first plan is flown; their changes are not printed."""
 
 
 @dataclass(frozen=True)
@@ -162,12 +162,12 @@ def _flying(scenarios: Collection[Scenario]) -> Iterator[list[Flown]]:
         return
     with pool.processes(1, polite=True) as worker:
         plugged = plugins.loaded()
-        with system.blocked(signal.SIGINT):  # not Ctrl-C but this process ends the worker
+        with system.blocked(signal.SIGINT):  # Ctrl-C ends this process, which ends the worker
             flying = [(each, worker.submit(_fly_beside, plugged, each)) for each in scenarios]
         try:
             yield flying
         except BrokenExecutor:
-            raise CommandError("--beside: the process that flew it has died") from None
+            raise CommandError("--beside: the process that flew the scenario has died") from None
 
 
 def _fly_beside(plugged: tuple[Plugin, ...], scenario: Scenario) -> Record:

@@ -25,7 +25,7 @@ def paged(at: str | None, folder: Path | None = None) -> Iterator[Path | None]:
     """Serve a page of a flight during the block; yields the folder of the flight's sockets.
 
     Args:
-        at: HOST:PORT; NONE or None for no page.
+        at: HOST:PORT of the page; NONE or None for no page.
         folder: folder of the flight's sockets; with a page, a temporary one if None.
     """
     if at is None or at == NONE:

@@ -233,7 +233,7 @@ def _probe(options: ProbeOptions, names: Sequence[str], paths: Sequence[NetworkP
     if not all(prober.finished for prober in probers):
         seconds = min(outcome.figures.seconds for _, outcome in results)
         raise CommandError(
-            f"ended early, after {seconds:.3g} s: all figures are of this time", INTERRUPTED
+            f"ended early: all figures are from the first {seconds:.3g} s", INTERRUPTED
         )
 
 
@@ -315,7 +315,7 @@ def _say(event: Event) -> None:
 
 
 def _check(options: ProbeOptions, paths: int) -> None:
-    """Refuse impossible measurements of this number of paths, and files that cannot be written."""
+    """Refuse invalid options for this number of paths, and files that cannot be written."""
     for flag, value, least, most in (
         ("--duration", options.duration, 1.0, SECONDS_MAX),
         ("--rate", options.rate, 0.1, RATE_MAX),
@@ -342,7 +342,7 @@ def _check(options: ProbeOptions, paths: int) -> None:
 
 
 def _trace_name(way: str, path: int) -> str:
-    """File of a direction of a path, from 0, named as by `skytether export`."""
+    """Name of the trace of a path's direction, as in `skytether export`; paths count from 0."""
     return f"{way}-path-{path + 1}.csv" if path else f"{way}.csv"
 
 
@@ -416,7 +416,7 @@ def _tell_accuracy(outcome: ProbeOutcome, of_path: str) -> None:
 
 
 def _flights(options: ProbeOptions, outcomes: Sequence[ProbeOutcome]) -> Sequence[str]:
-    """Flights over the models, and over the traces."""
+    """Commands that fly over the models and over the traces."""
     paths = [
         {"downlink": each.figures.downlink, "uplink": each.figures.uplink} for each in outcomes
     ]

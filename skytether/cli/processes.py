@@ -1,9 +1,8 @@
-"""A flight over real UDP: server, netem and client as processes on loopback.
+"""Flight over real UDP: server, netem and client as processes on loopback.
 
 Each process writes its events as JSON on its standard output (`--log json`). Other output, such as
-a traceback or the one line of an error, is kept to report why the process failed.
-
-The loop is asyncio's own: uvloop would reset signals that the children must go on ignoring.
+a traceback or an error message, is kept to report why the process failed. The loop is asyncio's
+own: uvloop would reset signals that the children must go on ignoring.
 """
 
 import asyncio
@@ -67,7 +66,7 @@ Chain = Sequence[Sequence[Sequence[str]]]
 replaced by the address of the process `server` of an earlier stage."""
 OnEvent = Callable[[LogLine], None]
 Shortfall = RecordIncomplete | NotFlown
-"""Events after which a flight goes on, and which its command reports at the end."""
+"""Events that do not end a flight; the command reports them at the end."""
 
 
 @dataclass(slots=True)
@@ -92,7 +91,7 @@ class Child:
         return code
 
     def last_words(self) -> str:
-        """Why the process ended: the signal that ended it, or the last line of its output."""
+        """Reason why the process ended: a signal, or the last line of its output."""
         code = self.process.returncode
         if code is not None and code < 0:  # the last line is unrelated to the signal
             return f"{self.name}: ended by a signal: {signal.strsignal(-code)}"
@@ -382,7 +381,7 @@ async def _fly(
     on_second: Callable[[float], None],
     on_event: OnEvent,
 ) -> None:
-    """Run processes, each connected to those before, until the flight of the client ends.
+    """Run processes, each connected to those of earlier stages, until the client's flight ends.
 
     Args:
         spares: names of processes; all but one of them may end during the flight.

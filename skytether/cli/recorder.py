@@ -84,7 +84,7 @@ def beside() -> int:
 class _Source:
     begun: bool = False
     ended: bool = False
-    """False again once the feed has been reopened."""
+    """Whether the feed has ended and is not yet open again."""
     resumed: bool = False
     """Whether the next frames may repeat earlier ones."""
     last_ns: int = 0
@@ -150,9 +150,9 @@ class Live:
         self._subscriber = Subscriber(feeds, self._take, self._lost)
 
     def finish(self, summary: Summary | None = None, flown: Record | None = None) -> str | None:
-        """Complete the file after the processes have ended; returns its fault, as a line, or None.
+        """Complete the file after the end of the processes; returns why it is incomplete, or None.
 
-        Further calls return the same fault.
+        Further calls return the same text.
 
         Args:
             summary: summary of the flight, if there is one.

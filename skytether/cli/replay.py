@@ -24,7 +24,7 @@ from skytether.view.recordings.outcome import brakes
 @dataclass(frozen=True)
 class ReplayOptions:
     file: Annotated[Path, Argument(positional=True, metavar="FILE")]
-    """The recording, as `fly --record FILE.mcap` makes it."""
+    """The recording (.mcap), as written by `fly --record`."""
     page: str = HOST_PORT
     """HOST:PORT to serve the page on; if the port is taken, the next free one."""
     plugin: command.Plugins = ()
@@ -41,7 +41,7 @@ def replay(argv: Sequence[str]) -> None:
         closing(Explainer(options.file, brakes(recorded))) as explainer,
     ):
         added = [player.controls]
-        if not recorded.about.began:  # in virtual time: it can be flown again
+        if not recorded.about.began:  # only virtual flights can be flown again
             added.append(explainer.controls)
 
         def more(gui: GuiApi) -> Callable[[], None]:

@@ -41,7 +41,7 @@ from skytether.shell.processes.log import Log
 from skytether.view.rows import check_columns, planned
 
 REPEAT_S = 1.0
-"""Interval at which the newest paths are published again, for tools that have started since."""
+"""Interval at which the newest paths are published again, for tools that started later."""
 GOALS, POINT, VELOCITY = "mission.goals", "reference.points_m", "reference.velocity_mps"
 
 
@@ -87,7 +87,7 @@ def connect(argv: Sequence[str]) -> None:
 
 
 class Bridge:
-    """Nodes of a flight's vehicles in the ROS graph, a Zenoh session each."""
+    """Nodes of a flight's vehicles in the ROS graph, each with its own Zenoh session."""
 
     def __init__(self, options: Ros2Options, line: Line, out: Log) -> None:
         self._options, self._line, self._out = options, line, out

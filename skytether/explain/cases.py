@@ -73,7 +73,7 @@ Unit: TypeAlias = Bad | UsualDelay | Setting | Stall
 
 @dataclass(frozen=True, slots=True)
 class Delivered:
-    """Stretch in which every packet arrives within `most_s` after sending [s]."""
+    """Stretch in which every packet arrives at most `most_s` after sending [s]."""
 
     where: Stretch
     most_s: float

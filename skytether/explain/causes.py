@@ -45,7 +45,7 @@ class Part:
     plans: int = 0
     """Number of plans among these packets."""
     shortest_s: tuple[float, float] | None = None
-    """Lengths of the shortest sufficient outages with this one's beginning or end [s], sorted."""
+    """Lengths of the shortest sufficient outages that begin or end as this one does [s], sorted."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -211,7 +211,7 @@ def lane_name(lane: Lane) -> str:
 def rescues(
     found: Cause, here: Circumstances, moment: Moment, flown: Outcome, fly_all: FlyAll
 ) -> Rescues:
-    """Packets of the cause, sent before the moment, that each avert it if delivered."""
+    """Packets of the cause, sent before the moment, each of which averts it if delivered."""
     met = {
         number: part.unit
         for part in found.parts

@@ -52,12 +52,12 @@ class ExplainOptions:
 def explain_flight(argv: Sequence[str]) -> None:
     """Fly a scenario in virtual time, and explain why something went wrong.
 
-    The same flight is flown again without its outages, its lost and late packets, its wind and
-    noise, until the smallest set is found that suffices. Then: whether each of it is needed,
+    The same flight is flown again without its outages, lost and late packets, wind and noise, to
+    find the smallest set of them that suffices. Further flights show whether each is needed,
     whether a single packet would have averted it, how long an outage must be, and what other keys
-    would do, over the same network and, with --seeds, over that of other seeds.
+    would change, over the same network and, with --seeds, with other seeds.
 
-    It explains this flight, of the simulated vehicle. Ctrl-C leaves what is known by then.
+    It explains this flight of a simulated vehicle. Ctrl-C prints the explanation so far.
     """
     if argv and argv[0].endswith(RECORDING):
         options = read(ExplainOptions(), argv, "skytether explain", explain_flight.__doc__)

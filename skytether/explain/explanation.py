@@ -124,8 +124,8 @@ def _chosen(found: Sequence[Moment], at_s: float | None) -> Moment | None:
         raise ConfigError(f"at: got {at_s:g}, expected {expected}{because}")
 
     def order(each: Moment) -> tuple[float, float, int]:
-        # Times are printed in tenths of a second; of several moments then, take the one that
-        # begins.
+        # Times are printed in tenths of a second; if several moments fit, take the one that begins
+        # then.
         return round(distance_s(each), 1), round(abs(each.start_s - at_s), 1), -WEIGHTS[each.kind]
 
     return min(near, key=order)
@@ -185,4 +185,4 @@ def check_same(flown: Outcome, trace: str, name: str) -> None:
     """
     if flown.trace != trace:
         expected = "one in virtual time by this version, without changes or faults"
-        raise ConfigError(f"{name}: its flight does not come about again, expected {expected}")
+        raise ConfigError(f"{name}: its flight cannot be reproduced, expected {expected}")

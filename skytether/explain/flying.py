@@ -53,10 +53,10 @@ class Packets:
     """Packets that entered the network; each array has a row per packet."""
 
     time_s: Array
-    """Time in the flight at which the packet entered [s]."""
+    """Time of flight at which the packet entered the network [s]."""
     lane: list[Lane]
     slot: Indices
-    """Slot in which it entered, in milliseconds from the flow's first packet."""
+    """Slot in which the packet entered, in milliseconds from the flow's first packet."""
     delay_s: Array
     lost: Flags
     is_plan: Flags
@@ -69,7 +69,7 @@ class Outcome:
     tracks: tuple[Track, ...]
     packets: Packets
     began_s: dict[Lane, float]
-    """Time in the flight of the first packet of each lane [s]."""
+    """Time of flight at the first packet of each lane [s]."""
     separation_s: Array
     separation_m: Array
     """Smallest distance between two vehicles of a mission at those times [m]."""

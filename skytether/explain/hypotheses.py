@@ -231,7 +231,7 @@ def _tube(scenario: Scenario, vehicles: Sequence[Flown]) -> Hypothesis:
 
 
 def _steps_in_time(scenario: Scenario, record: Record) -> Hypothesis:
-    """Check the largest delay of a step, from the vehicle's figures; an event tells the step."""
+    """Check the largest delay of a step, from the vehicle's figures and events."""
     name, most_s = "each step begins in time", STALL_NS / SECOND_NS
     figures = record.figures.get("client", {}).get("by_vehicle", {})
     late_s = {

@@ -66,8 +66,8 @@ SETTINGS: Sequence[tuple[str, Keys]] = (
 
 
 def perfect(case: Case) -> Case:
-    """Case in which every packet arrives at once and nothing else is wrong; it has the same wind,
-    without gusts.
+    """Case in which every packet arrives without delay and nothing else is wrong; same wind without
+    gusts.
     """
     network, none = case.scenario.network, {"uplink": "none", "downlink": "none"}
     paths = tuple(msgspec.structs.replace(each, **none) for each in network.paths)

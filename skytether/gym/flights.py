@@ -46,7 +46,7 @@ _SPACE = Box(-1e9, 1e9, (len(OBSERVED),), np.float32)
 
 
 class Decided(Trigger):
-    """Trigger with a threshold for each vehicle that an agent sets.
+    """Trigger with a threshold for each vehicle, which an agent sets.
 
     Args:
         vehicle: number of the vehicle in each row; shape (capacity,).

@@ -101,7 +101,7 @@ NOTHING_SENT: Options = {"uplink": "loss(1)", "price": 0.0}
 
 
 class _Far:
-    """Common part of `Networked` and `NetworkedVector`: an agent and `count` robots far from it."""
+    """Common part of `Networked` and `NetworkedVector`: an agent and `count` remote robots."""
 
     def __init__(
         self,

@@ -72,7 +72,7 @@ class Player(ABC):
 
 
 class Clocked(Player):
-    """Player of the present step's row, from the newest chunk that has this row."""
+    """Player that plays the present step's row, from the newest chunk that has this row."""
 
     def accept(self, chunk: Held, step: int) -> None:
         if any(each.generation == chunk.generation for each in self.held):
@@ -159,7 +159,7 @@ class Queue(Player):
 
 
 class Freshest(Player):
-    """Player with the newest row for each step, as in DRTC (distributed real-time chunking).
+    """Player that plays the newest row of each step, as in DRTC (distributed real-time chunking).
 
     Steps are counted by rows played, as in `Queue`. A chunk older than the newest so far is
     ignored. Rows of a newer chunk replace rows of the same steps, except steps that were played;

@@ -1,4 +1,4 @@
-"""A bad network in front of a server, inside a Python program: `bad_network`."""
+"""`bad_network`: emulates a bad network in front of a server, inside a Python program."""
 
 import asyncio
 import logging

@@ -1,4 +1,4 @@
-"""Comparisons from Python: `compare` compares your contenders with the built-in ones."""
+"""`compare`: compares your contenders with the built-in ones, from Python."""
 
 from collections.abc import Iterable
 from itertools import product

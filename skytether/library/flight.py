@@ -47,7 +47,7 @@ PARTS = ("client", "server", "netem", "plan")
 QUIET_S = 2.0
 """Time after which a progress bar is shown [s]."""
 UNITS = MappingProxyType({"m": "m", "mps": "m/s", "s": "s", "ns": "ns", "bytes": "B"})
-"""Unit of an array by the last word of its name; other arrays have none."""
+"""Unit of an array, by the last word of its name; other arrays have no unit."""
 
 
 class Column(NamedTuple):
@@ -141,7 +141,7 @@ class Flight:
         """Explain why the vehicle braked or was far off: moments, cause, rescues and remedies.
 
         The flight, which must be in virtual time, is flown again up to a hundred times, see
-        docs/explain.md. If stderr is a terminal, it shows a progress bar.
+        docs/explain.md. A progress bar is shown if stderr is a terminal.
 
         Args:
             at: time of the moment to explain, counted as in `events` [s]; by default the gravest.

@@ -4,8 +4,8 @@ A frame begins with 0xFD (MAVLink 2) or 0xFE (MAVLink 1), and has its length and
 that fit no frame are skipped one at a time, so a truncated frame does not lose the frames after it.
 
 The checksum includes a byte that depends on the type of the message. PX4 sends several frames a
-second of types that the dialect lacks. A frame of such a type is accepted if some value of this
-byte fits, which is so for one damaged frame in 256.
+second of types that the dialect lacks. A frame counts as one of these if some value of this byte
+fits, which is true of one damaged frame in 256.
 """
 
 from typing import Any
@@ -101,8 +101,8 @@ def _is_unknown(frame: bytes | bytearray) -> bool:
         return False
     ends = (10 if frame[0] == 0xFD else 6) + frame[1]
     wanted = int.from_bytes(frame[ends : ends + 2], "little")
-    # One more byte, mixed to t, makes the checksum c of the bytes before
-    # (c >> 8) ^ (t << 8) ^ (t << 3) ^ (t >> 4); its high byte gives t, and the low one has to fit.
+    # With one more byte, mixed to t, the checksum c becomes (c >> 8) ^ (t << 8) ^ (t << 3) ^ (t >>
+    # 4); the high byte determines t, and the low byte must fit.
     mixed = wanted ^ dialect.x25crc(frame[1:ends]).crc >> 8
     t = mixed >> 8 ^ mixed >> 13
     return mixed & 0xFF == (t << 3 ^ t >> 4) & 0xFF

@@ -36,7 +36,7 @@ class Texts:
         """Chunks so far of each text, by system, component and text id."""
 
     def take(self, message: Message) -> str | None:
-        """Text completed by a message; None if more chunks follow, or its beginning is lost."""
+        """Text completed by a message; None if chunks are missing."""
         if message.id == 0:
             return str(message.text)
         key = message.get_srcSystem(), message.get_srcComponent(), message.id

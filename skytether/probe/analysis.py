@@ -35,7 +35,7 @@ WINDOWS = 12
 CERTAIN = 5.0
 """Number of standard errors above which a drift is significant; large, because of few WINDOWS."""
 Z95 = 1.959963984540054
-"""Two-sided 95 % quantile of the standard normal distribution."""
+"""Quantile of the standard normal distribution for a two-sided 95 % interval."""
 ALIKE_S = 50e-6
 """Standard deviation below which values count as equal [s]."""
 LAGS = 20
@@ -107,7 +107,7 @@ def delays(measured: MeasuredPath) -> tuple[Clocks, Delays, Delays]:
     down, up = measured.downlink, measured.uplink
     alone = down.came & (down.train < 0), up.came & (up.train < 0)
     if min(each.sum() for each in alone) < 2:
-        raise ValueError("fewer than two packets went each way")
+        raise ValueError("fewer than two packets arrived in a direction")
     near_ns, far_ns = int(down.sent_ns[0]), int(down.came_ns[down.came].min())
     x_down, y_down = _points(down.sent_ns - near_ns, down.came_ns - far_ns)
     y_up = (up.came_ns - near_ns - (up.sent_ns - far_ns)) / SECOND_NS

@@ -188,7 +188,7 @@ class Listener(Endpoint):
         answer = ProbeAnswer(name, held.number, now_ns, first, session.logged, arrivals)
         size = held.size - (OVERHEAD_BYTES if self._gate.secure else 0)
         packet = line.seal(encode(answer, size))
-        if len(packet) <= held.size:  # probes that are too short for any prober get no answer
+        if len(packet) <= held.size:  # a probe that is too short gets no answer
             self.send(packet, held.peer)
             self._answered += 1
 

@@ -3,9 +3,8 @@
     velocity → acceleration → attitude → rates → rotors → forces
 
 No module of this package reads a clock or draws unseeded random numbers; the caller advances time.
-It imports `shared.base` and `shared.law`; `client.simulated.quadrotor` flies it in place of the
-plant for `vehicle.kind = "quadrotor"`, and the simulated autopilot flies it too. Its kernels need
-the extra `server`.
+It imports `shared.base` and `shared.law`; `client.simulated.quadrotor` flies it for `vehicle.kind =
+"quadrotor"`, and so does the simulated autopilot. Its kernels need the extra `server`.
 """
 
 from skytether.shared.base import extras

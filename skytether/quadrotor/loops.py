@@ -81,8 +81,8 @@ PX4 = Gains(
     tilt_max=0.785,
 )
 """PX4 1.17: its defaults MPC_XY_VEL_P_ACC, _I_ACC and _D_ACC, MPC_Z_VEL_P_ACC and _I_ACC and
-MPC_TILTMAX_AIR. A velocity set-point from outside is not shaped. Both integrals are limited to g:
-the vertical one by itself, the horizontal one by the largest tilt."""
+MPC_TILTMAX_AIR. An external velocity set-point is not shaped. Both integrals are limited to g: the
+vertical one by itself, the horizontal one by the largest tilt."""
 
 CRAZYFLIE = Gains(
     jerk=0.0,
@@ -99,7 +99,7 @@ CRAZYFLIE = Gains(
     tilt_max=0.349,
 )
 """Crazyflie's firmware: its defaults of `position_controller_pid.c`, velocity to tilt with 25° and
-1° for each m/s, at most 20°, and to thrust 25 000 and 15 000 of 65 535, as accelerations of a
+1° per m/s, at most 20°, and to thrust 25 000 and 15 000 of 65 535, converted to accelerations of a
 Crazyflie. Its integrals do not reach their limits; 5 m/s² is assumed."""
 
 AHEAD_MAX_M = 2.0

@@ -102,7 +102,7 @@ class Entity(NamedTuple):
     type_hash: str
 
     def takes(self, topic: Topic) -> bool:
-        """Whether it has the type and the type hash of a topic."""
+        """Whether the entity has the type and the type hash of a topic."""
         return (self.dds_kind, self.type_hash) == (topic.dds_kind, topic.type_hash)
 
     def __str__(self) -> str:

@@ -2,12 +2,12 @@
 
 **A run in a batch equals the same run alone, bit for bit.** The runs of a batch share only a
 server, which plans for all of them at once. Each run has its own network, winds and clocks, from
-its seed. Three rules make the records equal. The server's ticks lie on the grid of its own clock,
-and a random phase from the seed shifts the start of the vehicles instead. The server's computing
-time delays the packets that it sends, not those that it receives, and at one instant the server is
-woken after all other hosts (`sim.hosts`). The numbers of vehicles and sessions, which differ
-between runs, always take the same number of bytes on the wire. Events are equal as well, once the
-vehicles of each run are numbered from 1.
+its seed. Three rules make the records equal. The server's ticks have no random phase; a random
+phase from the seed shifts the start of the vehicles instead. The server's computing time delays the
+packets that it sends, not those that it receives, and at one instant the server is woken after all
+other hosts (`sim.hosts`). The numbers of vehicles and sessions, which differ between runs, always
+take the same number of bytes on the wire. Events are equal as well, once the vehicles of each run
+are numbered from 1.
 """
 
 from collections import deque
@@ -69,11 +69,11 @@ class Plain:
     """Ends of links without encryption; `sealed.Sealed` makes encrypted ones."""
 
     def link(self, seed: int, vehicle: int, purpose: str = "") -> ClientLink | None:  # noqa: ARG002
-        """Link of a client."""
+        """Link of a client: None, without encryption."""
         return None
 
     def gate(self, entropy: Callable[[int], bytes]) -> Gate | None:  # noqa: ARG002
-        """Gate of a server."""
+        """Gate of a server: None, without encryption."""
         return None
 
 

@@ -45,7 +45,7 @@ class Clock:
 
 @dataclass(slots=True)
 class Host:
-    """Endpoint in the world; its socket s has the address (name, s)."""
+    """Host with an endpoint; socket s of the endpoint has the address (name, s)."""
 
     name: str
     endpoint: Endpoint

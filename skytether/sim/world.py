@@ -121,7 +121,7 @@ class World(Hosts):
     def set_clock(self, name: str, *, step_ns: int = 0, drift_ppb: int | None = None) -> None:
         """Step a host's clock, or change its rate from now on.
 
-        The host is not informed. Its pending wake comes when it would have come, because timers are
+        The host is not informed. The time of its pending wake does not change, because timers are
         independent of the clock.
 
         Args:

@@ -239,7 +239,7 @@ def test_a_time_without_a_moment_is_refused_with_those_there_are() -> None:
 def test_a_record_that_does_not_come_about_again_is_refused() -> None:
     flown = skytether.fly("demo", seed=1, duration=10)
     other = skytether.Flight(skytether.load("demo", seed=2, duration=10), flown.record, name="mine")
-    with pytest.raises(ConfigError, match="mine: its flight does not come about again"):
+    with pytest.raises(ConfigError, match="mine: its flight cannot be reproduced"):
         other.explain()
 
 

@@ -218,8 +218,8 @@ def test_nothing_else_gives_way(kind: str, tmp_path: Path) -> None:
     with pytest.raises(LocalError) as refused:
         Control(path, running())
     assert str(refused.value) == (
-        f"{path}: cannot create the socket: expected a new path, or a socket that an ended "
-        "process left behind"
+        f"{path}: cannot create the socket: expected a new path, or a socket that is no longer "
+        "in use"
     )
     assert path.lstat() == before
 

@@ -88,7 +88,7 @@ def test_a_file_that_is_cut_or_flipped_anywhere_is_refused(path: Path) -> None:
     flipped = [held[:i] + bytes([held[i] ^ (1 << i % 8)]) + held[i + 1 :] for i in places]
     for wrong in (*cut, *flipped, held + b"\0"):
         put(path, wrong)
-        with pytest.raises(MemoryRefused, match=r"it is damaged, or was kept with another key"):
+        with pytest.raises(MemoryRefused, match=r"it is damaged, or was written with another key"):
             kept.read()
     put(path, held)
     assert kept.read() == (CONTENT, WRITTEN_NS)
@@ -118,7 +118,7 @@ def test_a_file_of_another_flight_or_secret_or_that_others_may_write_is_refused(
 
 def test_two_processes_do_not_share_a_memory(path: Path) -> None:
     first = MemoryFile(path, IDENTITY)
-    with pytest.raises(OSError, match=r"another process keeps its memory there"):
+    with pytest.raises(OSError, match=r"another process uses this memory file"):
         MemoryFile(path, IDENTITY)
     first.close()
     MemoryFile(path, IDENTITY).close()
@@ -135,7 +135,7 @@ def test_on_a_disk_that_failed_a_client_starts_unless_another_holds_the_lock(
 
     with closing(MemoryFile(path, IDENTITY)), monkeypatch.context() as disk:
         disk.setattr(files, "appending", failed)
-        with pytest.raises(OSError, match=r"another process keeps its memory there"):
+        with pytest.raises(OSError, match=r"another process uses this memory file"):
             MemoryFile(path, IDENTITY)
     monkeypatch.setattr(files, "appending", failed)
     monkeypatch.setattr(files, "replacing", failed)

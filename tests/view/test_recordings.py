@@ -898,7 +898,7 @@ def date(found: list[Any], time_ns: int) -> None:
         (forget, "client has no part 'client'"),
         (partial(date, time_ns=2**61), "ns after the first"),
         (partial(date, time_ns=2**63), "a frame at 9223372036854775808 ns"),
-        (partial(date, time_ns=-1), "rows of client from before it began"),
+        (partial(date, time_ns=-1), "rows of client before its first frame"),
         (partial(write_in, column="step", value=600_000_000), "client: step: got 600000000"),
         (partial(write_in, column="step", value=2**40), "client: step: got 1099511627776"),
         (partial(write_in, column="mode", value=200), "client: mode: got 200"),

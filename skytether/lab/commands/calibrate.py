@@ -61,8 +61,8 @@ def calibrate(argv: Sequence[str]) -> None:
     """Search for the values of some keys that reproduce the paper's Table 1, or minimise the error.
 
     Every point is flown in virtual time with the same seeds. OUT/best.toml is the best scenario,
-    and can be flown like any other. All flights are kept: after Ctrl-C or a crash, the same command
-    continues.
+    and can be flown like any other. All flights are stored: after Ctrl-C or a crash, the same
+    command continues the search.
     """
     options = command.parse(CalibrateOptions(), argv, "skytether calibrate", calibrate.__doc__)
     command.check_count("--runs", options.runs, 1000)

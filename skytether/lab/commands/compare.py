@@ -45,7 +45,7 @@ class CompareOptions:
     """Only search for the weights of every contender in every case, each with the same effort, and
     write them to OUT/weights.toml."""
     generations: Annotated[int, Argument(metavar="N")] = 16
-    """Number of generations of each of these searches."""
+    """Number of generations of each search of --tune."""
     weights: Annotated[str, Argument(metavar="FILE")] = reading.COMPARED
     """File of weights, as written by --tune; by default the included file."""
     contender: Annotated[tuple[Path, ...], Argument(metavar="FILE", append=True)] = ()
@@ -58,7 +58,7 @@ def compare(argv: Sequence[str]) -> None:
     """Compare schemes and triggers on a target whose motion only the server sees.
 
     OUT/report.html has the tables and figures, and opens offline; each is in OUT as CSV, PNG and
-    PDF as well. All flights are kept: after Ctrl-C or a crash, the same command continues; after
+    PDF as well. All flights are stored: after Ctrl-C or a crash, the same command continues; after
     the last flight, it only draws the report again.
     """
     options = read(CompareOptions(), argv, "skytether compare", compare.__doc__)

@@ -1,4 +1,4 @@
-"""Machine and commit that figures were measured with."""
+"""Machine and commit with which figures were measured."""
 
 import contextlib
 import platform
@@ -17,9 +17,9 @@ def processor() -> str:
 
 @cache
 def commit() -> str | None:
-    """Commit of the checkout that this code runs from; None without a checkout.
+    """Commit of the checkout from which this code runs; None without a checkout.
 
-    Cached, because a benchmark that writes its results into the checkout makes it dirty.
+    Cached, because a benchmark may write results to the checkout, which is then marked as modified.
     """
     command = ["git", "describe", "--always", "--abbrev=12", "--dirty", "--exclude=*"]
     here = Path(__file__).parent

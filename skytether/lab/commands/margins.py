@@ -27,7 +27,7 @@ class MarginsOptions:
     runs: Annotated[int, Argument(metavar="N")] = 16
     """Number of flights of each vehicle; seeds count up from the scenario's."""
     json: Path | None = None
-    """File for the figures."""
+    """File for the figures, as JSON."""
     pool: PoolFlags = Flags()
     config: ScenarioFlags = Scenario()
 
@@ -45,8 +45,8 @@ def margins(argv: Sequence[str]) -> None:
       bound    share of the steps with an input at its bound
 
     The server plans with the scenario's model. The first row has the scenario's own vehicle; in the
-    other rows the vehicle differs as stated. The second table has limits, found by bisection: how
-    far one quantity may differ, relative to the model, before the loop is no longer stable. A
+    other rows the vehicle differs as described. The second table has limits, found by bisection:
+    how far one quantity may differ, relative to the model, before the loop is no longer stable. A
     trigger that uses the state is replaced by a periodic one with the same mean rate for pushes,
     because a weak push stays below every threshold.
     """

@@ -74,7 +74,7 @@ PoolFlags = Annotated[Flags, Argument(name="")]
 
 
 class Interrupted(CommandError):
-    """Error: interrupted by Ctrl-C; the same command continues the work."""
+    """Interrupted by Ctrl-C; the same command continues the work."""
 
     def __init__(self, done: float, total: float, unit: str) -> None:
         message = f"interrupted with {done:.0f} of {total:.0f} {unit} done"

@@ -75,7 +75,7 @@ class ContenderRuns:
         return interval(self.values(figure))
 
     def values(self, figure: str) -> list[float]:
-        """Values of one of FIGURES, without runs that failed or have no value."""
+        """Values of one of FIGURES; runs that failed or have no value are left out."""
         flew = (run for run in self.runs if run.rmse_xy is not None)
         values = (getattr(run, figure) for run in flew)
         return [value for value in values if value is not None]

@@ -197,7 +197,7 @@ def _unsearched(name: str, title: str, keys: Mapping[str, Any]) -> Case:
 def _circle(name: str, title: str, keys: Mapping[str, Any], effort_mps: float) -> Case:
     """Case on the paper's circle; costs and thresholds are hundreds of times smaller there."""
     small = {"trigger.cost_gap": 1.0, "trigger.expected_gap": 1.0, "trigger.state_gap": 300.0}
-    round_ = {**keys, "duration": 32.5}  # one full circle after the time that RMSE leaves out
+    round_ = {**keys, "duration": 32.5}  # one full circle after `settle`, which RMSE leaves out
     return Case(name, title, "paper", round_, effort_mps, contenders=CIRCLE, start=small)
 
 
@@ -454,7 +454,7 @@ def search_start(contender: Contender, case: Case, scale: ComparisonSize) -> Sce
 
 
 def entry(contender: Contender, case: Case) -> str:
-    """Name of a contender's table for a case in the file of weights."""
+    """Name of the table for a contender and a case in the file of weights."""
     return f"{contender.name}-{case.weights or case.name}"
 
 
@@ -513,7 +513,7 @@ def _inline(value: Any) -> str:
 
 
 def differences(scenario: Scenario, plant: str) -> dict[str, Any]:
-    """Keys of a scenario's sections that differ from the plant, with dots, and their values."""
+    """Dotted keys of a scenario's sections that differ from the plant, and their values."""
     own, plant_values = (
         dict(flat(reading.to_table(each))) for each in (scenario, reading.load(plant))
     )

@@ -76,7 +76,7 @@ class StudyJournal(Generic[E]):
         try:
             before = dict(flat(toml.loads(path.read_text())))
         except ValueError as error:
-            raise ConfigError(f"{path}: no valid TOML: {error}") from None
+            raise ConfigError(f"{path}: not valid TOML: {error}") from None
         now = dict(flat(toml.loads(text.decode())))
         for key in [*now, *before]:
             if now.get(key) != before.get(key):

@@ -62,7 +62,7 @@ WIND_ALONE = 0.1
 CLOCK_ONLY = ("always", "periodic", "silence", "budget")
 """Triggers that do not use the state."""
 RATE_RUNS, LIMIT_RUNS = 4, 4
-"""Number of seeds for the rate of a trigger, and largest number for each bisection of a limit."""
+"""Number of seeds for measuring a trigger's rate, and largest number for a bisection."""
 HALVINGS = 7
 
 
@@ -70,7 +70,7 @@ T = TypeVar("T", NetworkConfig, PathConfig)
 
 
 def impaired(scenario: Scenario, change: Callable[[str], str]) -> Scenario:
-    """Scenario with the text of each direction changed, on every path."""
+    """Scenario with the impairments of each direction changed, on every path."""
 
     def changed(each: T) -> T:
         return replace(each, uplink=change(each.uplink), downlink=change(each.downlink))

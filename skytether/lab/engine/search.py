@@ -93,7 +93,7 @@ def plain(table: Any) -> Any:
 
 
 class Optimiser:
-    """CMA-ES over free keys, from the values of a scenario.
+    """CMA-ES over free keys, starting at the values of a scenario.
 
     `sigma` is the initial step size, as a share of the logarithmic range of each key.
     """
@@ -101,7 +101,7 @@ class Optimiser:
     def __init__(
         self, start: Scenario, free: Sequence[Free], *, population: int, sigma: float, seed: int
     ) -> None:
-        import cma  # takes half a second to import
+        import cma  # the import takes 0.5 s
 
         self._start = start
         self._free = free

@@ -79,7 +79,7 @@ def parse_axis(text: str) -> GridAxis:
 
 
 def _linear(start: str, stop: str, count: str) -> list[float]:
-    """Evenly spaced values, ends included; integers if all of them are whole."""
+    """Evenly spaced values, including both ends; integers if all values are whole."""
     first, last, n = float(start), float(stop), int(count)
     if n < 2 or not math.isfinite(first - last):
         raise ValueError

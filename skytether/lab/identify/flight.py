@@ -1,7 +1,7 @@
 """Flight of an experiment: an endpoint that flies a vehicle without a server.
 
-The vehicle takes off, flies the experiment, and lands. Any event that keeps it from following a
-plan ends the flight at once; if a pilot takes over, the pilot keeps the vehicle.
+The vehicle takes off, flies the experiment, and lands. Any event that prevents it from following a
+plan ends the flight at once; if a pilot takes over, the pilot keeps control of the vehicle.
 """
 
 from typing import Any

@@ -2,7 +2,7 @@
 
     home → rest → 0 to v → v to 0 → 0 to -v → -v to 0 → home …
 
-All inputs pass the fence, as in a flight. A step that the fence cuts short is not used, and the
+The fence limits all inputs, as in a flight. A step that the fence shortens is not used, and the
 vehicle flies home.
 """
 
@@ -50,7 +50,7 @@ class FlownStep(NamedTuple):
     after: float
     began_ns: int
     ended_ns: int
-    """Time at which the input changed again, or the step was cut short [ns]."""
+    """Time at which the input changed again, or the fence shortened the step [ns]."""
 
 
 def reference_speeds(scenario: Scenario) -> list[float]:
@@ -144,7 +144,7 @@ class Experiment:
         yield from self._go_home()
 
     def _repetition(self, axis: int, speed: float) -> Iterator[list[float]]:
-        """One repetition: rest, then steps out and back, until the fence cuts one short."""
+        """One repetition: rest, then steps out and back, until the fence shortens a step."""
         before = 0.0
         for number, after in enumerate((0.0, speed, 0.0, -speed, 0.0)):
             began_ns = self._now_ns

@@ -229,7 +229,7 @@ def as_interval(estimate: Estimate, spec: str) -> str:
 
 
 def html(drawn: Drawn, scenario: Scenario, calls: Sequence[Mapping[str, Any]]) -> str:
-    """Page of a report.
+    """HTML page of a report.
 
     `calls` has facts about each call of the command that made the report, in order.
     """

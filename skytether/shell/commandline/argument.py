@@ -10,7 +10,7 @@ HELP_KEYS = "--help-keys"
 
 @dataclass(frozen=True, slots=True)
 class Argument:
-    """Annotation of a field: its form on the command line."""
+    """Annotation of a field: how its option is written on the command line."""
 
     name: str | None = None
     """Name of the flag, if different from the field's; "": each field of the value has a flag."""

@@ -186,7 +186,7 @@ def unsealed(*addresses: Address) -> CommandError:
 
 
 def check_sockets(flag: str, given: int) -> None:
-    """Raise this process's limit of open files for this number of sockets, or refuse the number."""
+    """Raise this process's limit of open files for a number of sockets, or refuse the number."""
     most = sockets_max()
     if given > most:
         needed = f"got {given}, which takes {given + SPARE_FILES} open files"

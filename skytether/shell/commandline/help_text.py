@@ -1,4 +1,4 @@
-"""Help of a command: its options in groups, as wide as the terminal."""
+"""Help of a command: its options in groups, wrapped to the terminal's width."""
 
 import dataclasses
 import math

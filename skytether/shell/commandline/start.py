@@ -1,7 +1,5 @@
-"""Start of every command, before the imports that take seconds.
-
-Handles, in one place, missing standard streams, terminals that cannot print Greek letters, and
-SIGTERM or SIGUSR1 during the imports.
+"""Start of every command, before the imports that take seconds. It handles missing standard
+streams, terminals that cannot print Greek letters, and SIGTERM or SIGUSR1 during the imports.
 """
 
 import contextlib
@@ -53,7 +51,7 @@ def begin() -> None:
         try:
             os.fstat(number)
         except OSError:
-            # open() takes the lowest free descriptor, which is this one
+            # open() returns the lowest free descriptor, which is the closed one
             os.open(os.devnull, os.O_RDWR)
             os.set_inheritable(number, True)
         if getattr(sys, name) is None:

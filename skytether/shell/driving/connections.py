@@ -36,7 +36,7 @@ class SocketHalf:
         self._source, self._target = source, target
         self._peer, self._hear = peer, hear
         self.pieces: asyncio.Queue[bytes] = asyncio.Queue()
-        """Pieces that have passed the endpoint."""
+        """Pieces that the endpoint has relayed."""
         self._held, self._has_capacity = 0, asyncio.Event()
         self._has_capacity.set()
         self._has_ended = False

@@ -39,7 +39,7 @@ ANSWER_BYTES_MAX = 65_536
 
 
 class ControlError(OSError):
-    """No process answers at the socket; the message says why."""
+    """No process answers at the socket; the message has the reason."""
 
 
 class Control:

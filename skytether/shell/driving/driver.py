@@ -82,8 +82,8 @@ Numbers = dict[Address, Address]
 class OpenLine(Protocol):
     """Connection beside the UDP sockets.
 
-    The module in LINES has `open_line(line, hear, refused) -> OpenLine`: `hear` is called with the
-    datagrams that arrive at once, `refused` with the reason why something sent cannot arrive.
+    The module in LINES has `open_line(line, hear, refused) -> OpenLine`: `hear` is called with
+    datagrams that arrive together, `refused` with the reason why a sent datagram cannot arrive.
     """
 
     address: Address | None
@@ -105,7 +105,7 @@ class Arrivals:
 
 
 def new_event_loop() -> asyncio.AbstractEventLoop:
-    """Event loop: uvloop's where it is installed, else asyncio's own."""
+    """Event loop: uvloop's if it is installed, otherwise asyncio's."""
     try:
         import uvloop
     except ImportError:
@@ -402,8 +402,8 @@ class Shell:
     def _read_batch(
         self, number: int, batch: DatagramBatch, last_ns: int
     ) -> list[tuple[int, Datagram]]:
-        """Datagrams that one call reads from a socket, each with its arrival time [ns], which does
-        not decrease.
+        """Datagrams that one call reads from a socket, each with its arrival time [ns], in rising
+        order.
 
         Args:
             last_ns: arrival time of the datagram before them [ns].

@@ -35,7 +35,7 @@ from skytether.shell.host.local import Local
 READERS_MAX = 8
 """Largest number of readers at once; further ones are refused and counted."""
 WAITING_BYTES_MAX = 4 * 1024 * 1024
-"""Largest number of bytes queued for a reader; a reader with more is dropped and counted."""
+"""Largest number of bytes queued for a reader; a slower reader is disconnected and counted."""
 BACKLOG_BYTES_MAX = 1024 * 1024
 """Largest number of bytes of sent frames that are kept for readers that connect later."""
 ROWS_BYTES_MAX = 256 * 1024

@@ -149,7 +149,7 @@ def _configure(mtu: int) -> None:
         )
         with suppress(subprocess.CalledProcessError):  # a kernel without IPv6
             _ip(f"addr add {ADDRESS6}/64 dev netem nodad", "route add ::/0 dev netem")
-    # File capabilities, which `ping` or a web server use for the same, have no effect here.
+    # File capabilities, with which `ping` or a web server do the same, have no effect here.
     group = os.getegid()
     for name, value in (
         ("ping_group_range", f"{group} {group}"),

@@ -88,7 +88,7 @@ class MemoryFile:
         except OSError as error:
             if error.errno != EBUSY:
                 raise
-            raise OSError(f"{path}: another process keeps its memory there") from None
+            raise OSError(f"{path}: another process uses this memory file") from None
         self._wanted: bytes | None = None
         self._changed = threading.Condition()
         self._ends = False
@@ -124,7 +124,7 @@ class MemoryFile:
             written = envelope.identity.get(name, "")
             if written != expected:
                 mismatch = f"{name}: got {written or 'nothing'}, expected {expected}"
-                raise MemoryRefused(f"{self._path}: it was kept by another flight: {mismatch}")
+                raise MemoryRefused(f"{self._path}: it was written in another flight: {mismatch}")
         try:
             self._write(content)
         except OSError as error:
@@ -136,7 +136,7 @@ class MemoryFile:
     def _opened(self, held: bytes) -> _Envelope:
         digest, body = held[len(MAGIC) :][:DIGEST_BYTES], held[len(MAGIC) + DIGEST_BYTES :]
         if not held.startswith(MAGIC) or digest != self._digest(body):
-            raise MemoryRefused(f"{self._path}: it is damaged, or was kept with another key")
+            raise MemoryRefused(f"{self._path}: it is damaged, or was written with another key")
         try:
             return msgspec.msgpack.decode(body, type=_Envelope)
         except (msgspec.DecodeError, RecursionError) as error:

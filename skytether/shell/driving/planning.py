@@ -1,7 +1,7 @@
 """Planners of plug-ins in real time: each call in a thread, with a time limit.
 
-If a planner takes too long, the tick continues without it: its plan is dropped when it is ready,
-and it is not called before. So a planner that hangs delays other vehicles' plans once, by the
+If a planner takes too long, the tick continues without it: its late plan is dropped, and before
+that it is not called again. So a planner that hangs delays other vehicles' plans once, by the
 limit, and no tick is missed. Threads cannot be ended; they end with the process. So once
 HANGING_MAX calls hang, also of vehicles that have left, no further call is started.
 """

@@ -100,7 +100,7 @@ def program(
 
     Args:
         mtu: MTU of its device [B].
-        path_mtu: largest packet that slirp4netns sends to it [B].
+        path_mtu: largest packet that slirp4netns sends to the program [B].
         exposed: addresses on this machine; TCP and UDP to them go to the program's same port.
 
     Raises:

@@ -24,7 +24,7 @@ class ByteStream:
     """Byte stream to an autopilot, over TCP or a serial port.
 
     Args:
-        hear: called with each piece of bytes, from the peer `LINE`.
+        hear: called with the bytes of each read, from the peer `LINE`.
 
     Raises:
         AddressError: the system has no serial ports, or not this rate.

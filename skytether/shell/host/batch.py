@@ -262,7 +262,7 @@ class Segments:
 
 
 def _clocks() -> tuple[int, int]:
-    """Lead of CLOCK_REALTIME over CLOCK_MONOTONIC, and the time of the latter [ns].
+    """CLOCK_REALTIME minus CLOCK_MONOTONIC, and the time of CLOCK_MONOTONIC [ns].
 
     The process may be preempted between the two readings, which shifted arrival times by 20 ms on a
     busy machine. So both clocks are read again unless the readings are within NEAR_NS.

@@ -130,7 +130,7 @@ def _have_compiled(kernels: "deque[Missing]", on_done: Callable[[], None]) -> No
         assert helper.stdout
         while each := _next(kernels):
             print(each.name, file=helper.stdin, flush=True)
-            if not helper.stdout.readline():  # killed, by the system or by Ctrl-C
+            if not helper.stdout.readline():  # the helper was killed, by the system or by Ctrl-C
                 return
             on_done()
 

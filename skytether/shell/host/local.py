@@ -1,4 +1,4 @@
-"""Unix sockets that only their owner can use, and that are removed at close."""
+"""Unix sockets that only their owner can use; closing removes them."""
 
 import os
 import socket
@@ -70,7 +70,7 @@ def _clear(path: Path, kind: socket.SocketKind) -> None:
     except FileNotFoundError:
         return
     if not stat.S_ISSOCK(status.st_mode) or status.st_uid != system.user():
-        raise OSError("expected a new path, or a socket that an ended process left behind")
+        raise OSError("expected a new path, or a socket that is no longer in use")
     with system.local_socket(kind) as caller:
         caller.setblocking(False)  # a listener whose queue is full counts as alive
         if caller.connect_ex(str(path)) == ECONNREFUSED:

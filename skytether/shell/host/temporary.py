@@ -22,7 +22,7 @@ MARK = ".of-a-process"
 
 @contextlib.contextmanager
 def folder() -> Iterator[Path]:
-    """Temporary folder for the duration of the block; first removes those of dead processes."""
+    """Temporary folder for the duration of the block; first removes folders of dead processes."""
     _clear(Path(tempfile.gettempdir()))
     path = Path(tempfile.mkdtemp(prefix=PREFIX))
     with _marked(path):

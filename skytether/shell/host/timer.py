@@ -37,7 +37,7 @@ class _Itimerspec(ctypes.Structure):
 
 
 class KernelTimer:
-    """A Linux timerfd. Python below 3.13 has no `os.timerfd_create`, so libc is called directly.
+    """Timer that uses Linux's timerfd, through libc: Python below 3.13 has no `os.timerfd_create`.
 
     Raises:
         OSError: the system has no timerfd.
@@ -75,7 +75,7 @@ class KernelTimer:
 
 
 class LoopTimer:
-    """The loop's own timer, for systems without timerfd."""
+    """Timer that uses the event loop's own timer, for systems without timerfd."""
 
     def __init__(self, loop: asyncio.AbstractEventLoop, callback: Callable[[], None]) -> None:
         self._loop = loop

@@ -126,7 +126,7 @@ class _Handler(WSGIRequestHandler):
 
 
 class Metrics(ThreadingMixIn, WSGIServer):
-    """HTTP server of a process's metrics, with a thread for each connection.
+    """HTTP server of a process's metrics, with one thread per connection.
 
     Args:
         address: address to listen at; port 0 takes a free one.

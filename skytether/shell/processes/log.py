@@ -1,4 +1,4 @@
-"""The log of a process: its events on stdout, as text for an operator or as JSON for a program.
+"""Log of a process: its events on stdout, as text for an operator or as JSON for a program.
 
 A line of text begins with the local time and the name of the process. A thread writes lines from a
 bounded queue, so that logging never blocks the process; if stdout is closed or full, lines are lost
@@ -104,7 +104,7 @@ class Log:
         if self._unread:
             before, self._unread = self._unread, 0
             self.say(Omitted(kind="lines", count=before))
-            if self._unread:  # the output still accepts nothing
+            if self._unread:  # stdout is still blocked
                 self._unread = before
 
     def close(self) -> None:

@@ -278,7 +278,7 @@ LEFT_OUT = {
     "server": (
         "tick_ms_p50",
         "tick_ms_p99",
-    ),  # cumulative since the start; the histogram serves any period
+    ),  # cumulative since the start; the exported histogram suits any period
     "netem": (
         "{direction}/delay_ms_p50",
         "{direction}/delay_ms_p99",
@@ -289,7 +289,7 @@ LEFT_OUT = {
         "vehicles",  # constant
         "by_vehicle/{vehicle}/missed",  # covered by the other metrics
         "by_vehicle/{vehicle}/began_s",  # a time on the client's own clock
-        "by_vehicle/{vehicle}/autopilot/mode",  # the number of the mode is exported
+        "by_vehicle/{vehicle}/autopilot/mode",  # the mode's number is exported instead
     ),
 }
 """Figures that are deliberately not exported."""

@@ -2,7 +2,7 @@
 
 Each process has its own socket at the address (SO_REUSEPORT): the kernel assigns peers to the
 processes by a hash of their address, so a peer always reaches the same process while all of them
-live. When one ends, all are ended.
+live. When one process ends, all others are ended.
 """
 
 import contextlib

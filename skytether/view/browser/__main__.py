@@ -4,7 +4,7 @@ import sys
 
 from skytether.shell.commandline.start import run
 
-if __name__ == "__main__":  # called before the slow imports below
+if __name__ == "__main__":  # called first, because the imports below are slow
     sys.exit(run("skytether.view.browser.__main__:show", "page"))
 
 from collections.abc import Sequence

@@ -4,7 +4,7 @@ viser itself accepts any connection and any message: uploads of any size, reques
 on the internet, values of any attribute. `Guard.served` makes it listen with these rules:
 
 - no answer may be shown in a website's frame; the page itself gets our style and script (`DRESS`);
-- a websocket is opened only for browsers that may look (`access.refusal`), up to BROWSERS_MAX;
+- a websocket is opened only for browsers that may watch (`access.refusal`), up to BROWSERS_MAX;
 - if there are too many connections, the one that was silent longest is closed;
 - only messages that our page sends (`MESSAGES`) are accepted, of at most 64 KiB in 64 pieces;
 - at most `RATE_HZ` messages a second are read; more of them wait in the browser's kernel;

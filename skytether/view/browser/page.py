@@ -143,7 +143,7 @@ class Page:
                         panel.show(now_ns)
 
     def _wait(self) -> None:
-        """Show what flights wait for that have not begun."""
+        """Show what the flights that have not begun are waiting for."""
         waits = [flight.waits for flight in self._flights if not flight.state.name]
         text = "\n\n".join(waits)
         if self._waiting is None:

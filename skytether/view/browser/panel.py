@@ -105,7 +105,7 @@ class Panel:
         gui.main_panel.set_width(360)
         self._scene = scene
         self._aimed = scene.camera(WIDE)[0]
-        """Position at which the panel has put the camera."""
+        """Position of the camera as last set by the panel."""
         with tabs.add_tab("Now") if tabs else nullcontext():
             self._add_words(more if may_play else None, may_play=may_play)
         self._plots: list[Plots] = []

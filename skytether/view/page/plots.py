@@ -41,7 +41,7 @@ BANDS = {GREEN: "TRACK", AMBER: "COAST", RED: "BRAKE", BLUE: "HOVER", VIOLET: "L
 """Mode shown for each colour."""
 LINKS = {GREEN: "link good", AMBER: "degraded", RED: "cut"}
 UNSEEN: uplot.Series = {"label": "\u00a0", "stroke": "transparent", "points": {"show": False}}
-"""Invisible series that widens a plot's range: changing the range itself would redraw all."""
+"""Invisible series that widens a plot's range, because changing the range redraws all."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -206,7 +206,7 @@ def _mission(state: State, vehicle: int) -> list[tuple[str, str]]:
 
 def _autopilot(state: State, vehicle: int) -> list[tuple[str, str]]:
     says = group(state.of_vehicle("client", vehicle), "autopilot")
-    if "mode" not in says:  # a flight without modes has none of these figures
+    if "mode" not in says:  # without modes, these figures do not exist
         return []
     armed = "armed" if says.get("armed") else "disarmed"
     charge, volts = 100.0 * figure(says, "battery"), figure(says, "voltage_v")

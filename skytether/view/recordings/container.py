@@ -41,7 +41,7 @@ from skytether.shared.telemetry.record import RECORDING
 
 MAGIC = b"\x89MCAP0\r\n"
 ENCODING = "msgpack"
-"""Encoding of the messages that are read back; others are written for other programs."""
+"""Encoding of the messages that `recorded` reads; others are for other programs."""
 COPY, COPY_OF = "/copy", "copy_of"
 """Topic prefix of a channel that copies another channel's first message, and metadata key for the
 number of the other channel.
@@ -134,7 +134,7 @@ class Container:
                 raise RecordingError(f"{path}: {what}, expected a recording ({RECORDING})")
             self._file.seek(max(self._size - len(MAGIC), len(MAGIC)))
             self.is_whole = self._file.read() == MAGIC
-            """Whether the file was completed; those of killed flights are not."""
+            """Whether the file was completed; files of killed flights are not."""
         except BaseException:
             self.close()
             raise
@@ -143,7 +143,7 @@ class Container:
         self._file.close()
 
     def messages(self) -> Iterator[tuple[str, bytes]]:
-        """Topics and contents of messages in the encoding that is read back, in file order.
+        """Topics and contents of messages with the encoding ENCODING, in file order.
 
         Damaged records are skipped, and everything before the next chunk. The copy of a message is
         returned if the message is lost.
@@ -186,7 +186,7 @@ class Container:
                 continue
             left_bytes -= size
             if left_bytes < 0:
-                raise ValueError("its chunks are larger than any flight's, for a file of its size")
+                raise ValueError("the chunks are too large for a file of this size")
             try:
                 records = breakup_chunk(record, validate_crc=True)
             except (CRCValidationError, zstandard.ZstdError):

@@ -178,7 +178,7 @@ class Outcome:
 
     @property
     def verdict(self) -> str:
-        """Sentences about a mission: who arrived, and the least separation."""
+        """Sentences about a mission: which vehicles arrived, and the smallest separation."""
         late = [each.vehicle for each in self.ended if not self.arrived(each)]
         count = len(self.ended)
         first = "" if count == len(self.numbers) else f"Of the first {count} vehicles, "

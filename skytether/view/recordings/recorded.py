@@ -117,7 +117,7 @@ def read(path: Path) -> Recorded:
             raise RecordingError(f"{path}: {message}")
         begun = msgspec.msgpack.decode(data, type=Begun)
         if abs(begun.about.offset_ns) > TIME_NS_MAX:
-            raise ValueError(f"a clock that is {begun.about.offset_ns} ns off")
+            raise ValueError(f"the clock offset {begun.about.offset_ns} ns is too large")
         scenario = check(toml.loads(begun.scenario), "its scenario", any_network=True)
         frames = _Frames(scenario)
         for topic, data in messages:
@@ -171,11 +171,11 @@ class _Frames:
                 if row_type is None:
                     raise ValueError(f"{process[:20]} has no part {frame.part[:20]!r}")
                 if frame.time_ns < self._begun_ns[process]:
-                    raise ValueError(f"rows of {process[:20]} from before it began")
+                    raise ValueError(f"rows of {process[:20]} before its first frame")
                 rows = self._rows.setdefault(frame.part, [])
                 rows.append((frame.time_ns, feed.table(frame.rows, row_type)))
                 if rows[0][1].dtype != row_type:
-                    raise ValueError(f"the part {frame.part} has columns of two kinds")
+                    raise ValueError(f"the part {frame.part} has two sets of columns")
             case Figures():
                 drops.counted(frame.figures)
         self._frames.append((process, frame))

@@ -159,7 +159,7 @@ class Recording:
         self._writer.add_attachment(0, self._now_ns, name, kind, content)
 
     def _add_frame(self, process: str, frame: Frame) -> None:
-        """Add a frame unchanged, for `recorded`."""
+        """Add a frame unchanged, to be read by `recorded`."""
         self._add(f"{FEED}{process}", ENCODING, 0, feed.pack(frame))
 
     def _add_twice(self, topic: str, content: bytes) -> None:
