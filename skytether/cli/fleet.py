@@ -145,7 +145,7 @@ class FleetFlight:
 
 
 def fleet(argv: Sequence[str]) -> None:
-    """Fly many vehicles on one server, each over a network of its own.
+    """Fly many vehicles on one server, each over its own network.
 
     Server, netem and all vehicles run as three processes on loopback, or in virtual time in one
     process. It shows the server's CPU time per vehicle and step. Ctrl-C ends the flight and still

@@ -1,4 +1,4 @@
-"""Page of a flight, in a process of its own: the flight goes on if the page fails."""
+"""Page of a flight, in its own process, so that the flight goes on if the page fails."""
 
 import contextlib
 import subprocess

@@ -102,7 +102,7 @@ class _Source:
 
 
 class Live:
-    """Recorder of a flight over UDP, in threads of its own, so that the flight never waits for it.
+    """Recorder of a flight over UDP, in its own threads, so that the flight never waits for it.
 
     A slow disk blocks only these threads: processes then drop feeds that are not read in time, and
     the recording is reported as incomplete.

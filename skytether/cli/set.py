@@ -20,7 +20,7 @@ class SetOptions:
     path: Annotated[Path, Argument(positional=True, metavar="PATH")]
     """Control socket: the path given to server, netem or client as --control."""
     changes: Annotated[tuple[str, ...], Argument(positional=True, metavar="KEY=VALUE")]
-    """Keys and values, as in network.uplink.loss=0.3; a value is TOML, or else a string."""
+    """Keys and values, as in network.uplink.loss=0.3; a value is TOML, otherwise a string."""
 
 
 def set_keys(argv: Sequence[str]) -> None:

@@ -23,7 +23,7 @@ horizon and the delays."""
 SHORTEST_MS = 20
 """Accuracy of the length of the shortest outage that suffices [ms]."""
 SETS_MAX = 3
-"""Largest number of searched sets of which each suffices."""
+"""Largest number of sufficient sets that are searched."""
 PACKETS_MAX = 64
 """Largest number of packets, the newest before the moment, whose single delivery is tested."""
 
@@ -63,7 +63,7 @@ class Cause:
     also: tuple[tuple[Part, ...], ...] = ()
     """Further smallest sets, each of which suffices and has no unit of the earlier sets."""
     others: tuple[Part, ...] = ()
-    """Losses and late packets that were examined and are in none of the sets."""
+    """Losses and late packets that were examined and are not in any of the sets."""
     innocent: tuple[tuple[str, float], ...] = ()
     """Other groups of units, and change of the error without each group [m]."""
     is_all: bool = True
@@ -83,7 +83,7 @@ class Packet:
 
 @dataclass(frozen=True, slots=True)
 class Rescues:
-    """Packets of a cause whose timely arrival, each alone, would have averted the moment."""
+    """Packets of a cause, each of which would have averted the moment if delivered in time."""
 
     packets: tuple[Packet, ...]
     tried: int
@@ -92,7 +92,7 @@ class Rescues:
 def cause(
     case: Case, moment: Moment, flown: Outcome, fly_all: FlyAll, at_once: int
 ) -> tuple[Cause, Circumstances]:
-    """Cause of a moment, without the effects of its parts, and the circumstances of the search."""
+    """Find the cause of a moment, without its parts' effects; also returns the circumstances."""
     case = replace(case, until_s=moment.end_s + AFTER_S + 1.0)
 
     def suffice(cases: Iterable[Case]) -> list[bool]:
@@ -145,8 +145,8 @@ def _met(unit: Bad, flown: Outcome) -> list[int]:
 def needed(
     found: Cause, here: Circumstances, moment: Moment, fly_all: FlyAll
 ) -> tuple[Cause, list[Outcome]]:
-    """Cause with the results of flights without each of its parts and without each other group, and
-    the flight without each part.
+    """Add to a cause the results of flights without each part and without each other group; also
+    returns the flights without each part.
     """
     parts, others = found.parts, _groups(found, here)
     cases = [here.without(part.unit) for part in parts]
@@ -237,7 +237,7 @@ def rescues(
 
 
 def lengths(found: Cause, here: Circumstances, moment: Moment, fly_all: FlyAll) -> Cause:
-    """Cause with the shortest sufficient length of each needed outage, by bisection from both ends.
+    """Add to a cause the shortest sufficient length of each needed outage, found by bisection.
 
     The moment occurs from this length on, provided that it occurs for all longer outages.
     """

@@ -35,7 +35,7 @@ class ExplainOptions:
     """A scenario's name (`skytether list scenarios`), a .toml file, or a recording (.mcap) of a
     flight in virtual time."""
     at: Annotated[float | None, Argument(metavar="T")] = None
-    """Time of flight of the moment to explain [s]; by default that of the gravest."""
+    """Time of flight of the moment to explain [s]; by default the gravest moment."""
     seeds: Annotated[int, Argument(metavar="N")] = 0
     """Number of flights of each remedy with other seeds, which count up from the scenario's."""
     vehicles: Annotated[int | None, Argument(metavar="N")] = None

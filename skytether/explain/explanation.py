@@ -35,11 +35,11 @@ class Explanation:
     moment: Moment | None
     """Moment that is explained; None if nothing went wrong."""
     flown: Outcome
-    """The flight as it was."""
+    """Outcome of the explained flight."""
     cause: Cause | None = None
     rescues: Rescues | None = None
     remedies: tuple[Remedy, ...] | None = None
-    """Flights with other keys; the first is the flight as it was."""
+    """Flights with other keys; the first is the explained flight."""
     curves: tuple[tuple[str, Outcome], ...] = ()
     """Flights drawn for comparison: without a part of the cause, and with a remedy."""
 

@@ -58,7 +58,7 @@ class Moment:
     says: str
     """Description of the moment: a sentence without subject."""
     figure: float
-    """Largest error meanwhile [m]; separation: smallest distance [m]; packets: rate [1/s]."""
+    """Largest error during the moment [m], or smallest separation [m], or rate of packets [1/s]."""
     usual: float
     """The same figure of the perfect flight."""
     level: float
@@ -174,7 +174,7 @@ def _moment(
 
 
 def _levels(figure: float, usual: float) -> tuple[float, float]:
-    """`level` and `calm` of a moment: the usual figure and a half, or a quarter, of the rest."""
+    """`level` and `calm` of a moment: `usual` plus a half, or a quarter, of the excess."""
     return usual + 0.5 * (figure - usual), usual + 0.25 * (figure - usual)
 
 

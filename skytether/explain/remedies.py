@@ -56,7 +56,7 @@ class Remedy:
 def remedies(
     found: Cause, case: Case, moment: Moment, fly_all: FlyAll
 ) -> tuple[list[Remedy], list[Outcome]]:
-    """Fly each remedy; the first result is the flight as it was."""
+    """Fly each remedy; the first result is the explained flight, unchanged."""
     tried = [(AS_FLOWN, Keys()), *possible(found, case)]
     outcomes = fly_all([replace(case, keys=keys, until_s=None) for _, keys in tried])
     flown = [

@@ -83,7 +83,7 @@ def perfect(case: Case) -> Case:
 
 @dataclass(frozen=True, slots=True)
 class Circumstances:
-    """Flight as it was, and the units that may be removed from it."""
+    """Explained flight, and the units that may be removed from it."""
 
     case: Case
     units: tuple[Unit, ...]

@@ -81,7 +81,7 @@ class _Vehicle:
 
     @property
     def begins_s(self) -> float:
-        """Time at which the server first knows that the vehicle flies a motion [s]."""
+        """Time at which the server learns that the vehicle flies its first motion [s]."""
         return float(self.time_s[self.heard_at[np.argmax(self.accepted >= 0)]])
 
 

@@ -26,7 +26,7 @@ SPEED = 4.0
 FRAMES_MAX = 600
 """Largest number of frames; a longer flight is shown faster."""
 TRAIL_S = 2.0
-"""Length of the path that is drawn behind each vehicle."""
+"""Duration of the flown path that is drawn behind each vehicle."""
 COLOURS = 64
 
 

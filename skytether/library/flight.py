@@ -117,7 +117,7 @@ class Flight:
 
     @cached_property
     def summary(self) -> Summary:
-        """Figures of the flight; with several vehicles, those of the first."""
+        """Figures of the flight; with several vehicles, of the first vehicle."""
         client = self.record.client
         client = client[client["vehicle"] == client["vehicle"][:1]]
         rows = client, self.record.server, self.record.netem

@@ -222,8 +222,8 @@ def _planner(planner: Callable[..., Planner], *, udp: bool) -> str:
 
 
 def _over_udp(scenario: Scenario, *, secure: bool) -> Record:
-    """Fly over UDP in a thread of its own, because the caller's thread may already run an event
-    loop, as in a notebook.
+    """Fly over UDP in a separate thread, because the caller's thread may already run an event loop,
+    as in a notebook.
     """
     from skytether.cli import processes
     from skytether.shell.commandline.command import CommandError

@@ -271,7 +271,7 @@ def effective(count: int, correlations: Array) -> float:
 
 
 def correlation_time_s(apart_s: Array, correlations: Array, count: int) -> float:
-    """Time in which the autocorrelation falls to 1/e [s]; 0 without significant correlation."""
+    """Time after which the autocorrelation is 1/e [s]; 0 without significant correlation."""
     if not len(correlations) or correlations[0] < max(4.0 / sqrt(count), 0.02):
         return 0.0
     low = np.flatnonzero(correlations < max(0.1, 2.0 / sqrt(count)))

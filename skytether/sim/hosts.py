@@ -72,7 +72,7 @@ woken.
 
 
 class Act(Protocol):
-    """Action on an endpoint, at a time of its own clock."""
+    """Action on an endpoint, at a time of the host's clock."""
 
     def __call__(self, *, now_ns: int) -> object:
         """Perform the action."""

@@ -90,7 +90,7 @@ async def _measure(
     finally:
         back.close()
         forth.close()
-    # Rows of netem's record are in order of entry, hence of sequence numbers.
+    # Rows of netem's record are in order of entry, which is the order of sequence numbers.
     drawn, rows = read(record), []
     for direction, end in ((DOWNLINK, server), (UPLINK, client)):
         of = drawn[drawn["direction"] == direction]

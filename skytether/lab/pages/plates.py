@@ -45,7 +45,7 @@ STYLES: Mapping[str, Mapping[str, Any]] = {
     EVENT: {"color": "#c1272d", "linestyle": "-", "marker": "^"},
     PERIODIC: {"color": "#0072b2", "linestyle": "--", "marker": "v"},
 }
-"""Line style of each method; methods can be told apart without colour."""
+"""Line style of each method; methods can be distinguished without colour."""
 RATIO_LOG = 20.0
 """Ratio of the largest to the smallest value above which an axis is logarithmic."""
 

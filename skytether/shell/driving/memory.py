@@ -56,7 +56,7 @@ def folder(given: str) -> Path:
 
     Args:
         given: key `vehicle.memory`: a path, or "auto" for the state folder of the systemd service,
-            else of the user.
+            otherwise the user's.
     """
     if given != "auto":
         return Path(given).expanduser()

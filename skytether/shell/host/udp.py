@@ -403,7 +403,7 @@ class Names:
 
 
 def look_up(peer: Address, family: int = socket.AF_UNSPEC) -> Address:
-    """Numeric address of a name or number, of either family, IPv4 where a name has both; blocks.
+    """Numeric address of a name or number, IPv4 if a name has addresses of both families; blocks.
 
     Raises:
         OSError: it cannot be resolved.

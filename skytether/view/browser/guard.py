@@ -163,7 +163,7 @@ class Guard:
             return connection.respond(HTTPStatus.FORBIDDEN, f"{why}\n")
         if (
             why is TurnedAway.HOST and request.path == "/"
-        ):  # otherwise viser would wait for this client's websocket for ever
+        ):  # otherwise viser would wait endlessly for this client's websocket
             return connection.respond(HTTPStatus.FORBIDDEN, f"{why}\n")
         if response and response.headers.get("Content-Type", "").startswith("text/html"):
             _dress(response)

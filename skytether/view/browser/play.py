@@ -17,7 +17,7 @@ Answered = Callable[[str, Mapping[str, Any], Answer | None], None]
 
 
 class Operator:
-    """Sender of changes to a flight's processes, in a thread of its own.
+    """Sender of changes to a flight's processes, in its own thread.
 
     Args:
         folder: folder of their control sockets.

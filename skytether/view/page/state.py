@@ -622,7 +622,7 @@ class State:
         return list(pairs)[:PATHS_MAX]
 
     def nearest_m(self, number: int, points: int = 1) -> Array:
-        """Distance from a vehicle to the nearest other one in the last minute [m].
+        """Distance from a vehicle to the nearest other vehicle in the last minute [m].
 
         Args:
             points: number of times, of which the last is the present.
