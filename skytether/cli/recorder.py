@@ -1,4 +1,4 @@
-"""Recorders of flights: over UDP, from the feeds of the processes, during the flight."""
+"""Recorders of flights; a flight over UDP is recorded from the feeds of its processes."""
 
 import sys
 import threading

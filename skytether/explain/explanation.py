@@ -109,7 +109,7 @@ def explain(
 
 
 def _chosen(found: Sequence[Moment], at_s: float | None) -> Moment | None:
-    """Moment to explain; raises ConfigError if there is none at the requested time."""
+    """Choose the moment to explain; raises ConfigError if there is none at the requested time."""
     if at_s is None:
         return worst(found) if found else None
 

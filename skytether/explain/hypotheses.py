@@ -205,7 +205,7 @@ def _least(
 
 
 def _beginning(scenario: Scenario, vehicles: Sequence[Flown]) -> Iterator[Hypothesis]:
-    """Condition 1, checked at the first motion of each vehicle."""
+    """Check condition 1 at the first motion of each vehicle."""
     first = {each.vehicle: int(np.argmax(each.in_force >= 0)) for each in vehicles}
     places = {
         each.vehicle: _scaled(scenario, each.position[first[each.vehicle]]) for each in vehicles

@@ -1,4 +1,4 @@
-"""Flight for Python: its arrays, summary, events, picture and recording."""
+"""`Flight`: arrays, summary, events, picture and recording of a flight, for Python."""
 
 import time
 from collections.abc import Iterable

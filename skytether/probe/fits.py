@@ -141,7 +141,7 @@ def _paper(delay_s: Array) -> Found | None:
     def concentration(slot_s: float) -> float:
         return abs(complex(np.mean(np.exp(2j * pi * sample / slot_s))))
 
-    # The grid of 1/slot is uniform, because a peak over 1/slot is as wide as 1/span.
+    # Slot lengths are tried on a uniform grid of 1/slot, on which all peaks are 1/span wide.
     inverse = np.linspace(1.0 / span, min(SLOTS / (4.0 * span), 1e3), SLOTS)
     # Computes concentration(1 / inverse). Each exponential is the product of one for its row and
     # one for its column, so that a thirtieth of the exponentials suffices.

@@ -383,7 +383,7 @@ def fly_runs(
 
 
 def _tell_time(world: Hosts, hosts: Mapping[str, Endpoint], error_ns: int) -> None:
-    """Give the hosts the time of day, alternately early and late by `error_ns`; no effect if 0."""
+    """Give each host a time of day that is wrong by ±`error_ns`, alternately; no effect if 0."""
     for number, (host, each) in enumerate(hosts.items() if error_ns else ()):
         wrong_ns = error_ns if number % 2 else -error_ns
         world.act(host, partial(each.learn_time, world.now_ns + wrong_ns, error_ns))

@@ -477,7 +477,7 @@ def test_ctrl_c_ends_a_sweep_in_one_line_and_keeps_what_was_done(tmp_path: Path)
         (["--workers", "0"], "--workers: got 0, expected 1 to 1024"),
         (
             ["--workers", "2", "--scheduler", "tcp://127.0.0.1:1"],
-            "--workers: got --scheduler as well, which has its own",
+            "--workers: got --scheduler as well, with its own workers",
         ),
         (["--grid", "control.input_weight"], f"--grid: got 'control.input_weight', {FORM}"),
     ],

@@ -897,7 +897,7 @@ def date(found: list[Any], time_ns: int) -> None:
         (cut_row, "got 9 B, expected rows of"),
         (forget, "client has no part 'client'"),
         (partial(date, time_ns=2**61), "ns after the first"),
-        (partial(date, time_ns=2**63), "a frame at 9223372036854775808 ns"),
+        (partial(date, time_ns=2**63), "a frame has the impossible time 9223372036854775808 ns"),
         (partial(date, time_ns=-1), "rows of client before its first frame"),
         (partial(write_in, column="step", value=600_000_000), "client: step: got 600000000"),
         (partial(write_in, column="step", value=2**40), "client: step: got 1099511627776"),

@@ -67,7 +67,7 @@ class Flags:
         if self.workers is not None:
             command.check_count("--workers", self.workers, 1024)
             if self.scheduler:
-                raise CommandError("--workers: got --scheduler as well, which has its own", 2)
+                raise CommandError("--workers: got --scheduler as well, with its own workers", 2)
 
 
 PoolFlags = Annotated[Flags, Argument(name="")]
@@ -293,7 +293,7 @@ def _executor(flags: Flags) -> AbstractContextManager[Executor]:
 
 @contextmanager
 def _thread() -> Iterator[Executor]:
-    """Run tasks in a thread of this process, which has the plug-ins that the user registered."""
+    """Executor with one thread of this process, which has the user's registered plug-ins."""
     pool = ThreadPoolExecutor(1)
     try:
         yield pool

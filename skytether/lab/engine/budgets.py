@@ -94,7 +94,7 @@ def flying(contender: Contender, case: Case, tuned: Scenario) -> list[FlownConte
     tuned_threshold = value(reading.to_table(tuned), f"control.{key}") if key else None
     if tuned_threshold is not None:
         scaled = [tuned_threshold * factor for factor in contender.factors]
-        if isinstance(tuned_threshold, int):  # steps
+        if isinstance(tuned_threshold, int):  # a period in steps
             scaled = [max(1, round(value)) for value in scaled]
         values = sorted({*scaled})
     reports_by_itself = any(key.startswith(("vehicle.", "link.")) for key in contender.keys)
@@ -135,7 +135,7 @@ def _between(lower: float | None, upper: float | None) -> float | None:
     if lower is None or upper is None:
         return None
     mean = math.sqrt(lower * upper)
-    if isinstance(upper, int):  # steps
+    if isinstance(upper, int):  # a period in steps
         return round(mean) if lower < round(mean) < upper else None
     return float(f"{mean:.4g}") if upper > CLOSE * lower else None
 

@@ -129,7 +129,7 @@ class Process:
         return Log(self.name, self.options.log, beside, to_stderr=to_stderr)
 
     def _running(self, endpoint: Endpoint) -> Running:
-        """The endpoint with its scenario, ready for changes in flight."""
+        """Running endpoint with its scenario, for changes in flight."""
         if journal := self.journal:
             from skytether.shell.processes.preloading import preload
 

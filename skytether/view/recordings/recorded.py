@@ -158,7 +158,7 @@ class _Frames:
             ValueError: the frame is impossible in flights of this scenario.
         """
         if abs(frame.time_ns) > TIME_NS_MAX:
-            raise ValueError(f"a frame at {frame.time_ns} ns")
+            raise ValueError(f"a frame has the impossible time {frame.time_ns} ns")
         match frame:
             case Opened():
                 self._begun_ns[process] = frame.time_ns
@@ -190,7 +190,7 @@ class _Frames:
         begin_ns = ordered[0][1].time_ns if ordered else 0
         timed = [(frame.time_ns - begin_ns, process, frame) for process, frame in ordered]
         if timed and timed[-1][0] > SPAN_NS_MAX:
-            raise ValueError(f"a frame {timed[-1][0]} ns after the first")
+            raise ValueError(f"the last frame is {timed[-1][0]} ns after the first")
         parts, times_ns = {}, {}
         for part, frames in self._rows.items():
             begins_ns, tables = zip(*frames, strict=True)
