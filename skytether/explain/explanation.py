@@ -132,7 +132,7 @@ def _chosen(found: Sequence[Moment], at_s: float | None) -> Moment | None:
 
 
 def _curves(cause: Cause, without: Sequence[Outcome]) -> tuple[tuple[str, Outcome], ...]:
-    """Flights without the needed parts of a cause, one each, for the first CURVES_MAX."""
+    """Label and outcome of flights without one needed part of a cause, at most CURVES_MAX."""
     needed = [
         (f"without the {causes.named(part.unit)}", each)
         for part, each in zip(cause.parts, without, strict=True)

@@ -264,7 +264,7 @@ def _acceptance(scenario: Scenario, vehicles: Sequence[Flown]) -> Hypothesis:
 
 
 def _flown_to_the_end(scenario: Scenario, vehicles: Sequence[Flown]) -> Hypothesis:
-    """Check that motions are flown to their end; margin: time from the end to no motion."""
+    """Check that motions are flown to their end; margin: time in force after the end."""
     margins = {}
     for each in vehicles:
         left = each.changed[each.in_force[each.changed] < 0]
@@ -280,7 +280,7 @@ def _flown_to_the_end(scenario: Scenario, vehicles: Sequence[Flown]) -> Hypothes
 
 
 def _all_vehicles(scenario: Scenario, record: Record, vehicles: Sequence[Flown]) -> Hypothesis:
-    """Margin: time from the last vehicle's first observation to the first moving motion."""
+    """Check that all vehicles were observed before any moves; margin: the time between."""
     name, mission = "the server observes all first", scenario.make_reference()
     assert isinstance(mission, Mission)
     server = record.server

@@ -84,7 +84,7 @@ class Connections:
         self._server, self._most, self._refused = listen.server, listen.most, refused
         self._hear: Hear = lambda piece, peer: hear(Datagram(piece, peer, 1))
         self._ways: dict[Address, SocketHalf] = {}
-        """Directions of connections, by the peer to which they send."""
+        """Each direction of each connection, by its target's peer."""
         self._running: set[asyncio.Task[None]] = set()
         self._opened = 0
         host, port = listen.bind

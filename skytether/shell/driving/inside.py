@@ -138,7 +138,7 @@ def _open_device() -> int:
 
 
 def _configure(mtu: int) -> None:
-    """Bring the device up, without a link-local address, so that the kernel sends no packet."""
+    """Bring the device up; it gets no link-local address, so that the kernel sends no packet."""
     with _handing_down():
         _ip(
             "link set lo up",

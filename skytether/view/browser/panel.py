@@ -68,7 +68,7 @@ const label = [...document.querySelectorAll('label')].find(each => each.textCont
 const prefers = matchMedia('(prefers-color-scheme: light)').matches;
 if (prefers && !label.control.checked) label.control.click();
 ">"""
-"""HTML that makes the page light if the browser prefers that, which the server does not know."""
+"""HTML that makes the page light if the browser prefers light pages."""
 
 More = Callable[[viser.GuiApi], Callable[[], None]]
 
@@ -724,7 +724,7 @@ class _Handle:
         return np.asarray(self._handle.position)
 
     def stay(self) -> None:
-        """Ignore positions for HELD_S, in which the answer to a change arrives."""
+        """Ignore positions for HELD_S, until the answer to a change has arrived."""
         self._free_s = time.monotonic() + HELD_S
 
     def put(self, place: NDArray[Any]) -> None:

@@ -75,7 +75,7 @@ def grid(middle: Array, reach_m: float) -> NDArray[np.float32]:
 
 
 def extent(scenarios: Sequence[Scenario]) -> tuple[Array, float]:
-    """Centre [m; shape (3,)] and extent [m] of the volume of the flights."""
+    """Centre [m; shape (3,)] and size [m] of the volume in which flights take place."""
     points = np.concatenate([in_space(_desired(each)) for each in scenarios]).astype(np.float64)
     low, high = points.min(axis=0), points.max(axis=0)
     return (low + high) / 2, max(1.0, 1.25 * float((high - low).max()) / 2)
