@@ -65,7 +65,7 @@ class Cause:
     others: tuple[Part, ...] = ()
     """Losses and late packets that were examined and are not in any of the sets."""
     innocent: tuple[tuple[str, float], ...] = ()
-    """Other groups of units, and change of the error without each group [m]."""
+    """Groups of units outside the cause, and the change of the error without each group [m]."""
     is_all: bool = True
     """Whether the moment does not occur without all sets together."""
 

@@ -46,7 +46,7 @@ class Wait:
     """Time of flight at the beginning [s]."""
     for_s: float
     other: int = 0
-    """Vehicle for which it waited; 0: itself, or a zone."""
+    """Number of the vehicle waited for; 0 for a wait without another vehicle, as for a zone."""
     motion_s: float = math.nan
     """Time of sending of the unacknowledged motion, its own or the other vehicle's [s]."""
     plans: tuple[int, int] = (0, 0)

@@ -25,7 +25,7 @@ ORDERED_SHARE = 0.01
 class ModelFigures(msgspec.Struct, frozen=True):
     text: str
     bic: float
-    """Bayesian information criterion: the smaller, the better."""
+    """Bayesian information criterion; smaller is better."""
 
 
 class DirectionFigures(msgspec.Struct, frozen=True, kw_only=True):

@@ -110,7 +110,7 @@ def run(
 
 
 def _scout(options: CompareOptions, plans: Sequence[Plan], number: int) -> int:
-    """Fly the scouting flights of a round: in the first all points, later points near the budgets.
+    """Fly the scouting flights of a round: first all points, in later rounds points near budgets.
 
     Returns the number of flights flown by this call.
     """
