@@ -47,15 +47,16 @@ PLAYERS: dict[str, tuple[str, Callable[[], Player]]] = {
 of one is left or less (LeRobot's threshold), for DRTC's when a quarter was played and the one
 before should have come (its cooldown), for the last player when it differs from what the robot
 plays anyway, for the others always."""
-BOUNDS: dict[str, tuple[str, Callable[[], Player], Options]] = {
-    "nothing": ("nothing sent", Newest, NOTHING_SENT),
-    "oracle": ("no network, an action a step", Newest, ORACLE),
-    "chunks": ("no network, half a chunk at once", Queue, ORACLE),
+BOUNDS: dict[str, tuple[str, str, Options]] = {
+    "nothing": ("nothing sent", "newest", NOTHING_SENT),
+    "oracle": ("no network", "newest", ORACLE),
+    "chunks": ("no network", "replace", ORACLE),
 }
-"""Title, player and options of each bound."""
-DELAYS_S, LOSSES = (0.0, 0.05, 0.1, 0.2), (0.0, 0.1, 0.3)
+"""Row, player and options of each bound."""
+NETWORKS = ((0.0, 0.0), (0.05, 0.1), (0.1, 0.1), (0.1, 0.3), (0.2, 0.1))
+"""Mean delay [s] and share of losses, each way, of each network of the table."""
 SEEDS = 50
-"""Number of seeds of the tables in docs/gym.md, from 1 on."""
+"""Number of seeds of the table in docs/gym.md, from 1 on."""
 FOR_S = 0.4
 """Time of rows that the robot keeps in hand when a chunk is not needed [s]."""
 
@@ -163,16 +164,16 @@ def fly_cell(cell: Cell) -> FlownCell:
     mean = cell.delay_s
     delays = f"gamma({mean / 2:g}, {mean:g}, {mean / 5:g})" if mean else "none"
     way = f"{delays} & loss({cell.loss:g})"
-    played, make_player = Played(task.make()), (PLAYERS | BOUNDS)[name][1]
+    _, player, bound = BOUNDS.get(name, ("", name, Options()))
+    played, make_player = Played(task.make()), PLAYERS[player][1]
     options: Options = {
         "uplink": way,
         "downlink": way,
         "thinking": task.thinking_s,
         "player": make_player,
         "step_s": task.step_s,
+        **bound,
     }
-    if name in BOUNDS:
-        options |= BOUNDS[name][2]
     env = Networked(played, **options)
     observation, info = env.reset(seed=cell.seed)
     terminated = truncated = False
@@ -205,33 +206,31 @@ def fly_cell(cell: Cell) -> FlownCell:
 def cells(seeds: int) -> list[Cell]:
     numbers = range(1, seeds + 1)
     bounds = product(TASKS, BOUNDS, (0.0,), (0.0,), numbers)
-    kinds = product(TASKS, PLAYERS, DELAYS_S, LOSSES, numbers)
-    return [Cell(*each) for each in (*bounds, *kinds)]
+    networks = [
+        Cell(task, player, delay_s, loss, number)
+        for task, player, (delay_s, loss), number in product(TASKS, PLAYERS, NETWORKS, numbers)
+    ]
+    return [*(Cell(*each) for each in bounds), *networks]
 
 
 def tables(flights: Sequence[FlownCell]) -> dict[str, TextTable]:
-    """The bounds; and for each task the mean score and packets a second."""
-    found: dict[tuple[Any, ...], list[FlownCell]] = {}
+    """For each task and network, and for the bounds, the mean score and packets a second."""
+    found: dict[tuple[str, str], dict[str, list[FlownCell]]] = {}
     for each in flights:
-        found.setdefault(each.cell[:-1], []).append(each)
-    shown = {}
-    tasks = list(dict.fromkeys(key[0] for key in found))
-    if any(key[1] in BOUNDS for key in found):
-        headings = ["task", *(title for title, *_ in BOUNDS.values())]
-        bounds = [
-            [TASKS[task].title, *(_mean(found[task, name, 0.0, 0.0]) for name in BOUNDS)]
-            for task in tasks
+        cell = each.cell
+        network = f"{1e3 * cell.delay_s:g} ms, {cell.loss:.0%}"
+        row, player, _ = BOUNDS.get(cell.player, (network, cell.player, Options()))
+        found.setdefault((cell.task, row), {}).setdefault(player, []).append(each)
+    rows = [
+        [
+            TASKS[task].title,
+            row,
+            *(_score(cells[name]) if name in cells else "" for name in PLAYERS),
         ]
-        shown["players bounds"] = TextTable(headings, bounds)
-    for task in tasks:
-        networks = list(dict.fromkeys(key[2:] for key in found if key[1] in PLAYERS))
-        headings = ["delay, loss each way", *(title for title, _ in PLAYERS.values())]
-        rows = []
-        for delay_s, loss in networks:
-            row = [f"{1e3 * delay_s:g} ms, {loss:.0%}"]
-            rows.append(row + [_score(found[task, name, delay_s, loss]) for name in PLAYERS])
-        shown[f"players {task} scores"] = TextTable(headings, rows)
-    return shown
+        for (task, row), cells in sorted(found.items(), key=lambda each: [*TASKS].index(each[0][0]))
+    ]
+    headings = ["task", "delay, loss each way", *(title for title, _ in PLAYERS.values())]
+    return {"players": TextTable(headings, rows)}
 
 
 def _mean(flown: Sequence[FlownCell]) -> str:
@@ -243,7 +242,9 @@ def _mean(flown: Sequence[FlownCell]) -> str:
 
 
 def _score(flown: Sequence[FlownCell]) -> str:
-    """Mean score, and packets a second."""
+    """Mean score, and over a network packets a second."""
+    if flown[0].cell.player in BOUNDS:
+        return _mean(flown)
     return f"{_mean(flown)}, {np.mean([each.packets_per_s for each in flown]):.1f}/s"
 
 
