@@ -343,9 +343,9 @@ def tables(result: Mapping[str, Any]) -> dict[str, TextTable]:
         "packets of the flood sent [1/s]": [f"{each.sent:.0f}" for each in floods],
         "read and refused [1/s]": [f"{each.read:.0f}" for each in floods],
         "rejected by the kernel's filter [1/s]": [f"{each.kept_out:.0f}" for each in floods],
-        "no room, never read [1/s]": [f"{each.unread:.0f}" for each in floods],
+        "dropped by a full buffer [1/s]": [f"{each.unread:.0f}" for each in floods],
         "observations sent": [str(each.good) for each in floods],
-        "never handled": [str(each.lost) for each in floods],
+        "observations never handled": [str(each.lost) for each in floods],
         f"share handled during the flood (≥ {HANDLED:.1%})": [
             f"{each.share:.2%}" for each in floods
         ],

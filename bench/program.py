@@ -219,7 +219,7 @@ def tables(result: Mapping[str, Any]) -> dict[str, TextTable]:
             f"{result['delayed_ms']:.1f} ms",
         ],
         [
-            f"of {echoes} echoes over loss({LOST_UP}) and loss({LOST_DOWN}) lost",
+            f"lost of {echoes} echoes over loss({LOST_UP}) and loss({LOST_DOWN})",
             f"{mean:.0f} ± {half:.0f}",
             f"{result['lost']}",
         ],
@@ -234,16 +234,16 @@ def tables(result: Mapping[str, Any]) -> dict[str, TextTable]:
     ]
     rows += [
         [
-            f"TCP (Reno) from the program over loss({loss}), beside Mathis' formula",
+            f"TCP (Reno) from the program over loss({loss}), by Mathis' formula",
             *(f"{found[each] / 1e6:.2f} Mbit/s" for each in ("asked", "came")),
         ]
         for loss, found in result["losses"].items()
     ]
     rows += [
         [
-            f"TCP {way} the program without impairments, beside slirp4netns alone",
+            f"TCP {way} the program without impairments, by slirp4netns alone",
             *(f"{found[each] / 1e6:.0f} Mbit/s" for each in ("asked", "came")),
         ]
         for way, found in result["unimpaired"].items()
     ]
-    return {"program": TextTable(["", "asked, or beside it", "came"], rows)}
+    return {"program": TextTable(["", "expected", "measured"], rows)}

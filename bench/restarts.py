@@ -328,7 +328,7 @@ def verdicts_of(result: Mapping[str, Any]) -> list[RestartVerdict]:
 
 
 def tables(result: Mapping[str, Any]) -> dict[str, TextTable]:
-    headings = ["process", "times", "gone\n[s]", f"brakes [s]\n(≤ {BRAKES_S:g})", "\nworst"]
+    headings = ["process", "times", "down\n[s]", f"brakes [s]\n(≤ {BRAKES_S:g})", "\nworst"]
     headings += ["over curve\n[m/s]", "\ntrue", f"flies [s]\n(≤ {RETURNS_S:g})", "\nworst"]
     headings += ["within\n0.5 m [s]", "\nworst", "outside"]
     rows, verdicts = [], verdicts_of(result)

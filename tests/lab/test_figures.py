@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from bench import figures, netem
-from bench.__main__ import RESULTS
+from bench.__main__ import DOCUMENT, RESULTS, write
 from bench.figures import (
     Figure,
     Number,
@@ -193,3 +193,11 @@ def test_each_error_of_netem_has_the_lateness_of_a_sleeping_process_beside_it() 
             for statistic_of in ("p50", "p99", "max"):
                 figure = load[f"{name}_{statistic_of}"]
                 assert any(number == pytest.approx(figure, abs=0.06) for number in written)
+
+
+def test_the_tables_of_performance_follow_from_the_recorded_results(tmp_path: Path) -> None:
+    results, page = tmp_path / "results.json", tmp_path / "performance.md"
+    results.write_bytes(RESULTS.read_bytes())
+    page.write_text(DOCUMENT.read_text())
+    write({}, results, page, tmp_path)
+    assert page.read_text() == DOCUMENT.read_text()
