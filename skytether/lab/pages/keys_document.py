@@ -17,17 +17,17 @@ from skytether.shared.scenario.whole import Scenario
 
 HEAD = """# Keys of a scenario
 
-Every key that a scenario's file may have; each is also a flag of every command that flies. This
-page is for looking up; `make keys` makes it from the sections of `shared/scenario/schema.py` and of
-rooms.
+Every key that a scenario's file may have; each is also a flag of every command that flies. `make
+keys` makes this page from the sections of `shared/scenario/schema.py` and of optional features.
 
-- **Values** are written as in TOML, with the unit in brackets; bounds of a list hold for each of
-  its numbers.
+- **Values** are written as in TOML, with the unit in square brackets; bounds of a list apply to
+  each of its numbers.
 - The **owner** of a key is the process that uses its value. A key of *both ends* is a
-  [term](protocol.md#terms): if the ends differ in it, there is no flight. Other keys may differ;
-  with *each end*, both use a value of their own. Keys of *virtual time* are not used over UDP.
-- A key *in flight* may be [changed in flight](operating.md#change-keys-in-flight); position and
-  velocity of a point only with `reference.shape = "live"`.
+  [term](protocol.md#terms): if server and vehicle have different values, there is no flight. Other
+  keys may differ; with *each end*, server and vehicle each use their own value. Keys of *virtual
+  time* are not used over UDP.
+- A key marked *in flight* can be [changed in flight](operating.md#change-keys-in-flight);
+  `reference.points_m` and `reference.velocity_mps` only with `reference.shape = "live"`.
 - Meanings use the terms of the [glossary](glossary.md), such as [horizon](glossary.md#horizon),
   [trigger](glossary.md#trigger) and [scheme](glossary.md#scheme).
 """
