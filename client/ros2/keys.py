@@ -18,16 +18,16 @@ class Ros2Config(Section, frozen=True):
     command: OfVehicle[TopicName] = "/cmd_vel"
     """Topic on which velocities are commanded."""
     stamped: OfVehicle[bool | Literal["auto"]] = "auto"
-    """Whether commands are geometry_msgs/TwistStamped; otherwise Twist. auto: what the subscriber
-    of `command` takes."""
+    """Whether commands are geometry_msgs/TwistStamped; otherwise Twist. auto: the type that the
+    subscriber of `command` expects."""
     drive: OfVehicle[Literal["holonomic", "differential", "fixed"]] = "holonomic"
-    """Way in which the robot is commanded: any velocity in its own frame; forwards and a turn; or
-    any velocity in the fixed frame of its odometry."""
+    """Kind of commands: holonomic: any velocity in the robot's frame; differential: forwards and a
+    turn; fixed: any velocity in the fixed frame of its odometry."""
     ahead_m: OfVehicle[Annotated[float, Meta(ge=0.01, le=10)]] = 0.2
-    """Distance before the axle of the point of a differential robot that is flown [m]."""
+    """Distance from the axle forwards to the point that follows a plan (`differential`) [m]."""
     origin: OfVehicle[Literal["start", "odometry"]] = "start"
-    """Origin of the scenario: where the robot stands at the start (on a mission, its start is
-    there), or the origin of its odometry."""
+    """Origin of the scenario: start: the robot's position at the start (on a mission, that position
+    is its first goal); odometry: the origin of its odometry."""
     silence_s: OfVehicle[Annotated[float, Meta(ge=0.05, le=5)]] = 0.5
     """Time without odometry after which the robot brakes [s]."""
 

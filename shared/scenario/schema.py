@@ -315,11 +315,11 @@ class NetworkConfig(Section, frozen=True):
     downlink: OfImpairment[Direction] = "paper(0.4, 0.02, 2.0) & loss(0.1)"
     """Impairments from vehicle to server."""
     mtu: OfNetem[Annotated[int, Meta(ge=PAYLOAD_BYTES_MAX, le=65_507)]] = 1472
-    """Largest UDP payload that passes [B]; 1472 fills an Ethernet frame."""
+    """Largest UDP payload that is delivered [B]; 1472 fills an Ethernet frame."""
     paths: OfEach[Annotated[tuple[PathConfig, ...], Meta(max_length=PATHS_MAX)]] = ()
-    """Paths of the session, each a network of its own, see docs/network.md: tables with `uplink`,
-    `downlink` (by default those above) and `price`, that of a packet relative to the other paths
-    (more than 0, by default 1). They replace `uplink` and `downlink`."""
+    """Paths of the session, each a separate network, see docs/network.md: tables with `uplink`,
+    `downlink` (default: those above) and `price`, the price of a packet relative to the other paths
+    (more than 0, default 1). They replace `uplink` and `downlink`."""
 
 
 class LinkConfig(Section, frozen=True):
@@ -344,10 +344,10 @@ class LinkConfig(Section, frozen=True):
     """Silence after which the vehicle brakes and asks for a new session [s]. The server frees the
     vehicle's number after the same time, or twice this time with heartbeats "auto"."""
     spread: OfEach[Literal["auto", "best", "all"]] = "auto"
-    """Paths that a message takes, of several: auto: those with the least expected cost, see
-    docs/protocol.md; best: the best one; all: every path."""
+    """Choice of paths for a message. auto: the paths with the least expected cost, see
+    docs/protocol.md; best: the best single path; all: every path."""
     leader: Annotated[Literal["server", "standby"], Key(Owner.VEHICLE, InFlight.LEADER)] = "server"
-    """Server that an operator lets lead, chosen in flight only; it leads until it is silent, see
+    """Server that leads, chosen by an operator in flight; it leads until it is silent, see
     docs/operating.md."""
     connect_s: OfVehicle[Interval] = 120.0
     """Longest wait of the vehicle for its first session [s]; a new server compiles for up to a
