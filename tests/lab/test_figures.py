@@ -36,7 +36,7 @@ NOT_MEASURED = {
     "docs/compare.md: Cases": "what cases are",
     "docs/two-links.md": "addresses",
     "docs/straight.md: Set-points sent straight": "numbers of laws, and of the tables of Measured",
-    "docs/netem.md: A program of its own": "addresses",
+    "docs/netem.md: A program behind netem": "addresses",
     "docs/paper.md: What the paper leaves open, and what is done": "the paper's own numbers",
     "docs/torture.md: The invariants": "bounds",
     "docs/triggers.md: Policies": "defaults",
