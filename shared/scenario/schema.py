@@ -440,16 +440,12 @@ class Scenario(Section, frozen=True):
         network = self.network
         return network.paths or (PathConfig(uplink=network.uplink, downlink=network.downlink),)
 
-    @property
-    def network_of_standby(self) -> Self:
-        """Scenario of the network to a standby server, which is impaired like the first."""
-        return self.on_path(len(self.paths))
-
     def on_path(self, index: int) -> Self:
         """Scenario of one path alone; the first has the scenario's seed, others one of their own.
 
         Args:
-            index: number of the path, from 0; one more than there are: see `network_of_standby`.
+            index: number of the path, from 0; one more than there are: the network to another
+                server, impaired like the first path.
         """
         path = (*self.paths, self.paths[0])[index]
         network = msgspec.structs.replace(

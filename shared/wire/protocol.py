@@ -212,7 +212,7 @@ class Idle(IntEnum):
     OBSERVATION = 1, "its newest observation at the server is older than link.age_max_s"
     DELAY = 2, "the delay to it is longer than a horizon can cover"
     UNSOLVED = 3, "the solver has found no plan"
-    STANDBY = 4, "another server leads it"
+    OTHER_SERVER = 4, "another server leads it"
 
     def __str__(self) -> str:
         return self.text

@@ -312,7 +312,7 @@ def _missing(scenario: Scenario, flown: Record) -> str | None:
 def _tell(event: Event) -> None:
     """Print events of the link and of the record above the progress bar."""
     begins = isinstance(event, ModeChanged) and event.before in ON_THE_GROUND
-    stands_by = isinstance(event, PlanningStopped) and event.why == str(Idle.STANDBY)
+    stands_by = isinstance(event, PlanningStopped) and event.why == str(Idle.OTHER_SERVER)
     is_printed = isinstance(event, PRINTED) or type(event).__name__ in PRINTED_OF_ROOMS
     if is_printed and not (begins or stands_by):
         page_process.say(event)

@@ -170,7 +170,7 @@ class Run:
         """Endpoint and scenario of each host."""
         networks = [(SERVER, each) for each in scenario.networks]
         if has_standby:
-            networks.append((STANDBY, scenario.network_of_standby))
+            networks.append((STANDBY, scenario.on_path(len(scenario.paths))))
         for i, (server, own) in enumerate(networks):
             host = f"netem {scenario.seed}/{i + 1}" if i else f"netem {scenario.seed}"
             netem = Proxy(own, server=server, flows=vehicles, recorder=self._packets, path=i)
