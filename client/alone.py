@@ -16,10 +16,8 @@ from skytether.shared.endpoints.endpoint import Address, Datagram, Events
 from skytether.shared.law.terms import Terms
 from skytether.shared.scenario.catalogue import keys_of
 from skytether.shared.scenario.owners import InFlight
-from skytether.shared.scenario.registry import load
 from skytether.shared.scenario.schema import Scenario
-from skytether.shared.wire.drop import Drop, ProtocolError
-from skytether.shared.wire.protocol import Horizon, Message, Trajectory
+from skytether.shared.wire.protocol import Message, decode
 
 LEADER_KEY = "link.leader"
 NAMES = ("server", "standby")
@@ -44,7 +42,7 @@ class MotionInForce(NamedTuple):
 class Fresh:
     """A client that saves nothing: its vehicle begins on the ground."""
 
-    leadership, heard_ns = 0, 0
+    heard_ns = 0
     began_ns: int | None = None
     motion: Any = None
 
@@ -52,6 +50,10 @@ class Fresh:
         self.before: Any = self
         """What an earlier run has saved: nothing."""
         self.boot_id = boot_id
+
+    def servers(self, parts: "Parts") -> "OneServer":
+        """Servers of a client that reaches one; an earlier run may have reached more."""
+        return OneServer(parts.failsafe)
 
     @property
     def unsaved(self) -> bool:
@@ -86,6 +88,8 @@ class Role:
     """Whether the vehicle flies the plans of the server."""
     may_observe = True
     """Whether the server may be sent observations."""
+    decode: Callable[[bytes, Terms], Message] = staticmethod(decode)
+    """Decodes a message of the server, see `protocol.decode`."""
 
     def __init__(self, failsafe: Failsafe) -> None:
         self.heard: Callable[..., None] = failsafe.heard
@@ -98,14 +102,8 @@ class Role:
     def begin(self) -> None:
         """Note another session with the server."""
 
-    def check(self, plan: Horizon | Trajectory) -> None:
-        """Check a plan of the server.
-
-        Raises:
-            ProtocolError: it must not be flown.
-        """
-        if plan.leadership != 0:
-            raise ProtocolError(Drop.NOT_THE_LEADER)
+    def check_plan(self) -> None:
+        """Raise ProtocolError if the plan that was decoded last must not be flown."""
 
     def take(self, message: Message, now_ns: int) -> bool:
         """Take a message of the room; False if it has none."""
@@ -215,12 +213,10 @@ class Reach:
         return [Route((self._server,), (0,), parts.out)]
 
     def servers(self, parts: Parts) -> OneServer:
-        """Servers, without their sessions; a previous run may have had a standby server.
+        """Servers, without their sessions.
 
         Raises:
             ConfigError: the scenario is not suited for these servers.
         """
-        if not parts.before.leadership:
-            return OneServer(parts.failsafe)
-        servers: OneServer = load("skytether.client.servers", "a standby server").Servers(1, parts)
+        servers: OneServer = parts.before.servers(parts)
         return servers

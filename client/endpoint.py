@@ -142,7 +142,7 @@ class Client(Endpoint):
         self.horizons = 0
         self._leaves = False
         """Whether an operator has asked the client to end."""
-        self.dropped: Counter[Drop] = Counter()
+        self.dropped: Counter[str] = Counter()
 
     @property
     def _session(self) -> ServerSession:

@@ -25,11 +25,12 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from skytether.client.alone import Fresh
+from skytether.client.alone import Fresh, OneServer, Parts
 from skytether.client.leadership import NUMBER_MAX
 from skytether.client.vehicle import VehicleMemory
 from skytether.shared.base.units import MILLISECOND_NS
 from skytether.shared.law.terms import Terms
+from skytether.shared.scenario.registry import load
 from skytether.shared.wire.protocol import KNOTS_MAX
 
 TIME_MAX_NS = 2**62
@@ -80,6 +81,13 @@ class SavedState(msgspec.Struct, frozen=True, kw_only=True):
     frame: VehicleMemory = VehicleMemory()
     leadership: Annotated[int, msgspec.Meta(ge=0, le=NUMBER_MAX)] = 0
     """Number of the leadership, see `client.leadership`."""
+
+    def servers(self, parts: Parts) -> OneServer:
+        """See `Fresh`: the server may know a leadership of a standby server that there was."""
+        if not self.leadership:
+            return OneServer(parts.failsafe)
+        servers: OneServer = load("skytether.client.servers", "a standby server").Servers(1, parts)
+        return servers
 
     def after(self, time_ns: int) -> "SavedState":
         began_ns = None if self.began_ns is None else self.began_ns + time_ns

@@ -19,13 +19,13 @@ from skytether.shared.events.flight import address_text
 from skytether.shared.events.standby import LeaderChanged, LimitsDiffer
 from skytether.shared.law.heartbeat import SESSION_NS
 from skytether.shared.law.limits import LIMITS
-from skytether.shared.law.terms import Difference
+from skytether.shared.law.terms import Difference, Terms
 from skytether.shared.scenario.catalogue import differences
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Reason
-from skytether.shared.wire.drop import Drop, ProtocolError
-from skytether.shared.wire.lead import Lead
-from skytether.shared.wire.protocol import Horizon, Message, Trajectory
+from skytether.shared.wire.drop import ProtocolError
+from skytether.shared.wire.lead import Lead, decode_led
+from skytether.shared.wire.protocol import Message
 
 SOON_NS = 200 * MILLISECOND_NS
 """Time after which a server that has to lead is sent LEAD again if it has not answered [ns]."""
@@ -35,6 +35,8 @@ answers HELLOs only, of which the first need several packets each way."""
 DEPARTURES = frozenset({Reason.CLOSED, Reason.RESTARTED})
 """Causes after which a server stops leading if another is heard."""
 NEVER_NS = -(2**63)
+NOT_THE_LEADER = "not the leader"
+"""Reason for dropping a plan of a server that does not lead, or of an earlier leadership."""
 LOST_TIMES = 6
 """Silence after which a server that does not lead counts as lost, as a multiple of the time-out;
 half of SESSION_NS bounds it."""
@@ -62,7 +64,8 @@ class Servers(OneServer):
 
     def __init__(self, count: int, parts: Parts) -> None:
         super().__init__(parts.failsafe)
-        number, timeout_ns = parts.before.leadership, seconds_to_ns(parts.scenario.link.timeout_s)
+        number = getattr(parts.before, "leadership", 0)  # without saved state there is none
+        timeout_ns = seconds_to_ns(parts.scenario.link.timeout_s)
         # A vehicle that has lost its standby server tells the other that it leads now.
         number += bool(number and count == 1)
         self.leadership = Leadership(count, number, timeout_ns)
@@ -272,6 +275,8 @@ class OneOfServers(Role):
 
     def __init__(self, servers: Servers, server: int) -> None:
         self._servers, self._server = servers, server
+        self._plan_number = 0
+        """Number of the leadership of the plan that was decoded last."""
         super().__init__(servers.failsafe)
         self.heard, self.malformed, self.meet = self._heard, self._malformed, self._meet
 
@@ -284,12 +289,16 @@ class OneOfServers(Role):
         """See `Role`: a server that does not know who leads would take itself for the leader."""
         return self._servers.knows_leader(self._server)
 
+    def decode(self, payload: bytes, terms: Terms) -> Message:
+        message, self._plan_number = decode_led(payload, terms)
+        return message
+
     def begin(self) -> None:
         self._servers.begin(self._server)
 
-    def check(self, plan: Horizon | Trajectory) -> None:
-        if not self.is_followed or plan.leadership != self._servers.leadership.number:
-            raise ProtocolError(Drop.NOT_THE_LEADER)
+    def check_plan(self) -> None:
+        if not self.is_followed or self._plan_number != self._servers.leadership.number:
+            raise ProtocolError(NOT_THE_LEADER)
 
     def take(self, message: Message, now_ns: int) -> bool:
         return self._servers.take(self._server, message, now_ns)

@@ -41,7 +41,6 @@ from skytether.shared.wire.protocol import (
     Time,
     Trajectory,
     Welcome,
-    decode,
     encode,
 )
 
@@ -196,7 +195,7 @@ class ServerSession:
         self.silence_asked = message.silence
         self.hearing.hear(message.number, server_ns)
         if not isinstance(message, Heartbeat):
-            self.role.check(message)
+            self.role.check_plan()
             self.idle = str(Idle.PLANS)
             return message
         if message.idle in DEAF:
@@ -207,7 +206,7 @@ class ServerSession:
 
     def _decode(self, payload: bytes, now_ns: int) -> Message:
         try:
-            return decode(payload, self._terms)
+            return self.role.decode(payload, self._terms)
         except ProtocolError:
             # In plaintext anybody could make the vehicle brake with five packets.
             if self.link.secure:

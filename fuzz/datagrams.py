@@ -21,9 +21,10 @@ from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
 from skytether.shared.endpoints.endpoint import EVENTS_MAX, Datagram, Endpoint
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.whole import Scenario
-from skytether.shared.wire import protocol
+from skytether.shared.wire import lead, protocol
 from skytether.shared.wire.drop import ProtocolError
-from skytether.shared.wire.protocol import decode, encode, kind_of
+from skytether.shared.wire.lead import decode_led, with_leadership
+from skytether.shared.wire.protocol import encode, kind_of
 from skytether.sim.sealed import make_keys
 
 SCENARIOS = (
@@ -63,18 +64,19 @@ class Decoder(Datagrams):
     again.
     """
 
-    code = (protocol,)
+    code = (protocol, lead)
 
     def __init__(self, scenario: Scenario) -> None:
         self._terms = scenario.terms()
 
     def __call__(self, payload: bytes) -> None:
         try:
-            message = decode(payload, self._terms)
+            message, number = decode_led(payload, self._terms)
         except ProtocolError:
             return
-        again = encode(message)
-        assert encode(decode(again, self._terms)) == again, payload.hex()
+        again = with_leadership(number, encode(message))
+        read, number = decode_led(again, self._terms)
+        assert with_leadership(number, encode(read)) == again, payload.hex()
 
 
 class EndpointInFlight(Datagrams):

@@ -32,7 +32,6 @@ from skytether.shared.scenario.pace import first_too_fast
 from skytether.shared.scenario.reference import Reference
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Recorder
-from skytether.shared.wire.drop import Drop
 from skytether.shared.wire.protocol import CLOSES, Close, Refusal, encode
 
 VEHICLES_MAX = 64
@@ -206,7 +205,7 @@ class Server(Endpoint):
         return self._grid.missed
 
     @property
-    def dropped(self) -> Counter[Drop]:
+    def dropped(self) -> Counter[str]:
         return self._reception.dropped
 
     @property

@@ -105,7 +105,7 @@ class Reception:
         self._plausibility = Plausibility(terms, len(sessions.vehicle))
         self.observations = 0
         """Number of accepted observations, in any order of arrival."""
-        self.dropped: Counter[Drop] = Counter()
+        self.dropped: Counter[str] = Counter()
         self.refused: Counter[Refusal] = Counter()
         self.time: TimeOfDay | None = None
         """Time of day; None if the host does not know it."""
@@ -115,7 +115,7 @@ class Reception:
         self._report_ns = 0
         """Earliest time of the next report of unauthenticated datagrams."""
 
-    def hear(self, datagram: Datagram, *, now_ns: int) -> Drop | None:
+    def hear(self, datagram: Datagram, *, now_ns: int) -> str | None:
         self._stopwatch.start()
         if self._sessions.routes.is_copy(datagram, now_ns):
             self.dropped[Drop.COPY] += 1
@@ -222,7 +222,7 @@ class Reception:
         if (newest - step) * self._terms.dt_ns > session.hearing.overtaken_ns:
             raise ProtocolError(Drop.OVERTAKEN)
 
-    def _report_unauthenticated(self, address: Address, reason: Drop, now_ns: int) -> None:
+    def _report_unauthenticated(self, address: Address, reason: str, now_ns: int) -> None:
         host, port = address
         event = Unauthenticated(count=self._unauthenticated, host=host, port=port, reason=reason)
         self._events.append(event)

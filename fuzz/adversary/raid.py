@@ -29,8 +29,8 @@ from skytether.shared.missions.derived import zones
 from skytether.shared.missions.zones import Zones
 from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.summary import Track, nearest
-from skytether.shared.wire.lead import Lead
-from skytether.shared.wire.protocol import Observation, decode, encode
+from skytether.shared.wire.lead import Lead, decode_led
+from skytether.shared.wire.protocol import Observation, encode
 from skytether.sim.flight import SERVER, STANDBY
 
 BASE_NS = 50 * MILLISECOND_NS
@@ -213,7 +213,7 @@ class AdversaryNetwork(HeldPackets):
     def _forged(self, payload: bytes, number: float, leads: float) -> bytes | None:
         """Claim of leadership in the session of a packet; None if the packet has none."""
         assert self._terms is not None
-        packet = decode(payload, self._terms)
+        packet, _ = decode_led(payload, self._terms)
         if (session := getattr(packet, "session", None)) is None:
             return None
         step = packet.step if isinstance(packet, Observation) else 0

@@ -30,7 +30,7 @@ from skytether.shared.scenario.gain import regulator
 from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import Recorder, client_columns
 from skytether.shared.wire.framing import split
-from skytether.shared.wire.lead import Lead
+from skytether.shared.wire.lead import Lead, decode_led
 from skytether.shared.wire.protocol import NO_HORIZON, Horizon, Mode, Trajectory, decode, kind_of
 
 WELCOME, OBSERVATION, HORIZON, HEARTBEAT, TRAJECTORY, LEAD = 2, 3, 4, 5, 7, 10
@@ -291,7 +291,7 @@ class WatchedLife(Recorder):
         self._heard = True
         if self._good_ns is None:
             self._good_ns = self._clock()
-        if horizon is not None and self._decoded(horizon[2]).leadership >= self._leadership:
+        if horizon is not None and self._decoded(horizon[2])[1] >= self._leadership:
             self._horizons.append(horizon)
 
     def lose(self) -> None:
@@ -403,15 +403,16 @@ class WatchedLife(Recorder):
         """Horizon in force, identified by its step and its observation."""
         # The step alone is ambiguous: two runs of the server may have planned for the same step.
         for session, life, payload in reversed(self._horizons):
-            horizon = self._decoded(payload)
+            horizon, _ = self._decoded(payload)
             if horizon.step == made_for and horizon.step - horizon.age == self._observed:
                 return session, life, horizon
         raise Violation("foreign", f"a horizon for step {made_for} that was never received")
 
-    def _decoded(self, payload: bytes) -> Horizon | Trajectory:
-        horizon = decode(split(payload)[1], self._terms)
+    def _decoded(self, payload: bytes) -> tuple[Horizon | Trajectory, int]:
+        """Horizon or trajectory, and the number of its leadership."""
+        horizon, leadership = decode_led(split(payload)[1], self._terms)
         assert isinstance(horizon, Horizon | Trajectory)
-        return horizon
+        return horizon, leadership
 
     def _check_follows(self, step: int, state: Array, flown: list[float], *, covered: bool) -> None:
         """Check that the input follows the horizon within the rate limit, and that its plan is not

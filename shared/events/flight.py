@@ -15,7 +15,6 @@ from typing import Any, Literal, dataclass_transform
 import msgspec
 
 from skytether.shared.law.terms import Difference
-from skytether.shared.wire.drop import Drop
 
 
 def address_text(host: str, port: int) -> str:
@@ -125,7 +124,7 @@ class Unauthenticated(Event):
     count: int
     host: str
     port: int
-    reason: Drop
+    reason: str
 
     def __str__(self) -> str:
         newest = f"the newest from {address_text(self.host, self.port)}: {self.reason}"

@@ -2,7 +2,7 @@
 
 A dropped datagram is an error of the peer or the network: it is counted by reason and never
 answered. Message codec (`protocol`), encryption (`channel`, `handshake`) and both ends raise the
-same error, so that figures and metrics have one list of reasons.
+same error. Rooms have further reasons, where they are found.
 """
 
 from enum import StrEnum
@@ -67,13 +67,11 @@ class Drop(StrEnum):
     TOO_LATE = "too late"
     """Its inputs were due before it came: all of them, or so many that others were flown."""
     NOT_TAKEN = "not taken"
-    NOT_THE_LEADER = "not the leader"
-    """The plan is of a server that does not lead the vehicle, or of an earlier leadership."""
 
 
 class ProtocolError(Exception):
     """Error of the peer: its datagram is to be dropped."""
 
-    def __init__(self, reason: Drop) -> None:
+    def __init__(self, reason: str) -> None:
         super().__init__(reason)
         self.reason = reason

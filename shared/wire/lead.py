@@ -1,6 +1,9 @@
 """LEAD, the message that says which of its servers leads a vehicle, and the leadership of plans.
 
-The protocol knows its number, and imports this module as it does `path_proof`.
+The protocol knows its number, and imports this module as it does `path_proof`. HORIZON and
+TRAJECTORY to a vehicle with two servers have one more field at the end:
+
+    leadership  number of the leadership for which the plan was made, see `Lead`; 0 is not sent
 """
 
 from typing import NamedTuple
@@ -12,7 +15,27 @@ from numpy.typing import NDArray
 from skytether.shared.law.limits import Limits
 from skytether.shared.law.terms import Terms
 from skytether.shared.wire.drop import Drop, ProtocolError
-from skytether.shared.wire.protocol import FLAG, U16, U31, U32, OrNone, add, is_plain, knots_in
+from skytether.shared.wire.protocol import (
+    FLAG,
+    U16,
+    U31,
+    U32,
+    Horizon,
+    Message,
+    OrNone,
+    Trajectory,
+    add,
+    checked,
+    decode,
+    is_plain,
+    kind_of,
+    knots_in,
+    number_of,
+    unpacked,
+)
+
+PLANS = {number_of(plan): len(plan._fields) + 3 for plan in (Horizon, Trajectory)}
+"""Number of elements of an encoded plan with a leadership, by the type number of the plan."""
 
 
 class Lead(NamedTuple):
@@ -48,6 +71,23 @@ def with_leadership(number: int, plan: bytes) -> bytes:
     if not number:
         return plan
     return bytes([plan[0] + 1]) + plan[1:] + msgpack.packb(number)  # an array of one element more
+
+
+def decode_led(payload: bytes, terms: Terms) -> tuple[Message, int]:
+    """Message in a datagram, and the number of its leadership if it is a plan, else 0.
+
+    Raises:
+        ProtocolError: the datagram is not one of our messages.
+    """
+    if (kind := kind_of(payload)) not in PLANS:
+        return decode(payload, terms), 0
+    fields = unpacked(payload)
+    if len(fields) != PLANS[kind]:
+        return checked(fields, terms), 0
+    *plain, number = fields
+    if type(number) is not int or number not in U32:
+        raise ProtocolError(Drop.FIELD)
+    return checked(tuple(plain), terms), number
 
 
 def _limits(value: object, ours: Terms) -> Limits | None:  # noqa: ARG001

@@ -9,7 +9,6 @@ Each message is a class below; `docs/protocol.md` describes its bytes. With the 
     age         steps from the server's newest observation to `step`
     number      number of packets that the sender has sent in the session before, modulo NUMBERS
     silence     longest silence that the sender allows the other end [half steps]; 0 for no bound
-    leadership  number of the leadership, see `Lead`; 0 is not sent
 
 A state is sampled at the start of its step, so the step number is also its time stamp. Other time
 stamps are in microseconds modulo 2^32 (71 minutes); the receiver adds the multiple of 2^32 that
@@ -177,7 +176,6 @@ class Horizon(NamedTuple):
     FEEDBACK), or (axes, 0) without feedback."""
     number: int = 0
     silence: int = 0
-    leadership: int = 0
 
 
 class Trajectory(NamedTuple):
@@ -194,7 +192,6 @@ class Trajectory(NamedTuple):
     """Position [m] and velocity [m/s] of each knot; shape (axes, knots, 2)."""
     number: int = 0
     silence: int = 0
-    leadership: int = 0
 
 
 class Idle(IntEnum):
@@ -428,10 +425,10 @@ _TYPES: dict[int, tuple[type[Any], tuple[Check, ...]]] = {
             *(range(2 * _DOES), _motion, _NUMBER, U16),
         ),
     ),
-    4: (Horizon, (U16, U32, U32, _STAMP, _AGE, _inputs, _feedback, _NUMBER, U16, U32)),
+    4: (Horizon, (U16, U32, U32, _STAMP, _AGE, _inputs, _feedback, _NUMBER, U16)),
     5: (Heartbeat, (U16, U32, _STAMP, range(len(Idle)), FLAG, _NUMBER, U16)),
     6: (Close, (U16, U32)),
-    7: (Trajectory, (U16, U32, U32, _STAMP, _AGE, _SPACING, knots_in, _NUMBER, U16, U32)),
+    7: (Trajectory, (U16, U32, U32, _STAMP, _AGE, _SPACING, knots_in, _NUMBER, U16)),
     8: (Time, (U16, U32, U32, _STAMP, U32)),
 }
 """Message of each type number (from 1) and the check of each of its fields on the wire."""
@@ -520,10 +517,6 @@ def _observation(fields: Iterable[Any]) -> Observation:
     )
 
 
-def _is_plain_plan(message: Message) -> bool:
-    return isinstance(message, Horizon | Trajectory) and not message.leadership
-
-
 def number_of(message: type[Any]) -> int:
     """Type number of a message, by its class."""
     return _NUMBERS[message]
@@ -535,8 +528,7 @@ def encode(message: Message) -> bytes:
         payload: bytes = _PACKER.pack(_observation_fields(message))
     else:
         values: Any = message
-        fields = values[: -1 if _is_plain_plan(message) else None]
-        payload = _PACKER.pack([VERSION, _NUMBERS[type(message)], *fields])
+        payload = _PACKER.pack([VERSION, _NUMBERS[type(message)], *values])
     assert len(payload) <= PAYLOAD_BYTES_MAX
     return payload
 
@@ -578,15 +570,24 @@ def decode(payload: bytes, terms: Terms) -> Message:
     Raises:
         ProtocolError: the datagram is not one of our messages.
     """
-    # First of all checks: nothing is parsed of a packet that is too long.
-    if len(payload) > PAYLOAD_BYTES_MAX:
-        raise ProtocolError(Drop.TOO_LONG)
-    if payload.startswith(_QUICK_START):
+    if payload.startswith(_QUICK_START) and len(payload) <= PAYLOAD_BYTES_MAX:
         with suppress(msgspec.DecodeError):
             quick = list(_QUICK.decode(payload)[2:])
             for i, made_of in _MADE:
                 quick[i] = made_of(quick[i], terms)
             return _observation(quick)
+    return checked(unpacked(payload), terms)
+
+
+def unpacked(payload: bytes) -> tuple[Any, ...]:
+    """Version, type number and fields of a message, which are not checked yet.
+
+    Raises:
+        ProtocolError: the bytes are not one msgpack array of two elements or more.
+    """
+    # First of all checks: nothing is parsed of a packet that is too long.
+    if len(payload) > PAYLOAD_BYTES_MAX:
+        raise ProtocolError(Drop.TOO_LONG)
     try:
         # No message has a map or an extension, so none is ever built from received bytes.
         fields = msgpack.unpackb(payload, use_list=False, max_map_len=0, max_ext_len=0)
@@ -594,18 +595,21 @@ def decode(payload: bytes, terms: Terms) -> Message:
         raise ProtocolError(Drop.NOT_MSGPACK) from error
     if type(fields) is not tuple or len(fields) < 2:
         raise ProtocolError(Drop.NOT_A_MESSAGE)
+    return fields
+
+
+def checked(fields: tuple[Any, ...], terms: Terms) -> Message:
+    """Message of unpacked fields; raises ProtocolError as `decode` does."""
     version, number, *body = fields
     if type(version) is not int or version != VERSION:
         raise ProtocolError(Drop.VERSION)
     if type(number) is not int or not (number in _TYPES or _is_of_a_room(number)):
         raise ProtocolError(Drop.TYPE)
     message, checks = _TYPES[number]
-    if message in (Horizon, Trajectory) and len(body) == len(checks) - 1:
-        body.append(0)
     if len(body) != len(checks):
         raise ProtocolError(Drop.NOT_A_MESSAGE)
-    fields = _checked(body, checks, terms)
-    return _observation(fields) if message is Observation else message._make(fields)
+    values = _checked(body, checks, terms)
+    return _observation(values) if message is Observation else message._make(values)
 
 
 def _is_of_a_room(number: int) -> bool:

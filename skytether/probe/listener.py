@@ -86,7 +86,7 @@ class Listener(Endpoint):
         self._gate, self._secret = gate, secret
         self._sessions: OrderedDict[bytes, ProbeSession] = OrderedDict()
         """Measurements by session id, in order of their newest probe, oldest first."""
-        self._dropped: Counter[Drop] = Counter()
+        self._dropped: Counter[str] = Counter()
         self._answered = 0
 
     def receive(self, datagram: Datagram, *, now_ns: int) -> None:

@@ -144,7 +144,7 @@ class Prober(Endpoint):
         """Largest known number of arrivals at the listener."""
         self._settled = False
         self._trains = 0
-        self._dropped: Counter[Drop] = Counter()
+        self._dropped: Counter[str] = Counter()
 
     # -- incoming ------------------------------------------------------------------------------
 

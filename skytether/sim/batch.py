@@ -13,7 +13,6 @@ from skytether.shared.endpoints.endpoint import Datagram, by_name
 from skytether.shared.events.flight import Fault
 from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import Record
-from skytether.shared.wire.drop import Drop
 from skytether.sim.flight import fly_runs
 
 COMPANY_MAX = 100
@@ -27,7 +26,7 @@ class SharedServer(Server):
 
     def __init__(self, *args: Any, **options: Any) -> None:
         super().__init__(*args, **options)
-        self.dropped_by_host: defaultdict[str, Counter[Drop]] = defaultdict(Counter)
+        self.dropped_by_host: defaultdict[str, Counter[str]] = defaultdict(Counter)
         """Number of dropped datagrams, by the sending host and the reason."""
 
     def receive(self, datagram: Datagram, *, now_ns: int) -> None:
@@ -35,8 +34,8 @@ class SharedServer(Server):
         if dropped is not None:
             self.dropped_by_host[datagram.peer[0]][dropped] += 1
 
-    def dropped_of(self, hosts: Sequence[str]) -> Counter[Drop]:
-        return sum((self.dropped_by_host[host] for host in hosts), Counter[Drop]())
+    def dropped_of(self, hosts: Sequence[str]) -> Counter[str]:
+        return sum((self.dropped_by_host[host] for host in hosts), Counter[str]())
 
 
 def _dropped(server: Any, hosts: Sequence[str]) -> Mapping[str, Any]:

@@ -10,6 +10,7 @@ from helpers import packaged
 from skytether.client.endpoint import Client
 from skytether.client.leadership import ASK_SHARE, NUMBER_MAX, Leadership
 from skytether.client.memory import SavedState, recall
+from skytether.client.servers import NOT_THE_LEADER
 from skytether.client.several import STANDBY_SOCKETS, Several
 from skytether.client.simulated.vehicle import SimulatedVehicle, simulated
 from skytether.shared.base.errors import ConfigError
@@ -18,8 +19,8 @@ from skytether.shared.endpoints.endpoint import Address, Datagram
 from skytether.shared.events.standby import LeaderChanged
 from skytether.shared.law.limits import Limits
 from skytether.shared.scenario.whole import Scenario
-from skytether.shared.wire.drop import Drop
-from skytether.shared.wire.lead import Lead
+from skytether.shared.wire.drop import ProtocolError
+from skytether.shared.wire.lead import Lead, decode_led, with_leadership
 from skytether.shared.wire.protocol import (
     Close,
     Heartbeat,
@@ -206,8 +207,8 @@ def test_a_server_that_leaves_leads_no_more(server: int, vehicle: Vehicle) -> No
 def plan(scenario: Scenario, step: int, server: int, leadership: int) -> bytes:
     terms = scenario.terms()
     inputs = np.zeros((terms.axes, terms.horizon), np.float32)
-    fields = 4, 7 + server, step, 1_000_000, 1, inputs, np.empty((0, 0), np.float32), 0, 0
-    return encode(Horizon(*fields, leadership))
+    made = Horizon(4, 7 + server, step, 1_000_000, 1, inputs)
+    return with_leadership(leadership, encode(made))
 
 
 def test_a_plan_of_another_leadership_is_not_flown() -> None:
@@ -219,7 +220,23 @@ def test_a_plan_of_another_leadership_is_not_flown() -> None:
         payload = plan(scenario, 3, server, leadership)
         datagram = Datagram(payload, SERVERS[server], SOCKETS[server])
         vehicle.client.receive(datagram, now_ns=vehicle.now_ns)
-        assert vehicle.client.dropped[Drop.NOT_THE_LEADER] == dropped
+        assert vehicle.client.dropped[NOT_THE_LEADER] == dropped
+
+
+def test_the_leadership_of_a_plan_is_read_with_it() -> None:
+    scenario = packaged("paper-every-step")
+    terms, payload = scenario.terms(), plan(scenario, 3, 0, 0)
+    for number in (0, 1, 127, 128, NUMBER_MAX):
+        read, leadership = decode_led(with_leadership(number, payload), terms)
+        assert (encode(read), leadership) == (payload, number)
+    assert decode_led(encode(Close(4, 7)), terms) == (Close(4, 7), 0)
+    fields = msgpack.unpackb(payload)
+    for wrong in ([2**32], [-1], [True], [None], [b""]):
+        with pytest.raises(ProtocolError, match=r"^field$"):
+            decode_led(msgpack.packb([*fields, *wrong]), terms)
+    for payload in (msgpack.packb([*fields, 1, 1]), msgpack.packb(fields[:-1])):
+        with pytest.raises(ProtocolError, match=r"^not a message$"):
+            decode_led(payload, terms)
 
 
 def test_a_larger_number_is_followed_only_from_the_server_that_it_names(vehicle: Vehicle) -> None:
@@ -299,7 +316,7 @@ def test_a_vehicle_that_has_no_standby_any_more_is_led_by_its_server() -> None:
     vehicle.answer(0)
     datagram = Datagram(plan(vehicle.scenario, 3, 0, 4), SERVERS[0], SOCKETS[0])
     vehicle.client.receive(datagram, now_ns=vehicle.now_ns)
-    assert not vehicle.client.dropped[Drop.NOT_THE_LEADER]
+    assert not vehicle.client.dropped[NOT_THE_LEADER]
 
 
 def test_a_number_is_saved_before_it_is_told(vehicle: Vehicle) -> None:

@@ -17,7 +17,7 @@ from skytether.shared.scenario import reading
 from skytether.shared.scenario.catalogue import differences
 from skytether.shared.wire import protocol
 from skytether.shared.wire.drop import Drop, ProtocolError
-from skytether.shared.wire.lead import Lead, with_leadership
+from skytether.shared.wire.lead import Lead, decode_led, with_leadership
 from skytether.shared.wire.protocol import (
     FEEDBACK,
     INPUTS_MAX,
@@ -143,7 +143,6 @@ messages: st.SearchStrategy[Message] = st.one_of(
         ),
         number,
         u16,
-        u32,
     ),
     st.builds(Heartbeat, u16, u32, u32, st.sampled_from(Idle), st.integers(0, 1), number, u16),
     st.builds(Close, u16, u32),
@@ -168,7 +167,6 @@ trajectories = st.builds(
     knots,
     number,
     u16,
-    u32,
 )
 leads = st.builds(
     Lead, u16, u32, u32, st.just(1), u32, u31, st.none() | u31, u16, knots, limits, u31
@@ -194,6 +192,14 @@ def test_a_trajectory_and_what_is_told_of_it_are_read_as_they_were_written(
     message: Message,
 ) -> None:
     assert same(decode(encode(message), along_splines), message)
+
+
+@settings(max_examples=50)
+@given(trajectories, u32)
+def test_the_leadership_of_a_plan_is_read_as_it_was_written(plan: Trajectory, number: int) -> None:
+    read, leadership = decode_led(with_leadership(number, encode(plan)), along_splines)
+    assert same(read, plan)
+    assert leadership == number
 
 
 @given(st.floats(-1e6, 1e6))
@@ -356,14 +362,15 @@ def test_a_horizon_made_of_bytes_is_the_message() -> None:
     for count in (0, FEEDBACK):
         feedback = np.ones((2, count), np.float32)
         horizon = Horizon(1, 2**31, 500, 2**32 - 1, 9, inputs, feedback, 7, 300)
-        *fields, _, _, number, silence, _ = horizon
+        *fields, _, _, number, silence = horizon
         bytes_of = (array.ravel().data.cast("B") for array in (inputs, feedback))
         plan = encode_horizon(*fields, *bytes_of, number, silence)
         assert plan == encode(horizon)
         for leadership in (1, 127, 128, 2**32 - 1):
-            assert with_leadership(leadership, plan) == encode(
-                horizon._replace(leadership=leadership)
-            )
+            led = with_leadership(leadership, plan)
+            assert msgpack.unpackb(led) == [*msgpack.unpackb(plan), leadership]
+            with pytest.raises(ProtocolError, match="not a message"):
+                decode(led, TERMS)
         assert with_leadership(0, plan) == plan
 
 
