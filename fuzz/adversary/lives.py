@@ -34,9 +34,10 @@ from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import MemoryRecorder, client_columns
 from skytether.shared.telemetry.summary import Track, track
 from skytether.shared.wire.protocol import Mode
-from skytether.sim.flight import SERVER, STANDBY
+from skytether.sim.flight import SERVER
 from skytether.sim.hosts import Clock
 from skytether.sim.process import Process
+from skytether.sim.standby import STANDBY
 from skytether.sim.world import World
 
 Saved = tuple[bytes, int]

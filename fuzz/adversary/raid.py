@@ -31,7 +31,8 @@ from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.summary import Track, nearest
 from skytether.shared.wire.lead import Lead, decode_led
 from skytether.shared.wire.protocol import Observation, encode
-from skytether.sim.flight import SERVER, STANDBY
+from skytether.sim.flight import SERVER
+from skytether.sim.standby import STANDBY
 
 BASE_NS = 50 * MILLISECOND_NS
 """Delay of every packet before any move [ns]."""

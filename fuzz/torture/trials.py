@@ -57,10 +57,10 @@ from skytether.shared.scenario.whole import Scenario
 from skytether.shared.wire.channel import LIFE_NS
 from skytether.shared.wire.keys import Keyring
 from skytether.shared.wire.protocol import Mode
-from skytether.sim.flight import STANDBY
 from skytether.sim.hosts import Clock
 from skytether.sim.process import Process
 from skytether.sim.sealed import make_keys
+from skytether.sim.standby import STANDBY
 from skytether.sim.world import World
 
 CLOCK_NS = 10**7 * SECOND_NS

@@ -58,7 +58,6 @@ MIDNIGHT_NS = 86_400 * SECOND_NS
 BOOT_ID = 2**63 + 2**31
 """Boot id of every endpoint: large, so that it takes as many bytes as a random boot id."""
 SERVER: Address = ("server", 0)
-STANDBY: Address = ("standby", 0)
 ASK_NS = 100 * MILLISECOND_NS
 """Virtual time between two calls of `stopped` [ns]."""
 EVENTS_MAX = 65_536
@@ -78,6 +77,29 @@ class Plain:
 
 
 PLAIN = Plain()
+
+
+class Alone:
+    """Servers of a flight: one; `standby.WithStandby` has a second one that takes over."""
+
+    def networks(self, scenario: Scenario) -> list[tuple[Address, Scenario]]:
+        """Server and scenario of each network of a vehicle."""
+        return [(SERVER, each) for each in scenario.networks]
+
+    def reach(self, addresses: list[Address], link: Callable[..., ClientLink | None]) -> Reach:
+        """How a vehicle reaches its servers, behind the addresses of its networks."""
+        if len(addresses) == 1:
+            return Reach(addresses[0], link())
+        several = load("skytether.client.several", "several paths")
+        reach: Reach = several.Several(addresses, link())
+        return reach
+
+    def others(self, seed: int, started: Callable[..., Server]) -> dict[str, Endpoint]:  # noqa: ARG002
+        """Further servers, by their hosts."""
+        return {}
+
+
+ALONE = Alone()
 
 
 def fly(
@@ -117,6 +139,9 @@ def fly(
     ends = PLAIN
     if secure:
         ends = load("skytether.sim.sealed", "keys").Sealed(scenario.seed, vehicles)
+    servers = ALONE
+    if standby:
+        servers = load("skytether.sim.standby", "a standby server").WithStandby(standby)
     plan_recorder = MemoryRecorder(plan_columns(scenario.model.axes, scenario.control.horizon))
     (flight,) = fly_runs(
         scenario,
@@ -131,7 +156,7 @@ def fly(
         server,
         beside,
         actions,
-        standby=standby,
+        servers=servers,
     )
     return replace(flight, plan=plan_recorder.rows())
 
@@ -145,7 +170,8 @@ class Run:
         server_figures: returns the server's figures so far for the datagrams of hosts.
         number: number of the run, from 0; its vehicles are numbered after those of earlier runs.
         vehicles: number of vehicles.
-        keyring: keys of the vehicles; None without encryption.
+        ends: makes the ends of links.
+        servers: servers of the vehicles.
     """
 
     def __init__(
@@ -157,8 +183,7 @@ class Run:
         number: int,
         vehicles: int,
         ends: Plain,
-        *,
-        has_standby: bool = False,
+        servers: Alone = ALONE,
     ) -> None:
         self._server_rows, self._server_figures = server_rows, server_figures
         self._before = number * vehicles
@@ -168,16 +193,12 @@ class Run:
         self._netems: dict[str, Proxy] = {}
         self.flown: dict[str, Flown] = {}
         """Endpoint and scenario of each host."""
-        networks = [(SERVER, each) for each in scenario.networks]
-        if has_standby:
-            networks.append((STANDBY, scenario.on_path(len(scenario.paths))))
-        for i, (server, own) in enumerate(networks):
+        for i, (server, own) in enumerate(servers.networks(scenario)):
             host = f"netem {scenario.seed}/{i + 1}" if i else f"netem {scenario.seed}"
             netem = Proxy(own, server=server, flows=vehicles, recorder=self._packets, path=i)
             self._netems[host], self.flown[host] = netem, (netem, own)
             world.add(host, netem)
         addresses: list[Address] = [(host, 0) for host in self._netems]
-        standby = [addresses.pop()] if has_standby else []
         self.hosts: dict[str, Endpoint] = dict([*self._netems.items()][:1])
         """Endpoints of netem, of the first path, and of the vehicles, in this order."""
         self._events: deque[FlightEvent] = deque(maxlen=EVENTS_MAX)
@@ -188,24 +209,14 @@ class Run:
         )
         start_ns = int(stream(scenario.seed, "phase").integers(scenario.dt_ns))
 
-        def reach(vehicle: int) -> Reach:
-            link = ends.link(scenario.seed, vehicle)
-            if len(addresses) == 1 and not standby:
-                return Reach(addresses[0], link)
-            several: Reach = load("skytether.client.several", "several paths or servers").Several(
-                addresses,
-                link,
-                standby=standby,
-                standby_link=ends.link(scenario.seed, vehicle, "standby"),
-            )
-            return several
-
         self._clients = [
             Client(
                 scenario,
                 kinds.make(scenario, vehicle),
                 vehicle=self._before + vehicle,
-                server=reach(self._before + vehicle),
+                server=servers.reach(
+                    addresses, partial(ends.link, scenario.seed, self._before + vehicle)
+                ),
                 boot_id=BOOT_ID,
                 recorder=self.steps,
             )
@@ -281,7 +292,7 @@ def fly_runs(
     beside: Mapping[str, Endpoint] = MappingProxyType({}),
     actions: Sequence[tuple[float, Callable[[Any], None]]] = (),
     *,
-    standby: Endpoint | bool = False,
+    servers: Alone = ALONE,
     make_server: Callable[..., Server] = Server,
     figures_of: Callable[[Any, Sequence[str]], Mapping[str, Any]] = lambda server, _: (
         server.figures()
@@ -295,7 +306,7 @@ def fly_runs(
     """
 
     def on_event(time_ns: int, host: str, event: Event) -> None:
-        if host in (SERVER[0], STANDBY[0]):
+        if host in by_host:
             if not isinstance(event, VehicleEvent):
                 for run in runs:
                     run.hear(time_ns, host, event)
@@ -332,11 +343,7 @@ def fly_runs(
         )
 
     server = own_server or started(entropy)
-    servers = {SERVER[0]: server}
-    if standby:
-        of_standby = stream(scenario.seed, "standby").bytes
-        servers[STANDBY[0]] = started(of_standby) if standby is True else standby
-
+    by_host = {SERVER[0]: server, **servers.others(scenario.seed, started)}
     runs = [
         Run(
             world,
@@ -346,7 +353,7 @@ def fly_runs(
             number,
             vehicles,
             ends,
-            has_standby=bool(standby),
+            servers,
         )
         for number, run in enumerate(each)
     ]
@@ -355,11 +362,11 @@ def fly_runs(
         world.add(name, endpoint)
     # The server is added last, so that at one instant it is woken last, after all arrivals.
     compute_ns = seconds_to_ns(scenario.simulation.compute_s)
-    for number, (name, endpoint) in enumerate(servers.items(), start=1):
+    for number, (name, endpoint) in enumerate(by_host.items(), start=1):
         world.add(name, endpoint, clock=Clock(number * MIDNIGHT_NS), compute_ns=compute_ns)
     if changes:
         own = {host: each for run in runs for host, each in run.flown.items()}
-        others = {name: (each, scenario) for name, each in (servers | {**beside}).items()}
+        others = {name: (each, scenario) for name, each in (by_host | {**beside}).items()}
         load("skytether.sim.changes", "changes in flight").plan(world, others | own, changes)
     for time_s, act in actions:
         world.at(seconds_to_ns(time_s), partial(act, world))

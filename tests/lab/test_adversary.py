@@ -46,7 +46,8 @@ from skytether.shared.scenario import reading
 from skytether.shared.scenario.whole import Scenario
 from skytether.shell.commandline import command
 from skytether.shell.commandline.command import CommandError
-from skytether.sim.flight import SERVER, STANDBY
+from skytether.sim.flight import SERVER
+from skytether.sim.standby import STANDBY
 from skytether.sim.world import World
 
 Patch = Callable[[pytest.MonkeyPatch], None]

@@ -21,7 +21,8 @@ from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.summary import nearest
 from skytether.shared.wire.lead import Lead
 from skytether.shared.wire.protocol import NO_HORIZON
-from skytether.sim.flight import SERVER, STANDBY
+from skytether.sim.flight import SERVER
+from skytether.sim.standby import STANDBY
 from two_vehicles import along, ready
 
 SPLIT_S = 30

@@ -21,7 +21,8 @@ from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import Record
 from skytether.shared.telemetry.summary import summarise
 from skytether.shared.wire.protocol import Mode
-from skytether.sim.flight import SERVER, STANDBY, fly
+from skytether.sim.flight import SERVER, fly
+from skytether.sim.standby import STANDBY
 from skytether.sim.world import World
 
 SECONDS, DIES_S = 18.0, 7.3
