@@ -208,7 +208,7 @@ HEADINGS = [
     "moved [m]",
     "off its path [m]",
     "stands after [s]",
-    "in the end, motors off after [s]",
+    "outcome, motors off after [s]",
 ]
 
 
