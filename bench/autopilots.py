@@ -61,8 +61,8 @@ even if the server is silent; the first two brake after two seconds and after on
 CALM: Air = "calm"
 WIND: Air = "wind"
 LEADS: dict[FlavourName, tuple[float, float]] = {"ardupilot": (0.55, 1.1), "px4": (0.85, 1.4)}
-"""Leads of the laws `targets` and `led` [s], tuned by hand in calm air: with a real ArduCopter, and
-with the simulated PX4."""
+"""Lead times of the laws `targets` and `lead` [s], tuned by hand in calm air: with a real ArduCopter
+and with the simulated PX4."""
 MODELS: dict[FlavourName, dict[str, Any]] = {
     "ardupilot": {},
     "px4": {
@@ -112,15 +112,15 @@ class FlownCell(msgspec.Struct, frozen=True, kw_only=True):
 
 def contenders(flavour: FlavourName) -> dict[str, Law | None]:
     """Laws of the contenders by name; None for Skytether."""
-    targets_s, led_s = LEADS[flavour]
+    targets_s, lead_s = LEADS[flavour]
     return {
         "velocity": Law("velocity", gain=0.3),
         "targets": Law("targets"),
-        "targets, led": Law("targets", targets_s),
-        "led, gain 0.3": Law("led", led_s, 0.3),
-        "led, gain 0.5": Law("led", led_s, 0.5),
-        "led, gain 0.5, T - 0.1 s": Law("led", led_s - 0.1, 0.5),
-        "led, gain 0.5, T + 0.1 s": Law("led", led_s + 0.1, 0.5),
+        "targets with lead": Law("targets", targets_s),
+        "lead, gain 0.3": Law("lead", lead_s, 0.3),
+        "lead, gain 0.5": Law("lead", lead_s, 0.5),
+        "lead, gain 0.5, T - 0.1 s": Law("lead", lead_s - 0.1, 0.5),
+        "lead, gain 0.5, T + 0.1 s": Law("lead", lead_s + 0.1, 0.5),
         **dict.fromkeys(OURS),
     }
 

@@ -4,7 +4,7 @@ With the desired trajectory r, the newest received position y, and its time of m
 
     velocity   u(t) = r'(t) + k (r(t) - y)
     targets    p(t) = r(t + T), u(t) = r'(t + T): the autopilot regulates
-    led        u(t) = r'(t + T) + k (r(t_m) - y(t_m))
+    lead       u(t) = r'(t + T) + k (r(t_m) - y(t_m))
 
 T is the lead time of set-points: delay, dead time and lag together, estimated by hand.
 """
@@ -20,7 +20,7 @@ from skytether.shared.scenario.reference import Reference
 
 @dataclass(frozen=True, slots=True)
 class Law:
-    name: Literal["velocity", "targets", "led"]
+    name: Literal["velocity", "targets", "lead"]
     lead_s: float = 0.0
     """Lead time of set-points, T [s]; `velocity` has none."""
     gain: float = 0.0
@@ -54,7 +54,7 @@ def setpoint(law: Law, reference: Reference, time_s: float, heard: Heard | None)
     if law.name == "targets":
         return Setpoint(velocity, position)
     if heard is not None:
-        then_s = heard.time_s if law.name == "led" else time_s
+        then_s = heard.time_s if law.name == "lead" else time_s
         desired = reference(np.array(then_s))[:, 0]
         velocity = velocity + law.gain * (desired - heard.position)
     return Setpoint(velocity, None)

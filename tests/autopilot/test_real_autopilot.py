@@ -177,7 +177,7 @@ class Flight:
 
 @needs_arducopter
 async def test_arducopter_flies_a_figure_eight_over_the_papers_network(tmp_path: Path) -> None:
-    """With set-points sent directly at 20 Hz by the law `led` the error is 0.055 m."""
+    """With set-points sent directly at 20 Hz by the law `lead` the error is 0.055 m."""
     flight = Flight(tmp_path, scenario("udp:127.0.0.1:14650", **OF_ARDUCOPTER))
     async with arducopter(tmp_path), flight.begun() as (client, _):
         assert await asyncio.wait_for(client.end(), 200.0) == 0

@@ -38,7 +38,7 @@ NONE = ""
 LAWS = {
     "velocity": Law("velocity", gain=0.3),
     "targets": Law("targets"),
-    "led": Law("led", 1.1, 0.5),
+    "lead": Law("lead", 1.1, 0.5),
 }
 
 
@@ -46,7 +46,7 @@ def scenario(**table: Any) -> Scenario:
     return packaged("autopilot", {"duration": 4.0, "settle": 0.0}, table)
 
 
-def flown(law: str = "led", flavour: FlavourName = "ardupilot", **table: Any) -> Record:
+def flown(law: str = "lead", flavour: FlavourName = "ardupilot", **table: Any) -> Record:
     return straight.fly(scenario(**table), LAWS[law], flavour)
 
 
@@ -63,7 +63,7 @@ def test_velocity_flies_to_where_the_vehicle_should_be_now() -> None:
 
 def test_led_compares_what_was_measured_with_where_it_should_have_been_then() -> None:
     """Set-point u(t) = r'(t + T) + k (r(t_m) - y(t_m))."""
-    law = Law("led", 1.0, 0.4)
+    law = Law("lead", 1.0, 0.4)
     chosen = setpoint(law, EIGHT, 4.0, Heard(3.0, np.array([1.0, 2.0, 3.0])))
     ahead, then = EIGHT(np.array(5.0))[:, 1], EIGHT(np.array(3.0))[:, 0]
     np.testing.assert_allclose(chosen.velocity, ahead + 0.4 * (then - [1.0, 2.0, 3.0]))
@@ -83,7 +83,7 @@ def test_a_vehicle_that_was_where_it_should_be_is_told_the_desired_velocity(
     time_s: float, lead_s: float, age_s: float
 ) -> None:
     heard = Heard(time_s - age_s, EIGHT(np.array(time_s - age_s))[:, 0])
-    chosen = setpoint(Law("led", lead_s, 0.5), EIGHT, time_s, heard)
+    chosen = setpoint(Law("lead", lead_s, 0.5), EIGHT, time_s, heard)
     np.testing.assert_allclose(chosen.velocity, EIGHT(np.array(time_s + lead_s))[:, 1])
 
 
@@ -91,7 +91,7 @@ def test_a_vehicle_that_was_where_it_should_be_is_told_the_desired_velocity(
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(("law", "measured_m"), [("led", 0.055), *OTHERS])
+@pytest.mark.parametrize(("law", "measured_m"), [("lead", 0.055), *OTHERS])
 def test_it_flies_as_an_arducopter_was_measured_to(law: str, measured_m: float) -> None:
     """RMSE xy of a whole figure eight over the paper's network, within a tenth."""
     whole = flown(law, duration=40.0, settle=10.0)
@@ -142,7 +142,7 @@ def test_after_a_cut_px4_is_back_by_itself() -> None:
     began_s = autopilots.began_ns(flown(duration=8.0, flavour="px4")) / 1e9
     both = ("network.uplink.loss", "network.downlink.loss")
     changes = [(began_s + 1.0, dict.fromkeys(both, 1.0)), (began_s + 4.0, dict.fromkeys(both, 0.1))]
-    record = straight.fly(scene, LAWS["led"], "px4", changes)
+    record = straight.fly(scene, LAWS["lead"], "px4", changes)
     summary = summary_of(scene, record)
     assert summary.mode == "track"
     said = [str(event.event) for event in record.events if event.host == "autopilot"]
@@ -167,7 +167,7 @@ class Sky:
     def __init__(self, faults: Sequence[str] = ()) -> None:
         scene = scenario(duration=6.0, network={"uplink": NONE, "downlink": NONE})
         self.events: list[tuple[int, object]] = []
-        self.station = Station(scene, LAWS["led"])
+        self.station = Station(scene, LAWS["lead"])
         self.autopilot = Autopilot(
             scene,
             "ardupilot",
@@ -198,7 +198,7 @@ def test_a_pilot_that_takes_over_keeps_the_vehicle() -> None:
 @settings(max_examples=20)
 @given(st.lists(st.binary(max_size=60), max_size=5), st.integers(0, 300))
 def test_bytes_of_anybody_change_nothing(garbage: list[bytes], system: int) -> None:
-    station = Station(scenario(), LAWS["led"])
+    station = Station(scenario(), LAWS["lead"])
     other = Codec(system % 256, 190).encode(dialect.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3))
     for now_ns, payload in enumerate([*garbage, other]):
         station.receive(Datagram(payload, ("anybody", 1)), now_ns=now_ns)
@@ -208,7 +208,7 @@ def test_bytes_of_anybody_change_nothing(garbage: list[bytes], system: int) -> N
 
 
 def test_what_is_no_quadrotor_is_not_flown() -> None:
-    station = Station(scenario(), LAWS["led"])
+    station = Station(scenario(), LAWS["lead"])
     plane = dialect.MAVLink_heartbeat_message(1, 3, 0, 0, 4, 3)
     station.receive(Datagram(Codec(1, 1).encode(plane), ("plane", 1)), now_ns=0)
     assert "MAV_TYPE 1" in str(station.failure)
@@ -217,7 +217,7 @@ def test_what_is_no_quadrotor_is_not_flown() -> None:
 
 def test_a_flight_that_begins_on_the_ground_is_refused() -> None:
     with pytest.raises(ConfigError, match=r"takeoff_m: got 'auto' at altitude 0 m"):
-        Station(scenario(reference={"altitude_m": 0.0}), LAWS["led"])
+        Station(scenario(reference={"altitude_m": 0.0}), LAWS["lead"])
 
 
 # -- the record ----------------------------------------------------------------------------------
