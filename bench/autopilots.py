@@ -61,8 +61,8 @@ even if the server is silent; the first two brake after two seconds and after on
 CALM: Air = "calm"
 WIND: Air = "wind"
 LEADS: dict[FlavourName, tuple[float, float]] = {"ardupilot": (0.55, 1.1), "px4": (0.85, 1.4)}
-"""Lead times of the laws `targets` and `lead` [s], tuned by hand in calm air: with a real ArduCopter
-and with the simulated PX4."""
+"""Lead times of the laws `targets` and `lead` [s], tuned by hand in calm air: with a real
+ArduCopter, and with the simulated PX4."""
 MODELS: dict[FlavourName, dict[str, Any]] = {
     "ardupilot": {},
     "px4": {
