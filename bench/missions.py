@@ -42,7 +42,7 @@ import tyro
 
 from bench.harness import Study, StudyOptions, TextTable
 from skytether.server.endpoint import Server
-from skytether.server.missions.routes import Routes
+from skytether.server.missions.routes import RoutesAroundZones
 from skytether.shared.base import files
 from skytether.shared.base.chance import stream
 from skytether.shared.law.model import Array
@@ -59,7 +59,7 @@ from skytether.shared.telemetry.summary import least_separation
 from skytether.shared.wire.protocol import Mode
 from skytether.shell.commandline import command
 from skytether.sim import flight
-from skytether.sim.process import Process
+from skytether.sim.process import VirtualProcess
 
 GOAL_AT_S = 2.0
 """Time from which the goals of random and published missions hold [s]."""
@@ -215,7 +215,7 @@ def fly_with_deaths(
         lives.append(Server(scenario, boot_id=1 + number, entropy=entropy, capacity=vehicles))
         return lives[-1]
 
-    server = Process(flight.SERVER[0], live)
+    server = VirtualProcess(flight.SERVER[0], live)
     actions = [each for down, up in deaths for each in ((down, server.kill), (up, server.start))]
     return flight.fly(scenario, vehicles=vehicles, server=lives[0], actions=actions), lives
 
@@ -310,7 +310,7 @@ def _places(
 ) -> Array:
     """Starts and goals of the vehicles [m]; shape (2, vehicles, 2)."""
     room_m = 0.75 * apart_m  # from zones, so that others can pass a vehicle at its goal
-    routes, chosen = Routes(forbidden, room_m), list[Array]()
+    routes, chosen = RoutesAroundZones(forbidden, room_m), list[Array]()
     while len(chosen) < 2:
         places = np.zeros((0, 2))
         for _ in range(20_000):

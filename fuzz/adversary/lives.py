@@ -36,7 +36,7 @@ from skytether.shared.telemetry.summary import Track, track
 from skytether.shared.wire.protocol import Mode
 from skytether.sim.flight import SERVER
 from skytether.sim.hosts import Clock
-from skytether.sim.process import Process
+from skytether.sim.process import VirtualProcess
 from skytether.sim.standby import STANDBY
 from skytether.sim.world import World
 
@@ -120,7 +120,7 @@ class Lives:
         self._lives: dict[int, list[Life]] = {number: [] for number in mission.vehicles}
         self.bodies = {number: Body(scenario, number) for number in mission.vehicles}
         self.clients = {
-            number: Process(f"client {number}", partial(self._client, number))
+            number: VirtualProcess(f"client {number}", partial(self._client, number))
             for number in mission.vehicles
         }
         for number, client in self.clients.items():
@@ -131,7 +131,7 @@ class Lives:
         self._running: dict[str, Running] = {}
         """Newest run of each server, and its scenario."""
         self.servers = {
-            name: Process(name, partial(self._server, name))
+            name: VirtualProcess(name, partial(self._server, name))
             for name, _ in (SERVER, STANDBY)[: 1 + has_standby]
         }
         for name, server in self.servers.items():

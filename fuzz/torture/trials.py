@@ -58,7 +58,7 @@ from skytether.shared.wire.channel import LIFE_NS
 from skytether.shared.wire.keys import Keyring
 from skytether.shared.wire.protocol import Mode
 from skytether.sim.hosts import Clock
-from skytether.sim.process import Process
+from skytether.sim.process import VirtualProcess
 from skytether.sim.sealed import make_keys
 from skytether.sim.standby import STANDBY
 from skytether.sim.world import World
@@ -244,7 +244,7 @@ class Torture:
         """Time within which a vehicle must fly again after the last fault [ns]."""
         self.counts: Counter[str] = Counter()
         self._servers = 0
-        self._processes: dict[str, Process[Steady]] = {}
+        self._processes: dict[str, VirtualProcess[Steady]] = {}
         names = [f"client {number}" for number in range(1, count + 1)]
         self.saboteur = Saboteur(
             stream(trial.seed, "torture", "saboteur"), [(name, 0) for name in names]
@@ -300,7 +300,7 @@ class Torture:
         self, name: str, make: Callable[[int], Steady], *, within_ns: int = 1, compute_ns: int = 0
     ) -> None:
         """Add a host and its process, which starts at a random time before `within_ns`."""
-        self._processes[name] = process = Process(name, make)
+        self._processes[name] = process = VirtualProcess(name, make)
         start_ns, clock = int(self._chance.integers(within_ns)), Clock(CLOCK_NS)
         self.world.add(
             name, process.endpoint, clock=clock, start_ns=start_ns, compute_ns=compute_ns

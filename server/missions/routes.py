@@ -23,7 +23,7 @@ TINY_M = 1e-6
 """Rounding tolerance [m]."""
 
 
-class Routes:
+class RoutesAroundZones:
     """Routes around zones, at a distance of `clearance_m`."""
 
     def __init__(self, zones: Zones, clearance_m: float) -> None:

@@ -9,7 +9,7 @@ import math
 from collections import deque
 from typing import NamedTuple
 
-from skytether.server.missions.routes import Routes
+from skytether.server.missions.routes import RoutesAroundZones
 from skytether.server.missions.yielding import Yielding
 from skytether.shared.base.kernel import shared
 from skytether.shared.law.model import Array
@@ -49,7 +49,7 @@ class VehicleMotions:
         self.outside_m = 0.0
         """Distance outside the tube when last observed [m]."""
         self.speed_mps = 0.0
-        self.detour: Routes | None = None
+        self.detour: RoutesAroundZones | None = None
         """Routes around resting vehicles where the vehicle was stuck; None if it never was."""
         self.detour_until = 0
         """Step until which `detour` is used."""

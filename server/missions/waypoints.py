@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 
 import numpy as np
 
-from skytether.server.missions.routes import Routes
+from skytether.server.missions.routes import RoutesAroundZones
 from skytether.server.missions.vehicle_motions import VehicleMotions
 from skytether.shared.law.model import Array
 from skytether.shared.missions.zones import Zone, Zones
@@ -54,7 +54,7 @@ class Waypoints:
         self.change_zones(zones)
 
     def change_zones(self, zones: Zones) -> None:
-        self._zones, self.routes = zones, Routes(zones, self._tube_m)
+        self._zones, self.routes = zones, RoutesAroundZones(zones, self._tube_m)
 
     def candidates(
         self,
@@ -97,7 +97,7 @@ class Waypoints:
             if vehicle.turned_rad > TURN_MAX:
                 vehicle.turned_rad = float(self._rng.uniform(TURN_BACK, 2.0 * np.pi))
 
-    def _ways_of(self, vehicle: VehicleMotions, k: int) -> Routes:
+    def _ways_of(self, vehicle: VehicleMotions, k: int) -> RoutesAroundZones:
         uses_detour = k < vehicle.detour_until or vehicle.closed
         return vehicle.detour if vehicle.detour and uses_detour else self.routes
 
@@ -119,7 +119,7 @@ class Waypoints:
 
     def _detour(
         self, place: Array, goal: Array, resting: Iterable[Array], closed: Iterable[Array]
-    ) -> Routes:
+    ) -> RoutesAroundZones:
         """Routes around zones, closed positions, and vehicles at rest nearby that are not at the
         goal.
         """
@@ -134,7 +134,7 @@ class Waypoints:
             if near_m > 2.0 * self._tube_m:
                 radius_m = min(self._closed_m, near_m) - self._tube_m
                 zones.append(_octagon("a closed place", at, radius_m, place))
-        return Routes(Zones(zones), self._tube_m)
+        return RoutesAroundZones(Zones(zones), self._tube_m)
 
 
 def _octagon(name: str, at: Array, radius_m: float, seen_from: Array) -> Zone:

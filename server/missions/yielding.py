@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from skytether.server.missions.routes import Routes
+from skytether.server.missions.routes import RoutesAroundZones
 from skytether.server.missions.zone_clearance import comes_near
 from skytether.shared.law.model import Array
 from skytether.shared.missions.zones import Zones
@@ -86,7 +86,7 @@ def place_to_yield(
     apart_m: float,
     scale: Array,
     zones: Zones,
-    routes: Routes,
+    routes: RoutesAroundZones,
     clearance_m: float,
 ) -> Array | None:
     """Nearest position off a path to which a vehicle at rest can go; None if there is none.

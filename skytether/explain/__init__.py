@@ -14,7 +14,7 @@ The modules, in the order of their use:
 | module | what is in it |
 |---|---|
 | `cases` | a flight that is to be flown, and the units that can be removed from it |
-| `flying` | `fly(case) -> Outcome`, the only function that flies; can run in a worker process |
+| `flying` | `fly(case) -> CaseOutcome`, the only function that flies; can run in a worker process |
 | `moments` | what went wrong, beside the same flight over a perfect network |
 | `units` | what the network did: outages, packets lost or late; and wind, noise, a stall |
 | `smallest` | delta debugging: the smallest set of units that suffices |

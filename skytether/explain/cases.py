@@ -72,7 +72,7 @@ Unit: TypeAlias = Bad | UsualDelay | Setting | Stall
 
 
 @dataclass(frozen=True, slots=True)
-class Delivered:
+class DeliveredStretch:
     """Stretch in which every packet arrives at most `most_s` after sending [s]."""
 
     where: Stretch
@@ -80,7 +80,7 @@ class Delivered:
 
 
 @dataclass(frozen=True, slots=True)
-class Case:
+class FlightCase:
     """Flight to be flown: a scenario, and changes to it."""
 
     scenario: Scenario
@@ -88,7 +88,7 @@ class Case:
     secure: bool = False
     stalls: tuple[Stall, ...] = ()
     keys: Keys = ()
-    delivered: tuple[Delivered, ...] = ()
+    delivered: tuple[DeliveredStretch, ...] = ()
     until_s: float | None = None
     """Time of flight at which the flight may end [s]; None: at its regular end."""
 

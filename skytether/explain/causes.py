@@ -11,8 +11,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from skytether.explain import units
-from skytether.explain.cases import Bad, Case, Lane, Setting, Stall, Unit, UsualDelay
-from skytether.explain.flying import FlyAll, Outcome
+from skytether.explain.cases import Bad, FlightCase, Lane, Setting, Stall, Unit, UsualDelay
+from skytether.explain.flying import CaseOutcome, FlyAll
 from skytether.explain.moments import AFTER_S, Moment, comes_about, error_m, is_averted
 from skytether.explain.smallest import smallest
 from skytether.explain.units import Circumstances
@@ -29,7 +29,7 @@ PACKETS_MAX = 64
 
 
 @dataclass(frozen=True, slots=True)
-class Part:
+class CausePart:
     """Unit of a cause, and its effect."""
 
     unit: Unit
@@ -52,7 +52,7 @@ class Part:
 class Cause:
     """Smallest set of units that suffices for a moment."""
 
-    parts: tuple[Part, ...]
+    parts: tuple[CausePart, ...]
     """Units of the cause; empty if the scenario itself is the cause."""
     since_s: float
     """Time of flight at which the search for units began [s]."""
@@ -60,9 +60,9 @@ class Cause:
     """Number of units that were examined."""
     error_m: float
     """Largest error with this cause alone [m]."""
-    also: tuple[tuple[Part, ...], ...] = ()
+    also: tuple[tuple[CausePart, ...], ...] = ()
     """Further smallest sets, each of which suffices and has no unit of the earlier sets."""
-    others: tuple[Part, ...] = ()
+    others: tuple[CausePart, ...] = ()
     """Losses and late packets that were examined and are not in any of the sets."""
     innocent: tuple[tuple[str, float], ...] = ()
     """Groups of units outside the cause, and the change of the error without each group [m]."""
@@ -90,12 +90,12 @@ class Rescues:
 
 
 def cause(
-    case: Case, moment: Moment, flown: Outcome, fly_all: FlyAll, at_once: int
+    case: FlightCase, moment: Moment, flown: CaseOutcome, fly_all: FlyAll, at_once: int
 ) -> tuple[Cause, Circumstances]:
     """Find the cause of a moment, without its parts' effects; also returns the circumstances."""
     case = replace(case, until_s=moment.end_s + AFTER_S + 1.0)
 
-    def suffice(cases: Iterable[Case]) -> list[bool]:
+    def suffice(cases: Iterable[FlightCase]) -> list[bool]:
         return [comes_about(moment, each) for each in fly_all([*cases])]
 
     until_s, tried = moment.end_s + AFTER_S, list[tuple[float, Circumstances]]()
@@ -124,18 +124,18 @@ def cause(
     return Cause(first, *counts, tuple(also), others, is_all=not still), here
 
 
-def _part(unit: Unit, flown: Outcome) -> Part:
+def _part(unit: Unit, flown: CaseOutcome) -> CausePart:
     if isinstance(unit, Stall):
-        return Part(unit, unit.at_s, unit.at_s + unit.for_s, False, np.nan)
+        return CausePart(unit, unit.at_s, unit.at_s + unit.for_s, False, np.nan)
     if not isinstance(unit, Bad):
-        return Part(unit, 0.0, 0.0, False, np.nan)
+        return CausePart(unit, 0.0, 0.0, False, np.nan)
     began_s, which = flown.began_s[unit.lane], _met(unit, flown)
     plans = int(flown.packets.is_plan[which].sum())
     times = began_s + unit.first * 1e-3, began_s + unit.end * 1e-3
-    return Part(unit, *times, False, np.nan, len(which), plans)
+    return CausePart(unit, *times, False, np.nan, len(which), plans)
 
 
-def _met(unit: Bad, flown: Outcome) -> list[int]:
+def _met(unit: Bad, flown: CaseOutcome) -> list[int]:
     """Numbers of the packets that a unit lost or delayed."""
     packets = flown.packets
     within = np.flatnonzero((packets.slot >= unit.first) & (packets.slot < unit.end))
@@ -144,7 +144,7 @@ def _met(unit: Bad, flown: Outcome) -> list[int]:
 
 def needed(
     found: Cause, here: Circumstances, moment: Moment, fly_all: FlyAll
-) -> tuple[Cause, list[Outcome]]:
+) -> tuple[Cause, list[CaseOutcome]]:
     """Add to a cause the results of flights without each part and without each other group; also
     returns the flights without each part.
     """
@@ -209,7 +209,7 @@ def lane_name(lane: Lane) -> str:
 
 
 def rescues(
-    found: Cause, here: Circumstances, moment: Moment, flown: Outcome, fly_all: FlyAll
+    found: Cause, here: Circumstances, moment: Moment, flown: CaseOutcome, fly_all: FlyAll
 ) -> Rescues:
     """Packets of the cause, sent before the moment, each of which averts it if delivered."""
     met = {

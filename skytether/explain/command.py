@@ -10,9 +10,9 @@ import numpy as np
 
 from skytether.cli import recordings
 from skytether.explain import mission, picture
-from skytether.explain.cases import Case
+from skytether.explain.cases import FlightCase
 from skytether.explain.explanation import FIRST, STEPS, Explanation, check_same, explain
-from skytether.explain.flying import Outcome, fly, trace
+from skytether.explain.flying import CaseOutcome, fly, trace
 from skytether.explain.hypotheses import hypotheses
 from skytether.figures import flights as figures
 from skytether.lab.commands.pool import Flags, Interrupted, PoolFlags, crew
@@ -75,7 +75,7 @@ def explain_flight(argv: Sequence[str]) -> None:
         options = command.parse(ExplainOptions(), argv, "skytether explain", explain_flight.__doc__)
         vehicles = _vehicles(options)
         command.check_count("--vehicles", vehicles, 255)
-        name, case, recorded = options.scenario, Case(options.config, vehicles), ""
+        name, case, recorded = options.scenario, FlightCase(options.config, vehicles), ""
     if options.seeds:
         command.check_count("--seeds", options.seeds, 10_000)
     options.pool.check()
@@ -114,7 +114,7 @@ def _judge(options: ExplainOptions, recorded: Recorded) -> None:
     print("A flight over UDP cannot be flown again: what caused what is not said.")
 
 
-def _recorded(recorded: Recorded) -> tuple[str, Case, str]:
+def _recorded(recorded: Recorded) -> tuple[str, FlightCase, str]:
     """Name, case and hash of a recorded flight.
 
     Raises:
@@ -126,7 +126,7 @@ def _recorded(recorded: Recorded) -> tuple[str, Case, str]:
         raise CommandError(f"{path}: got a flight over UDP, {expected}", command.CONFIGURATION)
     if client is None:
         raise CommandError(f"{path}: no step was flown", command.CONFIGURATION)
-    case = Case(
+    case = FlightCase(
         recorded.scenario,
         vehicles=len(np.unique(client["vehicle"])),
         secure=recorded.about.secure,
@@ -134,7 +134,7 @@ def _recorded(recorded: Recorded) -> tuple[str, Case, str]:
     return recorded.about.scenario, case, trace(client)
 
 
-def _explain(options: ExplainOptions, name: str, case: Case, recorded: str) -> None:
+def _explain(options: ExplainOptions, name: str, case: FlightCase, recorded: str) -> None:
     """Explain a flight, and show the explanation even if it is incomplete.
 
     Raises:
@@ -144,7 +144,7 @@ def _explain(options: ExplainOptions, name: str, case: Case, recorded: str) -> N
     at_once = options.pool.workers or system.cores()
     with crew(options.pool, f"explaining {name}", STEPS + bool(options.seeds), "steps") as flyers:
 
-        def fly_all(cases: Sequence[Case]) -> list[Outcome]:
+        def fly_all(cases: Sequence[FlightCase]) -> list[CaseOutcome]:
             nonlocal flights
             outcomes = flyers.map(fly, cases)
             flights += len(cases)

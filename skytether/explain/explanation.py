@@ -6,9 +6,9 @@ from dataclasses import dataclass, replace
 import msgspec
 
 from skytether.explain import causes, mission, remedies, units, words
-from skytether.explain.cases import Case
+from skytether.explain.cases import FlightCase
 from skytether.explain.causes import Cause, Rescues
-from skytether.explain.flying import FlyAll, Outcome, fly
+from skytether.explain.flying import CaseOutcome, FlyAll, fly
 from skytether.explain.moments import WEIGHTS, Moment, moments, worst
 from skytether.explain.remedies import Remedy
 from skytether.shared.base.errors import ConfigError
@@ -34,13 +34,13 @@ class Explanation:
     """Moments at which something went wrong, in order of time."""
     moment: Moment | None
     """Moment that is explained; None if nothing went wrong."""
-    flown: Outcome
+    flown: CaseOutcome
     """Outcome of the explained flight."""
     cause: Cause | None = None
     rescues: Rescues | None = None
     remedies: tuple[Remedy, ...] | None = None
     """Flights with other keys; the first is the explained flight."""
-    curves: tuple[tuple[str, Outcome], ...] = ()
+    curves: tuple[tuple[str, CaseOutcome], ...] = ()
     """Flights drawn for comparison: without a part of the cause, and with a remedy."""
 
     def __str__(self) -> str:
@@ -59,7 +59,7 @@ class Explanation:
 
 
 def explain(
-    case: Case,
+    case: FlightCase,
     name: str,
     fly_all: FlyAll,
     *,
@@ -131,7 +131,7 @@ def _chosen(found: Sequence[Moment], at_s: float | None) -> Moment | None:
     return min(near, key=order)
 
 
-def _curves(cause: Cause, without: Sequence[Outcome]) -> tuple[tuple[str, Outcome], ...]:
+def _curves(cause: Cause, without: Sequence[CaseOutcome]) -> tuple[tuple[str, CaseOutcome], ...]:
     """Label and outcome of flights without one needed part of a cause, at most CURVES_MAX."""
     needed = [
         (f"without the {causes.named(part.unit)}", each)
@@ -142,7 +142,7 @@ def _curves(cause: Cause, without: Sequence[Outcome]) -> tuple[tuple[str, Outcom
 
 
 def explained(
-    case: Case,
+    case: FlightCase,
     name: str,
     *,
     at_s: float | None = None,
@@ -162,7 +162,7 @@ def explained(
     """
     done, step = 0, FIRST
 
-    def fly_all(cases: Sequence[Case]) -> list[Outcome]:
+    def fly_all(cases: Sequence[FlightCase]) -> list[CaseOutcome]:
         outcomes = []
         for each in cases:
             on_flight(done, step)
@@ -177,7 +177,7 @@ def explained(
     return known
 
 
-def check_same(flown: Outcome, trace: str, name: str) -> None:
+def check_same(flown: CaseOutcome, trace: str, name: str) -> None:
     """Refuse a recorded flight that cannot be reproduced: the hash of its vehicles' rows differs.
 
     Raises:

@@ -11,7 +11,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from skytether.explain.cases import Case, Lane, Stall
+from skytether.explain.cases import FlightCase, Lane, Stall
 from skytether.explain.hypotheses import Hypothesis, hypotheses
 from skytether.explain.server_ticks import are_plans
 from skytether.explain.waits import Reason, Wait, waits
@@ -63,7 +63,7 @@ class Packets:
 
 
 @dataclass(frozen=True, slots=True)
-class Outcome:
+class CaseOutcome:
     """Result of flying a case."""
 
     tracks: tuple[Track, ...]
@@ -86,11 +86,11 @@ class Outcome:
     """Waits of a mission's vehicles, the longest first."""
 
 
-FlyAll: TypeAlias = Callable[[Sequence[Case]], list[Outcome]]
+FlyAll: TypeAlias = Callable[[Sequence[FlightCase]], list[CaseOutcome]]
 """Function that flies cases, and returns their outcomes in order; may raise `Interrupted`."""
 
 
-def fly(case: Case) -> Outcome:
+def fly(case: FlightCase) -> CaseOutcome:
     """Fly a case; raises ConfigError if it cannot be flown."""
     scenario = case.flown()
     reached_s = 0
@@ -129,7 +129,7 @@ def _questions(
         yield number * every_s, ask
 
 
-def _actions(stall: Stall, case: Case) -> Iterable[tuple[float, Callable[[World], None]]]:
+def _actions(stall: Stall, case: FlightCase) -> Iterable[tuple[float, Callable[[World], None]]]:
     seed, vehicles = case.scenario.seed, range(1, case.vehicles + 1)
     clients = [f"client {seed}.{vehicle}" for vehicle in vehicles]
     for host in ["server"] if stall.process == "server" else clients:
@@ -137,7 +137,7 @@ def _actions(stall: Stall, case: Case) -> Iterable[tuple[float, Callable[[World]
         yield stall.at_s + stall.for_s, partial(World.thaw, name=host)
 
 
-def outcome(scenario: Scenario, record: Record, reasons: Sequence[Reason] = ()) -> Outcome:
+def outcome(scenario: Scenario, record: Record, reasons: Sequence[Reason] = ()) -> CaseOutcome:
     """Outcome of a recorded flight in virtual time; `reasons`: see `waits`."""
     began_ns = _lanes_began_ns(record)
     flying_ns = {
@@ -153,7 +153,7 @@ def outcome(scenario: Scenario, record: Record, reasons: Sequence[Reason] = ()) 
             tracks.append(_track(scenario, rows, record.server, vehicle, began))
     dt_s, scale = scenario.control.dt, scenario.mission.height_scale if scenario.keeps_apart else 1
     times_s, nearest_m = separations(flown, began_s, dt_s, scale)
-    return Outcome(
+    return CaseOutcome(
         tuple(tracks),
         _packets(scenario, record, began_ns),
         {lane: ns / SECOND_NS for lane, ns in began_ns.items()},

@@ -17,7 +17,7 @@ from typing import Literal
 
 import numpy as np
 
-from skytether.explain.flying import Outcome, Track
+from skytether.explain.flying import CaseOutcome, Track
 from skytether.shared.law.model import Array, Flags
 from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import Reason
@@ -68,7 +68,7 @@ class Moment:
     `usual`; `level` is half of it."""
 
 
-def moments(flown: Outcome, perfect: Outcome, scenario: Scenario) -> list[Moment]:
+def moments(flown: CaseOutcome, perfect: CaseOutcome, scenario: Scenario) -> list[Moment]:
     """Moments of a flight in order of time, without errors that result from a brake."""
     usual = {track.vehicle: track for track in perfect.tracks}
     found = [
@@ -96,7 +96,7 @@ def worst(found: Sequence[Moment]) -> Moment:
 WEIGHTS: Mapping[Kind, int] = {"failure": 3, "separation": 2, "brake": 2, "error": 1, "packets": 0}
 
 
-def measured(moment: Moment, outcome: Outcome) -> float:
+def measured(moment: Moment, outcome: CaseOutcome) -> float:
     """Size of a moment in another flight; from `moment.level` on, it occurs there."""
     match moment.kind:
         case "failure":
@@ -116,16 +116,16 @@ def measured(moment: Moment, outcome: Outcome) -> float:
             return _rate(outcome, moment.start_s - AROUND_S, moment.end_s + AROUND_S)
 
 
-def comes_about(moment: Moment, outcome: Outcome) -> bool:
+def comes_about(moment: Moment, outcome: CaseOutcome) -> bool:
     return measured(moment, outcome) >= moment.level
 
 
-def is_averted(moment: Moment, outcome: Outcome) -> bool:
+def is_averted(moment: Moment, outcome: CaseOutcome) -> bool:
     """Whether the moment is clearly averted in a flight, not just below `moment.level`."""
     return measured(moment, outcome) <= moment.calm
 
 
-def error_m(moment: Moment, outcome: Outcome) -> float:
+def error_m(moment: Moment, outcome: CaseOutcome) -> float:
     """Largest error of the moment's vehicle during and shortly after it [m]; of all vehicles if the
     moment has vehicle 0.
     """
@@ -186,7 +186,7 @@ def _usual_m(track: Track, usual: Track) -> Array:
     return np.array([usual.error_m[a:b].max(initial=0.0) for a, b in zip(first, end, strict=True)])
 
 
-def _too_near(flown: Outcome, perfect: Outcome, scenario: Scenario) -> Iterator[Moment]:
+def _too_near(flown: CaseOutcome, perfect: CaseOutcome, scenario: Scenario) -> Iterator[Moment]:
     if not np.isfinite(flown.separation_m).any():
         return
     bound_m = scenario.mission.separation_m
@@ -199,7 +199,7 @@ def _too_near(flown: Outcome, perfect: Outcome, scenario: Scenario) -> Iterator[
         yield Moment("separation", 0, start_s, end_s, says, least_m, usual_m, *levels)
 
 
-def _wasted(flown: Outcome, perfect: Outcome) -> Iterator[Moment]:
+def _wasted(flown: CaseOutcome, perfect: CaseOutcome) -> Iterator[Moment]:
     usual = _rate(perfect, WARM_S, np.inf)
     sent = _sent_s(flown)
     each = np.searchsorted(sent, sent + 1.0) - np.arange(len(sent))
@@ -211,12 +211,12 @@ def _wasted(flown: Outcome, perfect: Outcome) -> Iterator[Moment]:
         yield Moment("packets", 0, *times, says, float(most), usual, *levels)
 
 
-def _sent_s(outcome: Outcome) -> Array:
+def _sent_s(outcome: CaseOutcome) -> Array:
     """Times at which the server sent a plan [s]; once for all paths."""
     return np.unique(outcome.packets.time_s[outcome.packets.is_plan])
 
 
-def _rate(outcome: Outcome, start_s: float, end_s: float) -> float:
+def _rate(outcome: CaseOutcome, start_s: float, end_s: float) -> float:
     """Largest number of plans in a second that begins between two times [1/s]."""
     sent = _sent_s(outcome)
     begun = sent[(sent >= start_s) & (sent < end_s)]
@@ -243,7 +243,7 @@ def _least(distances_m: Array) -> float:
     return float(np.nanmin(distances_m)) if np.isfinite(distances_m).any() else np.inf
 
 
-def _track(outcome: Outcome, vehicle: int) -> Track | None:
+def _track(outcome: CaseOutcome, vehicle: int) -> Track | None:
     return next((track for track in outcome.tracks if track.vehicle == vehicle), None)
 
 

@@ -5,9 +5,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from skytether.explain.cases import Bad, Lane
-from skytether.explain.causes import Part, lane_name
+from skytether.explain.causes import CausePart, lane_name
 from skytether.explain.explanation import Explanation
-from skytether.explain.flying import Outcome
+from skytether.explain.flying import CaseOutcome
 from skytether.explain.moments import AFTER_S, Moment
 from skytether.figures.page import blank
 from skytether.shared.base.errors import ConfigError
@@ -55,7 +55,7 @@ def _draw_errors(axes: "Axes", known: Explanation, moment: Moment) -> None:
     axes.legend(loc="upper left", frameon=False)
 
 
-def _errors(outcome: Outcome, moment: Moment) -> tuple[Array, Array]:
+def _errors(outcome: CaseOutcome, moment: Moment) -> tuple[Array, Array]:
     """Times and errors of the moment's vehicle, or of the first vehicle."""
     tracks = [each for each in outcome.tracks if each.vehicle == moment.vehicle] or outcome.tracks
     return (tracks[0].time_s, tracks[0].error_m) if tracks else (np.zeros(0), np.zeros(0))
@@ -69,7 +69,7 @@ def _lanes(known: Explanation, moment: Moment) -> list[Lane]:
     return sorted(lanes, key=lambda lane: (lane[2], lane[1], lane[0]))
 
 
-def _stretches(known: Explanation) -> tuple[list[Part], list[Part]]:
+def _stretches(known: Explanation) -> tuple[list[CausePart], list[CausePart]]:
     """Stretches of the cause, and other examined stretches."""
     cause = known.cause
     if cause is None:

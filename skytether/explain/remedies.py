@@ -11,9 +11,9 @@ from dataclasses import dataclass, replace
 import msgspec
 import numpy as np
 
-from skytether.explain.cases import Bad, Case, Keys, Setting, Stall, Unit, UsualDelay
+from skytether.explain.cases import Bad, FlightCase, Keys, Setting, Stall, Unit, UsualDelay
 from skytether.explain.causes import Cause
-from skytether.explain.flying import FlyAll, Outcome
+from skytether.explain.flying import CaseOutcome, FlyAll
 from skytether.explain.moments import Moment, comes_about, error_m
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.scenario.whole import Scenario
@@ -54,8 +54,8 @@ class Remedy:
 
 
 def remedies(
-    found: Cause, case: Case, moment: Moment, fly_all: FlyAll
-) -> tuple[list[Remedy], list[Outcome]]:
+    found: Cause, case: FlightCase, moment: Moment, fly_all: FlyAll
+) -> tuple[list[Remedy], list[CaseOutcome]]:
     """Fly each remedy; the first result is the explained flight, unchanged."""
     tried = [(AS_FLOWN, Keys()), *possible(found, case)]
     outcomes = fly_all([replace(case, keys=keys, until_s=None) for _, keys in tried])
@@ -73,7 +73,7 @@ def remedies(
     return flown, outcomes
 
 
-def with_others(each: Remedy, case: Case, seeds: Sequence[int], fly_all: FlyAll) -> Remedy:
+def with_others(each: Remedy, case: FlightCase, seeds: Sequence[int], fly_all: FlyAll) -> Remedy:
     """Add the means over flights of other seeds to a remedy."""
     scenario = case.scenario
     cases = [
@@ -88,18 +88,18 @@ def with_others(each: Remedy, case: Case, seeds: Sequence[int], fly_all: FlyAll)
     return replace(each, elsewhere=Elsewhere(len(outcomes), *means))
 
 
-def brakes(outcome: Outcome) -> int:
+def brakes(outcome: CaseOutcome) -> int:
     """Number of times that a vehicle began to brake, to land or to stand still."""
     worse = [np.isin(track.mode, WORSE) for track in outcome.tracks]
     return sum(int((each[1:] & ~each[:-1]).sum()) for each in worse)
 
 
-def _largest_m(outcome: Outcome, scenario: Scenario) -> float:
+def _largest_m(outcome: CaseOutcome, scenario: Scenario) -> float:
     errors = [each.error_m[each.step_s >= scenario.settled_s] for each in outcome.tracks]
     return float(max((each.max(initial=0.0) for each in errors), default=np.nan))
 
 
-def possible(found: Cause, case: Case) -> Iterator[tuple[str, Keys]]:
+def possible(found: Cause, case: FlightCase) -> Iterator[tuple[str, Keys]]:
     """Names and keys of remedies that the scenario can be flown with."""
     for name, keys in _listed([part.unit for part in found.parts], case.scenario):
         try:

@@ -13,8 +13,8 @@ import numpy as np
 
 from skytether.explain.cases import (
     Bad,
-    Case,
-    Delivered,
+    DeliveredStretch,
+    FlightCase,
     Keys,
     Lane,
     Setting,
@@ -22,7 +22,7 @@ from skytether.explain.cases import (
     Unit,
     UsualDelay,
 )
-from skytether.explain.flying import Outcome
+from skytether.explain.flying import CaseOutcome
 from skytether.shared.scenario.whole import Scenario
 
 OUTAGE_MS = 50
@@ -65,7 +65,7 @@ SETTINGS: Sequence[tuple[str, Keys]] = (
 """Properties of vehicle, wind and server, and values of keys that remove them."""
 
 
-def perfect(case: Case) -> Case:
+def perfect(case: FlightCase) -> FlightCase:
     """Case in which every packet arrives without delay and nothing else is wrong; same wind without
     gusts.
     """
@@ -85,7 +85,7 @@ def perfect(case: Case) -> Case:
 class Circumstances:
     """Explained flight, and the units that may be removed from it."""
 
-    case: Case
+    case: FlightCase
     units: tuple[Unit, ...]
     """Units in an order in which related units are neighbours."""
     window: tuple[Stretch, ...]
@@ -93,29 +93,29 @@ class Circumstances:
     usual_s: dict[tuple[int, int], float]
     """Longest usual delay of a path and direction [s]."""
 
-    def without(self, *taken: Unit) -> Case:
+    def without(self, *taken: Unit) -> FlightCase:
         """Case of the flight without these units."""
         delivered = [
-            Delivered(each, self._most_s(each.lane, taken))
+            DeliveredStretch(each, self._most_s(each.lane, taken))
             for each in taken
             if isinstance(each, Bad)
         ]
         directions = {each.direction for each in taken if isinstance(each, UsualDelay)}
         left = [each for each in self.units if isinstance(each, Bad) and each not in taken]
         delivered += [
-            Delivered(each, 0.0)
+            DeliveredStretch(each, 0.0)
             for stretch in self.window
             if stretch.lane[1] in directions
             for each in _between(stretch, left)
         ]
         return self._with(delivered, taken)
 
-    def only(self, kept: Collection[Unit]) -> Case:
+    def only(self, kept: Collection[Unit]) -> FlightCase:
         """Case of the flight with these units only; other packets in the window are delivered."""
         taken = [each for each in self.units if each not in kept]
         bad = [each for each in kept if isinstance(each, Bad)]
         delivered = [
-            Delivered(each, self._most_s(each.lane, taken))
+            DeliveredStretch(each, self._most_s(each.lane, taken))
             for stretch in self.window
             for each in _between(stretch, bad)
         ]
@@ -124,7 +124,7 @@ class Circumstances:
     def _most_s(self, lane: Lane, taken: Collection[Unit]) -> float:
         return 0.0 if UsualDelay(lane[1]) in taken else self.usual_s[lane[:2]]
 
-    def _with(self, delivered: Sequence[Delivered], taken: Collection[Unit]) -> Case:
+    def _with(self, delivered: Sequence[DeliveredStretch], taken: Collection[Unit]) -> FlightCase:
         keys = [key for each in taken if isinstance(each, Setting) for key in each.keys]
         stalls = tuple(each for each in self.case.stalls if each not in taken)
         return replace(self.case, delivered=tuple(delivered), keys=tuple(keys), stalls=stalls)
@@ -143,7 +143,7 @@ def _between(stretch: Stretch, bad: Collection[Bad]) -> Iterator[Stretch]:
 
 
 def circumstances(
-    case: Case, flown: Outcome, start_s: float, end_s: float, *, with_delay: bool = False
+    case: FlightCase, flown: CaseOutcome, start_s: float, end_s: float, *, with_delay: bool = False
 ) -> Circumstances:
     """Circumstances of a flight between two times in it [s].
 
@@ -169,7 +169,7 @@ def _order(lane: Lane) -> tuple[int, int, int]:
     return -direction, flow, path
 
 
-def _usual_s(flown: Outcome, lane: Lane) -> float:
+def _usual_s(flown: CaseOutcome, lane: Lane) -> float:
     """Longest delay of a packet that is not late [s]."""
     packets = flown.packets
     same = np.array([each[:2] == lane[:2] for each in packets.lane], dtype=bool)
@@ -190,7 +190,7 @@ def _is_there(scenario: Scenario, keys: Keys) -> bool:
     return False
 
 
-def _bad(case: Case, flown: Outcome, within: Stretch, usual_s: float) -> Iterator[Bad]:
+def _bad(case: FlightCase, flown: CaseOutcome, within: Stretch, usual_s: float) -> Iterator[Bad]:
     """Outages within a stretch, and single lost or late packets outside them, sorted by time."""
     fates, usual_ns = case.fates(within.lane), round(usual_s * 1e9)
 

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from itertools import groupby
 
 from skytether.explain.cases import Bad
-from skytether.explain.causes import WHAT, Cause, Part, Rescues, lane_name, named
+from skytether.explain.causes import WHAT, Cause, CausePart, Rescues, lane_name, named
 from skytether.explain.moments import Moment
 from skytether.explain.remedies import Remedy
 from skytether.shared.telemetry.record import UPLINK
@@ -82,7 +82,7 @@ def _cause(cause: Cause, moment: Moment) -> Iterator[str]:
         yield f"Without all of them {without}."
 
 
-def _table(parts: Sequence[Part], moment: Moment) -> Iterator[str]:
+def _table(parts: Sequence[CausePart], moment: Moment) -> Iterator[str]:
     rows = [_row(list(some), moment) for _, some in groupby(parts, _kind)]
     shown = [column for column in zip(*rows, strict=True) if any(column)]
     widths = [max(map(len, column)) for column in shown]
@@ -95,7 +95,7 @@ def _units(count: int, other: str = "") -> str:
     return f"{words} unit{'s' * (count != 1)} (losses, late packets, wind …)"
 
 
-def _counted(parts: Iterable[Part]) -> list[str]:
+def _counted(parts: Iterable[CausePart]) -> list[str]:
     """Nouns of parts with their number, such as "2 outages of the uplink"."""
     nouns = Counter(
         f"{WHAT[part.unit.is_late, part.unit.is_packet]}|of the {_way(part.unit)}"
@@ -115,13 +115,13 @@ def _way(unit: Bad) -> str:
     return ("uplink", "downlink")[unit.lane[1]]
 
 
-def _kind(part: Part) -> object:
+def _kind(part: CausePart) -> object:
     """Kind of a part; neighbouring parts of one kind, such as lost packets, share a row."""
     unit = part.unit
     return (unit.lane, unit.is_late) if isinstance(unit, Bad) and unit.is_packet else part
 
 
-def _row(parts: Sequence[Part], moment: Moment) -> list[str]:
+def _row(parts: Sequence[CausePart], moment: Moment) -> list[str]:
     """Cells of a row: where, when, what was lost, how much is enough, and the flight without it."""
     first, last = parts[0], parts[-1]
     unit, plans = first.unit, sum(part.plans for part in parts)
@@ -142,7 +142,7 @@ def _row(parts: Sequence[Part], moment: Moment) -> list[str]:
     return [lane_name(unit.lane), when, met, enough, _without(parts, moment)]
 
 
-def _without(parts: Sequence[Part], moment: Moment) -> str:
+def _without(parts: Sequence[CausePart], moment: Moment) -> str:
     needed = sum(part.is_needed for part in parts)
     if math.isnan(parts[0].error_m) and not needed:  # not flown yet
         return ""

@@ -150,12 +150,12 @@ class Flight:
         Raises:
             ConfigError: the flight cannot be reproduced, or has no moment at that time.
         """
-        from skytether.explain.cases import Case
+        from skytether.explain.cases import FlightCase
         from skytether.explain.explanation import STEPS, explained
         from skytether.explain.flying import trace
 
         client = self.record.client
-        case = Case(self.scenario, len(np.unique(client["vehicle"])) or 1, self.secure)
+        case = FlightCase(self.scenario, len(np.unique(client["vehicle"])) or 1, self.secure)
         began_s = time.monotonic()
         with ExitStack() as stack:
             bar: terminal.Bar | None = None

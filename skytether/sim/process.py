@@ -12,7 +12,7 @@ from skytether.sim.world import World
 Run = TypeVar("Run", bound=Endpoint)
 
 
-class Process(Generic[Run]):
+class VirtualProcess(Generic[Run]):
     """Process of a host; `endpoint` is its newest run. The caller adds the first run to the world.
 
     Its methods take the world first, so that they can be `actions` of `sim.flight.fly`.

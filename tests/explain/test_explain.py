@@ -12,9 +12,9 @@ import pytest
 
 import skytether
 from skytether.explain import moments, picture, units
-from skytether.explain.cases import Bad, Case, Setting, Stall, UsualDelay
+from skytether.explain.cases import Bad, FlightCase, Setting, Stall, UsualDelay
 from skytether.explain.explanation import Explanation, _chosen, explain, explained
-from skytether.explain.flying import Outcome, fly
+from skytether.explain.flying import CaseOutcome, fly
 from skytether.explain.moments import Moment, comes_about
 from skytether.library import flight as flight_module
 from skytether.netem.impairments.outages import Delivered
@@ -26,13 +26,15 @@ BURSTS = "paper(0.4, 0.02, 2.0) & gilbert_elliott(0.1, 2.0)"
 SHORT = "constant(0.05)"
 
 
-def flight(name: str, seed: int, uplink: str = "", downlink: str = "", **keys: object) -> Case:
+def flight(
+    name: str, seed: int, uplink: str = "", downlink: str = "", **keys: object
+) -> FlightCase:
     if uplink:
         keys |= {"network.uplink": uplink, "network.downlink": downlink or uplink}
-    return Case(skytether.load(name, seed=seed, **keys))
+    return FlightCase(skytether.load(name, seed=seed, **keys))
 
 
-def up_to(step: str, own: Case, at_s: float | None = None) -> Explanation:
+def up_to(step: str, own: FlightCase, at_s: float | None = None) -> Explanation:
     """What is known before a step of the explanation."""
     steps = explain(own, "demo", lambda cases: [fly(each) for each in cases], at_s=at_s)
     return next(known for following, known in steps if following == step)
@@ -112,11 +114,11 @@ def test_packets_lost_one_after_another_are_the_cause_together() -> None:
     assert len(known.rescues.packets) > 10
 
 
-def made() -> dict[str, Case]:
+def made() -> dict[str, FlightCase]:
     """Flights in which one known thing is wrong."""
     good = flight("demo", 13, f"{SHORT} & loss(0.05)")
 
-    def other(**keys: object) -> Case:
+    def other(**keys: object) -> FlightCase:
         return flight("demo", 17, f"{SHORT} & loss(0.05)", **keys)
 
     gusts = {"vehicle.gust_mps2": 3.0, "vehicle.gust_every_s": 12.0}
@@ -259,7 +261,7 @@ def test_text_json_and_picture_say_what_is_known(tmp_path: Path) -> None:
 def test_whoever_interrupts_keeps_what_is_known_by_then() -> None:
     flights = 0
 
-    def fly_some(cases: Sequence[Case]) -> list[Outcome]:
+    def fly_some(cases: Sequence[FlightCase]) -> list[CaseOutcome]:
         nonlocal flights
         flights += len(cases)
         if flights > 16:
@@ -281,7 +283,7 @@ def test_whoever_interrupts_keeps_what_is_known_by_then() -> None:
 
 def test_two_vehicles_that_come_too_close_are_a_moment() -> None:
     scenario = skytether.load("swap", duration=20)
-    outcome = fly(Case(scenario, vehicles=4))
+    outcome = fly(FlightCase(scenario, vehicles=4))
     near = replace(outcome, separation_m=outcome.separation_m.copy())
     bound_m = scenario.mission.separation_m
     assert moments.moments(outcome, outcome, scenario) == []

@@ -20,7 +20,7 @@ from skytether.__main__ import main
 from skytether.cli import recordings
 from skytether.client.compensator import Compensator
 from skytether.explain import flying, mission
-from skytether.explain.cases import Case
+from skytether.explain.cases import FlightCase
 from skytether.explain.hypotheses import Hypothesis, broken, flown, hypotheses
 from skytether.explain.waits import Wait
 from skytether.library.flight import Flight
@@ -198,7 +198,7 @@ def test_a_vehicle_in_a_zone_is_found() -> None:
 def waits(kind: str, vehicles: int, duration: float, **keys: Any) -> list[Wait]:
     reference = {"shape": f"swap({vehicles})"}
     scenario = packaged("swap", duration=duration, reference=reference, **keys)
-    outcome = flying.fly(Case(scenario, vehicles))
+    outcome = flying.fly(FlightCase(scenario, vehicles))
     assert mission.text(outcome.hypotheses, outcome.waits)
     return [each for each in outcome.waits if each.kind == kind]
 
@@ -260,6 +260,6 @@ def test_a_recorded_mission_over_udp_is_judged_without_another_flight(
 
 
 def test_asking_changes_nothing_in_a_flight_and_each_plan_has_its_packet() -> None:
-    outcome = flying.fly(Case(EIGHT, 8))
+    outcome = flying.fly(FlightCase(EIGHT, 8))
     assert outcome.trace == flying.trace(eight().client)
     assert outcome.packets.is_plan.sum() == eight().server["event"].sum()

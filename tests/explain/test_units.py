@@ -8,8 +8,8 @@ import pytest
 
 import skytether
 from skytether.explain import units
-from skytether.explain.cases import Bad, Case, Delivered, Setting, Stall, Stretch
-from skytether.explain.flying import Outcome, fly
+from skytether.explain.cases import Bad, DeliveredStretch, FlightCase, Setting, Stall, Stretch
+from skytether.explain.flying import CaseOutcome, fly
 from skytether.netem.fate import Fates
 from skytether.netem.impairments.direction import impairments
 from skytether.shared.scenario import reading
@@ -20,13 +20,13 @@ LOSSY = "constant(0.05) & loss(0.1) & outage(6, 2)"
 
 
 @cache
-def case() -> Case:
+def case() -> FlightCase:
     keys = {"network.uplink": LOSSY, "network.downlink": "constant(0.05)", "duration": 12}
-    return Case(skytether.load("demo", seed=7, **keys))
+    return FlightCase(skytether.load("demo", seed=7, **keys))
 
 
 @cache
-def flown() -> Outcome:
+def flown() -> CaseOutcome:
     return fly(case())
 
 
@@ -125,7 +125,7 @@ def test_without_a_unit_the_rest_stays_as_it_was_until_then() -> None:
 
 def test_the_perfect_flight_keeps_wind_and_loses_nothing() -> None:
     noisy = skytether.load(case().scenario, **{"sensor.position_noise_m": 0.1})
-    perfect = units.perfect(Case(noisy, stalls=(Stall("server", 5.0, 1.0),)))
+    perfect = units.perfect(FlightCase(noisy, stalls=(Stall("server", 5.0, 1.0),)))
     flies = perfect.flown()
     assert (flies.vehicle.wind, flies.sensor.position_noise_m) == (noisy.vehicle.wind, 0.0)
     assert perfect.stalls == ()
@@ -135,9 +135,9 @@ def test_the_perfect_flight_keeps_wind_and_loses_nothing() -> None:
 
 
 def test_each_path_is_changed_by_itself() -> None:
-    two = Case(
+    two = FlightCase(
         reading.load("demo-two-links"),
-        delivered=(Delivered(Stretch((1, DOWNLINK, 0), 100, 300), 0.1),),
+        delivered=(DeliveredStretch(Stretch((1, DOWNLINK, 0), 100, 300), 0.1),),
     )
     paths = two.flown().network.paths
     assert paths[1].downlink.endswith(" & delivered(0, 0.100, 0.200, 0.100000)")

@@ -28,7 +28,7 @@ from skytether.server.missions.half_planes import HalfPlanes, half_planes
 from skytether.server.missions.mission_planner import MissionPlanner
 from skytether.server.missions.mission_state import LONGEST, MissionState
 from skytether.server.missions.possible_motions import NEVER, PossibleMotion, PossibleMotions
-from skytether.server.missions.routes import Routes
+from skytether.server.missions.routes import RoutesAroundZones
 from skytether.server.missions.separation import too_near
 from skytether.server.missions.trajectory_qp import TrajectoryQP
 from skytether.server.missions.vehicle_motions import PROMPT_COUNT, SentMotion, VehicleMotions
@@ -756,7 +756,7 @@ def test_without_routes_they_wait_before_a_wall(monkeypatch: pytest.MonkeyPatch)
     table["mission"]["zones"] = "box(-0.5, 0.5, -4, 4)"
     walled = reading.check(table, "walled")
     assert max(left_m(flight.fly(walled, vehicles=2), walled)) < 0.3
-    monkeypatch.setattr(Routes, "way", lambda _, __, goal: goal[None])
+    monkeypatch.setattr(RoutesAroundZones, "way", lambda _, __, goal: goal[None])
     flown = flight.fly(walled, vehicles=2)
     assert max(left_m(flown, walled)) > 3.0
     assert clear_m(flown, zones(walled)) > 0.0
@@ -832,7 +832,7 @@ def test_a_place_to_yield_to_is_off_the_way(seed: int, axes: int) -> None:
     others, scale = rng.uniform(-3, 3, (5, axes)), np.array([1.0, 1.0, 0.5])[:axes]
     kept = zone_texts.parse("fence(-4, 4, -4, 4) & box(-1, 1, 1, 2)", axes)
     found = yielding.place_to_yield(
-        home, way, others, apart_m, scale, kept, Routes(kept, room_m), room_m
+        home, way, others, apart_m, scale, kept, RoutesAroundZones(kept, room_m), room_m
     )
     if found is not None:
         assert yielding.distance_from_way(found[None] * scale, way * scale)[0] >= apart_m
@@ -872,7 +872,9 @@ def test_one_that_is_too_near_already_yields_away_from_the_other() -> None:
 
     def place() -> Array | None:
         ones = np.ones(2)
-        return yielding.place_to_yield(home, way, way[:1], 0.93, ones, free, Routes(free, 0.2), 0.2)
+        return yielding.place_to_yield(
+            home, way, way[:1], 0.93, ones, free, RoutesAroundZones(free, 0.2), 0.2
+        )
 
     found = place()
     assert yielding.distance_from_way(way[:1], np.stack([home, found]))[0] == pytest.approx(0.91)

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from helpers import packaged, refusal
-from skytether.server.missions.routes import Routes
+from skytether.server.missions.routes import RoutesAroundZones
 from skytether.server.missions.zone_clearance import comes_near
 from skytether.shared.formats.zone_files import CRS84
 from skytether.shared.law.model import Array
@@ -342,7 +342,7 @@ def length_m(way: Array) -> float:
 )
 def test_a_way_goes_round(text: str, goal: tuple[float, float], least_m: float) -> None:
     kept, begin = zone_texts.parse(text, 2), np.array([0.0, -1.0 if text == U else 0.0])
-    way = np.vstack([begin, Routes(kept, 0.2).way(begin, np.array(goal))])
+    way = np.vstack([begin, RoutesAroundZones(kept, 0.2).way(begin, np.array(goal))])
     assert len(way) > 2
     assert not comes_near(kept, way, 0.2 - 1e-6)
     assert least_m < length_m(way) < 1.5 * least_m + 1.0
@@ -350,11 +350,11 @@ def test_a_way_goes_round(text: str, goal: tuple[float, float], least_m: float) 
 
 def test_where_there_is_no_way() -> None:
     kept = zone_texts.parse("fence(-5, 5, -5, 5) & box(-0.5, 0.5, -5, 5)", 2)
-    routes = Routes(kept, 0.2)
+    routes = RoutesAroundZones(kept, 0.2)
     begin, goal = np.array([-3.0, 0.0]), np.array([3.0, 0.0])
     assert routes.way(begin, goal).tolist() == [[3.0, 0.0]]
     assert not routes.reaches(begin, goal)
-    assert Routes(Zones(), 0.2).reaches(begin, goal)
+    assert RoutesAroundZones(Zones(), 0.2).reaches(begin, goal)
 
 
 def placemark(*parts: str, name: str = "roof") -> str:

@@ -5,7 +5,7 @@ import pytest
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
 from skytether.shared.endpoints.endpoint import Datagram, Endpoint
 from skytether.sim.hosts import Clock
-from skytether.sim.process import Process
+from skytether.sim.process import VirtualProcess
 from skytether.sim.world import World
 
 
@@ -38,7 +38,7 @@ class Run(Endpoint):
 
 class Hosted:
     def __init__(self) -> None:
-        self.world, self.other, self.process = World(), Run(0), Process("host", Run)
+        self.world, self.other, self.process = World(), Run(0), VirtualProcess("host", Run)
         self.world.add("host", self.process.endpoint, clock=Clock(10**15))
         self.world.add("other", self.other)
         self.ended_ms: list[int] = []
