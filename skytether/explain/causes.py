@@ -16,6 +16,7 @@ from skytether.explain.flying import CaseOutcome, FlyAll
 from skytether.explain.moments import AFTER_S, Moment, comes_about, error_m, is_averted
 from skytether.explain.smallest import smallest
 from skytether.explain.units import Circumstances
+from skytether.shared.endpoints.directions import FLIGHT
 
 BEFORE_S = 8.0
 """Time before a moment in which its cause is searched first [s]; longer than two time-outs, a
@@ -175,12 +176,11 @@ def _group(unit: Unit) -> str:
     match unit:
         case Bad():
             what = "late packets" if unit.is_late else "other losses"
-            return f"{what} of the {WAYS[unit.lane[1]]}"
+            return f"{what} of the {FLIGHT[unit.lane[1]]}"
         case _:
             return named(unit)
 
 
-WAYS = ("uplink", "downlink")
 WHAT = {
     (False, False): "outage",
     (False, True): "lost packet",
@@ -196,7 +196,7 @@ def named(unit: Unit) -> str:
         case Setting():
             return unit.name
         case UsualDelay():
-            return f"usual delay of the {WAYS[unit.direction]}"
+            return f"usual delay of the {FLIGHT[unit.direction]}"
         case Stall():
             return f"stall of the {unit.process}"
         case Bad():
@@ -205,7 +205,7 @@ def named(unit: Unit) -> str:
 
 def lane_name(lane: Lane) -> str:
     path, direction, flow = lane
-    return f"{WAYS[direction]} {path + 1}" + (f" of vehicle {flow + 1}" if flow else "")
+    return f"{FLIGHT[direction]} {path + 1}" + (f" of vehicle {flow + 1}" if flow else "")
 
 
 def rescues(
