@@ -3,7 +3,7 @@
 from collections.abc import Collection
 from contextlib import suppress
 
-from skytether.shared.base.errors import ConfigError
+from skytether.shared.base.errors import NotInstalledError
 from skytether.shared.base.hint import hint
 from skytether.shared.scenario import rooms
 from skytether.shared.scenario.registry import IMPAIRMENTS, TRIGGERS, load
@@ -20,15 +20,16 @@ def preload(changeable: Collection[str]) -> None:
         ("network.uplink", IMPAIRMENTS, "skytether.netem.impairments.guarded"),
     ):
         for name in table if key in changeable else ():
-            with suppress(ConfigError):  # a package that is not installed
+            with suppress(NotInstalledError):  # a package that is not installed
                 modules += [] if table[name].is_ours else [guarded]
     if "network.uplink" in changeable:
-        modules += ["skytether.netem.bottleneck", "skytether.shared.base.folders"]
+        modules.append("skytether.shared.base.folders")
+        with suppress(NotInstalledError):  # the package of queues
+            load("skytether.netem.bottleneck", "a change")
     if "armed" in changeable:
         modules.append("skytether.client.orders")
     if changeable:
         modules += [f"skytether.shared.scenario.{each}" for each in ("forms", "wrong_values")]
         hint("", ())  # imports difflib
     for module in modules:
-        with suppress(ConfigError):
-            load(module, "a change")
+        load(module, "a change")
