@@ -7,7 +7,6 @@ accepted. Deadlines of the vehicle are counted in its own steps, because a froze
 act; all others in virtual time. A "life" is one run of an endpoint, from start to restart.
 """
 
-import io
 import math
 from collections import OrderedDict, deque
 from collections.abc import Callable, Iterator, Sequence
@@ -212,7 +211,7 @@ class WatchedLife(Recorder):
         rekey_ns: int,
         drifted_m: float,
     ) -> None:
-        super().__init__(client_columns(scenario.model.axes), io.BytesIO())
+        super().__init__(client_columns(scenario.model.axes))
         self.links = [WatchedLink(self, each) for each in links]
         """Links to the server, and to the standby server if there is one."""
         self.vehicle, self._number = vehicle, number
