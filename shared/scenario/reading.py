@@ -228,8 +228,7 @@ def _with_files(scenario: Scenario, source: str, checked: schema.Scenario | None
             contents |= {file.name: file for file in files_of(key, text, source, own)}
     if not contents:
         return scenario
-    keys = {name: getattr(scenario, name) for name in Scenario.__struct_fields__}
-    return WithFiles(**keys, contents=tuple(contents.values()))
+    return WithFiles(**msgspec.structs.asdict(scenario), contents=tuple(contents.values()))
 
 
 def _naming_files(scenario: schema.Scenario) -> list[tuple[str, str]]:

@@ -425,10 +425,7 @@ class Scenario(Section, frozen=True):
         return file_of(self.files, file).content if self.reference.shape in rooms.FROM_FILE else b""
 
     def sections(self) -> Iterator[Section]:
-        for name in self.__struct_fields__:
-            section = getattr(self, name)
-            if isinstance(section, Section):
-                yield section
+        return (each for each in msgspec.structs.astuple(self) if isinstance(each, Section))
 
     def section(self, kind: type[S]) -> S:
         """Section that a room brings."""

@@ -12,13 +12,19 @@ from skytether.cli import recordings
 from skytether.explain import mission, picture
 from skytether.explain.cases import FlightCase
 from skytether.explain.explanation import FIRST, STEPS, Explanation, check_same, explain
-from skytether.explain.flying import CaseOutcome, fly, trace
+from skytether.explain.flying import CaseOutcome, fly
 from skytether.explain.hypotheses import hypotheses
 from skytether.figures import flights as figures
 from skytether.lab.commands.pool import Flags, Interrupted, PoolFlags, crew
 from skytether.shared.missions.mission import Mission
 from skytether.shared.scenario.whole import Scenario
-from skytether.shared.telemetry.record import PACKET_COLUMNS, RECORDING, FlightEvent, Record
+from skytether.shared.telemetry.record import (
+    PACKET_COLUMNS,
+    RECORDING,
+    FlightEvent,
+    Record,
+    trace_hash,
+)
 from skytether.shell.commandline import command
 from skytether.shell.commandline.argument import Argument
 from skytether.shell.commandline.command import CommandError, ScenarioFlags, ScenarioName
@@ -131,7 +137,7 @@ def _recorded(recorded: Recorded) -> tuple[str, FlightCase, str]:
         vehicles=len(np.unique(client["vehicle"])),
         secure=recorded.about.secure,
     )
-    return recorded.about.scenario, case, trace(client)
+    return recorded.about.scenario, case, trace_hash(client)
 
 
 def _explain(options: ExplainOptions, name: str, case: FlightCase, recorded: str) -> None:

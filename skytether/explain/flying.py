@@ -3,7 +3,6 @@
 A case and its outcome can be sent to another process and back.
 """
 
-import hashlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -21,7 +20,7 @@ from skytether.shared.events.flight import Failure, FlowOpened, Flying
 from skytether.shared.law.model import Array, Flags, Indices
 from skytether.shared.law.motion import SPACING
 from skytether.shared.scenario.whole import Scenario
-from skytether.shared.telemetry.record import DOWNLINK, UPLINK, Record, Rows
+from skytether.shared.telemetry.record import DOWNLINK, UPLINK, Record, Rows, trace_hash
 from skytether.shared.telemetry.summary import position_error, separations
 from skytether.shared.wire.protocol import Mode
 from skytether.sim import flight
@@ -79,7 +78,7 @@ class CaseOutcome:
     """Time of flight of the failure [s]; 0 if there was none."""
     packets_per_s: float
     trace: str
-    """Hash of the vehicles' rows, see `trace`."""
+    """Hash of the vehicles' rows, see `trace_hash`."""
     hypotheses: tuple[Hypothesis, ...] = ()
     """Assumptions of the theorem of separation, and whether they held; empty without a mission."""
     waits: tuple[Wait, ...] = ()
@@ -165,15 +164,10 @@ def outcome(scenario: Scenario, record: Record, reasons: Sequence[Reason] = ()) 
             0.0,
         ),
         len(record.netem) / max(1.0, float(np.ptp(record.netem["arrived_ns"])) / SECOND_NS),
-        trace(record.client),
+        trace_hash(record.client),
         hypotheses(record, scenario) if scenario.keeps_apart else (),
         waits(record, scenario, reasons) if scenario.keeps_apart else (),
     )
-
-
-def trace(client: Rows) -> str:
-    """Hash of the vehicles' rows, equal if the flights were equal to the last bit."""
-    return hashlib.sha256(client.tobytes()).hexdigest()
 
 
 def _track(scenario: Scenario, rows: Rows, server: Rows, vehicle: int, began_s: float) -> Track:

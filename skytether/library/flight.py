@@ -29,6 +29,7 @@ from skytether.shared.telemetry.record import (
     client_columns,
     plan_columns,
     server_columns,
+    trace_hash,
 )
 from skytether.shared.telemetry.record import Rows as Table
 from skytether.shared.telemetry.summary import Summary, desired, summarise
@@ -152,7 +153,6 @@ class Flight:
         """
         from skytether.explain.cases import FlightCase
         from skytether.explain.explanation import STEPS, explained
-        from skytether.explain.flying import trace
 
         client = self.record.client
         case = FlightCase(self.scenario, len(np.unique(client["vehicle"])) or 1, self.secure)
@@ -173,7 +173,7 @@ class Flight:
                 self.name,
                 at_s=at,
                 seeds=seeds,
-                trace=trace(client),
+                trace=trace_hash(client),
                 on_flight=on_flight,
             )
 

@@ -26,7 +26,7 @@ from skytether.explain.waits import Wait
 from skytether.library.flight import Flight
 from skytether.shared.missions.events import LeftMotion, LeftTube
 from skytether.shared.scenario.whole import Scenario
-from skytether.shared.telemetry.record import Record
+from skytether.shared.telemetry.record import Record, trace_hash
 from skytether.sim import flight
 
 WHOLE = {"horizon": 135}
@@ -261,5 +261,5 @@ def test_a_recorded_mission_over_udp_is_judged_without_another_flight(
 
 def test_asking_changes_nothing_in_a_flight_and_each_plan_has_its_packet() -> None:
     outcome = flying.fly(FlightCase(EIGHT, 8))
-    assert outcome.trace == flying.trace(eight().client)
+    assert outcome.trace == trace_hash(eight().client)
     assert outcome.packets.is_plan.sum() == eight().server["event"].sum()
