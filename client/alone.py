@@ -1,6 +1,6 @@
 """A client with one server, which its vehicle follows, and without saved state.
 
-Rooms may put others in their places: `client.servers` with a standby server, `client.several` with
+Rooms may put others in their places: `client.standby` with a standby server, `client.several` with
 several addresses, and `client.memory`, with which the next run of a client continues in the middle
 of a flight.
 """
@@ -11,17 +11,10 @@ from typing import Any, NamedTuple
 from skytether.client.failsafe import Failsafe
 from skytether.client.link import ClientLink, PlainLink
 from skytether.client.route import Route
-from skytether.shared.base.errors import ConfigError
 from skytether.shared.endpoints.endpoint import Address, Datagram, Events
 from skytether.shared.law.terms import Terms
-from skytether.shared.scenario.catalogue import keys_of
-from skytether.shared.scenario.owners import InFlight
 from skytether.shared.scenario.schema import Scenario
 from skytether.shared.wire.protocol import Message, decode
-
-LEADER_KEY = "link.leader"
-NAMES = ("server", "standby")
-"""Values of that key, by the number of the server."""
 
 
 class MotionInForce(NamedTuple):
@@ -125,7 +118,7 @@ class OneServer:
         failsafe: receives the packets and faults of the server that is followed.
     """
 
-    keys = keys_of(InFlight.LEADER)
+    keys: frozenset[str] = frozenset()
     """Keys with which an operator lets another server lead."""
 
     def __init__(self, failsafe: Failsafe) -> None:
@@ -143,27 +136,11 @@ class OneServer:
         return Role(self.failsafe)
 
     def follow(self, *, step: int, on_ground: bool, now_ns: int) -> None:
-        """Decide which server is followed; called at each step, and on the ground.
-
-        Args:
-            step: step of the vehicle.
-        """
-
-    def check(self, scenario: Scenario) -> None:
-        """Check the values of `keys` at the start.
-
-        Raises:
-            ConfigError: a value may be given only in flight.
-        """
-        if (named := scenario.link.leader) != NAMES[0]:
-            expected = f"expected {NAMES[0]!r}: it is chosen in flight"
-            raise ConfigError(f"{LEADER_KEY}: got {named!r}, {expected}")
+        """Decide which server is followed; called at each step, and on the ground."""
 
     def objection(self, scenario: Scenario) -> str:
         """Why an operator's order about `keys` is refused at present; empty if it is not."""
-        if (named := scenario.link.leader) == NAMES[0]:
-            return ""
-        return f"{LEADER_KEY}: got {named!r}, expected 'server' without a standby server"
+        return ""
 
     def obey(self, scenario: Scenario, *, now_ns: int) -> None:
         """Act on an operator's order about `keys`."""

@@ -9,6 +9,7 @@ own clock, so losing the server does not shift its steps.
 from collections import Counter
 from collections.abc import Sequence
 from functools import cached_property
+from operator import attrgetter
 from typing import TYPE_CHECKING, Any
 
 from skytether.client.alone import Fresh, Parts, Reach
@@ -36,7 +37,7 @@ from skytether.shared.events.flight import (
     address_text,
 )
 from skytether.shared.law.model import Array
-from skytether.shared.scenario.catalogue import keys_of
+from skytether.shared.scenario.catalogue import DECISIONS, keys_of
 from skytether.shared.scenario.owners import InFlight
 from skytether.shared.scenario.registry import load
 from skytether.shared.scenario.schema import Scenario
@@ -47,7 +48,7 @@ from skytether.shared.wire.protocol import CLOSES, Close, Mode, stamp_us
 if TYPE_CHECKING:
     from skytether.client.memory import SavedState
 
-ORDERS = keys_of(InFlight.ARMED, InFlight.LEAP)
+ORDERS = keys_of(InFlight.ARMED) | {*DECISIONS}
 """Keys of an operator's orders to any vehicle, see `orders`."""
 VEHICLE_SOCKET = 1
 """Socket used by the vehicle's own port; the server's is 0."""
@@ -122,11 +123,11 @@ class Client(Endpoint):
         reach = server if isinstance(server, Reach) else Reach(server, link)
         self._servers, self._ends = connect(reach, parts)
         self._sessions: list[ServerSession] = self._servers.sessions
-        if (choice := scenario.vehicle.after_leap) != "ask":
-            expected = "expected 'ask': it is chosen in flight"
-            raise ConfigError(f"vehicle.after_leap: got {choice!r}, {expected}")
-        self._servers.check(scenario)
-        self.changeable = flies.changeable | ORDERS | self._servers.keys
+        for key, undecided in DECISIONS.items():
+            if (got := attrgetter(key)(scenario)) != undecided:
+                expected = f"expected {undecided!r}: it is chosen in flight"
+                raise ConfigError(f"{key}: got {got!r}, {expected}")
+        self.changeable = flies.changeable | ORDERS
         self._log = FlightLog(
             scenario, vehicle, self._pilot, self._failsafe, self._servers, self._events
         )

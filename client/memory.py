@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skytether.client.alone import Fresh, OneServer, Parts
-from skytether.client.leadership import NUMBER_MAX
+from skytether.client.standby.leadership import NUMBER_MAX
 from skytether.client.vehicle import VehicleMemory
 from skytether.shared.base.units import MILLISECOND_NS
 from skytether.shared.law.terms import Terms
@@ -80,13 +80,14 @@ class SavedState(msgspec.Struct, frozen=True, kw_only=True):
     motion: FlownMotion | None = None
     frame: VehicleMemory = VehicleMemory()
     leadership: Annotated[int, msgspec.Meta(ge=0, le=NUMBER_MAX)] = 0
-    """Number of the leadership, see `client.leadership`."""
+    """Number of the leadership, see `client.standby.leadership`."""
 
     def servers(self, parts: Parts) -> OneServer:
         """See `Fresh`: the server may know a leadership of a standby server that there was."""
         if not self.leadership:
             return OneServer(parts.failsafe)
-        servers: OneServer = load("skytether.client.servers", "a standby server").Servers(1, parts)
+        standby = load("skytether.client.standby.servers", "a standby server")
+        servers: OneServer = standby.Servers(1, parts)
         return servers
 
     def after(self, time_ns: int) -> "SavedState":

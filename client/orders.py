@@ -4,12 +4,14 @@
 position. The servers and the vehicle have further keys.
 """
 
+from operator import attrgetter
+
 from skytether.client.alone import OneServer
 from skytether.client.failsafe import Failsafe
 from skytether.client.pilot import Pilot
 from skytether.client.vehicle import Vehicle
 from skytether.shared.events.flight import metres
-from skytether.shared.scenario.catalogue import keys_of
+from skytether.shared.scenario.catalogue import DECISIONS, keys_of
 from skytether.shared.scenario.owners import InFlight
 from skytether.shared.scenario.schema import Scenario
 
@@ -37,6 +39,9 @@ class Orders:
         """
         if keys & self._servers.keys and (objection := self._servers.objection(scenario)):
             return objection
+        for key in sorted(keys & DECISIONS.keys() - LEAP - self._servers.keys):
+            if (got := attrgetter(key)(scenario)) != (only := DECISIONS[key]):
+                return f"{key}: got {got!r}, expected {only!r} without a standby server"
         leap_m, choice = self._pilot.leap_m, scenario.vehicle.after_leap
         if leap_m is None and keys & LEAP and choice != "ask":
             return f"{AFTER_LEAP}: got {choice!r}, expected 'ask' before its position has leapt"

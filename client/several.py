@@ -72,7 +72,8 @@ class Several(Reach):
         if 3 * (link.fixed_ns or 0) > seconds_to_ns(link.timeout_s):
             expected = "expected at most a third of link.timeout_s with a standby server"
             raise ConfigError(f"link.heartbeat_s: got {link.heartbeat_s}, {expected}")
-        servers: OneServer = load("skytether.client.servers", "a standby server").Servers(2, parts)
+        standby = load("skytether.client.standby.servers", "a standby server")
+        servers: OneServer = standby.Servers(2, parts)
         return servers
 
     def _route(

@@ -17,9 +17,9 @@ import numpy as np
 
 from fuzz.torture.courses import Course, FollowedCourse, PlannedCourse
 from skytether.client.failsafe import GOOD_NS, STALL_NS, TRANSITIONS
-from skytether.client.leadership import ASK_SHARE
 from skytether.client.link import ClientLink
 from skytether.client.pilot import LAND_MPS
+from skytether.client.standby.leadership import ASK_SHARE
 from skytether.server.gate import Gate, GateCall, ReplyPath
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS, seconds_to_ns
 from skytether.shared.endpoints.endpoint import EVENTS_MAX, Datagram

@@ -20,14 +20,11 @@ from skytether.shared.endpoints import other_directions
 from skytether.shared.endpoints.endpoint import Endpoint
 from skytether.shared.events.flight import Changed, ChangeRefused, Event
 from skytether.shared.scenario import reading
-from skytether.shared.scenario.catalogue import keys_of
+from skytether.shared.scenario.catalogue import DECISIONS
 from skytether.shared.scenario.dotted import set_keys, text_key, value
-from skytether.shared.scenario.owners import InFlight
 from skytether.shared.scenario.whole import Scenario
 
 REQUEST_BYTES_MAX = 4096
-ONCE = keys_of(InFlight.LEAP, InFlight.LEADER)
-"""Keys of one-time decisions, which no later run of the process repeats."""
 KEY_SHOWN_MAX = 60
 """Largest number of characters of an unknown key repeated in a message."""
 
@@ -97,7 +94,7 @@ class Running:
         # Only after checking the whole scenario: a change is made completely, or not at all.
         self.endpoint.change(scenario, frozenset(values), now_ns=now_ns)
         self._scenario, after = scenario, reading.to_table(scenario)
-        lasting = {key: value for key, value in values.items() if key not in ONCE}
+        lasting = {key: value for key, value in values.items() if key not in DECISIONS}
         if lasting:
             self.settings = {**self.settings, **lasting}
         changed = tuple(

@@ -5,6 +5,7 @@ to one end, or to each end separately. A key without an owner in its type fails 
 """
 
 from collections.abc import Iterator, Mapping
+from operator import attrgetter
 from types import MappingProxyType
 from typing import NamedTuple
 
@@ -39,6 +40,11 @@ TERMS: Mapping[str, str] = MappingProxyType(
     }
 )
 """Dotted key of each term, by the term's field in `Terms`."""
+
+DECISIONS: Mapping[str, object] = MappingProxyType(
+    {name: attrgetter(name)(Scenario()) for name, key in KEYS.items() if key.is_decision}
+)
+"""Keys that are chosen in flight only, and their values until then."""
 
 
 def keys_of(*groups: str) -> frozenset[str]:

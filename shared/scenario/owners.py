@@ -36,8 +36,6 @@ class InFlight(StrEnum):
     ARMED = auto()
     LEAP = auto()
     """Operator's choice after a leap of the position."""
-    LEADER = auto()
-    """Operator's choice of the server that leads."""
     WIND = auto()
     IMPAIRMENT = auto()
 
@@ -48,6 +46,8 @@ class Key(msgspec.Struct, frozen=True):
     """Group with which the key may change in flight; empty if it may not change."""
     term: str = ""
     """Field of `Terms` for a key of both ends; empty if it has the key's name."""
+    is_decision: bool = False
+    """Whether it is chosen in flight only, and once: no later run of the process repeats it."""
 
 
 T = TypeVar("T")

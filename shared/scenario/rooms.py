@@ -40,12 +40,13 @@ ZONES = PluginTable(
 plug-ins cannot add any."""
 
 SECTIONS = {
+    "link": "skytether.client.standby.keys",
     "fence": f"{SHARED}fence.keys",
     "mission": f"{SHARED}missions.keys",
     "mavlink": "skytether.client.mavlink.keys",
     "ros2": "skytether.client.ros2.keys",
 }
-"""Sections of a scenario that rooms bring: the module whose SECTION each is."""
+"""Sections of a scenario that rooms bring, or bring keys of: the module whose SECTION each is."""
 
 FILES = {"mission.zones": (ZONES, 4_000_000)}
 """Keys of rooms whose text may name files, see `reading.FILES`."""

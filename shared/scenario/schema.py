@@ -243,7 +243,8 @@ class VehicleConfig(Section, frozen=True):
     """Action after `land_after_s`: land in place, or return home by the autopilot and land
     there."""
     after_leap: Annotated[
-        Literal["ask", "old", "new", "stay"], Key(Owner.VEHICLE, InFlight.LEAP)
+        Literal["ask", "old", "new", "stay"],
+        Key(Owner.VEHICLE, InFlight.LEAP, is_decision=True),
     ] = "ask"
     """Choice after a leap of the position, made in flight only: subtract the leap (old), accept it,
     so that the fence moves with it (new), or hover on (stay); see docs/failsafe.md."""
@@ -346,9 +347,6 @@ class LinkConfig(Section, frozen=True):
     spread: OfEach[Literal["auto", "best", "all"]] = "auto"
     """Choice of paths for a message. auto: the paths with the least expected cost, see
     docs/protocol.md; best: the best single path; all: every path."""
-    leader: Annotated[Literal["server", "standby"], Key(Owner.VEHICLE, InFlight.LEADER)] = "server"
-    """Server that leads, chosen by an operator in flight; it leads until it is silent, see
-    docs/operating.md."""
     connect_s: OfVehicle[Interval] = 120.0
     """Longest wait of the vehicle for its first session [s]; a new server compiles for up to a
     minute."""
@@ -406,8 +404,8 @@ class Scenario(Section, frozen=True):
     vehicle: VehicleConfig = VehicleConfig()
     sensor: SensorConfig = SensorConfig()
     network: NetworkConfig = NetworkConfig()
-    link: LinkConfig = LinkConfig()
     simulation: SimulationConfig = SimulationConfig()
+    link: LinkConfig = LinkConfig()
 
     @property
     def files(self) -> Files:
@@ -441,8 +439,7 @@ class Scenario(Section, frozen=True):
         """Scenario of one path alone; the first has the scenario's seed, others one of their own.
 
         Args:
-            index: number of the path, from 0; one more than there are: the network to another
-                server, impaired like the first path.
+            index: number of the path, from 0; one more than there are: to another server.
         """
         path = (*self.paths, self.paths[0])[index]
         network = msgspec.structs.replace(

@@ -8,11 +8,11 @@ from hypothesis import strategies as st
 
 from helpers import packaged
 from skytether.client.endpoint import Client
-from skytether.client.leadership import ASK_SHARE, NUMBER_MAX, Leadership
 from skytether.client.memory import SavedState, recall
-from skytether.client.servers import NOT_THE_LEADER
 from skytether.client.several import STANDBY_SOCKETS, Several
 from skytether.client.simulated.vehicle import SimulatedVehicle, simulated
+from skytether.client.standby.leadership import ASK_SHARE, NUMBER_MAX, Leadership
+from skytether.client.standby.servers import NOT_THE_LEADER
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.base.units import SECOND_NS, seconds_to_ns
 from skytether.shared.endpoints.endpoint import Address, Datagram

@@ -44,7 +44,7 @@ def test_the_documented_keys_change_in_flight() -> None:
     named = {socket: set(re.findall("`([a-z_.0-9]+)`", keys)) for socket, keys in rows}
     assert named["server"] == TRIGGER | POINT | ZONES | GOALS
     assert named["client"] == SimulatedVehicle.changeable | keys_of(
-        InFlight.ARMED, InFlight.LEAP, InFlight.LEADER, ORIGIN
+        InFlight.ARMED, InFlight.LEAP, "leader", ORIGIN
     )
     assert Proxy.changeable == {"network.uplink", "network.downlink"}
     assert named["netem"] == Proxy.changeable | {*RELAY, *RUN}

@@ -13,11 +13,10 @@ from skytether.client.simulated.vehicle import simulated
 from skytether.server.endpoint import Server
 from skytether.shared.base.chance import stream
 from skytether.shared.base.units import SECOND_NS
-from skytether.shared.endpoints.change import ONCE
 from skytether.shared.endpoints.endpoint import Datagram
 from skytether.shared.law.terms import Difference, Terms
 from skytether.shared.scenario import reading
-from skytether.shared.scenario.catalogue import KEYS, TERMS, differences
+from skytether.shared.scenario.catalogue import DECISIONS, KEYS, TERMS, differences
 from skytether.shared.scenario.dotted import flat, set_keys
 from skytether.shared.scenario.owners import Owner
 from skytether.shared.scenario.registry import PLANNERS
@@ -187,7 +186,7 @@ def test_ends_that_differ_in_a_term_are_refused_and_told(key: str, tmp_path: Pat
 
 
 def test_what_is_free_to_differ_changes_no_term(tmp_path: Path) -> None:
-    for key in sorted(KEYS.keys() - TERMS.values() - ONCE):
+    for key in sorted(KEYS.keys() - TERMS.values() - {*DECISIONS}):
         ours, theirs = differing(key, tmp_path)
         assert ours != theirs
         assert ours.terms() == theirs.terms(), key

@@ -36,10 +36,7 @@ ROOMS: dict[str, tuple[str, str]] = {
         "fly demo-two-links --virtual",
     ),
     "a standby server": (
-        (
-            "client/servers.py client/leadership.py shared/wire/lead.py shared/events/standby.py "
-            "sim/standby.py"
-        ),
+        "client/standby shared/wire/lead.py shared/events/standby.py sim/standby.py",
         f"{FLIES} --standby",
     ),
     "several addresses": ("client/several.py", f"{FLIES} --standby"),

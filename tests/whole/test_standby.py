@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from helpers import packaged
-from skytether.client.leadership import Leadership
-from skytether.client.servers import Servers
+from skytether.client.standby.leadership import Leadership
+from skytether.client.standby.servers import Servers
 from skytether.netem.proxy import Proxy
 from skytether.server.endpoint import Server
 from skytether.shared.endpoints.change import Running

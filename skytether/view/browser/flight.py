@@ -8,8 +8,9 @@ from typing import Any
 
 import msgspec
 
-from skytether.shared.endpoints.change import ONCE, Answer
+from skytether.shared.endpoints.change import Answer
 from skytether.shared.events.flight import Changed
+from skytether.shared.scenario.catalogue import DECISIONS
 from skytether.shared.telemetry.feed import Frame, Opened, Said
 from skytether.shell.driving.control import NETEMS, PROCESSES
 from skytether.shell.host.compiling import progress
@@ -18,7 +19,7 @@ from skytether.view.page import controls
 from skytether.view.page.changes import Mark, mark, together
 from skytether.view.page.state import LIVE_POINT, State
 
-FINAL = {*ONCE, "armed"}
+FINAL = {*DECISIONS, "armed"}
 """Keys whose changes cannot be undone: single decisions, and `armed`, which may end a flight."""
 
 

@@ -1,7 +1,7 @@
 """The servers of a vehicle: chooses which one leads, and tells each by LEAD messages.
 
-The vehicle changes the leader by the rules of `client.leadership`; packets and faults of the leader
-alone reach the failsafe.
+The vehicle changes the leader by the rules of `leadership`; packets and faults of the leader alone
+reach the failsafe.
 
 It takes the place of `client.alone.OneServer`; `client.several` loads it if there is a standby
 server, and `client.alone.Reach` if an earlier run of the client had one.
@@ -10,10 +10,11 @@ server, and `client.alone.Reach` if an earlier run of the client had one.
 from dataclasses import dataclass
 from typing import Any
 
-from skytether.client.alone import LEADER_KEY, NAMES, OneServer, Parts, Role
+from skytether.client.alone import OneServer, Parts, Role
 from skytether.client.failsafe import CLOSING
-from skytether.client.leadership import Leadership
 from skytether.client.session import ServerSession
+from skytether.client.standby.keys import LinkConfig
+from skytether.client.standby.leadership import Leadership
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS, seconds_to_ns
 from skytether.shared.events.flight import address_text
 from skytether.shared.events.standby import LeaderChanged, LimitsDiffer
@@ -27,6 +28,9 @@ from skytether.shared.wire.drop import ProtocolError
 from skytether.shared.wire.lead import Lead, decode_led
 from skytether.shared.wire.protocol import Message
 
+LEADER_KEY = "link.leader"
+NAMES = ("server", "standby")
+"""Values of that key, by the number of the server."""
 SOON_NS = 200 * MILLISECOND_NS
 """Time after which a server that has to lead is sent LEAD again if it has not answered [ns]."""
 GROUND_NS = 3 * SECOND_NS
@@ -61,6 +65,8 @@ class Servers(OneServer):
         count: number of servers.
         parts: parts of the client.
     """
+
+    keys = frozenset({LEADER_KEY})
 
     def __init__(self, count: int, parts: Parts) -> None:
         super().__init__(parts.failsafe)
@@ -162,10 +168,10 @@ class Servers(OneServer):
         return True
 
     def obey(self, scenario: Scenario, *, now_ns: int) -> None:
-        self.name(NAMES.index(scenario.link.leader), now_ns=now_ns)
+        self.name(NAMES.index(scenario.section(LinkConfig).leader), now_ns=now_ns)
 
     def objection(self, scenario: Scenario) -> str:
-        named = scenario.link.leader
+        named = scenario.section(LinkConfig).leader
         server = NAMES.index(named)
         if server >= len(self.sessions):
             return f"{LEADER_KEY}: got {named!r}, expected 'server' without a standby server"

@@ -1,0 +1,19 @@
+"""Key of a vehicle with a standby server."""
+
+from typing import Annotated, Literal
+
+from skytether.shared.scenario import schema
+from skytether.shared.scenario.owners import Key, Owner
+
+
+class LinkConfig(schema.LinkConfig, frozen=True):
+    """Time limits of a session, and its leader."""
+
+    leader: Annotated[
+        Literal["server", "standby"], Key(Owner.VEHICLE, "leader", is_decision=True)
+    ] = "server"
+    """Server that leads, chosen by an operator in flight; it leads until it is silent, see
+    docs/operating.md."""
+
+
+SECTION = LinkConfig
