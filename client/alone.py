@@ -45,7 +45,7 @@ class Fresh:
         self.boot_id = boot_id
 
     def servers(self, parts: "Parts") -> "OneServer":
-        """Servers of a client that reaches one; an earlier run may have reached more."""
+        """Servers of a client that reaches one, and knows of no other from an earlier run."""
         return OneServer(parts.failsafe)
 
     @property

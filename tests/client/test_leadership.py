@@ -384,6 +384,15 @@ def test_a_fixed_heartbeat_that_is_too_rare_for_a_standby_is_refused() -> None:
         Vehicle(rare)
 
 
+@pytest.mark.parametrize("has_standby", [False, True])
+def test_the_leader_is_chosen_in_flight_only(has_standby: bool) -> None:
+    flown = packaged("demo", link={"leader": "standby"})
+    with pytest.raises(
+        ConfigError, match=r"^link\.leader: got 'standby', expected 'server': it is"
+    ):
+        Vehicle(flown, has_standby=has_standby)
+
+
 def test_only_the_answer_to_a_recent_question_is_a_sign_of_life(vehicle: Vehicle) -> None:
     vehicle.step(0.1)
     for server in (0, 1):
