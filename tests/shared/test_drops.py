@@ -7,6 +7,7 @@ from typing import Any
 import msgspec
 import pytest
 
+from skytether.client.standby.servers import NOT_THE_LEADER
 from skytether.shared.telemetry.drops import DirectionCounts, counted, drops
 from skytether.shared.wire.drop import Drop
 
@@ -45,4 +46,4 @@ def test_the_page_lists_every_reason() -> None:
     section = OPERATING.read_text().split("## Dropped packets")[1].split("\n## ")[0]
     listed = re.findall(r"^\| `([^`]*)` \|", section, re.MULTILINE)
     of_netem = [f"uplink {each.name}" for each in msgspec.structs.fields(DirectionCounts)]
-    assert listed == [*Drop, *of_netem, "refused", "kernel"]
+    assert listed == [*Drop, NOT_THE_LEADER, *of_netem, "refused", "kernel"]
