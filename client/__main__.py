@@ -64,7 +64,7 @@ class ClientOptions(ProcessOptions):
             help="Path to the server, in place of --server; may be repeated, for one to four paths "
             "at once. LOCAL is an interface, as in wwan0=ground:47000, or an address of this "
             "machine, as in 192.0.2.7=ground:47000 or [2001:db8::7]=ground:47000, or empty for "
-            "any. Of several paths, any may be missing for a time.",
+            "any. Any of several paths may fail for a time.",
         ),
     ] = ()
     standby: Annotated[
@@ -72,9 +72,9 @@ class ClientOptions(ProcessOptions):
         Argument(
             metavar="HOST:PORT",
             append=True,
-            help="A second server, which leads the vehicle when the first is silent, or netem in "
-            "front of it. LOCAL=HOST:PORT as in --path; repeated, it gives each path to that "
-            "server. It may be missing for a time, also at the start. none: no standby server.",
+            help="A second server, or netem in front of it; it leads the vehicle when the first is "
+            "silent. LOCAL=HOST:PORT as in --path; repeated, it gives each path to that "
+            "server. It may be unreachable for a time, also at the start. none: no such server.",
         ),
     ] = ()
     number: Annotated[int, Argument(name="id")] = 1
@@ -103,8 +103,8 @@ class ClientOptions(ProcessOptions):
 def fly(argv: Sequence[str]) -> None:
     """Fly one simulated UAV for `--duration` seconds, or until SIGINT or SIGTERM.
 
-    SIGUSR1 prints the counters so far. The exit code is 1 if no server answers, if there was no
-    plan to fly at any time or at the end, or if the record is incomplete; 2 if the server flies
+    SIGUSR1 prints the counters so far. The exit code is 1 if no server answers, if no plan was ever
+    flown or none was in force at the end, or if the record is incomplete; 2 if the server flies
     another scenario, is full, or has another client with this number.
     """
     options = command.parse(ClientOptions(), argv, "skytether client", fly.__doc__)
@@ -144,9 +144,7 @@ def fly(argv: Sequence[str]) -> None:
         flying = [vehicles.make(scenario, number) for number in numbers]
         memory = stack.enter_context(_memory(options, flying, keyring))
         before = _before(memory, scenario, numbers[0], running.warnings) if memory else None
-        if kernel := sys.modules.get(
-            "skytether.shared.base.kernel"
-        ):  # a vehicle with compiled functions is used
+        if kernel := sys.modules.get("skytether.shared.base.kernel"):  # a simulation with kernels
             from skytether.shared.base import machine_code
 
             terminal.prepare(machine_code.missing())
@@ -224,7 +222,7 @@ def _several(
     scenario: Scenario,
     link: Callable[[], ClientLink],
 ) -> tuple[Reach, dict[int, NetworkPath]]:
-    """How a vehicle reaches its servers, and the path of each of its sockets."""
+    """Routes of a vehicle to its servers, and the network path of each of its sockets."""
     expected = len(scenario.paths)
     if len(paths) > 1 and 1 < expected != len(paths):
         message = f"--path: got {len(paths)}, expected {expected}, as many as network.paths"
@@ -255,7 +253,7 @@ def _standby(options: ClientOptions) -> Sequence[NetworkPath]:
 
 
 def _servers(paths: Sequence[NetworkPath], standby: Sequence[NetworkPath]) -> str:
-    """Servers that the client waits for, for the operator."""
+    """Addresses of the servers that the client waits for, in words."""
 
     def addresses(paths: Sequence[NetworkPath]) -> str:
         return " and ".join(dict.fromkeys(address_text(*path.peer) for path in paths))
@@ -312,7 +310,7 @@ def _before(
         before: SavedState = room.recall(*saved, time.monotonic_ns(), scenario.terms())
     except ValueError as error:
         warnings.append(NotRecalled(vehicle=number, reason=str(error)))
-        # The vehicle may have been armed, so it is armed again only by an operator.
+        # The vehicle may have been armed before: only an operator may arm it again.
         forgotten: SavedState = room.SavedState(frame=VehicleMemory(armed=True))
         return forgotten
     warnings.append(Recalled(vehicle=number, goes_on=before.boot_id is not None))

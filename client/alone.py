@@ -1,6 +1,6 @@
 """A client with one server, which its vehicle follows, and without saved state.
 
-Rooms may put others in their places: `client.standby` with a standby server, `client.several` with
+Other modules replace its parts: `client.standby` with a standby server, `client.several` with
 several addresses, and `client.memory`, with which the next run of a client continues in the middle
 of a flight.
 """
@@ -21,11 +21,11 @@ class MotionInForce(NamedTuple):
     """Motion of a mission that a vehicle flies."""
 
     step: int
-    """Step of its plan."""
+    """Step that the plan was made for."""
     observed: int
     """Step of the observation that the plan was made from."""
     since: int
-    """First step whose input came from it."""
+    """First step whose input was computed from the motion."""
     spacing: int
     """Steps from one knot to the next."""
     numbers: bytes
@@ -41,7 +41,7 @@ class Fresh:
 
     def __init__(self, boot_id: int) -> None:
         self.before: Any = self
-        """What an earlier run has saved: nothing."""
+        """State saved by an earlier run; here this object, which stands for no saved state."""
         self.boot_id = boot_id
 
     def servers(self, parts: "Parts") -> "OneServer":
@@ -50,16 +50,16 @@ class Fresh:
 
     @property
     def unsaved(self) -> bool:
-        """Whether the next run would not go on from the present state, although it should."""
+        """Whether saving the present state has failed, so that the next run lacks it."""
         return False
 
     @property
     def is_stale(self) -> bool:
-        """Whether the client, if it was started again now, would go on from an earlier state."""
+        """Whether the saved state is older than the present state."""
         return False
 
     def keep(self, state: Callable[[], dict[str, Any]], *, now_ns: int) -> bytes | None:
-        """Bytes to be written, if the state has changed."""
+        """State to be saved, as bytes; None if the state has not changed."""
         return None
 
     def may_tell(self, state: Callable[[], dict[str, Any]], *, now_ns: int) -> bool:
@@ -71,7 +71,7 @@ class Fresh:
 
 
 class Role:
-    """What a server is to its vehicle. The plain form: the vehicle follows its only server.
+    """Role of a server for its vehicle. In this base class the vehicle follows its only server.
 
     Args:
         failsafe: receives the packets and faults of a server that the vehicle follows.
@@ -88,9 +88,9 @@ class Role:
         self.heard: Callable[..., None] = failsafe.heard
         """Notes a packet of the session."""
         self.malformed: Callable[..., None] = failsafe.malformed
-        """Notes a malformed message that was sent by the server itself."""
+        """Notes a malformed message that proves to be from the server."""
         self.meet: Callable[..., None] = failsafe.meet
-        """Acts on a cause on the server's side."""
+        """Passes a failsafe cause that concerns the server to the failsafe."""
 
     def begin(self) -> None:
         """Note another session with the server."""
@@ -99,23 +99,23 @@ class Role:
         """Raise ProtocolError if the plan that was decoded last must not be flown."""
 
     def take(self, message: Message, now_ns: int) -> bool:
-        """Take a message of the room; False if it has none."""
+        """Process a message about leadership; False if it is another message."""
         return False
 
     def lost_after_ns(self, timeout_ns: int) -> int:
         """Silence after which the server counts as lost [ns].
 
         Args:
-            timeout_ns: the same for a server that the vehicle follows [ns].
+            timeout_ns: this silence for a server that the vehicle follows [ns].
         """
         return timeout_ns
 
 
 class OneServer:
-    """Servers of a vehicle: one, which it follows.
+    """The only server of a vehicle, which the vehicle follows.
 
     Args:
-        failsafe: receives the packets and faults of the server that is followed.
+        failsafe: receives the packets and faults of that server.
     """
 
     keys: frozenset[str] = frozenset()
@@ -124,7 +124,7 @@ class OneServer:
     def __init__(self, failsafe: Failsafe) -> None:
         self.failsafe = failsafe
         self.sessions: list[Any] = []
-        """Session with each server; the caller appends them."""
+        """Session with each server; the caller appends the sessions."""
 
     @property
     def followed(self) -> Any:
@@ -132,14 +132,14 @@ class OneServer:
         return self.sessions[0]
 
     def role(self, server: int) -> Role:
-        """What a server is to the vehicle."""
+        """Role of a server for the vehicle."""
         return Role(self.failsafe)
 
     def follow(self, *, step: int, on_ground: bool, now_ns: int) -> None:
-        """Decide which server is followed; called at each step, and on the ground."""
+        """Choose the server that the vehicle follows; called at each step, also on the ground."""
 
     def objection(self, scenario: Scenario) -> str:
-        """Why an operator's order about `keys` is refused at present; empty if it is not."""
+        """Why an operator's order about `keys` is refused at present; empty if it is accepted."""
         return ""
 
     def obey(self, scenario: Scenario, *, now_ns: int) -> None:
@@ -166,14 +166,14 @@ class Parts(NamedTuple):
     motion: Callable[[], MotionInForce | None]
     """Returns the motion in force of a mission; None on the ground, or without one."""
     may_tell: Callable[[int], bool]
-    """Saves the state if the client does so; returns whether it may be sent at a time [ns]."""
+    """Saves the state if needed; returns whether packets may be sent at a time [ns]."""
     out: list[Datagram]
     events: Events
     """List to which events for the operator are appended."""
 
 
 class Reach:
-    """How a vehicle reaches its servers. The plain form: one server at one address.
+    """Routes and links from a vehicle to its servers; in this base class one server, one address.
 
     Args:
         server: address of the server, or of the netem in front of it.

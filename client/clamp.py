@@ -1,7 +1,7 @@
-"""Last bound of every input, whichever part of the client chose it.
+"""Last bound on all inputs, independent of the part of the client that chose them.
 
-It shares no code with packet decoding or the choice of the input, so that a mistake there stops
-here. Only the fence acts after it: an input that leads back inside may change faster than this
+It shares no code with packet decoding or the choice of the input, so that it also stops errors
+there. Only the fence acts after it: an input that leads back inside may change faster than this
 bound allows.
 """
 
@@ -14,10 +14,10 @@ ROUNDING = 1e-9
 
 
 class Guard(Protocol):
-    """A room's limit on inputs, which acts after this bound, such as a fence."""
+    """Limit on inputs that is applied after the bound u_max, such as a fence."""
 
     holds: bool
-    """Whether it limited the latest requested input."""
+    """Whether the guard limited the latest requested input."""
 
     def limited(
         self, wanted: Sequence[float], state: Sequence[tuple[float, float]], u_max: Sequence[float]
@@ -50,7 +50,7 @@ def clamped(
         without_feedback: part of `wanted` that is not feedback, of each axis [m/s].
         speed_max: bound of the magnitude of that part over all axes [m/s].
     """
-    # Before any min and max, whose results depend on the order of arguments if one is NaN.
+    # Checked before min and max: with NaN, their results depend on the order of the arguments.
     if not all(map(math.isfinite, (*wanted, *without_feedback))):
         return None
     excess = 0.0

@@ -1,10 +1,10 @@
-"""The clock of an autopilot or a robot, converted to the client's. For an autopilot it is the time
-since its boot, asked for by TIMESYNC; for a robot see `client.ros2.odometry`.
+"""Conversion of an autopilot's or a robot's clock to the client's. An autopilot returns the time
+since its boot in answer to TIMESYNC; for a robot see `client.ros2.odometry`.
 
     the client asks at t₁; the answer, at which the autopilot's clock showed b, arrives at t₂:
     offset = (t₁ + t₂) / 2 - b, with an error of at most (t₂ - t₁) / 2
 
-Answers much slower than the fastest of the window are left out. A line through the rest gives
+Answers much slower than the fastest in the window are ignored. A line fitted to the rest gives
 offset and drift. Any two answers bound the drift:
 
     drift = (offset₂ - offset₁) / (t₂ - t₁), with an error of at most the mean of both round trips
@@ -25,19 +25,19 @@ WINDOW = 64
 KNOWN = 4
 """Number of answers needed for a usable clock."""
 ASKED_MAX = 16
-"""Number of open questions; older ones are given up."""
+"""Largest number of unanswered questions; older questions are discarded."""
 ROUND_TRIP_MAX_NS = SECOND_NS
 """Longest round trip of an answer that is used, for an autopilot aboard."""
 SPREAD_NS = MILLISECOND_NS
 """An answer is used if its round trip is at most 1.5 times the shortest, plus SPREAD_NS."""
 DRIFT_SPAN_NS = 10 * SECOND_NS
-"""Time span of the answers above which drift is fitted."""
+"""Shortest time span of the answers from which the drift is fitted."""
 DRIFT_MAX = 0.02
-"""Largest drift of the autopilot's clock that is followed: PX4's own simulator runs 0.9 % slow."""
+"""Largest usable drift of the autopilot's clock: PX4's own simulator runs 0.9 % slow."""
 WANDER = 500e-6
 """Largest change of the drift within the window, from a warming crystal or a busy simulator."""
 RATED = 8
-"""Number of newest answers that give the rate of a clock that cannot be followed."""
+"""Number of newest answers from which the rate of an unusable clock is computed."""
 JUMP_NS = 100 * MILLISECOND_NS
 """Deviation of an answer, beyond its round trip, that suggests a jump of the clock."""
 JUMPS = 3
@@ -69,8 +69,7 @@ class BootClock:
         self.drift = 0.0
         """Rate at which the client's clock gains on the autopilot's."""
         self._answers: deque[tuple[int, int]] = deque(maxlen=RATED)
-        """Newest answers, whether or not the line fits them: the client's clock and time since boot
-        [ns]."""
+        """Newest answers, used or not: time on the client's clock, and time since boot [ns]."""
         self.jumps = 0
         """Number of jumps of the autopilot's clock, mostly reboots."""
 
@@ -90,7 +89,7 @@ class BootClock:
             return None
         (local_ns, boot_ns), (local_after_ns, boot_after_ns) = self._answers[0], self._answers[-1]
         passed_ns, boot_passed_ns = local_after_ns - local_ns, boot_after_ns - boot_ns
-        # Error bounds of two answers as above; a reboot (negative time) is not a wrong rate.
+        # Sum of the error bounds of two answers; a reboot (negative time) is not a wrong rate.
         error_ns = 2 * (self.round_trip_ns or 0) + SPREAD_NS
         if (
             boot_passed_ns <= 0
@@ -101,7 +100,7 @@ class BootClock:
 
     @property
     def rate_fault(self) -> str:
-        """Rate of a clock that cannot be followed, in words; empty if it can be."""
+        """Message about the rate of an unusable clock; empty if the clock is usable."""
         rate = self.wrong_rate
         return "" if rate is None else f"{rate:.3g}, expected 1 within {DRIFT_MAX:.0%}"
 

@@ -44,7 +44,7 @@ class Compensator:
             horizons = load("skytether.client.horizons", f"control.scheme {terms.scheme}")
             self._horizons = horizons.Horizons(self._constants)
         self.begins = 0
-        """Step of stage 0: the step that the horizon was made for, or the step of its drop."""
+        """Step of stage 0: that for which the horizon was made, or at which it was dropped."""
         self.follower: Follower = self._braking(np.zeros(terms.axes))
         """Follower of the horizon in force; without a horizon, of the braking curve."""
         self._chosen = 0
@@ -59,7 +59,7 @@ class Compensator:
         self.covered = False
         """Whether the horizon in force has an input for the latest chosen step."""
         self.stale = 0
-        """Number of horizons that arrived after a newer one, or again."""
+        """Number of horizons that arrived after a newer horizon or a second time."""
         self.repeated = 0
         """Number of times that the horizon in force arrived again, because the server did not know
         that it had arrived."""
@@ -74,13 +74,13 @@ class Compensator:
 
         Raises:
             ProtocolError: the horizon is too far in the future; its observation is in the
-                future, or too old for any input; all of its inputs were due before it arrived, or
-                so many after its committed steps that other inputs were flown instead; or it is a
+                future, or too old for any input; it arrived after its last input was due, or too
+                long after its committed inputs, so that other inputs were flown; or it is a
                 mission's motion whose first knot is in the future.
         """
         if horizon.step > step + self._H:
             raise ProtocolError(Drop.FROM_THE_FUTURE)
-        # The newest generation wins, whatever the order of arrival (E11).
+        # The horizon made for the latest step is flown, in any order of arrival (E11).
         if horizon.step <= self.newest:
             self.stale += 1
             self.repeated += horizon.step == self.in_force
@@ -94,8 +94,8 @@ class Compensator:
         if length < 1:
             raise ProtocolError(Drop.TOO_OLD)
         if self._join and horizon.step > step:
-            # The server's estimate of the vehicle's step is ahead. Before its first knot the motion
-            # is not yet in force, and flying it now would be a leap.
+            # The server estimated a later step than the vehicle's. Flying the motion before the
+            # step of its first knot would make the reference jump.
             raise ProtocolError(Drop.TOO_EARLY)
         is_late = bool(self._join) and step - horizon.step > self._join
         if is_late or self._comes_too_late(horizon, step - horizon.step, length):
@@ -117,22 +117,22 @@ class Compensator:
         *,
         since: int | None = None,
     ) -> None:
-        """Put a spline in force: a new one, or one that an earlier run of this client accepted.
+        """Put a spline in force: a new spline, or one accepted by an earlier run of this client.
 
         Args:
             made_for: step of the first knot.
             observed: step of the observation that the spline was planned from.
             spacing: steps from one knot to the next.
             knots: position [m] and velocity [m/s] of each knot; shape (axes, knots, 2).
-            since: first step whose input came from it, in the earlier run.
+            since: first step whose input came from the spline, in the earlier run.
         """
         self._put_in_force(made_for, observed)
         if since is not None:
             self.since, self._new = since, False
         length = lasting(self._age_max + self._H, made_for, observed, self._age_max)
         if self._join:
-            # A mission's motion is flown to its last knot, however old its observation is by then:
-            # other vehicles keep clear of all of it, and of nothing else.
+            # A mission's motion is flown to its last knot, even if its observation is then too old:
+            # other vehicles avoid exactly this motion, to its end.
             length = max(length, spacing * (knots.shape[1] - 1) + 1)
         self.follower = SplineFollower(self._constants, knots, spacing, length)
 
@@ -150,7 +150,7 @@ class Compensator:
         self.begins, self.follower = step, self._braking(flown_last)
 
     def _braking(self, flown: Array) -> HorizonFollower:
-        """Horizon of one input that has ended, so that the rule of flight brakes from it."""
+        """Ended horizon with the single input `flown`, from which the rule of flight brakes."""
         return HorizonFollower(self._constants, flown[:, None], 1)
 
     def rest(self, step: int, state: Array) -> None:
@@ -192,7 +192,7 @@ class Compensator:
     def choose(
         self, step: int, state: Array, disturbance: Array, before: Array
     ) -> tuple[list[float], list[float]]:
-        """Input u* of a step, and the same without feedback, on each axis [m/s]; see
+        """Inputs u* of a step with and without feedback, on each axis [m/s]; see
         `Follower.input_at`.
 
         `step` never decreases.
@@ -209,7 +209,7 @@ class Compensator:
         return flown, without_feedback
 
     def flown_since(self, step: int) -> int:
-        """First step whose input comes from the horizon in force, if `step` is the next one."""
+        """First step whose input comes from the horizon in force, where `step` is the next step."""
         return step if self._new else self.since
 
     def foresee(self, states: Array, flown: Array | None = None) -> Array:

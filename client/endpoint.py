@@ -53,7 +53,7 @@ ORDERS = keys_of(InFlight.ARMED) | {*DECISIONS}
 VEHICLE_SOCKET = 1
 """Socket used by the vehicle's own port; the server's is 0."""
 LATEST_NS = SECOND_NS
-"""Time after the end of its motion within which a client that is asked to end does so [ns]."""
+"""Longest time between the end of the motion and the end of a client asked to end [ns]."""
 TIME_NS, TIME_ERROR_MAX_US = 2 * SECOND_NS, 2**32 - 1
 """Interval between two reports of the time of day [ns], and the largest error that fits in one
 [µs]."""
@@ -64,8 +64,8 @@ class Client(Endpoint):
 
     Args:
         scenario: scenario of the vehicle; its terms must equal the server's.
-        server: address of the server, or of the netem in front of it; or how the vehicle reaches
-            several, see `client.several`.
+        server: address of the server, or of the netem in front of it; or a `Reach` of several
+            servers or paths, see `client.several`.
         vehicle: number of the vehicle, unique among the vehicles of the server.
         boot_id: number unique to this run of the client.
         link: link to the server at an address; None: without keys.
@@ -195,7 +195,7 @@ class Client(Endpoint):
             horizon = session.hear(datagram.payload, path=path, now_ns=now_ns)
             if self._pilot.next_ns is None:
                 self._begin(now_ns)
-            elif self._failsafe.mode is Mode.INIT:  # the flight went on before there was a session
+            elif self._failsafe.mode is Mode.INIT:  # the earlier run's flight continues
                 self._failsafe.meet(Reason.OPENED, now_ns=now_ns)
             elif horizon is not None:
                 self._pilot.offer(horizon, now_ns=now_ns)
@@ -238,7 +238,7 @@ class Client(Endpoint):
     # -- saved state -------------------------------------------------------------------------
 
     def _to_keep(self) -> dict[str, Any]:
-        """Fields of `memory.SavedState`; on the ground those that change there."""
+        """Fields of `memory.SavedState`; on the ground only those that change on the ground."""
         pilot, always = self._pilot, {"frame": self._flies.frame} | self._servers.to_keep()
         if pilot.next_ns is None:
             return always
@@ -324,8 +324,8 @@ class Client(Endpoint):
         if pilot.step >= pilot.steps:
             self._flies.land()
             self._log.report_end(now_ns)
-        # Nothing is sent before the state is saved, or the disk has failed: otherwise the server
-        # would not know which motion the next run flies.
+        # Nothing is sent before the state is saved or saving has failed: otherwise the server would
+        # not know which motion the next run flies.
         if self.keeps:
             may_tell = self._may_tell(now_ns)
             self.waits_for_disk = self._memory.is_stale
@@ -373,7 +373,7 @@ class Client(Endpoint):
         session.tell_time(self._pilot.flown, epoch_us, error_us, now_ns=now_ns)
 
     def leave(self, *, now_ns: int) -> int:
-        """A vehicle on a mission's motion flies it to its end first."""
+        """Prepare to end: a vehicle on a mission's motion flies to the end of the motion first."""
         self._leaves = True
         if not self._pilot.is_moving:
             return now_ns
@@ -384,7 +384,7 @@ class Client(Endpoint):
         return rests_ns
 
     def close(self, *, now_ns: int) -> None:
-        """Tell the server that the vehicle leaves, and let it land by itself if it can."""
+        """Send CLOSE to the server, and let the vehicle land by itself if it can."""
         if self._port is not None:
             self._port.close(now_ns=now_ns)
             self._attend(self._port, now_ns)

@@ -23,7 +23,7 @@ from skytether.shared.wire.protocol import Mode
 GOOD_NS = SECOND_NS
 """Time for which the link has to be good before horizons are accepted."""
 STALL_NS = 100 * MILLISECOND_NS
-"""Lateness of a step above which the present plan counts as too old, whatever the cause."""
+"""Lateness of a step above which the present plan counts as too old, for any cause."""
 LATE_NS = 500 * MILLISECOND_NS
 """Time for which all horizons have to arrive late before the vehicle brakes."""
 LATE_SHARE = 0.75
@@ -40,7 +40,7 @@ BRAKE_SPARE_NS = 500 * MILLISECOND_NS
 """Margin added to the time that braking takes."""
 
 YIELDING = frozenset({Reason.TAKEN, Reason.DISARMED})
-"""Causes for which the vehicle is left to a pilot, or is disarmed."""
+"""Causes after which a pilot flies the vehicle, or nobody because it is disarmed."""
 GROUNDING = frozenset({Reason.BATTERY, Reason.ASTRAY, Reason.RIVAL, Reason.STRAYED})
 BROKEN = frozenset(
     {
@@ -72,8 +72,8 @@ AT_ONCE = YIELDING | {
     Reason.RIVAL,
     Reason.STRAYED,
 }
-"""Causes that take a vehicle off a mission's motion before its last knot: the vehicle itself cannot
-follow it, or a person says so. Every other cause waits for the last knot, see `Failsafe.meet`."""
+"""Causes that end a mission's motion before its last knot: the vehicle cannot follow the motion, or
+a person intervenes. Every other cause waits for the last knot, see `Failsafe.meet`."""
 
 HANGING = frozenset({Mode.SYNC, Mode.READY, Mode.HOVER})
 FOLLOWING = frozenset({Mode.TRACK, Mode.COAST})
@@ -90,8 +90,8 @@ _FAULTS = {(mode, Reason.NOT_FINITE): Mode.FAULT for mode in Mode if mode is not
 _TO_BRAKE = (
     BROKEN | GROUNDING | {Reason.ENDED, Reason.LATE, Reason.STALLED, Reason.UNARMED, Reason.LEAPT}
 )
-# Not in INIT, where nothing is flown yet, nor in LAND, RETURN and FAULT, which last until somebody
-# has attended to the vehicle.
+# Without INIT, in which nothing is flown yet, and without LAND, RETURN and FAULT, which only an
+# operator ends.
 _YIELDS = {
     (mode, cause): Mode.MANUAL
     for mode in Mode
@@ -173,7 +173,7 @@ class Transition(NamedTuple):
     after: Mode
     reason: Reason
     cause: Reason
-    """Cause that changed them; it is not the reason if it is one of `KEPT`."""
+    """Cause of the change; a cause in `KEPT` does not become the reason."""
     takes: bool
     """Whether horizons are accepted from now on."""
 
@@ -210,16 +210,16 @@ class Failsafe:
         self._timeout_ns, self._brake_ns = timeout_ns, brake_ns
         self._land_after_ns = land_after_ns
         self._alone = Reason.HOMEWARD if returns else Reason.ALONE
-        """Cause used after a long silence of the server."""
+        """Cause that ends hovering after a long silence of the server."""
         self.transitions: list[Transition] = []
-        """Transitions on which the pilot has not acted yet, oldest first. It acts after each packet
-        and in each step, so they are few: 5 at most, in tests under faults."""
+        """Transitions on which the pilot has not acted yet, oldest first. The pilot acts after each
+        packet and in each step, so the list is short: 5 at most, in tests under faults."""
         self.mode = Mode.INIT
         self.reason = Reason.BEGUN
         """Newest cause that changed mode or reason; while hovering, why the vehicle braked."""
         self._heard_ns: int | None = None
         self._good_ns = 0
-        """Time since which the link has been good; only valid while it is good."""
+        """Start of the present time with a good link; only valid while the link is good."""
         self._horizon_ns = 0
         self._late_ns: int | None = None
         """Time since which all horizons have been late; None if the newest was in time."""
@@ -235,9 +235,9 @@ class Failsafe:
         self._future: deque[int] = deque(maxlen=FUTURE_MAX)
         """Times of the newest horizons from the future."""
         self.keeps_motion = False
-        """Whether a mission's motion is in force whose last knot lies ahead."""
+        """Whether a mission's motion is in force and its last knot is still ahead."""
         self.postponed: Reason | None = None
-        """First cause that waits for the last knot of that motion; None if there is none."""
+        """First cause that waits for the last knot of the motion in force; None if none waits."""
 
     @property
     def heard_ns(self) -> int | None:
@@ -247,8 +247,8 @@ class Failsafe:
     def takes(self) -> bool:
         """Whether a horizon that arrives now is flown."""
         may = (self.mode, Reason.HORIZON) in self._table
-        # After a stall a newer motion is the better one; after any other cause it comes from a
-        # server that cannot be relied on.
+        # After a stall a newer motion is better; after any other cause the server that sent it is
+        # unreliable.
         may = may and self.postponed in (None, Reason.STALLED)
         return may and self.armed and not self.has_leapt and self.reason not in LOCKING
 
@@ -258,8 +258,8 @@ class Failsafe:
     def _is_good(self, now_ns: int) -> bool:
         """Whether a packet of the session has arrived within two thirds of the time-out.
 
-        A heartbeat comes at least every third of the time-out (`heartbeat.FEWEST`), so one may be
-        lost. The first comes a round trip after WELCOME, which may take a second.
+        A heartbeat arrives at least every third of the time-out (`heartbeat.FEWEST`), so one may be
+        lost. The first arrives a round trip after WELCOME, which may take a second.
         """
         return self._heard_ns is not None and now_ns - self._heard_ns <= self._timeout_ns * 2 // 3
 
@@ -276,7 +276,7 @@ class Failsafe:
         """Continue the flight of an earlier run.
 
         Args:
-            cause: RESUMED if its motion is flown on, LOST if there is none.
+            cause: RESUMED if that run's motion is continued, LOST if there is none.
             heard_ns: time at which that run last received a packet from the server.
         """
         self._heard_ns = self._good_ns = self._horizon_ns = heard_ns
@@ -295,11 +295,11 @@ class Failsafe:
 
     def horizon_taken(self, *, now_ns: int) -> None:
         self._horizon_ns = now_ns
-        self.postponed = None  # a stall, which the newer motion makes good
+        self.postponed = None  # a stall; the newer motion replaces the old one
         self.meet(Reason.HORIZON, now_ns=now_ns)
 
     def malformed(self, *, now_ns: int) -> None:
-        """Note a malformed message that was sent by the server itself."""
+        """Note a malformed message that proves to be from the server."""
         if _full(self._malformed, now_ns):
             self.meet(Reason.MALFORMED, now_ns=now_ns)
 
@@ -362,7 +362,7 @@ class Failsafe:
         """Note a leap of the state: no horizon is accepted until an operator
         has chosen the frame.
         """
-        # With HOLD there is no failsafe, and a leap stops nothing.
+        # With HOLD there is no failsafe, and a leap has no effect.
         self.has_leapt = self.brakes
         if self.reason not in LOCKING:
             self.meet(Reason.LEAPT, now_ns=now_ns)
@@ -371,8 +371,8 @@ class Failsafe:
         self.has_leapt = self.stays = False
 
     def motion_goes_on(self, goes_on: bool, *, now_ns: int) -> None:
-        """Note at each step whether a mission's motion is in force whose last knot lies ahead; at
-        the last knot the postponed cause acts.
+        """Note at each step whether a mission's motion is in force and its last knot still ahead;
+        at the last knot the postponed cause acts.
         """
         self.keeps_motion = goes_on
         if not goes_on and self.postponed is not None:
@@ -382,9 +382,9 @@ class Failsafe:
     def meet(self, cause: Reason, *, now_ns: int) -> None:
         """Act on a cause: change mode and reason, as the table says.
 
-        The other vehicles of a mission keep clear of the motion in force, and of nothing else. So
-        what arrives from the network, or does not, takes no vehicle off its motion: such a cause
-        acts at the last knot, where the vehicle rests, and until then no other motion is accepted.
+        The other vehicles of a mission avoid the motion in force and assume no other. So a faulty
+        or missing packet does not end the motion: such a cause acts at the last knot, where the
+        vehicle rests, and until then no other motion is accepted.
         """
         after = self._table.get((self.mode, cause))
         if after is None:

@@ -1,8 +1,8 @@
-"""Fence: a region that the vehicle never leaves, whatever the server or any plan demands.
+"""Fence: a region that the vehicle never leaves, independent of the server and of plans.
 
-The fence acts after everything that chooses an input, and uses the vehicle's own scenario file
-alone. From the state z = [p, v] in which the next input will take effect, a vehicle with zero input
-drifts on to
+The fence acts after all other limits and choices of the input, and uses only the vehicle's own
+scenario. From the state z = [p, v] in which the next input will take effect, a vehicle with zero
+input drifts on to
 
     s = p + τ v                 and with the input u, by eq. (1):   ṡ = g u + w
 
@@ -52,7 +52,7 @@ class Fence:
         self, wanted: Sequence[float], state: Sequence[tuple[float, float]], u_max: Sequence[float]
     ) -> list[float]:
         """See `client.clamp.Guard`."""
-        # The first known state, not the scenario's start: a real vehicle starts where it stands.
+        # Home is the first known state: a real vehicle need not stand at the scenario's start.
         self._home = self._home or [p for p, _ in state]
         rest = [p + tau * v for (p, v), tau in zip(state, self._tau, strict=True)]
         flown = self._inside(wanted, rest, u_max)
@@ -98,7 +98,7 @@ def _slowed(back: Sequence[float], flown: Sequence[float], speed: float) -> list
     """Fastest input within `speed` on the line between an input that leads back and one that is too
     fast.
 
-    Neither crosses a bound, and the allowed region is convex, so no input between them crosses one.
+    Both inputs are allowed, and the allowed region is convex, so all inputs between them are, too.
     """
     most = math.hypot(*back)
     if most >= speed:

@@ -13,7 +13,7 @@ random walk of w. Measurements are processed one number at a time, z = h x + noi
 
 so a missing number is simply skipped. A delayed measurement describes the step at which it was
 made: the filter's state is kept at that step, and the estimate is this state predicted to the
-present with the inputs since. A constant sensor error cannot be told from the truth.
+present with the inputs since. A constant sensor error cannot be detected.
 
 The covariance P does not depend on the measured values.
 """
@@ -54,7 +54,7 @@ Gain = tuple[float, float, float]
 
 
 def widened(axis: Axis, P: Spread, noise: Spread) -> Spread:
-    """P one step later, F P Fᵀ + Q."""
+    """Covariance P one step later, F P Fᵀ + Q."""
     pv = P.pv + axis.a01 * P.vv + axis.b0 * P.vw  # covariance of the next p and the present v
     pw = P.pw + axis.a01 * P.vw + axis.b0 * P.ww
     vw = axis.a11 * P.vw + axis.b1 * P.ww
@@ -72,7 +72,7 @@ def by_position(P: Spread, variance: float) -> tuple[Gain, Spread]:
     pp, pv, pw, vv, vw, ww = P
     total = pp + variance
     kp, kv, kw = pp / total, pv / total, pw / total
-    # (1 - K) P as variance / total · P: 1 - K loses its digits if the sensor is good.
+    # (1 - K) P computed as variance / total · P: 1 - K loses digits if the sensor is good.
     share = variance / total
     return (kp, kv, kw), Spread(
         share * pp, share * pv, share * pw, vv - kv * pv, vw - kv * pw, ww - kw * pw
@@ -171,7 +171,7 @@ class Kalman:
         self._acted: deque[tuple[Array, Array | None]] = deque(
             [(np.zeros(axes), None)] * delay, delay + 1
         )
-        """Inputs of the steps from there to the present, see `advance` [m/s]."""
+        """Inputs of the last `delay` steps, see `advance` [m/s]."""
         self._late = np.zeros((axes, 2))
         if any(terms.dead_time_s):
             self._late[:] = [each.late for each in rooms.dead_time().dead_times(terms)]

@@ -1,4 +1,4 @@
-"""Fleet: many vehicles in one process, each with a client and a socket of its own."""
+"""Fleet: many vehicles in one process, each with its own client and socket."""
 
 from collections.abc import Sequence
 from heapq import heapify, heappop, heappush

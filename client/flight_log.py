@@ -50,7 +50,7 @@ class FlightLog:
         """Largest lateness of a step so far."""
         self._reported_leap: tuple[float, ...] | None = None
         self.failure: NotFlown | None = None
-        """Why the flight counts as not flown; None if it was, or is under way."""
+        """Event of a failed flight; None if it succeeded or has not ended."""
 
     def report_transitions(self, transitions: Sequence[Transition], now_ns: int) -> None:
         """Report changes of mode or reason.
@@ -78,7 +78,7 @@ class FlightLog:
         return str(Reason.LOST) if is_lost else str(self._servers.followed.idle)
 
     def report_step(self, now_ns: int) -> None:
-        """Report what the pilot has met in the step that it has just flown."""
+        """Report a late step, the fence and a leap, if the newest step had one."""
         pilot = self._pilot
         if self._keeps_apart and pilot.late_ns > max(STALL_NS, self._latest_ns):
             late_s = pilot.late_ns / SECOND_NS
@@ -93,13 +93,13 @@ class FlightLog:
     def _report_leap(self, leap_m: tuple[float, ...] | None) -> None:
         self._reported_leap = leap_m
         if leap_m is not None and self._failsafe.has_leapt:
-            # One second more than after a lost link: positions have to be good again first.
+            # GOOD_NS more than after a lost link: positions have to be good for that time first.
             after_s = self._land_after_s + GOOD_NS / SECOND_NS if self._land_after_s else 0.0
             event = StateLeapt(vehicle=self._vehicle, by_m=leap_m, land_after_s=after_s)
             self._events.append(event)
 
     def report_end(self, now_ns: int) -> None:
-        """Report whether the flight was flown."""
+        """Report the end of the flight: finished, or failed for lack of a plan."""
         pilot, vehicle = self._pilot, self._vehicle
         if pilot.covered and pilot.without_ns <= self._timeout_ns:
             finished = Finished(vehicle=vehicle, steps=pilot.steps, missed=pilot.missed)

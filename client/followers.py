@@ -19,8 +19,8 @@ from skytether.shared.wire.protocol import DISTURBANCE, GAIN_P, GAIN_V, REFERENC
 
 SENT = [GAIN_P, GAIN_V, DISTURBANCE]
 TABLED = [rule.GAIN_P, rule.GAIN_V, rule.DISTURBANCE]
-"""Columns of a horizon's feedback on the wire (SENT), and the columns of the table that they
-fill."""
+"""Columns of a horizon's feedback as sent (SENT), and the corresponding columns of the rule's
+table."""
 
 
 class Follower(Protocol):
@@ -30,7 +30,7 @@ class Follower(Protocol):
     feeds_back: bool
 
     def input_at(self, stage: int, state: Array, disturbance: Array, before: Array) -> Array:
-        """Input u*, and the same without feedback [m/s]; shape (2, axes).
+        """Inputs u* with and without feedback [m/s]; shape (2, axes).
 
         Args:
             stage: present stage.
@@ -55,13 +55,13 @@ class Constants(NamedTuple):
     terms: Terms
     model: Model
     axes: list[Axis]
-    """The model by axis."""
+    """Model of each axis."""
     horizon: Array
-    """Parameters of flight along a horizon that do not depend on it, in the columns of
+    """Parameters that are the same for every horizon of inputs, in the columns of
     `shared.law.rule`; shape (axes, n)."""
     guide: Array
-    """Parameters of flight along a spline that do not depend on it, in the columns of
-    `shared.law.spline`; shape (axes, n)."""
+    """Parameters that are the same for every spline, in the columns of `shared.law.spline`; shape
+    (axes, n)."""
 
     @classmethod
     def of(cls, terms: Terms, regulator: Array) -> Self:

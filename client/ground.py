@@ -25,17 +25,14 @@ class GroundReports:
         self._vehicle, self._server, self._events = vehicle, server, events
         self._silence_ns = timeout_ns + SILENT_NS
         self._waits_for, self._waits_ns, self._reported_wait = "", 0, ""
-        """Reason why the vehicle cannot fly, the time since which it holds, and the reason logged
-        last."""
+        """Present reason why the vehicle cannot fly, its start time, and the last logged reason."""
         self._welcomed: int | None = None
         self._silent_ns: int | None = None
         """Time of the newest packet before the server was reported as silent; None if it is not
         silent."""
 
     def wait(self, waits_for: str, *, now_ns: int) -> None:
-        """Report the reason why the vehicle cannot fly (empty for none), once it has held for a
-        while.
-        """
+        """Report the reason why the vehicle cannot fly (empty for none) if it persists."""
         if waits_for != self._waits_for:
             self._waits_for, self._waits_ns = waits_for, now_ns
         if now_ns - self._waits_ns >= WAITED_NS and waits_for != self._reported_wait:
@@ -44,7 +41,7 @@ class GroundReports:
                 self._events.append(AutopilotWaits(vehicle=self._vehicle, waits_for=waits_for))
 
     def hear(self, session: int, newest_ns: int, *, now_ns: int) -> None:
-        """Report a new session, that its server falls silent, and that packets arrive again.
+        """Report a new session, silence of its server, and the end of the silence.
 
         Args:
             session: number of the session.

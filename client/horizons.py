@@ -1,4 +1,4 @@
-"""Horizons of inputs, as they come into force aboard; loaded with a scheme that sends them."""
+"""Horizons of inputs on the vehicle: acceptance, and choice of the input of a step."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,10 +9,10 @@ from skytether.shared.wire.protocol import Horizon
 
 
 def late_max(horizon: int) -> int:
-    """Number of steps after its committed ones at which a horizon may still come into force.
+    """Number of steps after the committed ones within which a horizon may still come into force.
 
-    By then the vehicle has flown other inputs than its plan begins with. The next plan corrects a
-    few; many would make the server's estimate and its plans oscillate.
+    By then the vehicle has flown other inputs than the first ones of the horizon. The next plan
+    corrects a few; many would make the server's estimate and its plans oscillate.
     """
     # A longer allowance let the estimate oscillate until the vehicle flew away
     # (tests/server/test_slow.py).
@@ -20,7 +20,7 @@ def late_max(horizon: int) -> int:
 
 
 class Horizons:
-    """What differs between horizons of inputs and trajectories when they arrive."""
+    """Handling of arriving horizons of inputs, where it differs from that of trajectories."""
 
     def __init__(self, constants: Constants) -> None:
         terms, self._constants = constants.terms, constants
@@ -35,8 +35,8 @@ class Horizons:
         return horizon.inputs[:, :1].repeat(self._lasts, axis=1)
 
     def is_late(self, horizon: Horizon, stage: int) -> bool:
-        """Whether a horizon with committed inputs arrives at a stage so long after them that other
-        inputs were flown instead.
+        """Whether a horizon arrives at a stage too long after its committed inputs, so that other
+        inputs were flown.
         """
         return self._commits and stage > horizon.inputs.shape[1] - self._H + late_max(self._H)
 

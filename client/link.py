@@ -10,8 +10,7 @@ from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
 HELLO_NS = SECOND_NS
 """Time between two HELLOs in plaintext until the server first answers."""
 AGAIN_NS = 400 * MILLISECOND_NS
-"""Time between two HELLOs otherwise: fewer than the five handshakes a second that a server
-allows."""
+"""Time between two HELLOs otherwise; a server allows at most five handshakes a second."""
 
 
 class ClientLink(Protocol):

@@ -3,19 +3,19 @@
 A process may die at any time and be started again while its vehicle is in the air. So the client
 saves, outside the process:
 
-    the motion in force, on a mission     other vehicles keep clear of this motion alone
+    the motion in force, on a mission     other vehicles avoid exactly this motion
     step 0, on the clock of the host      steps continue to count from it
     the boot id of the conversation       the server recognizes the same client
     the origin of the vehicle's frame     otherwise the flight would be shifted
-    the number of the leadership          plans of an earlier one are not flown
+    the number of the leadership          plans of an earlier leadership are not flown
     whether the vehicle was armed         starting a process must not arm it
 
-A core opens no file: `Client.keep` returns bytes when they have changed, the shell writes them
-(`shell.driving.memory`) and confirms by `Client.kept`. **Nothing is sent to a server before the
-state is saved**: otherwise the next run might fly a motion that the server no longer counts with.
-Where it cannot be saved, because a disk is full, read-only or stuck, the client goes on after
-`WAIT_NS`, and each observation says so: to the servers, a restart of the client is then one without
-saved state.
+A client opens no file: `Client.keep` returns the state's bytes when they have changed,
+`shell.driving.memory` writes them and confirms by `Client.kept`. **Nothing is sent to a server
+before the state is saved**: otherwise the next run might fly a motion that the server no longer
+expects. If it cannot be saved, because a disk is full, read-only or stuck, the client continues
+after `WAIT_NS`, and each observation says so: the servers then treat a restart of the client as one
+without saved state.
 """
 
 from collections.abc import Callable
@@ -36,10 +36,10 @@ from skytether.shared.wire.protocol import KNOTS_MAX
 TIME_MAX_NS = 2**62
 STEP_MAX = 2**40
 REFRESHES = 3
-"""Number of times that the state is written again before it would be too old."""
+"""Number of times that an unchanged state is written again before it would be too old."""
 WAIT_NS = 500 * MILLISECOND_NS
-"""Time after which a client does not wait any longer for its state to be saved [ns]: less than the
-silence after which it asks a standby server."""
+"""Longest time for which a client waits for its state to be saved [ns]: less than the silence after
+which it asks a standby server."""
 
 Time = Annotated[int, msgspec.Meta(ge=-TIME_MAX_NS, le=TIME_MAX_NS)]
 """Time on the host's clock [ns]; in the encoded bytes, relative to the time of writing."""
@@ -50,7 +50,7 @@ class FlownMotion(msgspec.Struct, frozen=True, kw_only=True):
     step: Step
     observed: Step
     since: Step = 0
-    """First step whose input came from it."""
+    """First step whose input was computed from the motion."""
     spacing: Annotated[int, msgspec.Meta(ge=1, le=2**16)]
     numbers: Annotated[bytes, msgspec.Meta(max_length=4 * 3 * 2 * KNOTS_MAX)]
     """Position [m] and velocity [m/s] of each knot, float32 of shape (axes, knots, 2)."""
@@ -97,7 +97,7 @@ class SavedState(msgspec.Struct, frozen=True, kw_only=True):
         return msgspec.structs.replace(self, began_ns=began_ns, heard_ns=heard_ns, frame=frame)
 
     def encode(self, written_ns: int) -> bytes:
-        """Bytes to save, with times relative to that of writing."""
+        """Bytes to save, with times relative to the time of writing."""
         return msgspec.msgpack.encode(self.after(-written_ns))
 
     @classmethod
@@ -123,7 +123,7 @@ class SavedState(msgspec.Struct, frozen=True, kw_only=True):
 def recall(content: bytes, written_ns: int | None, now_ns: int, terms: Terms) -> SavedState:
     """Saved state of an earlier run, as far as it is still valid.
 
-    A flight that was saved longer ago than any motion lasts is not continued.
+    A flight is not continued if its state is older than the longest possible motion.
 
     Args:
         content: bytes written by that run.
@@ -144,7 +144,7 @@ def recall(content: bytes, written_ns: int | None, now_ns: int, terms: Terms) ->
 
 
 def age_max_ns(terms: Terms) -> int:
-    """Age above which a saved state is not used [ns]: no motion is flown for longer."""
+    """Largest age of a saved state that is used [ns]: the longest time of a motion."""
     return terms.age_max * terms.dt_ns
 
 
@@ -161,20 +161,20 @@ class ClientMemory:
         self.boot_id = boot_id if self.before.boot_id is None else self.before.boot_id
         self._age_max_ns = age_max_ns(terms)
         self._handed: tuple[SavedState, int] | None = None
-        """State returned last for writing, and when."""
+        """State that was last returned for writing, and the time of its return [ns]."""
         self._saved = None if self.before.boot_id is None else self.before
-        """State that the next run would follow; None without one."""
+        """Saved state, which the next run would use; None if no state is saved."""
         self._is_removed = False
-        """Whether that state was removed, because it could not be replaced."""
+        """Whether the saved state was removed, because it could not be replaced."""
         self._differs_ns: int | None = None
-        """Time since which another state has to be saved; None once it is saved."""
+        """Time of the first change since the state was saved [ns]; None without a change."""
         self.unsaved = False
-        """Whether the next run would not go on from the state that `may_tell` was asked about last.
-        """
+        """Whether saving the newest state of `may_tell` has failed, so that the next run lacks
+        it."""
 
     @property
     def is_stale(self) -> bool:
-        """Whether the next run would follow an earlier state."""
+        """Whether the saved state is older than the present state."""
         return self._saved is not None and self._differs_ns is not None
 
     def keep(self, state: SavedState, *, now_ns: int) -> bytes | None:
@@ -193,8 +193,8 @@ class ClientMemory:
         self._saved = self._handed[0] if self._handed and not nothing else None
 
     def may_tell(self, state: SavedState, *, now_ns: int) -> bool:
-        """Whether messages may be sent: the next run will follow the same motion as this state, or
-        none, or the messages say that it cannot be known, by `unsaved`.
+        """Whether messages may be sent: this state is saved, or no other is, or saving it has
+        failed, which the messages then report (`unsaved`).
         """
         if self._saved is not None and _is_same(state, self._saved):
             self._differs_ns, self.unsaved = None, False
@@ -239,9 +239,7 @@ class Saving(Fresh):
 
 
 def _is_same(one: SavedState, other: SavedState) -> bool:
-    """Whether the next run would do the same with either state: times that only advance are
-    ignored.
-    """
+    """Whether two states are equal for the next run: times that only advance are ignored."""
     return _compared_part(one) == _compared_part(other)
 
 

@@ -31,8 +31,7 @@ from skytether.shared.scenario.schema import Scenario
 from skytether.shared.wire.protocol import FLOAT_MAX
 
 CARRIED_NS = SECOND_NS // 2
-"""Longest time over which a measurement is extrapolated; an older one is extrapolated by this
-time."""
+"""Longest time over which a measurement is extrapolated, even if the measurement is older."""
 SIGMAS = 10.0
 """Standard deviations of sensor noise by which two measurements may differ without counting as a
 leap."""
@@ -86,7 +85,7 @@ class Navigation:
             late = rooms.dead_time()
             self._inputs = late.PendingInputs(terms.model.axes(), late.dead_times(terms))
         self._delay_ns = sensor.delay * scenario.dt_ns
-        """Delay of measurements that the filter allows for [ns]."""
+        """Delay of measurements that the filter compensates [ns]."""
         self._tau_s, self._gain = np.array(terms.tau_s), np.array(terms.gain)
         self._begun = False
         self.leaps = Leaps(scenario)
@@ -107,7 +106,7 @@ class Navigation:
         """Whether the estimate is finite, also as float32."""
 
     def advance(self, measurements: Sequence[Measurement], command: Array, *, now_ns: int) -> None:
-        """Advance to a step; before the first the vehicle is at rest.
+        """Advance to a step; before the first step the vehicle is at rest.
 
         Args:
             measurements: measurements that became available since the previous step.
@@ -139,7 +138,7 @@ class Navigation:
             self.estimate = self.predicted = self.filter.estimate()
             if self._inputs is not None:
                 self.predicted = self._inputs.predict(self.estimate, self.filter.disturbance())
-            # Observations carry float32: a larger number would reach the server as infinity.
+            # Observations carry float32, in which a larger number would be infinite.
             self.is_known = all_within(self.predicted, FLOAT_MAX)
 
     def begin_anew(self) -> None:
@@ -151,7 +150,7 @@ class Navigation:
         return self.filter.disturbance()
 
     def _carried(self, measured: Measurement, to_ns: int, due: Array) -> Measurement:
-        """Measurement extrapolated by the model to a later time; an earlier time changes nothing.
+        """Measurement extrapolated by the model to a later time; unchanged for an earlier time.
 
         A real vehicle measures between steps. If an older input than `due` acted during part of the
         extrapolation, the filter has to correct the difference.
@@ -182,7 +181,7 @@ def _newest(measurements: Sequence[Measurement]) -> Sequence[Measurement]:
     """Measurements from the newest position on, from which the filter starts.
 
     Before the first step somebody else flew the vehicle, such as the autopilot during its climb.
-    With our inputs the filter would mistake that for a disturbance.
+    With our inputs the filter would interpret that motion as a disturbance.
     """
     placed = [i for i, measurement in enumerate(measurements) if measurement.position is not None]
     return measurements[placed[-1] :] if placed else ()
@@ -220,7 +219,7 @@ class Leaps:
             off_m = [displacement(*last_ns, time_p) for last_ns in moves]
             if any(abs(off) > most_m(time_p, self._noise_m) for off in off_m):
                 self.off_m = off_m
-        # Stored even after a leap: otherwise every later measurement would count as one, too.
+        # Stored even after a leap: otherwise all later measurements would count as leaps, too.
         if position is not None:
             self._position, self._position_ns = numbers[0], stamp_ns
         if velocity is not None:

@@ -1,7 +1,7 @@
-"""Orders of an operator in flight: keys of the scenario that a vehicle takes while it flies.
+"""Orders of an operator in flight: keys of the scenario that may change while a vehicle flies.
 
 `armed` allows plans to be flown, and `vehicle.after_leap` chooses the frame after a leap of the
-position. The servers and the vehicle have further keys.
+position. Servers and vehicles define further keys.
 """
 
 from operator import attrgetter
@@ -23,7 +23,7 @@ LEAP = keys_of(InFlight.LEAP)
 
 
 class Orders:
-    """Orders to one vehicle; loaded with the first, or before the flight (`preloading.preload`)."""
+    """Orders to one vehicle."""
 
     def __init__(
         self, flies: Vehicle, pilot: Pilot, failsafe: Failsafe, servers: OneServer
@@ -32,10 +32,9 @@ class Orders:
         self._failsafe, self._servers = failsafe, servers
 
     def objection(self, scenario: Scenario, keys: frozenset[str]) -> str:
-        """Why an order is refused at present; empty if it is not.
+        """Why an order is refused at present; empty if it is accepted.
 
-        After a leap, arming requires the operator to choose the frame, which says where the
-        vehicle is.
+        After a leap, the operator has to choose the frame in order to arm the vehicle.
         """
         if keys & self._servers.keys and (objection := self._servers.objection(scenario)):
             return objection
@@ -54,7 +53,7 @@ class Orders:
         return self._flies.objection(scenario, keys)
 
     def obey(self, scenario: Scenario, keys: frozenset[str], *, now_ns: int) -> None:
-        """Act on an order: the keys with a new value, and the scenario that has them."""
+        """Act on an order; `keys` have new values, which `scenario` contains."""
         self._failsafe.armed = scenario.armed
         if keys & ARMED and scenario.armed:
             self._flies.arm()

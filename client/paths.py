@@ -1,7 +1,7 @@
 """The route from a vehicle to a server over several paths, each an address with a socket.
 
-It takes the place of `client.route.Route`; `client.several` loads it for a server with several
-addresses. `shared.wire.paths` chooses the paths of each message.
+`client.several` uses it in place of `client.route.Route` for a server with several addresses.
+`shared.wire.paths` chooses the paths of each message.
 """
 
 from collections.abc import Callable, Sequence
@@ -22,10 +22,10 @@ class SeveralPaths(Route):
 
     Args:
         events: list to which events for the operator are appended.
-        names: what the log calls each path; its address unless given.
+        names: name of each path in the log; its address unless given.
         prices: price of a packet on each path.
         spread: `link.spread`.
-        timeout_ns: time without a packet after which an end takes the link for lost [ns].
+        timeout_ns: time without a packet after which an end considers the link lost [ns].
     """
 
     def __init__(
@@ -46,9 +46,9 @@ class SeveralPaths(Route):
         self._spread, self._timeout_ns = spread, timeout_ns
         self._all = range(len(addresses))
         self._paths: Paths | None = None
-        """Knowledge of the paths of the present session; None before the first."""
+        """State of the paths in the present session; None before the first session."""
         self._proofs: dict[int, int] = {}
-        """Number with which the server asked for a proof of each path."""
+        """Number in the server's newest request for a proof of each path."""
         self._greeted = 0
         """Path of the next HELLO."""
 
@@ -80,7 +80,7 @@ class SeveralPaths(Route):
         return True
 
     def watch(self, session: Conversation, now_ns: int) -> None:
-        """Send the newest packet again if it was lost, and try paths that are not known well."""
+        """Send the newest packet again if it was lost, and probe paths with few measurements."""
         if self._paths is None:
             return
         if resent := self._paths.again(session.hearing.silence_ns, now_ns, self._all):
@@ -101,7 +101,7 @@ class SeveralPaths(Route):
         return {"paths": self._paths.figures(now_ns)} if self._paths else {}
 
     def _name(self, session: Conversation, path: int, now_ns: int) -> None:
-        """Tell the server which path this is."""
+        """Send a PATH message, which names a path."""
         if session.number is not None and self._paths:
             least, proof = min(self._prices), self._proofs.get(path, 0)
             prices = tuple(round(1000 * price / least) for price in self._prices)

@@ -1,7 +1,7 @@
 """Pilot: flies the chosen input at every step, and records the step.
 
-The client's clock is the flight's clock: the epoch is the moment at which its session opened, step
-k begins at epoch + k Δt, and every time stamp used for control is taken here. `client.failsafe`
+The client's clock is the flight's clock: the epoch is the time at which the session opened, step k
+begins at epoch + k Δt, and all time stamps used for control are taken here. `client.failsafe`
 decides what the vehicle may do, `client.compensator` which input of a horizon it flies, and
 `client.clamp` bounds that input.
 """
@@ -41,17 +41,17 @@ from skytether.shared.wire.protocol import (
 LAND_MPS = 0.5
 """Speed of descent when landing [m/s]."""
 STOPPED = (Mode.FAULT, Mode.MANUAL)
-"""Modes in which the input is zero at once."""
+"""Modes in which the input becomes zero at once, without braking."""
 HOVERING = frozenset({Mode.INIT, Mode.SYNC, Mode.READY, Mode.HOVER, Mode.LAND})
 """Modes in which a vehicle holds its position, or descends from it."""
 UNPLACED = frozenset({Reason.MUTE, Reason.UNUSABLE, Reason.ASTRAY})
-"""Reasons for hovering with which nobody knows where the vehicle is."""
+"""Reasons for hovering with which the vehicle's position is unknown."""
 IMPOSSIBLE = frozenset({Drop.FROM_THE_FUTURE, Drop.OBSERVATION})
 """Reasons for dropping a horizon from the future."""
 
 
 class Pilot:
-    """Flies one vehicle, with a horizon or without."""
+    """Flies one vehicle, with or without a horizon."""
 
     def __init__(
         self,
@@ -65,15 +65,15 @@ class Pilot:
         self._dt_ns, self._keeps_apart = self._terms.dt_ns, scenario.keeps_apart
         self._splines = self._terms.splines
         self._late = LATE_SHARE * self._terms.reach
-        """Passed steps of a horizon above which it counts as late."""
+        """Number of past steps of a horizon above which it counts as late."""
         self.steps = scenario.steps
         self._number, self._vehicle = number, vehicle
         self._navigation = Navigation(scenario)
         self._failsafe = failsafe
         self._recorder = recorder
         self._holds = scenario.keeps_apart or (vehicle.drifts and failsafe.brakes)
-        """Whether a hovering vehicle holds its place: velocities alone let it drift, and other
-        vehicles of a mission keep clear of that place."""
+        """Whether a hovering vehicle holds its position: zero velocity alone would let it drift,
+        and other vehicles of a mission avoid only that position."""
         along = regulator(scenario) if self._splines or self._holds else None
         self.compensator = Compensator(self._terms, along)
         self._reporter = Reporter(self._terms, scenario.vehicle.report, self.compensator)
@@ -97,15 +97,15 @@ class Pilot:
         """Present step; measurements up to its start are included."""
         self._flown_ns = 0
         self._takes_from: int | None = None
-        """Step of the first observation that announced that horizons are accepted; None while they
-        are not."""
+        """Step of the first observation that announced that horizons are accepted; None while none
+        are."""
         self._input = np.zeros(self._terms.axes)
         """Desired velocity flown now [m/s]; shape (axes,)."""
         self._speed = 0.0
         """Magnitude of the input without feedback [m/s]."""
         self.covered = 0
         self._covered_last = 0
-        """Step after the last one with a planned input."""
+        """Step after the last step with a planned input."""
         self.missed = 0
         self.late_ns = self.latest_ns = 0
         """Time by which the present step began late, and the largest so far [ns]."""
@@ -157,11 +157,11 @@ class Pilot:
         if self._failsafe.transitions:
             self.obey()
         terms = self._terms
-        # An overtaken horizon is late anyway, and shows no delay of the newest.
+        # An overtaken horizon is always late, and says nothing about the newest one's delay.
         if horizon.step > self.compensator.newest:
             passed = self.step - horizon.step
             if isinstance(horizon, Horizon):
-                # Committed inputs come first, and have normally been flown at its arrival.
+                # The first inputs are committed, and usually flown before the horizon arrives.
                 passed -= horizon.inputs.shape[1] - terms.planned
             self._failsafe.horizon_arrived(late=passed > self._late, now_ns=now_ns)
         observed = horizon.step - horizon.age
@@ -200,7 +200,7 @@ class Pilot:
 
     @property
     def is_moving(self) -> bool:
-        """Whether the last knot of a mission's motion lies ahead."""
+        """Whether a mission's motion is in force and its last knot is still ahead."""
         return self._goes_on(self.step)
 
     def rest(self, *, now_ns: int) -> int:
@@ -210,7 +210,7 @@ class Pilot:
         return self.starts_ns(last) if self._goes_on(self.step) else now_ns
 
     def obey(self) -> None:
-        """Act on the transitions of the failsafe since the last call; needed only if it has any."""
+        """Act on the transitions of the failsafe since the last call, if there are any."""
         transitions = self._failsafe.transitions
         for each in transitions:
             if not each.takes:
@@ -225,14 +225,14 @@ class Pilot:
         transitions.clear()
 
     def _drop(self) -> None:
-        """Drop the horizon, or the place that is held, and brake from the present input."""
+        """Drop the horizon, or stop holding a position, and brake from the present input."""
         self.compensator.drop(self.step - 1, self._input)
         self._speed = math.hypot(*self._input.tolist())
 
     # -- steps -------------------------------------------------------------------------------
 
     def fly(self, *, now_ns: int) -> None:
-        """Advance to the present step; during missed steps the old input was flown."""
+        """Advance to the present step; the old input was flown during missed steps."""
         assert self._epoch_ns is not None
         assert self.next_ns is not None
         # A client delayed beyond the end of its flight still flies the last step.
@@ -285,7 +285,7 @@ class Pilot:
         if failsafe.transitions:
             self.obey()
         if self.step == self.steps - 1 and self._goes_on(self.step):
-            # Where the flight ends on the way, the vehicle would stop off its motion.
+            # A flight that ends before the motion's last knot is prolonged to it.
             failsafe.meet(Reason.OVER, now_ns=now_ns)
             self.steps = self.compensator.last_step + 1
         if not navigation.is_known:
@@ -310,7 +310,7 @@ class Pilot:
         """
         mode, terms, compensator = self._failsafe.mode, self._terms, self.compensator
         navigation, had_plan = self._navigation, compensator.covered
-        # From here on the compensator is at this step.
+        # `choose` has advanced the compensator to this step.
         wanted, without_feedback = compensator.choose(
             self.step, navigation.predicted, navigation.disturbance, self._input
         )
@@ -335,18 +335,17 @@ class Pilot:
         if flown is None or mode in STOPPED:
             return [0.0] * terms.axes, 0.0, flown is not None
         # The braking curve applies to the input without feedback; feedback is bounded by u_max
-        # alone (docs/failsafe.md). The fence's correction does not count either: it may last for
-        # ever.
+        # alone (docs/failsafe.md). The fence's correction is excluded too: it may last for ever.
         speed = min(math.hypot(*without_feedback), speed_max) if feeds_back else math.hypot(*flown)
         if self._fence is not None:
             within = self._fence.limited(flown, navigation.predicted.tolist(), terms.u_max)
             if mode is Mode.LAND and terms.axes > ALTITUDE:
-                within[ALTITUDE] = flown[ALTITUDE]  # the fence stops no descent of a landing
+                within[ALTITUDE] = flown[ALTITUDE]  # the fence does not stop a landing
             flown = within
         return flown, speed, True
 
     def _rest(self) -> None:
-        """Hold the place of a vehicle that hovers without a plan: where it comes to rest."""
+        """Hold the position at which a vehicle that hovers without a plan comes to rest."""
         if self._is_to_rest() and self._navigation.is_known:
             place = self._navigation.predicted.copy()
             if not self._keeps_apart:
@@ -358,7 +357,7 @@ class Pilot:
         is_free = compensator.in_force == NO_HORIZON and not compensator.rests
         if not is_free:
             return False
-        # After a change of the frame the estimate is of the old one until a position comes.
+        # After a change of the frame, the estimate is in the old frame until a position arrives.
         is_measured = bool(np.isfinite(self._navigation.measured[:, 0]).all())
         return is_measured and (self._keeps_apart or failsafe.reason not in UNPLACED)
 
@@ -440,7 +439,7 @@ class Pilot:
         )
 
     def figures(self) -> dict[str, Any]:
-        """Figures of the flight so far; ages only while a horizon is in force."""
+        """Figures of the flight so far; ages are only given while a horizon is in force."""
         figures: dict[str, Any] = {
             "mode": str(self._failsafe.mode),
             "step": self.step,

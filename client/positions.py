@@ -1,4 +1,4 @@
-"""Measurements of an autopilot or a robot: by the client's clock, in order, each once."""
+"""Measurements of an autopilot or a robot, converted to the client's clock, in order, each once."""
 
 import math
 from collections import Counter, deque
@@ -22,10 +22,10 @@ OLD_NS = SECOND_NS
 RECALLED_MAX_NS = 600 * SECOND_NS
 """Longest time for which an origin saved by an earlier run is valid."""
 REBOOT_NS = SECOND_NS
-"""Allowed difference between the advances of the two clocks since the origin was saved, beside
+"""Allowed difference of the two clocks' elapsed times since the origin was saved, in addition to
 drift."""
 DRIFT_PARTS = 40
-"""Inverse of the allowed drift since then: 2.5 %."""
+"""Inverse of the allowed drift of the two clocks since the origin was saved: 2.5 %."""
 SPEED_MAX = 1e3
 """Largest speed on an axis that is accepted [m/s]."""
 
@@ -43,7 +43,7 @@ Vector = tuple[float, float, float]
 
 
 def take_off_place(scenario: Scenario, vehicle: int) -> Vector:
-    """Position of take-off, in our axes [m]; on a mission, below its start position."""
+    """Position of take-off, in our axes [m]; on a mission, below the vehicle's start position."""
     if not scenario.keeps_apart:
         return 0.0, 0.0, 0.0
     x, y = scenario.start_m(vehicle)[:2].tolist()
@@ -79,7 +79,7 @@ class Positions:
         """Stamp of the newest measurement [ns; the client's clock]."""
         self._leaps = leaps
         self.is_flown = False
-        """Whether the vehicle is flown by its measurements, so that a leap counts."""
+        """Whether the pilot flies by these measurements, so that a leap matters."""
         self.leap_m: Vector | None = None
         """Displacement of the position about which the operator has not decided, in our axes [m];
         None without a leap. The origin has been displaced by the same vector, so the vehicle keeps
@@ -91,9 +91,9 @@ class Positions:
         self.is_recalled = False
         """Whether the origin was saved by an earlier run since this boot of the autopilot."""
         self._recalled: VehicleMemory | None = None
-        """State saved by an earlier run, until it is known whether it is of this boot."""
+        """State saved by an earlier run, until it is clear whether it is from this boot."""
         self._boot_ns = 0
-        """Time since the autopilot's boot of the newest measurement [ns]."""
+        """Time of the newest measurement since the autopilot's boot [ns]."""
         self.position: Vector | None = None
         """Newest position in the autopilot's local frame, in our axes [m]."""
         self.velocity: Vector = (0.0, 0.0, 0.0)
@@ -114,11 +114,11 @@ class Positions:
 
     @property
     def altitude(self) -> float:
-        """Altitude above our origin [m]; 0 before the first measurement."""
+        """Altitude above the scenario's origin [m]; 0 before the first measurement."""
         return self.position[2] - self.origin[2] if self.position else 0.0
 
     def take_in(self, boot_ns: int, position: Vector, velocity: Vector, *, now_ns: int) -> None:
-        """Process what was measured at a time since the autopilot's boot, in our axes [m, m/s]."""
+        """Process a position and a velocity measured at a time since boot, in our axes [m, m/s]."""
         self.heard_ns = now_ns
         self._fault = reason = self._wrong(boot_ns, position, velocity, now_ns)
         if reason:
@@ -128,9 +128,7 @@ class Positions:
         if self._recalled is not None:
             self._recall(self._recalled, now_ns)
         stamp_ns = min(self._clock.local_ns(boot_ns), now_ns)
-        if (
-            self._newest_ns is not None
-        ):  # the clock's correction is smaller than the time between them
+        if self._newest_ns is not None:  # a correction of the clock must not reverse the order
             stamp_ns = max(stamp_ns, self._newest_ns + 1)
         self._newest_boot_ns, self._newest_ns = boot_ns, stamp_ns
         self.position, self.velocity = position, velocity
@@ -152,7 +150,7 @@ class Positions:
             self.displace((dx, dy, dz))
 
     def displace(self, by_m: Vector, *, asks: bool = True) -> None:
-        """Displace the origin together with the position; `asks` an operator to decide about it."""
+        """Displace the origin together with the position; with `asks` an operator has to decide."""
         dx, dy, dz = by_m
         (x, y, z), before = self.origin, self.leap_m or (0.0, 0.0, 0.0)
         self.origin = x + dx, y + dy, z + dz
@@ -160,7 +158,7 @@ class Positions:
             self.leap_m = before[0] + dx, before[1] + dy, before[2] + dz
 
     def decide(self, *, keeps_frame: bool) -> None:
-        """Keep the old frame for good, or use the new one from now on."""
+        """Keep the old frame permanently, or use the new one from now on."""
         if self.leap_m is not None and not keeps_frame:
             pairs = zip(self.origin, self.leap_m, strict=True)
             x, y, z = (zero - leapt for zero, leapt in pairs)
@@ -191,7 +189,7 @@ class Positions:
         return "late" if boot_ns < self._newest_boot_ns else ""
 
     def begin(self) -> None:
-        """Set our origin: the present position minus the scenario's start."""
+        """Set the scenario's origin: the present position minus the scenario's start."""
         if self.position is not None:
             x, y, z = (at - start for at, start in zip(self.position, self._start, strict=True))
             self.place((x, y, z))
@@ -201,7 +199,7 @@ class Positions:
         self._waiting.clear()
 
     def recall(self, saved: VehicleMemory) -> None:
-        """Restore the origin saved by an earlier run, once it is known to be of this boot."""
+        """Restore the origin saved by an earlier run, once it proves to be from this boot."""
         if not self.has_origin and saved.origin is not None:
             self._recalled = saved
 
@@ -220,7 +218,7 @@ class Positions:
 
     @property
     def _boot_ms(self) -> int:
-        """Time of the newest measurement [ms], in the 32 bits that MAVLink has for it."""
+        """Time of the newest measurement since boot, modulo 2^32 as in MAVLink [ms]."""
         return self._boot_ns // MILLISECOND_NS % 2**32
 
     def frame(self, *, armed: bool) -> VehicleMemory:

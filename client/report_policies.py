@@ -22,7 +22,7 @@ def periodic(now: Unreported, N: Annotated[int, Meta(ge=1, le=PERIOD_MAX)]) -> b
 
 @REPORTS
 def deviation(now: Unreported, metres: Annotated[float, Meta(ge=0, le=1e9)]) -> bool:
-    """Sends if the vehicle is farther than this many metres from where the server expects it, if
+    """Sends if the vehicle is more than `metres` away from the state that the server predicts, if
     another horizon has come into force or the same one was received again, or if its mode has
     changed.
     """

@@ -1,9 +1,9 @@
-"""Reports of the vehicle's state: the state that the server predicts, and when to send an
+"""Reports of the vehicle's state: the server's prediction of it, and the decision to send an
 observation.
 
 The server predicts the state from the newest observation by the rule of flight (`shared.law.rule`).
-The vehicle computes the same prediction from the observation that it sent last and the horizon in
-force. While the prediction is close to the real state, the server needs no observation.
+The vehicle computes the same prediction from its last observation and the horizon in force. While
+the prediction is close to the real state, the server needs no observation.
 """
 
 import math
@@ -42,7 +42,7 @@ class Reporter:
 
     Args:
         report: `vehicle.report`.
-        compensator: has the horizon in force, from which the input of the step has been chosen.
+        compensator: contains the horizon in force, which gave the input of the step.
     """
 
     def __init__(self, terms: Terms, report: str, compensator: Compensator) -> None:
@@ -60,7 +60,7 @@ class Reporter:
         self._reported_step, self._step = 0, 0
         """Step of the newest observation, and latest step for which `is_due` was called."""
         self._ready: int | None = None
-        """Step since which the vehicle waits for a horizon; None while it does not."""
+        """Step since which the vehicle waits for a horizon; None while it does not wait."""
 
     def is_due(
         self,
@@ -76,13 +76,13 @@ class Reporter:
 
         Args:
             session: number of the session.
-            step: k; it has just begun.
+            step: k, which has just begun.
             mode: mode of the vehicle.
             states: estimated state; shape (axes, 2).
             flown: input flown from this step on, of each axis [m/s].
             silence: longest silence that the server allows [half steps]; 0 for no bound.
         """
-        if self.always:  # no prediction is needed
+        if self.always:  # the report's policy needs no prediction
             return True
         situation = self._compensator.in_force, mode, self._compensator.repeated
         slept = step > self._step + 1
@@ -101,7 +101,7 @@ class Reporter:
         return due
 
     def _waits(self, step: int, mode: Mode) -> bool:
-        """Whether a vehicle that waits for a horizon reports, at once or again.
+        """Whether a vehicle that waits for a horizon reports now, for the first time or again.
 
         The server plans only for a vehicle that has reported that it is ready. Without these
         reports, a vehicle that reports every 4 s began to fly up to 4 s late, and 8 s if one packet

@@ -1,6 +1,6 @@
 """Policies of `vehicle.report`, which decide when the vehicle sends an observation.
 
-They are combined with & and | like policies of a trigger (`shared.scenario.grammar`), and
+They are combined with & and | like a trigger's policies (`shared.scenario.grammar`), and
 `client.reporting` evaluates them aboard, once per step. Two observations are sent in any case: the
 first of a session, and one after the longest silence that the server allows.
 """
@@ -34,7 +34,7 @@ Report = Callable[[Unreported], bool]
 
 @REPORTS
 def silence(now: Unreported, seconds: Annotated[float, Meta(ge=0.001, le=3600)]) -> bool:
-    """Sends after this many seconds without an observation."""
+    """Sends an observation if none was sent for the given time in seconds."""
     return now.steps * now.dt_s > seconds - now.dt_s / 2.0
 
 
@@ -43,7 +43,7 @@ def is_always(text: str) -> bool:
 
 
 def make_report(text: str) -> Report:
-    """Report rule from a text that has been checked."""
+    """Function for a text of `vehicle.report`, which must be valid."""
 
     def make(expression: Expression) -> Report:
         if isinstance(expression, Combination):

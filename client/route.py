@@ -1,6 +1,4 @@
-"""The route from a vehicle to a server: one link. A room may put another in its place, as
-`client.paths` does.
-"""
+"""The route from a vehicle to a server over one link; `client.paths` replaces it for several."""
 
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, Protocol
@@ -14,7 +12,7 @@ from skytether.shared.wire.protocol import Message, encode
 
 
 class Conversation(Protocol):
-    """The session to which a route belongs."""
+    """Session to which a route belongs."""
 
     vehicle: int
     number: int | None
@@ -29,8 +27,8 @@ class Route:
     """One link: an address, and the socket from which it is reached.
 
     Args:
-        addresses: addresses of the server, or of the netem in front of it: one.
-        sockets: number of the socket of each.
+        addresses: the single address of the server, or of the netem in front of it.
+        sockets: number of the socket for each address.
         out: list to which datagrams are appended.
     """
 
@@ -41,7 +39,7 @@ class Route:
 
     @property
     def others(self) -> tuple[str, ...]:
-        """All addresses but the first, in words."""
+        """All addresses except the first, as texts."""
         return tuple(address_text(*each) for each in self.addresses[1:])
 
     @property
@@ -60,26 +58,26 @@ class Route:
         """Seal a message and send it."""
         self.put(seal(encode(message)))
 
-    # -- what a room may add ---------------------------------------------------------------------
+    # -- for routes over several paths ----------------------------------------------------------
 
     def begin(self) -> None:
         """Begin a new session."""
 
     def is_copy(self, datagram: bytes, path: int) -> bool:
-        """Whether a datagram has come before."""
+        """Whether the same datagram has arrived before."""
         return False
 
     def heard(
         self, report: Report, message: Message, datagram: bytes, path: int, now_ns: int
     ) -> None:
-        """Note a report that stood in front of a message of the session."""
+        """Note a loss report that preceded a message of the session in its datagram."""
 
     def take(self, session: Conversation, message: Message, path: int, now_ns: int) -> bool:
-        """Take a message of the room; False if it has none."""
+        """Process a message about paths; False if it is another message."""
         return False
 
     def watch(self, session: Conversation, now_ns: int) -> None:
-        """Send what is due; called once a step."""
+        """Send the packets that are due; called once a step."""
 
     def figures(self, now_ns: int) -> dict[str, Any]:
         return {}

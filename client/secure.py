@@ -1,12 +1,12 @@
 """The vehicle's side of a secured link: handshakes with the server, and the channels they create.
 
 A handshake is one attempt with one ephemeral key. Its INITIATION is repeated with the newest cookie
-until the resulting WELCOME is adopted, or for ATTEMPT_NS. An answer to no open attempt is dropped:
-otherwise an attacker could open a channel a second time and so reset its counters.
+until the resulting WELCOME is adopted, or for ATTEMPT_NS. An answer that belongs to no open attempt
+is dropped: otherwise an attacker could open a channel a second time and reset its counters.
 
 An attacker who copies an INITIATION to the server from another address receives a cookie valid for
-that address only, and may forward it to the vehicle, which cannot tell it from its own. So the
-vehicle tries each cookie at once and never relies on a single one, but tries each no more often
+that address only, and may forward it to the vehicle, which cannot distinguish it from its own. So
+the vehicle tries each cookie at once and never relies on a single one, but tries each no more often
 than it sends HELLOs.
 """
 
@@ -30,9 +30,9 @@ from skytether.shared.wire.keys import VehicleKey
 from skytether.shared.wire.noise_nnpsk0 import KEY_BYTES, Initiator, NoiseError
 
 ATTEMPT_NS = 60 * SECOND_NS
-"""Time for which an attempt is repeated before another one begins."""
+"""Time for which a handshake attempt is repeated before a new attempt begins."""
 COOKIES_MAX = 64
-"""Number of cookies remembered per attempt; the one tried longest ago is replaced."""
+"""Number of cookies stored per attempt; the cookie tried longest ago is replaced."""
 
 
 class _Attempt:
@@ -110,7 +110,7 @@ class SecureLink:
         assert self._candidate is not None
         if self._current is not None:
             self._current.retire(now_ns=now_ns)
-        # Packets that the server sent before it learnt of the new channel are still on their way.
+        # Packets that the server sent before it used the new channel are still in flight.
         self._previous, self._current = self._current, self._candidate
         self._attempt = self._candidate = None
 
@@ -139,7 +139,7 @@ class SecureLink:
 
     def _initiation(self, attempt: _Attempt, now_ns: int) -> bytes:
         tried_ns = attempt.tried_ns
-        # Removed and inserted again: the dictionary is ordered by time.
+        # Removed and inserted again, because the dictionary is ordered by time.
         tried_ns.pop(self._cookie, None)
         tried_ns[self._cookie] = now_ns
         if len(tried_ns) > COOKIES_MAX:

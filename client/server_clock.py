@@ -1,8 +1,8 @@
-"""The server's clock as a vehicle knows it, from the time stamps of the server's packets.
+"""The server's clock as estimated by a vehicle from the time stamps of the server's packets.
 
-The newest packet is echoed in observations, from which the server estimates the delays. If a packet
-comes after one that was sent much later, nothing of it is believed. Only a WELCOME is taken at any
-time: it answers a HELLO, and lets a server go on whose clock was set back.
+The newest packet is echoed in observations, from which the server estimates the delays. A packet
+that arrives after one that was sent much later is dropped. Only a WELCOME is always accepted: it
+answers a HELLO, and a server whose clock was set back can then continue.
 """
 
 from typing import NamedTuple
@@ -13,8 +13,8 @@ from skytether.shared.wire.drop import Drop, ProtocolError
 from skytether.shared.wire.protocol import stamped_ns
 
 SLEPT_NS = JUMP_NS // 2
-"""Advance of the server's clock over the client's that shows that this machine was suspended; far
-more than changing delays cause."""
+"""Advance of the server's clock relative to the client's that proves a suspension of this machine;
+changing delays cause far less."""
 
 
 class Echo(NamedTuple):
@@ -23,9 +23,9 @@ class Echo(NamedTuple):
     server_ns: int
     """Server time at which the packet was sent [ns]."""
     received_ns: int
-    """Time of its arrival [ns; the client's clock]."""
+    """Arrival time of the packet [ns; the client's clock]."""
     heard: int
-    """Number of packets received up to and including that packet, modulo NUMBERS."""
+    """Number of packets received up to and including this packet, modulo NUMBERS."""
 
 
 NEVER = Echo(0, 0, 0)
@@ -36,7 +36,7 @@ class ServerClock:
     """Clock of one server.
 
     Args:
-        overtaken_ns: time by which a packet may have been sent before one that came first [ns].
+        overtaken_ns: time by which an accepted packet may be older than the newest [ns].
     """
 
     def __init__(self, overtaken_ns: int) -> None:
@@ -44,8 +44,8 @@ class ServerClock:
         self._overtaken_ns = overtaken_ns
 
     def begin(self) -> None:
-        """Begin with another run of the server, whose time stamps cannot be compared with those of
-        the run before.
+        """Begin again after a restart of the server, whose time stamps cannot be compared with
+        those of the run before.
         """
         self.echo = NEVER
 
@@ -63,10 +63,10 @@ class ServerClock:
     def hear(self, server_ns: int, now_ns: int) -> bool:
         """Note a packet sent at a time of the server; returns whether this machine was suspended.
 
-        The client's clock may have stood still, or its jump was mistaken for a clock that was set
-        (`shared.endpoints.steady`); the server's clock has gone on in both cases. After a
-        suspension longer than time stamps can express, the server has forgotten the session, and
-        its WELCOME contains the full time.
+        During a suspension the client's clock may have stood still, or its jump was mistaken for a
+        clock that was set (`shared.endpoints.steady`); the server's clock has advanced in both
+        cases. After a suspension too long for time stamps, the server has forgotten the session,
+        and its WELCOME contains the full time.
         """
         slept = self.echo != NEVER and server_ns - self._expected_ns(now_ns) > SLEPT_NS
         self.echo = Echo(server_ns, now_ns, (self.echo.heard + 1) % NUMBERS)

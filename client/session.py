@@ -1,5 +1,4 @@
-"""The client's side of the conversation: a session with the server, and the server's messages in
-it.
+"""The client's side of the conversation: a session with the server, and the server's messages.
 
     HELLO → WELCOME, or a refusal → HORIZON, HEARTBEAT … → CLOSE, silence or another WELCOME
 
@@ -45,17 +44,17 @@ from skytether.shared.wire.protocol import (
 )
 
 UNANSWERED_NS = 5 * SECOND_NS
-"""Time without a first answer after which the log reports it."""
+"""Time after which the log reports that the server has not answered yet."""
 REFUSED = {
     Refusal.OTHER_TERMS: Drop.OTHER_TERMS,
     Refusal.FULL: Drop.FULL,
     Refusal.TAKEN: Drop.TAKEN,
 }
-"""Reason for dropping a WELCOME that refuses the vehicle."""
+"""Drop reason of a WELCOME that refuses the vehicle, by the refusal."""
 DEAF = frozenset({Idle.OBSERVATION, Idle.DELAY})
-"""Reasons for which a server cannot plan that may not hold for another server."""
+"""Reasons why one server cannot plan that do not apply to every server."""
 DEGRADED = "the server misses its deadlines"
-"""Why there is no newer horizon although the server plans: it reports that it is degraded."""
+"""Reason for the lack of newer horizons if the server reports that it is degraded."""
 
 
 Stamped = Horizon | Trajectory | Heartbeat
@@ -71,9 +70,9 @@ class ServerSession:
     Args:
         terms: terms that the server has to agree to.
         boot_id: number unique to this run of the client.
-        role: what the server is to the vehicle.
+        role: role of the server for the vehicle.
         route: route to the server.
-        timeout_ns: time without a packet after which an end takes the link for lost [ns].
+        timeout_ns: time without a packet after which an end considers the link lost [ns].
         connect_s: time after which a vehicle that was never answered gives up [s].
         hearing: measures losses, and chooses the longest silence to allow the server.
         events: list to which events for the operator are appended.
@@ -104,17 +103,17 @@ class ServerSession:
         self.sent = 0
         """Number of packets sent in the session, modulo NUMBERS."""
         self.heard_ns: int | None = None
-        """Time of the newest packet of the session; None before the first, and once it is closed.
+        """Time of the newest packet of the session; None before the first packet and after the end.
         """
         self.useful_ns: int | None = None
-        """The same without heartbeats that say that the server cannot plan."""
+        """Time of the newest packet except heartbeats that report that the server cannot plan."""
         self.sent_step = -1
         """Step of the newest observation; -1 before the first of the session."""
         self._events = events
         self.hello_ns = 0
         """Time before which no further HELLO is sent."""
         self._awaits_welcome = False
-        """Whether a HELLO is out, and nothing else has been heard in a session since."""
+        """Whether a HELLO was sent, and no packet of a session has arrived since."""
         self._began_ns: int | None = None
         self._is_unanswered = False
         self.number: int | None = None
@@ -123,7 +122,7 @@ class ServerSession:
         self._server_boot_id: int | None = None
         self.clock = ServerClock(hearing.overtaken_ns)
         self.idle = str(Idle.PLANS)
-        """Why no newer horizon comes, as the server last reported."""
+        """Reason for the lack of newer horizons, as the server last reported it."""
         self._refusal: NoSession | None = None
         """Newest refusal of a session by the server; None after a session was opened."""
         self.failure: Failure | None = None
@@ -149,7 +148,7 @@ class ServerSession:
         """Process a datagram of this session; return its horizon or trajectory, if it contains one.
 
         Args:
-            path: number of the path over which it came.
+            path: number of the path over which the datagram arrived.
 
         Raises:
             ProtocolError: the datagram must be dropped.
@@ -160,8 +159,8 @@ class ServerSession:
         if payload is None:
             for answer in self.link.outbox():
                 self.route.put(answer, path)
-            # The answer to a CHALLENGE carries the HELLO, so none is due for a while, unless a
-            # stranger has provoked it by repeating an earlier one: its WELCOME is not taken.
+            # The answer to a CHALLENGE contains the HELLO, so the next HELLO is delayed. It is not
+            # if an attacker caused the CHALLENGE by replaying an old HELLO.
             if self._awaits_welcome:
                 self.hello_ns = now_ns + AGAIN_NS
             return None
@@ -172,7 +171,7 @@ class ServerSession:
             return None
         if isinstance(message, FromVehicle):
             raise ProtocolError(Drop.NOT_FOR_A_CLIENT)
-        # Nothing of a message is believed before it is found to be of this session, and recent.
+        # A message's content is used only if the message is recent and of this session.
         self._check(message)
         server_ns = 0
         if isinstance(message, Stamped):
@@ -217,8 +216,8 @@ class ServerSession:
         if (welcome.vehicle, welcome.boot_id) != (self.vehicle, self._boot_id):
             raise ProtocolError(Drop.FOR_ANOTHER_LIFE)
         if not self._awaits_welcome:
-            # A late copy, or an answer to a late copy of a HELLO: it would lead to a session that
-            # has ended, or that nobody asked for.
+            # The WELCOME is a late copy or answers a late copy of a HELLO: no session is requested
+            # now.
             raise ProtocolError(Drop.UNASKED)
         if welcome.terms != self._terms:
             # Only before the first session: in flight the vehicle keeps its horizon, and the
@@ -244,7 +243,7 @@ class ServerSession:
         self._is_open = True
         self.link.adopt(now_ns=now_ns)
         self._heard(welcome.server_ns, now_ns)
-        self._awaits_welcome = True  # another HELLO may be answered by a session that lives longer
+        self._awaits_welcome = True  # another HELLO may open a newer session
         if restarted:
             self.role.meet(Reason.RESTARTED, now_ns=now_ns)
 
@@ -280,7 +279,7 @@ class ServerSession:
 
     def ask(self, *, now_ns: int) -> None:
         """Send HELLO if the server is silent, or the link needs new keys."""
-        # The motion of an earlier run is flown before there is a session.
+        # An earlier run's motion is flown even without a session.
         silent = self.number is None or self.is_lost(now_ns)
         wanted = silent or self.link.wants_hello(now_ns)
         if wanted and now_ns >= self.hello_ns:
@@ -308,7 +307,7 @@ class ServerSession:
         self.post(Time(self.vehicle, self.number, step, epoch_us, error_us), now_ns)
 
     def is_observation_due(self, step: int) -> bool:
-        """Whether a server that is not followed is to be sent an observation."""
+        """Whether an observation is due for a server that the vehicle does not follow."""
         return self.sent_step < 0 or 2 * (step - self.sent_step) >= self.hearing.rare
 
     def post(self, message: Message, now_ns: int) -> None:
@@ -316,11 +315,11 @@ class ServerSession:
         self.route.post(self.link.seal, message, now_ns)
 
     def close(self) -> None:
-        """Close the session; only another WELCOME opens one."""
+        """Close the session; only another WELCOME opens a session."""
         self._is_open, self.heard_ns, self.useful_ns = False, None, None
 
     def wait(self, *, now_ns: int) -> bool:
-        """Whether to go on waiting for the flight; fails after too long without a session."""
+        """Whether to continue waiting for the flight; fails after too long without a session."""
         if self.number is not None:  # the vehicle is still on the ground
             return True
         if self._began_ns is None:
@@ -344,7 +343,7 @@ class ServerSession:
         )
 
     def _give_up(self, waited_s: float) -> None:
-        """Fail for lack of a first session; a refusal has been reported already."""
+        """Fail because no session was ever opened; a refusal has been reported already."""
         if self._refusal is not None:
             self.failure = self._refusal
             return

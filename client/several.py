@@ -14,7 +14,7 @@ from skytether.shared.scenario.registry import load
 PATH_SOCKETS = (0, 2, 3, 4)
 """Numbers of a client's sockets, one for each path to its server; 1 is its autopilot's."""
 STANDBY_SOCKETS = (5, 6, 7, 8)
-"""The same for each path to its standby server."""
+"""Numbers of a client's sockets, one for each path to its standby server."""
 
 T = TypeVar("T")
 
@@ -33,9 +33,9 @@ class Several(Reach):
     Args:
         paths: address of the server, or of the netem in front of it, on each path.
         link: link to the server; None: without keys.
-        names: what the log calls each path; empty: its address.
-        standby: the same as `paths` for a second server, which leads when the first does not; empty
-            without one.
+        names: name of each path in the log; empty: its address.
+        standby: addresses of a second server, as in `paths`, which leads when the first does not;
+            empty without one.
         standby_link: link to that server.
     """
 
@@ -88,7 +88,7 @@ class Several(Reach):
             parts.out,
             events=parts.events,
             names=names,
-            # All alike where the scenario has another number of paths.
+            # Equal prices if the scenario has another number of paths.
             prices=prices if len(prices) == len(paths) else (1.0,) * len(paths),
             spread=link.spread,
             timeout_ns=seconds_to_ns(link.timeout_s),

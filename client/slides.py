@@ -1,13 +1,13 @@
-"""Slides: the position moves, and the receiver's velocity says that it does not.
+"""Slides: changes of the measured position that the receiver's velocity does not show.
 
-Where the receiver's position shifts by some metres, as when a correction arrives, the
-autopilot's estimate slides there within 2 to 5 s, and its velocity bends so that both agree.
-The receiver measures its own velocity by other means, which does not follow. With that g
+When the receiver's position shifts by some metres, for example after a correction, the autopilot's
+estimate slides there within 2 to 5 s, and its velocity changes accordingly. The receiver measures
+its velocity g independently, and this velocity does not change:
 
     o(t) = position(t) - ∫ g dt      slides if |o(t) - o(t - SLIDE_NS)| > SLID_M + LAG_S |Δg|
 
-where Δg is the change of g in that time: a fix is reported late. Once a slide is found it is
-measured for FOLLOWED_NS more, from where it began.
+where Δg is the change of g in that time, which covers late fixes. After its detection a slide is
+measured for another FOLLOWED_NS, from its beginning.
 """
 
 import math
@@ -17,23 +17,23 @@ from typing import NamedTuple
 from skytether.shared.base.units import SECOND_NS
 
 SLIDE_NS, SLID_M = 5 * SECOND_NS, 1.5
-"""Time within which a slide is noticed, and the least one [m]."""
+"""Time within which a slide is detected, and the smallest slide detected [m]."""
 LAG_S = 0.3
 """Largest delay of a fix of the receiver behind the autopilot's estimate."""
 FOLLOWED_NS = 5 * SECOND_NS
 """Time for which a slide is measured after it was noticed."""
 STEP_NS, STEP_M = SECOND_NS, 0.3
-"""Least time, and least displacement [m], between two `Slide`s of one slide."""
+"""Minimum time, and minimum displacement [m], between two reports (`Slide`) of one slide."""
 FIX_GAP_NS = SECOND_NS
 """Longest time between two fixes over which the receiver's velocity is integrated."""
 OFFSETS_MAX = 128
 
 Plane = tuple[float, float]
-"""North and east."""
+"""North and east component."""
 
 
 class Offset(NamedTuple):
-    """Position minus the distance travelled, at one fix."""
+    """Offset o(t) at one fix: position minus integrated velocity."""
 
     stamp_ns: int
     velocity: Plane
@@ -42,7 +42,7 @@ class Offset(NamedTuple):
 
 class Slide(NamedTuple):
     by_m: Plane
-    """Displacement of the position since the last one that was returned [m]."""
+    """Displacement of the position since the `Slide` returned before [m]."""
     begins: bool
 
 
@@ -51,12 +51,12 @@ class Slides:
 
     def __init__(self) -> None:
         self._past: deque[Offset] = deque(maxlen=OFFSETS_MAX)
-        """Offsets of the last SLIDE_NS, or that from which a slide is measured."""
+        """Offsets of the last SLIDE_NS, or the offset at which the present slide began."""
         self._travelled: Plane = (0.0, 0.0)
         self._velocity: Plane = (0.0, 0.0)
         self._stamp_ns = -FIX_GAP_NS
         self._until_ns: int | None = None
-        """Time until which a slide is measured; None without one."""
+        """Time until which the present slide is measured; None without a slide."""
         self._next_ns = 0
 
     def begin(self) -> None:
@@ -65,7 +65,7 @@ class Slides:
         self._until_ns = None
 
     def slid(self, place: Plane, velocity: Plane, stamp_ns: int) -> Slide | None:
-        """Slide that is to be subtracted from the position from now on; None without one.
+        """Slide to be subtracted from the position from now on; None if none was detected.
 
         Args:
             place: position in the plane, without earlier slides [m].

@@ -9,7 +9,7 @@ from skytether.shared.law.model import Array
 
 
 class Newest:
-    """Stand-in for a filter: the newest measured value of each number."""
+    """Replacement for a filter: it returns the newest measured value of each number."""
 
     def __init__(self, axes: int) -> None:
         self._zero = np.zeros(axes)

@@ -1,9 +1,9 @@
 """Interface of a vehicle to the pilot: it accepts a velocity and returns measurements.
 
 A vehicle measures at its own rate with its own time stamps, and may return measurements late or not
-at all; they are the client's only source of its state. `client.simulated` contains simulated
-vehicles. A real one communicates with its autopilot through a `port`, an endpoint like any other,
-driven by datagrams and time. `client.vehicles` has the table of all kinds.
+at all; they are the client's only source of the vehicle's state. `client.simulated` contains
+simulated vehicles. A real one communicates with its autopilot through a `port`, an endpoint like
+any other, driven by datagrams and time. `client.vehicles` has the table of all kinds.
 """
 
 import math
@@ -57,12 +57,12 @@ class VehicleMemory(msgspec.Struct, frozen=True, kw_only=True):
     """Origin of the scenario's frame in the autopilot's local frame, in our axes [m]; None if
     unknown."""
     leap_m: tuple[Coordinate, Coordinate, Coordinate] | None = None
-    """Displacement in `origin` about which the operator has not decided, see
-    `Vehicle.leap_m` [m]."""
+    """Part of `origin` due to a leap about which the operator has not decided, see `Vehicle.leap_m`
+    [m]."""
     boot_ms: Annotated[int, msgspec.Meta(ge=0, lt=2**32)] = 0
     """Time since the autopilot's boot at which the fields above were last valid [ms]."""
     at_ns: Annotated[int, msgspec.Meta(ge=-(2**62), le=2**62)] = 0
-    """Host's clock at that time [ns]; in the encoded bytes, relative to the time of writing."""
+    """Host's clock at `boot_ms` [ns]; in the encoded bytes, relative to the time of writing."""
 
 
 class Vehicle(ABC):
@@ -76,12 +76,12 @@ class Vehicle(ABC):
     """Node of the ROS graph whose topics the port is connected to; None: the port is connected to
     the line at `vehicle.address`."""
     drifts = False
-    """Whether the vehicle drifts while it is commanded to stand."""
+    """Whether the vehicle drifts at a commanded velocity of zero."""
     returns = False
     """Whether the vehicle can return home by itself, see `return_home`."""
     leap_m: tuple[float, ...] | None = None
     """Displacement of the measured position on each axis about which the operator has not decided
-    [m]; it is subtracted meanwhile. None: no leap, or the vehicle does not detect any."""
+    [m]; it is subtracted until then. None: no leap, or the vehicle does not detect leaps."""
     failure: Failure | None = None
     """Event that makes the vehicle unusable, so that no session is requested."""
 
@@ -98,7 +98,7 @@ class Vehicle(ABC):
         """
 
     def set_parameters(self) -> bool:
-        """Allow unsafe parameters of the hardware to be changed; False if the vehicle has none.
+        """Allow changes of unsafe parameters of the hardware; False if it has no parameters.
 
         Called before anything else, if at all.
         """
@@ -137,12 +137,12 @@ class Vehicle(ABC):
         """Decide about `leap_m` after a leap.
 
         Args:
-            keeps_frame: True if the displacement is subtracted for good (the old frame stays),
-                False if the new frame is used.
+            keeps_frame: True to subtract the displacement permanently (keep the old frame), False
+                to use the new frame.
         """
 
     def land(self) -> bool:
-        """Land without further commands; False if the vehicle cannot, and has to be flown down."""
+        """Land without further commands; False if it cannot, so that the pilot descends."""
         return False
 
     def return_home(self) -> None:  # noqa: B027 - optional

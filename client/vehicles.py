@@ -1,7 +1,7 @@
-"""Table of vehicles: the names that `vehicle.kind` accepts, and how each vehicle is made.
+"""Table of vehicles: the names that `vehicle.kind` accepts, and functions that make the vehicles.
 
-`shared.scenario.rooms` names the modules of ours, which are imported when a scenario names one; a
-plug-in adds a vehicle in the same way.
+`shared.scenario.rooms` names the built-in modules, imported when a scenario names one; a plug-in
+adds a vehicle in the same way.
 """
 
 from typing import TYPE_CHECKING
@@ -37,7 +37,7 @@ def make(scenario: Scenario, number: int) -> Vehicle:
 
 
 def connection(flies: Vehicle, scenario: Scenario) -> "Line | Node | None":
-    """Connection of a vehicle's port, which becomes its process's socket 1; None without a port."""
+    """Connection of a vehicle's port, used as socket 1 of its process; None without a port."""
     if flies.port is None:
         return None
     from skytether.shared.endpoints.line import parse_line
@@ -48,6 +48,6 @@ def connection(flies: Vehicle, scenario: Scenario) -> "Line | Node | None":
 def apart_ns(vehicles: int, dt_ns: int) -> int:
     """Time from one vehicle's start to the next's [ns]: one step, less in a large fleet.
 
-    Vehicles that start together would send all their packets together, which then queue.
+    Vehicles that start at the same time would send all packets at the same time, which then queue.
     """
     return min(dt_ns, START_NS // vehicles)

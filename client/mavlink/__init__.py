@@ -5,14 +5,14 @@
     vehicle     the pilot's interface: velocities in, measurements out
     port        messages from and to the autopilot
     connection  the autopilot's address, and the sender of each message
-    autopilot   from the first heartbeat to a vehicle that can be flown
-    setup       which autopilot it is, and whether its parameters are safe (`safety`)
+    autopilot   states from the first heartbeat to a vehicle that can be flown
+    setup       identification of the autopilot, and check of its parameters (`safety`)
     launch      mode, arming, take-off and landing, all done by the autopilot
-    setpoints   when a desired velocity is sent, and repeated
+    setpoints   times at which a desired velocity is sent, and repeated
     hindrances  reasons that forbid following a plan, such as a second commander (`rivals`)
 
 `condition` has the autopilot's newest status, `positions` and `receiver` its measurements, and
 `timesync` asks for its clock. Axes, frames and encoding are in `skytether.mavlink`. The package
-imports that, `shared`, and of the client the interface of a vehicle, its clock, positions and
-filter. `keys` and `kind` load without the extra `mavlink`.
+imports `skytether.mavlink`, `shared` and, from the client, the interface of a vehicle, its clock,
+positions and filter. `keys` and `kind` load without the extra `mavlink`.
 """

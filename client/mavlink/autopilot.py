@@ -41,7 +41,7 @@ WARNING = int(dialect.MAV_SEVERITY_WARNING)
 
 
 class Parts(NamedTuple):
-    """Parts created once it is known which autopilot it is."""
+    """Parts created once the kind of autopilot is known."""
 
     setup: Setup
     launch: Launch
@@ -49,14 +49,12 @@ class Parts(NamedTuple):
 
 
 class Autopilot:
-    """One autopilot and its state as known from its messages; `altitude` is
-    that of take-off [m].
-    """
+    """One autopilot and its state as known from its messages; `altitude`: take-off altitude [m]."""
 
     parts: Parts | None = None
     """Parts of the autopilot; None until a heartbeat of a suitable autopilot has arrived."""
     _unfit: NotTakenOff | None = None
-    """Event that makes the vehicle unusable: unsuitable or silent."""
+    """Failure event if the autopilot is unsuitable or silent; None otherwise."""
     _set_up_ns: int | None = None
     """Time at which everything except the clock was ready."""
     _began_ns: int | None = None
@@ -110,7 +108,7 @@ class Autopilot:
         return now_ns - since_ns > QUIET_NS
 
     def take_off(self, *, may_arm: bool, now_ns: int) -> bool:
-        # If an earlier run has flown it since this boot, its parameters were safe.
+        # If an earlier run has flown the vehicle since this boot, its parameters were safe.
         may_fly = self.is_ready or self.positions.is_recalled
         if self.parts is None or not may_fly or self.failure:
             return False
@@ -137,7 +135,7 @@ class Autopilot:
         return self.positions.frame(armed=self._was_armed or self.took_off)
 
     def meet(self, heartbeat: Message, target: tuple[int, int]) -> None:
-        """Begin with the autopilot that sent a heartbeat, if it can be flown.
+        """Begin the set-up of the autopilot that sent a heartbeat, if it can be flown.
 
         `target` are the numbers of its system and component.
         """
@@ -181,7 +179,7 @@ class Autopilot:
         self.parts = Parts(setup, launch, streams)
 
     def hear(self, message: Message, *, now_ns: int) -> None:
-        """Process a message of the autopilot; ignored from an unsuitable one."""
+        """Process a message of the autopilot; an unsuitable autopilot's are ignored."""
         if self.parts is None:
             return
         condition, (setup, launch, streams) = self.condition, self.parts

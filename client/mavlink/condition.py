@@ -23,7 +23,7 @@ KNOWS = dialect.ESTIMATOR_VELOCITY_HORIZ
 PLACED = dialect.ESTIMATOR_POS_HORIZ_ABS | dialect.ESTIMATOR_POS_HORIZ_REL
 """Flags of an estimate with a valid position; one is enough."""
 STANDS_IN = dialect.ESTIMATOR_CONST_POS_MODE
-"""Flag of an estimate without data, which assumes that the vehicle stands still."""
+"""Flag of an estimate that assumes a vehicle at rest, for lack of data."""
 UNKNOWN_MV, UNKNOWN_PERCENT = 65535, -1
 BATTERY_BAD = range(
     int(dialect.MAV_BATTERY_CHARGE_STATE_LOW), int(dialect.MAV_BATTERY_CHARGE_STATE_UNHEALTHY) + 1
@@ -66,7 +66,7 @@ class Condition:
         self._low_ns: int | None = None
         self.receiver = Receiver()
         self.has_new_fix = False
-        """Whether the newest message had a usable fix of the receiver that is new."""
+        """Whether the newest message had a new and usable fix of the receiver."""
 
     def hear(self, message: Message, *, now_ns: int) -> None:
         """Process a message of the autopilot, unless a newer one arrived before it.
@@ -160,7 +160,7 @@ class Condition:
 
 
 def _since(before_ns: int | None, now_so: bool, now_ns: int) -> int | None:
-    """Start of a condition that holds now; None if it does not hold."""
+    """Start time of a condition that holds now; None if it does not hold."""
     if not now_so:
         return None
     return now_ns if before_ns is None else before_ns

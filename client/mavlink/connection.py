@@ -1,8 +1,8 @@
-"""Connection to the autopilot: its address, its numbers, and the sender of each message.
+"""Connection to the autopilot: its address and numbers, and the sender of each message.
 
-The first autopilot from which a heartbeat arrives is flown. If that autopilot falls silent and its
-heartbeats then come from another address, it has restarted: on a UDP line it is followed to the new
-address if it is disarmed.
+The client flies the first autopilot that sends a heartbeat. If that autopilot falls silent and its
+heartbeats then come from another address, it has restarted: on a UDP line, the client uses the new
+address if the autopilot is disarmed.
 """
 
 from collections import Counter
@@ -57,7 +57,7 @@ class Connection:
 
         Args:
             is_quiet: whether the autopilot has been silent for a while.
-            armed: whether its newest heartbeat reported it armed.
+            armed: whether the autopilot was armed in its newest heartbeat.
         """
         if self.peer is not None and datagram.peer != self.peer:
             self.counts["elsewhere"] += 1

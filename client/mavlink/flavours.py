@@ -39,18 +39,18 @@ class Flavour:
     """Number of the mode that follows set-points."""
     land: int
     back: int
-    """Number of the mode that returns home and lands there."""
+    """Number of the mode that returns home and lands."""
     hold: int
     lift: int
-    """Number of the mode that a take-off command leads to."""
+    """Number of the mode during a commanded take-off."""
     steps: tuple[LaunchStep, ...]
     streams_first: bool
-    """Whether the autopilot needs set-points before it enters its guided mode; set-points also
-    bring it back there."""
+    """Whether the autopilot needs set-points before it enters its guided mode; later set-points
+    also switch it back to this mode."""
     words_for_stations: bool
     """Whether the autopilot sends status texts to ground stations only."""
     fixed_heartbeats: bool
-    """Whether the rate of its heartbeats cannot be set, so that each one is requested."""
+    """Whether the rate of heartbeats cannot be set, so that each heartbeat is requested."""
     time_out: str
     """Name of the parameter of the set-point time-out [s]."""
     above_sea: bool

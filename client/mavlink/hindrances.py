@@ -18,7 +18,7 @@ from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Reason
 
 FRESH_NS = 200 * MILLISECOND_NS
-"""Age up to which a velocity is compared with the command."""
+"""Largest age of a velocity that is compared with the command."""
 
 
 class Hindrances:
@@ -88,7 +88,7 @@ class Hindrances:
         return self._silence(now_ns)
 
     def _rival(self, now_ns: int) -> Reason | None:
-        """Second commander, by the way it was detected; None if there is none."""
+        """Reason by the way in which a second commander was detected; None if there is none."""
         event: VehicleEvent
         if self.rivals.are_there(now_ns=now_ns):
             system, component, content = self.rivals.newest

@@ -4,8 +4,8 @@
 
 A step is done when the autopilot's own state says so; until then its command is repeated. A vehicle
 is armed only on the ground and only if `armed` is set in the scenario. A mode chosen by somebody
-else is not changed: once the vehicle is armed, the client replaces only the mode that it has set
-itself, or that its take-off command led to. The mode that follows set-points gives it back.
+else is not changed: once the vehicle is armed, the client replaces only a mode that it has set, or
+to which its take-off command led. A pilot returns control by the mode that follows set-points.
 
 A vehicle that an earlier run of the client, or somebody else, has armed is not armed again before
 an operator allows it: a process restarted after a landing must not take off. A vehicle in the air
@@ -39,15 +39,14 @@ RETURN_MAX_NS = 600 * SECOND_NS
 REFUSED_NS = 4 * SECOND_NS
 """Time after which a vehicle that ignores the command to return is commanded to land."""
 QUIET_NS = 3 * SECOND_NS
-"""Silence of the autopilot after which that silence is reported as the reason for a step not
-done."""
+"""Time after which the autopilot's silence is reported as the reason for an unfinished step."""
 SILENT_MAX_NS = 10 * SECOND_NS
-"""Silence of the autopilot after which the end of a landing is no longer awaited."""
+"""Silence of the autopilot after which the client stops waiting for the end of a landing."""
 THERE_M = 0.3
-"""Largest difference from the take-off altitude at which the climb is over."""
+"""The climb is over within this distance of the take-off altitude."""
 LIFTED_M = 1.0
 """Distance below the take-off altitude from which the autopilot may end the climb by itself: PX4
-does at NAV_MC_ALT_RAD, by default 0.8 m."""
+ends it at NAV_MC_ALT_RAD, by default 0.8 m."""
 STILL_MPS = 0.3
 """Vertical speed below which the climb is over."""
 SET_MODE = int(dialect.MAV_CMD_DO_SET_MODE)
@@ -83,7 +82,7 @@ class Launch:
         target: numbers of the autopilot's system and component.
         altitude: take-off altitude above the ground [m].
         patience_ns: time that each step may take [ns].
-        from_takeoff: whether our origin is where the vehicle is armed.
+        from_takeoff: whether the scenario's origin is the place of arming.
     """
 
     def __init__(
@@ -110,15 +109,15 @@ class Launch:
         """Time at which the command of the current step was last sent."""
         self._accepted = False
         self._own_mode: int | None = None
-        """Number of the mode that is the client's own beside the guided one; None if there is
-        none, as in flight or after somebody else has changed it."""
+        """Number of the mode, other than the guided one, that the client has set; None in flight,
+        or after somebody else has changed the mode."""
         self._lift_asked = False
         self.why_not_armed = ""
         """Why an operator has to allow arming; empty if not needed."""
         self._asked_to_arm = False
         self._hovers_ns: int | None = None
-        """Time since which the vehicle hovers because the origin is unknown; None while it does
-        not."""
+        """Time since which the vehicle hovers because the origin is unknown; None if it does not
+        hover."""
         self.took_off = False
         self._closed = False
         """Whether take-off is no longer allowed."""
@@ -126,9 +125,9 @@ class Launch:
         self.waits_for = ""
         """Reason why the vehicle cannot take off yet, in words; empty if there is none."""
         self._stated_reason = ""
-        """Reason that the autopilot gave in this step."""
+        """Reason for a refusal that the autopilot gave in the present step of the launch."""
         self._refused: set[tuple[int, int]] = set()
-        """Refusals reported in this step: command and result."""
+        """Refusals reported in the present step of the launch: command and result."""
         self.failure: NotTakenOff | None = None
 
     # -- take-off --------------------------------------------------------------------------
@@ -327,8 +326,8 @@ class Launch:
         return self._has_own_mode(now_ns) and condition.armed and condition.is_fresh(now_ns=now_ns)
 
     def _has_own_mode(self, now_ns: int) -> bool:
-        """Whether nobody else has chosen the present mode; follows the changes of mode to which the
-        client's own commands lead.
+        """Whether nobody else has chosen the present mode; changes of mode by the client's own
+        commands are followed.
         """
         mode, flavour = self._condition.mode, self._flavour
         is_high = self._positions.altitude >= self._altitude - LIFTED_M
@@ -353,7 +352,7 @@ class Launch:
         return is_asked and self._flavour.steps[self._step] is LaunchStep.HOLD
 
     def _is_late_to_lift(self, now_ns: int) -> bool:
-        """Whether the mode of an accepted take-off should have been reported long ago."""
+        """Whether an accepted take-off has not led to its mode for too long."""
         climbs = self.phase is Phase.CLIMBING and self._accepted
         if not climbs or self._flavour.steps[self._step] is not LaunchStep.CLIMB:
             return False
@@ -415,7 +414,7 @@ class Launch:
             if self._condition.home is None:
                 self._stated_reason = "its autopilot reports no home position"
                 return None
-            # Home was set a while ago, and the height estimate has drifted since.
+            # The height estimate has drifted since home was set.
             ground = self._positions.origin[2] - self._condition.home_up
             altitude += self._condition.home[2] + ground
         self._lift_asked = True

@@ -5,19 +5,19 @@ The commanded velocity u of an axis gives two bounds of the real velocity, low a
     high(t) = max(g u of the last θ + 0.3 s, each with an error of a quarter;  high(t - Δt) - a Δt)
 
 and low likewise: a vehicle may follow at once, or as slowly as with a = 1 m/s² and 0.3 s later than
-its dead time θ. A velocity outside these bounds by more than a
-share of 1 m/s + fence.wind_mps, over all axes, is explained neither by wind nor by model errors:
-somebody else commands the autopilot, or it has failed. The longer it lasts, the smaller the share:
+its dead time θ. Neither wind nor model errors explain a velocity outside these bounds by more than
+a share of 1 m/s + fence.wind_mps, over all axes: somebody else commands the autopilot, or it has
+failed. The share is smaller if the deviation lasts longer:
 
-    all of it for 0.1 s;  3/4 for 3 s;  1/5 for 5 s while no command points the way it moves
+    all of it for 0.1 s;  3/4 for 3 s;  1/5 for 5 s while no command has its direction
 
-Such a vehicle counts as obedient again once the deviation has stayed below 0.15 of it for 0.5 s,
-and not any more after a second time within a minute: the one who commands it is still there.
+Such a vehicle counts as obedient again once the deviation has stayed below 0.15 of it for 0.5 s.
+After a second deviation within a minute it never does: the other commander is still active.
 
 `python -m pytest tests/client/test_rivals_aboard.py` flies both autopilots in wind and turbulence,
 with models wrong by 30 % and 20 %, without a false alarm. The largest deviations there, on PX4 with
-the default of fence.wind_mps, are 1.73 m/s for 0.1 s of 2.0, 1.30 for 3 s of 1.5, and standing 0.32
-for 5 s of 0.4.
+the default of fence.wind_mps, are 1.73 m/s for 0.1 s (allowed: 2.0), 1.30 for 3 s (1.5), and at
+rest 0.32 for 5 s (0.4).
 """
 
 import math
@@ -40,13 +40,13 @@ NOTICED = (
     (0.75, 3 * SECOND_NS, math.inf),
     (0.2, 5 * SECOND_NS, 0.1),
 )
-"""Shares of the allowed deviation; time for which the deviation has to be larger; and largest
-command in the direction of motion at which this counts [m/s]."""
+"""Rows: share of the allowed deviation, time for which the deviation has to be larger, and largest
+command in the direction of motion for which the row applies [m/s]."""
 CALM_SHARE, QUIET_NS = 0.15, 500 * MILLISECOND_NS
 """Share of the allowed deviation below which the deviation has to stay, and the time for which it
 has to, until the vehicle counts as obedient again."""
 AGAIN_NS = 60 * SECOND_NS
-"""Time after one disobedience within which the next one is final."""
+"""Time after the end of one disobedience within which another one is final."""
 COMMANDS_MAX = 256
 
 
@@ -62,7 +62,7 @@ class Obedience:
         self._low = self._high = [0.0, 0.0, 0.0]
         self._stepped_ns: int | None = None
         self._outside_ns: list[int | None] = [None] * len(NOTICED)
-        """Time since which the deviation has been too large, by row of NOTICED; None while it is
+        """Time since which the deviation has been too large, by row of NOTICED; None if it is
         not."""
         self._restless_ns = 0
         """Newest time at which the deviation was too large for an obedient vehicle."""
@@ -70,7 +70,7 @@ class Obedience:
         self._ended_ns: int | None = None
         """Time at which the newest disobedience ended; None without one."""
         self.off_mps = 0.0
-        """Newest distance of the velocity from its bounds [m/s]."""
+        """Distance of the newest velocity from the allowed range [m/s]."""
 
     def begin(self) -> None:
         """Start again after somebody else has flown the vehicle."""
@@ -78,7 +78,7 @@ class Obedience:
         self.strays, self._is_final, self._ended_ns = False, False, None
 
     def pause(self) -> None:
-        """Compare from the next velocity on; a vehicle that strays is not obedient again by it."""
+        """Compare again from the next velocity on; a disobedient vehicle stays disobedient."""
         self._commands.clear()
         self._stepped_ns, self._outside_ns = None, [None] * len(NOTICED)
 

@@ -31,7 +31,7 @@ CLOSES = 3
 
 
 class Port(Endpoint):
-    """Connection to one autopilot; `altitude` is that of take-off [m]."""
+    """Connection to one autopilot; `altitude`: take-off altitude [m]."""
 
     def __init__(self, scenario: Scenario, vehicle: int, line: Line, altitude: float) -> None:
         super().__init__()
@@ -126,8 +126,8 @@ class Port(Endpoint):
             self._say(_heartbeat(dialect.MAV_TYPE_GCS))
 
     def _request_heartbeat(self) -> None:
-        """Request the first heartbeat: it may come a second later by itself, and a client that is
-        started again in flight has to send set-points before.
+        """Request the first heartbeat: unrequested, it may come a second later, and a client
+        restarted in flight has to send set-points earlier.
         """
         if self._connection.unmet is not None:
             peer, target = self._connection.unmet
@@ -135,8 +135,8 @@ class Port(Endpoint):
             self.send(self._connection.codec.encode(wanted), peer)
 
     def _is_given_up(self) -> bool:
-        """Whether the vehicle ignores the command to land: without the client's heartbeats its own
-        failsafe lands it.
+        """Whether the vehicle ignores the command to land. Its own failsafe lands it once the
+        client stops its heartbeats.
         """
         parts, condition = self.autopilot.parts, self.autopilot.condition
         lands = parts is not None and parts.launch.phase is Phase.LANDING
@@ -146,8 +146,8 @@ class Port(Endpoint):
         """Whether to announce the client to PX4 as a ground station too: PX4 sends its texts to
         stations only.
 
-        Not if PX4 reacts to losing its ground station: then it would not notice the loss of another
-        one.
+        False if PX4 reacts to the loss of its ground station: it would no longer notice the loss of
+        another station.
         """
         parts = self.autopilot.parts
         return (
@@ -189,7 +189,7 @@ class Port(Endpoint):
             self.send(self._connection.codec.encode(message), self._connection.peer)
 
     def close(self, *, now_ns: int) -> None:
-        """A vehicle in the air under our control lands by itself."""
+        """Command a vehicle in the air under our control to land by itself."""
         self.now_ns = now_ns
         if (parts := self.autopilot.parts) is not None:
             for message in parts.launch.close(now_ns=now_ns) * CLOSES:

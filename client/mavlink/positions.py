@@ -12,7 +12,7 @@ from skytether.shared.base.units import MILLISECOND_NS
 from skytether.shared.scenario.schema import Scenario
 
 FRESH_NS = 200 * MILLISECOND_NS
-"""Age up to which a position is compared with a fix of the receiver."""
+"""Largest age of a position that is compared with a fix of the receiver."""
 
 
 def given_origin(scenario: Scenario) -> Vector | None:
@@ -36,7 +36,7 @@ class Positions(positions.Positions):
         self._slides = Slides()
 
     def hear(self, message: Message, *, now_ns: int) -> None:
-        # The stamp is in whole milliseconds: its middle is the best guess.
+        # The stamp is in whole milliseconds: the middle of the millisecond is the best guess.
         boot_ns = message.time_boot_ms * MILLISECOND_NS + MILLISECOND_NS // 2
         position = turned((message.x, message.y, message.z))
         velocity = turned((message.vx, message.vy, message.vz))
@@ -54,11 +54,11 @@ class Positions(positions.Positions):
         is_old = now_ns - self.came_ns > FRESH_NS
         if is_old or self.origin != self._origin_before:
             self._slides.begin()
-        if is_old:  # if newer positions were dropped, the fixes have moved on and this has not
+        if is_old:  # later positions were dropped; this position is older than the fix
             return
         (north, east, _), (x, y, _) = self.position, self.origin
         slide = self._slides.slid((north - x, east - y), velocity, stamp_ns)
         if slide is not None:
-            # An operator who has decided about a slide is not asked about the rest of it.
+            # The operator is asked once per slide, not about the rest of the slide.
             self.displace((*slide.by_m, 0.0), asks=slide.begins or self.leap_m is not None)
         self._origin_before = self.origin

@@ -1,7 +1,7 @@
 """Position receiver of an autopilot, from GPS_RAW_INT: whether it has a fix, and its velocity.
 
 An autopilot flies on for seconds after the last fix, by its accelerometers alone, before its own
-flags say so. A vehicle whose receiver never had a fix since the client began has another source.
+flags say so. A vehicle whose receiver had no fix since the client's start uses another source.
 """
 
 import math
@@ -13,13 +13,13 @@ from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
 LOST_NS = 1500 * MILLISECOND_NS
 """Time without a usable fix after which the receiver counts as lost, unless fixes are rare."""
 FEWEST = 3
-"""Number of intervals between fixes without one after which the receiver counts as lost."""
+"""Number of usual intervals without a fix after which the receiver counts as lost."""
 INTERVAL_MAX_NS = 2 * SECOND_NS
-"""Largest interval that counts as one between fixes."""
+"""Largest time between two fixes that counts as a usual interval."""
 UNHEARD_NS = SECOND_NS // 2
-"""Pause of all messages after which the time without a fix counts anew."""
+"""Pause of all messages after which the time without a fix is counted from 0."""
 ACCURACY_MM = 5000
-"""Largest horizontal error of a usable fix [mm], as both autopilots' own checks have it."""
+"""Largest horizontal error of a usable fix [mm], as in both autopilots' own checks."""
 UNKNOWN = 65535
 US_NS = 1000
 
@@ -30,13 +30,13 @@ class Receiver:
         """Time of the newest usable fix, on the autopilot's clock, or of its arrival if it has no
         time [ns]; -1 before the first."""
         self.velocity: tuple[float, float] | None = None
-        """Velocity of that fix, north and east [m/s]; None if it has none."""
+        """Velocity of the newest usable fix, north and east [m/s]; None if the fix has none."""
         self._fix_ns: int | None = None
-        """Arrival of that fix, or a later time from which the time without one counts [ns]."""
+        """Time from which the time without a fix counts [ns]: arrival of the fix, or later."""
         self._interval_ns = 0
 
     def hear(self, message: Message, *, now_ns: int) -> bool:
-        """Process a GPS_RAW_INT; returns whether it has a usable fix that is new."""
+        """Process a GPS_RAW_INT; returns whether it has a new and usable fix."""
         stamp_ns = message.time_usec * US_NS or now_ns  # 0: PX4, if the receiver knows no date
         if not _is_usable(message) or stamp_ns == self.stamp_ns:
             return False

@@ -13,8 +13,8 @@ from skytether.shared.base.units import SECOND_NS
 WINDOW_NS = SECOND_NS
 """Window in which set-points are counted."""
 LEAST = 2
-"""Number of set-points in the window that count as a second commander; a single one may be a
-stray."""
+"""Number of set-points in the window that count as a second commander; one alone may be a stray
+packet."""
 QUIET_NS = 3 * SECOND_NS
 """Silence after which a second commander counts as gone."""
 STREAMS = frozenset(
@@ -37,7 +37,7 @@ GOTO = frozenset(
 """Commands that move a vehicle in its present mode, and are sent once. A change of mode is detected
 from heartbeats."""
 GUIDED_ITEM = (2, 3)
-"""Values of `current` of a mission item that is flown to at once, or sets an altitude."""
+"""Values of `current` that mark a mission item as a goal or an altitude to fly to at once."""
 STICK = 50
 """Smallest stick deflection that counts, of 1000, or of 500 µs."""
 CENTRE_US = 1500

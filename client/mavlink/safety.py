@@ -4,8 +4,7 @@
 one second at most, and once the client's process has ended it has to come down; hovering or flying
 on for ever is unsafe.
 
-A required parameter that the autopilot does not have makes it unsafe; any other is reported as
-missing.
+The autopilot is unsafe if it lacks a required parameter; any other is reported as missing.
 """
 
 import math
@@ -27,7 +26,7 @@ TOLERANCE = 1e-6
 
 def returns_below_m(scenario: Scenario) -> float | None:
     """Altitude below which a vehicle without a link returns home [m], infinite without a fence;
-    None for a vehicle that lands where it is.
+    None if the vehicle lands in place.
     """
     if scenario.vehicle.on_loss != "return":
         return None
@@ -37,7 +36,7 @@ def returns_below_m(scenario: Scenario) -> float | None:
 
 class Rule(NamedTuple):
     names: tuple[str, ...]
-    """Names of the parameter in versions of the autopilot, newest last."""
+    """Names of the parameter in different versions of the autopilot, newest last."""
     meaning: Callable[[float], str]
     is_safe: Callable[[float], bool] = lambda _: True
     wanted: str = ""
@@ -112,7 +111,7 @@ def _options(value: float) -> str:
 
 
 CLEAR_M = 1.0
-"""Distance below the fence of the return altitude that is set."""
+"""Distance from the fence down to the return altitude that the client sets [m]."""
 
 
 def _below(value: float, below_m: float) -> bool:
@@ -171,7 +170,7 @@ def _px4_returns(below_m: float | None) -> tuple[Rule, ...]:
 def ardupilot(system: int, returns_below_m: float | None = None) -> tuple[Rule, ...]:
     """Rules for ArduCopter, for `system` as the client's own MAVLink system.
 
-    `returns_below_m` is the altitude below which the vehicle has to return home, if it does.
+    `returns_below_m`: altitude below which the vehicle has to return home; None: it lands in place.
     """
     return (
         *_ardupilot_returns(returns_below_m),
@@ -236,8 +235,8 @@ def ardupilot(system: int, returns_below_m: float | None = None) -> tuple[Rule, 
 
 
 def px4(returns_below_m: float | None = None) -> tuple[Rule, ...]:
-    """Rules for PX4; `returns_below_m` is the altitude below which it has to return home, if it
-    does.
+    """Rules for PX4; `returns_below_m`: altitude below which the vehicle has to return home; None:
+    it lands in place.
     """
     return (
         *_px4_returns(returns_below_m),

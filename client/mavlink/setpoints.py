@@ -1,4 +1,4 @@
-"""Set-points: when a desired velocity is sent, and repeated; never a position.
+"""Set-points: times at which a desired velocity, never a position, is sent and repeated.
 
 pilot's command → sent at once → repeated SETPOINTS_MIN_HZ times a second → no new command for
 UNFLOWN_NS: silence, and the autopilot's own time-out acts
@@ -16,14 +16,14 @@ UNFLOWN_NS = 500 * MILLISECOND_NS
 """Time after which a silent pilot counts as gone; then no set-point is sent."""
 SETPOINTS_MIN_HZ, SETPOINTS_MAX_HZ = 20, 50.0
 CURRENT_NS = 300 * MILLISECOND_NS
-"""Time after a pause of set-points from which on a heartbeat counts as current: earlier ones may
-have waited in a queue."""
+"""Time after a pause of set-points before a heartbeat counts as current: an earlier one may have
+waited in a queue."""
 LATE = 1.1
-"""Number of intervals after which a set-point is repeated, since a step may come late."""
+"""Number of intervals after which a set-point is repeated; above 1, as steps may be late."""
 ZERO_NS = 50 * MILLISECOND_NS
 """Interval between zero set-points, if a mode needs a stream of them."""
 VELOCITY_ALONE = 0b110111000111
-"""Type mask of a set-point with neither position nor acceleration, nor yaw or yaw rate."""
+"""Type mask of a set-point with a velocity only."""
 FRAME = int(dialect.MAV_FRAME_LOCAL_NED)
 ZERO = 0.0, 0.0, 0.0
 
@@ -31,7 +31,7 @@ ZERO = 0.0, 0.0, 0.0
 class Sends(Enum):
     NOTHING = auto()
     ZEROS = auto()
-    """Zeros, if the next mode needs a stream of set-points before it is entered."""
+    """Send zeros, because the next mode needs a stream of set-points first."""
     COMMANDS = auto()
 
 

@@ -1,4 +1,4 @@
-"""Set-up: which autopilot it is, and whether its parameters are safe.
+"""Set-up: identification of the autopilot, and check of its parameters.
 
     heartbeat → version → parameters, read one by one → all safe, or refused, or set and read again
 
@@ -27,10 +27,10 @@ from skytether.shared.events.aboard import (
 
 AGAIN_NS = 400 * MILLISECOND_NS
 TRIES = 10
-"""Number of times that a question is asked; with 10 % loss each way, one in ten million stays
-open."""
+"""Number of times that a question is sent; with 10 % loss each way, one in ten million stays
+unanswered."""
 AT_ONCE = 4
-"""Largest number of open questions at once, for the sake of serial lines."""
+"""Largest number of unanswered questions at once, because serial lines are slow."""
 VERSION = int(dialect.MAVLINK_MSG_ID_AUTOPILOT_VERSION)
 BYTEWISE = dialect.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE
 CONVERTED = dialect.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_C_CAST
@@ -42,7 +42,7 @@ class Setup:
     Args:
         target: numbers of the autopilot's system and component.
         system: number of the client's own system.
-        returns_below_m: altitude below which the vehicle has to return home, if it does [m].
+        returns_below_m: altitude below which the vehicle has to return home [m]; None: it lands.
     """
 
     def __init__(
@@ -67,7 +67,7 @@ class Setup:
         self._version: str | None = None
         self._version_tries = 0
         self._tries: dict[str, int] = {name: 0 for rule in self._rules for name in rule.names}
-        """Times that each unknown parameter was requested, or set."""
+        """Number of times that each unknown parameter was requested or set."""
         self._values: dict[str, float] = {}
         self._kinds: dict[str, int] = {}
         self._setting: dict[str, tuple[float, float]] = {}
@@ -90,7 +90,7 @@ class Setup:
             return "the version of its autopilot"
         return f"parameters of its autopilot: {', '.join(list(self._tries)[:AT_ONCE])}"
 
-    # What is heard
+    # Answers
 
     def hear(self, message: Message) -> None:
         match message.get_type():
@@ -126,7 +126,7 @@ class Setup:
             AutopilotFound(vehicle=self._vehicle, name=name, system=self._target[0])
         )
 
-    # What is asked
+    # Questions
 
     def ask(self, *, now_ns: int) -> list[Message]:
         if self.is_done or self.failure:
@@ -164,7 +164,7 @@ class Setup:
         sent = parameters.to_wire(value, bytewise=self._bytewise)
         return dialect.MAVLink_param_set_message(*self._target, name.encode(), sent, kind)
 
-    # What follows
+    # Verdict
 
     def _judge(self) -> None:
         """Report all parameters; then finish, set the unsafe ones, or fail."""

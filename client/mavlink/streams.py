@@ -1,6 +1,6 @@
 """Streams of messages, requested again if they do not arrive.
 
-An autopilot that sends heartbeats at its own rate only is asked for each of them instead.
+If the rate of an autopilot's heartbeats is fixed, each additional heartbeat is requested.
 """
 
 from collections.abc import Mapping
@@ -29,7 +29,7 @@ RATES = {
     int(dialect.MAVLINK_MSG_ID_BATTERY_STATUS): 1.0,
     int(dialect.MAVLINK_MSG_ID_HOME_POSITION): 0.5,
 }
-"""Requested rates [Hz], beside those of heartbeats, positions and the estimator status."""
+"""Requested rates of messages other than heartbeats, positions and estimator status [Hz]."""
 
 
 def rates(flavour: Flavour, positions_hz: float) -> dict[int, float]:
@@ -58,9 +58,9 @@ class _Stream:
         self.count = 0
         self.least_ns = max(WINDOW_NS, round(LEAST / rate * SECOND_NS))
         self.window_ns = 0
-        """Length of this window [ns]; 0 before the first."""
+        """Length of the present window [ns]; 0 before the first window."""
         self.until_ns = 0
-        """End of this window, when the stream is requested again unless enough messages arrived."""
+        """End of the window; the stream is then requested again unless enough messages arrived."""
 
 
 class Streams:
@@ -76,14 +76,14 @@ class Streams:
         self.newest = ""
         self._streams = {number: _Stream(rate) for number, rate in rates.items()}
         self._heartbeat_ns = 0
-        """Time of the next request for a heartbeat, if they are no stream."""
+        """Time of the next request for a heartbeat, if each one is requested."""
 
     def hear(self, number: int) -> None:
         if number in self._streams:
             self._streams[number].count += 1
 
     def ask(self, *, now_ns: int) -> list[Message]:
-        """Requests for a heartbeat, if one is due, and for the next missing stream."""
+        """Requests that are due: for a heartbeat, and for the next missing stream."""
         if HEARTBEAT in self._streams or now_ns < self._heartbeat_ns:
             return self._ask_stream(now_ns)
         self._heartbeat_ns = now_ns + round(SECOND_NS / HEARTBEAT_HZ)

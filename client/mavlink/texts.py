@@ -11,7 +11,7 @@ SAME_TEXT_NS = 30 * SECOND_NS
 TEXTS_KEPT = 16
 """Number of texts remembered, and largest number logged at once."""
 TEXT_NS = 2 * SECOND_NS
-"""Time after which one more may be logged."""
+"""Time after which one more text may be logged."""
 
 
 class LoggedTexts:
@@ -20,9 +20,9 @@ class LoggedTexts:
         self._texts = Texts()
         self._logged_ns: dict[str, int] = {}
         self._left, self._left_ns = TEXTS_KEPT, 0
-        """Number of texts that may be logged now, and time of its last change."""
+        """Number of texts that may be logged now, and the time at which it last changed."""
         self._omitted = 0
-        """Number of texts left out since the last report of such texts."""
+        """Number of texts not logged since the last report of this number."""
 
     def hear(self, message: Message, *, now_ns: int) -> str:
         """Log the text that a STATUSTEXT completes; return the text, empty if none is complete."""

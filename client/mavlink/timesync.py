@@ -44,9 +44,7 @@ class Timesync:
         return True
 
     def ask(self, *, is_heard: bool, now_ns: int) -> list[Message]:
-        """Question, if it is due. An autopilot that sends messages but no
-        answers is reported once.
-        """
+        """Question if one is due. An autopilot that sends messages but no answers is reported."""
         clock, was_reported = self._clock, self._reported_silent
         silent_ns = now_ns - clock.heard_ns if clock.is_known and is_heard else 0
         self._reported_silent = silent_ns > SILENT_NS

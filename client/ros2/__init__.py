@@ -5,9 +5,9 @@
     vehicle   the pilot's interface: velocities in, measurements out
     port      messages from and to the robot
     odometry  measurements from nav_msgs/Odometry: frames, and the robot's clock
-    drive     the command of a robot for a velocity of the point that is flown
+    drive     the robot's command that gives its controlled point a velocity
 
-Messages and names are in `skytether.ros2`. The package imports that, `shared`, and of the client
-the interface of a vehicle, its clock, positions and filter. `keys` and `kind` load without the
-extra `ros2`.
+Messages and names are in `skytether.ros2`. The package imports `skytether.ros2`, `shared` and, from
+the client, the interface of a vehicle, its clock, positions and filter. `keys` and `kind` load
+without the extra `ros2`.
 """

@@ -1,14 +1,14 @@
-"""The point of a robot that is flown, and the command that gives it a velocity.
+"""The controlled point of a robot, and the command that gives this point a velocity.
 
 A holonomic robot moves in every direction, and the point is the origin of its child frame. A
-differential one moves along its axis only, and turns: there the point lies `ahead` metres before
-the axle, where every velocity can be reached (feedback linearisation by a point ahead). With the
-rotation R and the turn ω of the robot:
+differential robot only moves along its axis, and turns: its point is `ahead` metres in front of the
+axle, where every velocity is possible (feedback linearisation by a point ahead). With the rotation
+R and the turn ω of the robot:
 
     position = p + R (ahead, 0, 0)      velocity = R (v + (0, ahead ω, 0))
     command: linear x = (Rᵀ u)₁, and turn = (Rᵀ u)₂ / ahead
 
-The heading then follows the motion by itself, stably as long as the robot drives forward.
+The heading then follows the motion, and is stable while the robot drives forward.
 """
 
 from collections.abc import Sequence
@@ -20,7 +20,7 @@ from skytether.ros2.messages import Odometry, Rotation, Vector
 class Command(NamedTuple):
     frame: str
     linear: Vector
-    """Linear velocity in that frame [m/s]."""
+    """Linear velocity in the frame of the command [m/s]."""
     turn: float
     """Turn about the vertical axis [rad/s]."""
 

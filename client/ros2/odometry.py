@@ -1,12 +1,12 @@
-"""Measurements from nav_msgs/Odometry: in one frame, by the client's clock, in order.
+"""Measurements from nav_msgs/Odometry, in one frame, on the client's clock, in order.
 
-A robot answers no questions about its clock, so it is known from the arrivals alone:
+A robot answers no questions about its clock, so only the arrivals of messages show its time:
 
     the fastest message of an interval, stamped b, arrives at t, after at most ROUND_TRIP_NS:
     offset = t - ROUND_TRIP_NS / 2 - b
 
-which is a sample like the answer of an autopilot. A delay that all messages have in common cannot
-be seen, and makes the measurements that much younger than they are.
+which is a sample like the answer of an autopilot. A delay common to all messages cannot be
+detected; measurements then count as younger by this delay.
 """
 
 from skytether.client.clock import BootClock
@@ -22,11 +22,11 @@ from skytether.shared.scenario.schema import Scenario
 ROUND_TRIP_NS = 4 * MILLISECOND_NS
 """Assumed bound of the delay of an interval's fastest message: the client runs aboard."""
 BEGIN_NS, INTERVAL_NS = 100 * MILLISECOND_NS, SECOND_NS
-"""Interval of the samples before the clock is known, and after."""
+"""Interval of clock samples before the clock is known, and after."""
 
 
 class OdometryFilter:
-    """Odometry of one robot, turned into positions and velocities of the point that is flown."""
+    """Conversion of one robot's odometry to positions and velocities of its controlled point."""
 
     def __init__(self, scenario: Scenario, vehicle: int) -> None:
         keys = scenario.section(Ros2Config)
@@ -44,10 +44,10 @@ class OdometryFilter:
         self.heard = 0
         self._frames: tuple[str, str] | None = None
         self._fastest: tuple[int, int] | None = None
-        """Arrival and stamp of the interval's fastest message [ns]."""
+        """Arrival and stamp of the fastest message of the present interval [ns]."""
         self._sampled_ns: int | None = None
         self._fault = ""
-        """What is wrong with the newest message by itself, in words; empty if nothing is."""
+        """Fault of the newest message, apart from its time, in words; empty if it has none."""
 
     @property
     def fault(self) -> str:
@@ -81,7 +81,7 @@ class OdometryFilter:
         self._fault = fault
 
     def _time(self, stamp_ns: int, now_ns: int) -> None:
-        """Sample the robot's clock with the fastest message of each interval."""
+        """Take a sample of the robot's clock from the fastest message of each interval."""
         if self._sampled_ns is None:
             self._sampled_ns = now_ns
         if self._fastest is None or now_ns - stamp_ns < self._fastest[0] - self._fastest[1]:

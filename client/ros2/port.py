@@ -1,11 +1,10 @@
 """The connection to a robot as an endpoint: its topics are the peers of the datagrams.
 
-    in   odometry; commands of anybody else; tokens of the graph, with an empty payload for one that
-         is gone
+    in   odometry; commands of other nodes; tokens of the graph, with an empty payload once removed
     out  commands, at each of the pilot's steps; after a landing zeros for ZEROS_NS, then silence
 
-Commands are of the type that a subscriber takes: TwistStamped or Twist. Without a subscriber of
-either, no flight begins, for the robot would not move.
+Commands have the type that a subscriber accepts: TwistStamped or Twist. Without a subscriber of
+either, no flight begins, because the robot would not move.
 
 No command is repeated: if the pilot stops, the robot's own time-out acts.
 """
@@ -28,20 +27,20 @@ from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Reason
 
 TICK_NS = 100 * MILLISECOND_NS
-"""Interval at which the time is followed while nothing arrives."""
+"""Interval at which timers are checked while nothing arrives."""
 ZEROS_NS = 500 * MILLISECOND_NS
 """Time for which zeros are commanded at the end of a flight, before the silence."""
 CLOSES = 3
-"""Number of zeros if the process ends."""
+"""Number of zero velocities sent when the process ends."""
 ZERO = 0.0, 0.0, 0.0
 RIVAL_NS, RIVALS_LEAST = SECOND_NS, 2
-"""Commands of others within this window that count as a second commander; one may be a stray."""
+"""Window, and number of other nodes' commands in it that count as a second commander."""
 QUIET_NS = 3 * SECOND_NS
 """Silence after which a second commander counts as gone."""
 REPORT_NS = 10 * SECOND_NS
 """Time after which a second commander is reported again."""
 ENTITIES_MAX = 96
-"""Number of others' publishers and subscribers that are kept."""
+"""Largest number of other nodes' publishers and subscribers that are stored."""
 
 
 class Port(Endpoint):
@@ -66,9 +65,9 @@ class Port(Endpoint):
         )
         self.odometry = OdometryFilter(scenario, vehicle)
         self._entities: dict[str, Entity] = {}
-        """Others' publishers and subscribers of our topics, by their tokens."""
+        """Other nodes' publishers and subscribers of our topics, by token."""
         self._form: int | None = None
-        """Index of the type of the commands in the node's `forms`, once one was sent."""
+        """Index of the commands' type in the node's `forms`, once a command was sent."""
         self._rivals_ns: deque[int] = deque(maxlen=RIVALS_LEAST)
         self._rival_ns: int | None = None
         """Time of the newest command of a second commander; None without one."""
@@ -84,7 +83,7 @@ class Port(Endpoint):
 
     @property
     def is_down(self) -> bool:
-        """Whether the robot is not, or no longer, commanded."""
+        """Whether the client sends no commands to the robot, or no more."""
         return not self._commands or (
             self._silent_ns is not None and self.now_ns >= self._silent_ns
         )
@@ -99,7 +98,7 @@ class Port(Endpoint):
 
     @property
     def _known_form(self) -> int | None:
-        """Index of the type of the commands; None while there is no subscriber of any."""
+        """Index of the commands' type; None while no type has a subscriber."""
         if self._form is not None:
             return self._form
         takers = self._those(SUBSCRIBER, self._keys.command)
@@ -140,7 +139,7 @@ class Port(Endpoint):
             self._silent_ns, self._zero_ns = self.now_ns + ZEROS_NS, self.now_ns
 
     def hindrance(self, *, now_ns: int) -> Reason | None:
-        """Second commander → silence → unusable odometry."""
+        """Reason, in this order: second commander, silence, unusable odometry."""
         self.now_ns = now_ns
         if self._rival_ns is not None and now_ns - self._rival_ns <= QUIET_NS:
             return Reason.RIVAL
@@ -179,7 +178,7 @@ class Port(Endpoint):
         if len(self._rivals_ns) < RIVALS_LEAST or now_ns - self._rivals_ns[0] > RIVAL_NS:
             return
         self._rival_ns = now_ns
-        if self._silent_ns is not None:  # the robot is left to others
+        if self._silent_ns is not None:  # after a landing other nodes may command the robot
             return
         if self._reported_ns is None or now_ns - self._reported_ns >= REPORT_NS:
             self._reported_ns = now_ns
@@ -221,14 +220,14 @@ class Port(Endpoint):
         self.send(payload, (keys.command, form))
 
     def close(self, *, now_ns: int) -> None:
-        """Stop the robot, whatever it does when commands end."""
+        """Send zeros, because not every robot stops when commands end."""
         self.now_ns = now_ns
         if self._commands and not self.is_down:
             for _ in range(CLOSES):
                 self._command(ZERO)
 
     def figures(self) -> dict[str, Any]:
-        """Names as those of an autopilot, so that the same metrics show them."""
+        """Figures under the same names as an autopilot's, so that the same metrics show them."""
         return {
             "measurements": self.odometry.positions.taken,
             "heard": self.odometry.heard,
@@ -240,7 +239,7 @@ class Port(Endpoint):
 
 
 def _instead(others: Sequence[Entity], expected: Iterable[Topic]) -> str:
-    """What there is instead of the expected types, in words; empty if there is nothing."""
+    """Mismatch between the types found and those expected, in words; empty if none was found."""
     if not others:
         return ""
     hashes = " or ".join(topic.type_hash for topic in expected)

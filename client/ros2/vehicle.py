@@ -13,11 +13,11 @@ from skytether.shared.telemetry.record import Reason
 
 
 class Ros2Vehicle(Vehicle):
-    """A robot that is commanded velocities.
+    """A robot that follows commanded velocities.
 
     Raises:
-        ConfigError: the address is not that of a Zenoh router or peer, or a differential robot is
-            to be flown in space.
+        ConfigError: the address is not that of a Zenoh router or peer, or the scenario of a
+            differential robot has three axes.
     """
 
     def __init__(self, scenario: Scenario, number: int) -> None:
@@ -33,7 +33,7 @@ class Ros2Vehicle(Vehicle):
         self.node = self._port.node
         self._positions = self._port.odometry.positions
         self._placed = 0
-        """Number of measurements before the origin was placed: the pilot needs one after it."""
+        """Number of measurements when the origin was placed; the pilot needs a later one."""
 
     def fly(self, velocity: Array) -> None:
         x, y, *up = velocity.tolist()
@@ -51,7 +51,7 @@ class Ros2Vehicle(Vehicle):
         return self._port.waits_for
 
     def take_off(self, *, now_ns: int) -> bool:
-        """Place the origin below the robot, unless it is known; a robot needs no take-off."""
+        """Set the origin to the robot's place, unless it is known; a robot needs no take-off."""
         self._port.now_ns = now_ns
         if self._port.is_ready and not self._positions.has_origin:
             self._positions.begin()

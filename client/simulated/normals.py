@@ -33,7 +33,7 @@ class Normals:
         return self._block[self._used - 1]
 
     def give_back(self) -> None:
-        """Rewind the stream to just after the numbers that were used."""
+        """Rewind the stream to its state after the used numbers."""
         if self._used < len(self._block):
             self._rng.bit_generator.state = self._before
             self._rng.standard_normal((self._used, *self._shape))

@@ -1,6 +1,6 @@
 """Simulated quadrotor: rigid body, rotors, control loops and air, see `quadrotor`.
 
-With two axes it holds its altitude by itself.
+In a scenario with two axes the quadrotor holds its altitude.
 """
 
 import numpy as np

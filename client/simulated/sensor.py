@@ -3,8 +3,8 @@
     z(k) = x(k - D) + b + σ n          D: delay [steps]   b: bias   σ n: noise
 
 A measurement is made at the start of a step, and becomes available at the start of the first step
-at which it is due and its delay has passed. At step 0 everything measured at all is due; before
-that the vehicle has stood at its start.
+at which it is due and its delay has passed. At step 0 every measured quantity is due; before step 0
+the vehicle stands at its start.
 """
 
 from collections import deque
@@ -56,7 +56,7 @@ class Sensor:
         self._noisy = noisy
         """Indices of the measured quantities with noise: position 0, velocity 1."""
         self._drawn = np.zeros_like(self._bias)
-        """Numbers n if only one has noise; shape (2, axes)."""
+        """Numbers n if only one of position and velocity has noise; shape (2, axes)."""
         self._states: deque[Array] = deque(maxlen=self.delay + 1)
         self._step = 0
 

@@ -27,7 +27,7 @@ class Plant(Protocol):
         """Fly one step with this desired velocity [m/s]; shape (axes,)."""
 
     def change(self, vehicle: VehicleConfig) -> None:
-        """Change the winds from the next step on."""
+        """Use changed winds from the next step on."""
 
 
 class SimulatedVehicle(Vehicle):

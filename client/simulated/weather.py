@@ -22,7 +22,7 @@ def shoved(x: Table, white: Table, drawn: Table) -> None:
 
     Args:
         x: position [m] and velocity [m/s] of each axis; shape (axes, 2).
-        white: square root of its covariance, [L11, L21, L22] of each axis.
+        white: square root of the effect's covariance, [L11, L21, L22] of each axis.
         drawn: two normal random numbers per axis.
     """
     for i in range(len(x)):
@@ -39,7 +39,7 @@ class Weather:
         self._dt_s = scenario.control.dt
         self._tau = scenario.true_tau_s
         self._gust: Array | None = None
-        """Direction of the gust, of any length; shape (axes,). None between gusts."""
+        """Direction of the gust, not normalised; shape (axes,). None between gusts."""
         self._normals = Normals(rng, (len(self._tau), 2))
         self.change(scenario.vehicle)
 
@@ -64,13 +64,13 @@ class Weather:
         return self._push
 
     def shove(self, x: Array) -> None:
-        """Add the effect of white acceleration over that step to `x`, in place.
+        """Add the effect of one step of white acceleration to `x`, in place.
 
         `x` has position [m] and velocity [m/s] of each axis; shape (axes, 2).
         """
         if self._white is None:
             return
-        # Gusts draw numbers between those of two steps.
+        # Not drawn in advance if gusts use numbers of the same stream between two steps.
         gusty = self._gust_mps2 != 0.0
         drawn = self._rng.standard_normal(x.shape) if gusty else self._normals.next()
         shoved(x, self._white, drawn)

@@ -1,10 +1,10 @@
-"""Leadership: which of its servers plans for a vehicle.
+"""Leadership: the choice of the server that plans for a vehicle.
 
 The vehicle decides, by a number that only rises: with s servers, number n means that server n mod s
-leads, and what was planned under another number is not flown. The vehicle raises it when the leader
-is silent and another server is heard; when an operator says so; and on a mission when a server that
-it hears has received a larger number from another vehicle, so that all then follow one server.
-On a mission it follows no server that plans within other limits than the one that leads.
+leads, and plans made under another number are not flown. The vehicle raises the number when the
+leader is silent and another server answers; on an operator's order; and on a mission when a server
+reports a larger number from another vehicle, so that all vehicles follow one server. On a mission
+it follows no server whose motions have other limits than those of the leader.
 """
 
 from collections.abc import Sequence
@@ -12,11 +12,11 @@ from collections.abc import Sequence
 from skytether.shared.law.limits import Limits
 
 NUMBER_MAX, JUMP_MAX = 2**32 - 1, 10_000
-"""Largest number, and largest rise at once to a number that a server sends."""
+"""Largest number of a leadership, and largest accepted rise to a number from a server."""
 ASK_SHARE, CHANGE_SHARE = 0.35, 0.75
-"""Shares of the time-out for which the leader has to be silent before another server is asked
-whether it is there, and before it leads. The first is just more than the time between heartbeats
-over a good link: every tenth of a second counts, since the plan in force ends."""
+"""Shares of the time-out for which the leader has to be silent before the vehicle sends LEAD to
+another server, and before that server leads. The first is just above the interval of heartbeats
+over a good link, because the plan in force soon ends."""
 
 
 class Leadership:
@@ -25,7 +25,7 @@ class Leadership:
     Args:
         servers: number of servers, 1 or more.
         number: number of an earlier run of the client.
-        timeout_ns: silence after which the vehicle takes a server for lost [ns].
+        timeout_ns: silence after which the vehicle considers a server lost [ns].
     """
 
     def __init__(self, servers: int, number: int, timeout_ns: int) -> None:
@@ -33,18 +33,18 @@ class Leadership:
         self._ask_ns = round(ASK_SHARE * timeout_ns)
         self._change_ns = round(CHANGE_SHARE * timeout_ns)
         self.limits: list[Limits | None] = [None] * servers
-        """Limits of each server's motions, as it last sent them; None before that, or without a
+        """Limits of each server's motions, as last received; None before that, or without a
         mission."""
         self._changes = [0] * servers
-        """Number of changes of these limits in the server's run, as it last sent it."""
+        """Number of changes of `limits` in each server's run, as last received."""
 
     @property
     def leader(self) -> int:
-        """Which server leads, from 0."""
+        """Number of the leading server, from 0."""
         return self.number % self._servers
 
     def begin(self, server: int) -> None:
-        """Begin a session with another run of a server, which counts its changes anew."""
+        """Begin a session with another run of a server, whose count of changes starts at 0."""
         self._changes[server] = 0
 
     def hear_limits(self, server: int, limits: Limits | None, changes: int) -> None:
@@ -53,38 +53,38 @@ class Leadership:
             self._changes[server], self.limits[server] = changes, limits
 
     def may_lead(self, server: int) -> bool:
-        """Whether a server plans within the limits of the present leader, as far as is known."""
+        """Whether a server's limits equal the leader's, or one of the two is unknown."""
         theirs, ours = self.limits[server], self.limits[self.leader]
         return theirs is None or ours is None or theirs == ours
 
     def doubts(self, heard_ns: Sequence[int], now_ns: int) -> bool:
-        """Whether the leader is silent for so long that other servers are to be asked.
+        """Whether the leader has been silent for ASK_SHARE of the time-out.
 
         Args:
-            heard_ns: when each server was last heard.
+            heard_ns: time of the newest packet of each server [ns].
         """
         return now_ns - heard_ns[self.leader] >= self._ask_ns
 
     def successor(self, heard_ns: Sequence[int], now_ns: int) -> int | None:
-        """Server that is to lead in place of a silent leader; None if the leader is not silent, or
-        no other server is heard that may lead.
+        """Server that replaces a silent leader; None if the leader is not silent, or no other
+        server answers that may lead.
         """
         last_ns = heard_ns[self.leader]
         if now_ns - last_ns < self._change_ns:
             return None
         newest = max(filter(self.may_lead, range(self._servers)), key=heard_ns.__getitem__)
-        # Only one that was heard since the leader was doubted: both may be out of reach.
+        # Only a server that was heard since the leader was doubted: both may be out of reach.
         return newest if heard_ns[newest] >= last_ns + self._ask_ns else None
 
     def hand_over(self, server: int) -> None:
-        """Let a server lead from now on; no effect if it leads, or once no number is left."""
+        """Let a server lead from now on; no effect if it leads or all numbers are used up."""
         raised = self.number + (server - self.number) % self._servers
         if raised <= NUMBER_MAX:
             self.number = raised
 
     def exceed(self, number: int, server: int) -> None:
-        """Let `server` lead, if it may, with a number above one that it received from an earlier
-        run of this vehicle, which has not saved it.
+        """Let `server` lead, if it may, with a number above `number`, which an earlier run of this
+        vehicle sent but did not save.
         """
         if self.number < number <= NUMBER_MAX - self._servers:
             leads = server if self.may_lead(server) else self.leader
@@ -92,7 +92,7 @@ class Leadership:
             self.hand_over(leads)
 
     def learn(self, number: int, server: int) -> bool:
-        """Take over a larger number from a server that leads with it, if it may lead."""
+        """Adopt a larger number from the server that leads under it, if that server may lead."""
         is_larger = self.number < number <= min(NUMBER_MAX, self.number + JUMP_MAX)
         if not is_larger or number % self._servers != server or not self.may_lead(server):
             return False

@@ -1,10 +1,10 @@
-"""The servers of a vehicle: chooses which one leads, and tells each by LEAD messages.
+"""The servers of a vehicle: choice of the one that leads, and LEAD messages that report it.
 
-The vehicle changes the leader by the rules of `leadership`; packets and faults of the leader alone
-reach the failsafe.
+The vehicle changes the leader by the rules of `leadership`; the failsafe receives packets and
+faults of the leader only.
 
-It takes the place of `client.alone.OneServer`; `client.several` loads it if there is a standby
-server, and `client.alone.Reach` if an earlier run of the client had one.
+The class `Servers` replaces `client.alone.OneServer`; `client.several` loads it if there is a
+standby server, and `client.alone.Reach` if an earlier run of the client had one.
 """
 
 from dataclasses import dataclass
@@ -30,20 +30,20 @@ from skytether.shared.wire.protocol import Message
 
 LEADER_KEY = "link.leader"
 NAMES = ("server", "standby")
-"""Values of that key, by the number of the server."""
+"""Values of `link.leader`, by the number of the server."""
 SOON_NS = 200 * MILLISECOND_NS
-"""Time after which a server that has to lead is sent LEAD again if it has not answered [ns]."""
+"""Time after which LEAD is sent again to a leader that has not answered [ns]."""
 GROUND_NS = 3 * SECOND_NS
-"""Additional time for which the leader of a vehicle on the ground may be silent [ns]: there it
-answers HELLOs only, of which the first need several packets each way."""
+"""Additional time for which the leader of a vehicle on the ground may be silent [ns]: it then only
+answers HELLOs, and the first ones need several packets each way."""
 DEPARTURES = frozenset({Reason.CLOSED, Reason.RESTARTED})
-"""Causes after which a server stops leading if another is heard."""
+"""Causes after which a server stops leading if another server answers."""
 NEVER_NS = -(2**63)
 NOT_THE_LEADER = "not the leader"
 """Reason for dropping a plan of a server that does not lead, or of an earlier leadership."""
 LOST_TIMES = 6
-"""Silence after which a server that does not lead counts as lost, as a multiple of the time-out;
-half of SESSION_NS bounds it."""
+"""Silence after which a server that does not lead counts as lost, as a multiple of the time-out; at
+most half of SESSION_NS."""
 
 
 @dataclass(slots=True)
@@ -51,11 +51,11 @@ class LeadState:
     """LEAD messages to one server, and its answers, in the present session."""
 
     number: int | None = None
-    """Largest number of a leadership in its answers; None before the first."""
+    """Largest number of a leadership in the server's answers; None before the first answer."""
     again_ns: int = 0
-    """Time before which no further LEAD is sent to it [ns]."""
+    """Time before which no further LEAD is sent to the server [ns]."""
     asked: tuple[int, int] = 0, -SESSION_NS
-    """Vehicle's step, and time [ns], at which the newest LEAD was sent to it."""
+    """Vehicle's step, and time [ns], of the newest LEAD sent to the server."""
 
 
 class Servers(OneServer):
@@ -70,9 +70,9 @@ class Servers(OneServer):
 
     def __init__(self, count: int, parts: Parts) -> None:
         super().__init__(parts.failsafe)
-        number = getattr(parts.before, "leadership", 0)  # without saved state there is none
+        number = getattr(parts.before, "leadership", 0)  # none without saved state
         timeout_ns = seconds_to_ns(parts.scenario.link.timeout_s)
-        # A vehicle that has lost its standby server tells the other that it leads now.
+        # A vehicle without its former standby server informs the other server that it leads now.
         number += bool(number and count == 1)
         self.leadership = Leadership(count, number, timeout_ns)
         self.sessions: list[ServerSession] = []
@@ -83,15 +83,15 @@ class Servers(OneServer):
         self._reported = number
         """Number of the leadership that was last reported."""
         self._differing: dict[int, tuple[Difference, ...]] = {}
-        """Reported differences of the limits of each server that may not lead."""
+        """Latest reported differences of limits, by number of a server that may not lead."""
         self._now_ns = NEVER_NS
         self._counted_from_ns: int | None = None
         """Time before which the silence of the leader does not count [ns]: a server that does not
         lead, or leads a vehicle on the ground, sends rarely. None before the first wake."""
         self._was_on_ground = False
         self._silent_since_ns = NEVER_NS
-        """Begin of the leader's silence for which the failsafe last got another time-out [ns]: it
-        gets one for each silence."""
+        """Begin of the leader's silence for which the failsafe's time-out was last restarted [ns];
+        one restart per silence."""
 
     @property
     def followed(self) -> ServerSession:
@@ -103,7 +103,7 @@ class Servers(OneServer):
         self.leadership.begin(server)
 
     def knows_leader(self, server: int) -> bool:
-        """Whether a server has answered that it knows who leads."""
+        """Whether a server has confirmed which server leads."""
         return self._lead_states[server].number is not None
 
     def to_keep(self) -> dict[str, Any]:
@@ -119,7 +119,7 @@ class Servers(OneServer):
     # -- deciding ----------------------------------------------------------------------------
 
     def follow(self, *, step: int, on_ground: bool, now_ns: int) -> None:
-        """Let another server lead if the leader is silent, and tell all servers who leads.
+        """Let another server lead if the leader is silent, and inform all servers of the leader.
 
         Args:
             step: step of the vehicle.
@@ -139,22 +139,22 @@ class Servers(OneServer):
             lead.hand_over(successor)
         self._report()
         self._report_limits()
-        # Only once the number is saved: the next run must not follow an earlier leadership than the
-        # servers do.
+        # Sent only once the number is saved: the next run of the client must not follow an earlier
+        # leadership than the servers.
         if self._may_tell(now_ns):
             self._tell(lead.doubts(heard_ns, now_ns), heard_ns[lead.leader], step, now_ns)
 
     def name(self, server: int, *, now_ns: int) -> None:
-        """Let a server lead, on an operator's order or because the leader has left."""
+        """Let a server lead, on an operator's order or after the leader's CLOSE."""
         self.leadership.hand_over(server)
         self._counted_from_ns = now_ns
         self._report()
 
     def leave(self, server: int, cause: Reason, *, now_ns: int) -> bool:
-        """Act on a fault of a server, or on its end, by letting another lead.
+        """Let another server lead after a fault of a server, or after its end.
 
         Returns:
-            whether another leads; otherwise the failsafe has to act on the cause.
+            whether another server leads now; otherwise the failsafe has to act on the cause.
         """
         if self.sessions[server].role.is_followed:
             others = [i for i, each in enumerate(self.sessions) if i != server]
@@ -183,19 +183,19 @@ class Servers(OneServer):
             return f"{LEADER_KEY}: got {named!r}, but {self._limits_differ(server)}"
         return ""
 
-    # -- telling -----------------------------------------------------------------------------
+    # -- LEAD messages -----------------------------------------------------------------------
 
     def _tell(self, doubts: bool, leader_ns: int, step: int, now_ns: int) -> None:
         """Send LEAD to each server that has not answered with the present leadership.
 
         Args:
-            doubts: whether the leader is silent; then the other servers are sent LEAD too, and an
-                answer shows that they are there.
+            doubts: whether the leader is silent; LEAD is then sent to the other servers too, whose
+                answers show that they are reachable.
             leader_ns: time at which the leader was last heard [ns].
         """
         if doubts and leader_ns != self._silent_since_ns and not self._is_alone(now_ns):
             self._silent_since_ns = leader_ns
-            self.failsafe.heard(now_ns=now_ns)  # the other server gets a time-out to answer
+            self.failsafe.heard(now_ns=now_ns)  # wait another time-out for the other server
         for state, session in zip(self._lead_states, self.sessions, strict=True):
             if session.number is None or now_ns < state.again_ns:
                 continue
@@ -208,8 +208,8 @@ class Servers(OneServer):
     def take(self, server: int, message: Message, now_ns: int) -> bool:
         """Process a LEAD of a server; False for any other message.
 
-        A late answer does no harm: numbers of leaderships only rise. It counts as a sign of life
-        only if the LEAD that it answers was sent recently.
+        A late answer does no harm: numbers of leaderships only rise. It counts as an answer of a
+        live server only if the LEAD that it answers was sent recently.
         """
         if not isinstance(message, Lead):
             return False
@@ -225,7 +225,7 @@ class Servers(OneServer):
         return True
 
     def _is_alone(self, now_ns: int) -> bool:
-        """Whether no other server is heard that may lead."""
+        """Whether no other server that may lead answers."""
         may_lead = filter(self.leadership.may_lead, range(self._count))
         return all(
             self.sessions[i].role.is_followed or self.sessions[i].is_lost(now_ns) for i in may_lead
@@ -260,7 +260,7 @@ class Servers(OneServer):
                 self._events.append(event)
 
     def _report(self) -> None:
-        """Report that another server leads; the failsafe goes by its packets from now on."""
+        """Report that another server leads; its packets reach the failsafe from now on."""
         if self._reported == self.leadership.number:
             return
         self._reported, session = self.leadership.number, self.followed
@@ -273,10 +273,10 @@ class Servers(OneServer):
 
 
 class OneOfServers(Role):
-    """What one of several servers is to the vehicle; faults of the leader alone reach the failsafe.
+    """Role of one of several servers; only the leader's packets and faults reach the failsafe.
 
     Args:
-        server: its number, from 0.
+        server: number of the server, from 0.
     """
 
     def __init__(self, servers: Servers, server: int) -> None:
@@ -292,7 +292,7 @@ class OneOfServers(Role):
 
     @property
     def may_observe(self) -> bool:  # type: ignore[override] # changes in flight
-        """See `Role`: a server that does not know who leads would take itself for the leader."""
+        """See `Role`: a server that does not know the leader would assume that it leads itself."""
         return self._servers.knows_leader(self._server)
 
     def decode(self, payload: bytes, terms: Terms) -> Message:
@@ -310,7 +310,7 @@ class OneOfServers(Role):
         return self._servers.take(self._server, message, now_ns)
 
     def lost_after_ns(self, timeout_ns: int) -> int:
-        """See `Role`: before the server forgets the session."""
+        """See `Role`; shorter than the time after which the server forgets the session."""
         if self.is_followed:
             return timeout_ns
         return max(timeout_ns, min(LOST_TIMES * timeout_ns, SESSION_NS // 2))
