@@ -39,12 +39,12 @@ if TYPE_CHECKING:
     from skytether.shell.driving.program import Program
 
 NETWORK = "transparent"
-"""Scenario of a relay that belongs to no flight."""
+"""Default scenario: without impairments, for packets of any program."""
 COLLECT_AFTER = 100_000
 """Number of new objects after which garbage is collected. Queued packets are not garbage, and the
 default of 700 would scan all of them many times a second."""
 MTU_MIN, MTU_MAX = 1280, 65_520
-"""Bounds of an MTU: the least that IPv6 allows, and the most that slirp4netns takes [B]."""
+"""Bounds of an MTU: the smallest that IPv6 allows, the largest that slirp4netns accepts [B]."""
 
 
 @dataclass(frozen=True)
@@ -53,8 +53,8 @@ class NetemOptions(ProcessOptions):
 
     scenario: command.ScenarioName = NETWORK
     """A scenario's name (`skytether list scenarios`) or a .toml file, for its network and seed.
-    netem is part of that scenario's flight then: fates follow the time, and not the number of a
-    packet in its flow."""
+    netem then belongs to a flight: a packet's fate depends on its time, not on its number in its
+    flow."""
     bind: str = "127.0.0.1:47000"
     """HOST:PORT to listen on for clients; port 0 takes a free one. An IPv6 host is written in
     brackets, as in [::1]:47000; its socket receives IPv6 only, even for [::]. A name means its IPv4
@@ -67,13 +67,13 @@ class NetemOptions(ProcessOptions):
     to_server: str | None = None
     """Impairments of packets from clients to the server; the key network.downlink."""
     path: Annotated[int, Argument(metavar="N")] = 1
-    """Path of the scenario to emulate, from 1, see network.paths; one more than there are is that
-    to a standby server, impaired like the first."""
+    """Path of the scenario to emulate, from 1, see network.paths; the number after the last is the
+    path to a standby server, impaired like the first."""
     tcp: bool = False
     """Relay TCP connections in place of UDP: latency, a rate and cuts, and no packet loss."""
     flows: Annotated[int | None, Argument(metavar="N")] = None
-    """Largest number of clients at once, each of which takes a socket; by default 512, or as many
-    as the system allows. With --tcp, of connections: 1 to 128, the default."""
+    """Largest number of clients at once; each needs a socket. By default 512, or as many as the
+    system allows. With --tcp, of connections: 1 to 128, the default."""
 
 
 @dataclass(frozen=True)
@@ -88,7 +88,7 @@ class RunOptions(ProcessOptions):
     from_program: str | None = None
     """Impairments of packets from the program; the key network.downlink."""
     expose: Annotated[tuple[str, ...], Argument(metavar="PORT", append=True)] = ()
-    """Port of this machine, TCP and UDP, that leads to the same port of the program; PORT listens
+    """Port of this machine, TCP and UDP, forwarded to the same port of the program; PORT listens
     on 127.0.0.1, HOST:PORT at another IPv4 address. May be repeated."""
     mtu: Annotated[int, Argument(metavar="BYTES")] = 1500
     """Largest packet of the program's network device, 1280 to 65520 bytes."""
@@ -107,7 +107,7 @@ def emulate(argv: Sequence[str]) -> None:
 
     Without these, packets pass at once. With one seed, the packet with the same number in its flow
     has the same fate in each run. SIGUSR1 prints the counters so far; they are also printed
-    at the end. With --control, `skytether set` changes the impairments meanwhile.
+    at the end. With --control, `skytether set` changes the impairments while it runs.
 
     `skytether netem run … -- CMD ARG…`: the same, for all packets of one program.
     """
@@ -151,12 +151,12 @@ def emulate_for(argv: Sequence[str]) -> None:
             -- curl http://10.0.2.2:8000/
 
     All its packets of IPv4 and IPv6 are impaired, as are those of its children: TCP, UDP, QUIC,
-    ICMP, DNS. It reaches other machines as ever, and this one at 10.0.2.2 and fd00::2. With one
-    seed, the packet with the same number in its flow has the same fate in each run. It needs Linux
-    and slirp4netns, and root or user namespaces.
+    ICMP, DNS. It reaches other machines as before, and this machine at 10.0.2.2 and fd00::2. With
+    one seed, the packet with the same number in its flow has the same fate in each run. It needs
+    Linux and slirp4netns, and root or user namespaces.
 
     SIGUSR1 prints the counters so far to stderr; with --control, `skytether set` changes the
-    impairments meanwhile. All other signals are the program's.
+    impairments while it runs. All other signals are passed to the program.
     """
     from skytether.netem.tunnel import Tunnel
     from skytether.shell.driving.program import ProgramError, program
@@ -181,7 +181,7 @@ def emulate_for(argv: Sequence[str]) -> None:
         try:
             passing = min(mtu, path_mtu)
             with program(argv[end + 1 :], mtu, path_mtu=passing, exposed=exposed) as run_:
-                signal.signal(signal.SIGINT, lambda *_: None)  # also while all is taken down
+                signal.signal(signal.SIGINT, lambda *_: None)  # also during the shutdown
                 endpoint = Tunnel(running.scenario, mtu=passing, recorder=running.recorder)
                 running.drive(endpoint, bind=None, waiting_for="", line=run_, on_signal=run_.signal)
         except ProgramError as error:
@@ -209,20 +209,20 @@ def _exposed(text: str) -> Address:
 
 
 def _end_like(program: "Program") -> None:
-    """End this process as the program has ended."""
+    """End this process with the exit code or signal with which the program ended."""
     if program.fault or program.status is None:
         raise command.CommandError(program.fault or "the program was killed with its namespaces")
     if os.WIFSIGNALED(program.status):
         number = os.WTERMSIG(program.status)
-        system.dump_no_core()  # the program has dumped its own
-        with suppress(OSError):  # SIGKILL always has its own action
+        system.dump_no_core()  # the program has written its own core
+        with suppress(OSError):  # the action of SIGKILL cannot change
             signal.signal(number, signal.SIG_DFL)
         os.kill(os.getpid(), number)
     raise SystemExit(os.waitstatus_to_exitcode(program.status))
 
 
 def _with_directions(options: NetemOptions) -> NetemOptions:
-    """Options with the scenario of --path alone, and --to-client and --to-server in its network.
+    """Options whose scenario has only the path --path, with --to-client and --to-server applied.
 
     Raises:
         CommandError: the scenario has no such path.
@@ -236,7 +236,7 @@ def _with_directions(options: NetemOptions) -> NetemOptions:
 def _impaired(
     options: NetemOptions | RunOptions, names: Directions, *, tcp: bool = False
 ) -> Scenario:
-    """Scenario of the options with the texts of its two directions, where they are given.
+    """Scenario of the options, with the impairments of both directions replaced if given.
 
     Args:
         names: options of both directions.
@@ -260,7 +260,7 @@ def _impaired(
 
 
 def _check_server(server: Address, bind: Address) -> None:
-    """Refuse an address of netem itself as the server, since packets would circulate."""
+    """Refuse netem's own address as the server's, because packets would circulate."""
     with suppress(OSError):  # an unknown host is reported when it is used
         if leads_back(server, bind):
             at = address_text(*server)

@@ -19,7 +19,7 @@ from skytether.shared.law.model import Array
 
 QUANTUM_BYTES = 300
 """Bytes that each flow may send per turn under fair queueing [B]: a few small packets; a larger
-packet waits for several turns."""
+packet needs several turns."""
 TARGET_NS, INTERVAL_NS = 5 * MILLISECOND_NS, 100 * MILLISECOND_NS
 """CoDel's parameters: acceptable time in the queue, and time to react to more (RFC 8289) [ns]."""
 
@@ -30,17 +30,17 @@ T = TypeVar("T")
 class Waiting(Generic[T]):
     item: T
     size: int
-    """Bytes including headers [B]."""
+    """Size of the packet, headers included [B]."""
     flow: int
     entered_ns: int
 
 
 @dataclass(slots=True)
 class Codel:
-    """Controlled delay (RFC 8289): drops packets ever more often until queueing times fall."""
+    """Controlled delay (RFC 8289): drops packets more and more often until queueing times fall."""
 
     above_ns: int = 0
-    """Time at which waits will have been too long for INTERVAL_NS; 0 while they are short."""
+    """End of INTERVAL_NS since waits became too long [ns]; 0 while they are short."""
     drop_ns: int = 0
     """Time of the next drop."""
     count: int = 0
@@ -118,7 +118,7 @@ class Bottleneck(Generic[T]):
         queue.packets.append(packet)
         self._count(key, packet, 1)
         while self.waiting_bytes > self._queue.room_bytes and not self._queue.keeps_all:
-            # The flow with the longest queue loses its newest packet, at no other flow's expense.
+            # The flow with the longest queue loses its newest packet; other flows lose none.
             longest = max(self._lines, key=lambda flow_key: self._lines[flow_key].bytes)
             last = self._lines[longest].packets.pop()
             self._count(longest, last, -1)
@@ -171,9 +171,9 @@ class Bottleneck(Generic[T]):
 
     def _is_late(self, queue: FlowQueue[T], packet: Waiting[T], now_ns: int) -> bool:
         waited_ns = now_ns - packet.entered_ns
-        # At a low rate a single packet takes longer than 5 ms, and would be dropped for it.
+        # At a low rate a single packet takes longer than 5 ms, and must not be dropped for that.
         target_ns = max(TARGET_NS, round(self._largest / self._queue.bytes_per_s * SECOND_NS))
-        # With at most one packet behind it, dropping would leave the bottleneck idle.
+        # With at most one more packet waiting, a drop would leave the bottleneck idle.
         is_fine = waited_ns < target_ns or queue.bytes <= self._largest
         return queue.codel.drops(now_ns, is_fine=is_fine)
 
@@ -193,7 +193,7 @@ class _Rate:
         self._bytes_per_s = bytes_per_s
 
     def done_ns(self, now_ns: int, size: int) -> int:
-        """Time at which a packet of this size has passed, if its service starts now."""
+        """Time at which service of a packet of this size ends if it starts now."""
         return now_ns + round(size / self._bytes_per_s * SECOND_NS)
 
 
@@ -207,7 +207,7 @@ class _Deliveries:
         self._times_ns: list[int] = [round(time_s * SECOND_NS) for time_s in times_s]
         self._began_ns: int | None = None
         self._used_bytes = 0
-        """Bytes of the deliveries so far that were used or lost."""
+        """Number of bytes of past deliveries that were used or lost [B]."""
 
     def done_ns(self, now_ns: int, size: int) -> int:
         if self._began_ns is None:

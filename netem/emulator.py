@@ -1,8 +1,8 @@
-"""Both directions of an emulated network, for whatever passes through: see `proxy` for datagrams,
-`relay` for byte streams and `tunnel` for packets of IP.
+"""Both directions of an emulated network, independent of what it carries: see `proxy` for
+datagrams, `relay` for byte streams and `tunnel` for packets of IP.
 
-As in the paper, uplink is to the vehicle, or to whoever takes its place: a proxy's client, a
-tunnel's program. Users of other programs read names of their own (`shared.endpoints.directions`).
+As in the paper, uplink is to the vehicle; without a vehicle, to a proxy's client or a tunnel's
+program. With other programs the directions have other names (`shared.endpoints.directions`).
 """
 
 from abc import abstractmethod
@@ -25,12 +25,12 @@ Direction = Literal["uplink", "downlink"]
 
 
 class Emulator(Endpoint):
-    """Delays, reorders and loses what passes in two directions.
+    """Delays, reorders and loses packets or stream pieces in two directions.
 
     Args:
         mtu: largest payload that passes [B].
-        directions: names of both directions. Packets of a flight have fates by their time, since
-            two controllers send at times of their own; those of other programs by their number.
+        directions: names of both directions. The fate of a flight's packet depends on its time,
+            because controllers send at different times; that of another program's on its number.
         path: number of the session's path, from 0, in the record.
         header_bytes: see `Link`.
     """
@@ -56,7 +56,7 @@ class Emulator(Endpoint):
 
         self.uplink, self.downlink = make(UPLINK, "uplink"), make(DOWNLINK, "downlink")
         self._opened = 0
-        """Number of flows opened so far: the number of the next."""
+        """Number of flows opened so far, which is the number of the next flow."""
         self._faults: set[str] = set()
         """Tracebacks of errors in impairments of plug-ins: each is reported once."""
 
@@ -72,7 +72,7 @@ class Emulator(Endpoint):
         return self.uplink if name == "uplink" else self.downlink
 
     def fates(self, name: Direction, flow: int) -> Fates:
-        """What the packets of one flow meet in a direction."""
+        """Fates of the packets of one flow in a direction."""
         at = self._scenario.seed, name, flow
         return Fates(self.link(name).impairments, *at, by_number=self.directions != FLIGHT)
 

@@ -2,11 +2,11 @@
 
 Each direction has a list of impairments (`netem.impairments`), which modify the fate of a packet
 one after another. In a flight a fate depends on the seed, the direction, the flow and the time slot
-in which the packet enters, but not on earlier packets: so two controllers meet the same network,
-however often each of them sends. For any other program it depends on the packet's number in its
-flow, see `netem.impairments.draws`. Packets of a flight that enter in the same slot have
-different fates, by their rank in the slot: otherwise three CLOSEs sent at once would all be lost
-together. Control traffic is so sparse that nearly every packet is the first of its slot.
+in which the packet enters, but not on earlier packets: so two controllers get the same network even
+if they send at different rates. For any other program it depends on the packet's number in its
+flow, see `netem.impairments.draws`. Packets of a flight that enter in the same slot have different
+fates, by their rank in the slot: otherwise three CLOSEs sent at once would all be lost together.
+Control traffic is so sparse that nearly every packet is the first of its slot.
 
 An impairment of a plug-in that raises an exception, or sets an impossible value, has no effect, so
 that its errors end no flight.
@@ -25,9 +25,9 @@ class Fates:
     """Fates of the packets of one flow in one direction.
 
     Args:
-        by_number: whether what is drawn for a packet depends on its number in the flow, and not on
-            its slot.
-        is_common: whether what lasts for a time, such as an outage, is common to all flows.
+        by_number: whether a packet's random numbers depend on its number in the flow, not on its
+            slot.
+        is_common: whether lasting effects, such as outages, are common to all flows.
     """
 
     by_number = False

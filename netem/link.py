@@ -49,13 +49,13 @@ class Lane:
     slot: int = -1
     """Time slot of the newest packet, counted from `began_ns`."""
     rank: int = 0
-    """Rank of the newest packet in its slot."""
+    """Number of packets in the newest packet's slot before it."""
     taken: int = 0
     """Number of packets so far, lost packets included."""
     newest_out: int = -1
     """Highest number of a packet that has left, or -1."""
     latest_ns: int = 0
-    """Due time of the last packet."""
+    """Due time of the last packet [ns]."""
 
 
 class Entered(NamedTuple):
@@ -77,7 +77,7 @@ class Counts:
     forwarded: int = 0
     """Packets that have left."""
     undelivered: int = 0
-    """Packets that could not be sent on, or were refused on their way; they are not forwarded."""
+    """Packets that could not be sent on, or were refused later; they do not count as forwarded."""
     lost: int = 0
     """Packets lost by impairments."""
     reordered: int = 0
@@ -89,7 +89,7 @@ class Counts:
     dropped: int = 0
     """Packets dropped by the bottleneck's queue."""
     duplicated: int = 0
-    """Copies of packets."""
+    """Copies of packets made by impairments."""
     corrupted: int = 0
     """Packets with a flipped bit."""
     depth_max: int = 0
@@ -112,7 +112,7 @@ class Queue:
     """Queued packets, earliest due time first.
 
     A single heap would be deep and spread over memory: with 44 000 packets, each entry and exit
-    touches a dozen of them. So packets are kept unordered in slices of time, and only the first
+    touches a dozen of them. So packets are stored unordered in slices of time, and only the first
     slice is a heap.
     """
 
@@ -162,7 +162,7 @@ class Link:
 
     Args:
         number: number of the session's path, from 0, in the record.
-        header_bytes: size of the headers that the payload is without [B]; 0 for packets of IP.
+        header_bytes: size of the headers that precede the payload [B]; 0 for packets of IP.
     """
 
     def __init__(
@@ -204,7 +204,7 @@ class Link:
         """Accept a packet, addressed to its destination; True if a packet may be due now."""
         counts, number, size = self.counts, lane.taken, len(datagram.payload)
         slot = (now_ns - lane.began_ns) // SLOT_NS
-        # Packets in the same slot have a rank; otherwise they would all have the same fate.
+        # Packets in the same slot differ by their rank; otherwise all would have the same fate.
         if lane.fates.by_number:
             lane.rank = number
         else:
@@ -261,13 +261,13 @@ class Link:
     ) -> None:
         """Lose a packet that has passed the bottleneck, or queue it until it is due."""
         counts, due_ns, size = self.counts, now_ns + fate.delay_ns, len(datagram.payload)
-        # After the bottleneck: a packet that is lost has used the rate nevertheless.
+        # Lost after the bottleneck, because a lost packet uses the rate as well.
         if fate.lost:
             counts.lost += 1
             self._record_lost(lane, number, size, entered_ns, due_ns - entered_ns)
             return
         if self._is_ordered:
-            # In order: a packet that would overtake waits for the earlier packet.
+            # To keep the order, a packet waits for the earlier packets.
             due_ns = lane.latest_ns = max(due_ns, lane.latest_ns)
         if fate.flipped is not None and size:
             counts.corrupted += 1
@@ -343,7 +343,7 @@ class Link:
         return due_ns
 
     def has_room(self, size: int) -> bool:
-        """Whether a packet of this size [B] would be dropped by no full queue."""
+        """Whether the queues have space for a packet of this size [B]."""
         bottleneck = self._bottleneck
         return not self._is_full(size) and (bottleneck is None or bottleneck.has_room(size))
 

@@ -1,9 +1,9 @@
-"""Places of netem: the flows that have a place, and the order in which new clients replace them.
+"""Places of netem: a limited number of flows, and the order in which new clients replace them.
 
-netem reads no payload, so it cannot tell a vehicle from somebody who repeats a vehicle's packets.
-But it can count. An exchange is a packet of the client followed by one of the server, and EXCHANGES
-of them earn a flow its place for EARNED_NS. A single answer earns nothing, because anybody can
-provoke it. If no place is free, a new client replaces the first of these:
+netem reads no payload, so it cannot distinguish a vehicle from an attacker who repeats a vehicle's
+packets. It counts exchanges instead. An exchange is a packet of the client followed by one of the
+server, and EXCHANGES of them earn a flow its place for EARNED_NS. One answer is not enough, because
+anybody can cause one. If no place is free, a new client replaces the first of these:
 
     1. the oldest unearned flow, if it is unused for IDLE_NS
     2. the oldest unearned flow of the new client's own host, if that has more than HOST_FLOWS
@@ -27,20 +27,20 @@ from skytether.shared.endpoints.endpoint import Address
 EXCHANGES = 8
 """Number of exchanges that earn a flow its place."""
 EARNED_NS = 10 * SECOND_NS
-"""Time for which a place is earned [ns]."""
+"""Time for which a flow keeps a place that it has earned [ns]."""
 IDLE_NS = 5 * SECOND_NS
 """Time without a packet after which a flow is replaced before the flows of a crowded host [ns]."""
 HOST_FLOWS = 64
-"""Number of flows of a host above which they are replaced before the flows of other hosts."""
+"""Number of flows above which a host's flows are replaced before those of other hosts."""
 TRIALS = 8
-"""One place in TRIALS is left to new clients by hosts with more than HOST_FLOWS flows."""
+"""Hosts with more than HOST_FLOWS flows leave one place in TRIALS to new clients."""
 
 
 @dataclass(slots=True)
 class Flow:
     client: Address
     socket: int
-    """Number of its socket towards the server, from 1."""
+    """Number of the flow's socket towards the server, from 1."""
     uplink: Lane
     downlink: Lane
     used_ns: int
@@ -48,11 +48,11 @@ class Flow:
     host: str
     """Host of the client, see `shared.endpoints.endpoint.host_of`."""
     order: "Order"
-    """Flows among which this flow is ordered: `Places._earned` or `Places.others`."""
+    """Order that contains this flow: `Places._earned` or `Places.others`."""
     laps: int
-    """Number of other addresses that had sent the flow's first packet before, see `Proxy._laps`."""
+    """Number of addresses that sent the same first packet earlier, see `Proxy._laps`."""
     asks: bool = False
-    """Whether a packet of the client has come since the newest exchange."""
+    """Whether a packet of the client has arrived since the newest exchange."""
     exchanges: int = 0
     """Number of exchanges since the flow last earned its place."""
     earned_ns: int = 0
@@ -60,7 +60,7 @@ class Flow:
 
 
 class Order:
-    """Flows in order, oldest first, all together and by host."""
+    """Flows ordered by time, oldest first: one order for all, and one for each host."""
 
     def __init__(self) -> None:
         self.flows: OrderedDict[Address, Flow] = OrderedDict()
@@ -95,16 +95,16 @@ class Order:
         return next(iter(flows.values())) if flows else None
 
     def oldest_of_a_crowd(self, but: str = "") -> Flow | None:
-        """Oldest flow of a host with more than HOST_FLOWS, except the host `but`, or None."""
+        """Oldest flow of any host with more than HOST_FLOWS flows except `but`, or None."""
         return next((self.oldest(host) for host in self._crowded if host != but), None)
 
 
 class Places:
     def __init__(self, count: int) -> None:
         self._trials = count // TRIALS
-        """Number of places that a host with more than HOST_FLOWS cannot keep from others."""
+        """Number of places that hosts with more than HOST_FLOWS flows leave to others."""
         self._earned = Order()
-        """Flows that have earned their place, by the time at which they last did."""
+        """Flows that have earned their place, in the order of the newest time of earning it."""
         self.others = Order()
         """All other flows, by the time of their last packets."""
 
@@ -136,7 +136,7 @@ class Places:
         return flow
 
     def _crowding(self, host: str) -> Flow | None:
-        """Flow of a host with more than HOST_FLOWS that a new client of `host` replaces."""
+        """Flow, of a host with more than HOST_FLOWS flows, that a new client of `host` replaces."""
         earned, others = self._earned, self.others
         if earned.count(host) + others.count(host) > HOST_FLOWS and others.count(host):
             return others.oldest(host)

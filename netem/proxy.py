@@ -1,13 +1,13 @@
 """UDP proxy that emulates the network and never decodes packets.
 
-Clients send to netem's bound socket. Each client address is a flow with a socket of its own towards
-the server, so that the server's answers are sent back to the right client. As in the paper, uplink
-is server to client, downlink is client to server.
+Clients send to netem's bound socket. Each client address is a flow with its own socket towards the
+server, so that the server's answers are sent back to the right client. As in the paper, uplink is
+server to client, downlink is client to server.
 
 If no place is free for a new client, it replaces a flow chosen by `places`. A server address that
-leads back to netem is detected: until the server has sent its first packet, a packet that has come
-from LAPS_MAX new addresses, one after another, opens no further flow. The first packet that is too
-long, and the first that does not reach the server, are reported.
+leads back to netem is detected: until the server has sent its first packet, a packet that has
+arrived from LAPS_MAX new addresses, one after another, opens no further flow. The first packet that
+is too long, and the first that does not reach the server, are reported.
 """
 
 from collections import OrderedDict
@@ -32,7 +32,7 @@ from skytether.shared.telemetry.record import Recorder
 FLOWS_MAX = 512
 """Default largest number of clients at once; packets of further clients are dropped and counted."""
 LAPS_MAX = 16
-"""Largest number of flows, each from another address, that one packet opens before an answer."""
+"""Largest number of flows that copies of one packet, from new addresses, open before an answer."""
 
 
 class Proxy(Emulator):
@@ -69,10 +69,10 @@ class Proxy(Emulator):
         self._is_unreachable = False
         """Whether packets to the server have failed since its last answer."""
         self._passed: OrderedDict[int, tuple[int, Address]] = OrderedDict()
-        """Until the server answers: laps of each of the newest packets, and the latest client that
-        sent it, by hash of the packet: Python's own, of 64 bits with a key of the process."""
+        """Number of laps and latest client of each of the newest packets, until the server answers;
+        by Python's hash of the packet (64 bits, with a secret key of the process)."""
         self.refused = 0
-        """Number of packets from clients without a flow, and to a flow's socket not from the
+        """Number of packets from clients without a flow, or to a flow's socket but not from the
         server."""
 
     def receive(self, datagram: Datagram, *, now_ns: int) -> None:
@@ -146,9 +146,9 @@ class Proxy(Emulator):
         return flow
 
     def _laps(self, datagram: Datagram) -> int:
-        """Number of new addresses, one after another, from which a packet has come.
+        """Number of new addresses, one after another, from which the same packet has arrived.
 
-        If no server answers, such a packet is one that netem itself has sent.
+        If no server answers, netem itself has sent such a packet.
         """
         passed = self._passed.get(hash(datagram.payload)) if not self._is_answered else None
         if passed is None:
@@ -184,7 +184,7 @@ def merged(each: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def _added(each: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Sums of the counts with one name, in groups too; no quantiles and no maxima."""
+    """Sums of the counts of equal name, also within groups; without quantiles and maxima."""
     total: dict[str, Any] = {}
     for name in dict.fromkeys(name for one in each for name in one):
         values = [one[name] for one in each if name in one]

@@ -1,12 +1,12 @@
-"""Relay of byte streams: latency, a rate and cuts of TCP connections, which lose no byte.
+"""Relay of byte streams: adds latency, a rate limit and cuts to TCP connections; no byte is lost.
 
-A stream has no packets that could be lost. Each piece of it passes the same impairments as a packet
-would; a piece that would be lost holds up its stream and is tried again every RETRY_NS, about as a
-retransmission would be. Pieces never overtake each other, and are neither copied nor damaged. A
-full queue takes nothing from its connections until there is room. This is no packet loss: TCP's own
-answer to loss shows only where its packets pass, in a network namespace.
+A stream has no packets that could be lost. Each piece of a stream passes the same impairments as a
+packet; a piece that would be lost holds up its stream and is tried again every RETRY_NS, similar to
+a retransmission. Pieces never overtake each other, and are neither copied nor damaged. A full queue
+reads nothing from its connections until it has space. This is no packet loss: TCP's own reaction to
+loss only appears if its packets are emulated, see `netem.tunnel`.
 
-The ends of connection N are the peers `(CLIENT, N)` and `(SERVER, N)`; an empty piece says that an
+The ends of connection N are the peers `(CLIENT, N)` and `(SERVER, N)`; an empty piece means that an
 end sends no more.
 """
 
@@ -30,10 +30,10 @@ from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Recorder
 
 TRY = 1 << 32
-"""Distance, in numbers of pieces, of what is drawn for one try of a piece and for its next."""
+"""Difference of the piece numbers used to draw one try of a piece and its next try."""
 RETRY_NS = 200 * MILLISECOND_NS
-"""Time after which a piece that would have been lost is tried again [ns]: Linux's smallest
-retransmission time-out."""
+"""Time after which a piece that a link would have lost is sent again [ns]: the smallest
+retransmission time-out of Linux."""
 
 
 class LosslessFates(Fates):
@@ -53,13 +53,13 @@ class HalfConnection:
         self.tries = 0
         """Number of times that the first held piece would have been lost."""
         self.retry_ns: int | None = None
-        """Time at which the first held piece is tried again; None while it waits for room."""
+        """Time at which the first held piece is tried again; None while it waits for space."""
 
     def loses(self, now_ns: int) -> bool:
-        """Whether the first held piece would be lost now, as a packet."""
+        """Whether the first held piece would be lost now if it was a packet."""
         slot = (now_ns - self.lane.began_ns) // SLOT_NS
         number = self.lane.taken + TRY * self.tries
-        return Fates.at(self.lane.fates, slot, number).lost  # those of its own lose nothing
+        return Fates.at(self.lane.fates, slot, number).lost  # `LosslessFates` would never lose it
 
 
 class Relay(Emulator):
@@ -85,7 +85,7 @@ class Relay(Emulator):
         self._holding: dict[Address, HalfConnection] = {}
         """Streams with held pieces, in the order in which they are tried."""
         self._ended: set[Address] = set()
-        """Sources whose end has left."""
+        """Sources whose end-of-stream piece has left the link."""
         self._retries = 0
 
     def receive(self, datagram: Datagram, *, now_ns: int) -> None:
@@ -142,7 +142,7 @@ class Relay(Emulator):
                 self._end(_other(side), number)
 
     def _end(self, side: str, number: int) -> None:
-        """Forget a connection once both of its ends have sent all."""
+        """Forget a connection once both sides have closed it."""
         self._ended.add((side, number))
         both = (CLIENT, number), (SERVER, number)
         if self._ended.issuperset(both):
@@ -171,7 +171,7 @@ class Relay(Emulator):
         return objection(scenario)
 
     def change(self, scenario: Scenario, keys: frozenset[str], *, now_ns: int) -> None:
-        """See `Endpoint`; streams that are held up are tried again at once."""
+        """See `Endpoint`; held pieces of streams are tried again at once."""
         super().change(scenario, keys, now_ns=now_ns)
         for stream in self._holding.values():
             stream.retry_ns = now_ns
@@ -182,7 +182,7 @@ class Relay(Emulator):
 
 
 def objection(scenario: Scenario) -> str:
-    """Why the network of a scenario suits no byte streams, in words; empty if it does."""
+    """Why byte streams cannot pass the network of a scenario, in words; empty if they can."""
     for key, of in zip(KEYS, (scenario.uplink, scenario.downlink), strict=True):
         if names := _only_packets(of):
             expected = "nothing that acts on packets alone, for TCP is relayed as a stream of bytes"
@@ -196,13 +196,13 @@ def _other(side: str) -> str:
 
 
 def _only_packets(of: Impairments) -> list[str]:
-    """Names of what byte streams cannot have."""
+    """Names of the impairments that cannot apply to byte streams."""
     names = [name for name, each in of.parts if each.only_packets]
     return [*names, "drop=codel"] if of.queue and of.queue.drop == "codel" else names
 
 
 def _for_streams(of: Impairments) -> Impairments:
-    """The same for pieces of byte streams: they stay in order, and its queue drops none."""
+    """Impairments for pieces of byte streams: pieces stay in order, and the queue drops none."""
     same = copy(of)
     same.is_ordered = True
     if same.queue:

@@ -1,7 +1,7 @@
-"""Tunnel: the network of one program, whose packets of IP pass it both ways.
+"""Tunnel: the network of one program, which carries the program's IP packets both ways.
 
-As for a vehicle, uplink is to the program and downlink is from it. A program that sends alike meets
-the same network in each run, see `netem.impairments.draws`.
+As for a vehicle, uplink is to the program and downlink is from it. A program that sends the same
+packets gets the same network in each run, see `netem.impairments.draws`.
 """
 
 from collections import OrderedDict
@@ -18,14 +18,14 @@ from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Recorder
 
 FLOWS_MAX = 16_384
-"""Largest number of flows known at once; a further one replaces that which was silent longest."""
+"""Largest number of flows stored; a further one replaces the flow that was silent longest."""
 
 
 class Tunnel(Emulator):
     """Delays, reorders and loses packets between a program and the outside.
 
-    A datagram's peer is PROGRAM or OUTSIDE, and its payload a packet of IP. An empty one is the
-    end: of the program, whose last packets still go out; or of the outside, and of all.
+    A datagram's peer is PROGRAM or OUTSIDE, and its payload a packet of IP. An empty payload is the
+    end: of the program, whose last packets are still sent; or of the outside, and of all.
 
     Args:
         mtu: largest packet that passes [B]; the program gets an ICMP error for a longer one.
@@ -35,15 +35,15 @@ class Tunnel(Emulator):
         super().__init__(scenario, mtu=mtu, directions=RUN, recorder=recorder, header_bytes=0)
         self._mtu = mtu
         self._flows: OrderedDict[bytes, tuple[Lane, Lane]] = OrderedDict()
-        """Uplink and downlink of each flow by its key, that which was silent longest first.
+        """Uplink and downlink of each flow by its key; the flow that was silent longest is first.
 
         A flow is packets with the same protocol, addresses and ports, both ways."""
         self._began_ns = 0
-        """Time of the first packet: outages and traces begin with it, for all flows."""
+        """Time of the first packet, at which outages and traces begin, for all flows."""
         self._has_ended = self._is_cut = False
         """Whether the program has ended, and whether the outside has."""
         self.refused = 0
-        """Number of packets that were not of IP."""
+        """Number of packets that were not IP packets."""
 
     def receive(self, datagram: Datagram, *, now_ns: int) -> None:
         packet, peer, number = datagram

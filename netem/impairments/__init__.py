@@ -1,6 +1,6 @@
 """Impairments of the network, which delay, lose or change packets, in the table IMPAIRMENTS.
 
-    impairment  base class: how to write one
+    impairment  base class, and an example of an impairment
     direction   the impairments of one direction, from the text of a scenario
     draws       their random numbers, from the seed and the packet
 

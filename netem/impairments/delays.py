@@ -84,7 +84,7 @@ def _poisson(mean: float) -> tuple[int, Sequence[float]]:
         number that the first probability belongs to, and the probabilities P(N ≤ number), P(N ≤
             number + 1), …
     """
-    if mean == 0.0:  # log(0) would fail
+    if mean == 0.0:  # avoids log(0)
         return 0, (1.0,)
     wide = 10.0 * sqrt(mean) + 20.0
     numbers = range(max(0, floor(mean - wide)), floor(mean + wide))

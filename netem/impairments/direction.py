@@ -1,8 +1,8 @@
 """Impairments of one direction of the network, from a text such as `constant(0.05) & loss(0.1)`.
 
 Every packet first passes the queue of `rate` or `deliveries`, if there is one. Then the other
-impairments act on it, with random numbers of the time at which it entered: delays add up, and a
-packet lost by one is lost.
+impairments act on it, with random numbers for the time of its entry: delays add up, and a loss by
+one impairment is final.
 """
 
 from functools import lru_cache
@@ -19,7 +19,7 @@ PARTS_MAX = 16
 
 
 class Impairments:
-    """Impairments of one direction, from their calls and the files that these name.
+    """Impairments of one direction, from their calls and the files named in these.
 
     Raises:
         GrammarError: an impairment refuses its arguments, or there are two queues.
@@ -48,7 +48,7 @@ class Impairments:
 
 
 def impairments(text: str, files: Files = ()) -> Impairments:
-    """Parse the impairments of a direction, joined by &; an empty text has none.
+    """Parse the impairments of a direction, joined by &; an empty text means no impairments.
 
     Args:
         files: files that the text names, with their contents.

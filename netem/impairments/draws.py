@@ -2,13 +2,13 @@
 
 In a flight the fate of a packet depends on the seed, its direction, its flow and the slot of
 SLOT_NS in which it enters, counted from the start of the flow. It does not depend on earlier
-packets. So two controllers are compared on the same network, however often each of them sends.
+packets. So two controllers are compared on the same network, even if they send at different rates.
 Packets of one flow in one slot are numbered by rank.
 
-Any other program is different: two runs of it send the same packets, but never in the same
-milliseconds. There a packet's rank is its number in its flow, and what is drawn for it alone
-depends on that number; what lasts depends on the time since the flow's first packet, or, for all
-flows of one program (`netem.tunnel`), since the first of all.
+Two runs of any other program send the same packets, but never in the same milliseconds. So there a
+packet's rank is its number in its flow, and its own random numbers depend on that number; lasting
+effects depend on the time since the flow's first packet, or, if they are common to all flows of a
+program (`netem.tunnel`), since the program's first packet.
 """
 
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ from struct import Struct
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
 
 SLOT_NS = MILLISECOND_NS
-"""Length of a slot: shorter than any step, so that no two horizons or observations share one."""
+"""Length of a slot: shorter than any step, so that two horizons or observations share no slot."""
 SLOT_S = SLOT_NS / SECOND_NS
 _PLACE = Struct("<qq")
 """Input of the hash: slot and rank, or cell and number."""
@@ -35,7 +35,7 @@ class Fate:
     slot: int = 0
     """Slot in which the packet enters, counted from the start of its flow."""
     rank: int = 0
-    """Number of packets of its flow that entered in the same slot before it."""
+    """Number of earlier packets of the same flow in the same slot."""
     delay_ns: int = 0
     """Delay [ns], also drawn for a lost packet."""
     lost: bool = False
@@ -43,7 +43,7 @@ class Fate:
     copies: int = 0
     """Number of extra copies that arrive."""
     flipped: float | None = None
-    """Position of a flipped bit, as a fraction below 1 of the packet's length; None: of none."""
+    """Position of a flipped bit, as a fraction below 1 of the packet's length; None: no flip."""
 
     @property
     def time_s(self) -> float:
@@ -59,7 +59,7 @@ class Stream:
     """
 
     def __init__(self, *names: str | int) -> None:
-        # A hash and not a generator: any place can be drawn without drawing those before it.
+        # A hash, not a generator: a draw does not depend on earlier draws.
         self._names = names
         self._seeded = blake2b(repr(names).encode(), digest_size=_DRAWN.size)
         self._at, self._number, self._pair = -1, -1, (0.0, 0.0)
@@ -92,9 +92,9 @@ class Draws:
 
     Args:
         packets: stream with a pair of numbers for each packet, shared by two impairments.
-        which: index of this impairment's number in the pair, 0 or 1.
+        which: index of the impairment's number in that pair, 0 or 1.
         names: names of the stream for `lasting`.
-        by_number: whether a packet's own numbers follow from its rank alone, not from its slot.
+        by_number: whether a packet's own numbers depend only on its rank, not on its slot.
     """
 
     def __init__(
@@ -103,7 +103,7 @@ class Draws:
         self._pair, self._which, self._names = packets.pair, which, names
         self._by_number = by_number
         self.flow = names[2]
-        """Number of the packets' flow, from 0; 0 where what lasts is common to all flows."""
+        """Number of the packets' flow, from 0; always 0 if lasting effects are common."""
 
     @cached_property
     def _events(self) -> Stream:
@@ -117,9 +117,9 @@ class Draws:
         """Random number below 1 that is redrawn at the events of a Poisson process.
 
         Its distribution is uniform and its autocorrelation falls exponentially. It depends on the
-        newest event only. To find that event, the events of one cell of length `mean_s` after the
-        other are drawn, backwards from the packet's time. A cell has one event on average, and none
-        with probability 1/e.
+        newest event only. To find that event, the events of cells of length `mean_s` are drawn one
+        cell after another, backwards from the packet's time. A cell has one event on average, and
+        none with probability 1/e.
 
         Args:
             fate: the packet.

@@ -1,4 +1,4 @@
-"""Impairments of plug-ins with their errors caught: one that fails has no effect."""
+"""Impairments of plug-ins with their errors caught: an impairment that fails has no effect."""
 
 import traceback
 from collections.abc import Iterable

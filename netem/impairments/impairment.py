@@ -45,14 +45,14 @@ class Impairment:
     is_ordered: bool = False
     """Whether packets of a flow stay in order."""
     is_queue: bool = False
-    """Whether it is a finite rate with a queue, see `queues.Queued`."""
+    """Whether the impairment is a finite rate with a queue, see `queues.Queued`."""
     only_packets: bool = False
-    """Whether byte streams, such as connections of TCP, cannot have the impairment."""
+    """Whether the impairment cannot apply to byte streams, such as TCP connections."""
 
     def __call__(self, fate: Fate, draws: Draws) -> None:
         """Change the fate of a packet that enters.
 
         Args:
-            fate: fate of the packet after the impairments before this one.
+            fate: fate of the packet after the preceding impairments.
             draws: random numbers of this impairment.
         """

@@ -1,4 +1,4 @@
-"""Independent losses of packets; `outages` has those that last."""
+"""Independent losses of packets; `outages` has losses that last for a time."""
 
 from skytether.netem.impairments.draws import Draws, Fate
 from skytether.netem.impairments.impairment import Impairment, Share, impairment

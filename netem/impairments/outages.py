@@ -54,7 +54,7 @@ class Outage(Impairment):
 
 @impairment(name="outages")
 class Outages(Impairment):
-    """Loses everything for for_s seconds, then nothing for every_s: random, with these means."""
+    """Loses everything for a random time, mean for_s, then nothing for one with mean every_s."""
 
     def __init__(self, every_s: Annotated[float, Meta(ge=0.001, le=3600)], for_s: Time) -> None:
         self.loss = for_s / (every_s + for_s)
@@ -67,7 +67,7 @@ class Outages(Impairment):
 
 @impairment(name="delivered")
 class Delivered(Impairment):
-    """Delivers what those before it lose or delay: flow, at_s, for_s, delay_s of each stretch."""
+    """Delivers packets despite earlier impairments: flow, at_s, for_s, delay_s of each stretch."""
 
     def __init__(self, *stretches: Annotated[float, Meta(ge=0, le=86400)]) -> None:
         each = list(zip(*(iter(stretches),) * 4, strict=False))

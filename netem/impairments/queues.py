@@ -1,6 +1,6 @@
 """Impairments that depend on other packets: finite rates with queues, and order.
 
-They only describe the queue: `netem.bottleneck` is it.
+They only describe the queue; `netem.bottleneck` implements it.
 """
 
 from typing import Annotated, Literal
@@ -38,7 +38,7 @@ class Queued(Impairment):
     """Times at which DELIVERY_BYTES may leave the queue [s]; the last is also the period. None: at
     any time."""
     keeps_all = False
-    """Whether nothing is dropped, because whoever sends waits for room."""
+    """Whether nothing is dropped, because senders wait for space in the queue."""
 
     def __init__(self, queue: int, drop: Drop, serve: Served) -> None:
         self.room_bytes = queue

@@ -29,7 +29,7 @@ from skytether.shared.scenario.registry import File
 
 @impairment(name="trace")
 class Trace(Impairment):
-    """Delays and loses packets as a recorded path did at that time; repeatedly, or once."""
+    """Delays and loses packets like a recorded path; the recording is used repeatedly or once."""
 
     kind = "delay"
 

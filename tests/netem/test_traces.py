@@ -309,8 +309,8 @@ def test_one_way_delays_beyond_their_round_trip_are_refused() -> None:
 @pytest.mark.parametrize(
     ("content", "said"),
     [
-        (gzip.compress(b"x" * 100, mtime=0)[:-9], "got a cut file"),
-        (2 * gzip.compress(b"x" * 100, mtime=0), "got a cut file, several"),
+        (gzip.compress(b"x" * 100, mtime=0)[:-9], "got a truncated file"),
+        (2 * gzip.compress(b"x" * 100, mtime=0), "got a truncated file, several"),
         (b"\x1f\x8bxxxxxxxxx", "cannot be read"),
         (b"time_s,delay_s\n0,0\0\n", "cannot be read"),
         (b"\xd4\xc3\xb2\xa1" + bytes(40), "got a capture of packets"),
@@ -331,7 +331,7 @@ def test_bytes_that_are_no_text_are_refused(content: bytes, said: str) -> None:
         ("time_s,delay_s\n0,0.1\n1,-2\n", "row 2: got -2, expected a delay of at least 0"),
         ("time_s,delay_s\n0,0.1\n1,5000\n", "row 2: got 5000, expected a delay of at most 3600 s"),
         ("time_s,delay_s\n0,0.1\n60,0.1\n1,0.1\n", "row 3: got 1, expected a time at most 10 s"),
-        ("time_s,delay_s\n7,0.1\n7,0.1\n7,0.1\n8,0.1\n", "got one time for most rows"),
+        ("time_s,delay_s\n7,0.1\n7,0.1\n7,0.1\n8,0.1\n", "got equal times in most rows"),
         ("time_s,delay_s\nnan,0.1\n", "row 1: got nan, expected a time"),
         ("time_s,delay_s\n0,1\n\n1,x\n", "line 4: got 'x', expected numbers"),
         ("time_s,delay_s\n0\n", "line 2: got 1 columns, expected at least 2"),
