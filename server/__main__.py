@@ -62,8 +62,8 @@ class ServerOptions(ProcessOptions):
     """Largest number of vehicles at once, per worker."""
     workers: Annotated[int, Argument(metavar="N")] = 1
     """Number of processes that share the address and the vehicles, best one per core. With several,
-    each writes numbered files of its own, as in RECORD.1 or RECORD.1.mcap, and worker N serves
-    metrics at PORT + N - 1."""
+    each writes its own numbered files, as in RECORD.1 or RECORD.1.mcap, and worker N serves metrics
+    at PORT + N - 1."""
     keys: Path | None = None
     """File with the keys of all vehicles, made by `skytether keygen`. Without it the link is
     plaintext, which is refused if other machines can reach the address."""
@@ -73,7 +73,7 @@ class ServerOptions(ProcessOptions):
 
 
 def serve(argv: Sequence[str]) -> None:
-    """Plan for every vehicle that asks for it, until SIGINT or SIGTERM.
+    """Plan for every vehicle that requests a session, until SIGINT or SIGTERM.
 
     SIGUSR1 prints the counters so far.
     """
@@ -111,11 +111,11 @@ def serve(argv: Sequence[str]) -> None:
 
 
 def _ready(scenario: Scenario) -> None:
-    """Load the compiled planner, and what a vehicle's packet may call for, now: before workers are
-    forked, so that they share its memory, and before a tick would have to wait for it.
+    """Load the compiled planner and all modules that a vehicle's packet may need, before workers
+    are forked, so that they share the memory, and before the first tick, which has to be on time.
     """
     for room in (assignment.ROOM, routes.ROOM):
-        with suppress(ConfigError):  # not installed: its messages are refused
+        with suppress(ConfigError):  # messages of packages that are not installed are refused
             load(room, "a message")
     others = loading.others(scenario)
     terminal.prepare(machine_code.missing(without=others))

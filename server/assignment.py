@@ -1,6 +1,6 @@
-"""Which vehicles a server plans for. The plain form: each of them.
+"""Assignment of vehicles to a server; in this base class the server plans for all vehicles.
 
-`server.standby` takes its place once a vehicle says that it has two servers.
+`server.standby` replaces it once a vehicle reports that it has two servers.
 """
 
 from collections.abc import Iterable
@@ -13,23 +13,23 @@ from skytether.shared.wire.drop import Drop, ProtocolError
 from skytether.shared.wire.protocol import Message, Observation, RoomMessage
 
 ROOM, MESSAGES = "skytether.server.standby", "skytether.shared.wire.lead"
-"""Modules of vehicles with two servers, and of what such a vehicle says."""
+"""Module for vehicles with two servers, and module of the messages of such vehicles."""
 
 
 class Decider(Protocol):
-    """What decides on the plans of the vehicles, for those who hear them; see `Controller`."""
+    """Interface of `Controller` to the modules that receive messages of vehicles."""
 
     observed_step: Indices
     """Step of the newest observation of each vehicle, or -1; shape (capacity,)."""
 
     def begin(self, row: int, vehicle: int) -> None:
-        """Begin with a vehicle in a row that was forgotten."""
+        """Assign a new vehicle to a free row."""
 
     def forget(self, row: int) -> None:
         """Forget everything about the vehicle of a row."""
 
     def restart(self, row: int) -> bool:
-        """Note that a client has restarted without its state; whether that is to be reported."""
+        """Note a client's restart without saved state; return whether to report it."""
 
     def observe(self, row: int, observation: Observation) -> bool:
         """Store an observation unless a newer one is stored; True if stored."""
@@ -40,7 +40,7 @@ class Decider(Protocol):
         """Note whether this server plans for a vehicle.
 
         Args:
-            message: what the vehicle has said of it; None if it has no other server.
+            message: the vehicle's message about its servers; None if it has no other server.
             plans_due: number of plans to send next, whatever the trigger says.
         """
 
@@ -52,9 +52,9 @@ class Assignment:
         self.controller, self.limits = controller, limits
         """Limits of motions, see `Scheme.limits`; None if vehicles may follow different servers."""
         self.changes = 0
-        """Number of their changes in flight."""
+        """Number of changes of `limits` in flight."""
         self.changed_ns: int | None = None
-        """Time of the newest change."""
+        """Time of the newest change of `limits`."""
 
     def change(self, limits: Any, now_ns: int) -> None:
         if limits is not self.limits:
@@ -71,21 +71,21 @@ class Assignment:
         return assignment
 
     def begin(self, session: Any) -> None:
-        """Begin with a vehicle in a row that was forgotten."""
+        """Assign the vehicle of a new session."""
         self.controller.assign(session.row, None)
 
     def take(self, session: Any, message: Message) -> Message:
-        """Take a message of the room; returns the answer.
+        """Process a message about the vehicle's servers; returns the answer.
 
         Raises:
-            ProtocolError: the session has no such messages.
+            ProtocolError: the vehicle of the session has one server.
         """
         raise ProtocolError(Drop.FIELD)
 
     def signed(self, session: Any, plan: bytes) -> bytes:
-        """Plan as it is sent to a vehicle."""
+        """Bytes of a plan as sent to a vehicle; here unchanged."""
         return plan
 
     def spread(self, sessions: Iterable[Any], now_ns: int) -> Iterable[Datagram]:
-        """What vehicles have to know of their servers, once a second."""
+        """Datagrams about the servers, due once a second; here none."""
         return ()

@@ -1,16 +1,16 @@
-"""Byte budget shared by all vehicles of a server, spent where the old plan costs most.
+"""Byte budget shared by all vehicles of a server, spent on the plans with the largest gain.
 
-The trigger decides whether a vehicle asks for a packet. The budget grants as many requests as it
-has bytes for, in this order:
+The trigger decides whether a vehicle requests a packet. The budget grants requests while it has
+bytes, in this order:
 
 1. urgent packets: a plan that replaces a heartbeat, and the first plan of a vehicle. They are
-   always granted, as heartbeats are, at the expense of the others.
-2. vehicles without a packet for WAIT_S, longest first, so that none is starved;
+   always granted, like heartbeats, at the expense of the others.
+2. vehicles without a packet for WAIT_S, longest wait first, so that none is neglected;
 3. all others by the figure that their trigger compares, per byte.
 
 It is a token bucket: b ← b + r Δt, within ± r BURST_S, minus the bytes sent, headers included;
-urgent packets may make it negative. So a window of T seconds has at most r (T + BURST_S) bytes
-beside the urgent ones. The rate r is `control.shared_bytes_per_s`.
+urgent packets may make it negative. So a window of T seconds has at most r (T + BURST_S) bytes of
+packets that are not urgent. The rate r is `control.shared_bytes_per_s`.
 
 A refused vehicle asks again at the next step. The ranking covers all blocks of vehicles, with the
 latest request of each vehicle, at most one step old.
@@ -26,11 +26,11 @@ from skytether.shared.endpoints.endpoint import Datagram
 from skytether.shared.law.model import Array, Flags, Indices
 
 BURST_S = 0.1
-"""Size of the bucket, as time at the rate r [s]."""
+"""Size of the token bucket, as a time at the rate r [s]."""
 WAIT_S = 1.0
-"""Time since its last packet from which a vehicle takes precedence [s]."""
+"""Time without a packet after which a vehicle takes precedence [s]."""
 NEVER = -2
-"""Tick of a vehicle that has not asked: earlier than any tick."""
+"""Tick of the latest request of a vehicle without a request: earlier than any tick."""
 GUESS_BYTES = 100
 """Assumed size of a packet, with headers, until the first is sent [B]."""
 
@@ -67,7 +67,7 @@ class SharedBudget:
         self._filled_ns = now_ns
         rate = self.bytes_per_s
         tokens, most = self._tokens - self._spent + rate * passed_s, rate * BURST_S
-        # Debts are bounded too, so that urgent packets cannot keep plans waiting for long.
+        # The negative balance is bounded too, so that urgent packets cannot delay plans for long.
         self._tokens, self._spent = min(max(tokens, -most), most), 0
         self._tick += 1
 
@@ -78,8 +78,8 @@ class SharedBudget:
 
         Args:
             rows: the vehicles.
-            event: which vehicles ask.
-            urgent: which requests are always granted.
+            event: whether each vehicle requests a packet.
+            urgent: whether each request must be granted.
             worth: figure that the trigger compares.
             since_s: time since the last packet to each [s].
         """
@@ -92,8 +92,8 @@ class SharedBudget:
         # np.lexsort sorts by its last key first: longest wait, then largest gain.
         order = np.lexsort((-self._gain[waiting], -self._waited_s[waiting]))
         ranked = waiting[order]
-        # The first that does not fit stops all behind it: otherwise smaller packets could pass it
-        # for ever.
+        # The first request that exceeds the budget stops all after it: otherwise smaller packets
+        # could overtake it for ever.
         goes = ranked[np.cumsum(self._bytes[ranked]) <= left]
         chosen = urgent & event | np.isin(rows, goes) & asks
         late = int(asks.sum() - (chosen & asks).sum())

@@ -5,7 +5,7 @@
 
 The schemes "predictive" and "none" have d = 0. With "trajectory", `schemes.trajectory` plans the
 spline to be followed; on a mission, `missions.mission_planner`. Plans are made for every vehicle at
-every step, since planning is a small part of the cost of a step.
+every step, because planning takes a small part of a step's time.
 """
 
 from collections import Counter
@@ -45,23 +45,23 @@ if TYPE_CHECKING:
 
 PLANS, OBSERVATION, DELAY, UNSOLVED, OTHER_SERVER = map(int, Idle)
 BLOCK = 128
-"""Number of vehicles planned for together: their data stay in the cache, and no array is so large
-(128 KiB) that the C library would get new memory from the kernel for it each time."""
+"""Number of vehicles planned for together: their data stay in the cache, and all arrays are below
+128 KiB, from which on the C library requests new memory from the kernel for each."""
 
 
 class Decisions(msgspec.Struct, frozen=True):
     """Plans and decisions for n vehicles at a step; valid until the next decisions are made."""
 
     batch: Batch
-    """The vehicles, their predictions, and which of them are sent a plan."""
+    """The vehicles, their predictions, and those to which a plan is sent."""
     figures: Figures
     planned: Array
     """Planned state x_p(k+d|k-1) [m, m/s]; shape (n, axes, 2)."""
     verdict: Verdict
     event: Flags
-    """Whether each vehicle is sent its plan; shape (n,)."""
+    """Whether a plan is sent to each vehicle; shape (n,)."""
     solve_ns: int
-    """Time taken to plan for all of them [ns], or -1 if not measured."""
+    """Time of planning for all n vehicles [ns], or -1 if not measured."""
 
 
 class Controller:
@@ -121,7 +121,7 @@ class Controller:
         self._is_own = np.ones(capacity, dtype=np.bool_)
         """Whether this server plans for each vehicle; shape (capacity,)."""
         self._plans_due: dict[int, int] = {}
-        """Number of plans still due, whatever the trigger says, by row."""
+        """Number of plans, by row, that are still due independently of the trigger."""
         self._takes = np.ones(capacity, dtype=np.bool_)
         """Whether each vehicle accepts horizons, by its newest observation; shape (capacity,)."""
         self._counts: Counter[str] = Counter()
@@ -148,10 +148,10 @@ class Controller:
         self.faults += filter(None, [fault])
 
     def use_trigger(self, trigger: Trigger) -> None:
-        """Use another trigger from the next step on; it starts without a memory of sent plans."""
+        """Use another trigger from the next step on; it starts without data of sent plans."""
         terms, self._trigger = self._terms, trigger
         self.doubts = trigger.doubts
-        """Whether the trigger compares plans also for the case that horizons are lost."""
+        """Whether the trigger needs the costs for cases in which horizons are lost."""
         self._foresight = self.scheme.make_foresight(doubts=trigger.doubts)
         self._trigger_inputs = SituationArrays(
             model=terms.model,
@@ -175,7 +175,7 @@ class Controller:
             self._budget.forget(row)
 
     def begin(self, row: int, vehicle: int) -> None:
-        """Begin with a vehicle in a row that was forgotten."""
+        """Assign a new vehicle to a free row."""
         self.desired.assign(row, vehicle)
 
     def restart(self, row: int) -> bool:
@@ -185,8 +185,8 @@ class Controller:
     def assign(
         self, row: int, message: RoomMessage | None, *, is_own: bool = True, plans_due: int = 0
     ) -> None:
-        """Note whether this server plans for a vehicle; if so, it sends a plan at once, whatever it
-        sent before. See `assignment.Decider`.
+        """Note whether this server plans for a vehicle; if so, it sends a plan at once, even an
+        unchanged one. See `assignment.Decider`.
         """
         self._is_own[row] = is_own
         if is_own:
@@ -199,7 +199,7 @@ class Controller:
         self.scheme.follow(row, message)
 
     def figures(self) -> dict[str, Any]:
-        """Figures of all vehicles together, beside the server's own."""
+        """Figures of all vehicles together, in addition to the server's own."""
         figures = self.scheme.fleet_figures()
         return figures | {"budget": self._budget.figures()} if self._budget else figures
 
@@ -211,8 +211,8 @@ class Controller:
         return is_stored
 
     def begin_tick(self, tick_ns: int, now_ns: int, due: list[int]) -> None:
-        """Begin the tick of the time `tick_ns`; `due` are the rows to which a heartbeat is due
-        unless a plan is sent.
+        """Begin the tick of the time `tick_ns`; `due`: rows of the vehicles to which a heartbeat is
+        due unless a plan is sent.
         """
         self.desired.tick(tick_ns)
         if self._budget:
@@ -241,7 +241,7 @@ class Controller:
         return rows[able[:n]], step[able[:n]]
 
     def decide(self, rows: Indices, step: Indices) -> Decisions:
-        """Plan for at most BLOCK vehicles from `able`, and decide which are sent their horizon.
+        """Plan for at most BLOCK vehicles from `able`, and decide whose horizon is sent.
 
         Source: algorithms 1, 2.
         """
@@ -268,14 +268,14 @@ class Controller:
             event,
         )
         if self._budget:
-            # A trigger that compares nothing, as `periodic`, gives no figure to rank its vehicles
-            # by.
+            # A trigger without a comparison, such as `periodic`, has no figure by which to rank
+            # vehicles.
             compared = verdict.figure if verdict.compares else figures["cost_gap"]
-            # A vehicle without a plan cannot wait for bytes.
+            # A vehicle without a plan cannot wait for free bytes of the budget.
             urgent = self._heartbeat_due[rows] | figures["fresh"] | (self._sent_step[rows] < 0)
             event = self._budget.choose(rows, event, urgent, compared, situation.since_sent_s)
             events = int(np.count_nonzero(event))
-        # After the budget: the committed scheme may only replay horizons that are really sent.
+        # Called after the budget: the scheme "committed" may replay only horizons that are sent.
         self.scheme.remember(rows, step, predicted, event)  # eq. (12)
         _note_sent(rows, step, event, self._sent_step)
         if events == n:  # with one vehicle: all or none
@@ -316,7 +316,7 @@ def _able(
     idle: I1,
     able: B1,
 ) -> int:
-    """Fill in `able`, and `idle` of vehicles with a new step; returns the number of the able."""
+    """Fill in `able`, and `idle` of vehicles with a new step; return how many are able."""
     count = 0
     for i in range(len(rows)):
         row, step = rows[i], steps[i]
@@ -329,7 +329,7 @@ def _able(
         elif step - observed_step[row] > age_max:
             idle[row] = OBSERVATION
         elif shortest_ns(seen, row) > uplink_max:
-            # The horizon would have ended, or would be refused as too late, on arrival.
+            # On arrival the horizon would have ended, or would be refused as too late.
             idle[row] = DELAY
         able[i] = idle[row] == PLANS
         count += able[i]
@@ -351,8 +351,8 @@ def _withhold(
 ) -> tuple[int, int]:
     """Cancel events whose plan cannot be used, with the reason in `idle`, and set `last_step`.
 
-    A plan is not sent if it would begin when its observation is too old, or if its vehicle does not
-    accept horizons.
+    A plan is not sent if its observation would be too old at the plan's start, or if the vehicle
+    does not accept horizons.
 
     Returns:
         number of vehicles without a solution, and of remaining events.

@@ -1,4 +1,4 @@
-"""The server as an endpoint: datagrams in, datagrams out, and a tick on its own grid of Δt.
+"""The server as an endpoint: it receives and sends datagrams, and has a tick every Δt.
 
 It combines `reception` (messages of vehicles), `sessions`, and `tick` with `controller` (decisions
 for all vehicles).
@@ -37,8 +37,8 @@ from skytether.shared.wire.protocol import CLOSES, Close, Refusal, encode
 VEHICLES_MAX = 64
 """Default largest number of vehicles at once."""
 LATEST_NS = 2 * SECOND_NS
-"""Time after the end of all motions for which a server that is asked to end still waits for the
-vehicles' observations of it [ns]."""
+"""Time after the end of all motions for which a server that was asked to end waits for the
+vehicles' observations of the end [ns]."""
 TICK_EDGES_MS = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0)
 """Bin edges of the histogram of tick durations [ms]."""
 
@@ -47,16 +47,16 @@ POINT = keys_of(InFlight.POINT)
 
 
 class Server(Endpoint):
-    """Plans for every vehicle that asks.
+    """Plans for every vehicle that requests a session.
 
     Args:
         boot_id: number unique to this run of the server.
         entropy: returns this many random bytes.
         recorder: receives one row per tick and vehicle.
         plan_recorder: receives one row per horizon sent, see `record.plan_columns`.
-        stopwatch: measures the parts of a tick; the core has no clock of its own.
-        references: desired trajectory of each vehicle, by its number, if they differ; default: the
-            scenario's.
+        stopwatch: measures the parts of a tick; the server itself reads no clock.
+        references: desired trajectory of each vehicle, by its number; default: the scenario's for
+            all.
         planning: calls planners of plug-ins.
     """
 
@@ -143,8 +143,8 @@ class Server(Endpoint):
         if tick_ns is None:
             return
         if now_ns >= self._expire_ns:
-            # At full seconds of the clock: a vehicle is forgotten at the same time whatever other
-            # vehicles there are.
+            # At full seconds of the clock: the time at which a vehicle is forgotten does not depend
+            # on other vehicles.
             self._expire_ns = (now_ns // SECOND_NS + 1) * SECOND_NS
             for session in self.sessions.expire(now_ns):
                 self._events.append(SessionEnded(vehicle=session.vehicle))

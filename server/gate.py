@@ -20,7 +20,7 @@ class GateCall(NamedTuple):
 
     payload: bytes
     vehicle: int | None
-    """Number of the vehicle whose key encrypted it; None without keys."""
+    """Number of the vehicle whose key encrypted the message; None without keys."""
     line: ReplyPath
     """Encoder of the answers to the sender."""
     moves: bool
@@ -37,16 +37,16 @@ class Gate(Protocol):
         """Message in a datagram; None if it was part of a handshake.
 
         Raises:
-            ProtocolError: it is not from a vehicle.
+            ProtocolError: the datagram is not from a vehicle.
         """
 
     def repeated(self, datagram: Datagram) -> int | None:
-        """Number of the vehicle of which a replayed datagram repeats a recent packet; None if it
-        does not.
+        """Number of the vehicle whose recent packet a replayed datagram repeats; None if it repeats
+        none.
         """
 
     def admit(self, call: GateCall, *, now_ns: int) -> None:
-        """Accept the sender of this HELLO: its further packets are opened."""
+        """Accept the sender of this HELLO: from now on its packets are opened."""
 
     def outbox(self) -> list[Datagram]:
         """Datagrams of the gate itself; each is returned once."""

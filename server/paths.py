@@ -1,7 +1,7 @@
-"""Paths from the server to a vehicle: the proven addresses, and what is sent to each.
+"""Paths from the server to a vehicle: its proven addresses, and the datagrams sent to each.
 
-`RoutesOverPaths` takes the place of `server.routes.Routes` at the first report of a vehicle with
-several paths (`server.reception`); a server in real time loads it before its first packet.
+`RoutesOverPaths` replaces `server.routes.Routes` at the first report of a vehicle with several
+paths (`server.reception`); a server in real time loads it before its first packet.
 """
 
 import hashlib
@@ -37,11 +37,11 @@ CLOSE, PLANS = number_of(Close), (number_of(Horizon), number_of(Trajectory))
 PLACES = 2
 """Number of addresses of a path that are in use at once."""
 FORMER_NS = 2 * SECOND_NS
-"""Time for which packets are also sent to a path's former address after it was last heard [ns]."""
+"""Time after a former address's last packet for which packets are also sent there [ns]."""
 
 
 class Place(NamedTuple):
-    """Address of a vehicle, and the server's socket at which it is heard."""
+    """Address of a vehicle, and the server's socket that receives its packets."""
 
     peer: Address
     socket: int
@@ -50,18 +50,18 @@ class Place(NamedTuple):
 class ServerPaths:
     """Paths of one session.
 
-    A path is used once the vehicle has returned a number from its address that was sent only there:
-    somebody who copies its packets from elsewhere cannot. As with a cookie, the number is computed
-    from the address and a secret, so questions are not stored.
+    A path is used once the vehicle has returned, from the path's address, a number that was sent
+    only there: an attacker at another address, who copies packets, cannot. As with a cookie, the
+    number is computed from the address and a secret, so questions are not stored.
 
-    Somebody who forwards copies in both directions can: his address is then proven as well. So the
-    former address of a path stays in use for as long as packets still come from it, and he cannot
-    take the path away when he stops.
+    An attacker who forwards copies in both directions can: then the attacker's address is proven as
+    well. So the former address of a path stays in use while packets still come from it, and the
+    path works on when the attacker stops.
 
     Args:
         spread: `link.spread`.
         entropy: returns this many random bytes.
-        timeout_ns: time without a packet after which the vehicle takes the link for lost [ns].
+        timeout_ns: time without a packet after which the vehicle considers the link lost [ns].
     """
 
     def __init__(
@@ -74,16 +74,16 @@ class ServerPaths:
         self.paths, self.prices = Paths(prices, timeout_ns, spread), prices
         self._secret = entropy(hashlib.blake2s.MAX_KEY_SIZE)
         self._places: dict[int, dict[Place, int]] = {}
-        """Proven addresses of each path, and when they were last heard [ns]; the newest is last."""
+        """Proven addresses of each path, newest last, and the time of their last packet [ns]."""
         self.plan_worth = 0.0
-        """What the loss of the next plan costs, in packets."""
+        """Cost of losing the next plan, in units of the price of a packet."""
 
     def number(self, place: Place) -> int | None:
         """Number of the path with a proven address; None if there is none."""
         return next((path for path, places in self._places.items() if place in places), None)
 
     def hear(self, place: Place, now_ns: int) -> int | None:
-        """Note that a datagram has come from an address; returns `number`."""
+        """Note that a datagram has arrived from an address; returns `number`."""
         path = self.number(place)
         if path is not None:
             self._places[path][place] = now_ns
@@ -91,7 +91,7 @@ class ServerPaths:
 
     @property
     def places(self) -> Collection[Place]:
-        """Proven addresses."""
+        """Proven addresses of all paths."""
         return [*chain.from_iterable(self._places.values())]
 
     def set_prices(self, prices: tuple[int, ...]) -> None:
@@ -100,7 +100,7 @@ class ServerPaths:
             self.paths.set_prices(prices)
 
     def prove(self, message: PathProof, place: Place, now_ns: int) -> PathProof | None:
-        """Question to send to an address that names a path; None if it is proven."""
+        """Request for a proof to an address that names a path; None if the address is proven."""
         path = message.path
         if path >= len(self.paths.each) or place in self._places.get(path, ()):
             return None
@@ -113,7 +113,7 @@ class ServerPaths:
         return None
 
     def question(self, vehicle: int, session: int, place: Place, path: int = 0) -> PathProof:
-        """Question to an address; the vehicle knows which path it is."""
+        """Message whose proof the vehicle returns; without `path` the vehicle knows the path."""
         return PathProof(vehicle, session, path, self._proof(place), self.prices)
 
     def _proof(self, place: Place) -> int:
@@ -133,8 +133,8 @@ class ServerPaths:
     def watched(
         self, vehicle: int, session: int, line: ReplyPath, silence_ns: int, now_ns: int
     ) -> list[Datagram]:
-        """Datagrams that are due: the newest one again if it was lost, and one on each path that
-        was not used for long.
+        """Datagrams that are due: the newest one again if it was lost, and a probe on each path
+        that was not used for long.
         """
         due = []
         if resent := self.paths.again(silence_ns, now_ns, sorted(self._places)):
@@ -147,7 +147,7 @@ class ServerPaths:
         return due
 
     def turned(self, vehicle: int, now_ns: int) -> Iterator[PathDied | PathHealed]:
-        """Paths that have died, or are well again, since the last call."""
+        """Events for paths that have failed, or work again, since the last call."""
         for path, is_dead in self.paths.turned(now_ns):
             newest = next(reversed(self._places.get(path, {})), None)
             via = address_text(*newest.peer) if newest else "unproven"
@@ -168,7 +168,7 @@ class ServerPaths:
         return [*chain.from_iterable(self._to(path, datagram, now_ns) for path in on)]
 
     def _to(self, path: int, datagram: bytes, now_ns: int) -> list[Datagram]:
-        """A datagram to a path's newest address, and to the former one while that is heard."""
+        """A datagram to a path's newest address, and to its former one while that sends packets."""
         places = self._places[path]
         newest = next(reversed(places))
         return [
@@ -188,7 +188,7 @@ class RoutesOverPaths(Routes):
     Args:
         entropy: returns this many random bytes.
         spread: `link.spread`.
-        timeout_ns: time without a packet after which a vehicle takes the link for lost [ns].
+        timeout_ns: time without a packet after which a vehicle considers the link lost [ns].
     """
 
     def __init__(self, entropy: Callable[[int], bytes], spread: str, timeout_ns: int) -> None:
@@ -196,7 +196,7 @@ class RoutesOverPaths(Routes):
         self.of: dict[int, Session] = {}
         """Live sessions with several paths, by vehicle."""
         self.at: dict[Place, Session] = {}
-        """The same sessions, by the proven address of each path."""
+        """Live sessions with several paths, by the proven address of each path."""
 
     def of_several(self, entropy: Callable[[int], bytes], spread: str, timeout_ns: int) -> Routes:  # noqa: ARG002
         return self
@@ -224,8 +224,8 @@ class RoutesOverPaths(Routes):
     def observe(
         self, session: Session, report: Report, datagram: Datagram, now_ns: int, *, is_newest: bool
     ) -> PathProof | None:
-        """Note the report in front of an observation; returns the question for a proof if it comes
-        from a new address.
+        """Note the loss report that precedes an observation; return a request for a proof if the
+        sender's address is new.
         """
         count, paths = len(report.arrived), _paths(session)
         if paths is None or len(paths.prices) != count:
@@ -239,7 +239,7 @@ class RoutesOverPaths(Routes):
     def take(
         self, session: Session, message: Message, datagram: Datagram, now_ns: int
     ) -> PathProof | None:
-        """Note the address of a path once it is proven; until then return the question."""
+        """Note a path's address once it is proven; until then return the request for a proof."""
         paths = _paths(session)
         if paths is None or not isinstance(message, PathProof):
             raise ProtocolError(Drop.FIELD)
@@ -255,7 +255,7 @@ class RoutesOverPaths(Routes):
             self.forget(session)
 
     def restart(self, session: Session) -> None:
-        """Note that a client may have been started again: it keeps its session."""
+        """Note that a client, which keeps its session, may have restarted."""
         if paths := _paths(session):
             paths.paths.peer_may_restart = True
 
@@ -267,9 +267,9 @@ class RoutesOverPaths(Routes):
                 del self.at[place]
 
     def appraise(self, decisions: Decisions) -> None:
-        """Note what the loss of each plan costs.
+        """Note the cost of losing each plan.
 
-        A trigger sends if the cost of flying on exceeds its threshold, so the threshold is the
+        A trigger sends if the cost of not sending exceeds its threshold, so the threshold is the
         price of a packet.
         """
         rows, verdict = decisions.batch.rows, decisions.verdict

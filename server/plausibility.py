@@ -1,14 +1,14 @@
-"""Plausibility check of observations: rejects well-formed observations that cannot be true.
+"""Plausibility check of observations: rejects well-formed observations with impossible values.
 
 Each is compared with the vehicle's last accepted observation:
 
-    clock     with the delay of the other direction it must give a round trip of at least zero
-    horizon   the horizon in force, and since when, must advance with time and not beyond it
-    jump      position and velocity have changed by no more than a vehicle can fly
+    clock     with the delay of the other direction, its delay must give a round trip of at least 0
+    horizon   the horizon in force, and its first flown step, must advance with time, no faster
+    jump      position and velocity must change by no more than a vehicle can fly
 
-An observation that fails is dropped and counted. If the last accepted observation was the wrong
-one, REPEATS observations in a row that are consistent with each other are accepted, and the
-vehicle's data are reset.
+An observation that fails is dropped and counted. In case the last accepted observation was wrong,
+REPEATS observations in a row that are consistent with each other are accepted, and the vehicle's
+data are reset.
 """
 
 from enum import IntEnum
@@ -28,8 +28,8 @@ from skytether.shared.wire.protocol import NO_HORIZON, Observation
 REPEATS = 3
 """Number of consistent rejected observations in a row that replace the accepted observation."""
 SLACK_NS = 50 * MILLISECOND_NS
-"""Time by which a measured round trip may be too short [ns], beside what clocks drift apart from
-one observation to the other."""
+"""Tolerance for a measured round trip that is too short [ns], in addition to the drift of the
+clocks between two observations."""
 
 
 class Statement:
@@ -42,11 +42,11 @@ class Statement:
     since: int
     """First step flown with the horizon in force."""
     forward: int
-    """F of `server.planning.clock` [ns]."""
+    """Time difference F, see `server.planning.clock` [ns]."""
     backward: int
-    """G of `server.planning.clock` [ns]."""
+    """Time difference G, see `server.planning.clock` [ns]."""
     count: int
-    """Number of consistent rejected observations in a row, this one included; 0 if accepted."""
+    """Number of successive consistent rejected observations up to this one; 0 if accepted."""
 
 
 STATEMENT = record(Statement)
@@ -55,7 +55,7 @@ position_leaps, velocity_leaps = shared(leap.position_leaps), shared(leap.veloci
 
 class Belief(IntEnum):
     ANEW = -1
-    """Accepted, and the earlier observations are discarded."""
+    """Verdict: the observation is accepted, and earlier observations are discarded."""
     BELIEVED = 0
     CLOCK = 1
     HORIZON = 2
@@ -70,7 +70,7 @@ class HeardNumbers(NamedTuple):
     numbers: Annotated[NDArray[np.void], records(STATEMENT, 2)]
     """Last accepted, last rejected and new observation of each vehicle; shape (3, capacity)."""
     states: F4
-    """Positions [m] and velocities [m/s] in these observations; shape (3, capacity, axes, 2)."""
+    """Positions [m] and velocities [m/s] in the observations; shape (3, capacity, axes, 2)."""
 
 
 class Plausibility:
@@ -124,7 +124,7 @@ def _against(
         drift = int(abs(new.step - before.step) * dt * SECOND_NS) // DRIFT
         if min(trip, new.forward + new.backward) < -SLACK_NS - drift:
             verdict = CLOCK
-        elif new.step > before.step:  # an older one is checked for its clocks only
+        elif new.step > before.step:  # the clocks are checked in any order
             back = new.in_force < before.in_force or new.since < before.since
             if new.in_force != NO_HORIZON and back:
                 verdict = HORIZON
@@ -135,7 +135,7 @@ def _against(
 
 @part
 def _jumps(observed: HeardNumbers, row: int, which: int, time: float, noise_m: float) -> bool:
-    """Whether no vehicle can get from another observed state to the new one in a time [s]."""
+    """Whether a vehicle cannot fly from another observed state to the new one in a time [s]."""
     jumps = False
     for axis in range(observed.states.shape[2]):
         p, v = observed.states[which, row, axis, 0], observed.states[which, row, axis, 1]
@@ -169,8 +169,8 @@ def _judge(
     verdict = _against(observed, row, LAST, H, dt, noise_m)
     if verdict != BELIEVED:
         place = DOUBTED
-        # Three consistent observations are accepted after all: the vehicle may have been carried
-        # away, or have a new clock.
+        # Three consistent observations are accepted: the vehicle may have been moved, or its clock
+        # set.
         agrees = numbers[DOUBTED, row].step >= 0 and (
             _against(observed, row, DOUBTED, H, dt, noise_m) == BELIEVED
         )

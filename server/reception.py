@@ -142,15 +142,15 @@ class Reception:
         except ProtocolError as error:
             dropped = error.reason
             self.dropped[dropped] += 1
-        except NotInstalledError:  # the room that the message calls for
+        except NotInstalledError:  # a package that the message needs
             dropped = Drop.NOT_FOR_A_SERVER
             self.dropped[dropped] += 1
         self._stopwatch.lap("observe")
         return dropped
 
     def _note_repeat(self, datagram: Datagram, now_ns: int) -> bool:
-        """Note where else a recent packet of a vehicle has come from; returns whether it is the
-        copy of a packet of a vehicle with several paths, over one that is not proven.
+        """Note another address that repeats a vehicle's recent packet; return whether the vehicle
+        has several paths and the copy came over an unproven one.
         """
         vehicle = self._gate.repeated(datagram)
         session = None if vehicle is None else self._sessions.live(vehicle)
@@ -164,7 +164,7 @@ class Reception:
         """Process one message.
 
         Raises:
-            ProtocolError: it is not a vehicle's message, or contains another vehicle's number.
+            ProtocolError: the message is not a vehicle's, or contains another vehicle's number.
         """
         report, payload = split(call.payload)
         message = decode(payload, self._terms)
@@ -189,7 +189,7 @@ class Reception:
         datagram: Datagram,
         now_ns: int,
     ) -> None:
-        """Process a message; nothing of it is believed before it is found to be recent."""
+        """Process a message; its content is used only if it is recent."""
         sessions = self._sessions
         assigns = sessions.assignment.takes(message)
         session = sessions.welcomed(message) if assigns else sessions.find(message)
@@ -217,7 +217,7 @@ class Reception:
                     self._answer(answer, call, datagram)
 
     def _refuse_overtaken(self, session: Session, step: int) -> None:
-        """Refuse a message that a vehicle sent in a step long before its newest observation's."""
+        """Refuse a message that was sent long before the vehicle's newest observation."""
         newest = self._controller.observed_step[session.row] if session.row >= 0 else step
         if (newest - step) * self._terms.dt_ns > session.hearing.overtaken_ns:
             raise ProtocolError(Drop.OVERTAKEN)
@@ -246,7 +246,7 @@ class Reception:
             hello.vehicle, number, hello.boot_id, self._boot_id, now_ns, refusal, self._terms
         )
         self._answer(welcome, call, datagram)
-        # After sealing the answer, which creates the channel.
+        # After sealing the answer, because sealing creates the channel.
         if refusal is Refusal.ACCEPTED:
             self._gate.admit(call, now_ns=now_ns)
 
@@ -282,7 +282,7 @@ class Reception:
     ) -> None:
         session = self._sessions.find(observation) or self._begin(observation, call, now_ns)
         row, forward_ns = session.row, now_ns - observation.step * self._terms.dt_ns
-        # A round trip of half an hour or more is impossible: it becomes negative and is rejected.
+        # A round trip of half an hour or more becomes negative, and so is rejected.
         backward_ns = stamped_ns(observation.backward_us, near_ns=-forward_ns)
         verdict = self._plausibility.judge(row, observation, forward_ns, backward_ns)
         if verdict > BELIEVED:
@@ -293,12 +293,12 @@ class Reception:
         if verdict == ANEW:
             self._anew(row, None)
             session.hearing.begin()
-        # Only after it was judged: if the newest observation is the wrong one, this one is not old.
+        # After the plausibility check: if the newest observation was wrong, this one is not old.
         self._refuse_overtaken(session, observation.step)
         session.doubted = False
         if report:
             self._hear_paths(session, report, call, datagram, now_ns)
-        # Only after it was accepted: a rejected observation does not keep a session alive.
+        # Only an accepted observation keeps a session alive.
         session.heard_ns = now_ns
         session.asked_ns = observation.silence * self._terms.dt_ns // 2
         session.hearing.hear(observation.number, observation.step)
@@ -334,7 +334,7 @@ class Reception:
         datagram: Datagram,
         now_ns: int,
     ) -> None:
-        """Note the report of an observation; ask for a proof where it comes from a new address."""
+        """Note the loss report of an observation; request a proof of a new address."""
         sessions = self._sessions
         sessions.routes = sessions.routes.of_several(
             sessions.entropy, self._spread, self._timeout_ns
@@ -344,12 +344,12 @@ class Reception:
             self._answer(question, call, datagram)
 
     def _hear_time(self, session: Session, message: Time, now_ns: int) -> None:
-        """Narrow the bounds of a clock offset by the vehicle's time of day, if known here too."""
+        """Narrow a clock offset's bounds by the vehicle's time of day, if this host has one too."""
         error_ns = self.time and self.time.error_at(now_ns)
         if error_ns is None or self.time is None:
             return
-        # The stamp is ambiguous: choose the time closest to the estimate from delays. The clocks
-        # have drifted apart since it was sent.
+        # The stamp is ambiguous: choose the time closest to the estimate from delays. The error
+        # grows by the clocks' drift since the message was sent.
         offset_ns, bound_ns = self._clock.middle_ns(session.row, now_ns)
         ahead_ns = self.time.ahead_ns
         epoch_ns = stamped_ns(message.epoch_us, near_ns=ahead_ns - offset_ns)

@@ -1,6 +1,6 @@
-"""Routes to vehicles. The plain form: each vehicle has one address, which its session knows.
+"""Routes to vehicles that have one address each, which their sessions store.
 
-A room may put another in its place, as `server.paths` does for vehicles with several paths.
+`server.paths` replaces them if a vehicle has several paths.
 """
 
 from collections.abc import Callable, Sequence
@@ -14,7 +14,7 @@ from skytether.shared.wire.framing import Report
 from skytether.shared.wire.protocol import Message
 
 ROOM = "skytether.server.paths"
-"""Module of vehicles with several paths; the first report in front of an observation loads it."""
+"""Module for vehicles with several paths; the first loss report before an observation loads it."""
 
 
 class Route(Protocol):
@@ -22,7 +22,7 @@ class Route(Protocol):
 
     @property
     def is_ready(self) -> bool:
-        """Whether it may be used."""
+        """Whether the route may be used."""
 
     def sealed(self, payload: bytes, line: ReplyPath, now_ns: int) -> Sequence[Datagram]:
         """Datagrams that carry a message; see `Session.sealed`."""
@@ -37,23 +37,23 @@ class Routes:
         Args:
             entropy: returns this many random bytes.
             spread: `link.spread`.
-            timeout_ns: time without a packet after which a vehicle takes the link for lost [ns].
+            timeout_ns: time without a packet after which a vehicle considers the link lost [ns].
         """
         routes: Routes = load(ROOM, "paths").RoutesOverPaths(entropy, spread, timeout_ns)
         return routes
 
     def is_copy(self, datagram: Datagram, now_ns: int) -> bool:
-        """Whether a datagram has come before, over another path."""
+        """Whether the same datagram has arrived before, over another path."""
         return False
 
     def is_repeat(self, session: Any, datagram: Datagram) -> bool:
-        """Whether a datagram that the channel refused as a repeat came before over another path."""
+        """Whether a datagram refused as a repeat is the copy from another path."""
         return False
 
     def hear(
         self, session: Any, report: Report, message: Message, datagram: Datagram, now_ns: int
     ) -> None:
-        """Note the report in front of a message of a session."""
+        """Note the loss report that precedes a message of a session."""
 
     def observe(
         self,
@@ -64,35 +64,35 @@ class Routes:
         *,
         is_newest: bool,
     ) -> Message | None:
-        """Note the report in front of an observation; returns a question to its sender."""
+        """Note the loss report before an observation; return a request for a proof."""
         return None
 
     def take(
         self, session: Any, message: Message, datagram: Datagram, now_ns: int
     ) -> Message | None:
-        """Take a message of the room; returns the answer.
+        """Process a message about paths; returns the answer.
 
         Raises:
-            ProtocolError: the session has no such messages.
+            ProtocolError: the vehicle of the session has one path.
         """
         raise ProtocolError(Drop.FIELD)
 
     def narrow(self, session: Any) -> None:
-        """Note that a client was started again with one address."""
+        """Note that a client has restarted with one address."""
 
     def restart(self, session: Any) -> None:
-        """Note that a client may have been started again in its session."""
+        """Note that a client may have restarted and continued its session."""
 
     def forget(self, session: Any) -> None:
         """Forget a session that has ended."""
 
     def appraise(self, decisions: Any) -> None:
-        """Note what is decided for vehicles, before their plans are sent."""
+        """Note the decisions for vehicles, before their plans are sent."""
 
     def watch(
         self, put: Callable[[int, Sequence[Datagram]], None], events: Events, now_ns: int
     ) -> None:
-        """Send what is due, by row; called at each tick."""
+        """Send the datagrams that are due, by row; called at each tick."""
 
     def figures(self, session: Any, now_ns: int) -> dict[str, Any]:
         return {}

@@ -2,8 +2,8 @@
 
 A HELLO is answered in two steps. Without a valid cookie for the sender's address, the server
 answers with a CHALLENGE that contains one, and stores nothing. With the cookie, it answers with a
-RESPONSE that contains the WELCOME and a new channel. That channel is pending until the vehicle's
-first packet in it; only then does it replace the live channel. So an attacker who replays a
+RESPONSE that contains the WELCOME and opens a new channel. This channel is pending until the
+vehicle's first packet in it, and only then replaces the live one. So an attacker who replays a
 recorded HELLO cannot end a flight.
 """
 
@@ -35,13 +35,13 @@ from skytether.shared.wire.noise_nnpsk0 import KEY_BYTES, NoiseError, Responder
 from skytether.shared.wire.protocol import PAYLOAD_BYTES_MAX, Hello
 
 COOKIE_NS = 60 * SECOND_NS
-"""Period of the cookies; each is valid in its period and the next [ns]."""
+"""Length of a cookie's period; each cookie is valid in its period and the next one [ns]."""
 HANDSHAKES = 5
 """Number of handshake attempts of a vehicle per second, and of answers to repeats of an attempt."""
 PENDING_MAX = 64
 """Largest number of pending channels of a vehicle, which uses the first RESPONSE that it receives.
-Up to a round trip of 12 s this limit is not exceeded, even if an attacker replays its HELLOs (five
-a second)."""
+Round trips up to 12 s do not exceed this limit, even if an attacker replays the vehicle's HELLOs,
+five a second."""
 COMPLETED_MAX = 16
 """Number of stored completed attempts of a vehicle; repeats of them are not answered."""
 OUT_MAX = 1024
@@ -78,7 +78,7 @@ class _HandshakeRate:
 
     def grant(self, now_ns: int) -> bool:
         """Whether another handshake is granted."""
-        # Unused handshakes are saved up for one second at most.
+        # Unused handshakes accumulate for at most one second.
         begun_ns = max(self._granted_ns, now_ns - SECOND_NS)
         if begun_ns + SECOND_NS // HANDSHAKES > now_ns:
             return False
@@ -93,8 +93,7 @@ class _KeyedVehicle:
         self.attempts = _HandshakeRate(now_ns)
         """Rate limit of new handshake attempts, which only a holder of the key can make."""
         self.repeats = _HandshakeRate(now_ns)
-        """Rate limit of answers to repeated INITIATIONs, which anybody who has recorded one can
-        send."""
+        """Rate limit of answers to repeated INITIATIONs, which every eavesdropper can send."""
         self.live: Channel | None = None
         """Channel in which the vehicle sends."""
         self.previous: Channel | None = None
@@ -130,7 +129,7 @@ class _KeyedVehicle:
             del self.pending[older]
             if older == number:
                 break
-        # Packets of the previous channel are opened for a while: some are still on their way.
+        # Packets of the previous channel are opened for a while, because some are still in flight.
         if self.live is not None:
             self.live.retire(now_ns=now_ns)
         self.previous, self.live = self.live, channel
@@ -167,7 +166,7 @@ class _Answer:
 
 
 class SecureGate:
-    """Gate that only vehicles of the keyring pass; `entropy` returns unpredictable bytes."""
+    """Gate that accepts only vehicles of the keyring; `entropy` returns unpredictable bytes."""
 
     secure = True
 
@@ -249,7 +248,7 @@ class SecureGate:
             raise ProtocolError(Drop.UNKNOWN_KEY)
         cookie, message = read_initiation(key, packet)
         if not self._is_valid(cookie, peer, now_ns):
-            # Nothing is stored for a sender before a cookie has shown that it receives at its
+            # Nothing is stored for a sender before a cookie has proven that it receives at its
             # address.
             fresh = self._cookie(peer, now_ns // COOKIE_NS)
             challenge = write_challenge(key, fresh, message[:KEY_BYTES])
@@ -259,10 +258,10 @@ class SecureGate:
         if keyed is None:
             keyed = self._vehicles[vehicle] = _KeyedVehicle(now_ns)
         public = message[:KEY_BYTES]
-        if public in keyed.completed:  # the vehicle has completed this attempt
+        if public in keyed.completed:  # the vehicle has completed this handshake attempt
             raise ProtocolError(Drop.REPLAYED)
         response = keyed.response(public)
-        # A new attempt needs the key, a repeat only eavesdropping: so they have separate limits.
+        # A new attempt needs the key, a repeat only eavesdropping, so each has its own limit.
         if response is None:
             if not keyed.attempts.grant(now_ns):
                 raise ProtocolError(Drop.TOO_MANY_HANDSHAKES)
@@ -285,7 +284,6 @@ class SecureGate:
 
     def _cookie(self, peer: Address, period: int) -> bytes:
         host, port = peer
-        # Computed for each comparison and never stored: any number of unknown senders costs no
-        # memory.
+        # Computed for each comparison and never stored, so that unknown senders use no memory.
         text = f"{host} {port} {period}".encode()
         return hashlib.blake2s(text, key=self._secret, digest_size=COOKIE_BYTES).digest()

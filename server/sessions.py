@@ -3,8 +3,8 @@
 A vehicle is welcomed when it sends HELLO, and gets its row with its first observation; until then
 the session of an earlier run of its client continues. A row is kept free for each welcomed vehicle
 without a row, but no longer than WELCOME_NS if another vehicle needs it. While observations of one
-run of a client arrive, no other run gets its vehicle number: that would be another vehicle. Free
-rows are reused, lowest first, so that the rows in use are contiguous.
+run of a client arrive, no other run gets its vehicle number, because it may be another vehicle.
+Free rows are reused, lowest first, so that the rows in use are contiguous.
 """
 
 from collections import OrderedDict
@@ -30,7 +30,7 @@ InSession = Observation | Close | Time | RoomMessage
 """Messages of a vehicle in a session."""
 
 OTHER_NS = 2 * SECOND_NS
-"""Time for which packets are also sent where a repeat of a recent one has come from [ns]."""
+"""Time for which packets are also sent to an address that repeated a recent packet [ns]."""
 WELCOME_NS = 5 * SECOND_NS
 """Time after the last HELLO for which a row is kept for a vehicle without an observation [ns]."""
 
@@ -45,13 +45,13 @@ class Session:
     boot_id: int
     """Number of this run of the client."""
     home: Address
-    """Source address of the newest HELLO; a cookie has shown that the client receives there."""
+    """Source address of the newest HELLO; a cookie has proven that the client receives there."""
     address: Address
     """Source address of the newest observation."""
     line: ReplyPath
     """Encoder of packets to the vehicle."""
     hearing: Hearing
-    """Longest silence that the server asks of the vehicle."""
+    """Measures losses; has the longest silence that the server requests of the vehicle."""
     row: int = -1
     """Row of the vehicle in every array; -1 until its first observation."""
     heard_ns: int = 0
@@ -61,22 +61,22 @@ class Session:
     doubted: bool = False
     """Whether the newest observation was rejected."""
     unsaved: bool = False
-    """Whether a restart of the client would not continue its flight, by the newest observation."""
+    """Whether the client has reported that its state is unsaved, in its newest observation."""
     asked_ns: int = 0
-    """Longest silence that the vehicle asks of the server [ns]; 0 for no bound."""
+    """Longest silence that the vehicle requests of the server [ns]; 0 for no bound."""
     sent: int = 0
     """Number of packets sent in the session, modulo NUMBERS."""
     other: Address | None = None
-    """Address from which a recent packet came a second time: one of both senders may forward
-    copies, and the other one is then the vehicle."""
+    """Address from which a recent packet arrived a second time: one of the two senders may forward
+    copies, and the other is then the vehicle."""
     other_ns: int = 0
-    """Time of the newest such repeat."""
+    """Time of the newest repeat from `other` [ns]."""
     socket: int = 0
-    """Number of the server's socket at which the vehicle was heard."""
+    """Number of the server's socket that received the vehicle's newest packet."""
     route: Route | None = None
-    """Sends to the vehicle over several paths; None if `address` is the only one."""
+    """Route to the vehicle over several paths; None if it has only one address."""
     lead: Any = None
-    """What a room notes of the vehicle's servers; None if it has no other server."""
+    """The vehicle's messages about its leader (`SessionLead`); None if it has no other server."""
 
     def number_next(self, now_ns: int) -> int:
         number = self.sent
@@ -91,9 +91,9 @@ class Session:
         """Datagrams that carry a message to the vehicle: one, or copies for several addresses or
         paths.
 
-        Its address may have changed since its HELLO, or somebody may forward copies of its packets
-        that arrive first; in that case it must still be reached at its home address, or where the
-        repeats come from.
+        The vehicle's address may have changed since its HELLO, or an attacker may forward copies of
+        its packets that arrive first; then packets must also go to its home address, and to the
+        address of the repeats.
         """
         if self.route and self.route.is_ready:
             return self.route.sealed(payload, self.line, now_ns)
@@ -105,7 +105,7 @@ class Session:
         return [Datagram(packet, place, self.socket) for place in places]
 
     def move(self, address: Address, line: ReplyPath, now_ns: int, socket: int = 0) -> None:
-        """Note the address of a newest packet, and the server's socket that it came to."""
+        """Note the source address and the receiving socket of the newest packet."""
         self.address, self.line, self.socket = address, line, socket
         if self.other is not None and now_ns - self.other_ns > OTHER_NS:
             self.other = None
@@ -118,9 +118,9 @@ class Sessions:
         entropy: returns this many random bytes, for the numbers of sessions.
         silence_ns: time after which a silent vehicle may count as gone [ns].
         hearing: makes a `Hearing` for each session.
-        assignment: which of the vehicles the server plans for.
+        assignment: chooses the vehicles that the server plans for.
         keeps_rows: whether a row stays reserved for its vehicle after its session. On a mission the
-            other vehicles keep away from a vehicle that has fallen silent.
+            other vehicles avoid a silent vehicle.
     """
 
     def __init__(
@@ -141,7 +141,7 @@ class Sessions:
         self.welcomed_vehicles: OrderedDict[int, Session] = OrderedDict()
         """Welcomed vehicles without a row, oldest HELLO first; at most one for each free row."""
         self._successors: dict[int, Session] = {}
-        """New runs of vehicles that have a row, until their first observation, by vehicle."""
+        """Sessions of new client runs of vehicles with a row, until their first observation."""
         self._by_row: dict[int, Session] = {}
         self._free_rows = list(range(capacity))
         """Free rows, as a heap."""
@@ -156,9 +156,9 @@ class Sessions:
         """Number of observations of each session that arrived after a newer one; shape
         (capacity,)."""
         self.routes = Routes()
-        """Routes to the vehicles; another once one of them has several paths."""
+        """Routes to the vehicles; replaced once one of them has several paths."""
         self.assignment = assignment
-        """Which of the vehicles the server plans for."""
+        """Chooses the vehicles that the server plans for."""
         self.idle = np.zeros(capacity, dtype=np.int64)
         """`Idle` reason of the vehicle in each row, as last reported; shape (capacity,)."""
 
@@ -181,10 +181,10 @@ class Sessions:
         return self._by_row[row]
 
     def holder(self, hello: Hello, now_ns: int) -> Session | None:
-        """Session of another run that holds the vehicle's number, so that this HELLO is refused.
+        """Session of another run that uses the vehicle's number, so that this HELLO is refused.
 
-        It is the live session while its packets arrive; otherwise a welcomed session whose first
-        observation may still come.
+        This is the live session while its packets arrive; otherwise a welcomed session whose first
+        observation may still arrive.
         """
         live = self._live.get(hello.vehicle)
         if live is not None and live.boot_id == hello.boot_id:
@@ -197,10 +197,10 @@ class Sessions:
         return welcomed if _is_expected(welcomed, now_ns) else None
 
     def row_of_other_life(self, hello: Hello) -> int | None:
-        """Row of the HELLO's vehicle, if the row belongs to another run of its client, or may.
+        """Row of the HELLO's vehicle, if the row may belong to another run of its client.
 
-        A client that cannot save its state may have restarted with an older one, which contains the
-        same boot id.
+        A client that cannot save its state may have restarted from an older state with the same
+        boot id.
         """
         live = self._live.get(hello.vehicle)
         if live is None:
@@ -229,8 +229,8 @@ class Sessions:
             number, hearing = self._number(), self._hearing()
             session = Session(hello.vehicle, number, hello.boot_id, address, address, line, hearing)
         session.home, session.heard_ns, session.socket = address, now_ns, socket
-        # The oldest welcomed vehicle loses its row: `is_full` has found that it is not expected any
-        # more.
+        # The oldest welcomed vehicle loses its row: by `is_full`, its observation is not expected
+        # any more.
         if waiting is self.welcomed_vehicles and len(waiting) == len(self._free_rows):
             self.welcomed_vehicles.popitem(last=False)
         waiting[hello.vehicle] = session
@@ -251,7 +251,7 @@ class Sessions:
         return now_ns - live.heard_ns <= self._silence_ns
 
     def welcomed(self, message: RoomMessage) -> Session | None:
-        """Session of a message, whether its vehicle has a row yet or not."""
+        """Session of a message, even if its vehicle has no row yet."""
         waiting = self._waiting(message.vehicle).get(message.vehicle)
         for session in (self._live.get(message.vehicle), waiting):
             if session and session.number == message.session:
@@ -263,10 +263,10 @@ class Sessions:
         return session if session and session.number == message.session else None
 
     def begin(self, observation: Observation, now_ns: int) -> Session:
-        """Welcomed session of a first observation, now live.
+        """Make the welcomed session of a first observation the live one, and return it.
 
         Raises:
-            ProtocolError: no such session, or packets of an earlier run of the client arrive again.
+            ProtocolError: there is no such session, or an earlier run of the client is active.
         """
         before = self._live.get(observation.vehicle)
         waiting = self._waiting(observation.vehicle)
@@ -283,7 +283,7 @@ class Sessions:
         elif session.vehicle in self._reserved:
             session.row = self._reserved.pop(session.vehicle)
         else:
-            # The lowest free row, so that arrays are used from the front.
+            # The lowest free row, so that the rows in use are contiguous.
             session.row = heappop(self._free_rows)
         session.sent_ns = now_ns
         self._live[session.vehicle] = self._by_row[session.row] = session
@@ -305,7 +305,7 @@ class Sessions:
             self._reserved[session.vehicle] = session.row
         else:
             heappush(self._free_rows, session.row)
-            # A new run that was waiting for the old run to fall silent takes the free row.
+            # The row goes to a new run that was waiting for the silence of the old one.
             successor = self._successors.pop(session.vehicle, None)
             if successor is not None:
                 self.welcomed_vehicles[session.vehicle] = successor

@@ -1,8 +1,8 @@
-"""Leaders of vehicles that have two servers: what each vehicle says of its leader (LEAD), and the
+"""Leaders of vehicles that have two servers: each vehicle's reports of its leader (LEAD), and the
 number of the leadership in every plan, see docs/together-proof.md.
 
-`AssignmentOfTwo` takes the place of `server.assignment.Assignment` at the first LEAD
-(`server.reception`); a server in real time loads it before its first packet.
+`AssignmentOfTwo` replaces `server.assignment.Assignment` at the first LEAD (`server.reception`); a
+server in real time loads it before its first packet.
 """
 
 from collections.abc import Iterable, Iterator
@@ -15,22 +15,22 @@ from skytether.shared.wire.lead import Lead, with_leadership
 from skytether.shared.wire.protocol import Message, encode
 
 TAKEOVER_PLANS = 2
-"""Number of plans that a server sends when it takes over, whatever the trigger says."""
+"""Number of plans that a server sends when it takes over, independently of the trigger."""
 LIMITS_NS = 10 * SECOND_NS
-"""Time after a change for which vehicles are told every second of the limits of their motions."""
+"""Time for which vehicles get the limits of motions every second after a change [ns]."""
 
 
 class SessionLead(NamedTuple):
-    """What the vehicle of a session has said of its leader."""
+    """Reports of the vehicle of a session about its leader."""
 
     lead: Lead
-    """Its LEAD with the largest number of a leadership so far."""
+    """The vehicle's LEAD with the largest number of a leadership so far."""
     step: int
-    """Step of the vehicle in its newest LEAD."""
+    """Step in the vehicle's newest LEAD."""
 
 
 class AssignmentOfTwo(Assignment):
-    """Takes the place of a server's plain `Assignment` at the first LEAD."""
+    """Assignment that replaces the plain `Assignment` of a server at the first LEAD."""
 
     def __init__(self, plain: Assignment) -> None:
         super().__init__(plain.controller, plain.limits)
@@ -46,7 +46,7 @@ class AssignmentOfTwo(Assignment):
         self._note(session.row, said.lead if said else None)
 
     def take(self, session: Any, message: Message) -> Message:
-        """Note who leads a vehicle; a number counts once, for the vehicle repeats it."""
+        """Note which server leads a vehicle; repeats of the same number are ignored."""
         assert isinstance(message, Lead)
         said: SessionLead | None = session.lead
         if said is None or message.number > said.lead.number:
@@ -61,8 +61,8 @@ class AssignmentOfTwo(Assignment):
         return with_leadership(said.lead.number, plan) if said else plan
 
     def spread(self, sessions: Iterable[Any], now_ns: int) -> Iterator[Datagram]:
-        """Tell vehicles that follow a smaller number of the largest one, and for a while all of
-        changed limits.
+        """Send the largest number to vehicles that follow a smaller one, and for a while changed
+        limits to all vehicles.
         """
         is_changed = self.changed_ns is not None and now_ns < self.changed_ns + LIMITS_NS
         for session in sessions:
@@ -71,10 +71,10 @@ class AssignmentOfTwo(Assignment):
                 yield from session.sealed(encode(self._answer(session)), now_ns)
 
     def _note(self, row: int, lead: Lead | None) -> None:
-        """Note what a vehicle has said; None: it has no other server.
+        """Note a vehicle's LEAD; None: it has no other server.
 
         A server that takes over from another sends two plans: the vehicle may be about to brake,
-        and a plan may be lost. Vehicles of a mission hold their place instead.
+        and a plan may be lost. Vehicles of a mission hold their position instead.
         """
         leads = lead is None or bool(lead.leads)
         self._largest = max(self._largest, lead.number if lead else 0)
@@ -90,8 +90,8 @@ class AssignmentOfTwo(Assignment):
         return self._largest if self.limits else said.lead.number
 
     def _answer(self, session: Any) -> Lead:
-        """What the vehicle has said, the largest number that it should follow, and the limits of
-        the server's motions.
+        """LEAD with the vehicle's number, the largest number that it should follow, and the limits
+        of the server's motions.
         """
         said: SessionLead = session.lead
         return Lead(

@@ -29,7 +29,7 @@ from skytether.shared.wire.protocol import Heartbeat, Idle, encode, stamp_us
 MISSES_MAX = 5
 """Number of ticks that may be missed in a second before the server reports itself as degraded."""
 EXPECTED_GAP, OWN = str(Compared.EXPECTED_GAP), str(Compared.OWN)
-"""Columns of the record that may be empty."""
+"""Names of the record's columns that may be empty."""
 TICK_BIN_NS = MILLISECOND_NS // 20
 """Bin width of the histogram of tick durations [ns]."""
 
@@ -43,7 +43,7 @@ class Grid:
         self.missed = 0
         self._missed_ns: deque[int] = deque(maxlen=MISSES_MAX + 1)
         self.degraded = False
-        """Whether too many ticks are missed."""
+        """Whether the server is degraded: it misses too many ticks."""
 
     def arm(self, now_ns: int) -> None:
         dt_ns = self._dt_ns
@@ -59,7 +59,7 @@ class Grid:
         """Time of the tick that is due, or None; missed ticks are counted."""
         if self.due_ns is None or now_ns < self.due_ns:
             return None
-        # Missed ticks are not made up for: plans for past steps are useless, and a burst of ticks
+        # Missed ticks are not repeated: plans for past steps are useless, and a burst of ticks
         # would delay the next tick too.
         late = (now_ns - self.due_ns) // self._dt_ns
         self.missed += late
@@ -124,7 +124,7 @@ class Ticker:
             self._stopwatch.lap("encode")
             if self._records:
                 self._record(decisions)
-        # Comparing bytes takes a sixth of the time of comparing numbers, and they seldom differ.
+        # Comparing bytes is six times as fast as comparing numbers, and they seldom differ.
         if controller.idle.tobytes() != self._sessions.idle.tobytes():
             self._report_idle()
         if controller.faults:
@@ -133,7 +133,7 @@ class Ticker:
         if events := controller.scheme.events:
             self._events += events
             events.clear()
-        # Last, since a horizon sent at this tick replaces a heartbeat.
+        # Last, because a horizon sent at this tick replaces a heartbeat.
         if heartbeats:
             self._send_heartbeats(heartbeats, now_ns)
         self._sessions.routes.watch(self._put, self._events, now_ns)
@@ -151,8 +151,7 @@ class Ticker:
                 self._events.append(PlanningStopped(vehicle=vehicle, why=str(why)))
 
     def _send_plans(self, decisions: Decisions, now_ns: int) -> None:
-        # The time of sending, not the tick's due time: the vehicle measures the delay by this
-        # stamp.
+        # The stamp is the time of sending, not the tick's due time: it tells the vehicle the delay.
         batch, sessions, sent_us = decisions.batch, self._sessions, stamp_us(now_ns)
         sessions.routes.appraise(decisions)
 

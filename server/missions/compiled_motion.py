@@ -1,8 +1,8 @@
 """Motions in kernels: state at a step, and bounds of speed and curvature.
 
-Distances along the third axis may count less than those in the plane: coordinates are multiplied by
-`MotionMetric.scale` first. A sphere of that metric is an ellipsoid, higher than it is wide, as
-downwash requires.
+Vertical distances may count less than those in the plane: coordinates are first multiplied by
+`MotionMetric.scale`. In this metric a sphere is an ellipsoid that is higher than wide, because of
+downwash.
 """
 
 from typing import NamedTuple
@@ -26,7 +26,7 @@ class Extent(NamedTuple):
     speed: float
     """Largest speed, scaled [m/s]."""
     bend: float
-    """Largest distance from its straight pieces, SAMPLES per interval, scaled [m]."""
+    """Largest distance of the motion from its straight pieces, SAMPLES per interval, scaled [m]."""
 
 
 def states(motion: Motion, begin: int, count: int, dt_s: float) -> tuple[Array, Array]:

@@ -63,12 +63,12 @@ def half_planes(
     Args:
         times: common steps; shape (n,).
         in_force: positions of the motion in force at these steps [m]; shape (n, axes).
-        reach_m: distance from there that the plan cannot exceed [m]; shape (n,).
+        reach_m: largest distance of the plan from these positions [m]; shape (n,).
         row: row of the vehicle, whose own motions are left out.
-        lands: first step at which it may begin to land, or NEVER.
+        lands: first step at which the vehicle may begin to land, or NEVER.
         possible: motions of all vehicles.
         distance_m: distance to keep [m]; less if the motion in force is nearer already.
-        error: error of the vehicle's own steps.
+        error: error of the vehicle's counted steps.
     """
     capacity = len(times) * possible.count
     planes = HalfPlanes(
@@ -113,7 +113,7 @@ def _half_planes(
         other = motion_at(others, m)
         least, capacity = shifts(error, other.error, drift)
         for i in range(len(times)):
-            # At the last time all are at rest, and those that may land have landed.
+            # At the last time all vehicles are at rest, and those that may land have landed.
             descends = times[i] >= lands or (i == final and lands < NEVER)
             other_descends = times[i] + capacity >= other.lands or (
                 i == final and other.lands < NEVER
@@ -122,16 +122,16 @@ def _half_planes(
             away = _offset_from_way(
                 in_force[i], way[:corners], descends, other_descends, scale, off, scratch
             )
-            # Out of reach, the constraint could never be active; at the same position it has no
-            # direction.
+            # No constraint if it cannot be active (out of reach) or has no direction (both vehicles
+            # at the same position).
             if away >= keep + reach[i] or away == 0.0:
                 continue
             own = 0.0
             for x in range(axes):
                 planes.normal[n, x] = scale[x] * off[x] / away
                 own += planes.normal[n, x] * in_force[i, x]
-            # If the two are too near already, the boundary runs just behind the motion in force,
-            # which thereby remains feasible.
+            # If the two vehicles are too near already, the boundary runs just behind the motion in
+            # force, so that this motion remains feasible.
             ahead = (way[:corners] * planes.normal[n]).sum(axis=1).max()
             planes.time[n], planes.bound[n], planes.other[n] = i, min(ahead + keep, own - 1e-4), m
             n += 1
@@ -161,8 +161,8 @@ def _offset_from_way(
     Args:
         place: the point; shape (axes,).
         way: corners of the polyline; shape (n, axes).
-        descends, other_descends: whether the vehicle at the point, and that on the polyline, may be
-            landing.
+        descends, other_descends: whether the vehicle at the point, and the one on the polyline, may
+            be landing.
         off: output: vector from the nearest point to `place`, scaled [m]; shape (axes,).
     """
     nearest = np.inf

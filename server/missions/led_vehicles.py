@@ -1,7 +1,7 @@
-"""Led vehicles: which vehicles of a mission follow this server, with a standby server or without.
+"""Led vehicles: vehicles of a mission that follow this server, with or without a standby server.
 
-A server plans motions only if every vehicle of the mission has sent it the same number, with which
-this server leads, and was observed since (docs/together-proof.md, Two servers).
+A server plans motions only if all vehicles of the mission have sent it the same number of its
+leadership and were observed since (docs/together-proof.md, Two servers).
 """
 
 from skytether.shared.law.model import Indices
@@ -16,13 +16,13 @@ class LedVehicles:
         self._alone: set[int] = set()
         """Rows of vehicles that have no other server."""
         self._awaited: dict[int, int] = {}
-        """Rows that this server has begun to lead and has not observed since, with the step from
-        which on an observation was made under its lead."""
+        """Rows that this server has begun to lead and has not observed since, with the first step
+        of an observation under its lead."""
         self.missing: int | None = None
-        """Row because of which no motion may be planned; None if there is none."""
+        """Row of a vehicle that prevents all planning of motions; None if there is none."""
 
     def follow(self, row: int, lead: Lead | None) -> bool:
-        """Note who leads a vehicle; returns whether `lead` may contain a motion to take over."""
+        """Note a vehicle's leader; return whether `lead` may contain a motion to take over."""
         if lead is None:
             self._alone.add(row)
         else:
@@ -39,11 +39,11 @@ class LedVehicles:
 
     @property
     def is_standby(self) -> bool:
-        """Whether all vehicles that were heard are led by another server."""
+        """Whether another server leads all vehicles from which packets have arrived."""
         return bool(self._numbers) and set(self._numbers.values()) == {None}
 
     def awaits(self, row: int) -> bool:
-        """Whether nothing was observed of a vehicle since this server began to lead it."""
+        """Whether no observation of a vehicle has arrived since this server began to lead it."""
         return row in self._awaited
 
     def observed(self, rows: Indices, observed_step: Indices) -> None:
@@ -59,6 +59,6 @@ class LedVehicles:
         missing = (
             row for row, number in self._numbers.items() if number != newest or row in self._awaited
         )
-        # Where a vehicle has no other server, that server never hears all, and plans nothing.
-        # Whatever the others say, they fly what this server has sent, or hold their place.
+        # If a vehicle has only this server, another server never hears all vehicles, so it plans
+        # nothing: the other vehicles fly this server's motions, or hold their positions.
         self.missing = None if self._alone else next(missing, None)

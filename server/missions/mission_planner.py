@@ -1,14 +1,14 @@
-"""Mission planner: motions that keep vehicles apart and out of zones, whichever packets are lost.
+"""Mission planner: motions that keep vehicles apart and out of zones, even if packets are lost.
 
 A motion gives the position of a vehicle at all times: a spline that ends at rest, and rest after
 that. It is sent as a trajectory with all its knots, so a vehicle that receives no further packet
-flies it to its end and hovers there. For each vehicle the server keeps every motion that may be
-flown:
+flies it to its end and hovers there. For each vehicle the server stores every motion that the
+vehicle may fly:
 
 - the motion in force at its newest observation, which acknowledges it; and
 - each motion sent since, as long as its packet may still be accepted. The vehicle accepts a
-  trajectory no later than `link.join_s` after its first knot, so a later observation shows for
-  certain whether it did.
+  trajectory no later than `link.join_s` after its first knot, so a later observation shows reliably
+  whether the vehicle accepted it.
 
 A new motion is sent only if at all times it keeps the distance
 
@@ -17,10 +17,9 @@ A new motion is sent only if at all times it keeps the distance
 from all motions that all other vehicles may fly, at every position that the errors of their clocks
 allow. `tube_m` is the largest distance of a vehicle from its motion (wind, tracking); the others
 keep more distance from a vehicle observed outside its tube. The motions sent earlier were apart
-already. So whichever motions are accepted, and whichever packets are lost or late, vehicles are
-`separation_m` apart as long as each stays in its tube (docs/together-proof.md has the theorem). The
-distance from zones is `tube_m`. Staying on the motion in force is always possible: it needs no
-packet.
+already. So for any set of accepted motions and of lost or late packets, vehicles are `separation_m`
+apart as long as each stays in its tube (docs/together-proof.md has the theorem). The distance from
+zones is `tube_m`. Staying on the motion in force is always possible: it needs no packet.
 
 `mission_state` has the motions that may be flown, `trajectory_qp` the QP, `separation` and
 `half_planes` the distances, `routes` the paths around zones, `waypoints` the next target of a
@@ -69,19 +68,19 @@ ARRIVED_M = 0.02
 ROUNDS = 5
 """Largest number of QPs per waypoint, each with further constraints."""
 STUCK = 0.3
-"""A plan is stuck if it moves less than this share of the distance to its waypoint, 2 m at most."""
+"""A plan is stuck if it covers less than this share of the distance to its waypoint (max. 2 m)."""
 TURN = 2.0 * np.pi * np.arange(32) / 32
 AROUND = np.stack([np.cos(TURN), np.sin(TURN)], axis=1)
 """Directions in which a vehicle at rest within a zone searches for a way out."""
 OUT_M, OUT_STEPS = 0.1, 500
 """Distance between candidate positions on the way out [m], and their number."""
 NEARER_M = 1e-3
-"""Tolerance for a vehicle that leaves a zone: it may come nearer to the zone by this [m]."""
+"""Largest approach to a zone by a vehicle that leaves it, a tolerance [m]."""
 ZONE = "a zone"
 CLOCK_POINTS = 33
 """Number of possible steps of a vehicle that `clock_m` evaluates."""
 BINDS_M = 1e-4
-"""Distance from its half-plane within which a constraint counts as limiting a motion [m]."""
+"""Distance of a motion from a half-plane within which the half-plane counts as limiting it [m]."""
 
 ZONES, GOALS = keys_of(keys.ZONES), keys_of(keys.GOALS)
 
@@ -120,7 +119,7 @@ class MissionPlanner(SplineScheme):
             stream(scenario.seed, "together"),
         )
         self._leaves = False
-        """Whether the server ends, and plans no further motion."""
+        """Whether the server is about to end, and plans no further motion."""
         self._repeating: list[VehicleMotions] = []
         """Vehicles whose latest motion is repeated at this step."""
         self._scale = state.possible.metric.scale.copy()
@@ -151,13 +150,13 @@ class MissionPlanner(SplineScheme):
         foresight.estimate[:n] = foresight.start[:n] = self._state.state[rows]
 
     def plan(self, rows: Indices, step: Indices, foresight: Foresight) -> None:  # noqa: ARG002
-        """Plan for each vehicle every SPACING steps; different vehicles plan at different steps."""
+        """Plan for each vehicle every SPACING steps, for different vehicles at different steps."""
         figures, n = self.figures, len(rows)
         self._state.align(rows, step)
         figures["expected_gap"][:n] = 0.0
         figures["row"][:n], figures["step"][:n], figures["start"][:n] = rows, step, step
-        # In order of row, so that vehicles take turns: each plan accounts for the motions decided
-        # before it.
+        # Vehicles are planned in the order of rows: each plan accounts for the motions decided
+        # earlier.
         for vehicle in self._repeating:
             vehicle.repeat = None
         self._repeating.clear()
@@ -172,7 +171,7 @@ class MissionPlanner(SplineScheme):
                 self._plan_to_goal(row, vehicle, k)
         for i in due:
             vehicle = self._state.vehicles[int(rows[i])]
-            # A figure above any threshold: a motion that was found has to be sent.
+            # A figure above any threshold: every motion that was found has to be sent.
             if vehicle.next or vehicle.repeat:
                 figures["expected_gap"][i] = 1e9
             if vehicle.next:
@@ -211,14 +210,14 @@ class MissionPlanner(SplineScheme):
                 vehicle.goal = None  # closed positions and progress belong to the old zones
 
     def objection(self, scenario: Scenario, keys: frozenset[str]) -> str:
-        """A new zone must not be in the way of a vehicle."""
+        """Refuse a zone in the way of a vehicle."""
         objection = self._objection(zones(scenario)) if keys & ZONES else ""
         return f"mission.zones: got {objection}; nothing was changed" if objection else ""
 
     def _objection(self, zones: Zones) -> str:
         """Reason why these zones are refused; empty if they are accepted.
 
-        A server that leads no vehicle leaves that to the one that does, and knows all motions.
+        A server that leads no vehicle accepts all; the leader, which has all motions, checks.
         """
         if self.is_standby:
             return ""
@@ -231,8 +230,8 @@ class MissionPlanner(SplineScheme):
                 + max(vehicle.outside_m, self._state.brakes_m(vehicle))
             )
             for motion in vehicle.motions():
-                # Earliest step that the vehicle may be at. Before its first knot a motion is at
-                # rest, so an unbounded clock error needs no earlier steps.
+                # Earliest possible step of the vehicle. Before its first knot a motion is at rest,
+                # so even with an unbounded clock error no earlier step is needed.
                 late = max(self._state.error(row).late, 0.0)
                 step = self._state.now + self._state.ahead(row)
                 k = math.floor(max(step - late, motion.first))
@@ -248,7 +247,7 @@ class MissionPlanner(SplineScheme):
 
     @property
     def is_standby(self) -> bool:
-        """Whether all vehicles that were heard are led by another server."""
+        """Whether another server leads all vehicles from which packets have arrived."""
         return self._state.led_vehicles.is_standby
 
     def leave(self) -> int:
@@ -265,9 +264,9 @@ class MissionPlanner(SplineScheme):
         return {name: value for name, value in figures.items() if value is not None}
 
     def _clock_m(self, row: int) -> float | None:
-        """Displacement along its motion that a vehicle's clock error may cause [m]; or None.
+        """Displacement of a vehicle along its motion by its clock error [m]; None if unknown.
 
-        Other vehicles keep away by this much more, along its path.
+        Other vehicles keep this additional distance along its path.
         """
         vehicle, error = self._state.vehicles.get(row), self._state.error(row)
         if vehicle is None or vehicle.in_force is None:
@@ -298,7 +297,7 @@ class MissionPlanner(SplineScheme):
         return not vehicle.waits_for
 
     def _own_wait(self, row: int, vehicle: VehicleMotions) -> str:
-        """Reason why this vehicle has to wait before it is sent a motion, in words; or empty."""
+        """Reason why no motion may be sent to this vehicle yet, in words; empty if one may be."""
         if self._leaves:
             return "another server: this one ends"
         if row in self._state.restarted:
@@ -306,7 +305,7 @@ class MissionPlanner(SplineScheme):
         if self._state.led_vehicles.awaits(row):
             return "its first observation"
         if vehicle.sent:
-            return "an acknowledgement"  # before it, the motion flown is unknown
+            return "an acknowledgement"  # the present motion is unknown
         has_motion = vehicle.in_force is not None and vehicle.in_force.step >= 0
         return "" if has_motion or vehicle.speed_mps <= RESTS_MPS else "coming to rest"
 
@@ -390,13 +389,13 @@ class MissionPlanner(SplineScheme):
         return np.concatenate([place[None], self._waypoints.routes.way(place, goal)])
 
     def _has_to_pass(self, yields: Yielding, home: Array) -> bool:
-        """Whether the asking vehicle has yet to pass the goal of the yielding vehicle."""
+        """Whether the asking vehicle has not yet passed the goal of the yielding vehicle."""
         path = self._way(yields.asker, self._state.goal(yields.asker)) * self._scale
         (away_m,) = yielding.distance_from_way(home[None] * self._scale, path)
         return bool(away_m < self._clearances.planned_apart_m)
 
     def _ask_to_yield(self, row: int, way: Array) -> bool:
-        """Ask the first vehicle at rest at its goal in the way to yield; False if none does."""
+        """Let the first vehicle that rests at its goal in the way yield; False if none can."""
         keep_m = self._clearances.planned_apart_m
         rest_ends, homes = list[tuple[int, Array]](), list[int]()
         for other, each in self._state.vehicles.items():
@@ -432,8 +431,8 @@ class MissionPlanner(SplineScheme):
     def _motion_toward(
         self, row: int, vehicle: VehicleMotions, k: int, goal: Array, path: Array | None
     ) -> Motion | None:
-        """Motion from the motion in force along a path, or if that is blocked towards a goal; None
-        if none is found.
+        """Motion that continues the motion in force along a path, or, if the path is blocked,
+        towards a goal; None if none is found.
 
         The result is added to the possible motions, so that the next vehicle's plan accounts for
         it. Constraints are added once a solution violates them: usually the path is free and
@@ -493,7 +492,7 @@ class MissionPlanner(SplineScheme):
         if not self._zones:
             return planes
         near = self._zones.planes(in_force, qp.reach_m + self._clearances.planned_clear_m)
-        # A vehicle too near to a zone already only must not come nearer.
+        # A vehicle already too near to a zone is only forbidden to come nearer.
         bound = np.minimum(self._clearances.planned_clear_m, near.away_m - 1e-4)
         bound += np.einsum("ij,ij->i", near.normal, near.border)
         return HalfPlanes(
@@ -517,8 +516,8 @@ class MissionPlanner(SplineScheme):
         return f"vehicle {self._state.number_of(int(self._state.possible.rows[most]))}"
 
     def _conflicts(self, row: int, motion: Motion, planned: PossibleMotion) -> Flags:
-        """Flags of the motions that are too near; the last is for zones. `planned`: in common
-        steps.
+        """Flags of the motions that are too near; the last flag is for zones. `planned`: motion in
+        common steps.
         """
         vehicle = self._state.vehicles[row]
         assert vehicle.in_force is not None

@@ -32,12 +32,12 @@ from skytether.shared.wire.protocol import NO_HORIZON, Mode, Observation
 LONGEST = (INTERVALS + JOIN_MAX) * SPACING
 """Largest duration of a motion [steps]."""
 RESTART_STEPS = 20
-"""Number of steps after a client's restart in which an observation may be from before it."""
+"""Number of steps after a client's restart in which older observations may still arrive."""
 PLANNED = np.arange(1.0, INTERVALS + 1.0)
 """Numbers n of a motion's planned knots."""
 PLAN_DUE, REPEAT_DUE = 1, 2
-"""Flags in `MissionState.due`: a motion may be planned for the vehicle at this step; its latest
-motion is repeated."""
+"""Flags in `MissionState.due`: at this step, a motion may be planned for the vehicle; the vehicle's
+latest motion is sent again."""
 
 
 class VehicleRows(NamedTuple):
@@ -51,9 +51,9 @@ class VehicleRows(NamedTuple):
     number: I1
     """Number of the vehicle last observed in the row."""
     observed_step: I1
-    """Step of its newest observation; -1 before the first."""
+    """Step of the vehicle's newest observation; -1 before the first."""
     lands: I1
-    """First step at which it may begin to land, or NEVER."""
+    """First step at which the vehicle may begin to land, or NEVER."""
     unknown_until: I1
     """Last step at which the vehicle may fly a motion sent by another server."""
     sent_step: I1
@@ -82,7 +82,7 @@ class MissionState:
     steps.
 
     Args:
-        block: largest number of vehicles decided on together.
+        block: largest number of vehicles in one call of `align`.
         references: goal of each vehicle over time, by its number.
         number_of: number of the vehicle in a row.
     """
@@ -100,10 +100,10 @@ class MissionState:
         self._clock, self._dt_ns = clock, terms.dt_ns
         self.counts: Counter[str] = Counter()
         self.events: list[Event] = []
-        """What the operator is to be told; the caller empties the list."""
+        """Events for the operator; the caller empties the list."""
         self.margins = {"tube": 0.0, "join": 0.0}
         """Largest distance of a vehicle from its motion, and largest time after a motion's first
-        knot at which one was accepted, each as a share of what the theorem assumes."""
+        knot at which it was accepted, each as a share of the value that the theorem assumes."""
         self.state = np.zeros((capacity, terms.axes, 2))
         """Newest observed states; shape (capacity, axes, 2)."""
         self.vehicles: dict[int, VehicleMotions] = {}
@@ -121,7 +121,7 @@ class MissionState:
         )
         self._dead_time_s = terms.dead_time_s
         self.kept_steps = -(-terms.join // SPACING) * SPACING
-        """Steps after the first knot up to which a motion equals the one in force."""
+        """Number of steps from the first knot for which a new motion equals the one in force."""
         self._land_after = terms.land_after if lands(scenario) else NEVER
         """Steps of hovering without packets after which a vehicle lands."""
         self._tau_s, self._braking = max(terms.tau_s), 2.0 * terms.brake_mps2
@@ -139,7 +139,7 @@ class MissionState:
         self.possible = PossibleMotions(scale, terms.dt_s)
         """All motions that may be flown, as of the last `update_possible`."""
         self._is_updated = False
-        """Whether `possible` is as of the present step."""
+        """Whether `possible` has been updated for the present step."""
         self._changed: set[int] = set()
         """Rows whose motions, extra distance or offset on the grid have changed since the last
         `update_possible`."""
@@ -157,7 +157,7 @@ class MissionState:
         self.observed_step[row] = -1
         self.rows.heard[row] = False
         if row in self.vehicles:
-            # Another run of the client counts its own steps.
+            # Another run of the client numbers its steps from 0 again.
             self.vehicles[row].goal = None
 
     def restart(self, row: int) -> bool:
@@ -171,7 +171,7 @@ class MissionState:
         return True
 
     def follow(self, row: int, lead: Lead | None) -> None:
-        """Note who leads a vehicle.
+        """Note which server leads a vehicle.
 
         If this server begins to lead the vehicle, `lead` contains its motion in force. The vehicle
         drops all plans of an earlier leadership, so no other motion needs to be expected.
@@ -217,7 +217,7 @@ class MissionState:
         return PossibleMotion(self.in_common(row, motion), self.lands(row), self.error(row))
 
     def in_common(self, row: int, motion: Motion) -> Motion:
-        """Motion of a vehicle, by common steps."""
+        """Motion of a vehicle, converted to steps of the common grid."""
         return motion._replace(first=motion.first - self.ahead(row))
 
     def lands(self, row: int) -> int:
@@ -236,7 +236,7 @@ class MissionState:
     def unknown(self) -> int | None:
         """Number of a vehicle whose possible positions are unknown; None if there is none.
 
-        A restarted server has no observation of it yet, or it flies a motion of the earlier server.
+        A restarted server has not observed the vehicle, or it flies an earlier server's motion.
         """
         unheard = self.absent.difference(self.rows.number[list(self.vehicles)].tolist())
         if unheard:
@@ -265,7 +265,7 @@ class MissionState:
             # ended.
             vehicle.in_force = SentMotion(-1, resting(k, self._place(row, observation.state[:, 0])))
             vehicle.is_foreign = False
-            # No motion of an earlier session will be accepted either.
+            # Motions of an earlier session will not be accepted either.
             if not observation.takes or not self.rows.heard[row]:
                 vehicle.sent.clear()
         elif vehicle.in_force is None or vehicle.in_force.step != observation.in_force:
@@ -274,7 +274,7 @@ class MissionState:
                 None,
             )
             vehicle.is_foreign = accepted is None
-            if accepted is None:  # sent by another server, or to the row's previous vehicle
+            if accepted is None:  # a motion of another server, or of the row's previous vehicle
                 self.rows.unknown_until[row] = observation.in_force + LONGEST
                 accepted = SentMotion(observation.in_force, resting(k, observation.state[:, 0]))
             vehicle.in_force = accepted
@@ -282,8 +282,8 @@ class MissionState:
         if flies_on:
             self.foreign = row
         if flies_on or vehicle.is_foreign:
-            # Also at the first observation after that motion has ended: the vehicle rests there,
-            # not at an earlier observed position.
+            # Done once more after the end of the foreign motion: the vehicle rests at the end, not
+            # at an earlier observed position.
             vehicle.in_force = SentMotion(
                 vehicle.in_force.step, resting(k, observation.state[:, 0])
             )
@@ -302,7 +302,7 @@ class MissionState:
         return True
 
     def _watch(self, row: int, vehicle: VehicleMotions, observation: Observation) -> None:
-        """Check what the theorem assumes of motions: each is accepted in time, and flown to its
+        """Check the theorem's assumptions about motions: each is accepted in time, and flown to its
         end.
         """
         before = vehicle.in_force
@@ -329,7 +329,7 @@ class MissionState:
         if self._land_after == NEVER:
             return
         match observation.mode:
-            # The first observation may be from another run of the client, with steps of its own.
+            # The first observation may be from another run of the client, whose steps differ.
             case Mode.HOVER if lands[row] < NEVER and self.rows.heard[row]:
                 # The vehicle may land from now on, but not before the step computed earlier.
                 lands[row] = max(lands[row], k)
@@ -360,7 +360,7 @@ class MissionState:
         return vehicle.speed_mps * (self._tau_s + vehicle.speed_mps / self._braking)
 
     def _place(self, row: int, observed: Array) -> Array:
-        """Resting position without a motion: the start of the mission if near, or as observed."""
+        """Resting position of a vehicle without a motion: its start if near, else as observed."""
         number = self.number_of(row)
         if number not in self.absent:
             return observed
@@ -372,11 +372,11 @@ class MissionState:
         n, self._is_updated = len(rows), False
         self.now = self._clock.tick_ns // self._dt_ns
         moved, foreign = _align(rows, step, self.now, self.rows, self.due, self._moved_by)
-        # All rows, since others keep away from silent vehicles too.
+        # All rows, because other vehicles avoid silent ones too.
         counted = self.now + self.rows.ahead
         self._clock.step_errors(self._all, counted, self.rows.early, self.rows.late)
         for row, since in self.restarted.items():
-            # It may have stopped anywhere on its motion, and be there still.
+            # The vehicle may have stopped anywhere on its motion.
             stands = float(LONGEST + counted[row] - since)
             self.rows.late[row] = max(self.rows.late[row], stands)
         if moved:
@@ -395,7 +395,7 @@ class MissionState:
         self._is_updated = True
         for row in self._changed & self.vehicles.keys():
             vehicle = self.vehicles[row]
-            # Includes motions whose acknowledgement is still on its way.
+            # This includes motions whose acknowledgement is still in flight.
             motions = [self.possible_motion(row, motion) for motion in vehicle.motions()]
             self.possible.replace(row, motions, vehicle.outside_m)
         self._changed.clear()
@@ -411,7 +411,7 @@ class MissionState:
     def targets(self, row: int) -> Array:
         """Points of a show's path for the planned knots of a motion [m]; shape (N, axes).
 
-        A vehicle is behind its motion by its dead time, so the motion is ahead of the path.
+        A vehicle lags its motion by its dead time, so the motion is ahead of the path by that.
         """
         steps = self.now + self.ahead(row) + self.kept_steps + SPACING * PLANNED
         places = [self._desired(row, steps * self._dt_s + dead_s) for dead_s in self._dead_time_s]
@@ -435,7 +435,7 @@ class MissionState:
 def _align(
     rows: I1, step: I1, now: int, vehicles: VehicleRows, due: I1, moved_by: I1
 ) -> tuple[int, int]:
-    """Map vehicles to the common grid, and find what is due for each.
+    """Map vehicles to the common grid, and set PLAN_DUE and REPEAT_DUE for each.
 
     Args:
         now: present step on the grid.

@@ -1,4 +1,4 @@
-"""The planner of missions, as the table of schemes sees it."""
+"""Entry of the mission planner in the table of schemes."""
 
 from collections.abc import Callable
 
@@ -16,11 +16,11 @@ from skytether.shared.scenario.schema import Scenario
 def references(
     scenario: Scenario, given: Callable[[int], Reference] | None, most: int
 ) -> Callable[[int], Reference]:
-    """Reference of each vehicle by its number, with goals that may be replaced in flight.
+    """References of vehicles by number, with goals that may be replaced in flight.
 
     Args:
         given: references without these goals; None: the scenario's.
-        most: largest number of vehicles.
+        most: number of vehicles at most.
     """
     goals = parse_goals(scenario.section(MissionConfig).goals, scenario.model.axes)
     return Guided(given or scenario.measured_reference, goals, most)

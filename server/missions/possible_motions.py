@@ -2,13 +2,13 @@
 
 The server knows the position of each vehicle on its motion up to the error of the step that it
 counts (`planning.clock.StepError`). Between two vehicles only the sum of both errors matters: the
-number of steps by which the second vehicle may be ahead or behind. So the first vehicle is taken at
-its counted step, and the second anywhere between two steps: a swept piece of its path, longer the
-faster it flies, and a point when it rests.
+number of steps by which the second vehicle may be ahead or behind. So the first vehicle is assumed
+at its counted step, and the second anywhere between two steps: on a piece of its path whose length
+grows with speed, a point at rest.
 
-In three dimensions a vehicle without contact lands after a while. From the first step at which it
-may, it may be anywhere between its motion, which is at rest by then, and the ground. So in the end
-any two motions have to be apart horizontally.
+In three dimensions a vehicle without contact lands after a while. From the first possible step of
+the landing on, it may be anywhere between its motion, at rest by then, and the ground. So in the
+end any two motions have to be apart horizontally.
 """
 
 from collections.abc import Sequence
@@ -28,7 +28,7 @@ NEVER = 2**62
 
 
 class PossibleMotion(NamedTuple):
-    """Motion that a vehicle may be flying, by common steps."""
+    """Motion that a vehicle may be flying, in steps of the common grid."""
 
     motion: Motion
     lands: int = NEVER
@@ -43,11 +43,11 @@ class MotionArrays(NamedTuple):
     row: I1
     lands: I1
     extra: F1
-    """Additional distance to keep from this motion [m]."""
+    """Additional distance to keep from the motion [m]."""
     early: F1
     """Largest number of steps by which the vehicle is ahead, see `planning.clock.StepError`."""
     late: F1
-    """Largest number of steps by which the vehicle is behind."""
+    """Largest number of steps by which the vehicle is behind the server's estimate."""
     position: F3
     """Positions of the knots [m]; shape (capacity, KNOTS, axes)."""
     velocity: F3
@@ -55,7 +55,7 @@ class MotionArrays(NamedTuple):
     low: F2
     """Lower corner of a box around the whole motion, scaled [m]; shape (capacity, axes)."""
     high: F2
-    """Upper corner of the box."""
+    """Upper corner of the box, scaled [m]; shape (capacity, axes)."""
 
 
 class PossibleMotions:
@@ -75,7 +75,7 @@ class PossibleMotions:
             self.add(row, motion, extra_m)
 
     def add(self, row: int, motion: PossibleMotion, extra_m: float = 0.0) -> None:
-        """Add a motion, from which `extra_m` more is kept than from others [m]."""
+        """Add a motion; the distance to keep from it is larger by `extra_m` [m]."""
         if self.count == len(self.arrays.row):
             self.arrays = MotionArrays._make(
                 np.concatenate([each, np.zeros_like(each)]) for each in self.arrays
@@ -93,7 +93,7 @@ class PossibleMotions:
         return self.arrays.row[: self.count]
 
 
-@making_part  # numba counts references to the arrays that the function returns
+@making_part  # compiled with reference counts, because it returns arrays
 def motion_at(arrays: MotionArrays, m: int) -> PossibleMotion:
     n = arrays.knots[m]
     return PossibleMotion(
@@ -139,7 +139,7 @@ def _add(
 
 @making_kernel
 def _remove(arrays: MotionArrays, count: int, row: int, metric: MotionMetric) -> int:
-    """Remove a vehicle's motions, whose places the last ones take; returns the number left."""
+    """Remove a vehicle's motions, and fill the gaps with the last ones; return the number left."""
     for m in range(count - 1, -1, -1):
         if arrays.row[m] == row:
             count -= 1

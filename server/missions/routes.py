@@ -1,4 +1,4 @@
-"""Routes around zones: the shortest polyline from a position to a goal that keeps its distance.
+"""Routes around zones: the shortest polyline from a position to a goal, at a distance from zones.
 
 The nodes of a visibility graph lie off the corners of zones; two nodes are joined if the straight
 line between them is clear. Shortest paths between all nodes are computed once (Floyd and Warshall).
@@ -16,7 +16,7 @@ from skytether.shared.missions.zones import Zones
 NODES_MAX = 200
 """Largest number of nodes; with more, corners of the last zones are left out."""
 OFF_M = 0.1
-"""Distance of nodes from corners beyond the clearance [m]."""
+"""Distance of nodes from corners in addition to the clearance [m]."""
 GRAPHS_MAX = 64
 """Largest number of cached graphs, one for each choice of zones by height."""
 TINY_M = 1e-6
@@ -133,6 +133,6 @@ def _nodes(zones: Zones, off_m: float) -> Array:
         straight = size[:, 0] < 1e-6
         halves[straight] = np.stack([-after[straight, 1], after[straight, 0]], axis=1)
         size[straight] = 1.0
-        # Vehicles may be on either side.
+        # On both sides, because vehicles may be inside or outside of a zone.
         points += [corners - sign * off_m * halves / size for sign in (1.0, -1.0)]
     return np.concatenate(points)

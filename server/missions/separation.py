@@ -1,4 +1,4 @@
-"""Separation: whether a motion comes too near to the motions that other vehicles may fly."""
+"""Separation: test whether a motion comes too near to the motions that other vehicles may fly."""
 
 from typing import NamedTuple
 
@@ -29,7 +29,7 @@ from skytether.shared.law.model import ALTITUDE, Flags
 from skytether.shared.law.motion import SAMPLES, SPACING, Motion
 
 NEARER_M = 1e-3
-"""Tolerance for motions that are too near already: a solver may bring them nearer by this [m]."""
+"""Distance by which motions that are already too near may approach: solver tolerance [m]."""
 PIECES_MAX = 10_000
 """Largest number of pieces sampled for a pair; usual motions and clocks need hundreds."""
 
@@ -124,9 +124,9 @@ def comes_too_near(
     least = _least_distance(Pair(planned, other, metric), begin, keep, sides)
     if least >= keep:
         return False
-    # The bounds of both motions are compared; otherwise the planned motion could come nearer by the
-    # error of the pieces again and again. If a vehicle may land, a bound may be wrong by more than
-    # the curvature, so a motion that only seems to be too near has to keep the distance.
+    # The bounds of both motions are compared; otherwise each plan could come nearer by the error of
+    # the pieces. If a vehicle may land, the error of a bound may exceed the curvature, so a motion
+    # that only seems too near has to keep the distance.
     before = Pair(PossibleMotion(in_force, planned.lands, planned.error), other, metric)
     if least < _least_distance(before, begin, keep, sides) - NEARER_M:
         return True
@@ -158,8 +158,8 @@ def _least_distance(pair: Pair, begin: int, limit: float, sides: F2) -> float:
             nearest = min(nearest, within)
             i += 1
             continue
-        # With each piece the midpoints approach by no more than both vehicles fly, and the sweep
-        # may grow by a piece: together less than twice as much.
+        # Per piece, the midpoints approach by at most the distance flown by both vehicles, and the
+        # sweep grows by at most a piece: in total less than twice this distance.
         skipped = int(spare / (2.0 * fastest)) if fastest > 0.0 else pieces
         i = max(i + 1, min(i + skipped, pieces))
     return max(nearest, 0.0)
@@ -169,15 +169,14 @@ def _least_distance(pair: Pair, begin: int, limit: float, sides: F2) -> float:
 def _sampled_distance(pair: Pair, begin: int, limit: float) -> float:
     """Upper bound of the distance of two motions from a step on, at most `limit` [m].
 
-    It is the least distance at some steps, a piece apart, and for some of the possible errors of
-    these steps.
+    It is the least distance at sampled steps, one per piece, and for sampled errors of these steps.
     """
     one, other, metric = pair.one, pair.other, pair.metric
     least, most = shifts(one.error, other.error, 0.0)
     piece = SPACING / SAMPLES
-    # At the last step both vehicles rest, and those that ever land have landed.
+    # At the last step both vehicles rest, after all possible landings.
     last = max(last_step(one.motion), last_step(other.motion) - least)
-    # Any steps give an upper bound: if the clock error is unbounded, not all are tried.
+    # Any subset of steps gives an upper bound: with an unbounded clock error not all are evaluated.
     pieces = int(np.ceil(min(max((last - begin) / piece, 0.0), PIECES_MAX))) + 1
     nearest = limit
     for i in range(pieces + 1):
@@ -210,7 +209,7 @@ def _difference(pair: Pair, step: float, shift: float, x: int) -> float:
 @part
 def _span(pair: Pair, begin: int, i: int, pieces: int, least: float, most: float) -> Span:
     """Time interval number `i` from a step on: first the pieces until the first motion ends, then
-    the time until the other rests too, then the time when all that ever land have landed.
+    the time until the other rests too, then the time after all landings.
     """
     other, lands, other_lands = pair.other.motion, pair.one.lands, pair.other.lands
     last = last_step(other)
@@ -227,7 +226,7 @@ def _span(pair: Pair, begin: int, i: int, pieces: int, least: float, most: float
 
 @part
 def _distance_of_middles(pair: Pair, span: Span, lands: bool) -> float:
-    """Distance of the midpoints of two motions [m]; if a vehicle `lands`, heights do not count."""
+    """Distance of the midpoints of two motions [m]; heights do not count if a vehicle `lands`."""
     square = 0.0
     middle, shift = 0.5 * (span.begin + span.end), 0.5 * (span.least + span.most)
     for x in range(len(pair.metric.scale)):

@@ -5,14 +5,14 @@ accelerations a_n between knots T apart, for n = 0 … N-1,
 
     min  Σ w_n |p_n - g_n|² + r Σ |a_n|²     v_N = 0,  |v_n + τ a_n| ≤ u,  |a_n| ≤ a_max
 
-with the targets g_n, all the same for a waypoint, and a half-plane for each near motion and zone
-and each time,
+with the targets g_n, equal for all n if the target is a waypoint, and a half-plane for each near
+motion and zone and each time,
 
     n(t) · (p(t) - q(t)) ≥ D     n(t) = (p̃(t) - q(t)) / |p̃(t) - q(t)|
 
 where q is the near motion, or the zone's nearest point, and p̃ the motion in force. The motion in
 force fulfils all constraints, so there is always a solution. DAQP, a dual active-set method, finds
-it: its cost depends on the constraints that bind, not on their number.
+it: its cost depends on the number of active constraints only.
 """
 
 from typing import NamedTuple
@@ -33,9 +33,9 @@ ACCELERATION_WEIGHT = 0.05
 LAST_WEIGHT = 5.0
 """Weight w_N of the last position; the others are 1."""
 VIOLATED = 1e-9
-"""Violation above which a constraint counts as violated."""
+"""Tolerance above which a constraint counts as violated."""
 EQUALITY, SOLVED = 5, 1
-"""DAQP's numbers of a kind of constraint, and of a result."""
+"""DAQP's codes for an equality constraint and for a solved problem."""
 
 
 class MotionProblem(NamedTuple):
@@ -51,7 +51,7 @@ class MotionProblem(NamedTuple):
     upper: Array
     lower: Array
     sense: NDArray[np.int32]
-    """Kind of each constraint, as DAQP numbers them."""
+    """Kind of each constraint, as DAQP's code."""
 
 
 class TrajectoryQP:
@@ -75,17 +75,17 @@ class TrajectoryQP:
         """Times at which distances are kept, from the beginning of the plan [intervals]."""
         self._after_s = self.times[:, None] * T
         self._to_sample = _positions(self.times, place, T)
-        """Positions at `times` from accelerations [s²]; shape (times, N)."""
+        """Matrix from accelerations to positions at `times` [s²]; shape (times, N)."""
         weights = np.ones(n)
         weights[-1] = LAST_WEIGHT
         self._to_gradient = to_position.T * weights
-        """Linear term from the distances to the targets [s²]; shape (N, N)."""
+        """Matrix from the distances to the targets to the QP's linear term [s²]; shape (N, N)."""
         one = self._to_gradient @ to_position
         hessian = np.kron(np.eye(axes), one + ACCELERATION_WEIGHT * np.eye(n))
         self._hessian = hessian.astype(np.float64)
         # Inputs v + τ a at the end and at the beginning of each interval.
         self._to_velocity = T * np.tril(np.ones((n, n)))
-        """Sums over intervals, times T [s]; shape (N, N)."""
+        """Matrix from accelerations to velocities at the knots [s]; shape (N, N)."""
         to_velocity = np.kron(np.eye(axes), self._to_velocity)
         before = np.kron(np.eye(axes), T * np.tril(np.ones((n, n)), -1))
         lag = np.diag(np.repeat(tau_s, n))
@@ -93,7 +93,7 @@ class TrajectoryQP:
         """Constraints that are always present; shape (axes + 2 axes N, axes N)."""
         moves = np.kron(np.eye(axes), np.ones((n, 1)))
         self._to_bounds = -np.vstack([0.0 * moves, np.eye(axes), moves, moves])
-        """Shift of the bounds from the velocity at the beginning; shape (axes + 3 axes N, axes)."""
+        """Shift of the bounds per initial velocity; shape (axes + 3 axes N, axes)."""
         a_max, u = np.full(n * axes, acceleration_mps2), np.repeat(most, n)
         self._upper = np.concatenate([a_max, np.zeros(axes), u, u])
         self._sense = np.where(self._upper == 0.0, EQUALITY, 0).astype(np.int32)
@@ -105,7 +105,7 @@ class TrajectoryQP:
     def solve(
         self, kept_p: Array, kept_v: Array, targets: Array, planes: HalfPlanes | None = None
     ) -> tuple[Array, Array] | None:
-        """Positions and velocities of the knots, kept ones first; None without a solution.
+        """Positions and velocities of all knots, `kept` first; None without a solution.
 
         Args:
             kept_p, kept_v: knots of the motion in force up to the beginning of the plan [m, m/s];
@@ -122,7 +122,7 @@ class TrajectoryQP:
         # The last velocity is 0 only within the solver's tolerance, but a motion has to end at
         # rest.
         velocity[-1] = 0.0
-        # Positions follow from these velocities, whatever error the solver's tolerance has left.
+        # Positions are computed from these velocities, so that both agree exactly.
         twice = velocity[kept:] + velocity[kept - 1 : -1]
         position = np.concatenate([kept_p, kept_p[-1] + self._to_velocity @ (0.5 * twice)])
         return position, velocity
@@ -130,7 +130,7 @@ class TrajectoryQP:
     def problem(
         self, p0: Array, v0: Array, targets: Array, planes: HalfPlanes | None
     ) -> MotionProblem:
-        """QP from the state p0, v0 on."""
+        """QP of a motion that starts from the state p0, v0."""
         off_m = p0 + self._until_knot_s * v0 - targets
         linear = (self._to_gradient @ off_m).T.ravel()
         shift, rows, sense = self._to_bounds @ v0, self._rows, self._sense
@@ -156,7 +156,7 @@ class TrajectoryQP:
 
 
 def _positions(times: Array, place: Indices, T: float) -> Array:
-    """Positions from accelerations of intervals, at times in intervals [s²]; shape (times, n)."""
+    """Matrix from accelerations to positions at `times` [intervals]; shape (times, n), [s²]."""
     into = np.clip(times[:, None] - place, 0.0, None)
     inside = np.minimum(into, 1.0)
     moved: Array = T * T * (0.5 * inside**2 + inside * (into - inside))

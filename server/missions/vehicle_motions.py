@@ -20,17 +20,16 @@ COPY_STEPS = 4
 PATIENCE_STEPS = 120
 """Number of steps without progress towards its goal after which a vehicle asks another to yield."""
 CLOSED_MAX = 8
-"""Largest number of closed positions."""
+"""Largest number of closed positions, see `VehicleMotions.closed`."""
 NEARER_M = 0.3
 """Reduction of the remaining path that counts as progress [m]."""
 PROMPT_COUNT = 8
-"""Number of motions in a row, each acknowledged promptly, after which motions are sent less
-often."""
+"""Number of successive, promptly acknowledged motions after which motions are sent less often."""
 
 
 class SentMotion(NamedTuple):
     step: int
-    """Step of its packet; -1 for the resting position of a vehicle without a motion."""
+    """Step of the motion's packet; -1 for the resting position of a vehicle without a motion."""
     motion: Motion
 
 
@@ -39,7 +38,7 @@ class VehicleMotions:
         self.in_force: SentMotion | None = None
         """Motion that the vehicle flies; None before the first observation."""
         self.is_foreign = False
-        """Whether `in_force` stands for a motion of another server: the vehicle rests where it was
+        """Whether `in_force` replaces a motion of another server: the vehicle rests where it was
         last observed, or is still flying."""
         self.sent: deque[SentMotion] = deque(maxlen=64)
         """Motions sent after the motion in force, oldest first, that may still be accepted."""
@@ -47,28 +46,28 @@ class VehicleMotions:
         self.turned_rad = 0.0
         """Angle by which waypoints are turned to the right of the goal [rad]."""
         self.outside_m = 0.0
-        """Distance outside the tube when last observed [m]."""
+        """Distance of the vehicle outside its tube in the newest observation [m]."""
         self.speed_mps = 0.0
         self.detour: RoutesAroundZones | None = None
         """Routes around resting vehicles where the vehicle was stuck; None if it never was."""
         self.detour_until = 0
         """Step until which `detour` is used."""
         self.closed: deque[Array] = deque(maxlen=CLOSED_MAX)
-        """Positions on routes between zones that are too close for a motion [m]."""
+        """Places between zones that are too narrow for a motion; routes avoid them [m]."""
         self.goal: Array | None = None
-        """Goal to which progress is measured [m]; shape (axes,). None before the first, and after
-        the zones or the client's steps have changed."""
+        """Goal to which progress is measured [m]; shape (axes,). None before the first goal, and
+        after the zones or the client's steps have changed."""
         self.remaining_m = 0.0
         """Shortest remaining path to `goal` so far [m]."""
         self.progress_step = 0
         """Step of the latest progress, or of the latest request to yield."""
         self.zone_blocks = False
-        """Whether a zone has limited its plans since it was last found stuck."""
+        """Whether a zone has limited the vehicle's plans since the vehicle was last stuck."""
         self.yielding: Yielding | None = None
-        """Temporary goal of a yielding vehicle; None if it flies to its own goal."""
+        """Temporary goal of a yielding vehicle; None if the vehicle flies to its mission goal."""
         self.in_zone = False
         self.waits_for = ""
-        """Reason for waiting, for the operator; empty if it does not wait."""
+        """Reason why the vehicle waits, as reported to the operator; empty if it does not wait."""
 
         self.copies = 1
         """Number of times that a motion is sent."""
@@ -93,7 +92,7 @@ class VehicleMotions:
             self.copies = max(self.copies - 1, 1)
 
     def is_stuck(self, step: int, goal: Array, remaining_m: float) -> bool:
-        """Whether there was no progress for PATIENCE_STEPS; True at most once in that time."""
+        """Whether there was no progress for PATIENCE_STEPS; True at most once per such time."""
         if self.goal is None or (goal != self.goal).any():
             self.detour = None
             self.closed.clear()

@@ -2,7 +2,7 @@
 of it.
 
 A stuck vehicle also flies around resting vehicles for a while, and its waypoints turn further and
-further to the right, finally to random directions: so vehicles that meet pass each other.
+further to the right, finally to random directions, so that vehicles that meet can pass.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -19,8 +19,8 @@ WAYPOINT_M = 3.0
 AHEAD_M = 1.5
 """Distance of a waypoint ahead on a route around zones [m]."""
 TURN, TURN_MAX, TURN_BACK = 0.5, 2.8, 0.8
-"""Angles to the right by which waypoints of a stuck vehicle turn: step, largest before random
-directions, and step back once it moves [rad]."""
+"""Angles to the right by which waypoints of a stuck vehicle turn: step, largest angle before random
+directions, and step back once the vehicle moves [rad]."""
 DETOUR_M, DETOUR_S = 5.0, 20.0
 """Distance and time for which a stuck vehicle flies around resting vehicles [m, s]."""
 CLOSED_M = 0.6
@@ -76,7 +76,7 @@ class Waypoints:
                 yield _along(place, way, AHEAD_M)
             yield way[0]
             vehicle.turned_rad = TURN
-            # Stuck: from now on, for a while, also around vehicles that rest on the route.
+            # If stuck, the route avoids resting vehicles too for the next `detour_steps`.
             vehicle.detour = self._detour(place, goal, resting_places(), vehicle.closed)
             vehicle.detour_until = k + self._detour_steps
             way = vehicle.detour.way(place, goal)
@@ -138,7 +138,7 @@ class Waypoints:
 
 
 def _octagon(name: str, at: Array, radius_m: float, seen_from: Array) -> Zone:
-    """Octagon around a circle, with a side facing a position: a corner there would be too near."""
+    """Octagon around a circle; a side faces the position `at`, where a corner would be too near."""
     half = np.pi / len(AROUND)
     x, y = seen_from[:2] - at[:2]
     c, s = np.cos(np.arctan2(y, x) + half), np.sin(np.arctan2(y, x) + half)

@@ -1,9 +1,9 @@
-"""Yielding: vehicles at rest make way for a vehicle that cannot pass them.
+"""Yielding: vehicles at rest move aside for a vehicle that cannot pass them.
 
-A vehicle without progress towards its goal for a while asks the first vehicle at rest at its own
-goal that stands in the way to yield. That vehicle flies to a position off the way, waits there
-until the other has passed, and flies back. Only its goal changes meanwhile: its motions are
-planned, checked and sent like any other.
+A vehicle without progress towards its goal for a while requests that the first vehicle that blocks
+the way, at rest at its own goal, yields. This vehicle flies to a position off the way, waits there
+until the other has passed, and flies back. Only its goal changes: its motions are planned, checked
+and sent like any other.
 """
 
 from itertools import pairwise
@@ -26,20 +26,20 @@ FURTHER = (1.2, 1.8, 2.7, 4.0)
 """Distances of yielding positions from the goal, as multiples of the distance between vehicles."""
 
 NO_NEARER_M = 1e-4
-"""Tolerance for a vehicle that must not come nearer, since its motion is checked in pieces [m]."""
+"""Tolerance for a vehicle that must not come nearer: motions are checked in pieces [m]."""
 
 
 class Yielding(NamedTuple):
     place: Array
     """Temporary goal [m]; shape (axes,)."""
     asker: int
-    """Row of the vehicle that is to pass."""
+    """Row of the vehicle that gets the right of way."""
     until: int
-    """Common step at which the vehicle flies back, even if the asking vehicle has not passed."""
+    """Step at which the yielding vehicle flies back, even if the other has not passed."""
 
 
 def first_on(way: Array, places: Array, apart_m: float) -> int | None:
-    """Index of the first position that a path passes too near to, or None.
+    """Index of the first position to which a path comes too near, or None.
 
     A position too near to the start of the path only counts if the path comes nearer to it.
 
@@ -62,8 +62,8 @@ def first_on(way: Array, places: Array, apart_m: float) -> int | None:
 def _kept_distance(places: Array, at: Array, apart_m: float) -> Array:
     """Distances to keep between a vehicle at `at` and vehicles at some positions [m]; shape (n,).
 
-    Plans keep a larger distance than motions must. A vehicle that is nearer already must only not
-    come nearer.
+    Plans keep a larger distance than motions must. A vehicle that is nearer already is only
+    forbidden to come nearer.
     """
     distance: Array = np.minimum(apart_m, np.linalg.norm(places - at, axis=1) - NO_NEARER_M)
     return distance
@@ -93,7 +93,7 @@ def place_to_yield(
 
     Args:
         home: position where it rests [m]; shape (axes,).
-        way: path of the vehicle that is to pass, from its position [m]; shape (n, axes).
+        way: path of the passing vehicle, from its position [m]; shape (n, axes).
         others: present or future resting positions of the other vehicles [m]; shape (m, axes).
         apart_m: distance between vehicles [m].
         scale: factors of coordinates in distances between vehicles; shape (axes,).

@@ -12,7 +12,7 @@ is_near = shared(outlines.is_near)
 
 
 def comes_near(zones: Zones, points: Array, clearance_m: float) -> bool:
-    """Whether lines from point to point come nearer to a zone than a clearance, or touch it."""
+    """Whether a line between successive points comes nearer to a zone than a clearance."""
     return _comes_near(zones.outlines, points, clearance_m)
 
 

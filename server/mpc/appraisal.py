@@ -1,4 +1,4 @@
-"""Start of each plan before it is solved, and its costs afterwards."""
+"""Initial values of each plan before it is solved, and its costs afterwards."""
 
 from typing import NamedTuple
 
@@ -23,22 +23,22 @@ class PlanMemory(NamedTuple):
     start: F3
     """Initial state of the generator's plan [m, m/s]; shape (capacity, axes, 2)."""
     step: I1
-    """Step of the plans, or -1; shape (capacity,)."""
+    """Step of the latest plans, or -1; shape (capacity,)."""
     bounded: B1
-    """Whether an input was at its bound; shape (capacity,)."""
+    """Whether an input of the latest plan was at its bound; shape (capacity,)."""
 
 
 class Draft(NamedTuple):
     """Plans being computed for a block of vehicles."""
 
     planned: F3
-    """Planned state x_p(k|k-1), the generator's initial state [m, m/s]; shape (block, axes, 2)."""
+    """Planned state x_p(k|k-1), initial state of the generator [m, m/s]; shape (block, axes, 2)."""
     gradient: F3
     """Gradient g of the QP, later the slope at its solution; shape (block, axes, H)."""
     guess: F3
     """Shifted plan of the previous step [m/s]; shape (block, axes, H)."""
     inputs: S4
-    """Inputs U(k) of both MPCs, rounded, since planning continues with the inputs as sent [m/s];
+    """Inputs U(k) of both MPCs, rounded, because planning continues with the sent inputs [m/s];
     shape (2, block, axes, H)."""
     distance: F1
     """Scratch: squared distances [m²]; shape (H + 1,)."""
@@ -46,7 +46,7 @@ class Draft(NamedTuple):
 
 @inline
 def begin(memory: PlanMemory, ahead: int, plan: PlanFigures, row: int, k: int) -> None:
-    """Fill in where a plan starts, and whether it is fresh."""
+    """Fill in the first step of a plan, and whether it is fresh."""
     last, start = memory.step[row], k + ahead
     plan.row, plan.step, plan.start, plan.gap = row, k, start, start - last
     plan.solved = True
@@ -79,11 +79,11 @@ def _deviate(
     axis: int,
     distance: F1,
 ) -> None:
-    """Add the squared deviations of flying on with `held` from the previous plan, on one axis.
+    """Add, on one axis, the squared deviations between the inputs `held` and the previous plan.
 
     Args:
         i: index of the vehicle in the block.
-        distance: input and output: sum over the axes at each stage, as far as both are flown [m²];
+        distance: input and output: sum over the axes at each stage of both [m²];
             shape (H + 1,).
     """
     held, usable = foresight.held[i, axis], foresight.usable[i]
@@ -123,9 +123,9 @@ def _add_gap(
         cost: the sum so far.
     """
     for stage in range(len(change)):
-        # The slope is nonzero only where a bound is active, and there every allowed change
-        # increases the cost: a negative product is rounding. Without this term the gap was wrong in
-        # 68 % of the tests of a flight in wind 0.3.
+        # The slope is nonzero only at an active bound, where every allowed change increases the
+        # cost: a negative product is a rounding error. Without this term the gap was wrong in 68 %
+        # of the tests of a flight in wind 0.3.
         change[stage] = held[stage] - u[stage]
         cost += 2.0 * max(0.0, steep[stage] * change[stage])
     return add_cost(mpc, axis, x, change, cost)
@@ -154,7 +154,7 @@ def conclude(
     """
     axes, H, P = len(mpc.model), memory.inputs.shape[3], terminal_weight
     row, d, state_gap, cost = plan.row, foresight.ahead[i], 0.0, 0.0
-    # Later inputs are never flown, so the old plan must not seem to end too early because of them.
+    # Only usable inputs are compared: later inputs are never flown.
     change = draft.guess[i, 0, : foresight.usable[i]]
     distance, furthest = draft.distance, 0.0
     sure, doubted = 1.0, 0.0
@@ -196,5 +196,5 @@ def conclude(
             copy(draft.inputs[which, i, axis], memory.inputs[which, row, axis])
         memory.start[row, axis, 0] = draft.planned[i, axis, 0]
         memory.start[row, axis, 1] = draft.planned[i, axis, 1]
-    # A failed first plan is not a previous plan.
+    # A failed first plan does not count as a previous plan.
     memory.step[row] = plan.start if plan.solved or not plan.fresh else -1

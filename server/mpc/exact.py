@@ -1,7 +1,7 @@
 """Exact solver of the QPs of `mpc`: an active-set method with a Riccati recursion per iteration.
 
-Where the method of `server.mpc.riccati` does not converge, DAQP, a dual active-set method, solves
-the QP, and its answer is used only if it meets the optimality conditions.
+If the method of `server.mpc.riccati` does not converge, DAQP, a dual active-set method, solves the
+QP, and its answer is used only if it meets the optimality conditions.
 
 For a single vehicle DAQP is as fast (24 µs for 10 in a hot loop, the same in a paced loop). This
 solver is kept for many vehicles: it solves them side by side, and takes 0.9 to 1.7 µs for each of
@@ -19,7 +19,7 @@ from skytether.shared.base.kernel import B1, F3, kernel
 from skytether.shared.law.model import Array, Flags
 
 SNAP = 1e-12
-"""Distance from its bound within which DAQP's input is moved onto the bound [m/s]."""
+"""Distance from the bound within which an input of DAQP is moved onto the bound [m/s]."""
 RESIDUAL_MAX = 1e-7
 """Largest residual of the optimality conditions of DAQP's answer, relative to the gradient."""
 
@@ -28,7 +28,7 @@ RESIDUAL_MAX = 1e-7
 def _solve(
     mpc: MPC, which: int, work: RiccatiWorkspace, gradient: F3, guess: F3, inputs: F3, settled: B1
 ) -> None:
-    """Fill in the inputs of n vehicles (n, axes, H), and which are solved (axes n,)."""
+    """Fill in the inputs of n vehicles (n, axes, H), and flags of solved problems (axes n,)."""
     alone, together, n = simd_batch(work.memory), simd_batch(work.together), len(gradient)
     for axis in range(len(mpc.model)):
         first = 0
@@ -46,7 +46,7 @@ def _solve(
 
 
 class ExactSolver:
-    """See `server.mpc.solver.Solver`; the answer depends on the problem alone, up to rounding.
+    """See `server.mpc.solver.Solver`; apart from rounding, the answer depends only on the problem.
 
     Source: eq. (10).
     """
@@ -82,11 +82,11 @@ class ExactSolver:
         answer, _, status, info = daqp.solve(
             hessian, gradient, nothing, bound, -bound, primal_tol=1e-12, dual_tol=1e-12
         )
-        # DAQP may leave an input short of its bound by a rounding error.
+        # DAQP may return an input that misses its bound by a rounding error.
         answer = np.where(np.abs(answer) > bound - SNAP, np.copysign(bound, answer), answer)
         inputs: Array = np.clip(answer, -bound, bound)
         slope = hessian @ inputs + gradient
-        # Optimal: slope zero inside, and not pointing inwards at a bound.
+        # Optimality: the slope is zero inside the bounds, and does not point inwards at a bound.
         slope = np.where(np.abs(inputs) >= bound, np.maximum(np.sign(inputs) * slope, 0.0), slope)
         if not np.abs(slope).max() <= RESIDUAL_MAX * (1.0 + np.abs(gradient).max()):
             raise SolverFailed(f"DAQP status {status}", info["iterations"])

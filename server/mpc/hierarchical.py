@@ -3,11 +3,11 @@
 Both are the MPC of eq. (9), one after the other, each warm-started from its own previous plan. The
 generator plans from its own last prediction and never uses the vehicle's state (E17); the tracker
 controls the vehicle's estimated state along the generator's plan. The new plan is compared with the
-inputs already sent: V of eq. (16), and cost and deviation of flying on with the old plan.
+inputs already sent: V of eq. (16), and cost and deviation of the flight with these inputs.
 
 With the exact solver all of this is one compiled pass for one or several vehicles
-(`server.mpc.problem`). Any other solver is called in between: pose the generator's QP, solve; pose
-the tracker's QP, solve; conclude.
+(`server.mpc.problem`). With any other solver there are five steps: pose the generator's QP, solve;
+pose the tracker's QP, solve; conclude.
 """
 
 from typing import NamedTuple
@@ -62,7 +62,7 @@ class PlanBatch(NamedTuple):
     terminal_weight: F1
     """Terminal weight P on position and velocity; shape (2,)."""
     compares: bool
-    """Whether the inputs sent before are known, so that a plan is compared with them."""
+    """Whether the inputs sent before are available, so that a plan is compared with them."""
     memory: PlanMemory
     draft: Draft
     desired: Window
@@ -142,7 +142,7 @@ class Planner:
         self._memory.step[row] = -1
 
     def remember(self, rows: Indices, event: Flags) -> None:
-        """Note which plans are sent: none of the MPC's matter, which goes on from every plan."""
+        """Ignore which plans are sent: the MPC continues from every plan."""
 
     def plan(self, rows: Indices, step: Indices, foresight: Foresight) -> None:
         """Plan for vehicles: generator, then tracker; fills in `foresight.horizons` and `figures`.
@@ -228,7 +228,7 @@ def _pose_generator(batch: PlanBatch, simd: SimdBatch, indices: I1, which: int, 
         if not plan.fresh:
             x = planned_state(mpc, memory, plan, axis)
         draft.planned[i, axis, 0], draft.planned[i, axis, 1] = x
-        # The generator does not use the vehicle's state, hence no disturbance either.
+        # The generator uses neither the vehicle's state nor its disturbance.
         simd.p[lane], simd.v[lane], simd.w[lane] = x[0], x[1], 0.0
         set_target(desired.states[page, axis, first : first + H + 1], simd, lane)
         before = memory.inputs[GENERATOR, plan.row, axis]
@@ -314,13 +314,13 @@ def _conclude(batch: PlanBatch, i: int) -> None:
 def _plan(batch: PlanBatch, rows: I1, steps: I1, work: RiccatiWorkspace) -> int:
     """Plan with the exact solver, see `Planner.plan`; returns the number of unsolved plans.
 
-    The data of unsolved vehicles do not change, except that `solved` is False in their figures.
+    Data of unsolved vehicles are unchanged, except that `solved` is False in their figures.
     """
     memory, foresight, figures = batch.memory, batch.foresight, batch.figures
     picked, undone = batch.picked, 0
-    # An iteration without any input at its bound takes a third of the time, so vehicles that were
-    # at a bound are planned for together: the others are collected from the front, these from the
-    # back.
+    # An iteration without any input at its bound takes a third of the time. So vehicles whose
+    # inputs were at a bound are planned for together, collected from the back; all others from the
+    # front.
     waiting, last = 0, len(rows)
     for i in range(len(rows)):
         begin(memory, foresight.ahead[i], figures[i], rows[i], steps[i])
@@ -342,7 +342,7 @@ def _plan(batch: PlanBatch, rows: I1, steps: I1, work: RiccatiWorkspace) -> int:
     while waiting - first >= WIDTH:
         undone += _plan_some(batch, batch.together, picked[first : first + WIDTH], LATER, work)
         first += WIDTH
-    # Too few are left for a full batch; alone each vehicle gets the same bits
+    # Too few vehicles are left for a full batch; planned singly, each gets the same bits
     # (tests/mpc/test_hierarchical.py).
     for at in range(first, waiting):
         undone += _plan_some(batch, batch.alone, picked[at : at + 1], LATER, work)
@@ -369,19 +369,19 @@ def _pose(batch: PlanBatch, rows: I1, steps: I1, left: I1, tier: int) -> None:
 
 
 def start_plans(batch: PlanBatch, rows: Indices, step: Indices) -> None:
-    """Fill in where plans that no solver makes start; the guess is the plan before, shifted."""
+    """Fill in the start of plans made without a solver; the guess is the shifted previous plan."""
     _pose(batch, rows, step, np.arange(len(rows)), GENERATOR)
 
 
 def conclude_given(batch: PlanBatch, n: int) -> None:
-    """Compare plans that no solver has made, and store them; each counts as the optimum."""
+    """Compare plans made without a solver, and store them; each counts as the optimum."""
     batch.draft.gradient[:n] = 0.0
     _conclude_all(batch, np.arange(n), False)
 
 
 @kernel
 def _conclude_all(batch: PlanBatch, left: I1, sloping: bool) -> None:
-    """Fill in figures and store plans; `sloping`: `draft.gradient` is g, and not yet the slope."""
+    """Fill in figures and store plans; `sloping`: `draft.gradient` is g, not the slope."""
     draft, simd = batch.draft, simd_batch(batch.alone)
     for i in left:
         which = FIRST if batch.figures[i].fresh else LATER

@@ -1,9 +1,9 @@
-"""Nominal MPC: the plan from which trajectories are made if the server sees the reference ahead.
+"""Nominal MPC: plan that becomes the trajectory if the server sees the reference ahead.
 
 It is the MPC of eq. (9) for an undisturbed vehicle, starting from the reference state at step k,
 along the desired trajectory as far as the server sees it, within the input bounds of eq. (6). The
-vehicle follows the planned states, so a trajectory never demands more than the vehicle can fly: it
-turns early before a sharp corner, and cuts small corners.
+vehicle follows the planned states, so a trajectory never exceeds the vehicle's abilities: the
+trajectory turns early before a sharp corner, and cuts small corners.
 """
 
 from typing import NamedTuple

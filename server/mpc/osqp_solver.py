@@ -16,9 +16,9 @@ from skytether.shared.law.model import Array, Flags
 
 ITERATIONS_MAX = 4000
 TOLERANCE = 1e-9
-"""Tolerance of both residuals: inputs are accurate to about 1e-8 m/s, after 30 iterations."""
+"""Tolerance of both residuals: after 30 iterations inputs are accurate to about 1e-8 m/s."""
 RHO_PER_CURVATURE = 2.5
-"""OSQP's step size over the mean curvature of the Hessian, for the fewest iterations."""
+"""OSQP's step size divided by the Hessian's mean curvature; chosen for few iterations."""
 
 
 class OsqpSolver:
@@ -51,7 +51,7 @@ class OsqpSolver:
         if not (np.isfinite(gradient).all() and np.isfinite(guess).all()):
             raise SolverFailed("problem not finite")
         problem, bound = self._axes[axis], self._u_max[axis]
-        # Multipliers that make the guess stationary where it is at its bound, and zero elsewhere.
+        # Multipliers for which the guess is stationary at active bounds; zero elsewhere.
         slope = self._hessian[axis] @ guess + gradient
         multipliers = np.where(np.abs(guess) >= NEAR * bound, -slope, 0.0)
         problem.update(q=gradient)

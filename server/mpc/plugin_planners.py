@@ -1,12 +1,11 @@
-"""Planners of plug-ins in place of the MPC (`shared.scenario.planners`): one for each vehicle.
+"""Planners of plug-ins that replace the MPC (`shared.scenario.planners`), one per vehicle.
 
-A planner that raises, takes too long, or returns what cannot be flown makes no plan for its vehicle
-at that step: the vehicle flies its present plan to the end, and then its failsafe acts. What takes
-too long is decided by the caller of planners (`server.planning.scheme.Planning`): a core has no
-clock.
+A planner that raises, takes too long, or returns an infeasible plan makes no plan for its vehicle
+at that step: the vehicle flies its present plan to the end, and then its failsafe acts. The caller
+of planners (`server.planning.scheme.Planning`) limits their time, because a core has no clock.
 
-A planner optimises a cost that nobody else knows. So its plan counts as the optimum, and the cost
-of flying on with the inputs already sent is that of their difference from it, ΔUᵀ 𝓗 ΔU of eq. (9).
+The cost that a planner optimises is unknown here. So its plan counts as the optimum, and the excess
+cost of the inputs already sent is ΔUᵀ 𝓗 ΔU of eq. (9), with their difference ΔU from the plan.
 """
 
 from collections.abc import Callable, Sequence
@@ -30,9 +29,9 @@ from skytether.shared.scenario.registry import PLANNERS
 from skytether.shared.wire.protocol import FLOAT_MAX
 
 ERRORS, LATE, NOT_CALLED = "planner_errors", "planner_late", "planner_not_called"
-"""Names of the counts of steps without a plan."""
+"""Names of the counts of steps without a plan, by cause."""
 EXPECTED = {TimeoutError: LATE, Full: NOT_CALLED}
-"""Counts of what stands for a planner that has not answered."""
+"""Count to increase for each error of a planner that has not answered."""
 
 
 @dataclass(slots=True)
@@ -40,13 +39,13 @@ class VehiclePlanner:
     """Planner of one vehicle, and its last plan."""
 
     number: int
-    """Differs from that of every other planner, also of one that had its row before."""
+    """Number of the planner, unique among all planners of its row."""
     planner: Any
-    """None until it is made, with its first plan."""
+    """The planner; None before its first plan."""
     inputs: Array
     """Inputs of the last plan [m/s]; shape (axes, H)."""
     start: int = -1
-    """Step at which that plan started, or -1."""
+    """Step at which the last plan started, or -1."""
 
 
 class PluginPlanners:
@@ -68,7 +67,7 @@ class PluginPlanners:
         self._errors = PluginErrors(f"the planner {text}", NO_PLAN, ERRORS, fleet.tell)
         self._numbers = count()
         self._own: dict[int, VehiclePlanner] = {}
-        """Planners by the rows of their vehicles."""
+        """Planner of each vehicle, by row."""
         try:
             self._spare = self._make()
             self._spare.plan  # noqa: B018 - a planner has it
@@ -90,8 +89,8 @@ class PluginPlanners:
         Args:
             rows: rows of the vehicles; shape (n,).
             starts: step at which each plan starts; shape (n,).
-            state: state at that step [m, m/s]; shape (n, axes, 2).
-            reference: desired states from then on [m, m/s]; shape (n, axes, H + 1, 2).
+            state: state at the start of each plan [m, m/s]; shape (n, axes, 2).
+            reference: desired states from the start on [m, m/s]; shape (n, axes, H + 1, 2).
 
         Returns:
             for each vehicle inputs within ±u_max [m/s], shape (axes, H); states [m, m/s], shape
@@ -124,7 +123,7 @@ class PluginPlanners:
             if own.planner is None:
                 own.planner = self._make()
             return own.planner.plan(state, reference, previous)
-        except SystemExit as error:  # of its library: it shall not end the others' flights
+        except SystemExit as error:  # must not end other flights
             raise RuntimeError(f"got SystemExit: {error}") from error
 
     def _checked(self, own: VehiclePlanner, start: int, answer: Any) -> Array | None:
@@ -153,10 +152,9 @@ class PluginPlanners:
 class InputPlanner(Planner):
     """Planners of plug-ins for a scheme that sends inputs, with the figures of the MPC.
 
-    What a planner returns is the generator's plan, which knows no disturbance; the tracker's, which
-    is sent, is the same minus the disturbance. The MPC's generator never uses the vehicle's state,
-    but a planner always starts from it. So the previous plan, with which triggers compare, is the
-    last that was sent.
+    The planner's result is the generator's plan, without disturbance; the tracker's plan, which is
+    sent, is this plan minus the disturbance. The MPC's generator never uses the vehicle's state,
+    but a planner always starts from it. So triggers compare with the plan that was sent last.
     """
 
     def __init__(self, fleet: Fleet) -> None:
@@ -166,7 +164,7 @@ class InputPlanner(Planner):
         self._planners = PluginPlanners(fleet, states=False)
         self._bounds = np.array(terms.u_max)[:, None]
         self._sent: list[NDArray[Any]] = []
-        """Inputs, start and step of the plans sent last to the vehicles of this block."""
+        """Inputs, start and step of the plans last sent to the vehicles of this block."""
 
     def forget(self, row: int) -> None:
         super().forget(row)
@@ -197,7 +195,7 @@ class InputPlanner(Planner):
 
 
 def in_turn(calls: Sequence[tuple[int, Callable[[], Any]]]) -> list[Any]:
-    """Call planners one after the other, however long they take, as in virtual time."""
+    """Call planners one after the other, without a time limit, as in virtual time."""
     answers = []
     for _, call in calls:
         try:

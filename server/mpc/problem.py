@@ -9,11 +9,10 @@ whose Hessian 𝓗 = ΓᵀWΓ + R + S is the same at every step; only the gradie
 the target and the previous plan. W holds Q at the stages 1 … H-1 and P at H.
 
 The work of a step is done in O(H), by recursion along the horizon, on one axis, for several
-vehicles at once. In a recursion every stage waits for the previous one, about ten cycles, while the
-processor could do many times as much: so the innermost loop runs over vehicles, and the compiler
-turns it into vector instructions. A single vehicle is a batch of size 1. Vehicles are independent,
-and a vehicle gets the same bits alone as in a batch, which a BLAS product with Γ does not
-guarantee.
+vehicles at once. In a recursion every stage waits about ten cycles for the previous one, and most
+of the processor is idle. So the innermost loop runs over vehicles, and the compiler turns it into
+vector instructions. A single vehicle is a batch of size 1. Vehicles are independent, and a vehicle
+gets the same bits alone as in a batch, which a BLAS product with Γ does not guarantee.
 """
 
 from dataclasses import dataclass
@@ -34,20 +33,20 @@ Inputs = F1 | S1
 class Weights(NamedTuple):
     """Weights of eq. (9), for the first step of a flight and for all later steps.
 
-    Without a previous plan there is no S-term (E8): the first of two rows leaves it out.
+    Without a previous plan there is no S-term (E8): the first of the two rows omits it.
     """
 
     states: F2
-    """W, diagonal; shape (H, 2)."""
+    """Diagonal of W, the weights of the states; shape (H, 2)."""
     inputs: F2
     """R + S, all weights of the input itself; shape (2, H)."""
     changes: F2
-    """S of the stages 0 … H-2, and 0 of the last; shape (2, H)."""
+    """Weights S of the stages 0 … H-2, and 0 for the last stage; shape (2, H)."""
     input: float
-    """R."""
+    """Weight R of the input."""
     target: F1
-    """Weight of the desired velocity: R / g if the input has a target of its own (E7), since flying
-    at v takes the input v / g; otherwise 0; shape (axes,)."""
+    """Weight of the desired velocity: R / g if the input has its own target (E7), because velocity
+    v needs the input v / g; otherwise 0; shape (axes,)."""
 
 
 FIRST, LATER = 0, 1
@@ -73,7 +72,7 @@ def make_mpc(terms: Terms, control: ControlConfig) -> MPC:
     states = np.tile(np.array(control.state_weight), (H, 1))
     states[-1] = control.terminal_weight
     changes = np.zeros((2, H))
-    # Eq. (9) sums S up to H - 2 only: the last input has no counterpart in the previous plan.
+    # Eq. (9) sums S only up to H - 2: the last input has no counterpart in the previous plan.
     changes[LATER, :-1] = control.change_weight
     weights = Weights(
         states=states,
@@ -111,8 +110,7 @@ def pose(model: Model, mpc: MPC, which: int) -> Problem:
             # Γ is a Toeplitz matrix: the response depends on the distance of the two stages alone.
             forced[:, later, :, later - stage] = response
         response = model.step(response, 0.0)
-    # As a full matrix, since it is computed twice a flight only; the work of a step is O(H), see
-    # below.
+    # A full matrix, because it is computed only twice per flight; each step takes O(H), see below.
     hessian = np.einsum("aipk,ip,aipl->akl", forced, mpc.weights.states, forced)
     return Problem(model, mpc, which, hessian + np.diag(mpc.weights.inputs[which]))
 
@@ -143,7 +141,7 @@ class SimdBatch(NamedTuple):
     p11: F1
     """Matrix P, entry of velocity; shape (L,)."""
     total: F1
-    """Sum of the gradient, which is not finite if one of its numbers is not; shape (L,)."""
+    """Sum of the gradient, as a test: finite if all its numbers are finite; shape (L,)."""
     changed: F1
     """Number of inputs that entered or left the active set in the last iteration; shape (L,)."""
     active: F1
@@ -169,13 +167,13 @@ class SimdBatch(NamedTuple):
     inputs: F2
     """Optimal inputs, not yet rounded [m/s]; shape (H, L)."""
     side: F2
-    """-1 or 1 if the input is at that bound, 0 if it is free; shape (H, L)."""
+    """-1 or 1 if the input is at its lower or upper bound, 0 if it is free; shape (H, L)."""
     own: F2
     """Unconstrained choice of each stage at x = 0 [m/s]; shape (H, L)."""
     k0: F2
     """Column K0 of the backward pass, see `exact`; shape (H, L)."""
     k1: F2
-    """Column K1."""
+    """Column K1 of the backward pass; shape (H, L)."""
     f00: F2
     f01: F2
     f10: F2
@@ -183,7 +181,7 @@ class SimdBatch(NamedTuple):
 
 
 def simd_memory(H: int, width: int) -> Array:
-    """Memory of a `SimdBatch` in one array, since each array costs time in a call."""
+    """Memory of a `SimdBatch` in one array, because each array argument takes time in a call."""
     return np.zeros((len(SimdBatch._fields), H + 1, width))
 
 
@@ -318,7 +316,7 @@ def adjoint(
 
 @inline
 def pulled(S: float, previous: float, T: float, target_v: float, R: float, w: float) -> float:
-    """S- and R-terms of the gradient of one input, with negative sign.
+    """Negative S- and R-terms of the gradient of one input.
 
     Args:
         S, T, R: weights of change, desired velocity and input, see `Weights`.

@@ -6,11 +6,10 @@ A condensed QP  ½ Uᵀ𝓗U + gᵀU  with 𝓗 = ΓᵀWΓ + diag(ρ) is the opt
 
 So for a fixed set of inputs at their bounds, a backward pass over 2 x 2 matrices solves it in O(H),
 where a factorisation of 𝓗 takes O(H³). The forward pass gives the unconstrained choice v of each
-stage: beyond the bound the stage belongs in the set, otherwise it does not. A set that reproduces
-itself is optimal. From the shifted plan of the previous step this takes one or two iterations. The
-set may cycle instead (long steps, a tiny R, corners of the reference); then only the input with the
-largest violation changes, one per iteration. What does not converge either is left to
-`server.mpc.exact`.
+stage: a stage belongs to the set if v is beyond the bound. A set that reproduces itself is optimal.
+Starting from the shifted previous plan, this takes one or two iterations. The set may cycle
+instead (long steps, a tiny R, corners of the reference); then only the input with the largest
+violation changes, one per iteration. `server.mpc.exact` solves what does not converge.
 """
 
 from typing import NamedTuple
@@ -23,14 +22,14 @@ from skytether.shared.base.kernel import B1, F1, F2, F3, F4, inline, kernel, lan
 from skytether.shared.law.model import Axis
 
 NEAR = 1.0 - 1e-6
-"""Share of the bound above which a guessed input, rounded to float32, counts as at the bound."""
+"""Share of the bound above which a guessed input, rounded to float32, counts as bounded."""
 
 ROUNDS_MAX = 8
 """Number of iterations in which the whole set may change; recorded flights needed five at most."""
 PIVOTS_MAX = 200
 """Number of further iterations, in which one input enters or leaves the set."""
 
-# Quantities of a stage that depend on the active set alone. The cost to go from the stage is ½ c u²
+# Quantities of a stage that depend only on the active set. The cost to go from the stage is ½ c u²
 # + (s x + d) u before its input u is chosen, and ½ xᵀPx + qᵀx after.
 K0, K1, INVERSE, F00, F01, F10, F11 = range(7)
 """Columns of `RiccatiWorkspace.free`: k = s / c, 1 / c and F = A - B k."""
@@ -43,7 +42,7 @@ class RiccatiWorkspace(NamedTuple):
     memory: F3
     """Scratch for a single vehicle, see `problem.simd_memory`."""
     together: F3
-    """Scratch for WIDTH vehicles."""
+    """Scratch for WIDTH vehicles, see `problem.simd_memory`."""
 
 
 Three = tuple[float, float, float]
@@ -139,8 +138,7 @@ def _round_free(mpc: MPC, axis: int, simd: SimdBatch, stages: F2) -> None:
 def _backward(mpc: MPC, axis: int, which: int, simd: SimdBatch) -> None:
     """Backward pass with each vehicle's active set.
 
-    Matrices and vectors are computed together, so that quantities needed only once are never
-    stored.
+    Matrices and vectors are computed together, so that intermediate results are not stored.
     """
     model, bound, W, L = axis_at(mpc.model, axis), mpc.bounds[axis], mpc.weights.states, len(simd.p)
     a01, a11 = model.a01, model.a11
@@ -173,7 +171,7 @@ def _backward(mpc: MPC, axis: int, which: int, simd: SimdBatch) -> None:
 
 @lanes
 def _forward(mpc: MPC, axis: int, simd: SimdBatch, singly: bool) -> None:
-    """Forward pass: unconstrained choices decide on the active set; `singly`: on one input only."""
+    """Forward pass: unconstrained choices change the active set; `singly`: by one input only."""
     model, bound, L = axis_at(mpc.model, axis), mpc.bounds[axis], len(simd.p)
     b0, b1, x0, x1 = model.b0, model.b1, simd.leader_p, simd.leader_v
     u, side, own, changed, active = simd.inputs, simd.side, simd.own, simd.changed, simd.active
@@ -187,7 +185,7 @@ def _forward(mpc: MPC, axis: int, simd: SimdBatch, singly: bool) -> None:
             own_, p_, v_, at = own[i, lane], x0[lane], x1[lane], side[i, lane]
             chosen = own_ - (k0[i, lane] * p_ + k1[i, lane] * v_)
             verdict = 1.0 if chosen > bound else -1.0 if chosen < -bound else 0.0
-            # An input that would leave its bound stays there for this iteration.
+            # An input that would leave its bound stays at the bound in this iteration.
             stays = at if at != 0.0 or singly else verdict
             value = chosen if stays == 0.0 else stays * bound
             then_p, then_v = advance(model, p_, v_, value)
@@ -243,7 +241,7 @@ def active_sets(mpc: MPC, axis: int, which: int, simd: SimdBatch, free: F4, sett
     while rounds < ROUNDS_MAX + PIVOTS_MAX:
         singly = rounds >= ROUNDS_MAX
         rounds += 1
-        # If no vehicle has an input at its bound, one table of stages serves all of them.
+        # If no vehicle has an input at its bound, all use the same table of stages.
         if singly or _any(simd.active):
             _backward(mpc, axis, which, simd)
             _forward(mpc, axis, simd, singly)

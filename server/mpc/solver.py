@@ -25,6 +25,6 @@ class Solver(Protocol):
             guess: initial guess of the inputs [m/s]; shape (n, axes, H).
 
         Returns:
-            inputs within the bounds, shape (n, axes, H), and which vehicles were solved, shape
+            inputs within the bounds, shape (n, axes, H), and flags of the solved vehicles, shape
             (n,). The inputs of an unsolved vehicle are its guess.
         """

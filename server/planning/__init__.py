@@ -1,1 +1,1 @@
-"""What every scheme plans with: interface of a scheme, clock of each vehicle, desired states."""
+"""Parts of planning common to all schemes: their interface, vehicles' clocks, desired states."""

@@ -1,13 +1,13 @@
 """Clock map: present step of each vehicle, from the server's clock and the vehicle's time stamps.
 
-Neither clock is set; the vehicle's clock counts from its step 0. Every observation gives F = t2 -
-t1 (sent by the vehicle, received by the server), and contains G = t4 - t3 (sent by the server,
+Neither clock is adjusted; the vehicle's clock counts from its step 0. Every observation gives F =
+t2 - t1 (sent by the vehicle, received by the server), and contains G = t4 - t3 (sent by the server,
 received aboard) of the server's newest packet. Over the last 20 s
 
     offset = (min G - min F) / 2,    bound = (min F + min G) / 2
 
-of the vehicle's clock minus the server's. Whether the two smallest delays are equal cannot be
-measured: the offset may be wrong by up to the bound. Step k begins at k Δt of the vehicle.
+of the vehicle's clock minus the server's. It cannot be measured whether the two smallest delays are
+equal: the offset may be wrong by up to the bound. Step k begins at k Δt of the vehicle.
 
 Independently of this estimate there are two bounds that hold for any delays. A delay is never
 negative, so the true offset O is at least -F and at most G at the time of each sample, and changes
@@ -15,7 +15,7 @@ by at most DRIFT of the elapsed time:
 
     max (-F - DRIFT age) ≤ O ≤ min (G + DRIFT age)
 
-over all samples, however old.
+over all samples of any age.
 
 Two settings narrow these bounds: the operator's bound on the difference of the smallest delays of
 the two directions, and the time of day if both ends know it. Each is checked against the bounds
@@ -35,7 +35,7 @@ from skytether.shared.law.heartbeat import SESSION_NS
 from skytether.shared.law.model import Array, Indices
 
 BUCKET_NS = SECOND_NS // 2
-"""Length of an interval for which minima are kept [ns]."""
+"""Length of an interval of which the minima are stored [ns]."""
 BUCKETS = 40
 RECENT = 3
 """Number of newest intervals that count as recent when looking for a step of a clock. If they hold
@@ -45,27 +45,27 @@ OLD = 8
 STEP_SAMPLES = 5
 """Number of samples needed in both recent and old minima to detect a step of a clock."""
 STEP_NS = 40 * MILLISECOND_NS
-"""Smallest step of a clock that is detected [ns]: it raises the estimated delay of one direction,
-and lowers that of the other by as much."""
+"""Smallest step of a clock that is detected [ns]. A step raises the estimated delay of one
+direction and lowers that of the other direction by as much."""
 
 ECHOES = 4
-"""Number of newest echoes kept per vehicle, from which the present delay to it is estimated."""
+"""Number of newest echoes stored per vehicle, for the estimate of the present delay to it."""
 
-# The sum of two of them fits in an int64, so sums of minima need no check.
+# 2 * UNSEEN fits in an int64, so sums of two minima need no check.
 UNSEEN = 2**61
 """Minimum of an interval without samples."""
 
 
 class Contradiction(IntEnum):
-    """Which earlier bound of a clock offset a sample contradicts."""
+    """Earlier bound of a clock offset that a sample contradicts."""
 
     NOTHING = 0
     CLOCK = 1
-    """The bounds from delays: a clock was set, or runs at a wrong rate."""
+    """Contradiction to the bounds from delays: a clock was set, or runs at a wrong rate."""
     ASYMMETRY = 2
-    """The operator's bound `link.asymmetry_s` on the difference of the delays each way."""
+    """Contradiction to the operator's bound `link.asymmetry_s` on the difference of delays."""
     TIME_OF_DAY = 3
-    """The time of day of one end."""
+    """Contradiction between a clock offset and the time of day of one end."""
 
 
 NOTHING, CLOCK, ASYMMETRY, TIME_OF_DAY = map(int, Contradiction)
@@ -87,20 +87,20 @@ class VehicleClock:
     high: int
     """Upper bound of the true offset at `bounded` [ns]; UNSEEN before the first sample."""
     bounded: int
-    """Server's time at which `low` and `high` hold [ns]; they widen before and after it."""
+    """Server's time at which `low` and `high` hold [ns]; the bounds at other times are wider."""
     sent: int
     """Earliest time at which the newest observation can have been sent, by the server's clock [ns];
     UNSEEN before the first."""
     echo: int
-    """`Observation.heard` of the newest observation that came in order; -1 before the first."""
+    """`Observation.heard` of the newest observation that arrived in order; -1 before the first."""
     echoed: int
-    """Earliest time at which that packet can have come aboard, by the server's clock [ns]."""
+    """Earliest possible arrival aboard of the packet `echo`, by the server's clock [ns]."""
     steps: int
     """Number of times that a sample contradicted the bounds from delays."""
     other_low: int
-    """Lower bound of the true offset at `other` from settings and time of day [ns], or -UNSEEN."""
+    """Lower bound of the true offset by settings and time of day, at the time `other` [ns]."""
     other_high: int
-    """Upper bound of the true offset at `other` from settings and time of day [ns], or UNSEEN."""
+    """Upper bound of the true offset by settings and time of day, at the time `other` [ns]."""
     other: int
     """Server's time at which `other_low` and `other_high` hold [ns]."""
     doubted: int
@@ -155,7 +155,7 @@ class ClockMap:
         self.tick_ns = 0
         """Server's time at which steps were last counted [ns]."""
         self._lives: list[tuple[int, int] | None] = [None] * capacity
-        """Number of the vehicle in each row, and boot id of its client."""
+        """Number of the vehicle in each row, and the boot id of the vehicle's client."""
         self.seen = Seen(
             vehicles=np.zeros(capacity, dtype=VEHICLE_CLOCK),
             minimum=np.empty((capacity, 2, BUCKETS), dtype=np.int64),
@@ -169,8 +169,8 @@ class ClockMap:
         """Reset the row for another vehicle, or for a new session.
 
         Args:
-            life: its number and the boot id of its client, or None if unknown. With the same boot
-                id, step 0 is the same and bounds found earlier remain valid.
+            life: the vehicle's number and its client's boot id, or None if unknown. With the same
+                boot id, step 0 is the same and bounds found earlier remain valid.
         """
         self.seen.minimum[row], self.seen.samples[row] = UNSEEN, 0
         self.seen.echoes[row] = -UNSEEN
@@ -196,22 +196,22 @@ class ClockMap:
         now_ns: int,
         is_newest: bool = True,
     ) -> Contradiction:
-        """Add one F and one G of a vehicle; returns what they contradict.
+        """Add one F and one G of a vehicle; returns the bound that they contradict.
 
         Args:
             forward_ns: F [ns].
             backward_ns: G [ns].
             heard: number of the server's packet that G belongs to.
             now_ns: server's time of reception [ns].
-            is_newest: whether the observation is the newest; for an echo in an older one the time
-                of its reception is unknown.
+            is_newest: whether the observation is the newest; the reception time of an echo in an
+                older one is unknown.
         """
         sample = forward_ns, backward_ns, heard, is_newest, self._asymmetry_ns, now_ns
         return Contradiction(_observe(self.seen, row, *sample))
 
     def tell(self, row: int, offset_ns: int, error_ns: int, *, now_ns: int) -> Contradiction:
-        """Narrow the bounds of a vehicle's clock offset by its time of day; returns what that
-        contradicts.
+        """Narrow the bounds of a vehicle's clock offset by its time of day; returns the
+        contradiction.
 
         Args:
             offset_ns: the vehicle's clock minus the server's [ns].
@@ -225,14 +225,14 @@ class ClockMap:
 
     def steps(self, rows: Indices, now_ns: int) -> Indices:
         """Step k of each vehicle at a time of the server's clock; shape (n,)."""
-        steps = rows.copy()  # a copy to write to: cheaper than a new array
+        steps = rows.copy()  # a copy that is overwritten: cheaper than a new array
         self.tick_ns = now_ns
         _steps(self.seen, rows, now_ns, self._dt_ns, steps)
         return steps
 
     def offset_ns(self, rows: Indices) -> Indices:
         """Vehicle's clock minus the server's, for observed vehicles [ns]; shape (n,)."""
-        # Updates `adopted`; the steps are not needed.
+        # The call updates `adopted`; its result is not needed.
         _steps(self.seen, rows, 0, self._dt_ns, rows.copy())
         offsets: Indices = self.seen.vehicles["adopted"][rows]
         return offsets
@@ -295,11 +295,11 @@ def _by_others(seen: Seen, row: int, now: int) -> tuple[int, int]:
 
 @part
 def bounds_ns(seen: Seen, row: int, now: int) -> tuple[int, int]:
-    """Bounds of a vehicle's clock offset at a time of the server [ns]."""
+    """Bounds of a vehicle's clock offset at a time of the server's clock [ns]."""
     low, high = _by_delays(seen, row, now)
     other_low, other_high = _by_others(seen, row, now)
     if seen.vehicles[row].doubted or max(low, other_low) > min(high, other_high):
-        # One of the two is wrong, and it is unknown which.
+        # One of the two bounds is wrong, and it is unknown which one.
         return min(low, other_low), max(high, other_high)
     return max(low, other_low), min(high, other_high)
 
@@ -311,7 +311,7 @@ def _bounds(seen: Seen, row: int, now: int, bounds: I1) -> None:
 
 @part
 def _narrow(seen: Seen, row: int, low: int, high: int, now: int) -> bool:
-    """Narrow the bounds of settings and time of day [ns]; if contradictory, reset them: False."""
+    """Narrow the bounds by settings and time of day [ns]; reset them if contradictory (False)."""
     vehicle = seen.vehicles[row]
     other_low, other_high = _by_others(seen, row, now)
     trip_low, trip_high = _by_delays(seen, row, now)
@@ -365,15 +365,15 @@ def _bound(
     """Narrow the bounds by F and G [ns]."""
     vehicle = seen.vehicles[row]
     low, high = _by_delays(seen, row, now)
-    # An echo came aboard after the observation before was sent, which did not contain it; the first
-    # echo is no older than a session lasts without packets, nor is that of an overtaken one.
+    # An echoed packet arrived aboard after the previous observation was sent, which did not echo
+    # it. The first echo, or that of an overtaken observation, is at most SESSION_NS old.
     is_new = is_newest and heard != vehicle.echo
     if is_new:
         vehicle.echoed = vehicle.sent if vehicle.sent < UNSEEN else now - SESSION_NS
         vehicle.echo = heard
     age = max(now - vehicle.echoed, 0) if heard == vehicle.echo else SESSION_NS
-    # F is as old as the observation, which is no older than the round trip, as far as clocks of
-    # this age tell it.
+    # F is as old as the observation, which is at most as old as the round trip, measured by clocks
+    # that drift.
     trip = max(forward + backward, 0) + age // DRIFT + 1
     low = max(low, -forward - trip // DRIFT - 1)
     if is_new:
@@ -382,8 +382,8 @@ def _bound(
         vehicle.sent = now - trip
     contradiction = CLOCK if low > high else NOTHING
     if contradiction == CLOCK:
-        # Nothing earlier holds any more. If a clock was set in between, the round trip of the
-        # newest sample may be negative.
+        # All earlier bounds are void. If a clock was set in between, the round trip of the newest
+        # sample may be negative.
         vehicle.steps += 1
         drift = max(age, trip) // DRIFT + 1
         low, high = min(-forward, backward) - drift, max(-forward, backward) + drift
@@ -410,7 +410,7 @@ def _observe(
         vehicle.heard = heard
         seen.echoes[row, vehicle.echoes % ECHOES] = backward
         vehicle.echoes += 1
-    # At most once round the ring, however long no observation came.
+    # At most one turn of the ring, even after a long time without observations.
     for passed in range(max(vehicle.newest + 1, bucket - BUCKETS + 1), bucket + 1):
         slot = passed % BUCKETS
         seen.minimum[row, 0, slot], seen.minimum[row, 1, slot] = UNSEEN, UNSEEN
@@ -447,13 +447,13 @@ def _drop_stepped(seen: Seen, row: int) -> None:
             recent, recently = recent + count, age + 1
         elif age >= OLD:
             old += count
-    # With few samples, a single delayed one would look like a step.
+    # With few samples, a single late one would look like a step.
     if min(recent, old) < STEP_SAMPLES:
         return
     forward = _change(seen.minimum[row, 0], newest, recently)
     backward = _change(seen.minimum[row, 1], newest, recently)
-    # A clock step raises one of the two and lowers the other by as much; a change of the network
-    # moves both the same way, or only one.
+    # A clock step raises one of the two delays and lowers the other by as much; a change of the
+    # network changes both in the same direction, or only one.
     large = min(abs(forward), abs(backward)) > STEP_NS
     if large and abs(forward + backward) < max(STEP_NS, 0.2 * abs(forward)):
         for age in range(recently, BUCKETS):
@@ -480,6 +480,6 @@ def _steps(seen: Seen, rows: I1, now: int, dt: int, steps: I1) -> None:
 def _step_errors(seen: Seen, rows: I1, steps: I1, now: int, dt: int, early: F1, late: F1) -> None:
     for i in range(len(rows)):
         low, high = bounds_ns(seen, rows[i], now)
-        # Subtract whole steps first: as floats, times of years in nanoseconds have too few digits.
+        # Subtract whole steps first: floats are too imprecise for years in nanoseconds.
         early[rows[i]] = (now + high - steps[i] * dt) / dt
         late[rows[i]] = (steps[i] * dt - now - low) / dt

@@ -1,16 +1,16 @@
-"""Desired trajectory as known to the server: the window of desired states for a plan.
+"""Desired trajectory as far as the server knows it: the window of desired states for a plan.
 
 The plan at step k covers the steps from k + d to k + d + H. `reference.preview` limits how far
 ahead the server may look: with "all" it sees the whole window, otherwise nothing after the step k +
 preview. Later states are extrapolated from the last visible state at its velocity; for a moving
 target with reflection at the bounds of its region (docs/schemes.md lists rejected alternatives). Of
-a point that is moved in flight (`live`) only the present state is known, the same for all vehicles.
+a point moved in flight (`live`) only the present state is known, the same for all vehicles.
 
 The plan of a vehicle with a dead time θ starts from the state in which its next input takes effect
 (`shared.law.dead_time`), and so follows the trajectory shifted by θ on each axis.
 
-Trajectories are computed in pages and looked up, not computed at each step. Vehicles with
-trajectories of their own have pages of their own.
+Trajectories are computed once, in pages, and then looked up at each step. A vehicle with its own
+trajectory has its own pages.
 """
 
 from collections.abc import Callable
@@ -34,7 +34,7 @@ PAGES = 256
 EMPTY = -1
 """Key of an empty slot."""
 FOUND = -1
-"""Result of a search that finds every vehicle's page."""
+"""Result of `_find` if the pages of all vehicles are stored."""
 TRAJECTORY = 2**40
 """Stride between keys of trajectories: page p of trajectory t has the key t * TRAJECTORY + p."""
 SPREAD = 31
@@ -54,7 +54,7 @@ class Window(NamedTuple):
     place: I1
     """Slot of each vehicle's states; shape (block,)."""
     first: I1
-    """Stage in that slot that is the step k + d; shape (block,)."""
+    """Index of the stage at step k + d within its slot; shape (block,)."""
 
 
 class Outlook(NamedTuple):
@@ -89,11 +89,11 @@ class Desired:
             self._point = module.live_point(scenario)
         self._all = wanted.preview == "all" and self._point is None
         self._reach = H
-        """Steps that a page covers beyond its first PAGE steps: H, or with a limited preview the
+        """Number of steps in a page after its first PAGE steps: H, or, with a limited preview, the
         visible steps."""
         if not self._all:
             seen_s = 0.0 if self._point or isinstance(wanted.preview, str) else wanted.preview
-            # TINY: 0.15 / 0.05 is 2.9999999999999996.
+            # TINY, because 0.15 / 0.05 is 2.9999999999999996.
             self._reach = min(int(seen_s / terms.dt_s + TINY), longest)
         seen_s = self._reach * terms.dt_s
         self._ahead_s = late_s if self._all else np.minimum(late_s, seen_s)
@@ -111,20 +111,20 @@ class Desired:
         self._dt_s = terms.dt_s
         self._steps = np.arange(PAGE + self._reach + 1)
         self._axes, self._late, shifts = axes, bool(late_s.any()), bool(self._ahead_s.any())
-        # With a dead time a page holds two sets of rows: the states shifted by it, and those at the
-        # steps.
+        # With a dead time a page has two sets of rows: states shifted by the dead time, and
+        # unshifted.
         rows = 2 * axes if shifts else axes
         pages = (1, axes, 1, 2) if self._point else (PAGES, rows, len(self._steps), 2)
         self._pages = np.zeros(pages)
         """Desired states in each slot [m, m/s]; for a live point only its present state."""
         self._at_once = np.zeros(block, dtype=np.int64)
-        """Zeros in place of d, for states from k on."""
+        """Zeros, passed as d to get states from step k on; shape (block,)."""
         self._keys = np.full(PAGES, EMPTY, dtype=np.int64)
         """Key of the page stored in each slot, or EMPTY; shape (PAGES,)."""
         self._found = Window(
             self._pages, np.zeros(block, dtype=np.int64), np.zeros(block, dtype=np.int64)
         )
-        """Slots and stages of the states from a step on."""
+        """Slots and stages of the visible desired states."""
         self._foreseen = Window(
             np.zeros((block, axes, H + 1, 2)),
             np.arange(block),
@@ -156,15 +156,15 @@ class Desired:
         return states
 
     def due(self, rows: Indices, steps: Indices) -> Array:
-        """Desired states at the steps k plus the dead time, when their inputs take effect; see
-        `now`.
+        """Desired states at the steps k plus the dead time, at which inputs of step k take effect;
+        see `now`.
         """
         if not self._late:
             return self.now(rows, steps)
         return self.states(rows, steps, np.zeros(len(rows), dtype=np.int64))[:, :, 0]
 
     def window(self, rows: Indices, steps: Indices, ahead: Indices) -> Window:
-        """Desired states from k + d on, valid until the next call; d: first n of `ahead`."""
+        """Desired states from k + d on, valid until the next call; `ahead` has d in its first n."""
         if self._all:
             return self._find(rows, steps, ahead)
         visible = self._find(rows, steps, self._at_once)
@@ -193,7 +193,7 @@ class Desired:
             at = plain(_slot)(keys, number, page)
             times_s = (page * PAGE + self._steps) * self._dt_s
             states = sample(times_s).transpose(1, 0, 2)
-            # Without a dead time both slices are the same rows, which are then written twice.
+            # Without a dead time both slices are the same rows, written twice.
             self._pages[at, : self._axes] = self._pages[at, -self._axes :] = states
             for axis in np.flatnonzero(self._ahead_s):
                 self._pages[at, axis] = sample(times_s + self._ahead_s[axis])[:, axis]
@@ -240,7 +240,7 @@ def _foresee(
     """Fill in the windows of vehicles: visible states, and extrapolated ones after them.
 
     Args:
-        visible: slots and stages of the desired states from k on; none after k + reach is used.
+        visible: slots and stages of the desired states from k on, used up to k + reach.
         ahead: d of each; shape (block,).
         outlook: visible part of the trajectory.
         bound_m: coordinate at which the extrapolation is reflected [m].

@@ -1,4 +1,4 @@
-"""A point that an operator moves in flight: position and velocity, from the moves alone.
+"""A point that an operator moves in flight: its position and velocity, computed from the moves.
 
 Its velocity is given with a move, or is a weighted mean over the moves: v ← v + (1 - exp(-h /
 MEMORY_S)) · (Δp / h - v), with h the time between two moves. A point without a given velocity that
@@ -42,7 +42,7 @@ class LivePoint:
                 return np.stack([self._position, self._velocity], axis=-1)
             # With a given velocity the point moves from the first call on.
             self._moved_ns = now_ns
-        # Never negative: a tick may be due before the move that has just arrived.
+        # At least 0: a tick may be due before the time of a move that has just arrived.
         since_s = max(0, now_ns - self._moved_ns) / SECOND_NS
         if not self._has_velocity and since_s > REST_S:
             return np.stack([self._position, np.zeros_like(self._velocity)], axis=-1)
@@ -56,7 +56,7 @@ class LivePoint:
         if h_s > 0.0:
             share = -math.expm1(-h_s / MEMORY_S)
             before = before + share * ((position - self._position) / h_s - before)
-        # Two moves a moment apart could give a velocity that no vehicle can follow.
+        # Two moves within a short time could give a velocity that no vehicle can follow.
         velocity: Array = np.clip(before, -self._fastest, self._fastest)
         return velocity
 

@@ -6,13 +6,13 @@ from skytether.server.planning.scheme import Tell
 
 
 class PluginErrors:
-    """Context in which a plug-in's code is called: an exception ends the block, and is noted.
+    """Context manager for calls of a plug-in's code: an exception ends the block and is counted.
 
     The first error of each count is reported, with its traceback.
 
     Args:
         what: kind and name of the plug-in, for the report.
-        then: what happens when it fails, for the report.
+        then: consequence of its failure, for the report.
         count: name of the count.
     """
 
@@ -29,7 +29,7 @@ class PluginErrors:
         return isinstance(error, Exception)
 
     def note(self, error: Exception, count: str = "") -> None:
-        """Note an error; with a `count` of its own it is expected, and needs no traceback."""
+        """Count an error; one with its own `count` is expected, and has no traceback."""
         name, text = count or self._count, ""
         if name not in self._reported:
             self._reported.add(name)

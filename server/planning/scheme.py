@@ -36,7 +36,7 @@ class Splines(NamedTuple):
     spacing: I1
     """Steps from one knot to the next; shape (block,)."""
     age: I1
-    """Age of the trajectory [steps]: 0 unless an old one is sent again; shape (block,)."""
+    """Age of the trajectory [steps]: 0 unless an old trajectory is sent again; shape (block,)."""
 
 
 class Foresight(NamedTuple):
@@ -66,8 +66,8 @@ class Foresight(NamedTuple):
     """Inputs from k+d on in each loss case, if no further packet is sent [m/s]; shape (block,
     loss_cases, axes, H)."""
     usable: I1
-    """Number of inputs from k+d on that a vehicle may fly before they reach `link.age_max_s`; shape
-    (block,)."""
+    """Number of inputs from k+d on that are younger than `link.age_max_s` when they are flown;
+    shape (block,)."""
     disturbance: F2
     """Estimated disturbance ŵ, as an equivalent input [m/s]; shape (block, axes)."""
     horizons: S3
@@ -80,18 +80,18 @@ class Foresight(NamedTuple):
 
 
 class PlanFigures:
-    """Numpy record: figures of one plan, from which triggers decide; costs are those of eq. (9)."""
+    """Numpy record: figures of one plan, which triggers compare; costs are those of eq. (9)."""
 
     row: int
     step: int
     start: int
     """Step k + d, where planning starts."""
     gap: int
-    """Steps from the start of the previous plan to the start of this one."""
+    """Steps from the start of the previous plan to the start of the new plan."""
     state_gap: float
     """V(k) of eq. (16): (x̂ - x_p)' P (x̂ - x_p)."""
     cost_gap: float
-    """Cost of flying on with the inputs already sent, minus the cost of the new plan."""
+    """Cost of the flight with the inputs already sent, minus the cost of the new plan."""
     expected_gap: float
     """Expected value of `cost_gap` over the losses of packets in flight."""
     deviation_m: float
@@ -100,7 +100,7 @@ class PlanFigures:
     fresh: bool
     """Whether no usable previous plan exists: first step, or a gap longer than H."""
     solved: bool
-    """Whether the solver has found a plan, so that it may be sent."""
+    """Whether the solver has found a plan, which may then be sent."""
 
 
 FIGURES = record(PlanFigures)
@@ -148,20 +148,20 @@ class Header(NamedTuple):
     number: int
     """Number of the packet in the session."""
     silence: int
-    """Longest time without a packet from the vehicle that the server asks for [half steps]."""
+    """Longest silence that the server requests of the vehicle [half steps]."""
 
 
 make_header: Callable[[tuple[int, int, int, int, int]], Header] = partial(tuple.__new__, Header)
-"""Header from its five values, in half the time of calling `Header`."""
+"""Function that makes a Header from its five values, twice as fast as calling `Header`."""
 
 
 class Batch(NamedTuple):
-    """Vehicles planned for together, and which of them are sent their plan."""
+    """Vehicles planned for together, and those whose plan is sent."""
 
     rows: Indices
     """Rows of the vehicles; shape (n,)."""
     step: Indices
-    """Step k of each; shape (n,)."""
+    """Step k of each vehicle; shape (n,)."""
     foresight: Foresight
     """Predictions and plans, in the first n rows of the arrays."""
     sent: Indices
@@ -180,12 +180,12 @@ class SentPlans(NamedTuple):
 
 
 Planning = Callable[[Sequence[tuple[int, Callable[[], Any]]]], list[Any]]
-"""Function that calls planners of plug-ins, each with a number of its own: returns what each has
-returned, or its exception; TimeoutError if it takes too long, `queue.Full` if too many hang."""
+"""Function that calls planners of plug-ins, each with its own number. It returns the result or the
+exception of each: TimeoutError if it takes too long, `queue.Full` if too many hang."""
 
 
 Tell = Callable[[str, str], None]
-"""Called at each error with the name of its count, and the text to report, or an empty one."""
+"""Called at each error with the name of its count, and a text to report, which may be empty."""
 
 
 class Fleet(NamedTuple):
@@ -202,7 +202,7 @@ class Fleet(NamedTuple):
     tell: Tell
     """Called at each error of a plug-in in flight."""
     planning: Planning | None = None
-    """Calls planners of plug-ins; None: one after the other."""
+    """Function that calls planners of plug-ins; None: they are called one after the other."""
 
 
 class Scheme(ABC):
@@ -226,7 +226,7 @@ class Scheme(ABC):
         """Step of the newest observation of each vehicle, or -1; shape (capacity,)."""
         self.counts: Counter[str] = Counter()
         self.events: list[Event] = []
-        """What the operator is to be told; the caller empties the list."""
+        """Events for the operator; the caller empties the list."""
         self.figures: Figures = np.zeros(fleet.block, dtype=FIGURES)
         """Figures of the newest plans, in the first rows."""
         self.planned: Array = np.zeros((fleet.block, fleet.terms.axes, 2))
@@ -237,7 +237,7 @@ class Scheme(ABC):
         """Arrays for a block of vehicles.
 
         Args:
-            doubts: whether the trigger also asks for the cases in which horizons are lost.
+            doubts: whether the trigger needs the cases in which horizons are lost.
         """
         terms, cases = self.terms, LOSS_CASES if doubts else 0
         return empty_foresight(
@@ -251,7 +251,7 @@ class Scheme(ABC):
 
     @abstractmethod
     def forget(self, row: int) -> None:
-        """Forget the vehicle in this row."""
+        """Delete the data of the vehicle in a row."""
 
     @abstractmethod
     def observe(self, row: int, observation: Observation) -> bool:
@@ -259,8 +259,8 @@ class Scheme(ABC):
 
     @abstractmethod
     def foresee(self, rows: Indices, step: Indices, foresight: Foresight) -> None:
-        """Fill in all of the foresight but the plans; the newest observation of each vehicle is
-        young enough.
+        """Fill in the foresight except the plans; the newest observation of each vehicle is recent
+        enough.
         """
 
     @abstractmethod
@@ -283,32 +283,32 @@ class Scheme(ABC):
         Args:
             batch: vehicles and plans.
             header: makes the header of the next packet to the vehicle in a row, with a new packet
-                number at each call: call once for each packet.
+                number at each call, so it is called once per packet.
         """
 
     @abstractmethod
     def sent_plans(self, batch: Batch) -> SentPlans:
         """Plans that are sent, for the record."""
 
-    # -- what a room may add -----------------------------------------------------------------------
+    # -- optional parts, for missions and plug-ins -------------------------------------------------
 
     changeable: frozenset[str] = frozenset()
-    """Keys that may be changed in flight, beside the server's own."""
+    """Keys that may be changed in flight, in addition to the server's own."""
     keeps_rows = False
-    """Whether vehicles keep their rows when they fall silent."""
+    """Whether silent vehicles keep their rows."""
     limits: Any = None
-    """Limits (`shared.law.limits`) of motions of vehicles that all have to follow one server, which
-    its standby must have too; None if each vehicle may follow another."""
+    """Limits (`shared.law.limits`) of motions if all vehicles have to follow one server; its
+    standby needs equal limits. None if each vehicle may follow another server."""
 
     def change(self, scenario: Scenario, keys: frozenset[str]) -> None:  # noqa: B027
-        """Act on changed keys; the caller has asked `objection` first."""
+        """Act on changed keys, after a call of `objection` that returned no reason."""
 
     def objection(self, scenario: Scenario, keys: frozenset[str]) -> str:  # noqa: ARG002
         """Reason why the keys cannot be changed now; empty if they can."""
         return ""
 
     def fleet_figures(self) -> dict[str, Any]:
-        """Figures of all vehicles together, beside the server's own."""
+        """Figures of all vehicles together, in addition to the server's own."""
         return {}
 
     def vehicle_figures(self, row: int) -> dict[str, Any]:  # noqa: ARG002
@@ -316,11 +316,11 @@ class Scheme(ABC):
         return {}
 
     def follow(self, row: int, lead: RoomMessage | None) -> None:  # noqa: B027
-        """Note who leads a vehicle, and its motion in force; None if it has no other server."""
+        """Note a vehicle's leader and its motion in force; None if it has no other server."""
 
     def leave(self) -> int:
-        """Plan nothing further: the server ends. Returns the longest time until all vehicles rest
-        [steps].
+        """Plan nothing further, because the server ends. Return the longest time until all vehicles
+        rest [steps].
         """
         return 0
 
@@ -329,7 +329,7 @@ class Scheme(ABC):
         return True
 
     def restart(self, row: int) -> bool:  # noqa: ARG002
-        """Note that a vehicle's client has restarted; False if this was known already."""
+        """Note that a vehicle's client has restarted; False if this was noted before."""
         return False
 
 
@@ -345,12 +345,12 @@ def given_references(scenario: Scenario, given: Given, most: int) -> Given:
 
 
 class SchemeCode(NamedTuple):
-    """What the module of a scheme brings, as its CODE."""
+    """Contents of the constant CODE in the module of a scheme."""
 
     make: Callable[[Fleet], Scheme]
     kernels: Callable[[str], Sequence[ModuleType]]
-    """Other modules and packages whose kernels the scheme of this text calls, without those that
-    every scheme calls."""
+    """Modules and packages whose kernels only this scheme calls, for the text of
+    `control.scheme`."""
     references: Callable[[Scenario, Given, int], Given] = given_references
-    """Desired trajectories as the scheme sees them, from those given from outside; the number is
-    the largest of vehicles."""
+    """Function that makes the scheme's desired trajectories from given ones; the number is the
+    largest number of vehicles."""

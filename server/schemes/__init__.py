@@ -2,7 +2,7 @@
 
     table       the module of a scheme, loaded when a scenario flies with it
     trajectory  splines, fitted by `knots`
-    horizons    what `predictive`, `none` and `committed` share: horizons of inputs
+    horizons    base of `predictive`, `none` and `committed`: horizons of inputs
     predictive  the paper's; `observer` estimates the disturbance
     committed   with `delay_bound`, `disturbance`, `loss_scenarios`, `replay`, `sent_horizons`
     sent        plans in force, in flight, or lost

@@ -8,7 +8,7 @@ flies the same inputs.
 
 Every observation acknowledges the horizon in force at its step. The prediction replays the inputs
 of this horizon, then those of each horizon in flight, from d steps after the step it was made for.
-A horizon that was not in force d steps after that step is lost, and is left out.
+A horizon that was not in force d steps after that step is lost, and is not replayed.
 
     x(i+1) = A x(i) + B (u(i) + w)        from the observation to k + d
 
@@ -79,7 +79,7 @@ class Replay:
 
     Args:
         gain: gain K of the feedback aboard, 0 without feedback; shape (axes, 2).
-        clock: gives half of the smallest round trip, the first value of the delay bound.
+        clock: clock map; half of the smallest round trip is the first value of the delay bound.
     """
 
     def __init__(
@@ -97,7 +97,7 @@ class Replay:
             follow=float(np.exp(-terms.dt_s / FOLLOW_S)),
             feeds_back=terms.feedback,
         )
-        # At most one horizon is sent per step, and none is flown for longer than `age_max`.
+        # At most one horizon is sent per step, and none is flown longer than `age_max`.
         ring = terms.age_max + H
         self._memory = ReplayMemory(
             sent=nothing_sent(capacity, ring, terms, control, most),
@@ -107,7 +107,7 @@ class Replay:
             inputs=np.zeros((capacity, ring, axes, most + H), dtype=np.float32),
             reference=np.zeros((capacity, ring, axes), dtype=REFERENCE_STATE),
         )
-        # From the oldest usable observation to the end of a plan made from it.
+        # The time from the oldest usable observation to the end of its plan.
         longest = terms.age_max + most + H + 1
         self._schedule = HorizonSchedule(
             np.empty(ring + 2, dtype=np.int64), np.empty(ring + 2, dtype=np.int64)
@@ -174,14 +174,14 @@ def _foresee(
     steps: I1,
     foresight: Foresight,
 ) -> int:
-    """Fill in the predictions at the steps k; returns the number of horizons newly known lost."""
+    """Fill in the predictions at the steps k; return the number of newly lost horizons."""
     axes, H, sent, lost = len(settings.laws), settings.H, memory.sent, 0
     for i in range(len(rows)):
         row, k, bound = rows[i], steps[i], sent.bound.steps
         delivery, observed = sent.delivery[row], sent.observed[row]
         age = k - observed  # at most age_max: the controller ensures it
-        # If the bound is so large that no plan could be flown, nothing would be sent, and no
-        # acknowledgement could ever show that the delay has become smaller. So it is reset.
+        # With a bound too large for any plan, nothing would be sent, and no acknowledgement could
+        # show that the delay has become smaller. So the bound is reset.
         if bound[row] > age and age + bound[row] > settings.age_max:
             bound[row], sent.bound.seen[row] = 0, 0
         lost += update_delay_and_loss(sent, clock, row)
@@ -202,7 +202,7 @@ def _foresee(
             state, law = memory.state[row, axis], settings.laws[axis]
             x = (state.p, state.v, state.u, speed)
             fly_schedule(settings, memory, row, axis, schedule, legs, k + d + H, x, track)
-            # If clocks disagree the observation may be later than k; then it is used unchanged.
+            # If the offset is wrong the observation may be later than k; it is then used as is.
             now, start = k - observed, k + d - observed
             for j in range(2):
                 foresight.estimate[i, axis, j] = track.states[max(now, 0), j]

@@ -1,4 +1,4 @@
-"""Delay bound d: number of steps within which a horizon comes into force after it is made.
+"""Delay bound d: largest number of steps from the making of a horizon to its coming into force.
 
 Every acknowledged horizon gives one sample: the step at which it came into force minus the step
 that it was made for. With each sample of a vehicle
@@ -22,13 +22,13 @@ SAMPLES = 128
 LATE = 0.01
 """Largest share of the samples that may exceed d."""
 RECENT = 16
-"""Number of newest samples none of which may exceed d. Measured on the paper's network, d then
-changes every 4 s (Δt = 0.02 s, a horizon at every step) to every 35 s (0.05 s, one step in ten),
-and 0.3 to 1.3 % of the horizons come later than d."""
+"""Number of newest samples of which none may exceed d. On the paper's network, d then changes every
+4 s (Δt = 0.02 s, a horizon at every step) to every 35 s (0.05 s, one step in ten), and 0.3 to 1.3 %
+of the horizons come later than d."""
 
 
 class DelayBound(NamedTuple):
-    """Delay bounds d of up to `capacity` vehicles, and the samples behind them."""
+    """Delay bounds d of up to `capacity` vehicles, and the samples from which they are computed."""
 
     steps: I1
     """Delay bound d of each vehicle, or 0 while it is unknown; shape (capacity,)."""
@@ -44,7 +44,7 @@ def delay_bound(capacity: int, dt_s: float, most: int, fixed_s: float | None) ->
     """Delay bounds without any sample, at most `most`; `fixed_s` is None to estimate them."""
     least = 1
     if fixed_s is not None:
-        # Rounded up: d has to cover the whole delay.
+        # Rounded up, because d has to cover the whole delay.
         fixed = -(-seconds_to_ns(fixed_s) // seconds_to_ns(dt_s))
         least = most = min(max(fixed, 1), most)
     steps, seen = np.zeros((2, capacity), dtype=np.int64)
@@ -73,11 +73,11 @@ def add_sample(bound: DelayBound, row: int, delay: int) -> None:
     newest = bound.seen[row] % SAMPLES
     bound.samples[row, newest] = delay
     bound.seen[row] += 1
-    # d rises at once: with too small a d every horizon comes into force after other inputs than its
+    # d rises at once: if d is too small, the inputs before each horizon differ from those that its
     # plan assumes.
     d = max(bound.steps[row], min(delay, bound.most))
     count = min(bound.seen[row], SAMPLES)
-    needed, since = 0, count  # samples of d or more, and number of samples after the last of them
+    needed, since = 0, count  # number of samples >= d, and number of later samples
     for slot in range(count):
         if bound.samples[row, slot] >= d:
             age = newest - slot if slot <= newest else newest - slot + SAMPLES

@@ -1,6 +1,6 @@
 """Disturbance observer of the scheme "committed".
 
-From each observation the flown horizons are replayed to the next one. The difference between the
+From each observation to the next, the flown horizons are replayed. The difference between the
 replayed and the observed velocity drives the disturbance observer (`server.schemes.observer`), with
 the time constant `control.observer_s`. Observed velocities are noisy, so they are low-pass filtered
 with the time constant FOLLOW_S; otherwise the noise would enter the estimate.
@@ -41,7 +41,7 @@ def observe_disturbance(
     # A vehicle that accepts no horizons brakes by its failsafe, whose inputs are unknown to the
     # server.
     inputs_known = seen.takes == 1 and seen.base_takes == 1 and min(before, after) > UNKNOWN
-    # Horizons older than `age_max` may be gone from the ring.
+    # Horizons older than `age_max` may have been overwritten in the ring.
     replayable = inputs_known and begin >= 0 and end - begin <= settings.age_max
     m, legs, speed = end - begin, 0, speed_of(memory.state[row].base_u)
     if replayable:
@@ -60,7 +60,7 @@ def observe_disturbance(
         if replayable:
             x = (state.base_p, state.base_v, state.base_u, speed)
             fly_schedule(settings, memory, row, axis, schedule, legs, end, x, track)
-            # Low-pass filter: `lag` is the part of the velocity difference not yet followed.
+            # Low-pass filter: `lag` is the part of the velocity difference that its output lacks.
             off, left = state.v - track.states[m, 1], settings.follow**m
             memory.state[row, axis].w = updated_disturbance(
                 state.w,

@@ -22,7 +22,7 @@ def feedback_gain(scenario: Scenario) -> Array:
 def stationary_gain(model: Model, control: ControlConfig) -> Array:
     """Gain K of the feedback around a horizon, on position [1/s] and velocity; shape (axes, 2).
 
-    S of the weights is added to R.
+    The weight S of the change of the input is added to R.
     """
     weight = control.input_weight + control.change_weight
     gain = converged_gain(model.A.tobytes(), model.B.tobytes(), control.state_weight, weight, 0.0)

@@ -35,7 +35,7 @@ from skytether.shared.wire.protocol import (
 
 
 class GuardedScheme(Scheme):
-    """A plug-in's scheme, called for a whole block, and for each vehicle alone if that fails."""
+    """A plug-in's scheme, called for a whole block, or if that fails for each vehicle alone."""
 
     def __init__(self, name: str, inner: Scheme, fleet: Fleet) -> None:
         super().__init__(fleet)
@@ -59,7 +59,7 @@ class GuardedScheme(Scheme):
         return False
 
     def foresee(self, rows: Indices, step: Indices, foresight: Foresight) -> None:
-        """Do nothing: `plan` calls the scheme's `foresee` too."""
+        """Do nothing, because `plan` also calls the scheme's `foresee`."""
 
     def plan(self, rows: Indices, step: Indices, foresight: Foresight) -> None:
         """See `Scheme`; a plan is unsolved if the scheme fails or its plan cannot be flown."""

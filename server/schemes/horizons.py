@@ -28,7 +28,7 @@ NO_FEEDBACK = memoryview(b"")
 def uplink_max_ns(terms: Terms) -> int:
     """Longest uplink delay at which a horizon can still be flown [ns]."""
     if terms.scheme not in INDEXED:
-        return UNSEEN  # the first input is flown whenever the horizon arrives
+        return UNSEEN  # the first input is flown at any time of arrival
     return (ahead_max(terms) if terms.scheme in COMMITTING else terms.horizon) * terms.dt_ns
 
 
@@ -63,7 +63,7 @@ class InputScheme(Scheme):
         self._packing = Packing(terms.axes, ahead_max(terms) + terms.planned, terms.planned)
 
     def encode(self, batch: Batch, header: Callable[[int], Header]) -> Iterator[tuple[int, bytes]]:
-        # Bytes of one input on all axes.
+        # Number of bytes of one input on all axes.
         width, planned = 4 * self.terms.axes, self.terms.planned
         feedback, feedback_bytes = NO_FEEDBACK, 0
         if self.terms.feedback:
@@ -139,7 +139,7 @@ class Packing:
         self._bytes = self._inputs.data.cast("B")
 
     def pack(self, batch: Batch, observed: Indices) -> tuple[list[list[int]], memoryview]:
-        """Pack the horizons that are sent.
+        """Pack the horizons to be sent.
 
         Args:
             observed: step of the newest observation of each vehicle; shape (capacity,).

@@ -21,13 +21,11 @@ OF_SOME = tuple(
         "mpc.riccati",
     )
 )
-"""Beginnings of the names of modules whose kernels only some schemes call."""
+"""Prefixes of the names of modules whose kernels only some schemes call."""
 
 
 def load_all() -> None:
-    """Load every built-in scheme and missions, as far as they are installed: what is flown is not
-    known yet.
-    """
+    """Load all installed built-in schemes and missions, because the scenario is not known yet."""
     ours = [f"{__package__}.{name}" for name, entry in SCHEMES.items() if entry.is_ours]
     for module in (*ours, SCHEME_APART):
         with suppress(ConfigError):
@@ -43,7 +41,7 @@ def _with_kernels(scenario: Scenario) -> Iterator[str]:
 def others(*scenarios: Scenario) -> set[str]:
     """Names of the loaded modules whose kernels none of these scenarios calls.
 
-    What they do call is loaded here, before a process compiles it or forks.
+    Modules that the scenarios need are loaded here, before a process compiles kernels or forks.
     """
     own = [f"{each}." for one in scenarios for each in _with_kernels(one)]
     names = {f"{each.__module__}." for each in KERNELS}

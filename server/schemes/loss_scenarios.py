@@ -1,6 +1,6 @@
 """Predictions for the cases in which horizons in flight are lost.
 
-In case j exactly the newest j + 1 horizons are lost; the last case also stands for more losses.
+In case j exactly the newest j + 1 horizons are lost; the last case also covers more losses.
 Losses are assumed independent, with the loss rate of recent horizons.
 """
 
@@ -44,7 +44,7 @@ def foresee_losses(
         if left < 0:
             continue
         share *= loss
-        # The last case stands for all in which this many or more are lost.
+        # The last case covers all cases with at least this many losses.
         last = left == 0 or j + 1 == cases
         foresight.loss_probability[i, j] = share if last else share * (1.0 - loss)
         arriving = range(in_flight.start, in_flight.start + left)

@@ -17,8 +17,8 @@ from skytether.shared.law.terms import Terms
 from skytether.shared.scenario.schema import ControlConfig
 
 TRIP_NS = 1_500_000_000
-"""Time from an observation to the start of the plan above which the observer is slowed down [ns]:
-with a longer delay an observer with T = `control.observer_s` makes the control loop oscillate."""
+"""Longest time from an observation to the start of the plan at which the observer keeps its full
+speed [ns]: beyond it, T = `control.observer_s` makes the control loop oscillate."""
 
 
 def decay_of(terms: Terms, control: ControlConfig) -> float:
@@ -38,7 +38,7 @@ def updated_disturbance(
         m: number of steps predicted.
         a11: share of the velocity that remains after a step.
         decay: see `decay_of`.
-        trip_ns: time from the observation to where planning starts [ns], see `TRIP_NS`.
+        trip_ns: time from the observation to the start of planning [ns], see `TRIP_NS`.
         bound: u_max [m/s].
     """
     # An input of 1 m/s for m steps changes the velocity by 1 - a11^m.

@@ -1,4 +1,4 @@
-"""Schemes of plug-ins, as the table of schemes sees them."""
+"""Entry of plug-ins' schemes in the table of schemes."""
 
 from types import ModuleType
 

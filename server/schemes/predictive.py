@@ -7,8 +7,8 @@
 
 The scheme "none" uses the same code and takes the newest observation as the present state.
 
-The paper has neither observer nor feedback aboard. With `control.observer_s` a disturbance ŵ is
-estimated between two observations (`server.schemes.observer`) and added to every û. With feedback
+The paper has neither observer nor feedback aboard. With `control.observer_s`, a disturbance ŵ is
+estimated from pairs of observations (`server.schemes.observer`) and added to every û. With feedback
 aboard the horizon carries x̂(k), ŵ and K.
 """
 
@@ -166,7 +166,7 @@ def _observe_disturbance(
             memory.base_velocity[row, i],
             memory.base_flown[row, i],
         )
-        # max: at least one step, if Δt itself is longer than APART_NS.
+        # max, so that it is one step if Δt is longer than APART_NS.
         if begin >= 0 and 0 < m <= max(1, near):
             w, change = memory.disturbance[row, i], (memory.flown[row, i] - u) / m
             p, v = 0.0, velocity

@@ -1,4 +1,4 @@
-"""Replay of horizons: a schedule of the horizon in force at each step, and the flight by it.
+"""Replay of horizons: a schedule of the horizon in force at each step, and the resulting flight.
 
 The schedule is made from the horizons in force and in flight, and flown by the rule of flight
 (`shared.law.rule`), one axis after the other:
@@ -79,7 +79,7 @@ def fly_schedule(
 
     Args:
         legs: number of legs of the schedule.
-        end: step after the last.
+        end: step after the last flown one.
         x: observation at the first step: position [m], velocity [m/s], input flown on this axis
             [m/s], and magnitude of the input over all axes [m/s].
         track: output: inputs and states from the first step on.
@@ -95,7 +95,7 @@ def fly_schedule(
         if first >= last:
             continue
         if number < 0:
-            # Horizon unknown: assume that the observed input is held.
+            # If the horizon is unknown, the observed input is assumed to be held.
             brake = settings.brake if number == HOVERS else 0.0
             one_input = AxisHorizon(
                 model, (first_input,), 1, first_speed, brake, bound, False, 0.0, 0.0, 0.0
@@ -160,7 +160,7 @@ def _fly(
     for k in range(first, last):
         u, _, ref_p, ref_v = step(horizon, k - made_for, ref_p, ref_v, p, v)
         if k == begin:
-            u = first_input  # as observed, whatever the rule of flight gives
+            u = first_input  # the observed input replaces that of the rule of flight
         track.commands[k - begin] = u
         track.states[k - begin, 0], track.states[k - begin, 1] = p, v
         p, v = advance(horizon.model, p, v, u + w)

@@ -1,4 +1,4 @@
-"""Tracker of the plans sent to vehicles: which are in force, in flight, or lost.
+"""Tracker of the plans sent to vehicles: in force, in flight, or lost.
 
 Plans (horizons or trajectories) are numbered from 0 in the order of sending; the newest are stored
 in a ring. An observation identifies the plan in force by the step that it was made for. A later
@@ -26,12 +26,12 @@ from skytether.shared.scenario.schema import ControlConfig
 from skytether.shared.wire.protocol import NO_HORIZON
 
 HOVERS, UNKNOWN = -1, -2
-"""In place of a plan's number: no plan is in force, so the vehicle brakes and hovers; or a plan
-that is not stored, since it was sent before the server restarted or dropped aboard."""
+"""Values that replace a plan's number: no plan is in force, so the vehicle brakes and hovers; or
+the plan is not stored, because it was sent before a restart of the server or dropped aboard."""
 MARGIN = 2
 """Steps added to half a round trip for the first delay bound, before any acknowledgement."""
 FIRST_LOSS, LOSS_WEIGHT = 0.1, 0.05
-"""Loss rate assumed at first, and weight of each new plan in its exponential average."""
+"""Loss rate assumed initially, and weight of each new plan in the rate's exponential average."""
 
 
 class Delivery:
@@ -44,11 +44,11 @@ class Delivery:
     acknowledged: int
     """Step that the newest plan with a delay sample was made for, or NO_HORIZON."""
     judged: int
-    """Step up to which losses have been counted."""
+    """Step up to which due plans have been counted as lost or not."""
     sent: int
     """Number of plans sent so far."""
     first: int
-    """Number of the first plan that the vehicle may still have: earlier plans were dropped."""
+    """Number of the first plan that the vehicle may still have; it has dropped earlier plans."""
     loss: float
     """Loss rate of recent plans, from 0 to 1."""
 
@@ -105,8 +105,8 @@ def update_delay_and_loss(sent: Sent, clock: Seen, row: int) -> int:
     if bound.steps[row] == 0:
         set_first(bound, row, -(-half_trip_ns(clock, row) // sent.dt_ns) + MARGIN)
     raise_to(bound, row, -(-shortest_ns(clock, row) // sent.dt_ns))
-    # Plans later than the plan in force that are due now are lost. They stay in the ring, so
-    # `judged` keeps them from being counted twice.
+    # Plans made after the plan in force that are due now are lost. They stay in the ring; `judged`
+    # prevents that they are counted twice.
     lost = 0
     for number in range(first_after(sent, row, delivery.in_force), delivery.sent):
         if delivery.judged < sent.plans[row, number % sent.plans.shape[1]].due <= observed:
@@ -122,7 +122,7 @@ def update_delay_and_loss(sent: Sent, clock: Seen, row: int) -> int:
 
 @part
 def add_plan(sent: Sent, row: int, step: int, d: int) -> int:
-    """Store that a plan made for a step is sent, due d steps later; returns its ring index."""
+    """Store a sent plan, made for a step and due d steps later; return its index in the ring."""
     delivery = sent.delivery[row]
     slot = delivery.sent % sent.plans.shape[1]
     delivery.sent += 1
@@ -139,10 +139,10 @@ def oldest(sent: Sent, row: int) -> int:
 
 @part
 def number_of(sent: Sent, row: int, made_for: int) -> int:
-    """Number of the plan made for a step: HOVERS if negative, UNKNOWN if it is not stored."""
+    """Number of the plan made for a step; HOVERS for a negative step, UNKNOWN if not stored."""
     if made_for < 0:
         return HOVERS
-    # Search from the newest plan down: the plan in force is usually one of the last few.
+    # Search from the newest plan backwards: the plan in force is usually one of the last few.
     number = first_after(sent, row, made_for) - 1
     if number < oldest(sent, row):
         return UNKNOWN

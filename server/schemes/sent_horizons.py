@@ -1,6 +1,6 @@
 """Memory of the scheme "committed": newest observations of each vehicle, and its sent horizons.
 
-`schemes.sent` tracks which of the horizons are in force, in flight or lost.
+`schemes.sent` tracks the delivery of the horizons.
 """
 
 from typing import Annotated, NamedTuple
@@ -48,7 +48,7 @@ class SentHorizon:
     """Numpy record: a horizon that was sent, without its inputs."""
 
     length: int
-    """Number of inputs that are flown before they are too old."""
+    """Number of inputs that may be flown before they are too old."""
     speed: float
     """Magnitude of the last flown input over all axes [m/s]."""
 
@@ -97,9 +97,9 @@ class ReplayMemory(NamedTuple):
     horizons: Annotated[NDArray[np.void], records(SENT_HORIZON, 2)]
     """Horizons in the ring; shape (capacity, ring)."""
     inputs: S4
-    """Inputs of these horizons [m/s]; shape (capacity, ring, axes, largest d + H)."""
+    """Inputs of the stored horizons [m/s]; shape (capacity, ring, axes, largest d + H)."""
     reference: Annotated[NDArray[np.void], records(REFERENCE_STATE, 3)]
-    """Reference states of these horizons; shape (capacity, ring, axes)."""
+    """Reference states of the stored horizons; shape (capacity, ring, axes)."""
 
 
 @kernel
@@ -144,8 +144,7 @@ def store_sent(
         for axis in range(len(settings.laws)):
             for stage in range(length):
                 memory.inputs[row, slot, axis, stage] = foresight.horizons[i, axis, stage]
-            # Computed as `HorizonFollower` does aboard: both ends have to brake from the same
-            # speed.
+            # Computed as in `HorizonFollower` aboard: both ends have to brake from the same speed.
             last = bounded(
                 float(foresight.horizons[i, axis, length - 1]), settings.laws[axis].bound
             )

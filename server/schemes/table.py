@@ -1,7 +1,7 @@
 """Table of the schemes' code: the module of a scheme is loaded when a scenario flies with it.
 
-Each built-in scheme is the module of its name in this package; missions and plug-ins have a room
-each.
+Each built-in scheme is the module of its name in this package; missions and plug-ins have their own
+packages.
 """
 
 from skytether.server.planning.scheme import Fleet, Given, Scheme, SchemeCode
@@ -14,7 +14,7 @@ PLUGINS = f"{__package__}.plugins"
 
 
 def code_of(scenario: Scenario, *, apart: bool = True) -> SchemeCode:
-    """Code of what flies a scenario."""
+    """Code of the scheme, or of missions, for a scenario."""
     if apart and scenario.keeps_apart:
         module = load(SCHEME_APART, "missions")
     else:
@@ -26,7 +26,7 @@ def code_of(scenario: Scenario, *, apart: bool = True) -> SchemeCode:
 
 
 def make(fleet: Fleet) -> Scheme:
-    """Make the scheme that flies a scenario.
+    """Make the scheme, or the mission planner, of a scenario.
 
     Raises:
         ConfigError: a plug-in's scheme cannot be made.
@@ -35,10 +35,10 @@ def make(fleet: Fleet) -> Scheme:
 
 
 def references(scenario: Scenario, given: Given, most: int) -> Given:
-    """Desired trajectories of vehicles, as what flies the scenario sees them.
+    """Desired trajectories of vehicles for the scheme, or the missions, of a scenario.
 
     Args:
         given: desired trajectories from outside, or None.
-        most: largest number of vehicles.
+        most: number of vehicles at most.
     """
     return code_of(scenario).references(scenario, given, most)

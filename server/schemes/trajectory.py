@@ -6,7 +6,7 @@ At step k the server sends the trajectory to follow from k on:
 - the known desired trajectory itself, if the horizon is shorter than the time h below;
 - the target's present state, if the server knows nothing ahead;
 
-- what a planner of a plug-in plans along it, extrapolated where it is unknown
+- the plan of a plug-in's planner along it, extrapolated where it is unknown
   (`server.mpc.plugin_planners`).
 
 It is sent as a spline with the fewest uniform knots that keep its error within
@@ -29,8 +29,8 @@ summed over the axes, with the expectation over these cases, the weight Q_p on t
 and h = (1 + K_v) / K_p, with which the regulator weighs velocity: K_p (Δp + h Δv) is the change of
 its input. The gap is averaged over the steps k + d, when a packet sent now is in force at the
 latest; k + 2 d, when the server knows whether it arrived; and k + 3 d, when a packet sent then
-would be in force. With k + d alone, a trajectory that ends was replaced too late if a packet was
-lost. A vehicle that no trajectory has reached hovers at its observed position.
+would be in force. With k + d alone, an ending trajectory was replaced too late if a packet was
+lost. A vehicle without any received trajectory hovers at its observed position.
 """
 
 from typing import TYPE_CHECKING, Annotated, NamedTuple
@@ -85,11 +85,11 @@ RING = 64
 COMPARED = 3
 """Number of steps at which trajectories are compared: k + d, k + 2 d, k + 3 d."""
 IGNORED = 1e-3
-"""Total probability of cases that are left out of the expected gap."""
+"""Total probability of the cases that the expected gap ignores."""
 RUNS_OUT = 1e-2
 """Probability of losing all trajectories in flight above which one that ends soon is replaced."""
 TINY = 1e-9
-"""Smallest K_p, so that weights with K_p = 0 do not divide by 0 [1/s]."""
+"""Smallest K_p, which avoids a division by 0 with weights that give K_p = 0 [1/s]."""
 
 along, guided_to = shared(spline.along), shared(spline.guided_to)
 regulated = shared(spline.regulated)
@@ -115,18 +115,18 @@ class Settings(NamedTuple):
     age_max: int
     """Largest age of an observation that is used [steps]."""
     seen: int
-    """Number of steps for which the desired trajectory is known ahead, at most H; H if a planner of
-    a plug-in plans."""
+    """Number of steps for which the desired trajectory is known ahead, at most H; H with a
+    plug-in's planner."""
     bounds: F1
     """Largest velocity on each axis [m/s]; shape (axes,)."""
     weight: float
     """Weight Q_p on the position [1/m²]."""
     lead_s: F1
-    """Time h [s]; shape (axes,)."""
+    """Time h, by which velocity errors are weighed against position errors [s]; shape (axes,)."""
     error_m: float
     """`control.spline_error_m`: largest error of a spline, if KNOTS_MAX suffices [m]."""
     plans: bool
-    """Whether the nominal motion is sent, and not the desired trajectory itself."""
+    """Whether the nominal motion is sent instead of the desired trajectory itself."""
 
 
 class Memory(NamedTuple):
@@ -138,8 +138,8 @@ class Memory(NamedTuple):
     trajectories: Annotated[NDArray[np.void], records(TRAJECTORY, 2)]
     """Trajectories in the ring; shape (capacity, RING)."""
     knots: F4
-    """Knots of these trajectories, rounded as they are sent [m, m/s]; shape (capacity, RING, axes,
-    2 KNOTS_MAX)."""
+    """Knots of `trajectories`, rounded as they are sent [m, m/s]; shape (capacity, RING, axes, 2
+    KNOTS_MAX)."""
 
 
 class Guidance(SplineScheme):
@@ -149,8 +149,8 @@ class Guidance(SplineScheme):
         capacity, block, axes = fleet.capacity, fleet.block, terms.axes
         gain = regulator(fleet.scenario)
         lead_s = (1.0 + gain[:, 1]) / np.maximum(gain[:, 0], TINY)
-        # A plan shorter than h ends before the vehicle has come near the trajectory, and after its
-        # end the spline is a straight line: measured errors reached 12 m.
+        # A plan shorter than h ends before the vehicle is near the trajectory, and then its spline
+        # is extrapolated as a straight line: measured errors reached 12 m.
         plans = desired.seen > 0 and terms.horizon * terms.dt_s >= lead_s.max()
         self._own: PluginPlanners | None = None
         if control.planner != MPC:
@@ -192,8 +192,8 @@ class Guidance(SplineScheme):
         self.observed_step[row] = observation.step
         delivery["in_force"], delivery["since"] = observation.in_force, observation.since
         self._memory.state[row] = observation.state
-        # A vehicle that accepts no trajectories has dropped those it had, and drops those in
-        # flight.
+        # A vehicle that accepts no trajectories has dropped all received ones, and will drop those
+        # in flight.
         if not observation.takes:
             delivery["first"], delivery["in_force"] = delivery["sent"], NO_HORIZON
         return True
@@ -231,7 +231,7 @@ class Guidance(SplineScheme):
     def _plan_own(
         self, own: "PluginPlanners", rows: Indices, step: Indices, foresight: Foresight
     ) -> None:
-        """Fill in the trajectories of planners; without a plan the desired one, which is not
+        """Fill in the trajectories of planners; without a plan the desired trajectory, which is not
         sent.
         """
         n, intended, model = len(rows), self._intended, self.terms.model
@@ -257,7 +257,7 @@ CODE = SchemeCode(Guidance, lambda _: (knots, splines, riccati))
 @inline
 def _ahead(settings: Settings, intended: F2, stage: int) -> tuple[float, float]:
     """State at a stage after k of the trajectory that would be sent now [m, m/s]."""
-    # After its end the trajectory is a straight line, as the spline is.
+    # After its end the trajectory is extrapolated as a straight line, like its spline.
     last = min(stage, settings.seen)
     v = intended[last, 1]
     return intended[last, 0] + (stage - last) * settings.dt_s * v, v
@@ -285,7 +285,7 @@ def _arrives(bound: DelayBound, row: int, loss: float, since: int) -> float:
         count, later = min(bound.seen[row], SAMPLES), 0
         for slot in range(count):
             later += bound.samples[row, slot] > since
-        # As in Laplace's rule, + 1: the share is 1 without samples, and never 0.
+        # Laplace's rule adds 1: the share is 1 without samples, and never 0.
         left *= (later + 1) / (count + 1)
     return left / (left + loss)
 
@@ -294,7 +294,7 @@ def _arrives(bound: DelayBound, row: int, loss: float, since: int) -> float:
 def _gap(
     settings: Settings, memory: Memory, intended: F3, row: int, number: int, k: int, d: int
 ) -> tuple[float, float]:
-    """Mean of Q_p Σ (Δp + h Δv)² if a sent trajectory is followed, and |Δp| at k + d [m].
+    """Mean of Q_p Σ (Δp + h Δv)² if the vehicle follows a sent trajectory, and |Δp| at k + d [m].
 
     Args:
         intended: trajectory that would be sent now [m, m/s]; shape (axes, seen + 1, 2).
@@ -350,7 +350,7 @@ def _intend(
 
 @inline
 def _newest(sent: Sent, row: int, first: int) -> int:
-    """Number of the newest trajectory that may arrive, or the one in force; negative: none."""
+    """Number of the newest trajectory that may arrive, or of the one in force; negative: none."""
     delivery = sent.delivery[row]
     if first < delivery.sent:
         return delivery.sent - 1
@@ -368,8 +368,8 @@ def _begin(
     planned: F3,
     intended: F4,
 ) -> int:
-    """Fill in where the trajectories start that would be sent now, in `planned` and `intended`, and
-    which are `fresh`; returns the number of newly lost trajectories.
+    """Fill in the start of the trajectories that would be sent now, in `planned` and `intended`,
+    and their `fresh`; return the number of newly lost trajectories.
     """
     sent, lost, axes = memory.sent, 0, len(settings.bounds)
     for i in range(len(rows)):
@@ -383,7 +383,7 @@ def _begin(
         for number in range(first, delivery.sent):
             ends = max(ends, memory.trajectories[row, number % RING].ends)
         plan.row, plan.step, plan.start, plan.gap, plan.solved = row, k, k, 1, True
-        # Only if a new trajectory could be flown at k + d: otherwise one would be sent at each
+        # Only if a new trajectory could be flown at k + d: otherwise one would be sent at every
         # step.
         plan.fresh = ends <= k + d <= observed + settings.age_max
         newest = _newest(sent, row, first)
@@ -426,7 +426,7 @@ def _appraise(
         if not plan.fresh:
             newest = _newest(sent, row, first)
             plan.cost_gap, plan.deviation_m = _gap(settings, memory, intended[i], row, newest, k, d)
-        # The trajectory in force ends soon and all in flight may be lost: the vehicle would brake.
+        # The trajectory in force ends soon; if all those in flight are lost, the vehicle brakes.
         soon = in_force_ends <= k + COMPARED * d <= observed + settings.age_max
         plan.fresh |= soon and share > RUNS_OUT
 

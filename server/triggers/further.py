@@ -23,15 +23,15 @@ from skytether.shared.wire.protocol import AXES_MAX
 
 @trigger(needs="deviation_m")
 def deviation(situation: Situation, metres: Amount = 0.05) -> Verdict:
-    """Sends if flying on with the inputs already sent leads farther than this many metres from the
-    plan.
+    """Sends if the flight with the inputs already sent would deviate from the plan by more than
+    `metres`.
     """
     return above(situation, Compared.DEVIATION_M, metres)
 
 
 @trigger(name="send_on_delta")
 class SendOnDelta(Trigger):
-    """Sends if the reference is more than so many metres from where it was at the last packet.
+    """Sends if the reference has moved by more than a number of metres since the last packet.
 
     Level crossings with a hysteresis of one level; no model predicts the reference. Source:
     Miskowicz, Send-on-delta concept, Sensors 6 (2006).
@@ -57,8 +57,8 @@ class SendOnDelta(Trigger):
 
 @trigger(name="self_triggered")
 class SelfTriggered(Trigger):
-    """Sends at a time fixed at the last packet: when the reference, at its velocity then, has moved
-    so many metres, but after so many seconds at the latest.
+    """Sends at a time computed at the last packet: when the reference, at its velocity then, will
+    have moved a number of metres, but after a number of seconds at the latest.
 
     Source: Velasco, Fuertes, Marti, The self triggered task model for real-time control systems,
     RTSS (2003).
@@ -88,7 +88,7 @@ class SelfTriggered(Trigger):
 
 @trigger(name="budget")
 class Budget(Trigger):
-    """Sends while it has a token: combined by &, a hard limit on the rate of packets.
+    """Sends while it has a token; joined by & it is a hard limit on the packet rate.
 
     A token bucket: b ← min(b + g, burst) at every step, b ← b - 1 with a packet, and no packet if
     b < 1. So T seconds have at most burst + packets_per_s · T packets. A packet that another policy
@@ -116,7 +116,7 @@ class Budget(Trigger):
         return timed(filled >= 1.0, situation.figures)
 
     def sent(self, rows: Indices, figures: Figures) -> None:
-        # Not below 0: a packet that another policy sends without a token leaves no debt.
+        # At least 0: a packet that another policy sends without a token does not make it negative.
         self._tokens[rows] = np.maximum(self._filled(rows, figures) - 1.0, 0.0)
         self._step[rows] = figures["step"]
 

@@ -20,7 +20,7 @@ from skytether.shared.telemetry.record import Compared
 
 
 class Guarded(Trigger):
-    """A plug-in's policy with its errors caught: if it fails, it fires.
+    """A plug-in's policy with its errors caught; it fires if it fails.
 
     A needless packet costs bytes; a missing one may end the flight. A `budget` joined by & still
     limits the rate. The policy gets read-only arrays.
@@ -75,5 +75,5 @@ def column(values: Any, kind: type[np.generic], n: int) -> NDArray[Any]:
     if column.shape != (n,) or not np.can_cast(column.dtype, kind):
         got = f"{column.dtype.name} of shape {column.shape}"
         raise ValueError(f"got {got}, expected {np.dtype(kind).name} of shape ({n},)")
-    # Kernels do not check types at each call: they need this type, contiguous.
+    # Kernels do not check types at each call: the array must have this type and be contiguous.
     return np.ascontiguousarray(column, dtype=kind)

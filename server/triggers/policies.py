@@ -15,13 +15,13 @@ from skytether.shared.telemetry.record import Compared
 
 @trigger
 def heartbeat(situation: Situation) -> Flags:
-    """Sends if a heartbeat is due, and replaces it: the same number of packets, each useful."""
+    """Sends when a heartbeat is due, in its place: a plan at no additional packet."""
     return situation.heartbeat_due
 
 
 @trigger(name="expected_gap", needs="expected_gap")
 class ExpectedGap(Trigger):
-    """Sends if the expected extra cost of flying on is above c; packets in flight may be lost."""
+    """Sends if the cost of not sending exceeds c, as an expected value over losses in flight."""
 
     doubts = True
 

@@ -1,4 +1,4 @@
-"""Policies that send at fixed times, whatever the plans are."""
+"""Policies that send at fixed times, independently of the plans."""
 
 from typing import Annotated
 
@@ -44,7 +44,7 @@ class Periodic(Trigger):
     def test(self, situation: Situation) -> Verdict:
         rows, figures = situation.rows, situation.figures
         due = figures["step"] - self._sent_step[rows] >= self._period
-        # A horizon that is due at a fresh step stays due until it is sent.
+        # A horizon that is due at a step without a previous plan stays due until it is sent.
         fresh = figures["fresh"]
         if fresh.any():
             self._sent_step[rows[fresh]] = figures["step"][fresh] - self._period
@@ -56,10 +56,10 @@ class Periodic(Trigger):
 
 @trigger(name="silence")
 class Silence(Periodic):
-    """Sends after this many seconds without a packet, or after half a horizon if that is shorter.
+    """Sends after the given time without a packet [s], or after half a horizon if that is shorter.
 
-    A horizon that is replaced at its half does not run out, even if the first replacement is lost.
-    Trajectories do not run out, so only the seconds count for them.
+    A horizon that is replaced at half its length does not run out even if the first replacement is
+    lost. Trajectories do not run out, so only the seconds count for them.
     """
 
     def __init__(

@@ -2,7 +2,7 @@
 
 A scenario writes `cost_gap & budget(5, 2) | silence(1)` (`shared.scenario.grammar`). Policies are
 entries of the table `TRIGGERS` (`shared.scenario.registry`): ours in `policies`, `gaps`,
-`schedules` and `further`, and those of plug-ins. docs/triggers.md says when to use each, and how to
+`schedules` and `further`, and those of plug-ins. docs/triggers.md explains their use, and how to
 write one.
 
 The server evaluates the trigger once per step, after planning. A vehicle without a usable previous
@@ -51,7 +51,7 @@ class SituationArrays(NamedTuple):
     foresight: "Foresight"
     """Predictions and plans of the block."""
     computes: tuple[str, ...]
-    """What the scheme provides, see `SchemeProperties.computes`."""
+    """Figures that the scheme provides, see `SchemeProperties.computes`."""
     sent_step: Indices
     """Step at which a horizon was last sent to each vehicle, or -1; shape (capacity,)."""
     heartbeat_due: Flags
@@ -138,7 +138,7 @@ class Verdict(NamedTuple):
     event: Flags
     """Whether the trigger fires; shape (n,)."""
     figure: Array
-    """Figure of the leftmost policy that compares one, or V(k) of eq. (16) if none does; shape
+    """Figure of the leftmost policy with a comparison, or V(k) of eq. (16) without one; shape
     (n,)."""
     threshold: Array
     """Threshold of `figure`, or 0 if nothing is compared; shape (n,)."""
@@ -154,7 +154,7 @@ class Verdict(NamedTuple):
 _verdict: Callable[[tuple[Flags, Array, Array, Compared]], Verdict] = partial(
     tuple.__new__, Verdict
 )
-"""Verdict from its four values, in half the time of calling `Verdict`."""
+"""Function that makes a Verdict from its four values, twice as fast as calling `Verdict`."""
 
 
 class Trigger:
@@ -179,7 +179,7 @@ class Trigger:
 
 
 COLUMNS = {each: str(each) for each in Compared}
-"""Column of each figure of the plans."""
+"""Name of the record's column of each figure of the plans."""
 
 
 def above(situation: Situation, figure: Array | Compared, threshold: float) -> Verdict:
@@ -211,15 +211,15 @@ def all_of(n: int) -> Flags:
 
 
 def timed(event: Flags, figures: Figures) -> Verdict:
-    """Verdict of a policy that compares no figure."""
+    """Verdict of a policy without a comparison of figures."""
     return _verdict((event, figures["state_gap"], _constant(len(event), 0.0), Compared.NOTHING))
 
 
 class _Stateless(Trigger):
     """Policy made from a function.
 
-    If the function returns flags, vehicles that are `fresh`, or that were never sent a horizon,
-    fire in any case.
+    If the function returns flags, the policy also fires for vehicles that are `fresh` or were never
+    sent a horizon.
 
     Args:
         function: returns a verdict, or flags of shape (n,).
@@ -251,7 +251,7 @@ class Combined(Trigger):
 
     def test(self, situation: Situation) -> Verdict:
         left, right = self._left.test(situation), self._right.test(situation)
-        # The record has one figure: that of the leftmost policy which compares one.
+        # The record has one figure: that of the leftmost policy that compares a figure.
         shown = left if left.compares or not right.compares else right
         event = self._combine(left.event, right.event)
         return _verdict((event, shown.figure, shown.threshold, shown.compared))
@@ -271,7 +271,7 @@ def make_trigger(
     Args:
         control: `trigger`, and the keys that policies use.
         capacity: largest number of vehicles.
-        tell: called at each error of a plug-in in flight.
+        tell: function called at each error of a plug-in in flight.
     """
 
     def make(expression: Expression) -> Trigger:
