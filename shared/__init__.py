@@ -1,1 +1,1 @@
-"""Code of both ends of the link: endpoints, wire, model, reference, scenario, record."""
+"""Code shared by server, client and netem: endpoints, wire, model, reference, scenario, record."""

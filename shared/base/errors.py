@@ -6,12 +6,12 @@ class ConfigError(Exception):
 
 
 class NotInstalledError(ConfigError):
-    """A scenario, or a message, calls for a room that is not installed."""
+    """A scenario or a message needs a package of Skytether that is not installed."""
 
 
 class FlightError(Exception):
-    """A flight could not be completed, or has nothing to show."""
+    """A flight could not be completed, or has no results to show."""
 
 
 class RecordingError(ValueError):
-    """A file is not a readable recording; the message is one line that names the file."""
+    """A file is not a readable recording; the message is one line with the name of the file."""

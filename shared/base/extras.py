@@ -8,7 +8,7 @@ from importlib import util
 from skytether.shared.base.errors import ConfigError
 
 MODULES = {"eclipse-zenoh": "zenoh", "pillow": "PIL"}
-"""Import names of packages, where they differ from the names of the packages."""
+"""Import names of packages, if they differ from the packages' names."""
 
 
 class ExtraMissing(ModuleNotFoundError):
@@ -21,11 +21,11 @@ class ExtraMissing(ModuleNotFoundError):
 
 @contextmanager
 def named() -> Iterator[None]:
-    """Within this block, name the smallest extra that provides a missing module.
+    """Within this block, an error for a missing module names the smallest extra that provides it.
 
     Raises:
         ExtraMissing: instead of a ModuleNotFoundError, if an extra provides the module.
-        ConfigError: instead of it, if the module is one of ours that has been left out.
+        ConfigError: instead of it, if a module of Skytether itself was left out.
     """
     try:
         yield
@@ -49,7 +49,7 @@ def need(extra: str) -> None:
 
 
 def _extras() -> dict[str, list[str]]:
-    """Modules of each extra, named like their packages, except for MODULES."""
+    """Modules of each extra; their names are the packages' names, except for MODULES."""
     from importlib import metadata  # importing it takes a tenth of the client's start-up time
 
     extras: dict[str, list[str]] = {}

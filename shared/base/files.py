@@ -1,16 +1,16 @@
 """Files that a command writes, without destroying others; `input_files` reads them.
 
 Everything that a command writes is a plain file: a device, a pipe or a link in its place is
-refused. Otherwise `--out /dev/sda`, or a link left there by somebody else, would write elsewhere.
+refused. Otherwise `--out /dev/sda`, or a link made by another user, would redirect the output.
 
-- New content is written beside the old file and takes its name once it is complete (`replacing`): a
-full disk or a killed process leaves the old file as it was.
-- A file that grows during a flight (`Growing`) has its own name from the start, unless an older
-file has it.
+- New content is written to a temporary file, which replaces the old file once it is complete
+(`replacing`): a full disk or a killed process leaves the old file unchanged.
+- A file that grows during a flight (`Growing`) has its final name from the start, unless an older
+file has that name.
 - No command writes a file that it reads, and no two commands write the same file (`apart`,
 `claim`).
 
-Nothing else in this package opens a file for writing; tests/whole/test_writes.py checks it.
+No other module of the package opens a file for writing; tests/whole/test_writes.py checks it.
 """
 
 import os
@@ -30,20 +30,20 @@ except ImportError:  # Windows
     fcntl = None  # type: ignore[assignment]
 
 FLAGS = open_flags("O_NOFOLLOW", "O_NONBLOCK")
-"""Flags for files to be written: they guard against a link or a pipe in the file's place."""
+"""Flags for opening files to write: opening a link or a pipe fails instead."""
 MODE = 0o666
-"""Permissions of a new file, before the user's umask."""
+"""Permissions of a new file, which the user's umask restricts."""
 
 # -- files of a command -----------------------------------------------------------------------
 
 _ending: list[ExitStack] = []
-"""For each running command, see `uses`: releases its locks, and removes new files to which nothing
-was written."""
+"""For each running command, see `uses`: callbacks that release its locks and remove new files that
+are still empty."""
 
 
 @contextmanager
 def apart() -> Iterator[None]:
-    """Within this block, keep files that the command reads from being written.
+    """Within this block, refuse to write files that the command reads.
 
     Locks of `claim` last until the end of the block.
     """
@@ -56,7 +56,7 @@ def apart() -> Iterator[None]:
 
 
 def claim(path: Path) -> None:
-    """Lock a file that will be written, until the command ends; a missing one is created empty.
+    """Lock a file to be written until the command ends; a missing file is created empty.
 
     A new file that is still empty at the end is removed.
 
@@ -79,7 +79,7 @@ def claim_folder(path: Path) -> None:
         OSError: the folder cannot be created, or another command has locked it.
     """
     path.mkdir(parents=True, exist_ok=True)
-    # Windows opens no folders. Two options may name the same folder.
+    # Windows cannot open folders. Two options may name the same folder.
     if hasattr(os, "O_DIRECTORY") and not use(inode(path)):
         with _claimed(path, os.open(path, os.O_RDONLY | os.O_DIRECTORY)):
             pass
@@ -87,8 +87,8 @@ def claim_folder(path: Path) -> None:
 
 @contextmanager
 def _claimed(path: Path, descriptor: int) -> Iterator[ExitStack]:
-    """Lock an open file or folder until the command ends, or close it after an error; yields
-    what releases it.
+    """Lock an open file or folder until the command ends, or close it after an error; yields the
+    stack of callbacks that releases it.
     """
     with ExitStack() as ending:
         ending.callback(os.close, descriptor)
@@ -109,7 +109,7 @@ def lock(descriptor: int) -> None:
         OSError: the system, or its file system, has no locks.
     """
     if fcntl is None:
-        raise OSError(EOPNOTSUPP, "this system has no locks of files")
+        raise OSError(EOPNOTSUPP, "this system cannot lock files")
     fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
 
 
@@ -170,19 +170,19 @@ def write(path: Path, content: bytes) -> None:
 def replacing(
     path: Path, *, mode: int | None = None, is_new: bool = False, is_synced: bool = True
 ) -> Iterator[BinaryIO]:
-    """File for new content, which takes its name at the end of the block; after an error nothing
-    has changed.
+    """File for new content, which is renamed to `path` at the end of the block; an error leaves
+    everything unchanged.
 
-    A process that is killed meanwhile leaves NAME.part1.SUFFIX, with what it has written.
+    A process killed within the block leaves NAME.part1.SUFFIX with its output so far.
 
     Args:
         path: final path of the file.
-        mode: its permissions; None: those of the file that it replaces.
+        mode: permissions of the file; None: those of the file that it replaces.
         is_new: whether an existing file is an error.
-        is_synced: whether it is synced to disk at the end.
+        is_synced: whether the file is synced to disk at the end.
 
     Raises:
-        OSError: it cannot be written, is no plain file, or exists although it must be new.
+        OSError: the path cannot be written, is no plain file, or exists although it must be new.
     """
     status = check(path)
     if mode is None and status:
@@ -202,7 +202,7 @@ def replacing(
 
 
 def appending(path: Path) -> BinaryIO:
-    """Open a file for reading and appending, locked as by `held`; a missing one is created."""
+    """Open a file for reading and appending, locked as in `held`; a missing file is created."""
     return held(path, os.O_RDWR | os.O_CREAT)
 
 
@@ -223,10 +223,10 @@ def held(path: Path, flags: int = os.O_RDONLY) -> BinaryIO:
 
 
 class Growing:
-    """File that grows during a flight, and may be read meanwhile.
+    """File that grows during a flight, and that others may read while it grows.
 
-    It has its own name from the start. If an older file has that name, the new one is written
-    beside it as NAME.part1.SUFFIX until it is complete, see `end`.
+    It has its final name from the start. If an older file has that name, the new one is called
+    NAME.part1.SUFFIX until it is complete, see `end`.
 
     Args:
         buffering: as in `open`; 0: no buffer.
@@ -244,16 +244,16 @@ class Growing:
             self.at, self.file = _beside(path, buffering=buffering)
 
     def end(self, *, empty: bool, whole: bool) -> None:
-        """Close the file; if there is an older one, replace it, or stay beside it, or be removed.
+        """Close the file, and remove it, keep it, or let it replace an older file.
 
         Args:
-            empty: whether it contains nothing useful: then it is removed.
-            whole: whether it is complete: then it replaces the older one.
+            empty: whether the file contains nothing useful; it is then removed.
+            whole: whether the file is complete; it then replaces the older one.
 
         Raises:
             OSError: it cannot be renamed.
         """
-        with suppress(OSError):  # raised if its buffer cannot be written
+        with suppress(OSError):  # writing the rest of its buffer failed
             self.file.close()
         if self.at == self._path:
             return
@@ -273,7 +273,7 @@ def _opened(path: Path, flags: int, *, mode: int = MODE, buffering: int = -1) ->
 
 
 def _beside(path: Path, mode: int = MODE, *, buffering: int = -1) -> tuple[Path, BinaryIO]:
-    """Create a file beside another, with the first unused name."""
+    """Create a file in the folder of `path`, with the first unused name NAME.partN.SUFFIX."""
     for number in count(1):
         at = path.with_stem(f"{path.stem}.part{number}")
         with suppress(FileExistsError):

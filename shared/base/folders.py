@@ -8,7 +8,7 @@ from skytether.shared.base import input_files
 
 
 def zipped(folder: Path, most: int) -> bytes:
-    """The CSV files in a folder, as a zip that is equal for equal files."""
+    """The CSV files in a folder as a zip; equal files give equal bytes."""
     content, left = io.BytesIO(), most
     with zipfile.ZipFile(content, "w") as archive:
         for path in sorted(folder.glob("*.[cC][sS][vV]")):

@@ -4,7 +4,7 @@ from collections.abc import Iterable
 
 
 def hint(given: str, names: Iterable[str]) -> str:
-    """Question for the most similar known name; if none is similar, a list of all."""
+    """Suggestion of the most similar valid name; if none is similar, a list of all names."""
     import difflib  # imported only after a user's mistake
 
     close = difflib.get_close_matches(given, names, n=1)

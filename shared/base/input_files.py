@@ -1,7 +1,7 @@
-"""Files named by a user: read with a size limit, and noted as inputs of the command.
+"""Reading of files that a user names, with a size limit; they are noted as inputs of the command.
 
-`files` writes files, and refuses those that are noted here. A flight in virtual time loads this
-module alone.
+`files` writes files, and refuses the files noted here. A flight in virtual time loads only this
+module.
 """
 
 import os
@@ -17,7 +17,7 @@ Inode = tuple[int, int]
 Use = Literal["input", "output"]
 
 uses: list[dict[Inode, Use]] = []
-"""Files of the running commands, the newest command last, since a command may call another; empty
+"""Files of the running commands, newest command last, because a command may call another; empty
 outside `files.apart`."""
 
 
@@ -28,7 +28,7 @@ def inode(file: Path | int) -> Inode:
 
 
 def use(of: Inode) -> Use | None:
-    """What a running command does with a file."""
+    """Use of a file by a running command; None if no command uses it."""
     return next((each[of] for each in uses if of in each), None)
 
 

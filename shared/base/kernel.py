@@ -1,17 +1,17 @@
 """Compiled kernels: loops along a horizon, compiled by numba on their first call.
 
 A kernel's signature is taken from its annotations, so that mypy and numba check the same types: an
-array is annotated with one of the types below, an array of records with one made from its dtype,
-and arrays that belong together with their NamedTuple. A record is described by a class with one
-annotated field per line, which is never instantiated but is the record's type for mypy. A part is a
-function that only kernels call, and is compiled into each of them.
+array is annotated with one of the types below, an array of records with a type made from its dtype,
+and a group of arrays with its NamedTuple. A record is described by a class with one annotated field
+per line, which is never instantiated but is the record's type for mypy. A part is a function that
+only kernels call, and is compiled into each of them.
 
-What must not wait in flight compiles its kernels earlier: `machine_code.missing` lists the kernels
-without machine code, `load` prepares all of them. Importing compiles nothing.
+Processes that must not wait in flight compile kernels earlier: `machine_code.missing` lists the
+kernels without machine code, `load` prepares all. Importing compiles nothing.
 
 Machine code is stored on disk, beside the sources or in NUMBA_CACHE_DIR. Numba itself only checks
-whether the kernel's own file has changed; here every function and constant that a kernel uses is
-checked, in any module, so that no outdated machine code is used.
+whether the kernel's own file has changed; here all functions and constants that a kernel uses, in
+any module, are checked, so that outdated machine code is never used.
 """
 
 import ctypes
@@ -64,15 +64,15 @@ def record(kind: type) -> np.dtype[np.void]:
 
 
 def records(dtype: np.dtype[np.void], ndim: int) -> Any:
-    """Numba type of a contiguous array of such records, for an annotation."""
+    """Numba type of a contiguous array of records of a dtype, for an annotation."""
     return numba.types.Array(numba.from_dtype(dtype), ndim, "C")
 
 
 def kernel(function: F) -> F:
     """Function that is compiled on its first call, for the types of its annotations.
 
-    It cannot create arrays, since it is compiled without reference counts: they are an atomic
-    instruction per array and slice, and took half of the time of a plan.
+    It cannot create arrays, because it is compiled without reference counts: these take an atomic
+    instruction per array and slice, half of the time of a plan.
     """
     return _at_first_call(
         numba.njit(error_model="numpy", _nrt=False, pipeline_class=Called)(function)
@@ -84,12 +84,12 @@ def making_kernel(function: F) -> F:
 
 
 def _at_first_call(dispatcher: Any) -> Any:
-    """Kernel that compiles for its annotations on the first call; `dispatcher` is numba's.
+    """Kernel that is compiled for its annotations on the first call; `dispatcher` is numba's.
 
     A dispatcher determines the types of all arguments at every call to find the machine code for
     them: with 45 arrays in tuples that took 15 µs, and 70 µs when a tick comes every 50 ms and the
-    caches are cold. Here there is only one machine code, so the types are checked at the first
-    call, and later calls go straight to it. With `check_types` every call is checked.
+    caches are cold. Here there is only one machine code, so types are checked at the first call
+    only, and later calls run it directly. With `check_types` every call is checked.
     """
 
     def first(*arguments: Any) -> Any:
@@ -113,7 +113,7 @@ _CHECKED: list[bool] = []
 
 
 def check_types() -> None:
-    """From now on, check the types of arguments at each call of a kernel: for tests.
+    """From now on, check the types of arguments at each call of a kernel, for tests.
 
     Kernels that have been called already are not affected.
     """
@@ -144,7 +144,7 @@ def compile_kernel(dispatcher: Any) -> None:
     signature = signature_of(dispatcher)
     try:
         dispatcher.compile(signature)
-    except OSError:  # for example, a full disk: compiled, but not stored
+    except OSError:  # for example, a full disk: the kernel is compiled, but not stored
         dispatcher._cache = caching.NullCache()
         dispatcher.compile(signature)
     dispatcher.disable_compile()
@@ -166,8 +166,8 @@ def signature_of(dispatcher: Any) -> tuple[Any, ...]:
 def _type(hint: Any) -> Any:
     if hasattr(hint, "__metadata__"):
         kind = hint.__metadata__[0]
-        # Code that flies aboard does not import numba: there a number of dimensions stands for the
-        # type.
+        # Code aboard does not import numba: its annotations have a number of dimensions instead of
+        # a type.
         return numba.types.Array(numba.float64, kind, "C") if isinstance(kind, int) else kind
     if hasattr(hint, "_fields"):
         fields = get_type_hints(hint, include_extras=True)
@@ -189,8 +189,8 @@ def making_part(function: F) -> F:
 def _for_any_constant(dispatcher: Any) -> Any:
     """Part that is compiled once for all values of a constant argument.
 
-    Numba would compile it, and all that it calls, once for each constant that a caller passes,
-    which took 24 s of CPU instead of 15 for `server.mpc.hierarchical`.
+    Numba would compile the part, and all functions that it calls, once for each constant passed: 24
+    s of CPU instead of 15 for `server.mpc.hierarchical`.
     """
     whole = dispatcher.get_call_template
 
@@ -206,8 +206,8 @@ class PartLibrary(codegen.JITCodeLibrary):  # type: ignore[misc]
     """Code of a part: optimised and turned into machine code only within kernels that it is linked
     into.
 
-    Numba does both for each function by itself, and again for all that call it: with that, and the
-    wrappers that a part does not need, all kernels of `demo` took 21 s of CPU instead of 12.
+    Numba would do both for each function alone, and again in each caller, and make wrappers, which
+    a part does not need: all kernels of `demo` took 21 s of CPU instead of 12.
     """
 
     def _optimize_final_module(self) -> None:
@@ -217,27 +217,25 @@ class PartLibrary(codegen.JITCodeLibrary):  # type: ignore[misc]
         self._finalized = True
 
     def get_pointer_to_function(self, name: str) -> int:  # noqa: ARG002
-        """Address of what a call from Python reaches, which raises a TypeError: a part has no
-        code of its own.
-        """
+        """Address for calls from Python, which raise a TypeError: a part has no separate code."""
         self._ensure_finalized()
         return NOT_CALLABLE
 
     @property
     def codegen(self) -> "PartLibrary":
-        """What numba tells of a function's environment, see `set_env`."""
+        """Object on which numba calls `set_env`: the part itself."""
         return self
 
     def set_env(self, name: str, environment: object) -> None:
-        """Nothing: the environment is the kernel's, which has Python's objects for a function."""
+        """Do nothing: a part uses the environment (Python objects) of its kernel."""
 
 
 NOT_CALLABLE: int = ctypes.cast(ctypes.pythonapi.PyObject_Call, ctypes.c_void_p).value or 0
-"""Called with a function's environment in place of a callable object."""
+"""Address of PyObject_Call: it raises a TypeError, as a function's environment is not callable."""
 
 
 class Called(compiler.Compiler):  # type: ignore[misc]
-    """Numba's compiler for functions called from Python, and not from C."""
+    """Numba's compiler for functions that Python code calls and C code does not."""
 
     def define_pipelines(self) -> Any:
         self.state.flags.no_cfunc_wrapper = True
@@ -276,13 +274,13 @@ def lanes(function: F) -> F:
 
 
 def inline(function: F) -> F:
-    """Function of a few numbers that kernels call at every stage."""
+    """Function of a few numbers that is inlined into kernels, which call it at every stage."""
     compiled: F = numba.njit(error_model="numpy", _nrt=False, inline="always")(function)
     return compiled
 
 
 def shared(function: F) -> F:
-    """Unchanged function that kernels may call, too, with everything that it calls."""
+    """Unchanged Python function that kernels may call, too, with all functions that it calls."""
     for each in _dependencies(function):
         if inspect.isfunction(each) and each not in _SHARED:
             register_jitable(error_model="numpy", pipeline_class=Linked)(each)
@@ -321,13 +319,13 @@ def plain(function: F) -> F:
 
 
 class DependencyStamp:
-    """Makes a numba cache locator depend on everything that a kernel uses."""
+    """Mix-in for a numba cache locator: it depends on all code and constants of a kernel."""
 
     def get_source_stamp(self) -> str:
         return self.stamp
 
     def get_disambiguator(self) -> str:
-        """A file with another stamp is not even opened, since the stamp is part of its name."""
+        """Part of the file's name: the stamp, so that files with another stamp are never opened."""
         return self.stamp[:16]
 
     @classmethod
@@ -391,7 +389,7 @@ def stamp(function: Callable[..., Any]) -> str:
 
 
 def _dependencies(function: Callable[..., Any]) -> list[Callable[..., Any]]:
-    """A function and all that it calls, as Python functions."""
+    """A function and all functions that it calls, as Python functions."""
     reached, waiting = [], [function]
     while waiting:
         candidate = waiting.pop()

@@ -1,4 +1,4 @@
-"""Machine code of kernels: which kernels lack it, so that they are compiled before a flight."""
+"""Kernels without machine code, to be compiled before a flight."""
 
 from collections.abc import Callable, Collection
 from contextlib import suppress
@@ -26,10 +26,10 @@ class Missing(NamedTuple):
     name: str
     is_stored: bool
     compile: Callable[[], None]
-    """Function that compiles the kernel, or loads machine code compiled by another process
+    """Function that compiles the kernel, or loads machine code that another process has compiled
     since."""
     is_compiled: Callable[[], bool]
-    """Whether another process has compiled it since."""
+    """Function that returns whether another process has compiled the kernel since."""
 
 
 def missing(without: Collection[str] = ()) -> list[Missing]:
@@ -81,7 +81,7 @@ def _is_stored(dispatcher: Any) -> bool:
 
 
 def folder() -> Path | None:
-    """Folder with the machine code of one of the parts of every flight; None: not stored."""
+    """Folder for the machine code of kernels; None if machine code is not stored."""
     with suppress(RuntimeError):  # no folder is writable
         place = CacheFolders(stamp)
         place.locator.ensure_cache_path()

@@ -10,7 +10,7 @@ def meanings(of: type) -> dict[str, str]:
     """Docstring of each field, in one line."""
     docstrings: dict[str, str] = {}
     for each in reversed(of.__mro__):
-        with suppress(TypeError, OSError):  # not a class of Python's own, or without its source
+        with suppress(TypeError, OSError):  # a class without Python source
             (definition,) = ast.parse(inspect.getsource(each)).body
             assert isinstance(definition, ast.ClassDef)
             docstrings |= {

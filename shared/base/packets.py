@@ -1,7 +1,7 @@
-"""IP packets of a program, as far as netem reads them: flow, Ethernet frame, answer if too long.
+"""Parts of a program's IP packets that netem reads: flow, Ethernet frame, answer if too long.
 
 The addresses are those of slirp4netns, which speaks Ethernet. The program's device has no link
-layer, so nothing but the program's own packets passes it: no ARP, no neighbour discovery (ND).
+layer, so only the program's own packets pass it: no ARP, no neighbour discovery (ND).
 """
 
 import struct
@@ -10,7 +10,7 @@ from ipaddress import IPv4Address, IPv6Address
 PROGRAM = ("program", 0)
 """Peer of an endpoint between a program and the outside; a datagram's payload is a packet."""
 OUTSIDE = ("outside", 0)
-"""The other peer."""
+"""Peer that represents all other hosts."""
 ADDRESS, GATEWAY = IPv4Address("10.0.2.100"), IPv4Address("10.0.2.2")
 """Addresses of the program and of this machine, as the program sees them."""
 ADDRESS6, GATEWAY6 = IPv6Address("fd00::100"), IPv6Address("fd00::2")
@@ -21,7 +21,7 @@ ICMP, ICMP6 = 1, 58
 ECHOES = (0, 8)
 """ICMP's types of echo reply and echo request: no other ICMP message is answered with an error."""
 ERRORS6 = 128
-"""Number of ICMPv6's first type that is not an error."""
+"""Smallest ICMPv6 type that is not an error."""
 DISCOVERY = range(133, 138)
 """ICMPv6's types of ND, which slirp4netns sends by itself."""
 WITH_PORTS = frozenset((6, 17, 33, 132))
@@ -29,7 +29,7 @@ WITH_PORTS = frozenset((6, 17, 33, 132))
 SHORTEST, SHORTEST6 = 20, 40
 """Sizes of the headers of IPv4 and IPv6 without options [B]."""
 QUOTED, QUOTED6 = 548, 1232
-"""Largest part of a packet that an ICMP error quotes: its size is 576 or 1280 B at most [B]."""
+"""Largest part of a packet quoted in an ICMP error, which has at most 576 or 1280 B [B]."""
 
 _OUR_MAC, _ITS_MAC = bytes.fromhex("020000000001"), bytes.fromhex("52550a000202")
 _IPV4, _IPV6, _ARP = b"\x08\x00", b"\x86\xdd", b"\x08\x06"
@@ -37,9 +37,9 @@ _HEAD, _HEAD6 = _ITS_MAC + _OUR_MAC + _IPV4, _ITS_MAC + _OUR_MAC + _IPV6
 
 
 def flow_of(packet: bytes, *, is_outward: bool) -> bytes | None:
-    """Key of a packet's flow, the same both ways; None if it is not a packet of IP.
+    """Key of a packet's flow, equal in both directions; None if it is not an IP packet.
 
-    The key has protocol, addresses, and ports where the packet has them; fragments have none.
+    The key has protocol, addresses, and, if the packet has them, ports; fragments have none.
 
     Args:
         is_outward: whether the packet is from the program.
@@ -62,7 +62,7 @@ def flow_of(packet: bytes, *, is_outward: bool) -> bytes | None:
 
 
 def framed(packet: bytes) -> bytes:
-    """Ethernet frame of a packet, to slirp4netns."""
+    """Ethernet frame that carries a packet to slirp4netns."""
     return (_HEAD if packet[0] >> 4 == 4 else _HEAD6) + packet
 
 
@@ -88,7 +88,7 @@ def announcements() -> tuple[bytes, bytes]:
 
 
 def too_long(packet: bytes, mtu: int) -> bytes | None:
-    """Answer of a router to a packet longer than the path's MTU; None if it gets none."""
+    """Router's ICMP answer to a packet longer than the path's MTU; None if none is due."""
     if packet[0] >> 4 == 6:
         if packet[6] == ICMP6 and packet[SHORTEST6] < ERRORS6:
             return None

@@ -4,8 +4,8 @@
 def printable(text: str) -> str:
     r"""Text in which invisible characters are replaced by escapes such as `\x1b`.
 
-    A terminal interprets some of them: they clear the screen, move the cursor, or reverse the
-    direction of text.
+    Terminals interpret some such characters: they clear the screen, move the cursor, or reverse
+    text.
     """
     if text.isprintable():
         return text

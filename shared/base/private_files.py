@@ -12,7 +12,7 @@ def read(path: Path, most: int, *, is_input: bool = True) -> bytes:
     """Content of a private file; see `input_files.read`.
 
     Raises:
-        OSError: as `input_files.read` and `check`; or others may read or write the file.
+        OSError: as `input_files.read` and `check`, or if other users may read or write the file.
         ValueError: the name is invalid.
     """
     check(path)
@@ -25,11 +25,11 @@ def read(path: Path, most: int, *, is_input: bool = True) -> bytes:
 
 
 def check(path: Path) -> None:
-    """Refuse a private file if others can put another file in its place: if it is a link, or in a
-    folder that anybody may write to or replace.
+    """Refuse a private file that other users can replace: a link, or a file in a folder that
+    anybody may write to or replace.
 
     Raises:
-        OSError: says what was found and what was expected.
+        OSError: the message has the found and the expected kind of file.
         ValueError: the name is invalid.
     """
     if path.is_symlink():
@@ -37,7 +37,7 @@ def check(path: Path) -> None:
     for folder in (path.absolute().parent, path.parent.resolve()):
         for each in (folder, *folder.parents):
             mode = stat.S_IMODE(each.stat().st_mode)
-            # With the sticky bit, the folders within belong to their owners.
+            # With the sticky bit, only owners can replace the folders within.
             if mode & stat.S_IWOTH and (each == folder or not mode & stat.S_ISVTX):
                 problem = f"anybody may write to the folder {each}, whose mode is {mode:04o}"
-                raise OSError(EACCES, f"{problem}: expected one where nobody else may")
+                raise OSError(EACCES, f"{problem}: expected write access for its owner only")

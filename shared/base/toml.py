@@ -1,8 +1,8 @@
-"""TOML text, refused before parsing if that would take too much memory.
+"""Parser of TOML text, which is refused first if parsing would take too much memory.
 
 The standard library's parser stores every prefix of a dotted key: its memory grows with the square
 of the number of parts, and 26 kB of text take 3.5 GB. Nested brackets end in a RecursionError. So
-the text is first checked for both, in one pass. Nothing else parses TOML in this package;
+the text is first checked for both, in one pass. No other module of the package parses TOML;
 tests/shared/test_toml.py checks it.
 """
 

@@ -4,7 +4,7 @@ SECOND_NS = 1_000_000_000
 MILLISECOND_NS = 1_000_000
 MICROSECOND_NS = 1_000
 HEADER_BYTES = 28
-"""Headers of IPv4 and UDP on each packet."""
+"""Size of the headers of IPv4 and UDP of each packet [B]."""
 
 
 def seconds_to_ns(seconds: float) -> int:
@@ -12,5 +12,5 @@ def seconds_to_ns(seconds: float) -> int:
 
 
 JUMP_NS = 60 * SECOND_NS
-"""Largest advance of a clock between two readings, or past a wake that is due; a larger one is a
-jump, see `shared.endpoints.steady`."""
+"""Largest advance of a clock between two readings, or beyond a due wake, that is no jump, see
+`shared.endpoints.steady`."""

@@ -1,1 +1,1 @@
-"""What server, client and netem are: endpoints, driven by datagrams and time only."""
+"""Endpoints: interface of server, client and netem, driven by datagrams and time only."""

@@ -1,4 +1,4 @@
-"""Changes in flight: new values for some keys of a scenario while it is flown.
+"""Changes in flight: new values for keys of a scenario while it is flown.
 
     values by key → may these change? → checked like a scenario → `Endpoint.change` → `Changed`
 
@@ -36,15 +36,15 @@ class Answer(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     values: dict[str, Any] = {}
     """Keys that may change and their present values, if the request was empty."""
     names: dict[str, str] = {}
-    """What the operator calls some of these keys, see `endpoints.directions`."""
+    """Operator's names of keys in `values`, by key; see `endpoints.directions`."""
 
 
 class Running:
-    """The scenario that an endpoint flies, and its changes.
+    """Scenario that an endpoint flies, and changes of the scenario.
 
     Args:
         scenario: scenario that the endpoint was created with.
-        settings: values in it that were set in an earlier run.
+        settings: values of the scenario that were set in an earlier run.
     """
 
     def __init__(
@@ -91,7 +91,7 @@ class Running:
             reason = other_directions.named(str(error), self._names)
             self.refuse(reason)
             raise ConfigError(reason) from None
-        # Only after checking the whole scenario: a change is made completely, or not at all.
+        # After the check of the whole scenario: a change is made completely, or not at all.
         self.endpoint.change(scenario, frozenset(values), now_ns=now_ns)
         self._scenario, after = scenario, reading.to_table(scenario)
         lasting = {key: value for key, value in values.items() if key not in DECISIONS}
@@ -117,7 +117,7 @@ class Running:
         """Carry out a request, valid or not, and return the encoded answer.
 
         Args:
-            request: the request, or enough of it to show that it is too long.
+            request: the request, or a beginning that is long enough to be refused.
             now_ns: time on the endpoint's clock [ns].
         """
         if len(request) > REQUEST_BYTES_MAX:
@@ -140,8 +140,8 @@ class Running:
         return msgspec.json.encode(Answer(refused=reason))
 
     def _whole(self, values: Mapping[str, Any]) -> dict[str, Any]:
-        """Values of whole keys: an argument, such as `network.uplink.loss`, is replaced in its
-        text.
+        """Values by complete keys: the value of an argument, such as `network.uplink.loss`, is
+        inserted into the key's text.
 
         Raises:
             ConfigError: a key may not change, or a text has no such argument.
@@ -161,8 +161,8 @@ class Running:
                 value(table, text)
             except (KeyError, TypeError):
                 shown_key = key[:KEY_SHOWN_MAX]
-                # A request may come from any process that can open the socket: no control
-                # characters in the log.
+                # Any process that can open the socket may send requests: no control characters in
+                # the log.
                 shown_key = shown_key if shown_key.isprintable() else repr(shown_key)
                 names = [self._names.get(each, each) for each in may]
                 raise ConfigError(f"{shown_key}: no such key; {hint(key, names)}") from None
@@ -175,8 +175,8 @@ def with_values(scenario: Scenario, values: Mapping[str, Any]) -> Scenario:
     """Scenario with some values replaced; `values` are plain values by key.
 
     Raises:
-        ConfigError: a key is unknown, or the new scenario cannot be flown. A network may become
-            too bad to fly over.
+        ConfigError: a key is unknown, or the new scenario is invalid. A network too bad to fly is
+            allowed.
     """
     table = reading.to_table(scenario)
     set_keys(values, table)

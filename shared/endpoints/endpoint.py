@@ -21,14 +21,14 @@ Address = tuple[str, int]
 brackets, with a scope if needed, as in `fe80::1%eth0`."""
 
 NETWORK_BYTES = 8
-"""Length of the network part of an IPv6 address, which identifies a host [B]: whoever has one
-address of a 64-bit network has all of them."""
+"""Length of the network part of an IPv6 address, which identifies a host [B]: the owner of one
+address of a 64-bit network usually has all of them."""
 
 EVENTS_MAX = 1024
-"""Number of events kept until the driver reads them; older ones are dropped and counted."""
+"""Number of events stored until the driver reads them; older events are dropped and counted."""
 
 VEHICLES_SHOWN_MAX = 16
-"""Number of vehicles with individual figures."""
+"""Largest number of vehicles for which figures are given individually."""
 
 
 class Datagram(NamedTuple):
@@ -43,7 +43,7 @@ class Datagram(NamedTuple):
 
 
 make_datagram: Callable[[tuple[bytes, Address, int]], Datagram] = partial(tuple.__new__, Datagram)
-"""Datagram from its three values, in half the time of calling `Datagram`."""
+"""Function that makes a Datagram from its three values, twice as fast as `Datagram`."""
 
 
 def host_of(address: Address) -> str:
@@ -95,53 +95,53 @@ class Events(deque[Event]):
 
 
 class Endpoint(ABC):
-    """Base of everything that talks UDP. `now_ns` is always the driver's monotonic clock [ns]."""
+    """Base of all ends of UDP links. `now_ns` is always the driver's monotonic clock [ns]."""
 
     changeable: frozenset[str] = frozenset()
     """Keys of the scenario that may change in flight, see `shared.endpoints.change`."""
     directions: Directions = FLIGHT
-    """Names of both directions of its network."""
+    """Names of both directions of the endpoint's network."""
     keeps = False
     """Whether the endpoint has state for the next run of the process, see `keep`."""
     waits_for_disk = False
-    """Whether the next run would follow an earlier state until the newest is written, or the
-    earlier one removed."""
+    """Whether the state on disk is outdated, so that the next run would use it until the newest is
+    written or the old one removed."""
     patience_ns = 0
     """Longest time for which datagrams are collected on busy sockets [ns].
 
-    Each is received with its own time of arrival, before the next wake. On busy sockets wakes are
-    at least this far apart. 0: each datagram is received at once."""
+    Each datagram is received with its own time of arrival, before the next wake. On busy sockets
+    wakes are at least this far apart. 0: each datagram is received at once."""
 
     def __init__(self) -> None:
         # Shared with the parts of the endpoint, so never replaced.
         self._out: list[Datagram] = []
         self._events = Events()
         self.pending = self._out, self._events
-        """Datagrams and events that `outbox` and `events` return next; an endpoint round another
-        takes the other's, for in virtual time neither is called while there are none."""
+        """Datagrams and events that `outbox` and `events` return next. A wrapper uses those of the
+        wrapped endpoint, because virtual time calls neither while both are empty."""
 
     @abstractmethod
     def receive(self, datagram: Datagram, *, now_ns: int) -> None:
-        """Process a datagram. Never raises, whatever a peer has sent."""
+        """Process a datagram. Never raises, even if the datagram is malformed."""
 
     @abstractmethod
     def wake(self, *, now_ns: int) -> None:
-        """Do what is due now; the driver may call it early or late."""
+        """Do the work that is due now; the driver may call it early or late."""
 
     @abstractmethod
     def next_wake_ns(self) -> int | None:
         """Time of the next wake, or None to wait for datagrams only."""
 
     def leave(self, *, now_ns: int) -> int:
-        """Begin to end, as an operator asks.
+        """Start to shut down, on an operator's request.
 
-        The driver goes on until the endpoint has `finished`, or until the time that is returned
-        [ns], by default now, and then calls `close`. An operator who asks twice does not wait.
+        The driver continues until the endpoint has `finished`, or until the returned time [ns], by
+        default now, and then calls `close`. A second request ends it at once.
         """
         return now_ns
 
     def close(self, *, now_ns: int) -> None:  # noqa: B027 - optional
-        """Send the last datagrams before the driver ends; nothing else is called after it."""
+        """Send the last datagrams before the driver ends; this is the last call of the endpoint."""
 
     def objection(self, scenario: Scenario, keys: frozenset[str]) -> str:  # noqa: ARG002
         """Why a change is refused at present, in words; empty if it is accepted.
@@ -179,7 +179,7 @@ class Endpoint(ABC):
         self._events.append(event)
 
     def undelivered(self, socket: int, reason: str) -> None:  # noqa: B027 - optional
-        """Note that a datagram from a socket could not be sent, or was refused on its way."""
+        """Note that a datagram from a socket could not be sent, or was refused later."""
 
     def figures(self) -> dict[str, Any]:
         """Figures counted so far, by name; a nested dictionary is a group.
@@ -196,8 +196,8 @@ class Endpoint(ABC):
         return None
 
     def kept(self, *, nothing: bool = False) -> None:  # noqa: B027 - optional
-        """Note that the latest bytes from `keep` were written; or, with `nothing`, that they cannot
-        be, and that the next run will find no earlier ones either.
+        """Note that the latest bytes from `keep` were written; or, with `nothing`, that writing
+        failed and the earlier bytes were removed.
         """
 
     @property
@@ -209,7 +209,7 @@ class Endpoint(ABC):
         """Datagrams to be sent; each is returned once."""
         if not self._out:
             return []
-        # Copied and cleared, not replaced: the parts of an endpoint share this list.
+        # Copied and cleared, not replaced, because the parts of an endpoint share this list.
         out = self._out.copy()
         self._out.clear()
         return out

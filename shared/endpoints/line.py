@@ -43,14 +43,14 @@ class Line(NamedTuple):
 
 
 CONNECTIONS_MAX = 128
-"""Largest number of TCP connections at once: what they hold fits the queue of a link."""
+"""Largest number of TCP connections at once: their pieces fit the queue of a link."""
 
 
 class Listen(NamedTuple):
-    """TCP connections to relay: where clients connect, and where they are led."""
+    """TCP connections to relay: address for clients, and address of the server."""
 
     bind: Address
-    """Port 0 takes a free one."""
+    """Address for clients; port 0 takes a free port."""
     server: Address
     most: int = CONNECTIONS_MAX
     """Largest number of connections at once; further ones are closed."""
@@ -72,7 +72,7 @@ def parse_address(text: str) -> Address | None:
 
 
 def parse_line(key: str, text: str) -> Line:
-    """Line from its text.
+    """Line of the text `text`.
 
     Raises:
         ConfigError: the text is invalid; the message names `key`.

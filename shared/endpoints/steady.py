@@ -2,8 +2,8 @@
 
 An endpoint needs a clock that advances at the rate of real time. If the clock is set back or ahead,
 scheduled work would be late or early, and time stamps from before and after could not be compared.
-`Steady` removes every jump, so that the endpoint's time stands still for the jump and goes on from
-there:
+`Steady` removes every jump, so that the endpoint's time does not advance in the jump, and continues
+after it:
 
     steady = clock - (all jumps so far)
 
@@ -22,7 +22,7 @@ from skytether.shared.scenario.schema import Scenario
 class Steady(Endpoint):
     """Wraps an endpoint, and passes steady time to it.
 
-    An endpoint that waits for datagrams only may wait for any time: then only an advance backwards
+    An endpoint that waits for datagrams only may wait for any time: then only a step backwards
     counts as a jump.
     """
 
@@ -38,16 +38,14 @@ class Steady(Endpoint):
         seen_ns = now_ns if self._seen_ns is None else self._seen_ns
         self._seen_ns = now_ns
         if not 0 <= now_ns - seen_ns <= JUMP_NS and self._is_jump(seen_ns, now_ns):
-            # Subtract the whole jump, so that steady time stands still for it and goes on from
-            # there.
+            # Subtract the whole jump, so that steady time does not advance in it.
             self._jumps_ns += now_ns - seen_ns
         return now_ns - self._jumps_ns
 
     def _is_jump(self, seen_ns: int, now_ns: int) -> bool:
         if now_ns < seen_ns:
             return True
-        # Counted from the wake that is due: an endpoint that sleeps for an hour until then has not
-        # jumped.
+        # Counted from the due wake: an endpoint that waited an hour for it has not jumped.
         due_ns = self.next_wake_ns()
         return due_ns is not None and now_ns - max(seen_ns, due_ns) > JUMP_NS
 
@@ -77,7 +75,7 @@ class Steady(Endpoint):
         self._inner.learn_time(utc_ns, error_ns, now_ns=self._steady(now_ns))
 
     def keep(self, *, now_ns: int) -> bytes | None:
-        """Saved times are relative to the time of writing."""
+        """State for the next run; its times are relative to the time of writing."""
         return self._inner.keep(now_ns=self._steady(now_ns))
 
     def kept(self, *, nothing: bool = False) -> None:

@@ -5,10 +5,10 @@ from typing import NamedTuple
 from skytether.shared.base.units import SECOND_NS
 
 FRESH_NS = 10 * SECOND_NS
-"""Validity of a learned time of day."""
+"""Time for which a learned time of day is valid [ns]."""
 DRIFT = 1000
-"""Time in which two clocks drift apart by one unit: 0.1 %, for two hosts whose clocks are slewed by
-500 ppm each."""
+"""Inverse of the largest relative drift of two clocks: 0.1 %, for two hosts whose clocks are slewed
+by 500 ppm each."""
 
 
 class TimeOfDay(NamedTuple):

@@ -8,10 +8,10 @@ from skytether.shared.events.flight import Event, Failure, VehicleEvent
 class AutopilotParameter(msgspec.Struct, frozen=True, kw_only=True):
     name: str
     value: float | None
-    """Value; None if the autopilot does not have the parameter."""
+    """Value of the parameter; None if the autopilot does not have it."""
     meaning: str
     wanted: str = ""
-    """Safe values and the one to set, in words; empty if the value is safe."""
+    """Safe values, and the value to set, in words; empty if the present value is safe."""
 
     def __str__(self) -> str:
         value = "missing" if self.value is None else f"{self.value:g}"
@@ -53,7 +53,7 @@ class AutopilotRefused(VehicleEvent):
     sentence = "vehicle {vehicle}: its autopilot refuses to {asked}: {answer}"
     asked: str
     answer: str
-    """Name of the MAV_RESULT."""
+    """Name of the autopilot's answer, a MAV_RESULT."""
 
 
 class AutopilotText(VehicleEvent):
@@ -64,7 +64,7 @@ class AutopilotText(VehicleEvent):
 
 
 class AutopilotSaid(Event):
-    """Text of the stand-in of an autopilot (`skytether.autopilot`)."""
+    """Text of a simulated autopilot (`skytether.autopilot`)."""
 
     text: str
     severity: int
@@ -129,13 +129,13 @@ class SecondCommander(VehicleEvent):
     system: int
     component: int
     said: str
-    """Type of the newest message of that sender."""
+    """Type of the sender's newest message."""
 
 
 class SecondPublisher(VehicleEvent):
     topic: str
     nodes: tuple[str, ...]
-    """Other nodes of the ROS graph that may publish on the topic; empty if none has told."""
+    """Other nodes of the ROS graph that announced to publish on the topic; may be empty."""
 
     def __str__(self) -> str:
         who = " or ".join(self.nodes) or "a node without a name"

@@ -4,9 +4,9 @@ An endpoint returns its events (`Endpoint.events`); a driver passes them to a lo
 virtual time, or the command that started the process. `str(event)` is a sentence for the operator.
 For programs an event is a JSON object whose key `type` is the name of the class.
 
-Here are the events of any flight. Those of autopilots are in `aboard`, of several paths in
+This module has the events of all flights. Those of autopilots are in `aboard`, of several paths in
 `path_events`, of a standby server in `standby_events`, of processes in `process_events`, of
-missions in `shared.missions.events`. What decodes them all, `shared.telemetry.every_event`, imports
+missions in `shared.missions.events`. `shared.telemetry.every_event` decodes them all, and imports
 each of these modules.
 """
 
@@ -24,7 +24,7 @@ def address_text(host: str, port: int) -> str:
 
 @dataclass_transform(frozen_default=True, kw_only_default=True)
 class Event(msgspec.Struct, frozen=True, tag=True):
-    """Base of all events; what it is to msgspec and to mypy, its subclasses inherit."""
+    """Base of all events; subclasses inherit its settings for msgspec and mypy."""
 
     sentence = ""
     """Sentence for the operator, with fields and properties in braces; an event that needs more
@@ -34,7 +34,7 @@ class Event(msgspec.Struct, frozen=True, tag=True):
         return self.sentence.format_map(self)
 
     def __getitem__(self, name: str) -> Any:
-        """Value for a name in braces."""
+        """Value of a field or property, for its name in braces in `sentence`."""
         return getattr(self, name)
 
 
@@ -43,7 +43,7 @@ class VehicleEvent(Event):
 
 
 class Failure(VehicleEvent):
-    """Event after which a vehicle cannot fly, or cannot go on."""
+    """Event after which a vehicle cannot fly, or cannot continue its flight."""
 
 
 class ReferenceTooFast(Event):
@@ -55,7 +55,7 @@ class ReferenceTooFast(Event):
     """First time in the flight at which the trajectory is too fast [s]."""
     speed_mps: float
     most_mps: float
-    """Largest speed of the vehicle along the same axis [m/s]."""
+    """Largest speed of the vehicle along the axis [m/s]."""
 
 
 class Omitted(Event):
@@ -71,7 +71,7 @@ class RecordIncomplete(Event):
     sentence = "{file}: {reason}: the record is incomplete, the flight goes on"
     file: str
     reason: str
-    """System's message, such as "No space left on device"."""
+    """Message of the operating system, such as "No space left on device"."""
 
 
 class Fault(Event):
@@ -96,7 +96,7 @@ class Returned(Event):
         "never answered, and its address may lead back to this netem"
     )
     times: int
-    """Number of successive new addresses that the packet came from."""
+    """Number of new addresses, one after another, from which the packet has arrived."""
 
 
 class TooLong(Event):
@@ -145,7 +145,7 @@ class Changed(Event, omit_defaults=True):
     before: str
     after: str
     name: str = ""
-    """What the operator calls the key, if not by itself, see `endpoints.directions`."""
+    """Operator's name of the key, if it differs from the key, see `endpoints.directions`."""
 
     def __str__(self) -> str:
         return f"{self.name or self.key} is {self.after} from now on, it was {self.before}"
@@ -154,7 +154,7 @@ class Changed(Event, omit_defaults=True):
 class ChangeRefused(Event):
     sentence = "a change is refused: {reason}"
     reason: str
-    """Reason, which names the key, the given and the expected value."""
+    """Reason for the refusal, with the key, the given and the expected value."""
 
 
 class PeerEvent(VehicleEvent):
@@ -172,11 +172,11 @@ class SessionOpened(PeerEvent):
 
 
 class Leaving(Event):
-    """The process is asked to end while vehicles of a mission are on their motions."""
+    """An operator has asked the process to end while vehicles of a mission fly their motions."""
 
     vehicles: tuple[int, ...]
     most_s: float
-    """Longest time until it ends [s]."""
+    """Longest time until the process ends [s]."""
 
     def __str__(self) -> str:
         named = ", ".join(map(str, self.vehicles))
@@ -239,7 +239,7 @@ class NumberTaken(PeerEvent):
 
 
 class NoSession(PeerEvent, Failure):
-    """The server opens no session for a vehicle, which keeps asking."""
+    """The server opens no session for a vehicle, which repeats its request."""
 
     reason: Literal["full", "taken"]
 
@@ -253,7 +253,7 @@ class NoSession(PeerEvent, Failure):
 
 class UnansweredEvent(PeerEvent):
     others: tuple[str, ...] = ()
-    """Addresses of the server's other paths, from which no answer has come either."""
+    """Addresses of the server's other paths, which have not answered either."""
 
     @property
     def everywhere(self) -> str:
@@ -263,7 +263,7 @@ class UnansweredEvent(PeerEvent):
 class NoAnswer(UnansweredEvent, Failure, kw_only=True):
     waited_s: float
     secure: bool = False
-    """Whether the vehicle has a key, so that only answers with that key count."""
+    """Whether the vehicle has a key; it then ignores answers without this key."""
 
     def __str__(self) -> str:
         key, and_key = (" with this key", ", with this key") if self.secure else ("", "")
@@ -314,7 +314,7 @@ class ModeChanged(VehicleEvent):
     before: str
     """Name of the previous mode, see `shared.wire.protocol.Mode`."""
     after: str
-    """Name of the new mode; the same if only the reason has changed."""
+    """Name of the new mode; equal to the old name if only the reason has changed."""
     reason: str
 
     def __str__(self) -> str:
@@ -355,7 +355,7 @@ class StateDoubted(VehicleEvent):
 
 
 class SteppedLate(VehicleEvent):
-    """A step of a vehicle on a mission began later than any before, and too late: until then the
+    """A step of a vehicle on a mission began too late, and later than all before; until then the
     last input was flown.
     """
 
@@ -364,7 +364,7 @@ class SteppedLate(VehicleEvent):
         "still"
     )
     late_s: float
-    """Time by which it began late [s]."""
+    """Delay of the step's beginning [s]."""
 
 
 def metres(leap_m: tuple[float, ...]) -> str:

@@ -8,7 +8,7 @@ class PathDied(VehicleEvent):
     path: int
     """Number of the path, from 0."""
     via: str
-    """Its interface or address."""
+    """Interface or address of the path."""
 
 
 class PathHealed(VehicleEvent):

@@ -1,4 +1,4 @@
-"""Events of the process around an endpoint: its addresses, pages, keys, files and figures."""
+"""Events of the process that runs an endpoint: addresses, pages, keys, files and figures."""
 
 from typing import Any
 
@@ -30,7 +30,7 @@ class HostFound(Event):
 class PathMissing(Event):
     sentence = "the path {path} is down: {reason}; it is tried again every second"
     path: str
-    """LOCAL=HOST:PORT, as the user has written it."""
+    """Path LOCAL=HOST:PORT, as written by the user."""
     reason: str
 
 
@@ -46,7 +46,7 @@ class PageServed(Event):
     """Requested HOST:PORT if another process uses that address."""
 
     def __str__(self) -> str:
-        # Only a space may follow the address: it is copied, or clicked.
+        # Only a space may follow the address, because users copy or click it.
         taken = f" ({self.taken} is taken)" if self.taken else ""
         return f"the page is at {self.address}{taken}"
 
@@ -123,7 +123,7 @@ class SettingsRecalled(Event):
 class NotKept(Event):
     reason: str
     removed: bool = False
-    """Whether the file of an earlier state was removed: the next run would follow it."""
+    """Whether the file with an earlier state was removed, so that no later run uses it."""
 
     def __str__(self) -> str:
         hovers = "; a client that is restarted now hovers where it is" if self.removed else ""

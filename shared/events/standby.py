@@ -5,7 +5,7 @@ from skytether.shared.law.terms import Difference
 
 
 class LimitsDiffer(PeerEvent):
-    """A server must not lead a vehicle: it plans a mission within other limits than the leader."""
+    """A server must not lead a vehicle: its motions have other limits than the leader's."""
 
     differences: tuple[Difference, ...]
 

@@ -15,7 +15,7 @@ FENCED_STEPS_MAX = 100_000
 
 
 def of_way(scenario: Scenario) -> Iterator[Contradiction]:
-    """Contradictions of the fence: it leaves no place, or the desired trajectory crosses it."""
+    """Contradictions of the fence: its interior is empty, or the desired trajectory crosses it."""
     yield from list(_no_place(scenario)) or _outside(scenario)
 
 

@@ -12,8 +12,8 @@ from skytether.shared.scenario.schema import Contradiction, Position, Scenario, 
 
 
 class FenceConfig(Section, frozen=True):
-    """Fence that the vehicle does not leave, whatever inputs it receives. The vehicle uses its own
-    scenario's fence; a server with a fence refuses desired trajectories that cross it.
+    """Fence that the vehicle does not leave, independent of the received inputs. The vehicle uses
+    its own scenario's fence; a server with a fence refuses desired trajectories that cross it.
     """
 
     low_m: OfEach[tuple[Position, ...]] = ()

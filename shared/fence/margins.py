@@ -1,7 +1,7 @@
 """Inner bounds of a fence: the stated bounds, moved inwards by margins.
 
-A desired trajectory must stay within the inner bounds. Wind and model errors then do not carry the
-vehicle over the stated ones, see `client.fence`.
+A desired trajectory must stay within the inner bounds. Wind and model errors then do not move the
+vehicle over the stated bounds, see `client.fence`.
 """
 
 import math
@@ -10,17 +10,17 @@ from skytether.shared.fence.keys import FenceConfig
 from skytether.shared.scenario.schema import Scenario
 
 SLOW_STEPS = 2
-"""Steps by which the fence's time constant T exceeds the vehicle's."""
+"""Number of steps by which the fence's time constant T exceeds the vehicle's."""
 ERROR_S = 0.06
 """Margin for all model errors together, as a time at the vehicle's largest speed."""
 WEAK = 1.25
-"""Factor on the wind's margin, for a vehicle whose gain is 20 % below the model's."""
+"""Factor on the margin for wind, for a vehicle whose gain is 20 % below the model's."""
 LATER_S = 0.1
 """Largest excess of the vehicle's dead time over the model's."""
 
 
 def margins(scenario: Scenario) -> list[float]:
-    """Margin of the bounds on each axis, and as last item that of `fence.radius_m` [m]."""
+    """Margin of the bounds on each axis, and as last item the margin of `fence.radius_m` [m]."""
     terms, fence, dt = scenario.terms(), scenario.section(FenceConfig), scenario.control.dt
     fastest = fence.speed_mps or math.inf
     blown = [

@@ -7,8 +7,8 @@
     recorded, pings        recorded links, for `trace` of netem and for the probe
     bounded, geographic    files read within bounds; coordinates of the globe
 
-Each of the first is a `Format`, and is imported when a file of its format is read: a flight without
-such a file loads none of them. The package imports `shared.missions`, `shared.scenario`,
+Each module of a format of tracks is a `Format`, imported when a file of its format is read: a
+flight without such a file loads none. The package imports `shared.missions`, `shared.scenario`,
 `shared.law` and `shared.base`; ULog needs the extra `ulog`.
 """
 
@@ -28,7 +28,7 @@ HEAD_BYTES = 4096
 
 
 class Format(Protocol):
-    """Module of a format."""
+    """Module that reads a file format."""
 
     def tracks(
         self, content: bytes, axes: int, origin: Origin | None, speed_mps: float, /
@@ -37,7 +37,7 @@ class Format(Protocol):
 
         Args:
             axes: number of axes of the points.
-            origin: origin of the scenario; (): that of the file, if it has one; None: any.
+            origin: origin of the scenario; (): that of the file, if it has one; None: not needed.
             speed_mps: speed between places, for a file without times [m/s].
 
         Raises:
@@ -49,7 +49,7 @@ class Format(Protocol):
 
 
 def _has(name: str) -> Callable[[bytes], bool]:
-    """Whether a zip has a file whose name ends so."""
+    """Test whether a zip has a file whose name ends in `name`."""
     return lambda content: any(each.lower().endswith(name) for each in bounded.names(content))
 
 
@@ -58,7 +58,7 @@ def _begins(*heads: bytes) -> Callable[[bytes], bool]:
 
 
 def _root(tag: bytes) -> Callable[[bytes], bool]:
-    """Whether an XML text begins with an element, in UTF-8 or UTF-16."""
+    """Test whether an XML text, in UTF-8 or UTF-16, begins with the element `tag`."""
     return lambda content: tag in content[:HEAD_BYTES].replace(b"\0", b"")
 
 
@@ -75,14 +75,14 @@ FORMATS: tuple[tuple[str, tuple[str, ...], Callable[[bytes], bool]], ...] = (
     ("gpx", (), _begins(b"<")),
     ("tables", (".csv",), lambda _: True),
 )
-"""Module of each format, ends of its files' names, and whether a content has it; the first that
-has decides."""
+"""Module of each format, suffixes of its files' names, and a test of a content; the first
+successful test decides."""
 SUFFIXES = tuple(suffix for _, suffixes, _ in FORMATS for suffix in suffixes)
-"""Ends of the names of files with tracks."""
+"""Suffixes of the names of files with tracks."""
 
 
 def of(content: bytes) -> Format:
-    """Module of a content's format."""
+    """Module of the format of a file's content."""
     module = next(module for module, _, fits in FORMATS if fits(content))
     found: Any = import_module(f"{__name__}.{module}")
     return found

@@ -1,7 +1,7 @@
 """Files of other programs, read within bounds: zips, tables, JSON and XML.
 
-Each bound is checked before the work that it limits, since a small file can take much time and
-memory: a zip of 60 kB may have 60 MB of commas, of which a reader makes a text each.
+Each bound is checked before the work that it limits, because a small file can take much time and
+memory: a zip of 60 kB may contain 60 MB of commas, and a reader makes a text for each cell.
 """
 
 import csv
@@ -34,7 +34,7 @@ CHUNK_BYTES, TAG_BYTES_MAX = 1 << 16, 1 << 20
 
 
 UNREADABLE = (zipfile.BadZipFile, zlib.error, RuntimeError, NotImplementedError, EOFError)
-"""Exceptions that Python raises where a zip cannot be read."""
+"""Exceptions that Python raises if a zip cannot be read."""
 
 
 # -- zips -----------------------------------------------------------------------------------------
@@ -53,7 +53,7 @@ def names(content: bytes) -> list[str]:
 
 
 def _opened(content: bytes) -> zipfile.ZipFile:
-    if content.count(b"PK\1\2") > MEMBERS_MAX:  # each file in its list begins so
+    if content.count(b"PK\1\2") > MEMBERS_MAX:  # signature of each entry in the zip's directory
         raise ValueError(f"expected a zip of at most {MEMBERS_MAX} files")
     return zipfile.ZipFile(io.BytesIO(content))
 
@@ -62,11 +62,11 @@ def members(content: bytes, is_wanted: Callable[[str], bool], what: str) -> dict
     """Files in a zip, by name.
 
     Args:
-        is_wanted: whether a file of this name is to be read.
-        what: noun for these files, for messages.
+        is_wanted: returns whether to read a file of this name.
+        what: plural that names these files in messages.
 
     Raises:
-        ValueError: the zip cannot be read, has none of them, or is too large.
+        ValueError: the zip cannot be read, has no wanted file, or is too large.
     """
     try:
         with _opened(content) as archive:
@@ -84,13 +84,13 @@ def members(content: bytes, is_wanted: Callable[[str], bool], what: str) -> dict
 
 
 def _member(archive: zipfile.ZipFile, file: zipfile.ZipInfo) -> bytes:
-    """Content of a file in a zip, which may be longer than the zip says."""
+    """Content of a file in a zip; refused if it is longer than the zip states."""
     if file.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
         raise ValueError(f"{file.filename[:80]}: expected the compression deflate, or none")
     with archive.open(file) as member:
         content = member.read(file.file_size + 1)
     if len(content) > file.file_size:
-        raise ValueError(f"{file.filename[:80]}: expected no more than the zip says")
+        raise ValueError(f"{file.filename[:80]}: expected the size that the zip states")
     return content
 
 
@@ -98,14 +98,14 @@ def _member(archive: zipfile.ZipFile, file: zipfile.ZipInfo) -> bytes:
 
 
 def check_lines(tables: Mapping[str, bytes]) -> None:
-    """Refuse tables that have too many lines together by a ValueError."""
+    """Raise a ValueError if tables have too many lines in total."""
     lines = sum(max(each.count(b"\n"), each.count(b"\r")) for each in tables.values())
     if lines > LINES_MAX:
         raise ValueError(f"expected at most {LINES_MAX} lines, got {lines}")
 
 
 def rows(content: bytes) -> Iterator[tuple[int, list[str]]]:
-    """Rows of a CSV table that are not empty, each with the number of its line, from 1.
+    """Non-empty rows of a CSV table, each with the number of its line, from 1.
 
     Raises:
         ValueError: the table is invalid; the message names the fault and the line.
@@ -125,7 +125,7 @@ def rows(content: bytes) -> Iterator[tuple[int, list[str]]]:
             if each.count(",") >= COLUMNS_MAX:
                 raise ValueError(f"line {line}: expected at most {COLUMNS_MAX} columns")
             if line > begun + 1:
-                raise ValueError(f"line {begun + 1}: expected a row that ends with its line")
+                raise ValueError(f"line {begun + 1}: expected each row on a single line")
             yield each
 
     try:
@@ -144,7 +144,7 @@ def json_of(content: bytes) -> Any:
     """Value of a JSON text.
 
     Raises:
-        ValueError: it is invalid, too long, or nested too deeply.
+        ValueError: the text is invalid, too long, or nested too deeply.
     """
     parts = content.count(b"[") + content.count(b"{")
     if parts > PARTS_MAX:
@@ -156,13 +156,13 @@ def json_of(content: bytes) -> Any:
 
 
 class _Elements(ElementTree.TreeBuilder):
-    """Maker of a bounded tree without document types, and so without entities."""
+    """Builder of a bounded XML tree; it refuses document types, and so entities."""
 
     def __init__(self) -> None:
         super().__init__()
         self._count = 0
         self.has_come = False
-        """Whether anything has come since this was last set to False."""
+        """Whether any part has arrived since this was last set to False."""
 
     def start(self, tag: Any, attrs: Any, /) -> Any:
         self._count, self.has_come = self._count + 1 + len(attrs), True
@@ -182,8 +182,8 @@ def xml_of(content: bytes) -> ElementTree.Element:
     """Root of an XML text.
 
     Raises:
-        ValueError: it is invalid or too large, or has a document type; the message follows the
-            name of what is expected.
+        ValueError: it is invalid or too large, or has a document type; the message continues a text
+            such as "expected a GPX file".
     """
     made = _Elements()
     parser, silent = ElementTree.XMLParser(target=made), 0

@@ -1,12 +1,12 @@
 """DataFlash logs of ArduPilot (`.bin`): the track of one vehicle.
 
-A log describes itself: each message is 0xA3 0x95, its type, and a payload whose fields a message
-FMT (type 128) names. Places are those of POS, or else of GPS with a fix in space; altitudes are
-above the sea. Home is that of ORGN, or else the first place. Between messages, and after a cut
-one, bytes are skipped until the next message of a known type.
+A log describes itself: each message is 0xA3 0x95, its type, and a payload whose fields are named in
+a message FMT (type 128). Places are those of POS, or else of GPS with a fix in 3D; altitudes are
+above the sea. Home is that of ORGN, or else the first place. Between messages, and after an
+incomplete one, bytes are skipped until the next message of a known type.
 
-pymavlink's reader opens a file by its name, and prints a line for each byte that it skips; this
-one takes a content, in bounded time.
+pymavlink's reader needs a file's name, and prints a line for each skipped byte; this reader takes
+bytes, and bounded time.
 """
 
 from struct import Struct
@@ -23,7 +23,7 @@ HEAD = b"\xa3\x95"
 FMT, FMT_BYTES = 128, 89
 FIX_3D = 3
 HOME = 1
-"""Type of the place in a message ORGN that is home."""
+"""Type of a message ORGN whose place is home."""
 CODES = {
     **{code: code for code in "bBhHiIqQfd"},
     "c": "h",
@@ -38,15 +38,15 @@ CODES = {
     "Z": "64s",
     "a": "64s",
 }
-"""Codes of `struct` by those of a log."""
+"""Format codes of Python's `struct` by the log's codes of fields."""
 FACTORS = {"L": 1e-7, "c": 0.01, "C": 0.01, "e": 0.01, "E": 0.01}
-"""Factors of a field's number, by its code."""
+"""Factor from a field's number to its unit, by the field's code."""
 WANTED = {
     "POS": ("TimeUS", "Lng", "Lat", "Alt"),
     "GPS": ("TimeUS", "Lng", "Lat", "Alt", "Status"),
     "ORGN": ("Type", "Lng", "Lat", "Alt"),
 }
-"""Fields of the messages that are read."""
+"""Names of the fields to read, by message."""
 
 
 class _Fields:
@@ -109,7 +109,7 @@ def _messages(content: bytes) -> dict[str, list[list[Any]]]:
 
 
 def _format(content: bytes, at: int) -> tuple[int, int, _Fields | None]:
-    """Type and length of the messages that an FMT describes, and the reader of wanted ones."""
+    """Type and length of the messages that an FMT describes, and a reader if they are wanted."""
     of, size, name, codes, columns = Struct("<BB4s16s64s").unpack_from(content, at)
     title, named = (_text(each) for each in (name, codes))
     fields = _text(columns).split(",")

@@ -12,10 +12,10 @@ EARTH_M = 6_378_137.0
 """Equatorial radius of the earth, WGS 84 [m]."""
 METRES_MAX, DEGREES_MAX_M = 1e6, 1e5
 """Largest distance from the origin on each axis, for coordinates in metres and in degrees [m]. The
-latter is less because degrees are projected onto a plane."""
+latter is smaller because degrees are projected onto a plane."""
 Origin = tuple[float, ...]
-"""Latitude and longitude of a scenario's origin [degrees], and its altitude above the sea [m] if
-that is known; empty: not known."""
+"""Latitude and longitude of a scenario's origin [degrees], and, if known, its altitude above the
+sea [m]; empty: not known."""
 
 
 def check_origin(latitude: Any, longitude: Any, form: str) -> Origin:
@@ -32,8 +32,8 @@ def check_origin(latitude: Any, longitude: Any, form: str) -> Origin:
 
 
 def number(given: Any, key: str = "origin") -> float:
-    """Value of a member as a number; raises ValueError for a text, a truth value, NaN or anything
-    else.
+    """Value of a member as a number; raises ValueError for any other value, and for NaN and
+    booleans.
     """
     try:
         if isinstance(given, bool) or not isinstance(given, int | float) or math.isnan(given):
@@ -60,7 +60,7 @@ def coordinates(points: Any) -> Array:
 def local(degrees: Array, origin: Origin) -> Array:
     """Metres north and east of the origin, from longitude and latitude [degrees]; shape (n, 2).
 
-    A degree of longitude has its length at the mean of the two latitudes, as in ArduPilot.
+    The length of a degree of longitude is that at the mean of both latitudes, as in ArduPilot.
 
     Raises:
         ValueError: a coordinate is out of range, or the origin is not known.
@@ -93,9 +93,9 @@ def above_sea(places: Array, axes: int, origin: Origin | None, home: Origin = ()
 
     Args:
         places: longitude and latitude [degrees], and altitude [m]; shape (n, 3).
-        axes: number of axes asked for; with 2 the altitudes are ignored.
-        origin: the scenario's origin; (): not given; None: any.
-        home: origin of the file, and its altitude, for what the scenario does not give.
+        axes: number of axes to return; with 2 the altitudes are ignored.
+        origin: the scenario's origin; (): not given; None: not needed.
+        home: origin and altitude from the file, used where the scenario has none.
 
     Raises:
         ValueError: a coordinate is out of range, or origin or altitude are not known.

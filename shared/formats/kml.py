@@ -2,7 +2,7 @@
 
 Each `gx:Track`, or `gx:MultiTrack` with all its tracks, is a vehicle's path with times; in a file
 without them each `LineString` is one, followed at `reference.speed_mps`. Heights count if they are
-above the sea (`absolute`); clamped to the ground, which is KML's default, there are none.
+above the sea (`absolute`); KML's default is a path on the ground, without heights.
 """
 
 from array import array
@@ -27,7 +27,7 @@ CLAMPED = "clampToGround"
 class Path(NamedTuple):
     name: str
     mode: str
-    """What the heights refer to."""
+    """Reference of the heights: KML's altitudeMode."""
     places: Array
     """Longitude, latitude [degrees] and height [m]; shape (n, 3)."""
     times_ns: NDArray[np.int64] | None
@@ -100,7 +100,7 @@ def _track(name: str, tracks: list[Element]) -> Path:
         if len(whens) != len(coords):
             raise ValueError(f"expected as many times as places, got {len(whens)}, {len(coords)}")
         for when, coord in zip(whens, coords, strict=True):
-            if coord.strip():  # an empty one: the place was not known
+            if coord.strip():  # an empty entry: an unknown place
                 _append(numbers, coord.split())
                 times.append(moment_ns(when))
     return Path(name, _mode(tracks[0]), _shaped(numbers), np.array(times, dtype=np.int64))

@@ -5,8 +5,8 @@ because ping prints them in the user's language: an answer contains a round trip
 every packet a number, and a line with a number but no round trip is a lost packet. Windows prints
 no numbers: there each line between the first line and an empty one is a packet.
 
-A run is one call of ping. It ends with its summary, which counts the packets sent after the last
-answer too. A new run begins with ping's first line, with a number that is answered twice without
+A run is one call of ping. It ends with its summary, which also counts the packets sent after the
+last answer. A new run begins with ping's first line, with a number that is answered twice without
 the mark of a copy (`DUP!`), or with a number far below the previous one, unless icmp_seq, a number
 of 16 bits, has wrapped.
 """
@@ -28,15 +28,13 @@ EVERY_S = 1.0
 """Time between two packets in a log without times, summary and command line [s]."""
 WRAP = 65536
 NEAR = 1000
-"""Largest number of packets by which an answer is late, or that are lost where icmp_seq wraps."""
+"""Largest lateness of an answer [packets], and largest loss when icmp_seq wraps [packets]."""
 BACK_MAX_S = 10.0
-"""Largest step back of a log's times that counts as answers that overtook each other [s]."""
+"""Largest step back of a log's times that counts as reordering of answers [s]."""
 
 
 class LogError(ValueError):
-    """A log that contradicts itself; the message names the line, its content and the expected
-    content.
-    """
+    """Contradiction in a log; the message names the line, its content and the expected content."""
 
 
 @dataclass(slots=True)
@@ -45,7 +43,7 @@ class Run:
     """Number of the first packet; None if the log begins later."""
     numbered: bool = True
     peer: str = ""
-    """Host, in a log of fping."""
+    """Host of the run, in a log of fping."""
     trips: dict[int, tuple[float, float]] = field(default_factory=dict)
     """Time of the answer, or NaN, and round trip [s] by number; NaN for a packet without an
     answer."""
@@ -62,7 +60,7 @@ class Run:
         return min([self.last if self.first is None else self.first, *self.trips])
 
     def place(self, number: int) -> int | None:
-        """Number continued over wraps of icmp_seq; None if it belongs to a new run."""
+        """Packet number without wraps of icmp_seq; None if the packet belongs to a new run."""
         if self.last < 0:
             return number
         wrap = WRAP if number < WRAP else 0
@@ -100,7 +98,7 @@ class Log:
     run: Run | None = None
     """Run that the next line belongs to."""
     in_list: bool = False
-    """Whether every line is a packet, as in the output of Windows."""
+    """Whether every line describes a packet, as in the output of Windows."""
     every_s: float | None = None
     """Time between two packets of the newest command line [s]."""
 
@@ -150,7 +148,7 @@ class Log:
             return
         first = run.first if run.first is not None else int(time_ms is not None)
         answered, last = run.answered(), first + sent - 1
-        # If the log begins late, the answers before its first line are missing in it.
+        # A log that begins late lacks the answers before its first line.
         before = 0 if run.first is not None else max(min(run.trips, default=0) - first, 0)
         if last < run.last or came < answered:
             raise LogError(
@@ -160,7 +158,7 @@ class Log:
         if run.numbered and came - answered > before:
             raise LogError(
                 f"got a summary of {came} received, but {answered} answers above it, expected a "
-                "line for each packet: log without -q, and leave no line out"
+                "line for each packet: log without -q, and omit no line"
             )
         run.last = last
         if time_ms and sent > 1:
@@ -262,8 +260,8 @@ _TABLE: tuple[tuple[str, str, Callable[[Log, "re.Match[str]"], None]], ...] = (
     ("", r".", _other),
 )
 LINES = tuple((needle, re.compile(pattern), act) for needle, pattern, act in _TABLE)
-"""Kinds of lines, the first match applies: a substring for a quick check, the pattern, and the
-function that handles the line. Every pattern takes linear time."""
+"""Kinds of lines, of which the first match applies: a substring for a quick check, a pattern, and a
+function for such lines. Every pattern takes linear time."""
 _PACKET = re.compile(rf"\b(?:icmp_)?[sr]eq[= ]\d|: \[\d{{1,9}}\], |{_TIME}|^PING6?\b", re.MULTILINE)
 
 
@@ -272,7 +270,7 @@ def _number(text: str) -> float:
 
 
 def _trip_s(found: re.Match[str]) -> float:
-    """Round trip [s]; NaN without one, and half of the bound for `time<1ms`."""
+    """Round trip in a line [s]; NaN if the line has none, half of the bound for `time<1ms`."""
     if not found["ms"]:
         return nan
     return _number(found["ms"]) * 1e-3 * (0.5 if found["sign"] == "<" else 1.0)

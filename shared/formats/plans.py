@@ -1,7 +1,7 @@
 """Plans of QGroundControl (`.plan`): the geofence as zones, and the mission as a timed route.
 
 Coordinates are degrees; the scenario's origin is `reference.origin`, or else the planned home.
-Altitudes above home are taken as above the origin.
+Altitudes above home count as altitudes above the origin.
 """
 
 import math
@@ -36,16 +36,16 @@ FRAMES = {0: "above the sea", 3: "above home"}
 """MAV_FRAME of altitudes that can be flown."""
 MODE_FRAMES = {1: 3, 2: 0, 3: 0, 4: 10}
 """MAV_FRAME that QGroundControl gives an item, by its AltitudeMode: above home, above the sea,
-above the terrain (sent as above the sea), and above the terrain as the autopilot knows it."""
+above the terrain (sent as above the sea), and above the autopilot's own terrain data."""
 MULTICOPTERS, ROVERS = (None, 0, 2, 3, 4, 13, 14, 15, 29, 35), (10, 11)
-"""MAV_TYPE of vehicles that can stop at each place: in the air (or not given), and on the ground or
+"""MAV_TYPE of vehicles that can stop anywhere: in the air (None: not given), and on the ground or
 on water."""
 SCAN, SCANS = "TransectStyleComplexItem", ("survey", "CorridorScan")
 """Member with the simple items of a complex item, and the types of complex items that have it."""
 VERSIONS = {"plan": (1,), "mission": (2,), "geofence": (2,), SCAN: (1, 2)}
-"""Versions of a plan's parts that are read; a part without a version is taken as one of these."""
+"""Supported versions of a plan's parts; a part without a version counts as supported."""
 WRONG = (KeyError, TypeError, AttributeError, IndexError)
-"""Exceptions that Python raises where a file does not have the structure of a plan."""
+"""Exceptions that Python raises if a file does not have the structure of a plan."""
 
 
 class Home(NamedTuple):
@@ -53,10 +53,10 @@ class Home(NamedTuple):
 
     origin: Origin
     altitude_m: float | None
-    """Altitude of the origin above the sea, or else of the planned home [m]; None: not known."""
+    """Altitude above the sea of the origin, or else of the planned home [m]; None: unknown."""
 
     def local(self, latitude: Any, longitude: Any) -> Array:
-        """Metres north and east [m]; shape (2,)."""
+        """Position north and east of the origin [m]; shape (2,)."""
         place = np.array([[number(longitude, "longitude"), number(latitude, "latitude")]])
         return local(place, self.origin)[0]
 
@@ -96,7 +96,7 @@ def _polygon(part: Any, home: Home) -> Array:
 
 
 def _circle(part: Any, home: Home) -> Array:
-    """Corners around a circle to keep out of, or within a circle to stay within."""
+    """Corners of a polygon around an exclusion circle, or within an inclusion circle."""
     centre = home.local(*part["circle"]["center"])
     radius = number(part["circle"]["radius"], "radius")
     if not 0.0 < radius <= METRES_MAX:
@@ -129,10 +129,10 @@ def _fence(plan: dict[str, Any]) -> dict[str, list[Any]]:
 def route(content: bytes, axes: int, origin: Origin) -> tuple[Array, Array]:
     """Mission of a plan for one vehicle: times [s; shape (n,)] and places [m; shape (n, axes)].
 
-    The vehicle flies straight from place to place, at the plan's speed, and holds where an item
-    says so. It starts above the planned home at the altitude of the plan's take-off, as an
-    autopilot's own take-off leaves it, and ends above the place where it would land. A plan that
-    begins with another item starts on the ground; a later take-off is straight up.
+    The vehicle flies straight from place to place, at the plan's speed, and holds at items with a
+    hold time. It starts above the planned home at the altitude of the plan's take-off, as after an
+    autopilot's own take-off, and ends above the place where it would land. A plan that begins with
+    another item starts on the ground; a later take-off is straight up.
 
     Raises:
         ValueError: the file is not a plan, or an item cannot be flown; the message names it.
@@ -155,8 +155,8 @@ def along(
 
     Args:
         items: simple items, as in a plan.
-        start: place above which the first take-off is [m]; shape (3,).
-        speed_mps: speed before an item that changes it; `key` is its name for messages.
+        start: place of the first take-off, which is vertical [m]; shape (3,).
+        speed_mps: speed until an item changes it; `key`: its name in messages.
 
     Raises:
         ValueError: an item cannot be flown; the message names it.
@@ -206,7 +206,7 @@ def _speed_key(kind: Any) -> str:
 
 
 def _items(items: list[Any]) -> Iterator[Any]:
-    """Items of a mission, with the simple items of a survey or corridor scan in its place."""
+    """Items of a mission; a survey or corridor scan is replaced by its simple items."""
     for item in items:
         scan = item.get(SCAN) if isinstance(item, dict) else None
         inner = scan.get("Items") if isinstance(scan, dict) else None
@@ -215,7 +215,7 @@ def _items(items: list[Any]) -> Iterator[Any]:
 
 
 def _check_kind(item: dict[str, Any]) -> None:
-    """Refuse an item that is not simple by a ValueError."""
+    """Raise a ValueError if an item is not simple."""
     if item.get("type") == "SimpleItem":
         return
     kind, scan = str(item.get("complexItemType"))[:40], item.get(SCAN)
@@ -228,7 +228,7 @@ def _check_kind(item: dict[str, Any]) -> None:
 
 
 def _check_version(part: str, table: dict[str, Any]) -> None:
-    """Refuse a part of a plan of an unknown version by a ValueError."""
+    """Raise a ValueError if a part of a plan has an unknown version."""
     versions = VERSIONS[part]
     if (version := table.get("version", versions[0])) not in versions:
         expected = " or ".join(map(str, versions))
@@ -246,7 +246,7 @@ def _hold_s(command: int, params: list[Any]) -> float:
 
 
 def _speed(params: list[Any], before_mps: float) -> float:
-    """Speed after an item that changes it [m/s]; -1 and -2 leave it as it is."""
+    """Speed after an item that changes it [m/s]; the values -1 and -2 do not change it."""
     if params[0] not in (0, 1):
         raise ValueError(f"expected a speed over ground or in the air, got type {params[0]}")
     speed_mps = number(params[1], "speed")
@@ -275,13 +275,13 @@ def _place(
         if (belongs := MODE_FRAMES.get(mode := item.get("AltitudeMode"), frame)) != frame:
             raise ValueError(f"expected frame {belongs} with AltitudeMode {mode}, got {frame}")
         if frame == 0 and home.altitude_m is None:
-            raise ValueError("an altitude above home, for the home's above the sea is not known")
+            raise ValueError("an altitude above home: home's altitude above the sea is unknown")
         place[2] = number(params[6], "altitude") - ((home.altitude_m or 0.0) if frame == 0 else 0.0)
     return within(place, METRES_MAX)
 
 
 def _expected(content: bytes, origin: Origin) -> tuple[dict[str, Any], Home]:
-    """A plan as `_plan` reads it; the message of its ValueError is a sentence of its own."""
+    """Result of `_plan`; the message of its ValueError is a complete sentence."""
     try:
         return _plan(content, origin)
     except ValueError as error:

@@ -1,12 +1,12 @@
 """Recorded paths: files of measured delays, in one of several formats.
 
-- CSV with a line of names: a column of times, one of delays or round trips, and maybe `lost`
+- CSV with a line of names: a column of times, one of delays or round trips, and optionally `lost`
 (`_TIMES`, `_DELAYS`). `skytether probe` writes this format, with `time_s,delay_s,lost`.
 - Logs of ping and similar programs (`pings`).
 - The JSON that `irtt client -o` writes, gzipped or not.
 
-Each becomes rows of a time, and a delay or NaN; `_checked` turns these into a path. Half of a round
-trip is used for each direction, and a packet without an answer is lost in both.
+Each is read as rows of a time and a delay or NaN, which `_checked` converts to a path. Half of a
+round trip is used for each direction, and a packet without an answer is lost in both.
 """
 
 import re
@@ -50,7 +50,7 @@ class RecordedPath:
     lost: Flags
     halved: bool = False
     copies: int = 0
-    """Number of further answers to a packet, if the file lists them."""
+    """Number of duplicate answers, if the file lists them."""
     begin_s: float = 0.0
     """Time of the first packet on the file's own clock [s]."""
 
@@ -60,12 +60,12 @@ def recorded_in(file: File, way: Way = "auto") -> RecordedPath:
     """Path recorded in a file.
 
     Args:
-        file: its name and content.
+        file: name and content of the file.
         way: for a file of irtt, the delay from client to server (send) or back (receive), which
             needs synchronised clocks; auto: half of the round trip.
 
     Raises:
-        ValueError: the file has no delays, or they contradict each other.
+        ValueError: the file has no delays, or contradictory ones.
     """
     try:
         text = text_in(file)
@@ -97,7 +97,7 @@ def text_in(file: File) -> str:
             raise ValueError(f"cannot be read: {error}") from None
         if not unzip.eof or unzip.unused_data:
             raise ValueError(
-                f"got a cut file, several, or more than {TEXT_BYTES_MAX} bytes unzipped"
+                f"got a truncated file, several, or more than {TEXT_BYTES_MAX} bytes unzipped"
             )
     if content[:4] in CAPTURES:
         raise ValueError("got a capture of packets, expected a log")
@@ -109,7 +109,7 @@ def text_in(file: File) -> str:
     except ValueError:
         text = content.decode("latin-1")
     if "\0" in text:
-        raise ValueError("cannot be read: got bytes of 0, expected text")
+        raise ValueError("cannot be read: got NUL bytes, expected text")
     if not text.strip():
         raise ValueError("got an empty file, expected delays, see docs/network.md")
     return text
@@ -119,7 +119,7 @@ def text_in(file: File) -> str:
 
 _TIMES = ("time", "sent", "timestamp", "t")
 _DELAYS = {"delay": 1.0, "rtt": 0.5}
-"""Names of columns, without their unit, and the factor from a delay to a one-way delay."""
+"""Names of columns of delays, without units, and the factor to a one-way delay."""
 _UNITS = {"s": 1.0, "sec": 1.0, "ms": 1e-3, "msec": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9}
 _NAME = re.compile(r"([a-z]+)(?:[ _]?[\[(]?(s|sec|ms|msec|us|µs|ns)[\])]?)?", re.IGNORECASE)
 
@@ -158,7 +158,7 @@ def _cell(word: str) -> float:
 
 
 def _wrong_cell(text: str, columns: Sequence[int], delimiter: str) -> str:
-    """The first line without a number in a column that needs one."""
+    """Message for the first line without a number in a column that needs one."""
     for number, line in enumerate(StringIO(text), 1):
         cells = line.rstrip("\r\n").split(delimiter)
         if number == 1 or not line.strip():
@@ -205,9 +205,7 @@ def _of_csv(text: str) -> RecordedPath:
 
 
 def _unit_of_times(times: Array, name: str) -> float:
-    """Unit of a column of times without a unit: that of times since 1970
-    follows from their size.
-    """
+    """Unit of a column of times without a unit; that of times since 1970 follows from size."""
     largest = float(np.nanmax(times, initial=0.0))
     for least, unit in ((1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3), (1e8, 1.0)):
         if largest >= least:
@@ -254,15 +252,14 @@ class _Trip(msgspec.Struct):
 
 
 class _Irtt(msgspec.Struct):
-    """Part of irtt's JSON that is used; the rest is not stored."""
+    """Members of irtt's JSON that are read; the others are ignored."""
 
     round_trips: list[_Trip]
 
 
 _LOST = (np.nan, np.nan)
 CLOCKS_S = 1e-3
-"""Largest error of a one-way delay of irtt that may come from measurement alone, not from clocks
-[s]."""
+"""Largest measurement error of irtt's one-way delays; a larger error is one of the clocks [s]."""
 
 
 def _of_irtt(text: str, way: Way) -> RecordedPath:
@@ -334,7 +331,7 @@ def _checked(
     apart_s = np.diff(time_s)
     if (apart_s <= 0.0).any():
         if float(np.median(apart_s)) <= 0.0:
-            raise ValueError("got one time for most rows, expected times that tell packets apart")
+            raise ValueError("got equal times in most rows, expected a time for each packet")
         shift_s = TIE_S * np.arange(len(time_s))
         time_s = np.maximum.accumulate(time_s - shift_s) + shift_s
     came = ~lost

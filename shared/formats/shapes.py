@@ -16,13 +16,13 @@ def csv(scenario: Scenario) -> Reference:
 
 @REFERENCES
 def mission(scenario: Scenario) -> Reference:
-    """Mission with timed goals from `file`, at each of which a vehicle rests."""
+    """Mission with timed goals from `file`; a vehicle rests at each goal."""
     return _mission(scenario, is_show=False)
 
 
 @REFERENCES
 def show(scenario: Scenario) -> Reference:
-    """Mission of timed paths from `file`: each point is reached at its time, and not after it."""
+    """Mission of timed paths from `file`: each point is reached exactly at its time."""
     return _mission(scenario, is_show=True)
 
 

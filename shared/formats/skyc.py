@@ -2,10 +2,10 @@
 
 `show.json` lists the vehicles. A trajectory, in it or in a file that it names by `$ref`, has
 `takeoffTime` [s] and points [time after take-off [s], place [m], control points [m]]: from the
-point before, the vehicle flies along the Bézier curve of the control points, or straight without
-any. Until its take-off it waits at its first point.
+previous point, the vehicle flies along the Bézier curve of the control points, or straight if there
+are none. Until its take-off it waits at its first point.
 
-Coordinates are flown as they are. Source: `show/trajectory.py` of Skybrush's server.
+Coordinates are used without conversion. Source: `show/trajectory.py` of Skybrush's server.
 """
 
 from math import comb
@@ -22,7 +22,7 @@ SHOW = "show.json"
 CONTROLS_MAX = 6
 """Largest number of control points of a curve: Skybrush has up to degree 7."""
 WRONG = (KeyError, TypeError, AttributeError, IndexError)
-"""Exceptions that Python raises where a file does not have the structure of a show."""
+"""Exceptions that Python raises if a file does not have the structure of a show."""
 
 
 def tracks(content: bytes, axes: int, _: Origin | None, __: float) -> Tracks:
@@ -59,7 +59,7 @@ def _drones(files: dict[str, bytes]) -> list[Any]:
 
 
 def _trajectory(files: dict[str, bytes], drone: Any) -> dict[str, Any]:
-    """Trajectory of a drone, in the show's file or in one of its own."""
+    """Trajectory of a drone, from the show's file or from a separate file."""
     trajectory = drone["settings"]["trajectory"]
     if "$ref" in trajectory:
         name = trajectory["$ref"].partition("#")[0].removeprefix("./")
@@ -107,7 +107,7 @@ def _places(points: list[Any]) -> Array:
 
 
 def _bezier(controls: Array, share: Array) -> Array:
-    """Points of a Bézier curve at shares of its length in time; shape (len(share), 3)."""
+    """Points of a Bézier curve at shares of its duration; shape (len(share), 3)."""
     degree = len(controls) - 1
     powers = np.arange(degree + 1)
     factors = np.array([comb(degree, each) for each in powers])

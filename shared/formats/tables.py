@@ -1,4 +1,4 @@
-"""CSV tables of one or several vehicles, and zips or folders of tables with a vehicle each.
+"""CSV tables of one or several vehicles, and zips or folders with a table for each vehicle.
 
 | columns | content |
 |---|---|
@@ -34,7 +34,7 @@ DEGREE = 7
 
 
 class TableForm(NamedTuple):
-    """Columns of a table, and what makes metres north, east and up of its coordinates."""
+    """Columns of a table, and the conversion of its coordinates to metres north, east and up."""
 
     columns: tuple[str, str, str, str]
     """Time and three coordinates, the last for flights with three axes."""
@@ -52,8 +52,8 @@ def _from_ned(coordinates: Array, _: Origin | None) -> Array:
 
 
 def _from_globe(coordinates: Array, origin: Origin | None) -> Array:
-    """Metres from the origin. Altitudes are above the sea if the origin's altitude is known, and
-    otherwise above the origin, and then the lowest is 0.
+    """Metres from the origin. Altitudes are above the sea if the origin's altitude is known;
+    otherwise they are above the origin, and the lowest is 0.
     """
     heights_m, zero_m = coordinates[:, 2:], 0.0
     if origin is None:
@@ -87,7 +87,7 @@ def axes_of(content: bytes) -> int:
 
 
 def _table(content: bytes, axes: int, origin: Origin | None) -> Tracks:
-    """Tracks in a table, with a column `vehicle` or of one vehicle."""
+    """Tracks in a table of one vehicle, or of several with a column `vehicle`."""
     header = _header(content)
     if "duration" in header:
         return {1: _polynomials(content, axes)}
@@ -163,12 +163,12 @@ def _members(content: bytes) -> dict[str, bytes]:
 
 
 def _is_table(name: str) -> bool:
-    """Whether it is a CSV file, and not a copy of its attributes by macOS."""
+    """Whether a file is CSV, and not a file of attributes added by macOS."""
     return name.lower().endswith(".csv") and not name.rpartition("/")[2].startswith("._")
 
 
 def _natural(name: str) -> list[tuple[int, str]]:
-    """Key by which drone 2 comes before drone 10."""
+    """Key for natural order: drone 2 comes before drone 10."""
     parts = re.split(r"(\d+)", name)
     return [(int(part), "") if part.isdecimal() else (0, part) for part in parts]
 
@@ -185,7 +185,7 @@ def _names(header: Iterable[str]) -> list[str]:
 
 
 def _check_times(times_s: Array, lines: Indices) -> None:
-    """Refuse times in a table that do not start at 0, or do not rise, by a ValueError."""
+    """Raise a ValueError if times in a table do not start at 0 or do not rise."""
     if times_s[0] != 0.0:
         raise ValueError(f"line {lines[0]}: expected t = 0 as the first time, got {times_s[0]:g}")
     for i in np.flatnonzero(np.diff(times_s) <= 0.0)[:1]:

@@ -22,15 +22,15 @@ class Line(NamedTuple):
     """Points of one vehicle."""
 
     name: str
-    """What the file calls it, for messages."""
+    """Name of the vehicle in the file, for messages."""
     points_m: Array
     """Points [m]; shape (n, axes)."""
     times_ns: NDArray[np.int64] | None
-    """Times by the file's clock [ns]; shape (n,); None if it has none."""
+    """Times by the file's clock [ns]; shape (n,); None if the points have no times."""
 
 
 def moment_ns(text: str) -> int:
-    """Time since 1970 of a text in ISO 8601 [ns]; raises ValueError if it is none."""
+    """Time since 1970 of a text in ISO 8601 [ns]; raises ValueError if it is invalid."""
     match = _TIME.fullmatch(text.strip())
     if match is None:
         raise ValueError(f"expected a time such as 2026-05-01T12:00:00Z, got {text.strip()[:40]!r}")
@@ -40,13 +40,13 @@ def moment_ns(text: str) -> int:
 
 
 def together(lines: Iterable[Line], speed_mps: float) -> Tracks:
-    """Tracks of the vehicles of a file, numbered from 1 in its order.
+    """Tracks of the vehicles of a file, numbered from 1 in the order of the file.
 
     All times count from the earliest of the file; a vehicle that begins later waits at its first
-    point. A line without times is followed at a speed. Of points at the same time the first counts.
+    point. A line without times is followed at a speed. Of points at one time only the first counts.
 
     Raises:
-        ValueError: there are too many points, or times that fall.
+        ValueError: there are too many points, or decreasing times.
     """
     lines = list(lines)
     if sum(len(line.points_m) for line in lines) > POINTS_MAX:

@@ -14,12 +14,12 @@ from skytether.shared.scenario.points import timed_path
 from skytether.shared.scenario.reference import FAR_M, Reference
 
 
-@lru_cache(maxsize=2)  # each vehicle's reference needs them
+@lru_cache(maxsize=2)  # cached, because each vehicle's reference uses them
 def tracks(content: bytes, axes: int, origin: Origin | None = (), speed_mps: float = 1.0) -> Tracks:
     """Tracks in a file, in one of the formats of `formats.FORMATS`.
 
     Args:
-        origin: the scenario's origin; (): that of the file, if it has one; None: any.
+        origin: the scenario's origin; (): that of the file, if it has one; None: not needed.
         speed_mps: speed between the places of a file without times [m/s].
 
     Raises:
@@ -49,7 +49,7 @@ def path(content: bytes, axes: int, origin: Origin = (), speed_mps: float = 1.0)
 
 
 def lasts_s(content: bytes, axes: int, speed_mps: float = 1.0) -> float:
-    """Time of the last point in a file, wherever the scenario's origin is [s].
+    """Time of the last point in a file, for any origin of the scenario [s].
 
     Raises:
         ValueError: the file is invalid; the message names the fault and its place.

@@ -1,8 +1,8 @@
 """ULog of PX4 (`.ulg`): the track of one vehicle.
 
 Places are those of `vehicle_global_position`, with altitudes above the sea; home is the first
-`home_position`, or else the first place. A log without them has `vehicle_local_position`, in metres
-from where the estimator began.
+`home_position`, or else the first place. In a log without them, places are those of
+`vehicle_local_position`, in metres from the estimator's start.
 """
 
 import contextlib
@@ -20,12 +20,12 @@ from skytether.shared.law.model import Array
 
 GLOBAL, LOCAL, HOME = "vehicle_global_position", "vehicle_local_position", "home_position"
 READS_MAX, READS_LEAST, MESSAGE_BYTES = 4_000_000, 1000, 8
-"""Largest number of reads from a log, and bounds for a short one: two reads a message of at least
-so many bytes. In some damaged logs pyulog seeks back for ever."""
+"""Largest number of reads of a log, least such limit, and smallest message [B], for two reads per
+message. The limit ends pyulog's endless loop in some damaged logs."""
 
 
 class _Content(io.BytesIO):
-    """Content of a log, which can be read so many times and no more."""
+    """Content of a log with a limited number of reads."""
 
     def __init__(self, content: bytes) -> None:
         super().__init__(content)
@@ -70,16 +70,16 @@ def _times_ns(message: Any) -> NDArray[np.int64]:
 
 
 def _messages(content: bytes) -> dict[str, Any]:
-    """Fields of the wanted messages that the log has, by the message's name: an array each."""
+    """Fields of the wanted messages of a log, by the message's name; each field is an array."""
     with extras.named():
         from pyulog import ULog
     try:
-        with contextlib.redirect_stdout(io.StringIO()):  # it prints what it skips
+        with contextlib.redirect_stdout(io.StringIO()):  # pyulog prints skipped data
             log = ULog(_Content(content), [GLOBAL, LOCAL, HOME])
     except EOFError:
         most = f"of at most {READS_MAX // 2} messages"
         raise ValueError(f"expected a ULog {most}, or one without damage") from None
-    except Exception as error:  # it raises many kinds
+    except Exception as error:  # pyulog raises many kinds
         raise ValueError(f"expected a ULog ({type(error).__name__}: {error})") from None
     return {
         each.name: each.data

@@ -1,8 +1,8 @@
 """Waypoints of Mission Planner and QGroundControl (`QGC WPL 110`): the mission of one vehicle.
 
 Each line is an item: its index, whether it is the current one, frame, command, four parameters,
-latitude, longitude, altitude, and whether the next follows by itself. Item 0 is home. Items are
-flown as those of a plan (`plans.along`), at `reference.speed_mps` until one changes the speed.
+latitude, longitude, altitude, and whether to continue automatically. Item 0 is home. Items are
+flown as those of a plan (`plans.along`), at `reference.speed_mps` until an item changes the speed.
 """
 
 from typing import Any

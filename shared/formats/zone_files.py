@@ -44,7 +44,7 @@ def geojson(file: File) -> list[Zone]:
     for zone in _features(file.name.rpartition("/")[2], collection, file.origin):
         zones.append(zone)
         corners += len(zone.corners)
-        if corners > CORNERS_MAX:  # checking a ring takes quadratic time
+        if corners > CORNERS_MAX:  # bounded first, because checking a ring takes quadratic time
             raise ValueError(f"a GeoJSON file of at most {CORNERS_MAX} corners")
     if not zones:
         raise ValueError("a GeoJSON file with a Polygon, a MultiPolygon or a Point in it")
@@ -55,7 +55,7 @@ def kml(file: File, *, is_fence: bool) -> list[Zone]:
     """Zones of the polygons in a KML file; holes are treated as in `geojson`.
 
     Raises:
-        ValueError: it is not a KML file.
+        ValueError: the file is not KML.
         GrammarError: a placemark is invalid; the message names it and the expected form.
     """
     root = kml_root(file.content)
@@ -76,7 +76,7 @@ def kml(file: File, *, is_fence: bool) -> list[Zone]:
 
 
 def kml_root(content: bytes) -> ElementTree.Element:
-    """Root of a KML file, or of that in a KMZ; raises ValueError if it is none."""
+    """Root of a KML file, or of the one in a KMZ; raises ValueError if the content is neither."""
     if bounded.is_zip(content):
         content, *_ = bounded.members(content, _is_kml, "a KML file").values()
     try:
@@ -84,7 +84,7 @@ def kml_root(content: bytes) -> ElementTree.Element:
     except ValueError as error:
         raise ValueError(f"a KML file {error}") from None
     if next(_tagged(root, "NetworkLink"), None) is not None:
-        raise ValueError("a KML file without links to others")
+        raise ValueError("a KML file without links to other files")
     return root
 
 
@@ -131,7 +131,7 @@ def _below(element: ElementTree.Element, tag: str) -> Iterator[ElementTree.Eleme
     """Elements with a tag, of any namespace, below an element.
 
     Raises:
-        ValueError: one is within another; searching them would take quadratic time.
+        ValueError: such an element contains another; searching would take quadratic time.
     """
     for found in _tagged(element, tag):
         if next(islice(_tagged(found, tag), 1, None), None) is not None:
@@ -151,10 +151,9 @@ def _features(file: str, collection: Any, origin: Origin) -> Iterator[Zone]:
     """Zones of a FeatureCollection.
 
     Coordinates are degrees as in RFC 7946; the scenario's origin is `reference.origin`, or the
-    collection's member `origin` (longitude and latitude). Instead, a member `"units": "m"` makes
-    coordinates metres.
-    Properties of a feature may be `kind` ("keep_out" or "fence"), `low_m`, `high_m`, and `radius_m`
-    for a Point.
+    collection's member `origin` (longitude and latitude). With a member `"units": "m"` the
+    coordinates are metres. Properties of a feature may be `kind` ("keep_out" or "fence"), `low_m`,
+    `high_m`, and `radius_m` for a Point.
 
     Raises:
         ValueError: the collection is invalid, or too large.
@@ -170,7 +169,7 @@ def _features(file: str, collection: Any, origin: Origin) -> Iterator[Zone]:
                 yield zone
                 corners += len(zone.corners)
                 if corners > CORNERS_MAX:
-                    return  # `geojson` raises
+                    return  # `geojson` raises the error
         except (KeyError, TypeError, AttributeError, IndexError, ValueError) as error:
             said = isinstance(error, ValueError)
             expected = str(error) if said else "a feature with a geometry, as RFC 7946 has it"
@@ -181,14 +180,14 @@ def _frame(collection: dict[str, Any], given: Origin) -> Frame:
     """Function from coordinates to metres north and east of the scenario's origin.
 
     Args:
-        known: `reference.origin`, which counts more than the collection's member.
+        known: `reference.origin`, which takes precedence over the collection's member.
 
     Raises:
         ValueError: the unit or the origin of the coordinates is missing or invalid.
     """
     crs, units, origin = collection.get("crs"), collection.get("units"), collection.get("origin")
     if crs not in (None, CRS84):
-        raise ValueError(f"no crs, for RFC 7946 has degrees of WGS 84, got {str(crs)[:80]}")
+        raise ValueError(f"no crs: RFC 7946 uses degrees of WGS 84, got {str(crs)[:80]}")
     if units not in (None, "m"):
         raise ValueError(f'"units": "m" or none, got {str(units)[:80]!r}')
     if units is not None and origin is not None:
@@ -241,8 +240,8 @@ def _feature(file: str, i: int, feature: Any, placed: Frame) -> Iterator[Zone]:
     if not (isinstance(parts, list) and parts and all(parts)):
         raise ValueError("coordinates, got none")
     for rings in parts:
-        # A hole in a fence is a zone to keep out of. Other holes are ignored: they cannot be
-        # entered.
+        # A hole in a fence is a zone to keep out of. Holes in other zones are ignored: no vehicle
+        # can enter them.
         if len(rings) > 1 and not is_fence:
             zone = zone._replace(name=f"{zone.name}, with its holes")
         for hole, points in enumerate(rings if is_fence else rings[:1]):

@@ -16,7 +16,7 @@ def geojson(file: File) -> list[Zone]:
 
 @ZONES
 def kml(file: File, kind: Literal["keep_out", "fence"] = "keep_out") -> list[Zone]:
-    """Polygons of a KML file, to keep out of, or to stay within each of them."""
+    """Polygons of a KML file; vehicles keep out of all, or stay within all, by `kind`."""
     return zone_files.kml(file, is_fence=kind == "fence")
 
 

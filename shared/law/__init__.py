@@ -1,3 +1,1 @@
-"""Model and rules with which both ends predict: eq. (1)-(4), rule of flight,
-eq. (11), and terms.
-"""
+"""Model and rules for predictions at both ends: eq. (1)-(4), rule of flight, eq. (11), terms."""

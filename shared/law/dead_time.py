@@ -1,7 +1,7 @@
 """Dead time: an input issued at the time t acts from t + θ on.
 
 θ = n Δt + r: n whole steps, and a remainder r shorter than a step. So two inputs act within a step:
-for the time r that of n + 1 steps ago, then that of n steps ago:
+first, for the time r, the input of n + 1 steps ago, then the input of n steps ago:
 
     x(k+1) = A x(k) + B u(k-n) + L (u(k-n-1) - u(k-n))          L = B - B(Δt - r)
 
@@ -12,7 +12,7 @@ takes effect:
     z(k) = x at k Δt + θ             z(k+1) = A z(k) + B u(k), which is eq. (4)
 
 exactly, for any θ. So a vehicle uses z in its feedback and its observations, and the server plans
-for z, along the desired trajectory at k Δt + θ. Each axis has a dead time of its own.
+for z, along the desired trajectory at k Δt + θ. Each axis has its own dead time.
 """
 
 from collections import deque
@@ -31,7 +31,7 @@ class DeadTime(NamedTuple):
     rest: Axis | None
     """Model over the remainder r, eq. (4) with r for Δt; None without a remainder."""
     late: tuple[float, float]
-    """L, for position [s] and velocity; 0 without a remainder."""
+    """Matrix L, for position [s] and velocity; 0 without a remainder."""
 
 
 def dead_time(tau_s: float, dead_time_s: float, dt_ns: int, gain: float = 1.0) -> DeadTime:
@@ -39,7 +39,7 @@ def dead_time(tau_s: float, dead_time_s: float, dt_ns: int, gain: float = 1.0) -
     steps, rest_ns = divmod(seconds_to_ns(dead_time_s), dt_ns)
     if not rest_ns:
         return DeadTime(steps, None, (0.0, 0.0))
-    # B is not linear in time, so B(Δt - r) is discretised by itself, not taken as a share of B.
+    # B is not linear in time, so B(Δt - r) is discretised separately, not as a share of B.
     times_s = (dt_ns / SECOND_NS, (dt_ns - rest_ns) / SECOND_NS, rest_ns / SECOND_NS)
     whole, after, rest = (discretise([tau_s], time_s, gain).axes()[0] for time_s in times_s)
     return DeadTime(steps, rest, (whole.b0 - after.b0, whole.b1 - after.b1))
@@ -51,13 +51,13 @@ def dead_times(terms: Terms) -> list[DeadTime]:
 
 
 class PendingInputs:
-    """Inputs that one vehicle has issued and that still act; the arguments
-    have one item per axis.
+    """Inputs that one vehicle has issued and that still act or will act; the arguments have one
+    item per axis.
     """
 
     def __init__(self, model: Sequence[Axis], dead_times: Sequence[DeadTime]) -> None:
         self._axes = list(zip(model, dead_times, strict=True))
-        # n + 2 inputs: from the newest, which does not act yet, back to that of n + 1 steps ago,
+        # n + 2 inputs: from the newest, which does not act yet, back to the one of n + 1 steps ago,
         # which still acts for r.
         self._issued = [
             deque([0.0] * (axis_dead_time.steps + 2), axis_dead_time.steps + 2)
@@ -70,9 +70,9 @@ class PendingInputs:
         """Issue the input of a step, of each axis [m/s].
 
         Returns:
-            input acting at the end of this step on each axis [m/s]; and the input acting at its
-                start, for the remainder r, minus the former [m/s], None without a remainder on
-                any axis.
+            input acting at the end of this step on each axis [m/s]; and its difference from the
+                input acting at the step's start, for the remainder r [m/s], None without a
+                remainder on any axis.
         """
         for issued, u in zip(self._issued, command.tolist(), strict=True):
             issued.append(u)
@@ -87,12 +87,12 @@ class PendingInputs:
         Args:
             known: state at the end of the step whose input was issued last [m, m/s]; shape
                 (axes, 2).
-            disturbance: disturbance of each axis meanwhile, as an input [m/s].
+            disturbance: disturbance of each axis until then, as an input [m/s].
         """
         predicted = []
         axes = zip(self._axes, self._issued, states.tolist(), disturbance.tolist(), strict=True)
         for (model, late), issued, (p, v), w in axes:
-            # The input of n + 1 steps ago has ceased to act by the end of this step.
+            # The input of n + 1 steps ago no longer acts at the end of this step.
             inputs = iter(issued)
             next(inputs)
             first = next(inputs)

@@ -1,9 +1,9 @@
-"""Heartbeats: how long one end may be silent, as requested by the other end.
+"""Heartbeats: the longest silence of one end, as requested by the other end.
 
-Each end considers the other as gone after a time-out of its own, and measures the loss from the
-numbers of the packets that arrive. So each packet of a session has a number, and carries the
-longest silence that its sender allows the receiver. Any packet counts as a heartbeat; if there is
-nothing else to send, one is sent after that silence.
+Each end considers the other as gone after its own time-out, and measures the loss from the numbers
+of the packets that arrive. So each packet of a session has a number, and carries the longest
+silence that its sender allows the receiver. Any packet counts as a heartbeat; an end with nothing
+else to send sends one after that silence.
 
 With a packet every T, and n of them within the time-out, a working link is mistaken for lost
 
@@ -36,10 +36,10 @@ SILENCE_MAX = 2**16 - 1
 SESSION_NS = 30 * SECOND_NS
 """Silence after which the server forgets a vehicle."""
 RARE_TIMES = 2
-"""Longest silence between a vehicle and a server that it does not follow, as a multiple of the
-time-out; SESSION_NS bounds it."""
-# Three were worse: the observations from which plans were made became so old that at 30 % loss 5 of
-# 30 flights of `target` braked before a newer plan came; with two, none.
+"""Longest silence between a vehicle and a server that does not lead it, as a multiple of the
+time-out; bounded by SESSION_NS."""
+# At 30 % loss, no flight of `target` braked with the value 2. With 3, 5 of 30 flights braked,
+# because plans were made from observations that were too old.
 PATIENCE = 2
 """Server's time-out for a vehicle, as a multiple of the vehicle's own time-out."""
 
@@ -53,20 +53,20 @@ def false_per_h(silence_ns: int, timeout_ns: int, loss: float) -> float:
         loss: share of packets lost, independently.
     """
     n = int(TIMEOUT_SHARE * timeout_ns) // silence_ns
-    most = n / (n + 1)  # more loss gives fewer, but longer losses of the link
+    most = n / (n + 1)  # with more loss, the link is lost less often, but for longer
     loss = min(loss, most)
     return 3600 * SECOND_NS / silence_ns * loss**n * (1.0 - loss)
 
 
 @lru_cache
 def silences(timeout_ns: int, step_ns: int) -> tuple[tuple[float, int], ...]:
-    """Possible silences: the largest loss for which each is short enough, and the silence [ns].
+    """Possible silences [ns], each with the largest loss for which it is short enough.
 
     The longest comes first, shorter ones follow with increasing loss; the last is for any loss.
     """
     fewest, most = -(-timeout_ns // (MOST * step_ns)), timeout_ns // (FEWEST * step_ns)
     counts = range(max(most, 1), max(fewest, 1) - 1, -1) or (1,)
-    # A table, computed once: each packet then costs only a bisection.
+    # A table, computed once, so that each packet takes only a bisection.
     grid = [i / 1000 for i in range(1001)]
     table: list[tuple[float, int]] = []
     for count in counts:
@@ -80,23 +80,23 @@ def silences(timeout_ns: int, step_ns: int) -> tuple[tuple[float, int], ...]:
 
 
 class Hearing:
-    """Reception statistics of one end: the packets that arrived, and the silence to allow the other
-    end.
+    """Reception statistics of one end: the arrived packets, and the silence that the other end may
+    keep.
 
     Args:
         timeout_ns: time without a packet after which the other end counts as gone [ns].
         step_ns: length of a step, the resolution of heartbeats [ns].
-        fixed_ns: silence to allow whatever the loss [ns]; None to follow the loss.
+        fixed_ns: silence to allow at any loss [ns]; None: depends on the measured loss.
     """
 
     def __init__(self, timeout_ns: int, step_ns: int, fixed_ns: int | None) -> None:
         self._fixed_ns, self._half_step_ns = fixed_ns, step_ns // 2
         self.overtaken_ns = min(timeout_ns, (NUMBERS - 1) * step_ns)
-        """Time by which a packet was overtaken from which on it counts as lost [ns]: it came after
-        the time-out, or its number may have come round again."""
+        """Delay relative to newer packets above which a packet counts as lost [ns]: longer delays
+        exceed the time-out or make the number (modulo NUMBERS) ambiguous."""
         rare_ns = min(RARE_TIMES * timeout_ns, SESSION_NS // 4)
         self.rare = min(rare_ns // self._half_step_ns, SILENCE_MAX)
-        """Longest silence between a vehicle and a server that it does not follow [half steps]."""
+        """Longest silence between a vehicle and a server that does not lead it [half steps]."""
         table = silences(timeout_ns, step_ns)
         self._losses, self._silences = [loss for loss, _ in table], [ns for _, ns in table]
         self._received = 0
@@ -115,11 +115,11 @@ class Hearing:
     def hear(self, number: int, at: int) -> None:
         """Note a packet, in any order and possibly repeated.
 
-        A burst of NUMBERS losses or more is counted NUMBERS too short.
+        Bursts of NUMBERS losses or more are counted as shorter by a multiple of NUMBERS.
 
         Args:
-            number: its number, modulo NUMBERS.
-            at: step or time at which it was sent; larger for a later one.
+            number: number of the packet, modulo NUMBERS.
+            at: step or time at which the packet was sent; larger for a later packet.
         """
         if at > self._newest_at:
             ahead = (number - self.newest - 1) % NUMBERS + 1
@@ -127,26 +127,26 @@ class Hearing:
             self.newest += ahead
             self._newest_at = at
         else:
-            # A late packet was counted as lost until now.
+            # A late packet was counted as lost until it arrived.
             self._received |= 1 << (self.newest - number) % NUMBERS
         if self._fixed_ns is None:
             self._silence = 0
 
     @property
     def loss(self) -> float:
-        """Share of the other end's packets that are lost, estimated on the high side."""
+        """Share of the other end's packets that are lost; the estimate is rather too high."""
         counted = min(self.newest + 1, WINDOW)
         lost = counted - self._received.bit_count()
-        # A prior of WEIGHT packets: among the first few of a session a single loss must not look
-        # like a third.
+        # A prior of WEIGHT packets: a single loss among the first three packets of a session must
+        # not count as a loss of one third.
         return (lost + WEIGHT * ASSUMED) / (counted + WEIGHT)
 
     @property
     def silence_ns(self) -> int:
         """Longest silence to allow the other end [ns].
 
-        If it follows the loss it is half a step shorter than T, since steps are not woken to the
-        nanosecond.
+        If it depends on the loss it is half a step shorter than T, because wakes of steps are not
+        exact.
         """
         if self._fixed_ns is not None:
             return self._fixed_ns

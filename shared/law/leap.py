@@ -28,7 +28,7 @@ def displacement(p: float, v: float, after_p: float, after_v: float, time: float
         after_p, after_v: position [m] and velocity [m/s] after.
         time: time between the two [s].
     """
-    # The mean velocity leaves only the effect of acceleration within the interval.
+    # After prediction by the mean velocity, only the effect of acceleration remains.
     return after_p - p - 0.5 * (v + after_v) * time
 
 

@@ -6,14 +6,14 @@ from typing import NamedTuple
 
 
 class Limits(NamedTuple):
-    """Limits within which a server plans the motions of a mission. They may change in flight; two
-    servers of a vehicle must plan within the same.
+    """Limits of the motions that a server plans for a mission. They may change in flight, and must
+    be equal in two servers of a vehicle.
     """
 
     speed_mps: float
     acceleration_mps2: float
     asymmetry_s: float
-    """Bound of the error of clocks, as `link.asymmetry_s` [s]."""
+    """Bound of the clocks' error, see `link.asymmetry_s` [s]."""
     zones: str
     """Digest of the zones."""
 

@@ -8,8 +8,8 @@ system per axis, and the same code serves 2-D and 3-D:
     p(k+1) = p(k) + a01 v(k) + b0 u(k)          A = [[1, a01],   B = [b0,
     v(k+1) =        a11 v(k) + b1 u(k)               [0, a11]]        b1]
 
-`advance` is the only implementation of eq. (4). It takes the numbers of one axis or the arrays of
-all, and is compiled into every kernel that predicts a state.
+`advance` is the only implementation of eq. (4). Its arguments are the numbers of one axis or the
+arrays of all, and it is compiled into every kernel that predicts a state.
 """
 
 from collections.abc import Sequence
@@ -51,8 +51,8 @@ class Model(NamedTuple):
     b1: Array
 
     def axes(self) -> list[Axis]:
-        # numpy takes twice as long for sums of two or three numbers, and the vehicle's loops have
-        # no longer ones.
+        # numpy takes twice as long for sums of two or three numbers, the longest in the vehicle's
+        # loops.
         columns = [field.tolist() for field in self]
         return [Axis(*numbers) for numbers in zip(*columns, strict=True)]
 
@@ -78,7 +78,7 @@ class Model(NamedTuple):
 
     @property
     def A(self) -> Array:  # noqa: N802 - the paper's letter
-        """A of the discretised model; shape (axes, 2, 2).
+        """Matrix A of the discretised model; shape (axes, 2, 2).
 
         Source: eq. (4).
         """
@@ -87,7 +87,7 @@ class Model(NamedTuple):
 
     @property
     def B(self) -> Array:  # noqa: N802 - the paper's letter
-        """B of the discretised model; shape (axes, 2).
+        """Matrix B of the discretised model; shape (axes, 2).
 
         Source: eq. (4).
         """
@@ -129,7 +129,7 @@ def discretise(
 def white_acceleration(tau_s: Array, dt_s: float) -> Array:
     """Square root L of a step's covariance under white acceleration, L Lᵀ = ∫ e^{As} G Gᵀ e^{Aᵀs}.
 
-    With G = [0, 1], e^{As}G = [τ(1 - e^{-s/τ}), e^{-s/τ}], and the integrals over [0, Δt] follow.
+    With G = [0, 1], e^{As}G = [τ(1 - e^{-s/τ}), e^{-s/τ}] is integrated over [0, Δt].
 
     Args:
         tau_s: time constants [s]; shape (axes,).

@@ -36,12 +36,12 @@ def speed_bounds(u_max: Array, gain: Array, speed_mps: float) -> Array:
         speed_mps: largest speed over all axes [m/s]; 0: limited by the input bound only.
     """
     most: Array = INPUT_SHARE * u_max * gain
-    # A bound per axis keeps constraints linear: exact on the diagonal, stricter along an axis.
+    # Bounds per axis keep constraints linear; exact on the diagonal, stricter along an axis.
     return np.minimum(most, speed_mps / np.sqrt(len(most))) if speed_mps else most
 
 
 class Motion(NamedTuple):
-    """Position of a vehicle at every time, by its own steps."""
+    """Position of a vehicle at every time, in the vehicle's own steps."""
 
     first: int
     """Step of the first knot, a multiple of SPACING."""
@@ -57,7 +57,7 @@ class Motion(NamedTuple):
     def at(self, steps: Array, dt_s: float) -> tuple[Array, Array]:
         """Positions [m] and velocities [m/s] at steps, which may be fractional.
 
-        Before the first knot the vehicle is at rest there.
+        Before its first knot a motion is at rest at this knot.
 
         Args:
             steps: shape (n,).
@@ -82,16 +82,16 @@ class Clearances(NamedTuple):
     """Distances that motions of a mission keep [m]."""
 
     apart_m: float
-    """Distance from each other: the required separation, and the tubes of both."""
+    """Distance of motions from each other: the required separation plus both tubes."""
     tube_m: float
-    """Distance from zones: largest distance of a vehicle from its motion."""
+    """Distance of motions from zones: the largest distance of a vehicle from its motion."""
     bend_m: float
     """Largest distance of a motion from its straight pieces, SAMPLES per interval."""
 
     @property
     def margin_m(self) -> float:
-        """Margin of a plan beyond the other clearances, for times between those that are checked,
-        and the solver's tolerance [m].
+        """Margin of a plan in addition to the other clearances, for unchecked times between checked
+        ones, and for the solver's tolerance [m].
         """
         return max(MARGIN_M, 2.0 * self.bend_m + 0.02)
 

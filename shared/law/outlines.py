@@ -1,6 +1,6 @@
-"""Outlines of zones: whether a straight line comes too near to one.
+"""Outlines of zones, and a test whether a straight line comes too near to a zone.
 
-Plain arithmetic on numbers, which the server compiles, since it checks every piece of every motion.
+Plain arithmetic on numbers, which the server compiles, because it checks all pieces of all motions.
 """
 
 from typing import Annotated, NamedTuple
@@ -37,7 +37,7 @@ def is_near(
     Args:
         zone: index of the zone.
         x0, y0, x1, y1: both ends of the line [m].
-        low_m, high_m: its least and largest height.
+        low_m, high_m: least and largest height of the line.
         clearance_m: distance to keep [m].
     """
     box, is_fence = outlines.boxes[zone], outlines.fences[zone] > 0.0
@@ -98,8 +98,8 @@ def _is_left(x: float, y: float, x0: float, y0: float, x1: float, y1: float) -> 
         x, y: the point [m].
         x0, y0, x1, y1: both ends of the edge [m].
     """
-    # Heights are compared directly: a difference is rounded, and two edges that meet have to agree
-    # on which side of their common end the point is.
+    # Coordinates are compared without a subtraction, which rounds: two edges that meet must agree
+    # on the side of their common end on which the point is.
     if (y0 > y) == (y1 > y):
         return False
     return x < x0 + (y - y0) / (y1 - y0) * (x1 - x0)

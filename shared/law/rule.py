@@ -4,22 +4,22 @@
                                                             n: number of its inputs
                                                             k - k_h: the present stage
 
-No input is flown for longer than `link.age_max_s` after the observation that it was planned from: a
-longer horizon ends there. After its last input the vehicle repeats it for ever, or brakes from it.
-Without compensation the first input is flown at all stages until then: aboard it is repeated.
+No input is flown later than `link.age_max_s` after the observation that it was planned from: a
+longer horizon ends there. After the last input the vehicle repeats this input for ever, or brakes
+from it. Without compensation the vehicle flies the first input at all stages of the horizon.
 
 With feedback aboard the vehicle is controlled towards the reference state x̄ of these inputs, also
 after the last one:
 
     u*(k) = u(k) + K (x̄(k) - x(k)),     x̄(i+1) = A x̄(i) + B (u(i) + ŵ)
 
-ŵ is the disturbance that the inputs compensate. Once braking has ended it is left out, so that x̄
-comes to rest, and the vehicle stays there in any wind.
+ŵ is the disturbance that the inputs compensate. Once braking has ended it is omitted, so that x̄
+comes to rest, where the vehicle stays in any wind.
 
 This is the only implementation of the rule: `step` and `reference_at` combine its parts for one
 spatial axis, `fly_horizon` for all axes of a vehicle. The client flies by it; the server's replay
-compiles the same functions into its kernels, and so knows which input was flown. Only `speed`
-concerns all axes.
+compiles the same functions into its kernels, and so computes the flown input. Only `speed` depends
+on all axes.
 """
 
 from collections.abc import Sequence
@@ -53,12 +53,12 @@ def lasting(length: int, made_for: int, observed: int, age_max: int) -> int:
     """Number of a horizon's inputs that may be flown; none if it is less than 1.
 
     Args:
-        length: number of its inputs.
-        made_for: k_h, the step of the first.
-        observed: step of the observation that they were planned from.
+        length: number of the horizon's inputs.
+        made_for: k_h, the step of the first input.
+        observed: step of the observation from which the inputs were planned.
         age_max: largest age of that observation [steps].
     """
-    # The input at the age `age_max` itself is still flown, hence + 1.
+    # + 1, because the input at the age `age_max` is still flown.
     return min(length, observed + age_max - made_for + 1)
 
 
@@ -67,7 +67,7 @@ def entry(stage: int, length: int) -> int:
 
     Source: eq. (11).
     """
-    if stage < 0:  # in Python, aboard, this takes half the time of min and max
+    if stage < 0:  # in interpreted Python this is twice as fast as min and max
         return 0
     return stage if stage < length else length - 1
 
@@ -83,7 +83,7 @@ def bounded(u: float, bound: float) -> float:
 
 
 def braked(speed: float, steps: int, brake: float) -> float:
-    """Speed that is left after a number of steps of braking [m/s]; `brake` is the decrease per step
+    """Remaining speed after a number of steps of braking [m/s]; `brake` is the decrease per step
     [m/s].
     """
     return max(0.0, speed - steps * brake)
@@ -95,13 +95,13 @@ def remaining(stage: int, length: int, speed: float, brake: float) -> float:
     Args:
         stage: present stage; may be before the first or after the last input.
         length: number of inputs of the horizon.
-        speed: magnitude of its last input over all axes [m/s].
+        speed: magnitude of the horizon's last input over all axes [m/s].
         brake: decrease of speed per step when braking [m/s]; 0 repeats the last input for ever.
     """
-    # Brake 0 is the paper's vehicle, which repeats its last input for ever (E10).
+    # Brake 0 means the paper's vehicle, which repeats its last input for ever (E10).
     if stage < length or brake == 0.0:
         return 1.0
-    # The same factor for all axes: the vehicle slows down without turning.
+    # The factor is the same for all axes, so that the vehicle slows down without turning.
     return braked(speed, stage - length + 1, brake) / speed if speed > 0.0 else 0.0
 
 
@@ -109,7 +109,7 @@ def reference_input(without_feedback: float, disturbance: float, share: float) -
     """Input that drives the reference state x̄ [m/s]: with the disturbance ŵ, or 0 once braking has
     ended (`share` is 0).
     """
-    # With ŵ, x̄ would drift on for ever after the vehicle has braked.
+    # With ŵ, x̄ would drift without end after the vehicle has braked.
     return without_feedback + disturbance if share > 0.0 else 0.0
 
 
@@ -132,7 +132,7 @@ def flown(stage: int, without_feedback: float, back: float, bound: float) -> flo
         back: `feedback`, or 0 without it [m/s].
         bound: u_max [m/s].
     """
-    # Before stage 0 there is no x̄: it starts at the step that the horizon was made for.
+    # There is no x̄ before stage 0, the step that the horizon was made for.
     u = without_feedback + back if stage >= 0 else without_feedback
     return bounded(u, bound)
 
@@ -235,8 +235,8 @@ def fly_horizon(
     Args:
         table: the horizon without its inputs, one row per axis, see `horizon_of`.
         inputs: inputs of the horizon [m/s]; shape (axes, n).
-        reference: x̄ at the stage `first` [m, m/s]; with feedback advanced to `stage` if that is
-            later; shape (axes, 2).
+        reference: x̄ at the stage `first` [m, m/s]; with feedback it is advanced to a later
+            `stage`; shape (axes, 2).
         first: stage of the given x̄.
         stage: k - k_h.
         state: position [m] and velocity [m/s] of each axis; shape (axes, 2).

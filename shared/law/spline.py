@@ -1,4 +1,4 @@
-"""A trajectory as a spline, and the rule by which a vehicle flies along it.
+"""A trajectory as a spline, and the rule of flight along it.
 
 On each axis a spline has knots at uniform intervals, a position and a velocity at each; between two
 knots, a time T apart, it is the cubic Hermite polynomial, with s from 0 to 1,
@@ -15,7 +15,7 @@ The vehicle flies, at each stage i,
 ū is the input under which the velocity of eq. (4) follows the spline, K and λ the vehicle's
 regulator (`shared.scenario.gain`), u(i-1) the input flown until now, and ŵ the disturbance
 estimated by the vehicle's own filter. x is the state in which the input takes effect
-(`shared.law.dead_time`), so the spline is the desired trajectory later by the dead time. No input
+(`shared.law.dead_time`), so the spline is the desired trajectory shifted by the dead time. No input
 is flown for longer than `link.age_max_s` after the observation from which it was planned: from then
 on ū is held, or braked as in `shared.law.rule`, and x̄ follows eq. (4) with this ū until it rests.
 
@@ -55,7 +55,7 @@ class AxisSpline(NamedTuple):
     gain_v: float
     """K on velocity."""
     lag: float
-    """Share λ of the previous input that is kept, 0 to below 1."""
+    """Share λ of the previous input in the new one, 0 to below 1."""
 
 
 def spline_at(knots: Knots, spacing: int, dt_s: float, stage: int) -> tuple[float, float]:
@@ -67,11 +67,11 @@ def spline_at(knots: Knots, spacing: int, dt_s: float, stage: int) -> tuple[floa
         dt_s: length of a step [s].
         stage: steps since the first knot; negative before it.
     """
-    # Knots are one flat row of positions and velocities: numba and Python index it alike.
+    # Knots are a flat row of positions and velocities, which numba and Python index equally.
     last = len(knots) // 2 - 1
     knot = stage // spacing
     if knot < 0 or knot >= last:
-        # Straight at both ends: a spline that is late or has ended does not bend away.
+        # Straight before the first and after the last knot: the cubics would bend away there.
         knot = 0 if knot < 0 else last
         v = float(knots[2 * knot + 1])
         return float(knots[2 * knot]) + (stage - knot * spacing) * dt_s * v, v
@@ -130,7 +130,7 @@ def regulated(
     """Input demanded by the regulator on one axis, before `follow` smooths it.
 
     Args:
-        stage: steps since its first knot.
+        stage: steps since the first knot.
         ref_p, ref_v: x̄ at the stage, position [m] and velocity [m/s].
         p, v: state at the stage, position [m] and velocity [m/s].
         w: disturbance ŵ [m/s].
@@ -229,8 +229,8 @@ def foresee_spline(
 ) -> None:
     """State of each axis one step later, flown along the spline from a state at the stage.
 
-    The share λ of the previous input is left out, since its effect lasts for a few steps only. Wind
-    is assumed to be compensated.
+    The share λ of the previous input is omitted, because its effect lasts only a few steps. Wind is
+    assumed to be compensated.
 
     Args:
         table, knots, stage, state: see `fly_spline`.

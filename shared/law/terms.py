@@ -1,8 +1,8 @@
 """Terms of a flight: the values on which server and client must agree before it.
 
-Everything that both ends use for prediction is a term, and both build it from the terms alone, so
-that no other value can be used. Keys of a scenario that are not terms belong to one end, which may
-set them freely; `shared/scenario/schema.py` names the owner of each.
+All values that both ends use for prediction are terms, and both ends compute predictions only from
+terms, so that no other value can be used. Keys of a scenario that are not terms belong to one end,
+which may set them freely; `shared/scenario/schema.py` names the owner of each.
 """
 
 from typing import NamedTuple
@@ -20,13 +20,13 @@ class Difference(msgspec.Struct, frozen=True):
 
 
 FLOWN_AS = ("committed", "predictive", "trajectory", "none")
-"""Ways in which a vehicle flies the server's messages, by the names of the built-in schemes."""
+"""Modes in which a vehicle flies the server's messages, named after the built-in schemes."""
 INDEXED = ("committed", "predictive")
-"""Ways in which the vehicle reads a horizon at the present stage, not always at its first."""
+"""Modes that use the input of the present stage, not always the first input."""
 COMMITTING = ("committed",)
-"""Ways in which horizons begin with committed inputs."""
+"""Modes with horizons that begin with committed inputs."""
 ALONG_SPLINES = ("trajectory",)
-"""Ways in which splines of the desired trajectory are sent instead of inputs."""
+"""Modes in which the server sends splines instead of inputs."""
 
 
 class Terms(NamedTuple):
@@ -44,7 +44,7 @@ class Terms(NamedTuple):
     u_max: tuple[float, ...]
     """Bound of the input, eq. (6), on each axis [m/s]."""
     scheme: str
-    """How the vehicle flies the messages of the server, one of FLOWN_AS."""
+    """Mode in which the vehicle flies the server's messages, one of FLOWN_AS."""
     feedback: bool
     exhausted: str
     """Behaviour after a horizon's last input: "hold" or "brake"."""
@@ -69,10 +69,10 @@ class Terms(NamedTuple):
     table: str
     """Digest of the content of the trajectory's CSV file."""
     separation_m: float = 0.5
-    """Distance that vehicles of a mission keep [m]. Like the next two it is for the servers: two
-    servers of one vehicle plan with the same."""
+    """Distance between vehicles of a mission [m]. For servers, like the next two fields: two
+    servers of a vehicle must have equal values."""
     height_m: float = 0.0
-    """Distance that they keep above one another [m]; 0: `separation_m`."""
+    """Vertical distance between vehicles of a mission [m]; 0: `separation_m`."""
     tube_m: float = 0.15
     """Largest distance of a vehicle from its motion [m]."""
 

@@ -22,7 +22,7 @@ PLACES_MAX = 100_000_000
 
 
 def of_keys(scenario: Scenario) -> Iterator[Contradiction]:
-    """Contradictions between keys: vehicles have to keep apart whichever packets are lost."""
+    """Contradictions between keys: vehicles must keep apart for any loss of packets."""
     control, link, vehicle = scenario.control, scenario.link, scenario.vehicle
     if not _is_one(SCHEMES, control.scheme, "trajectory"):
         yield "control.scheme", repr(control.scheme), "'trajectory' on a mission"
@@ -38,14 +38,14 @@ def of_keys(scenario: Scenario) -> Iterator[Contradiction]:
         yield "link.join_s", link.join_s, f"more than 0, and at most {most_s:g} s, on a mission"
     mission = scenario.section(MissionConfig)
     if 0.0 < mission.height_m < mission.separation_m - TINY:
-        # Heights are scaled by separation_m / height_m: a factor above 1 would make tubes, which
-        # are as high as wide, too high.
+        # Heights are scaled by separation_m / height_m. Tubes are as high as wide, so with a factor
+        # above 1 they would be too high.
         expected = f"0, or at least mission.separation_m ({mission.separation_m:g})"
         yield "mission.height_m", mission.height_m, expected
     if vehicle.on_loss == "return":
         expected = "'land' on a mission: all other vehicles expect a vertical landing"
         yield "vehicle.on_loss", repr(vehicle.on_loss), expected
-    # A vehicle that receives nothing flies its motion to the end before it brakes.
+    # A vehicle without packets flies its motion to the end before it brakes.
     longest_s = (INTERVALS + JOIN_MAX) * SPACING * control.dt
     for key, value in (("link.timeout_s", link.timeout_s), ("link.age_max_s", link.age_max_s)):
         if value < longest_s - TINY:
@@ -53,7 +53,7 @@ def of_keys(scenario: Scenario) -> Iterator[Contradiction]:
 
 
 def _is_one(table: PluginTable, text: str, name: str) -> bool:
-    """Whether a text names this entry alone; what is no valid text is reported elsewhere."""
+    """Whether a text names this entry alone; an invalid text is reported elsewhere."""
     with suppress(GrammarError):
         return table.one(text).name == name
     return table is PLANNERS

@@ -1,4 +1,4 @@
-"""What follows for a mission from the keys of its scenario."""
+"""Values of a mission computed from the keys of its scenario."""
 
 import numpy as np
 
@@ -31,8 +31,8 @@ def rest_scale(scenario: Scenario) -> float:
 
 
 def zones(scenario: Scenario) -> Zones:
-    """Zones of a mission. If vehicles may land, zones have no upper end, so that no vehicle lands
-    in one.
+    """Zones of a mission. If vehicles may land, zones have no upper limit, so that no vehicle lands
+    in a zone.
 
     Raises:
         GrammarError: the text is invalid.

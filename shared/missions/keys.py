@@ -15,7 +15,7 @@ ZONES, GOALS = "zones", "goals"
 
 
 class MissionConfig(Section, frozen=True):
-    """Mission: several vehicles with goals, which keep apart whichever packets are lost; see
+    """Mission: several vehicles with goals, which keep apart for any loss of packets; see
     docs/together.md.
     """
 

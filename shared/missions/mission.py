@@ -1,4 +1,4 @@
-"""Missions: timed goals of several vehicles, or timed paths (a show), which the server keeps apart.
+"""Missions: timed goals or timed paths (a show) of several vehicles, kept apart by the server.
 
 A mission is also the reference of a vehicle: its present goal, with velocity 0; in a show, the
 present point and velocity of its path.
@@ -27,7 +27,7 @@ TINY_MPS = 1e-6
 PLACES_AT_ONCE = 1_000_000
 """Number of places of a show that are compared at once, which bounds memory."""
 CROWDED = 32
-"""Number of simultaneous stays in neighbouring cells above which two are certainly too near."""
+"""Number of simultaneous stays in neighbouring cells above which two must be too near."""
 
 
 class Mission(OfFleet):
@@ -85,7 +85,7 @@ class Mission(OfFleet):
         if self._path:
             return self._path(t)
         t = np.asarray(t, dtype=np.float64)
-        if not t.ndim:  # called for one vehicle at each step: no search in arrays
+        if not t.ndim:  # called once per step of a vehicle: faster without arrays
             state = np.zeros((self._axes, 2))
             state[:, 0] = self._points_m[max(bisect_right(self._times, float(t)) - 1, 0)]
             return state
@@ -102,7 +102,7 @@ class Mission(OfFleet):
             height: factor on distances along the third axis.
 
         Returns:
-            numbers of the two vehicles, time [s] and distance [m]; None if there are no such two.
+            numbers of the two vehicles, time [s] and distance [m]; None if there are none.
         """
         if self.is_show:
             return _nearest_on_paths(self._goals, apart_m, height)
@@ -155,7 +155,7 @@ class Mission(OfFleet):
 
 
 class _Stays(NamedTuple):
-    """Stays of all vehicles: a goal, from its time until that of the vehicle's next goal."""
+    """Stays of all vehicles: each at a goal, from its time until the time of the next goal."""
 
     vehicles: NDArray[np.int64]
     begin_s: Array
@@ -212,9 +212,9 @@ class _Stays(NamedTuple):
         others: NDArray[np.int64],
         apart_m: float,
     ) -> list[tuple[float, float, int, int]]:
-        """Time, distance and indices of pairs of stays that are too near.
+        """Times, distances and indices of pairs of stays that are too near.
 
-        Each turn compares every stay with its next candidate and keeps the earliest such pair.
+        Each iteration compares all stays with their next candidates and keeps the earliest pair.
 
         Args:
             stays: stays to compare with later ones; shape (m,).
@@ -238,16 +238,16 @@ class _Stays(NamedTuple):
                 number = int(with_[one])
                 at_s, distance_m = float(self.begin_s[number]), float(away_m[one])
                 pairs.append((at_s, distance_m, int(stays[one]), number))
-        raise AssertionError  # `count` is endless
+        raise AssertionError  # not reached, because `count` is endless
 
 
 def _neighbours(
     cells: Array, levels: Sequence[Array], shape: Sequence[int], occupied: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-    """Index of each cell among the occupied ones.
+    """Indices of cells in the sorted list of occupied cells.
 
     Returns:
-        indices of those cells that are occupied, shape (m,); and which are, shape (n,).
+        indices of the occupied cells among them, shape (m,); and their flags, shape (n,).
     """
     is_occupied = np.ones(len(cells), dtype=bool)
     index = np.empty(cells.shape, np.int64)
@@ -266,7 +266,7 @@ def _nearest_on_paths(
 ) -> tuple[int, int, float, float] | None:
     """First two vehicles of a show nearer than `apart_m` to each other, see `Mission.nearest`.
 
-    Between two successive times at which any goal is reached, every vehicle flies straight.
+    Between two consecutive goal times of any vehicles, every vehicle flies straight.
     """
     numbers = list(goals)
     times_s = np.unique(np.concatenate([own_s for own_s, _ in goals.values()]))
@@ -286,9 +286,7 @@ def _nearest_during(
     apart_m: float,
     height: float,
 ) -> tuple[int, int, float, float] | None:
-    """First two vehicles that are too near between these times; all times of points are among
-    them.
-    """
+    """First two vehicles too near between the given times, which include all times of points."""
     places = np.stack(
         [
             np.stack([np.interp(times_s, own_s, along) for along in points_m.T], axis=1)
@@ -300,7 +298,7 @@ def _nearest_during(
     for k, (begin, end) in enumerate(zip(places, [*places[1:], places[-1]], strict=True)):
         moved, middle = end - begin, 0.5 * (begin + end)
         reach_m = apart_m + float(np.linalg.norm(moved, axis=1).max())
-        # Vehicles sorted along the first axis are compared with those within reach behind them.
+        # Sorted along the first axis: each vehicle is compared with the next ones within reach.
         order = np.argsort(middle[:, 0])
         x, rank = middle[order, 0], np.arange(len(order))
         counts = np.searchsorted(x, x + reach_m, side="right") - rank - 1
@@ -320,12 +318,12 @@ def _nearest_during(
 
 
 class Guided:
-    """References of a mission's vehicles, with goals that may be replaced in flight.
+    """References of a mission's vehicles; their goals may be replaced in flight.
 
     Args:
         references: gives the reference of a vehicle by its number.
         goals: goals that replace those of the mission [m; shape (axes,)], by vehicle.
-        most: largest number of vehicles whose references are kept.
+        most: largest number of vehicles whose references are stored.
     """
 
     def __init__(
@@ -338,8 +336,8 @@ class Guided:
         return self._kept(vehicle)
 
     def _of(self, vehicle: int) -> Reference:
-        """Reference of a vehicle: after time 0 its replaced goal, if it has one; otherwise that of
-        the mission.
+        """Reference of a vehicle: after time 0 its replaced goal, if it has one; otherwise the
+        mission's goal.
         """
         original = self._references(vehicle)
 

@@ -1,4 +1,4 @@
-"""Missions whose goals follow from the keys of a scenario: vehicles change places."""
+"""Missions with goals computed from the keys of a scenario: vehicles change places."""
 
 from typing import Annotated
 

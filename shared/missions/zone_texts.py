@@ -24,7 +24,7 @@ from skytether.shared.scenario.rooms import ZONES
 
 
 def parse(text: str, axes: int, files: Files = ()) -> Zones:
-    """Parse a text of zones; an empty text has none.
+    """Parse a text of zones; an empty text has no zones.
 
     Args:
         axes: number of axes of the flight.
@@ -54,7 +54,7 @@ def parse(text: str, axes: int, files: Files = ()) -> Zones:
 def box(x0: float, x1: float, y0: float, y1: float, *heights: float) -> list[Zone]:
     """Box to keep out of, without vertical limits or between two altitudes."""
     if not (x0 < x1 and y0 < y1):
-        raise ValueError("box(x0, x1, y0, y1), or with z0, z1: from less to more")
+        raise ValueError("box(x0, x1, y0, y1), or with z0, z1: each pair ascending")
     return [_between(_corners(x0, x1, y0, y1), heights)]
 
 
@@ -68,7 +68,7 @@ def cylinder(x: float, y: float, radius: float, *heights: float) -> list[Zone]:
 
 def _between(corners: Array, heights: Sequence[float]) -> Zone:
     if len(heights) not in (0, 2) or not all(map(float.__lt__, heights[::2], heights[1::2])):
-        raise ValueError("two heights at the end, from less to more, or none")
+        raise ValueError("two ascending heights at the end, or none")
     low, high = heights or (-math.inf, math.inf)
     return Zone("", corners, low, high)
 
@@ -86,7 +86,7 @@ def fence(*corners: float) -> list[Zone]:
         return [Zone("", ring(_points(corners, 3, "fence")), is_fence=True)]
     x0, x1, y0, y1 = corners
     if not (x0 < x1 and y0 < y1):
-        raise ValueError("fence(x0, x1, y0, y1) from less to more, or at least 3 corners")
+        raise ValueError("fence(x0, x1, y0, y1) with ascending pairs, or at least 3 corners")
     return [Zone("", _corners(x0, x1, y0, y1), is_fence=True)]
 
 

@@ -30,7 +30,7 @@ class Planes(NamedTuple):
     """Half-planes that keep points out of zones: normal · x ≥ normal · border + distance."""
 
     at: Indices
-    """Index of the point that each half-plane is for; shape (n,)."""
+    """Index of the point to which each half-plane belongs; shape (n,)."""
     normal: Array
     """Unit vector from the zone's border to the point; shape (n, axes)."""
     border: Array
@@ -110,7 +110,7 @@ class Zones:
         inside = self._inside(points[:, :2])
         for i, zone in enumerate(self.zones):
             own = slice(self._starts[i], self._starts[i] + len(zone.corners))
-            if zone.is_fence:  # a half-plane for each edge
+            if zone.is_fence:  # one half-plane for each edge
                 n, edge = np.nonzero(away[:, own] < reach_m[:, None])
                 places = points[n]
                 places[:, :2] = nearest[n, edge + self._starts[i]]
@@ -187,7 +187,7 @@ def _facing(points: Array, places: Array, at: Indices) -> Planes:
 
 
 def ring(places: Array) -> Array:
-    """Corners of a polygon's ring, without a last point that repeats the first; of either winding.
+    """Corners of a polygon's ring of any winding, without a last point equal to the first.
 
     Raises:
         ValueError: there are fewer than 3 corners, or the border crosses itself.

@@ -1,4 +1,4 @@
-"""Arguments of the entries in a text, read and changed by name."""
+"""Reading and changing arguments of a text's entries by name."""
 
 from typing import Any
 
@@ -29,7 +29,7 @@ def with_argument(table: PluginTable, text: str, at: str, value: object) -> str:
 
 
 def argument(table: PluginTable, text: str, at: str) -> Value:
-    """Value of an argument, of the first such entry in a text; see `with_argument`."""
+    """Value of an argument in the first such entry of a text; see `with_argument`."""
     calls, index = _argument(table, text, at)
     return calls[0].values[index]
 

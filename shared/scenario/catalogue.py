@@ -55,7 +55,7 @@ def keys_of(*groups: str) -> frozenset[str]:
 def differences(
     here: NamedTuple, there: NamedTuple, names: Mapping[str, str] = TERMS
 ) -> tuple[Difference, ...]:
-    """Fields with two values; `names` has the dotted key of each."""
+    """Fields in which two tuples differ; `names` has the dotted key of each field."""
     return tuple(
         Difference(names[field], _text(field, ours), _text(field, theirs))
         for field, ours, theirs in zip(here._fields, here, there, strict=True)

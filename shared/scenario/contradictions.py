@@ -34,7 +34,7 @@ def contradictions(
     Args:
         checked: a scenario that was checked before; if the desired trajectory is the same, it is
             not checked again.
-        any_network: whether the network may be too slow, or lose too many packets, to fly over.
+        any_network: whether a network too slow or too lossy for a flight is allowed.
     """
     model, control, vehicle = scenario.model, scenario.control, scenario.vehicle
     axes = model.axes
@@ -84,7 +84,7 @@ def contradictions(
     no_network = list(_no_impairments(scenario))
     yield from no_network
     if not (no_network or any_network):
-        # One path suffices to fly over.
+        # One good path is enough for a flight.
         yield from min((list(_too_late(each)) for each in scenario.networks), key=len)
     yield from _no_trigger(control)
     yield from _no_policies("vehicle.report", vehicle.report, REPORTS, control)
@@ -197,7 +197,7 @@ def _no_reference(scenario: Scenario) -> Iterator[Contradiction]:
     if ref.points_m or ref.shape not in curves:
         placed = load("skytether.shared.scenario.placed", f"reference.shape {ref.shape}")
         yield from placed.contradictions(scenario)
-    most_m = shapes.FAST_MPS * ref.period_s / 8.0  # a square's round is eight radii long
+    most_m = shapes.FAST_MPS * ref.period_s / 8.0  # the perimeter of a square is eight radii
     if ref.shape in curves and ref.radius_m > most_m:
         most = f"at most {most_m:g} with reference.period_s = {ref.period_s:g}"
         yield "reference.radius_m", ref.radius_m, most

@@ -1,8 +1,8 @@
-"""Smooth closed curves as desired trajectories: entries of the table `REFERENCES`, which has others
-from `points` and `targets`.
+"""Smooth closed curves as desired trajectories: entries of the table `REFERENCES`; `points` and
+`targets` have others.
 
-Each makes a trajectory (`shared.scenario.reference`) from the keys of the scenario, as a plug-in's
-shape does.
+Each makes a trajectory (`shared.scenario.reference`) from the keys of the scenario, like a
+plug-in's shape.
 """
 
 import numpy as np

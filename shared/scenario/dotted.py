@@ -26,8 +26,8 @@ def set_keys(changes: Mapping[str, Any], table: dict[str, Any]) -> None:
     """Set values by dotted key in a nested table, in place.
 
     Raises:
-        ConfigError: a key is unknown, a text has no such argument, or the network is that of one
-            path and there are several.
+        ConfigError: a key is unknown, a text has no such argument, or a key of the network is set
+            although there are several paths.
     """
     for path, value in changes.items():
         network = table.get("network")

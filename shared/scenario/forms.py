@@ -1,4 +1,4 @@
-"""How a scenario writes the entries of a table, in words: for messages and lists."""
+"""Text forms of a table's entries in a scenario, for messages and lists."""
 
 import typing
 from typing import Annotated, Any, Literal
@@ -6,18 +6,18 @@ from typing import Annotated, Any, Literal
 from skytether.shared.scenario.registry import Entry, Parameter
 
 LOW, HIGH = {"ge": "<=", "gt": "<"}, {"le": "<=", "lt": "<"}
-"""Bounds of a number from below and above, by their names in msgspec.Meta."""
+"""Signs of lower and upper bounds of a number, by their names in msgspec.Meta."""
 FURTHER = {
     "multiple_of": "a multiple of",
     "pattern": "with the pattern",
     "min_length": "of a length from",
     "max_length": "of a length up to",
 }
-"""Other bounds, by their names in msgspec.Meta, and their words in messages."""
+"""Words for other bounds, by their names in msgspec.Meta."""
 
 
 def form(name: str, entry: Entry) -> str:
-    """How a scenario writes the entry, with its parameters and bounds, for messages."""
+    """Text form of an entry in a scenario, with its parameters and bounds, for messages."""
     if not entry.parameters:
         return name
     shown = ", ".join(

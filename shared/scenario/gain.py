@@ -54,7 +54,7 @@ def converged_gain(
     cost, before = np.tile(Q, (len(B), 1, 1)), np.zeros((len(B), 3, 3))
     gain = np.zeros_like(B)
     for _ in range(ROUNDS):
-        # Riccati recursion, until the cost matrix changes by rounding only.
+        # Riccati recursion, until the cost matrix changes only by rounding errors.
         if (np.abs(cost - before) <= 1e-12 * np.abs(before)).all():
             break
         ahead = np.einsum("ai,aij->aj", B, cost)

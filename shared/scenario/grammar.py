@@ -29,7 +29,7 @@ _CALL = re.compile(
 _ARGUMENT = re.compile(
     rf"\s*(?:([a-z_]\w*)\s*=)?\s*((?:{_QUOTED}|[^,\"])*?)\s*,", re.IGNORECASE | re.ASCII
 )
-"""An argument and the comma after it."""
+"""Pattern of an argument and the comma after it."""
 _BETWEEN = re.compile(r"[\s&|()_]*", re.ASCII)
 NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?", re.IGNORECASE | re.ASCII)
 
@@ -80,8 +80,8 @@ def parse(text: str, form: str) -> Expression:
     found, between = _calls(text, form)
     if len(found) > CALLS_MAX or between.count("(") > NESTED_MAX:
         raise GrammarError(text, form)
-    # Python's grammar has the same operators with the same precedence. Nothing of the text but
-    # operators and parentheses is in `between`.
+    # Python's grammar has the same operators with the same precedence. `between` contains only
+    # operators and parentheses of the text.
     rest = iter(found)
 
     def expression(node: ast.expr) -> Expression:
@@ -125,7 +125,7 @@ def calls(text: str, form: str) -> list[Call]:
 
 
 def _calls(text: str, form: str) -> tuple[list[Call], str]:
-    """Calls in a text, and the text with _ in the place of each."""
+    """Calls in a text, and the text with each call replaced by _."""
     found = []
 
     def note(match: re.Match[str]) -> str:
@@ -144,12 +144,12 @@ def _calls(text: str, form: str) -> tuple[list[Call], str]:
 
 
 DIGITS_MAX = 300
-"""Largest number of digits of a whole number; a longer one becomes a float, mostly infinite."""
+"""Largest number of digits of a whole number; longer ones become floats, usually infinite."""
 
 
 def _value(word: str) -> Value:
     if NUMBER.fullmatch(word):
-        # Python makes no whole number of more than 4300 digits; nothing here takes so large a one.
+        # Python refuses whole numbers of more than 4300 digits; no parameter needs them.
         is_whole = len(word) <= DIGITS_MAX and not re.search(r"[.e]", word, re.IGNORECASE)
         return int(word) if is_whole else float(word)
     return word[1:-1] if word[:1] == word[-1:] == '"' else word

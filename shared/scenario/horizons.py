@@ -1,4 +1,4 @@
-"""Contradictions of a scenario whose scheme sends horizons of inputs; loaded with such a scheme."""
+"""Contradictions of a scenario whose scheme sends horizons of inputs."""
 
 import math
 from collections.abc import Iterator
@@ -14,7 +14,7 @@ LOSSY = 0.3
 
 
 def ahead_s(scenario: Scenario) -> float:
-    """Time after which a plan is in force at the latest, if no packet is late [s]."""
+    """Latest time after which a plan is in force, if no packet is late [s]."""
     control, mean_s = scenario.control, scenario.uplink.mean_s
     if control.properties.flown_as in COMMITTING and control.delay_bound != "auto":
         return max(control.delay_bound, mean_s)
@@ -31,7 +31,7 @@ def too_late(scenario: Scenario) -> Iterator[Contradiction]:
 def _too_slow(scenario: Scenario) -> Iterator[Contradiction]:
     control, axes = scenario.control, scenario.model.axes
     up, down = scenario.uplink, scenario.downlink
-    # Delay as the server estimates it: its clock map knows only half of the smallest round trip.
+    # The server's estimate of the delay: its clock map assumes half of the smallest round trip.
     delay_s = up.mean_s - up.least_s + (up.least_s + down.least_s) / 2
     seen = f"the delay of {delay_s:g} s (half of the smallest round trip, and the uplink's jitter)"
     H, dt, bound_s = control.horizon, control.dt, control.delay_bound

@@ -19,16 +19,16 @@ class Owner(Enum):
     BOTH = "both ends"
     """A term of the flight: both ends predict with it, so it must be equal."""
     EACH = "each end"
-    """Each end uses its own value."""
+    """Key that each end reads from its own scenario."""
     SERVER = "server"
     VEHICLE = "vehicle"
     NETEM = "netem"
     VIRTUAL_TIME = "virtual time"
-    """Describes computers and clocks in virtual time; no effect on real ones."""
+    """A property of simulated computers and clocks; without effect in real time."""
 
 
 class InFlight(StrEnum):
-    """Groups of keys that change together in flight; rooms have further ones."""
+    """Groups of keys that change together in flight; missions and others add further groups."""
 
     TRIGGER = auto()
     POINT = auto()

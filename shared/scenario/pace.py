@@ -1,7 +1,7 @@
 """Check whether a desired trajectory is faster than the vehicle can fly.
 
 A vehicle's largest speed on an axis is u_max times its gain. On a faster trajectory, such as one
-from a table in millimetres, it falls behind at full speed.
+from a table in millimetres, the vehicle falls behind at full speed.
 """
 
 from typing import NamedTuple
@@ -59,9 +59,7 @@ def first_too_fast(scenario: Scenario) -> TooFast | None:
         return None
     times_s = np.arange(min(scenario.steps, STEPS_MAX) + 1) * scenario.control.dt
     if not REFERENCES[REFERENCES.one(scenario.reference.shape).name].is_ours:
-        times_s = SAMPLED_S[
-            scenario.duration >= SAMPLED_S
-        ]  # the times at which `sampled` checked the shape
+        times_s = SAMPLED_S[scenario.duration >= SAMPLED_S]  # the sampling times of `sampled`
     velocity = scenario.make_reference()(times_s)[..., 1]
     over = is_too_fast(scenario, velocity)
     if not over.any():

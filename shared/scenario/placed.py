@@ -1,4 +1,4 @@
-"""Contradictions of shapes that are not curves alone: given by points, by a file, or by goals."""
+"""Contradictions of shapes that are given by points, by a file, or by goals."""
 
 from collections.abc import Iterator
 from itertools import pairwise

@@ -1,8 +1,8 @@
-"""Planners: what `control.planner` names. A plug-in's replaces the MPC of eq. (9).
+"""Planners of `control.planner`. A plug-in's planner replaces the MPC of eq. (9).
 
 The server makes one for each vehicle, and calls its `plan` at every step;
-`server.mpc.plugin_planners` checks what it returns. Prediction, acknowledgements, trigger and
-failsafe stay those of the scheme.
+`server.mpc.plugin_planners` checks the result. Prediction, acknowledgements, trigger and failsafe
+are still those of the scheme.
 """
 
 from typing import NamedTuple, Protocol, Self
@@ -17,7 +17,7 @@ planner = PLANNERS
 
 
 class Problem(NamedTuple):
-    """What a planner is made from."""
+    """Problem of one vehicle, from which a planner is made."""
 
     model: Model
     """Model of the vehicle: `model.step(x, u)` is the state one step later, `model.roll(x, inputs)`
@@ -40,7 +40,7 @@ class Problem(NamedTuple):
 
 
 def _read_only(array: Array) -> Array:
-    """Copy that cannot be written to, so that no planner changes what others are made from."""
+    """Read-only copy, so that no planner can change the data of others."""
     copy = array.copy()
     copy.setflags(write=False)
     return copy
@@ -55,16 +55,16 @@ class Planner(Protocol):
         The model needs no wind: an estimated disturbance is subtracted from the inputs afterwards.
 
         Args:
-            state: where the vehicle will be when the plan comes into force [m, m/s]; shape (axes,
-                2). With the scheme "trajectory": where the trajectory it follows will be.
+            state: predicted state of the vehicle at the start of the plan [m, m/s]; shape (axes,
+                2). With the scheme "trajectory": state on the trajectory in force.
             reference: desired states from then on, extrapolated where they are unknown [m, m/s];
                 shape (H + 1, axes, 2).
             previous: inputs of the vehicle's last plan from then on, the last one repeated [m/s];
                 0 without one; shape (axes, H).
 
         Returns:
-            inputs [m/s], shape (axes, H), cut to ±u_max; or, with the scheme "trajectory", states
-            to be followed [m, m/s], shape (H + 1, axes, 2).
+            inputs [m/s], shape (axes, H), which are limited to ±u_max; or, with the scheme
+            "trajectory", states to follow [m, m/s], shape (H + 1, axes, 2).
         """
 
 

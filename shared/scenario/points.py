@@ -1,4 +1,4 @@
-"""Desired trajectories through given points: at rest in one, or along lines between them."""
+"""Desired trajectories through given points: rest at a point, or lines between points."""
 
 import numpy as np
 

@@ -37,7 +37,7 @@ FILES: Mapping[str, tuple[PluginTable, int]] = MappingProxyType(
 )
 """Keys whose text may name files: table of the text's entries, and largest size of a file [B]."""
 TABLE_BYTES_MAX, LOG_BYTES_MAX = 16_000_000, 64_000_000
-"""Largest size of `reference.file` [B]; the second for an autopilot's log."""
+"""Largest size of `reference.file`: a table, and an autopilot's log [B]."""
 LOGS = (".ulg", ".bin")
 WAYS = ("uplink", "downlink")
 COMPARED = "compare"
@@ -72,7 +72,7 @@ def load(name: str) -> Scenario:
 
 
 def load_base(name: str) -> Scenario:
-    """Load a scenario as `load` does, without looking for contradictions.
+    """Load a scenario like `load`, but without a check for contradictions.
 
     Command-line flags are applied to it next, which may resolve a contradiction of the file;
     `check` then judges the final values.
@@ -97,7 +97,7 @@ def check(
         source: file or command line of the values, for messages.
         checked: a scenario that was checked before; if the desired trajectory is the same, its
             files are not read again.
-        any_network: whether the network may be too slow, or lose too many packets, to fly over.
+        any_network: whether a network too slow or too lossy for a flight is allowed.
 
     Raises:
         ConfigError: the first error.
@@ -107,7 +107,7 @@ def check(
 
 
 def convert(raw: Mapping[str, Any], source: str = "") -> Scenario:
-    """Make a scenario from a table of plain values, checking each value by itself; see `check`.
+    """Make a scenario from a table of plain values, checking only single values; see `check`.
 
     Raises:
         ConfigError: the first invalid value.
@@ -133,7 +133,7 @@ def _without_contradictions(
     checked: schema.Scenario | None = None,
     any_network: bool = False,
 ) -> Scenario:
-    """Scenario with its files, refused if it has contradictions; see `check`."""
+    """Scenario with its files; raises ConfigError if it has contradictions, see `check`."""
     scenario = _with_files(scenario, source, checked)
     _refuse_first(contradictions(scenario, checked, any_network=any_network), source)
     return scenario
@@ -160,17 +160,17 @@ def to_toml(scenario: schema.Scenario) -> bytes:
 
 
 def _read(name: str, seen: Mapping[tuple[Path, str], str] = MappingProxyType({})) -> dict[str, Any]:
-    """Raw table of a scenario, merged with those it extends.
+    """Raw table of a scenario, merged with the tables of the scenarios that it extends.
 
     Args:
         name: name or path of the scenario.
-        seen: scenarios that extend this one, directly or indirectly, to detect circles.
+        seen: scenarios that extend this one, directly or indirectly, for the detection of circles.
     """
     file, _, entry = name.rpartition("/")
     if name.endswith(".toml") or name in names():
         file, entry = name, ""
     elif not (entry and (file == COMPARED or file.endswith(".toml"))):
-        with suppress(OSError):  # a name that is too long for a file
+        with suppress(OSError):  # the name is too long for a file
             if Path(name).exists():
                 expected = "expected the name of a scenario, or a file that ends in .toml"
                 raise ConfigError(f"{name}: {expected}")
@@ -232,7 +232,7 @@ def _with_files(scenario: Scenario, source: str, checked: schema.Scenario | None
 
 
 def _naming_files(scenario: schema.Scenario) -> list[tuple[str, str]]:
-    """Keys whose values may name files, and these values: those of the network for each path."""
+    """Keys whose values may name files, and these values; keys of the network for each path."""
     return [
         ("reference.file", scenario.reference.file),
         *((f"network.{way}", getattr(path, way)) for path in scenario.paths for way in WAYS),
@@ -241,7 +241,7 @@ def _naming_files(scenario: schema.Scenario) -> list[tuple[str, str]]:
 
 
 def _value(scenario: schema.Scenario, key: str) -> Any:
-    """Value of a key of a room's section; empty if the room is not installed."""
+    """Value of a key in an optional package's section; empty if it is not installed."""
     section, _, name = key.partition(".")
     return getattr(getattr(scenario, section, None), name, "")
 
@@ -253,7 +253,7 @@ def files_of(key: str, text: str, source: str = "", have: Files = ()) -> Files:
         key: `reference.file`, or one of FILES.
         text: value of the key.
         source: file or command line of the value, for messages.
-        have: files that have been read already.
+        have: files read before.
 
     Raises:
         ConfigError: a file cannot be read.
@@ -300,7 +300,7 @@ def _with_paths(raw: dict[str, Any], source: str) -> dict[str, Any]:
     network: Any = raw.get("network")
     paths = network.get("paths") if isinstance(network, Mapping) else None
     if not (isinstance(paths, list | tuple) and all(isinstance(each, Mapping) for each in paths)):
-        return raw  # there are none, or they are refused with their type
+        return raw  # no paths, or of a wrong type, which is refused elsewhere
     both = {way: getattr(NetworkConfig(), way) for way in WAYS}
     both |= {way: network[way] for way in WAYS if way in network}
     whole = [_overlay(both, dict(each), source, "network.") for each in paths]
@@ -323,7 +323,7 @@ def _path(file: str) -> Path:
         return SCENARIOS / f"{file}.toml"
     try:
         return Path(file).resolve()
-    except (ValueError, OSError, RuntimeError) as error:  # a zero byte, or a circle of links
+    except (ValueError, OSError, RuntimeError) as error:  # a NUL character, or a cycle of links
         raise ConfigError(f"{file}: cannot be read: {error}") from None
 
 

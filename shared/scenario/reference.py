@@ -21,7 +21,7 @@ FAST_MPS = 1e6
 """Largest velocity along an axis of a trajectory made from points [m/s]."""
 SAMPLED_S = np.concatenate([0.2347 * np.arange(512), np.geomspace(121.0, 86_400.0, 64)])
 """Times at which a plug-in's trajectory is checked before a flight [s]: dense for two minutes, then
-increasingly sparse up to a day. No round numbers, since a trajectory may be special at those."""
+increasingly sparse up to a day. Round numbers are avoided: a trajectory may have corners there."""
 
 Reference = Callable[[NDArray[Any]], Array]
 
@@ -40,11 +40,11 @@ class OfFleet(ABC):
 
     @abstractmethod
     def of(self, vehicle: int) -> Self:
-        """The same with another vehicle's as the reference."""
+        """Copy whose own reference is that of another vehicle."""
 
     @abstractmethod
     def allocated(self) -> Self:
-        """The same with each vehicle's goals allocated anew."""
+        """Copy in which the goals are newly allocated to the vehicles."""
 
 
 def planar(
@@ -53,8 +53,8 @@ def planar(
     axes: int,
     altitude_m: float,
 ) -> Reference:
-    """Planar curve from functions of time to (position, velocity) for x and y; altitude is
-    constant.
+    """Planar curve at constant altitude, from functions of time that give (position, velocity) in x
+    and y.
     """
 
     def sample(t: Array) -> Array:

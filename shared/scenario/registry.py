@@ -41,7 +41,7 @@ UNITS: Mapping[str, Mapping[str, tuple[float, float]]] = MappingProxyType(
         "": {"%": (1.0, 100.0)},
     }
 )
-"""Units that may follow a number, by the end of the parameter's name: multiplier, divisor."""
+"""Units allowed after a number, with multiplier and divisor, by the end of the parameter's name."""
 
 _NAME = re.compile(r"[a-z_]\w*(-\w+)*", re.ASCII | re.IGNORECASE)
 _WITH_UNIT = re.compile(rf"({grammar.NUMBER.pattern})([a-z]+|%)", re.ASCII | re.IGNORECASE)
@@ -79,7 +79,7 @@ class Parameter:
     default: Value | None = None
     """Default value; None if the argument is required."""
     is_rest: bool = False
-    """Whether the parameter takes all remaining arguments, like *args."""
+    """Whether the parameter collects all remaining arguments, like *args."""
 
     def takes(self, value: Any) -> bool:
         try:
@@ -150,11 +150,11 @@ class Entry:
 
 
 def load(module: str, what: str) -> Any:
-    """Import a built-in module that a scenario needs; raises ConfigError if it, or another of ours
-    that it imports, is not installed.
+    """Import a built-in module that a scenario needs; raises ConfigError if this module or one that
+    it imports is not installed.
 
     Args:
-        what: what needs it, for the message.
+        what: name of the feature that needs the module, for the message.
     """
     try:
         return import_module(module)
@@ -165,7 +165,7 @@ def load(module: str, what: str) -> Any:
 
 
 def _offered() -> None:
-    """Stand-in for an entry whose module is not loaded yet."""
+    """Placeholder for an entry whose module is not loaded yet."""
 
 
 _OFFERED = Entry(_offered, (), "")
@@ -181,7 +181,7 @@ class PluginTable(dict[str, Entry]):
         form: example of a text with entries, for messages.
         given: number of arguments that the program passes to a function.
         class_: number of arguments that the program passes to a class.
-        texts: whether entries may take words and file names besides numbers.
+        texts: whether entries may also have words and file names as arguments.
     """
 
     def __init__(
@@ -192,14 +192,14 @@ class PluginTable(dict[str, Entry]):
         self.form = form
         self._given, self._class, self._texts = given, class_, texts
         self._modules: dict[str, str] = {}
-        """Module of each entry that is offered."""
+        """Module of each entry declared by `offer`."""
         self._built_in: dict[str, Entry] = {}
-        """Those entries of their modules that are loaded."""
+        """Entries of the loaded built-in modules."""
 
     # -- entries of modules that are not loaded yet --------------------------------------------
 
     def offer(self, module: str, *names: str) -> None:
-        """Name entries of a built-in module, which is imported when one of them is first used."""
+        """Declare entries of a built-in module, which is imported at their first use."""
         for name in names:
             self._modules[name] = module
             super().__setitem__(name, _OFFERED)
@@ -238,7 +238,7 @@ class PluginTable(dict[str, Entry]):
     def one(self, text: str) -> Call:
         """Parse a text that names a single entry."""
         call = grammar.parse(text, self.form)
-        # Without arguments, no spaces or parentheses: other code compares the text with names.
+        # Without arguments, a text has no spaces or parentheses: other code compares it with names.
         if not isinstance(call, Call) or not (call.keys or text == call.name):
             raise GrammarError(text, self.form)
         return self._bound(call)
@@ -289,7 +289,7 @@ class PluginTable(dict[str, Entry]):
         return [(each, parameters[min(i, last)].file) for i, each in enumerate(call.values)]
 
     def with_values(self, text: str, call: Call, values: Sequence[Any]) -> str:
-        """Text in which a call has these values, all of them written out."""
+        """Text in which the call's arguments are replaced by these values."""
         files = [file for _, file in self._args(call)]
         shown = [
             f'"{value}"' if file else value if isinstance(value, str) else repr(value)
@@ -345,7 +345,7 @@ class PluginTable(dict[str, Entry]):
 
 
 def _forms() -> Any:
-    """Module that puts entries into words, loaded after a user's mistake."""
+    """Module that formats entries for messages, loaded after a user's mistake."""
     return load("skytether.shared.scenario.forms", "forms")
 
 
@@ -355,7 +355,7 @@ def _parameters(
     """Parameters that a function or class takes after the `given` first ones.
 
     Raises:
-        ConfigError: a parameter has an unusable type, or there are fewer than `given`.
+        ConfigError: a parameter has an unusable type, or there are fewer than `given` parameters.
     """
     function = make.__init__ if isinstance(make, type) else make  # type: ignore[misc]
     try:
@@ -426,7 +426,7 @@ PLANNERS = PluginTable("planner", "a planner such as 'mpc', or 'name(1.5)'", giv
 """Planners of `control.planner`, called with a `planners.Problem`. See
 `shared.scenario.planners`."""
 MPC = "mpc"
-"""The planner that the server has itself."""
+"""Name of the server's built-in planner."""
 VEHICLES = PluginTable(
     "vehicle", "a vehicle such as 'simulated', or 'name(1.5)'", given=2, class_=2
 )

@@ -1,6 +1,6 @@
-"""What scenarios can name, and the module that adds it: a module is imported when it is named.
+"""Entries, keys and sections of scenarios, and the modules that add them, imported when used.
 
-The order is that of help texts and documents. Nothing is imported here.
+Their order is also that of help texts and documents. This module imports none of them.
 """
 
 from collections.abc import Mapping
@@ -46,10 +46,10 @@ SECTIONS = {
     "mavlink": "skytether.client.mavlink.keys",
     "ros2": "skytether.client.ros2.keys",
 }
-"""Sections of a scenario that rooms bring, or bring keys of: the module whose SECTION each is."""
+"""Optional sections, and sections with optional keys: the module that defines each in SECTION."""
 
 FILES = {"mission.zones": (ZONES, 4_000_000)}
-"""Keys of rooms whose text may name files, see `reading.FILES`."""
+"""Keys of optional sections whose text may name files, see `reading.FILES`."""
 
 TEXTS: Mapping[str, PluginTable] = MappingProxyType(
     {
@@ -68,11 +68,11 @@ EVENTS = (
     f"{SHARED}events.standby",
     f"{SHARED}missions.events",
 )
-"""Modules with events of rooms, see `shared.telemetry.every_event`."""
+"""Modules with events of optional packages, see `shared.telemetry.every_event`."""
 
 
 def sections() -> dict[str, Any]:
-    """Sections of the rooms that are installed, by name."""
+    """Optional sections whose packages are installed, by name."""
     found = {}
     for name, module in SECTIONS.items():
         with suppress(ConfigError):
@@ -81,7 +81,7 @@ def sections() -> dict[str, Any]:
 
 
 def dead_time() -> Any:
-    """Module of what a model with a dead time needs."""
+    """Module for a model with a dead time."""
     return load(f"{SHARED}law.dead_time", "model.dead_time_s")
 
 

@@ -1,6 +1,6 @@
 """Keys of a scenario: everything about a flight, typed and frozen.
 
-A key is defined here, or in the module `keys` of the room that brings its section
+A key is defined here, or in the module `keys` of the optional package with its section
 (`rooms.SECTIONS`; `whole.Scenario` has all of them), and nowhere else: name, owner (`owners.py`),
 type with bounds, default, and a description with its unit in brackets. The description appears in
 `--help` and in docs/keys.md, which `make keys` writes. A `Term` is used by both ends: it has a
@@ -55,7 +55,7 @@ from skytether.shared.wire.protocol import INPUTS_MAX, PAYLOAD_BYTES_MAX
 # nanoseconds and no product of several values overflows a float.
 Factor = Annotated[float, Meta(ge=1e-3, le=1e3)]
 Factors = Factor | tuple[Factor, ...]
-"""One number for all axes, or one each."""
+"""One number for all axes, or one number for each axis."""
 DeadTime = Annotated[float, Meta(ge=0, le=2)]
 TrueDeadTime = Annotated[float, Meta(ge=0, le=10)]
 Strength = Annotated[float, Meta(ge=0, le=1e3)]
@@ -76,14 +76,14 @@ SHAPE_CHARS = 15
 
 
 Contradiction = tuple[str, object, str]
-"""Key, its value, and the expected value in words."""
+"""Key, its given value, and the expected value in words."""
 
 
 class Section(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Base of every table of a scenario. Rooms bring their own, see `rooms.SECTIONS`."""
+    """Base of every table of a scenario. Optional packages add sections, see `rooms.SECTIONS`."""
 
     def shared_terms(self) -> dict[str, Any]:
-        """Fields of `Terms` that a room's section fills in."""
+        """Fields of `Terms` that an optional section fills in."""
         return {}
 
     def guard(self) -> str:
@@ -91,7 +91,7 @@ class Section(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
         return ""
 
     def contradictions(self, scenario: "Scenario") -> Iterator[Contradiction]:  # noqa: ARG002
-        """Contradictions of a room's keys with others."""
+        """Contradictions of the section's keys with others."""
         yield from ()
 
     def contradictions_of_way(
@@ -100,21 +100,21 @@ class Section(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
         *,
         is_new: bool,  # noqa: ARG002
     ) -> Iterator[Contradiction]:
-        """Contradictions of a room's keys with the desired trajectory.
+        """Contradictions of the section's keys with the desired trajectory.
 
         Args:
-            is_new: whether the trajectory has not been checked before.
+            is_new: whether this is the first check of the trajectory.
         """
         yield from ()
 
     def assigned(self, reference: shapes.Reference, vehicle: int) -> shapes.Reference:  # noqa: ARG002
-        """Desired trajectory of a vehicle, which a room may give to another."""
+        """Desired trajectory of a vehicle after an assignment of goals, as on a mission."""
         return reference
 
 
 class ModelConfig(Section, frozen=True):
     """Model of the UAV, known to both ends, eq. (1)-(6). A list has one number for all axes, or one
-    each.
+    for each.
     """
 
     axes: Term[Literal[2, 3]] = 2
@@ -142,7 +142,7 @@ class ControlConfig(Section, frozen=True):
     """Whether the vehicle corrects deviations from a horizon's states. A vehicle that can only play
     back inputs needs false, and `input_weight` 3, as in the scenario `playback`."""
     delay_bound: OfServer[Duration | Literal["auto"]] = "auto"
-    """Longest time from making a horizon to flying it [s]; auto: as measured."""
+    """Longest time from the making of a horizon to its flight [s]; auto: as measured."""
     observer_s: OfServer[Duration] = 4.0
     """Time constant of the estimate of steady wind and a wrong gain [s]; longer if observations are
     old. 0, or scheme "none": no estimate."""
@@ -153,7 +153,7 @@ class ControlConfig(Section, frozen=True):
     """Largest data rate to all vehicles together, IP and UDP headers included [B/s]; horizons with
     the largest gain per byte are sent first. 0: no limit."""
     planner: OfServer[Text] = "mpc"
-    """What plans, see `skytether list planners`: the MPC of eq. (9), or a planner of your own."""
+    """Planner, see `skytether list planners`: the MPC of eq. (9), or a plug-in's."""
     solver: OfServer[Literal["exact", "osqp"]] = "exact"
     """Solver of eq. (9): a Riccati active set (exact and fast), or OSQP for comparison."""
     spline_error_m: OfServer[Annotated[float, Meta(ge=0, le=1e3)]] = 0.01
@@ -168,7 +168,7 @@ class ControlConfig(Section, frozen=True):
     """Weight S of eq. (9) on the change from the previous horizon; with the scheme "trajectory", on
     the change of the input from step to step [s²/m²]."""
     input_reference: OfServer[bool] = True
-    """Whether R weighs u - v_ref instead of u, so that it does not slow the vehicle down."""
+    """Whether R weighs u - v_ref instead of u, so that it does not make the vehicle slower."""
 
     @property
     def properties(self) -> SchemeProperties:
@@ -189,8 +189,8 @@ class ReferenceConfig(Section, frozen=True):
     turn_every_s: OfServer[Duration] = 0.0
     """Mean time between turns of a target [s]; 0: its velocity changes all the time."""
     noise_m: OfServer[Annotated[float, Meta(ge=0, le=1e3)]] = 0.0
-    """Noise of a target's position as the server measures it at every step [m]; it filters
-    position and velocity. 0: it knows both."""
+    """Noise of the server's measurement of a target's position at every step [m]; the server
+    filters position and velocity. 0: it knows both."""
     radius_m: Term[Annotated[float, Meta(ge=1e-3, le=shapes.FAR_M)]] = 1.55
     """Half the width of the shape, or of a target's area [m]."""
     period_s: Term[Annotated[float, Meta(ge=0.1, le=86400)]] = 27.5
@@ -300,7 +300,7 @@ class SensorConfig(Section, frozen=True):
 
 
 class PathConfig(Section, frozen=True):
-    """Path of a session: a network of its own between vehicle and server."""
+    """Path of a session: a separate network between vehicle and server."""
 
     uplink: Direction
     downlink: Direction
@@ -339,8 +339,8 @@ class LinkConfig(Section, frozen=True):
     """Largest difference between the smallest delays of uplink and downlink over 20 s [s]; 0:
     unknown. It bounds the error of the vehicle's clock."""
     time_of_day: OfEach[Literal["none", "host"]] = "none"
-    """Source of the time of day on a mission, which compares clocks if both ends have one; host:
-    the host's clock, with an error bound from its kernel (chrony)."""
+    """Source of the time of day on a mission; if both ends have one, their clocks are compared.
+    host: the host's clock, with an error bound from its kernel (chrony)."""
     timeout_s: OfEach[Interval] = 1.5
     """Silence after which the vehicle brakes and asks for a new session [s]. The server frees the
     vehicle's number after the same time, or twice this time with heartbeats "auto"."""
@@ -357,7 +357,7 @@ class LinkConfig(Section, frozen=True):
 
     @property
     def patience_ns(self) -> int:
-        """Time of silence after which the server takes a vehicle as lost [ns].
+        """Time of silence after which the server considers a vehicle lost [ns].
 
         A vehicle brakes if its server is silent. The server only reserves the vehicle's number, so
         it can wait longer, and then needs half as many heartbeats.
@@ -378,8 +378,8 @@ class SimulationConfig(Section, frozen=True):
     clock_drift_ppm: OfVirtualTime[Annotated[float, Meta(ge=-1000, le=1000)]] = 0.0
     """Drift of the vehicle's clock, positive if faster than the server's [ppm]."""
     time_error_s: OfVirtualTime[Duration] = 0.0
-    """Error of the time of day on a mission [s]: positive at odd vehicles, negative at the server
-    and even ones; 0: no time of day."""
+    """Error of the time of day on a mission [s]: positive at odd vehicles, negative at even ones
+    and the server; 0: no time of day."""
 
 
 S = TypeVar("S", bound=Section)
@@ -393,9 +393,9 @@ class Scenario(Section, frozen=True):
     duration: OfVehicle[Annotated[float, Meta(gt=0, le=86400)]] = 60.0
     """Length of the flight [s]."""
     settle: OfVehicle[Annotated[float, Meta(ge=0, le=86400)]] = 0.0
-    """Time at the start that RMSE leaves out [s]; half of the flight if the flight is shorter."""
+    """Time at the start that RMSE ignores [s]; in a shorter flight, half of the flight."""
     seed: OfEach[Annotated[int, Meta(ge=0, le=2**32 - 1)]] = 1
-    """Seed of all random numbers."""
+    """Seed of all random numbers of the flight."""
     armed: Annotated[bool, Key(Owner.VEHICLE, InFlight.ARMED)] = True
     """Whether plans may be flown; disarmed, the vehicle brakes and stays."""
     model: ModelConfig = ModelConfig()
@@ -426,7 +426,7 @@ class Scenario(Section, frozen=True):
         return (each for each in msgspec.structs.astuple(self) if isinstance(each, Section))
 
     def section(self, kind: type[S]) -> S:
-        """Section that a room brings."""
+        """Optional section of the class `kind`."""
         return next(each for each in self.sections() if isinstance(each, kind))
 
     @property
@@ -436,10 +436,10 @@ class Scenario(Section, frozen=True):
         return network.paths or (PathConfig(uplink=network.uplink, downlink=network.downlink),)
 
     def on_path(self, index: int) -> Self:
-        """Scenario of one path alone; the first has the scenario's seed, others one of their own.
+        """Scenario with one path only; the first has the scenario's seed, each other a derived one.
 
         Args:
-            index: number of the path, from 0; one more than there are: to another server.
+            index: number of the path, from 0; the number of paths: network to a standby server.
         """
         path = (*self.paths, self.paths[0])[index]
         network = msgspec.structs.replace(
@@ -450,7 +450,7 @@ class Scenario(Section, frozen=True):
 
     @property
     def networks(self) -> list[Self]:
-        """Scenario of each network between a vehicle and its server alone: one, or one a path."""
+        """Scenarios of the networks between a vehicle and its server: one, or one per path."""
         return [self.on_path(index) for index in range(len(self.paths))]
 
     @property
@@ -537,14 +537,14 @@ class Scenario(Section, frozen=True):
         )
 
     def make_reference(self, vehicle: int = 1) -> shapes.Reference:
-        """Desired trajectory of a vehicle, by its number; with the shape "target" each differs."""
+        """Desired trajectory of a vehicle, by its number; with the shape "target" all differ."""
         reference = self.unallocated_reference(vehicle)
         for section in self.sections():
             reference = section.assigned(reference, vehicle)
         return reference
 
     def measured_reference(self, vehicle: int = 1) -> shapes.Reference:
-        """Desired trajectory of a vehicle as the server sees it; see `reference.noise_m`."""
+        """Desired trajectory of a vehicle, as measured by the server; see `reference.noise_m`."""
         reference, config = self.make_reference(vehicle), self.reference
         if config.shape != "target" or not config.noise_m:
             return reference
@@ -574,7 +574,7 @@ class Scenario(Section, frozen=True):
 
     @property
     def keeps_apart(self) -> bool:
-        """Whether vehicles keep apart: each flies its motion to the end, or holds its place."""
+        """Whether vehicles keep apart: each flies its motion to the end, or holds its position."""
         return self.reference.shape.partition("(")[0].strip() in rooms.APART
 
     def _tabledigest(self) -> str:

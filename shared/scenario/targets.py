@@ -1,4 +1,4 @@
-"""Target: a random walk that the server follows, and its positions as measured with noise."""
+"""Target: a random walk that the vehicle has to follow, and noisy measurements of its positions."""
 
 import numpy as np
 
@@ -11,11 +11,11 @@ from skytether.shared.scenario.schema import Scenario
 GRID_S = 0.05
 """Time between the random velocities of a target; they are interpolated linearly."""
 TURN_S = 3600.0
-"""Time after which a target's path is run backwards, then forwards again, to bound the memory for
-the random walk."""
+"""Time after which a target follows its path backwards, then forwards again, to bound the memory
+for the random walk."""
 GRID_BLOCK = 1024
 GAINS_MAX = 10_000
-"""Largest number of steps until the gains of a filter are taken as steady."""
+"""Largest number of steps after which the gains of a filter count as steady."""
 
 
 def target(
@@ -30,10 +30,10 @@ def target(
     """Random walk from the origin, by white acceleration or by random turns.
 
     Velocity and position are reflected at their bounds. Before time 0 the target is at rest at the
-    origin. After TURN_S its path is run backwards.
+    origin. After TURN_S it follows its path backwards.
 
     Args:
-        rng: generator used by this walk only; later times draw more numbers from it.
+        rng: generator used by this walk only; states at later times draw more numbers.
         agility: strength of the white acceleration [m/s per √s].
         speed_mps: largest velocity along an axis [m/s].
         radius_m: largest coordinate [m].
@@ -74,9 +74,7 @@ class _Walk:
         self._positions = np.zeros((1, axes))
 
     def upto(self, last: int, *, agility: float, speed_mps: float) -> tuple[Array, Array]:
-        """Velocities [m/s] and positions [m] at grid points 0 … last at least;
-        each (points, axes).
-        """
+        """Velocities [m/s] and positions [m] at grid points 0 … last, or more; (points, axes)."""
         while len(self._free) <= last:
             kicks = self._rng.standard_normal((GRID_BLOCK, self._free.shape[1]))
             if self._turns < 1.0:
@@ -122,7 +120,7 @@ class Measured:
 
     def __call__(self, t: Array) -> Array:
         t = np.maximum(np.asarray(t, dtype=np.float64), 0.0)
-        # 1e-9: rounding errors of a time in steps.
+        # 1e-9 covers rounding errors of a time in steps.
         steps = np.floor(t / self._dt_s + 1e-9).astype(np.int64)
         self._estimate_until(int(steps.max(initial=0)))
         states = self._states[steps]

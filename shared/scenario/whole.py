@@ -1,4 +1,4 @@
-"""Scenario with the sections of all rooms that are installed (types: `whole.pyi`)."""
+"""Scenario with all installed optional sections (types: `whole.pyi`)."""
 
 import msgspec
 

@@ -1,4 +1,4 @@
-"""Wrong values of a scenario in words: loaded with the first of them."""
+"""Messages about wrong values of a scenario; loaded at the first wrong value."""
 
 import re
 import typing
@@ -27,10 +27,10 @@ def explain(message: str, raw: Mapping[str, Any], scenario: type[Any]) -> str:
 
     Args:
         message: the message.
-        raw: table of plain values that was to become a scenario.
+        raw: table of plain values that was to be converted.
         scenario: class of the scenario.
     """
-    # Unknown keys first: their names may contain anything, also the syntax of msgspec's messages.
+    # Unknown keys first: their names may contain any text, even the syntax of msgspec's messages.
     if unknown := _unknown_key(raw, scenario):
         return unknown
     parts = _ERROR.fullmatch(message)
@@ -78,7 +78,7 @@ def _unknown_key(table: object, section: Any, at: str = "") -> str | None:
 def _represented(given: object) -> str:
     try:
         return short(repr(given))
-    except ValueError:  # Python formats no number of more than 4300 digits
+    except ValueError:  # Python cannot format numbers of more than 4300 digits
         return "a number of thousands of digits"
 
 

@@ -30,12 +30,12 @@ class ProcessCounts(msgspec.Struct, frozen=True):
     dropped: dict[str, int] = {}
     by_vehicle: dict[str, VehicleCounts] = {}
     others_dropped: dict[str, int] = {}
-    """A client's counts of the vehicles that `by_vehicle` leaves out."""
+    """A client's counts for the vehicles that are missing in `by_vehicle`."""
     uplink: DirectionCounts = DirectionCounts()
     downlink: DirectionCounts = DirectionCounts()
     refused: int | dict[str, int] = 0
-    """netem's packets without a flow; in a server's figures, refused
-    HELLOs, which are answered and so not drops."""
+    """netem's packets without a flow; in a server's figures, refused HELLOs, which do not count as
+    dropped because they are answered."""
     kernel_drops: int = 0
 
 

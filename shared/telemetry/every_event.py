@@ -1,6 +1,6 @@
-"""Every kind of event, as one union: what reads a log, a feed or a recording decodes into it.
+"""Union of all kinds of events, into which readers of logs, feeds and recordings decode.
 
-Of a room that is not installed there are no events.
+Events of packages that are not installed are missing.
 """
 
 from collections.abc import Iterator
@@ -27,7 +27,7 @@ def kinds(base: type[Event] = Event) -> Iterator[type[Event]]:
             yield kind
 
 
-# The classes are found, not listed, so none can be forgotten. For mypy the union is its base.
+# Classes are searched, not listed, so that none is forgotten. For mypy the union is `Event`.
 if TYPE_CHECKING:
     EveryEvent = Event
 else:

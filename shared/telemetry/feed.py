@@ -2,8 +2,8 @@
 
 A feed is a stream of frames, each a length (`LENGTH_BYTES`, big-endian) followed by as many bytes
 of msgpack. The first is `Opened`; `Rows` follow for the parts of the record that it names. An
-observer that connects late gets the most recent frames, starting with a whole one. A reader that is
-too slow is dropped; the process never waits for one (`shell.driving.feed`).
+observer that connects late gets the most recent frames, starting with a complete one. A reader that
+is too slow is disconnected; the process never waits for readers (`shell.driving.feed`).
 """
 
 from collections.abc import Mapping
@@ -24,7 +24,7 @@ ROW_BYTES_MAX = 4096
 
 
 class FeedError(ValueError):
-    """The data are not a feed."""
+    """Invalid data in a feed."""
 
 
 class Opened(msgspec.Struct, frozen=True, tag=True, kw_only=True, omit_defaults=True):
@@ -81,7 +81,7 @@ def unpack(body: bytes | bytearray) -> Frame:
     """Frame from the bytes of `pack`; raises FeedError if they are not a frame."""
     try:
         frame: Frame = _DECODER.decode(body)
-        if isinstance(frame, Figures):  # msgpack has values and keys that JSON and recordings lack
+        if isinstance(frame, Figures):  # refuse values that JSON does not have
             msgspec.json.encode(frame.figures)
         return frame
     except _UNDECODABLE as error:

@@ -8,7 +8,7 @@ BINS = 500
 
 
 class Histogram:
-    """Counts of durations in bins of equal width; the last bin takes all longer ones."""
+    """Counts of durations in bins of equal width; the last bin has all longer durations."""
 
     def __init__(self, bin_ns: int) -> None:
         self.bin_ns = bin_ns
@@ -16,7 +16,7 @@ class Histogram:
         self.largest_ns = 0
 
     def add(self, value_ns: int) -> None:
-        # Called once per packet or step: comparisons cost half of min() and max().
+        # Called once per packet or step: comparisons are twice as fast as min() and max().
         index = value_ns // self.bin_ns
         self.counts[index if index < BINS else -1] += 1
         if value_ns > self.largest_ns:  # noqa: PLR1730
@@ -32,7 +32,7 @@ class Histogram:
         self.largest_ns = largest_ns
 
     def quantile_ms(self, share: float) -> float:
-        """Upper edge of the bin that contains a quantile [ms]; 0 if empty."""
+        """Upper edge of the bin that contains a quantile [ms]; 0 without durations."""
         wanted, seen = share * sum(self.counts), 0
         for index, count in enumerate(self.counts):
             seen += count
@@ -41,9 +41,9 @@ class Histogram:
         return self.largest_ns / MILLISECOND_NS
 
     def within(self, edges_ms: Sequence[float]) -> dict[str, int]:
-        """Number of durations below each ascending edge [ms], by its text, and all by "inf".
+        """Number of durations below each ascending edge, by the edge as text [ms]; "inf" for all.
 
-        A bin that contains an edge is counted above it.
+        A bin that contains an edge counts as above the edge.
         """
         counts_below, seen, index = {}, 0, 0
         for edge_ms in edges_ms:
@@ -53,7 +53,7 @@ class Histogram:
         return {**counts_below, "inf": seen + sum(self.counts[index:])}
 
     def by_bin(self) -> dict[str, int]:
-        """Counts by the lower edge of the bin [ms], keyed as in `20`; empty bins are left out."""
+        """Counts by the lower edge of the bin as text [ms], such as "20"; without empty bins."""
         return {
             f"{index * self.bin_ns / MILLISECOND_NS:g}": count
             for index, count in enumerate(self.counts)

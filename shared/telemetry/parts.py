@@ -21,7 +21,7 @@ def columns_of(descr: Any) -> np.dtype[np.void]:
     """
     try:
         fields = [(name, kind, *map(tuple, shape)) for name, kind, *shape in descr]
-        # numpy evaluates other kinds like Python code, with any kind of error if they are invalid.
+        # numpy would evaluate other kinds like Python code, and could raise any error.
         if not all(_NUMBER.fullmatch(kind) for _, kind, *_ in fields):
             raise ValueError("got a column of another kind, expected numbers")
         columns = np.dtype(fields)

@@ -25,7 +25,7 @@ from skytether.shared.scenario.schemes import properties
 Rows = NDArray[np.void]
 
 RECORDING = ".mcap"
-"""Suffix of a file that is a recording of a flight, not a part of the record."""
+"""Suffix of a recording of a flight; other files are parts of the record."""
 
 
 class Reason(IntEnum):
@@ -99,12 +99,12 @@ def client_columns(axes: int) -> np.dtype[np.void]:
             ("vehicle", "<u2"),
             ("step", "<i8"),
             ("state", "<f8", (axes, 2)),  # true state [m, m/s]; of a real vehicle, the estimate
-            ("measured", "<f8", (axes, 2)),  # since the step before [m, m/s]; NaN if not measured
+            ("measured", "<f8", (axes, 2)),  # newest since the last step [m, m/s]; NaN if none
             ("estimate", "<f8", (axes, 2)),  # for feedback and observations, see docs/vehicles.md
             ("input", "<f8", (axes,)),  # desired velocity that is flown from this step on [m/s]
             ("covered", "?"),  # whether the input is from a horizon: not when hovering or braking
             ("in_force", "<i8"),  # step that the horizon in force was made for; -1 if none is
-            ("age_ns", "<i8"),  # age of the observation it was planned from; -1 without it
+            ("age_ns", "<i8"),  # age of that horizon's observation; -1 without one
             ("stale", "<i8"),  # number of horizons older than the one in force, so far
             ("missed", "<i8"),  # number of missed steps so far
             ("mode", "<u1"),  # mode from this step on, a `shared.wire.protocol.Mode`
@@ -123,9 +123,9 @@ def server_columns(axes: int, scheme: str) -> np.dtype[np.void]:
         [
             ("vehicle", "<u2"),
             ("step", "<i8"),
-            ("reference", "<f8", (axes, 2)),  # x_d(k), as known to the server at that tick
+            ("reference", "<f8", (axes, 2)),  # desired state x_d(k), as known at the tick
             ("estimate", "<f8", (axes, 2)),  # x̂(k)
-            ("ahead", "<i8"),  # d: planning starts at k + d
+            ("ahead", "<i8"),  # delay bound d: planning starts at k + d
             ("planned", "<f8", (axes, 2)),  # x_p(k+d|k-1)
             ("input", "<f8", (axes,)),  # û(k), or the committed input of k
             ("observed_step", "<i8"),  # step of the observation from which x̂ was predicted
@@ -133,11 +133,11 @@ def server_columns(axes: int, scheme: str) -> np.dtype[np.void]:
             # plan, or without a trigger that needs expected_gap
             *((figure, "<f8") for figure in properties(scheme).figures),
             (str(Compared.OWN), "<f8"),  # figure of a plug-in's policy, in its own unit, or NaN
-            ("threshold", "<f8"),  # of the compared figure; 0 if nothing is compared
+            ("threshold", "<f8"),  # threshold of the compared figure, or 0
             ("compared", "<u1"),  # figure compared with the threshold, a `Compared`
             ("event", "?"),
             ("solved", "?"),
-            ("solve_ns", "<i8"),  # both MPCs, all vehicles of the tick; -1 if not measured
+            ("solve_ns", "<i8"),  # of both MPCs, for all vehicles; -1 if not measured
             ("stale", "<i8"),  # number of observations older than the newest, so far
             ("missed", "<i8"),  # number of missed ticks so far
         ]
@@ -154,7 +154,7 @@ def plan_columns(axes: int, planned: int) -> np.dtype[np.void]:
         [
             ("vehicle", "<u2"),
             ("step", "<i8"),  # k, the step of the plan
-            ("begins", "<i8"),  # step of the first of the inputs, k + d
+            ("begins", "<i8"),  # step of the first planned input, k + d
             ("state", "<f8", (axes, 2)),  # x̂(k+d), the state from which the inputs start [m, m/s]
             ("inputs", "<f4", (axes, planned)),  # desired velocities, one a step [m/s]
             ("disturbance", "<f8", (axes,)),  # ŵ, disturbance assumed in the prediction [m/s]
@@ -172,11 +172,11 @@ PACKET_COLUMNS: np.dtype[np.void] = np.dtype(
         ("path", "<u1"),  # number of the session's path, from 0
         ("flow", "<u4"),  # number of the client
         ("number", "<u4"),  # number of the packet in its flow and direction
-        ("bytes", "<u2"),  # UDP payload; of `netem run` the packet of IP
-        ("arrived_ns", "<i8"),  # [netem's clock]
-        ("delay_ns", "<i8"),  # as drawn, also for a lost packet
+        ("bytes", "<u2"),  # UDP payload; with `netem run` the IP packet
+        ("arrived_ns", "<i8"),  # time of arrival at netem [netem's clock]
+        ("delay_ns", "<i8"),  # drawn delay, also of a lost packet
         ("lost", "?"),
-        ("overtaken", "?"),  # by a later packet of the same flow
+        ("overtaken", "?"),  # whether a later packet of the flow left earlier
     ]
 )
 """Columns of netem's part: one row for each packet."""
@@ -201,7 +201,7 @@ class Recorder:
         self._sinks: list[Sink] = []
         self._row = _row(columns)
         self.pack = self._row.pack
-        """Function that encodes a row from a value for every column in order."""
+        """Function that encodes a row from the values of all columns, in their order."""
         if sink is not None:
             sink.write(json.dumps(columns.descr).encode() + b"\n")
             self._sinks.append(sink)
@@ -225,7 +225,7 @@ class Recorder:
             sink.write(row)
 
     def append_packed(self, rows: Sequence[bytes]) -> None:
-        """Append rows encoded by `pack`, in few pieces."""
+        """Append rows encoded by `pack`, with few writes to the sinks."""
         # A full sink drops a whole piece, so pieces are short.
         for first in range(0, len(rows), PIECE_ROWS):
             piece = b"".join(rows[first : first + PIECE_ROWS])
@@ -234,7 +234,7 @@ class Recorder:
 
 
 class MemoryRecorder(Recorder):
-    """Recorder that keeps its rows in memory."""
+    """Recorder that stores its rows in memory."""
 
     def __init__(self, columns: np.dtype[np.void]) -> None:
         super().__init__(columns)
@@ -288,7 +288,7 @@ class Record:
     """Figures of the endpoints "server" and "netem" (see `Endpoint.figures`); in a batch, those at
     the end of the batch."""
     events: tuple[FlightEvent, ...] = ()
-    """Events of the run's own endpoints, and those of the server about its vehicles, in order."""
+    """Events of the run's own endpoints, and the server's events about its vehicles, in order."""
     incomplete: tuple[RecordIncomplete, ...] = ()
     """Gaps in the record of a flight over real UDP, one per part."""
     plan: Rows = field(default_factory=lambda: np.empty(0, plan_columns(2, 1)))

@@ -1,4 +1,4 @@
-"""What sent the plans of a flight, from rows of the server's part of the record."""
+"""Causes of the plans sent in a flight, from rows of the server's part of the record."""
 
 from typing import NamedTuple
 
@@ -24,17 +24,17 @@ def compared(rows: Rows) -> Array:
 
 
 class SentBy(NamedTuple):
-    """Number of plans sent, by what sent them."""
+    """Numbers of plans sent, by cause."""
 
     above: int
-    """The figure that the trigger compares was above its threshold, also if a sign of life was due
-    as well."""
+    """Plans sent because the trigger's figure was above its threshold, even if a heartbeat was due
+    too."""
     due: int
-    """Plans sent below the threshold: as a sign of life, by a schedule, or as the first plan."""
+    """Plans sent below the threshold: as a heartbeat, by a schedule, or as the first plan."""
 
 
 def sent_by(rows: Rows) -> SentBy:
-    """Count the plans sent in rows of the server's part, by what sent them."""
+    """Count the plans sent in rows of the server's part, by cause."""
     sent = rows[rows["event"]]
     above = (sent["compared"] != Compared.NOTHING) & (compared(sent) > sent["threshold"])
     return SentBy(int(above.sum()), int((~above).sum()))

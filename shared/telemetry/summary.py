@@ -18,16 +18,16 @@ from skytether.shared.telemetry.sent import sent_by
 from skytether.shared.wire.protocol import NO_HORIZON, Mode
 
 AT_BOUND = 1.0 - 1e-6
-"""Share of the bound above which an input counts as at the bound: inputs are rounded on the
-wire."""
+"""Share of the bound above which an input counts as bounded: inputs are rounded when they are
+sent."""
 WORSE = (Mode.BRAKE, Mode.LAND, Mode.RETURN, Mode.FAULT)
 """Modes in which a vehicle no longer follows its plan because something went wrong."""
 STOPPED = (*WORSE, Mode.HOVER, Mode.INIT, Mode.SYNC, Mode.READY)
-"""Modes in which a brake may go on: at rest, waiting for a session and for a plan."""
+"""Modes that continue a braking manoeuvre: at rest, waiting for a session and for a plan."""
 
 
 class Summary(msgspec.Struct, frozen=True, kw_only=True):
-    """Summary of one vehicle's flight; None if something was not measured, or its record is
+    """Summary of one vehicle's flight; a field is None if it was not measured, or its record is
     missing.
     """
 
@@ -59,9 +59,9 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
     """Number of packets with a horizon that the server sent; the other uplink packets are
     heartbeats and the handshake's."""
     uplink_above: int | None = None
-    """Number of these that the trigger's figure sent, see `shared.telemetry.sent.SentBy`."""
+    """Number of horizons sent because of the trigger's figure, see `telemetry.sent.SentBy`."""
     uplink_due: int | None = None
-    """Number of the other ones, which were due."""
+    """Number of horizons sent because they were due by time."""
     uplink_packets: int | None
     """Number of packets that entered the network from the server, including lost ones."""
     uplink_bytes: int | None
@@ -69,7 +69,7 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
     downlink_packets: int | None
     downlink_bytes: int | None
     paths: list[tuple[int, int]] | None = None
-    """Number of packets on each path, up and down; None with a single path."""
+    """Number of uplink and downlink packets on each path; None with a single path."""
     uplink_packets_per_s: float | None = None
     """Rate of packets from the server, including heartbeats and lost ones [1/s]."""
     uplink_bytes_per_s: float | None = None
@@ -106,7 +106,7 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
     decreases."""
     plan_age_s_mean: float | None
     """Mean time since the horizon in force was made [s], over the steps from `settle` on: the age
-    of information that only the server has, such as the position of a target."""
+    of information that only the server knows, such as the position of a target."""
     effort_mps: float | None
     """Root mean square of the change of the input from step to step, over all axes together, from
     `settle` on [m/s]."""
@@ -236,7 +236,7 @@ def desired(scenario: Scenario, client: Rows, server: Rows | None = None) -> Arr
     """Desired position at every step of one vehicle [m]; shape (steps, axes).
 
     Only the server's record has the position of a live point and the goal of a vehicle on a
-    mission: at a step without a row the previous one holds. NaN if unknown.
+    mission: at a step without a row the previous row counts. NaN if unknown.
 
     Args:
         client: rows of the vehicle.
@@ -272,7 +272,7 @@ def position_error(scenario: Scenario, client: Rows, server: Rows | None = None)
 def _estimate_error(scenario: Scenario, client: Rows) -> Array:
     """Error of the position used by feedback [m]; shape (steps, axes).
 
-    With a dead time it is compared with the true position a dead time later; NaN after the flight.
+    With a dead time, the true position is that of a dead time later; NaN after the flight.
     """
     flown_by: Array = client["estimate"][..., 0]
     true = client["state"][..., 0]

@@ -1,4 +1,4 @@
-"""Channel: the encrypted packets of one handshake, both ways, each opened at most once.
+"""Channel: encrypted packets in both directions after one handshake, each opened at most once.
 
     DATA    version u8 | type u8 | vehicle u16 | channel u32 | counter u64 | sealed message
 
@@ -7,8 +7,8 @@ the packets of one direction from 0, is the nonce as in Noise: four zero bytes, 
 Each direction has its own key, so that a packet sent back to its sender is not accepted. Counters
 are in memory only: after a restart there is a new handshake with new keys.
 
-The receiving end enforces the limits (LIFE_NS, PACKETS_MAX). The sending end does not have to: a
-packet sealed too late is not opened.
+The receiving end enforces the limits (LIFE_NS, PACKETS_MAX), so that the sending end does not have
+to.
 """
 
 import struct
@@ -32,14 +32,14 @@ OVERHEAD_BYTES = HEADER.size + 16
 WINDOW = 2048
 """Number of newest counters that are tracked; a packet with an older one is not opened."""
 RECENT, REPEATS = 64, 2
-"""Number of newest counters whose repeats are checked, and most checks until a newer packet comes,
-see `Channel.repeats`."""
+"""Number of newest counters whose repeats are checked, and largest number of checks until a newer
+packet arrives, see `Channel.repeats`."""
 FRESH_NS, FRESH_PACKETS = 300 * SECOND_NS, 2**22
 """Age and number of packets of a channel after which a new one is needed."""
 LIFE_NS, PACKETS_MAX = 600 * SECOND_NS, 2**32
-"""Age and number of packets after which nothing is opened any more."""
+"""Age and number of packets after which no packet of the channel is opened."""
 OVERLAP_NS = 10 * SECOND_NS
-"""Time for which a replaced channel is still opened."""
+"""Time for which packets of a replaced channel are still opened."""
 
 _PREFIX = struct.Struct("<BBHI")
 _COUNTER = struct.Struct("<Q")
@@ -78,10 +78,10 @@ class ReplayWindow:
         self.newest = -1
         """Highest counter received; -1 before the first."""
         self._seen = 0
-        """Bit i stands for the counter `newest` - i."""
+        """Bits of the received counters: bit i is set if `newest` - i was received."""
 
     def is_new(self, counter: int) -> bool:
-        """Whether a counter has not been received, and is recent enough to tell."""
+        """Whether a counter has not been received; False if it is too old to be tracked."""
         back = self.newest - counter
         return back < 0 or (back < WINDOW and not self._seen >> back & 1)
 
@@ -90,13 +90,13 @@ class ReplayWindow:
         if back >= 0:
             self._seen |= 1 << back
             return
-        # Shifting by more would make a number as long as the jump.
+        # A shift by more would make a number with as many bits as the jump.
         self._seen = (self._seen << min(-back, WINDOW) | 1) & _MASK
         self.newest = counter
 
 
 class Channel:
-    """One end of a channel: seals what it sends and opens what it receives.
+    """One end of a channel: it seals packets to send, and opens received ones.
 
     Args:
         seal: key for packets that this end sends.
@@ -140,7 +140,7 @@ class Channel:
         """Message in a packet.
 
         Raises:
-            ProtocolError: the packet is not from the peer, is a repeat, or comes too late.
+            ProtocolError: the packet is not from the peer, is a repeat, or arrives too late.
         """
         if len(packet) < OVERHEAD_BYTES:
             raise ProtocolError(Drop.LENGTH)
@@ -150,23 +150,23 @@ class Channel:
         if now_ns > self._opens_until_ns or counter >= PACKETS_MAX:
             raise ProtocolError(Drop.EXPIRED)
         window = self._window
-        # Before checking the tag: a repeated packet costs no cryptography.
+        # Before the check of the tag, so that a repeated packet needs no cryptography.
         if not window.is_new(counter):
             raise ProtocolError(Drop.REPLAYED)
         try:
             payload = self._open(_NONCE.pack(counter), packet[HEADER.size :], packet[: HEADER.size])
         except InvalidTag:
             raise ProtocolError(Drop.FORGED) from None
-        # Only after checking the tag: a forged counter must not move the window.
+        # After the check of the tag, because a forged counter must not move the window.
         newest = counter > window.newest
         window.add(counter)
         self._repeats = 0 if newest else self._repeats
         return OpenedPacket(payload, newest)
 
     def repeats(self, packet: bytes) -> bool:
-        """Whether a packet is authentic and repeats one of the newest.
+        """Whether a packet is authentic and repeats one of the newest packets.
 
-        It costs cryptography, so at most REPEATS packets are checked until a newer one comes.
+        The check needs cryptography: at most REPEATS packets are checked per newer packet.
         """
         (counter,) = _COUNTER.unpack_from(packet, _PREFIX.size)
         back = self._window.newest - counter
@@ -180,12 +180,12 @@ class Channel:
         return True
 
     def retire(self, *, now_ns: int) -> None:
-        """From now on open only packets that are still on their way, for OVERLAP_NS."""
-        # The smaller of both: retiring never prolongs the life of a channel.
+        """Open only packets that are still in flight, for OVERLAP_NS from now on."""
+        # The earlier of both times: `retire` never prolongs the life of a channel.
         self._opens_until_ns = min(self._opens_until_ns, now_ns + OVERLAP_NS)
 
     def wants_successor(self, now_ns: int) -> bool:
         """Whether a new channel is needed, because of age or number of packets."""
-        # Both directions count, since one handshake renews the keys of both.
+        # Packets of both directions count, because one handshake renews the keys of both.
         packets = max(self._sent, self._window.newest + 1)
         return now_ns >= self._fresh_until_ns or packets >= FRESH_PACKETS

@@ -1,4 +1,4 @@
-"""Reasons for dropping a datagram, and the error that carries one.
+"""Reasons for dropping a datagram, and the error that has such a reason.
 
 A dropped datagram is an error of the peer or the network: it is counted by reason and never
 answered. Message codec (`protocol`), encryption (`channel`, `handshake`) and both ends raise the
@@ -9,9 +9,9 @@ from enum import StrEnum
 
 
 class Drop(StrEnum):
-    """Why a datagram is dropped; the value is the text for people and the name in metrics."""
+    """Reason for dropping a datagram; the value is its text in logs and its name in metrics."""
 
-    # No message.
+    # The datagram is not a message.
     TOO_LONG = "too long"
     NOT_MSGPACK = "not msgpack"
     NOT_A_MESSAGE = "not a message"
@@ -22,7 +22,7 @@ class Drop(StrEnum):
     NOT_FINITE = "not finite"
     INPUT_OUT_OF_RANGE = "input out of range"
 
-    # For another end, or another session.
+    # The message is for another end, or another session.
     ELSEWHERE = "not from the server's address"
     NOT_FOR_A_SERVER = "not for a server"
     NOT_FOR_A_CLIENT = "not for a client"
@@ -35,7 +35,7 @@ class Drop(StrEnum):
     FULL = "full"
     TAKEN = "taken"
 
-    # Not sealed correctly, see `wire.channel` and `wire.handshake`.
+    # The packet is not sealed correctly, see `wire.channel` and `wire.handshake`.
     NOT_SEALED = "not sealed"
     LENGTH = "length"
     UNKNOWN_KEY = "unknown key"
@@ -48,16 +48,16 @@ class Drop(StrEnum):
     TOO_MANY_HANDSHAKES = "too many handshakes"
 
     OVERTAKEN = "overtaken"
-    """A message of the session came first that was sent later by more than the time-out."""
+    """A message that was sent later by more than the time-out has arrived earlier."""
     COPY = "copy"
-    """The message has come over another path before."""
+    """The message has already arrived over another path."""
 
-    # Impossible observations, see `server.plausibility`.
+    # The observation is impossible, see `server.plausibility`.
     IMPLAUSIBLE_CLOCK = "implausible: clock"
     IMPLAUSIBLE_HORIZON = "implausible: horizon"
     IMPLAUSIBLE_JUMP = "implausible: jump"
 
-    # Horizons that are not flown, see `client.compensator`:
+    # The horizon is not flown, see `client.compensator`.
     FROM_THE_FUTURE = "from the future"
     OBSERVATION = "observation"
     """The observation from which the horizon was planned is impossible."""
@@ -65,7 +65,7 @@ class Drop(StrEnum):
     TOO_EARLY = "too early"
     """A mission's motion begins at a step that is in the future of the vehicle."""
     TOO_LATE = "too late"
-    """Its inputs were due before it came: all of them, or so many that others were flown."""
+    """The horizon arrived after its last input was due, or so late that other inputs were flown."""
     NOT_TAKEN = "not taken"
 
 

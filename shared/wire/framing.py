@@ -1,6 +1,6 @@
-"""What may stand in front of a message: the report of a session with several paths.
+"""Loss report that precedes a message in a session with several paths.
 
-`shared.wire.paths` says what it reports; an end with a single link ignores it.
+`shared.wire.paths` explains its contents; an end with a single link ignores it.
 """
 
 from struct import Struct
@@ -13,7 +13,7 @@ HEAD, BIN8 = Struct("<HH"), 0xC4
 
 
 class Report(NamedTuple):
-    """Report in front of a message."""
+    """Loss report that precedes a message."""
 
     sequence: int
     newest: int
@@ -21,10 +21,10 @@ class Report(NamedTuple):
 
 
 def split(payload: bytes) -> tuple[Report | None, bytes]:
-    """Report in front of a message, if there is one, and the message.
+    """Loss report that precedes a message, or None, and the message.
 
     Raises:
-        ProtocolError: the report is cut off, or not one of 2 to PATHS_MAX paths.
+        ProtocolError: the report is incomplete, or not for 2 to PATHS_MAX paths.
     """
     if not payload or payload[0] != BIN8:
         return None, payload

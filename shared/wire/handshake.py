@@ -8,9 +8,9 @@
 |      |            |         |        | MAC 16                                          |       |
 
 The header is version u8, type u8, vehicle u16 and the number of its key u8. The MAC is a keyed
-BLAKE2s over everything before it, and in an answer also over the ephemeral key that it answers: a
-packet of another peer, or for another attempt, is dropped before any costly computation. The HELLO
-in message 1 is padded, so that no answer is longer than its request.
+BLAKE2s over everything before it, and in an answer also over the client's ephemeral key: a packet
+from another peer, or for another attempt, is dropped before any costly computation. The HELLO in
+message 1 is padded, so that no answer is longer than its request.
 """
 
 import hashlib
@@ -60,7 +60,7 @@ class Response(NamedTuple):
 def check_place(message: bytes, *, in_handshake: bool) -> None:
     """Refuse a HELLO or WELCOME in a channel, and any other message in a handshake.
 
-    An attacker may repeat a packet of the handshake, so nothing else is accepted there.
+    An attacker may replay a packet of the handshake, so no other message is accepted in one.
 
     Raises:
         ProtocolError: the message is in the wrong place, even if its sender has the key.
@@ -82,7 +82,7 @@ def pad(hello: bytes) -> bytes:
 
 
 def unpad(padded: bytes) -> bytes:
-    # The byte 0x80 ends the message, so that a HELLO may end with zeros itself.
+    # The byte 0x80 marks the end of the message, because a HELLO itself may end with zeros.
     return padded.rstrip(b"\0")[:-1]
 
 
@@ -93,12 +93,12 @@ def write_initiation(key: VehicleKey, cookie: bytes, message: bytes) -> bytes:
 
 
 def write_challenge(key: VehicleKey, cookie: bytes, public: bytes) -> bytes:
-    """CHALLENGE from its parts; `public` is the ephemeral key that it answers."""
+    """CHALLENGE from its parts; `public` is the client's ephemeral key."""
     return _sealed(key, _header(key, CHALLENGE) + cookie, public)
 
 
 def write_response(key: VehicleKey, channel: int, message: bytes, public: bytes) -> bytes:
-    """RESPONSE from its parts; `public` is the ephemeral key that it answers."""
+    """RESPONSE from its parts; `public` is the client's ephemeral key."""
     packet = _sealed(key, _header(key, RESPONSE) + CHANNEL.pack(channel) + message, public)
     assert len(packet) <= INITIATION_BYTES
     return packet
@@ -141,8 +141,8 @@ def read_response(key: VehicleKey, packet: bytes, public: bytes) -> Response:
 
 
 def is_authentic(key: VehicleKey, packet: bytes, public: bytes = b"") -> bool:
-    """Whether the sender of a packet has the key; `public` is the ephemeral key that it answers."""
-    # In constant time: the time of a comparison would reveal how many bytes of a guess are right.
+    """Whether a packet's sender has the key; `public`: client's ephemeral key, in an answer."""
+    # In constant time: otherwise the time would reveal how many bytes of a guess are right.
     return hmac.compare_digest(packet[-MAC_BYTES:], _mac(key, packet[:-MAC_BYTES] + public))
 
 

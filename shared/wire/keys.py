@@ -3,7 +3,7 @@
     # vehicle  key  secret
     1 1 6f5e…  (64 hexadecimal digits)
 
-A vehicle has one key, or two during a key change: the present one and the next. No message and no
+A vehicle has one key, or, during a key change, two: the present and the next one. No message and no
 `repr` contains a secret.
 """
 
@@ -42,7 +42,7 @@ class VehicleKey:
 
     @classmethod
     def of(cls, vehicle: int, number: int, secret: bytes) -> "VehicleKey":
-        """Key derived from a secret, which itself is not stored."""
+        """Key derived from a secret; the secret is not stored."""
         assert len(secret) == SECRET_BYTES
         psk = hashlib.blake2s(key=secret, person=b"sky  psk").digest()
         mac = hashlib.blake2s(key=secret, person=b"sky  mac").digest()
@@ -89,7 +89,7 @@ def load(path: Path, *, is_input: bool = True) -> Keyring:
         is_input: whether the command must not write the file.
 
     Raises:
-        ConfigError: the file has none, or others than its owner can read or write it.
+        ConfigError: the file has no keys, or users other than its owner can read or write it.
     """
     name = str(path)
     try:

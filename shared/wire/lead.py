@@ -1,6 +1,6 @@
-"""LEAD, the message that says which of its servers leads a vehicle, and the leadership of plans.
+"""LEAD, the message about the server that leads a vehicle, and the leadership number in plans.
 
-The protocol knows its number, and imports this module as it does `path_proof`. HORIZON and
+`protocol` has its type number, and imports this module when needed, like `path_proof`. HORIZON and
 TRAJECTORY to a vehicle with two servers have one more field at the end:
 
     leadership  number of the leadership for which the plan was made, see `Lead`; 0 is not sent
@@ -39,38 +39,38 @@ PLANS = {number_of(plan): len(plan._fields) + 3 for plan in (Horizon, Trajectory
 
 
 class Lead(NamedTuple):
-    """LEAD: which of its servers leads a vehicle. The server answers with the same number, and with
-    the largest that it has received from any vehicle of its mission.
+    """LEAD: the server that leads a vehicle. A server answers with the same number, and with the
+    largest number received from any vehicle of its mission.
     """
 
     vehicle: int
     session: int
     number: int
-    """Number of the leadership, which only rises; a plan of another number is not flown."""
+    """Number of the leadership, which only rises; plans with another number are not flown."""
     leads: int
-    """1 if the server of this session leads the vehicle with that number, else 0."""
+    """1 if the server of this session leads the vehicle under the number, else 0."""
     largest: int = 0
     """Largest number that the server has received; 0 from a vehicle."""
     step: int = 0
-    """Step k in which the vehicle sends, on its grid; from a server, that of the newest LEAD from
-    the vehicle. The next three fields are empty from a server."""
+    """Step k in which the vehicle sends, on its grid; from a server, the step in the vehicle's
+    newest LEAD. The next three fields are empty from a server."""
     in_force: int | None = None
     """Step that the motion in force was made for; None without one."""
     spacing: int = 0
-    """Steps from one knot of that motion to the next."""
+    """Steps from one knot of the motion in force to the next."""
     knots: NDArray[np.float32] | bytes = b""
     """Position [m] and velocity [m/s] of each knot; shape (axes, knots, 2)."""
     limits: Limits | None = None
     """Limits of the server's motions; None from a vehicle, or without a mission."""
     changes: int = 0
-    """Number of changes of these limits in the server's run."""
+    """Number of changes of `limits` in the server's run."""
 
 
 def with_leadership(number: int, plan: bytes) -> bytes:
-    """Encoded plan with the number of its leadership as a last field; 0 is left out."""
+    """Encoded plan with the number of its leadership appended as last field, unless it is 0."""
     if not number:
         return plan
-    return bytes([plan[0] + 1]) + plan[1:] + msgpack.packb(number)  # an array of one element more
+    return bytes([plan[0] + 1]) + plan[1:] + msgpack.packb(number)  # the array has one more element
 
 
 def decode_led(payload: bytes, terms: Terms) -> tuple[Message, int]:

@@ -1,7 +1,7 @@
 """The handshake Noise_NNpsk0_25519_ChaChaPoly_BLAKE2s: one message each way, and two derived keys.
 
     initiator → responder    psk, e      encrypted with the pre-shared key
-    responder → initiator    e, ee       encrypted with that and the secret of both ephemeral keys
+    responder → initiator    e, ee       also with the shared secret of both ephemeral keys
 
 It follows The Noise Protocol Framework, revision 34 (sections 5, 7.5 and 9), with the names used
 there. Each derived key encrypts one payload, so every nonce is 0. All objects are immutable: a
@@ -27,7 +27,7 @@ MESSAGE_BYTES = KEY_BYTES + TAG_BYTES
 
 _NONCE = bytes(12)
 
-# The first key imports the bindings of OpenSSL: here, so that no first HELLO makes a server wait.
+# The first key imports OpenSSL's bindings: made here, so that no server is delayed at a HELLO.
 X25519PrivateKey.from_private_bytes(bytes(KEY_BYTES))
 
 
@@ -155,7 +155,7 @@ class Responder:
 
 def _begin(psk: bytes, prologue: bytes) -> Symmetric:
     """Initialize() and token "psk"."""
-    name = _hash(NAME)  # hashed because it is longer than a hash
+    name = _hash(NAME)  # hashed, because it is longer than a hash
     return Symmetric(name, name).mix_hash(prologue).mix_key_and_hash(psk)
 
 

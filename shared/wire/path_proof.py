@@ -1,7 +1,7 @@
-"""PATH, the message by which a session's paths are named and proven.
+"""PATH, the message that names and proves a session's paths.
 
-The protocol knows its number, and imports this module when such a message is sent or comes;
-processes in real time do so before the first packet (`protocol.preload`).
+`protocol` has its type number, and imports this module when such a message is sent or arrives;
+processes in real time import it before the first packet (`protocol.preload`).
 """
 
 from typing import NamedTuple
@@ -15,8 +15,8 @@ PRICE = range(1, 10**9)
 
 
 class PathProof(NamedTuple):
-    """PATH: names the path that it takes. The server answers with a proof, and sends on the path
-    once the client has returned the proof on it.
+    """PATH: names the path over which it is sent. The server answers with a proof, and uses the
+    path once the client has returned the proof over it.
     """
 
     vehicle: int
@@ -25,7 +25,7 @@ class PathProof(NamedTuple):
     """Number of the path, from 0."""
     proof: int
     """Number that the server sends only to the address to be proven; 0 from a client that has not
-    received it."""
+    received the number."""
     prices: tuple[int, ...]
     """Price of a packet on each path of the session, in thousandths of the least."""
 

@@ -1,26 +1,26 @@
-"""Several paths between a vehicle and its server: what each path does to packets, and over which of
-them the next message is sent.
+"""Several paths between a vehicle and its server: loss and delay of each path, and choice of the
+paths for each message.
 
-A message has one sequence number and one seal, and travels over any set of paths. The first copy
-counts; later copies are equal byte for byte, so they are recognised before anything is opened. In
-front of each message stands a report, sealed with it:
+A message has one sequence number and one seal, and is sent over any set of paths. The first copy
+counts; later copies are equal byte for byte, so they are recognised before decryption. Each message
+is preceded by a loss report, sealed with it:
 
     report = bin [sequence u16 | newest u16 | arrived u16, for each path]
 
-`newest` is the newest sequence number that has come from the other end, and bit i of `arrived` says
-whether the number `newest` - i has come over that path. So each end knows the loss, delay and
-silence of each path in its own direction, and finds out within a round trip that a path is dead.
+`newest` is the newest sequence number received from the other end, and bit i of `arrived` is set if
+the number `newest` - i has arrived over that path. So each end knows the loss, delay and silence of
+each path in its own direction, and detects a dead path within a round trip.
 
-A message goes over the set S of paths with the least expected cost,
+A message is sent over the set S of paths with the least expected cost,
 
     Σ price_p + worth · Π q_p + alive · Π r_p           q_p: probability that it does not arrive
         p in S           p in S         all p           r_p: that nothing sent on p arrives
 
-where `worth` is what its loss costs, in packets of price 1, and `alive` what it costs if nothing
-arrives after the newest packet that is known to have arrived. If many packets are under way on one
-path, all of them may be lost at once, so the next message takes another. q_p follows from the share
-of packets that path p loses, and from the probability that p is down: each packet in a row that has
-not arrived makes that likelier by Bayes' rule, and so does time without news of the path.
+where `worth` is the cost of losing the message, in packets of price 1, and `alive` the cost if
+nothing arrives after the newest acknowledged packet. If many packets are in flight on one path, all
+of them may be lost at once, so the next message is sent over another. q_p is computed from the
+share of packets that path p loses, and from the probability that p is down, which rises by Bayes'
+rule with each packet in a row that has not arrived, and with the time without reports of the path.
 """
 
 import math
@@ -35,57 +35,57 @@ from skytether.shared.wire.drop import Drop, ProtocolError
 from skytether.shared.wire.framing import BIN8, HEAD, PATHS_MAX, Report
 
 EVERYWHERE = 1e9
-"""Worth of a message that goes over every path."""
+"""Value of `worth` with which a message is sent over every path."""
 SEQUENCES = 2**16
-"""Modulus of sequence numbers: half of them are more than may be under way, so that a packet that
-is late, by however much, is never taken for one that is ahead."""
+"""Modulus of sequence numbers: half of it exceeds the number of packets in flight, so that even a
+very late packet is never mistaken for a newer one."""
 WINDOW = 16
 """Number of newest packets whose arrival is reported for each path."""
 COPIES = 32
 """Number of newest packets whose copies are recognised."""
 IN_FLIGHT_MAX = 64
-"""Largest number of packets on a path of which an acknowledgement is still accepted."""
+"""Largest number of unacknowledged packets that are tracked on a path."""
 DOWN, DOWN_EVERY_S = 0.05, 30.0
 """Share of the time for which a path is assumed to be down, and mean time between two outages [s].
 """
 DOWN_S = DOWN * DOWN_EVERY_S
 """Mean length of an outage [s]."""
 LOSS, LOSS_MIN, LOSS_WEIGHT = 0.05, 0.02, 1 / 32
-"""Share of lost packets assumed at first, least share, and weight of a new packet."""
+"""Loss ratio assumed initially, smallest loss ratio, and weight of a new packet."""
 OUTAGE = 3
-"""Number of packets lost in a row that count as an outage, and not as lost one by one."""
+"""Number of packets lost in a row that count as an outage, not as single losses."""
 DELAYS = 16
-"""Number of newest delays of acknowledgements that are kept."""
+"""Number of newest delays of acknowledgements that are stored."""
 GAPS = 16
-"""Number of newest times between messages of the other end that are kept."""
+"""Number of newest intervals between messages of the other end that are stored."""
 LATE_PART = 8
-"""The usual time by which overtaken packets are late moves by this part to each new one."""
+"""Inverse weight of the newest overtaken packet in the mean lateness of overtaken packets."""
 WAIT_NS, WAIT_MIN_NS, WAIT_MAX_NS = (
     600 * MILLISECOND_NS,
     150 * MILLISECOND_NS,
     5 * SECOND_NS,
 )
-"""Time after which a packet that no report names is taken for lost [ns]: WAIT_NS before the first
-acknowledgement; later it follows from the measured delays, between WAIT_MIN_NS and WAIT_MAX_NS."""
+"""Time after which an unacknowledged packet counts as lost [ns]: WAIT_NS before the first
+acknowledgement; later it is computed from measured delays, within WAIT_MIN_NS and WAIT_MAX_NS."""
 SPARE_NS = 50 * MILLISECOND_NS
-"""Margin added to measured delays before a packet is taken for lost [ns]."""
+"""Margin added to measured delays before a packet counts as lost [ns]."""
 LOOK_NS, AGAIN_NS, DEAR_MAX = 2 * SECOND_NS, SECOND_NS, 8.0
-"""Times after which a path that has not been used is tried, and a doubted path is tried again [ns].
-A dearer path is tried more rarely, in proportion to its price, but at most DEAR_MAX times."""
+"""Times after which an unused path is probed, and a doubted path is probed again [ns]. A more
+expensive path is probed more rarely, in proportion to its price, at most by the factor DEAR_MAX."""
 TRIES_MAX = 4
-"""Largest number of times that the interval between tries is doubled, on a path that brings packets
-of the other end but delivers none of ours."""
+"""Largest number of times that the interval between probes is doubled, on a path that delivers
+packets of the other end but none of this end."""
 DOUBT = 0.5
-"""Probability that a packet does not arrive above which a path is doubted."""
+"""A path is doubted if a packet on it fails to arrive with more than this probability."""
 DEAD, DEAD_NS = 0.9, SECOND_NS
-"""Probability that a packet does not arrive, and time without an arrival, above which a path is
-reported as dead, until it is not even doubted."""
+"""A path is reported as dead if a packet on it is lost with more than this probability and no
+packet has arrived for this time; the report ends when the path is no longer doubted."""
 PATIENCE = 3
-"""Largest factor by which a path that stays down is tried more rarely."""
+"""Largest factor on the interval between probes of a path that stays down."""
 ALIKE = 1.25
-"""Paths whose expected cost is within this factor of the least take turns."""
+"""Paths whose expected cost is within this factor of the least are used in turn."""
 ALIVE_WORTH = 40.0
-"""What it costs, in packets, if the other end takes a working link for lost."""
+"""Cost, in packets, if the other end considers a working link lost."""
 _SETS = {
     count: [*chain.from_iterable(combinations(range(count), size) for size in range(1, count + 1))]
     for count in range(1, PATHS_MAX + 1)
@@ -99,50 +99,50 @@ def _ahead(sequence: int, of: int) -> int:
 
 
 def _names(report: Report, arrived: int, sequence: int) -> bool:
-    """Whether a report's mask of a path contains a sequence number."""
+    """Whether the bits `arrived` of a report include a sequence number."""
     back = _ahead(report.newest, sequence)
     return 0 <= back < WINDOW and bool(arrived >> back & 1)
 
 
 @dataclass(slots=True)
 class _InFlight:
-    """Packet on a path that is not acknowledged."""
+    """Unacknowledged packet on a path."""
 
     sequence: int
     sent_ns: int
     is_lost: bool = False
-    """Whether it is taken for lost; a late acknowledgement corrects that."""
+    """Whether the packet counts as lost; a late acknowledgement corrects that."""
 
 
 @dataclass(slots=True)
 class PathState:
-    """What is known of one path in the direction in which this end sends."""
+    """State of one path in the direction in which this end sends."""
 
     price: float
     in_flight: deque[_InFlight] = field(default_factory=lambda: deque(maxlen=IN_FLIGHT_MAX))
     delays_ns: deque[int] = field(default_factory=lambda: deque(maxlen=DELAYS))
-    """Times from sending to the acknowledgement."""
+    """Newest times from sending a packet to its acknowledgement [ns]."""
     loss: float = LOSS
     missing: int = 0
     """Number of packets in a row, up to the newest, that have not arrived."""
     arrived_ns: int | None = None
-    """Time at which the newest packet that is known to have arrived was sent."""
+    """Time at which the newest acknowledged packet was sent."""
     used_ns: int | None = None
-    """Time of the newest packet."""
+    """Time of the newest packet sent on the path."""
     looked_ns: int | None = None
-    """Time at which the path was last tried."""
+    """Time at which the path was last probed."""
     packets: int = 0
     bytes: int = 0
     first: int = 0
-    """Number of packets from the other end of which this path brought the first copy."""
+    """Number of packets of the other end whose first copy arrived over this path."""
     copies: int = 0
-    """Number of later copies that this path brought."""
+    """Number of later copies that arrived over this path."""
     has_brought: bool = False
-    """Whether it has brought a packet since one was last sent on it."""
+    """Whether a packet has arrived over the path since the last packet was sent on it."""
     is_dead: bool = False
-    """Whether it is reported as dead."""
+    """Whether the path is reported as dead."""
     tries: int = 0
-    """Number of tries since the last arrival, because it had brought a packet."""
+    """Number of probes without acknowledgement that arrivals over the path caused."""
 
     def failure(self, now_ns: int) -> float:
         """Probability q that a packet sent now does not arrive."""
@@ -150,10 +150,10 @@ class PathState:
         return down + (1.0 - down) * self.loss
 
     def silence(self, now_ns: int, under_way: int, *, is_sent: bool) -> float:
-        """Probability r that nothing sent on the path arrives.
+        """Probability r that no packet sent on the path arrives.
 
         Args:
-            under_way: number of packets that may still arrive.
+            under_way: number of packets in flight.
             is_sent: whether another one is sent now; an outage may have ended since the last one.
         """
         down, loss = self._down(now_ns), self.loss
@@ -177,23 +177,23 @@ class PathState:
 
     @property
     def quick_ns(self) -> int:
-        """Time after which a packet that a report does not name has not arrived."""
+        """Time after which a packet counts as lost if a report does not acknowledge it."""
         if not self.delays_ns:
             return WAIT_NS
         return _within(min(self.delays_ns) * 3 // 2 + 2 * SPARE_NS)
 
     def acknowledge(self, report: Report, arrived: int, now_ns: int, *, is_newest: bool) -> None:
-        """Note which packets a report names.
+        """Note which packets a report acknowledges.
 
         Args:
-            arrived: the report's mask of this path.
-            is_newest: whether no newer report has come; an older one does not show what was lost.
+            arrived: bits of the report for this path.
+            is_newest: whether no newer report has arrived; an older one does not show losses.
         """
         waiting, has_arrived = list(self.in_flight), False
         self.in_flight.clear()
         for packet in waiting:
             if _names(report, arrived, packet.sequence):
-                if packet.is_lost:  # the path has become slower
+                if packet.is_lost:  # late, not lost: a slower path
                     self.delays_ns.clear()
                 self.delays_ns.append(now_ns - packet.sent_ns)
                 self._arrived(packet)
@@ -207,7 +207,7 @@ class PathState:
                 self.in_flight.append(packet)
 
     def expire(self, silence_ns: int, now_ns: int) -> None:
-        """Count packets as lost of which nothing was heard although a report was due.
+        """Count packets as lost if no report acknowledged them although one was due.
 
         Args:
             silence_ns: silence of the other end after which a report is due.
@@ -236,7 +236,7 @@ def _within(time_ns: int) -> int:
 
 @dataclass(slots=True)
 class _Newest:
-    """Newest packet that was sent: if it does not arrive, it is sent again."""
+    """Newest packet, which is sent again if it does not arrive."""
 
     sequence: int
     worth: float
@@ -249,7 +249,7 @@ class Paths:
 
     Args:
         prices: price of a packet on each path.
-        timeout_ns: time without a packet after which the other end takes the link for lost [ns].
+        timeout_ns: time without a packet after which the other end considers the link lost [ns].
         spread: `link.spread`.
     """
 
@@ -264,19 +264,19 @@ class Paths:
         self._masks = [0] * len(prices)
         self._heard_ns: int | None = None
         self._newest_path: int | None = None
-        """Path that brought the newest packet."""
+        """Path over which the newest packet arrived."""
         self._awaited: dict[int, int] = {}
-        """Times at which packets of the other end were found missing, by sequence number."""
+        """Times at which gaps in the other end's packets were noticed, by sequence number."""
         self._late_ns = 0
-        """Usual time after which such a packet still comes [ns]."""
+        """Mean time after which such a packet arrives late [ns]."""
         self._sent_ns = 0
         """Time of the newest packet sent [ns]."""
         self._gaps_ns: deque[int] = deque(maxlen=GAPS)
-        """Newest times from one message of the other end to the next."""
+        """Newest intervals between messages of the other end."""
         self.peer_may_restart = False
-        """Whether the other end may begin its sequence numbers anew."""
+        """Whether the other end may restart its sequence numbers."""
         self._before: int | None = None
-        """Newest sequence number before it did so; None if it has not."""
+        """Newest sequence number before the other end restarted them; None if it has not."""
         self._copies: dict[bytes, int] = {}
         """Sequence numbers of the newest datagrams of the other end, oldest first."""
 
@@ -287,18 +287,18 @@ class Paths:
     # -- sending -----------------------------------------------------------------------------
 
     def report(self) -> bytes:
-        """Report to put in front of the next message, which gets the next sequence number."""
+        """Loss report to precede the next message, which gets the next sequence number."""
         self._sequence = (self._sequence + 1) % SEQUENCES
         masks = Struct(f"<{len(self._masks)}H").pack(*self._masks)
         head = HEAD.pack(self._sequence, self._heard or 0)
         return bytes((BIN8, len(head) + len(masks))) + head + masks
 
     def choose(self, worth: float, now_ns: int, among: Sequence[int]) -> tuple[int, ...]:
-        """Paths for the next message; of sets that cost about the same, the one that has not
-        been used for longest.
+        """Paths for the next message; of sets with about equal cost, the set that was unused for
+        longest.
 
         Args:
-            worth: what its loss costs, in packets on the cheapest path.
+            worth: cost of losing the message, in packets on the cheapest path.
             among: paths that may be used, at least one.
         """
         if self._spread == "all":
@@ -325,13 +325,13 @@ class Paths:
         )
 
     def _arrived_ns(self) -> int | None:
-        """Time at which the newest packet that is known to have arrived on any path was sent."""
+        """Time at which the newest acknowledged packet of any path was sent."""
         return max(
             (path.arrived_ns for path in self.each if path.arrived_ns is not None), default=None
         )
 
     def _under_way(self) -> list[int]:
-        """Number of packets on each path since the newest one that is known to have arrived."""
+        """Number of packets on each path since the newest acknowledged one."""
         since_ns = self._arrived_ns()
         return [
             sum(since_ns is None or packet.sent_ns > since_ns for packet in path.in_flight)
@@ -339,7 +339,7 @@ class Paths:
         ]
 
     def alive_worth(self, now_ns: int) -> float:
-        """What it costs if nothing arrives: the other end takes the link for lost after its
+        """Cost if nothing arrives, so that the other end considers the link lost after its
         time-out.
         """
         since_ns = self._arrived_ns()
@@ -358,9 +358,9 @@ class Paths:
         """Note that a datagram with the newest report was sent.
 
         Args:
-            worth: what its loss costs, see `choose`. A sign of life is worth nothing: it does not
-                take the place of a message that may have to be sent again.
-            is_probe: whether it only tries a path, so that it is not sent again.
+            worth: cost of its loss, see `choose`; 0 for a heartbeat, which does not replace a
+                message that may have to be sent again.
+            is_probe: whether it only probes a path, so that it is not sent again.
         """
         newest = self._newest
         if newest and _ahead(self._sequence, newest.sequence) >= WINDOW:
@@ -379,13 +379,13 @@ class Paths:
             path.bytes += len(datagram)
 
     def again(self, silence_ns: int, now_ns: int, among: Sequence[int]) -> tuple[bytes, int] | None:
-        """Newest datagram, and another path on which it is sent now; None if it may still arrive.
+        """Newest datagram, and another path for sending it again now; None if it may still arrive.
 
         Args:
             silence_ns: longest silence of the other end.
             among: paths that may be used.
         """
-        if self._gaps_ns:  # the other end is seldom silent for as long as it may be
+        if self._gaps_ns:  # the other end usually sends before its longest silence
             silence_ns = min(silence_ns, sum(self._gaps_ns) // len(self._gaps_ns))
         for path in self.each:
             path.expire(silence_ns, now_ns)
@@ -407,7 +407,7 @@ class Paths:
 
     def looks(self, now_ns: int) -> list[int]:
         """Paths on which a probe is due: paths not used for long, paths that are doubted or have
-        delivered nothing yet, and one to report that a packet has not come.
+        delivered nothing yet, and one for a report of a missing packet.
         """
         due = []
         for one, path in enumerate(self.each):
@@ -415,11 +415,11 @@ class Paths:
             doubted = path.arrived_ns is None
             if path.missing and path.failure(now_ns) > DOUBT:
                 doubted = True
-                dear *= min(max(path.missing - OUTAGE, 1), PATIENCE)  # longer each time
+                dear *= min(max(path.missing - OUTAGE, 1), PATIENCE)  # with growing intervals
             since_ns = path.looked_ns if doubted else path.used_ns
             wait_ns = (AGAIN_NS if doubted else LOOK_NS) * dear
             is_back = doubted and path.missing > 0 and path.has_brought
-            if is_back:  # unless it is down in this direction only
+            if is_back:  # it works again, or at least in the other direction
                 wait_ns = min(wait_ns, path.quick_ns << path.tries)
             if since_ns is None or now_ns - since_ns >= wait_ns:
                 path.looked_ns = now_ns
@@ -431,9 +431,9 @@ class Paths:
         return due
 
     def turned(self, now_ns: int) -> list[tuple[int, bool]]:
-        """Paths that have gone down or come back since the last call; and whether each is down.
+        """Paths that have failed or work again since the last call, and whether each has failed.
 
-        A path over which nothing has arrived yet is left out.
+        A path over which no packet has arrived yet is omitted.
         """
         turned = []
         for one, path in enumerate(self.each):
@@ -449,7 +449,7 @@ class Paths:
         return turned
 
     def _misses(self, now_ns: int) -> bool:
-        """Whether to tell the other end that a packet was overtaken and has not come."""
+        """Whether to report to the other end that an overtaken packet has not arrived."""
         wait_ns = 2 * self._late_ns + SPARE_NS
         return any(
             self._sent_ns < due_ns <= now_ns
@@ -459,7 +459,7 @@ class Paths:
     # -- receiving ---------------------------------------------------------------------------
 
     def is_copy(self, datagram: bytes, path: int | None) -> bool:
-        """Whether a datagram has come before; notes the path that brought the copy."""
+        """Whether a datagram has arrived before; notes the path of the copy."""
         sequence = self._copies.get(datagram)
         if sequence is None:
             return False
@@ -477,15 +477,15 @@ class Paths:
         *,
         is_recent: bool = True,
     ) -> None:
-        """Note an authentic datagram, and which packets its report acknowledges.
+        """Note an authentic datagram, and the packets that its report acknowledges.
 
         Args:
-            is_recent: whether its message has been found recent; only then the report may come from
-                a new run of the other end, which has begun its numbers anew.
+            is_recent: whether its message proved to be recent; only then its report may be from a
+                new run of the other end, which has restarted its numbers.
 
         Raises:
-            ProtocolError: it reports another number of paths than this session has, or it is older
-                than WINDOW packets and its message was not found recent.
+            ProtocolError: its report has another number of paths than this session, or it is older
+                than WINDOW packets and its message did not prove to be recent.
         """
         if len(report.arrived) != len(self.each):
             raise ProtocolError(Drop.FIELD)
@@ -510,7 +510,7 @@ class Paths:
         if path is not None:
             self.each[path].first += 1
             self._mark(report.sequence, path)
-        if not any(report.arrived):  # before the first packet there is nothing to report
+        if not any(report.arrived):  # the other end has received no packet yet
             return
         for one, arrived in zip(self.each, report.arrived, strict=True):
             one.acknowledge(report, arrived, now_ns, is_newest=ahead > 0)
@@ -520,8 +520,8 @@ class Paths:
             self._newest = None
 
     def _progress(self, sequence: int, *, is_recent: bool) -> int:
-        """Number of packets by which a packet is ahead of the newest that has come; WINDOW if it is
-        the first, -WINDOW if it is of the other end's earlier run.
+        """Number of packets by which a packet is ahead of the newest received one; WINDOW if it is
+        the first, -WINDOW if it is from the other end's earlier run.
         """
         ahead = WINDOW if self._heard is None else _ahead(sequence, self._heard)
         if self.peer_may_restart and is_recent and ahead <= -WINDOW:
@@ -529,12 +529,12 @@ class Paths:
         elif self._before is not None and abs(_ahead(sequence, self._before)) <= IN_FLIGHT_MAX:
             if ahead >= WINDOW:
                 return -WINDOW
-            if _ahead(sequence, self._before) > 0:  # the new run has reached these numbers itself
+            if _ahead(sequence, self._before) > 0:  # the new run now uses these numbers
                 self._before = None
         return ahead
 
     def _await(self, sequence: int, ahead: int, now_ns: int) -> None:
-        """Note the packets that a packet with this sequence number has overtaken."""
+        """Note the missing packets that a packet with this sequence number has overtaken."""
         if ahead >= WINDOW:
             self._awaited.clear()
             return

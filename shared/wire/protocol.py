@@ -7,13 +7,13 @@ Each message is a class below; `docs/protocol.md` describes its bytes. With the 
 
     server_us   time stamp: the server's clock when the packet was sent
     age         steps from the server's newest observation to `step`
-    number      number of packets that the sender has sent in the session before, modulo NUMBERS
+    number      number of packets that the sender sent earlier in the session, modulo NUMBERS
     silence     longest silence that the sender allows the other end [half steps]; 0 for no bound
 
 A state is sampled at the start of its step, so the step number is also its time stamp. Other time
-stamps are in microseconds modulo 2^32 (71 minutes); the receiver adds the multiple of 2^32 that
-comes nearest to the expected time. A datagram that is not exactly one of these messages is an error
-of the peer (`ProtocolError`): dropped, counted by its reason, and never answered.
+stamps are in microseconds modulo 2^32 (71 minutes); the receiver adds the multiple of 2^32 with
+which the time is nearest to the expected one. A datagram that is not exactly one of these messages
+is an error of the peer (`ProtocolError`): dropped, counted by its reason, and never answered.
 """
 
 import math
@@ -39,7 +39,7 @@ from skytether.shared.wire.drop import Drop, ProtocolError
 # Below 0x80, so that msgpack writes it in one byte: `kind_of` and the quick decoder rely on that.
 VERSION = 1
 PAYLOAD_BYTES_MAX = 1200
-"""Limit below which no datagram is fragmented: two fragments turn 10 % loss into 19 %."""
+"""Size up to which no datagram is fragmented: two fragments turn 10 % loss into 19 %."""
 
 AXES_MAX = 3
 TEXT_MAX = 32
@@ -59,11 +59,11 @@ NO_FEEDBACK = np.empty((0, 0), np.float32)
 FLOAT_MAX = float(np.finfo(np.float32).max)
 """Largest number that fits in a state on the wire [m, m/s]."""
 NO_INPUT = np.empty(0)
-"""`Observation.input` with the scheme "trajectory", which does not use it."""
+"""Value of `Observation.input` with the scheme "trajectory", which does not use it."""
 
 INPUT_TOLERANCE = 1.001
-"""Factor by which an input may exceed its bound before the packet is refused, since float32
-rounds."""
+"""Factor by which an input may exceed its bound before the packet is refused, because of float32
+rounding."""
 
 
 class Refusal(IntEnum):
@@ -77,7 +77,7 @@ class Refusal(IntEnum):
 
 
 NO_HORIZON = -1
-"""`Observation.in_force` before the first horizon has arrived."""
+"""Value of `Observation.in_force` before the first horizon has arrived."""
 
 
 class Hello(NamedTuple):
@@ -97,7 +97,7 @@ class Welcome(NamedTuple):
     server_boot_id: int
     server_ns: int
     refusal: int
-    """One of `Refusal`."""
+    """Reason for the refusal, one of `Refusal`."""
     terms: Terms
 
 
@@ -111,7 +111,7 @@ class Mode(IntEnum):
     """Waits for a horizon, and to be armed."""
     TRACK = 3
     COAST = 4
-    """Flies on along a horizon without a newer one."""
+    """Continues along a horizon without receiving a newer one."""
     BRAKE = 5
     """Brakes to a stop from the last input."""
     HOVER = 6
@@ -121,9 +121,9 @@ class Mode(IntEnum):
     FAULT = 8
     """Has a fault: holds the position, and ignores horizons."""
     MANUAL = 9
-    """Flown by a pilot or nobody: nothing is sent to its autopilot."""
+    """Flown by a pilot, or by nobody: nothing is sent to the autopilot."""
     RETURN = 10
-    """Flown home by its autopilot, and landed there."""
+    """Flown home and landed by its autopilot."""
 
     def __str__(self) -> str:
         return self.name.lower()
@@ -139,7 +139,7 @@ class Observation(NamedTuple):
     in_force: int
     """Step that the horizon in force was made for, or NO_HORIZON."""
     since: int
-    """First step that was flown with that horizon."""
+    """First step that was flown with the horizon in force."""
     backward_us: int
     """Time stamp: arrival of the server's newest packet, in time since the vehicle's step 0, minus
     the server's clock when the packet was sent."""
@@ -147,7 +147,7 @@ class Observation(NamedTuple):
     """Number of packets of the server that have arrived, modulo NUMBERS."""
     mode: int
     takes: int
-    """1 if the vehicle would use a plan that arrives now, else 0."""
+    """1 if the vehicle accepts plans now, else 0."""
     state: Array
     """Position [m] and velocity [m/s]; shape (axes, 2). Sent as float32."""
     input: Array
@@ -156,7 +156,7 @@ class Observation(NamedTuple):
     number: int = 0
     silence: int = 0
     unsaved: int = 0
-    """1 if a restart of the client would not continue this flight, since its state cannot be saved,
+    """1 if a restarted client could not continue this flight, because its state cannot be saved,
     else 0."""
 
 
@@ -195,7 +195,7 @@ class Trajectory(NamedTuple):
 
 
 class Idle(IntEnum):
-    """Why the server sends no plan, or PLANS: plans are made, and sent when the trigger says so."""
+    """Why the server sends no plan; PLANS if plans are made and the trigger decides."""
 
     def __new__(cls, number: int, text: str = "") -> "Idle":
         made = int.__new__(cls, number)
@@ -205,7 +205,7 @@ class Idle(IntEnum):
     text: str
 
     PLANS = 0, "no newer horizon has arrived"
-    # … or would be older when a plan began.
+    # The observation is too old, or would be at the start of a plan.
     OBSERVATION = 1, "its newest observation at the server is older than link.age_max_s"
     DELAY = 2, "the delay to it is longer than a horizon can cover"
     UNSOLVED = 3, "the solver has found no plan"
@@ -227,7 +227,7 @@ class Heartbeat(NamedTuple):
 
 
 class Close(NamedTuple):
-    """Announcement that the sender ends; sent `CLOSES` times, since packets are lost."""
+    """Announcement that the sender ends; sent `CLOSES` times, because packets may be lost."""
 
     vehicle: int
     session: int
@@ -246,7 +246,7 @@ class Time(NamedTuple):
     """Largest error of `epoch_us` [µs]."""
 
 
-# With 10 % loss, all three are lost once in a thousand times.
+# With 10 % loss, all three are lost in one of a thousand cases.
 CLOSES = 3
 
 
@@ -259,7 +259,7 @@ def stamp_us(time_ns: int) -> int:
 def stamped_ns(stamp: int, near_ns: int) -> int:
     """Time with a given stamp that is nearest to `near_ns` [ns].
 
-    Correct to the microsecond if `near_ns` is correct to half an hour.
+    It is exact to a microsecond if `near_ns` is exact to half an hour.
     """
     near = near_ns // MICROSECOND_NS
     half = STAMPS // 2
@@ -268,7 +268,7 @@ def stamped_ns(stamp: int, near_ns: int) -> int:
 
 
 class RoomMessage(Protocol):
-    """Message that a room brings by `add`: a `NamedTuple` that begins with these."""
+    """Message of an optional package, see `add`: a `NamedTuple` that begins with these fields."""
 
     @property
     def vehicle(self) -> int: ...
@@ -283,7 +283,7 @@ Message = (
 
 
 class OrNone(NamedTuple):
-    """Check of a field that is empty or one of these integers."""
+    """Check of a field that is empty or an integer of a range."""
 
     integers: range
 
@@ -307,7 +307,7 @@ def _checked(values: list[object], checks: tuple[Check, ...], terms: Terms) -> l
 
 
 def _terms(value: object, ours: Terms) -> Terms:
-    """The peer's terms, which may differ from ours, but must have the same types."""
+    """The peer's terms; values may differ from ours, types must not."""
     if type(value) is not tuple or len(value) != len(ours):
         raise ProtocolError(Drop.FIELD)
     for theirs, our in zip(value, ours, strict=True):
@@ -341,7 +341,7 @@ def _motion(value: object, ours: Terms) -> tuple[Array, Array]:
     # The sum of float32 numbers is finite unless one of them is not.
     if not math.isfinite(sum(numbers)):
         raise ProtocolError(Drop.NOT_FINITE)
-    # zip with `strict` takes twice as long as this. Along splines there are no inputs.
+    # zip with `strict` takes twice as long. Along splines there are no inputs.
     for axis, u in enumerate(numbers[2 * axes :]):
         if abs(u) > ours.u_max[axis] * INPUT_TOLERANCE:
             raise ProtocolError(Drop.INPUT_OUT_OF_RANGE)
@@ -354,7 +354,7 @@ def _inputs(value: object, ours: Terms) -> NDArray[np.float32]:
         raise ProtocolError(Drop.TYPE)
     most = ours.horizon + ahead_max(ours)
     inputs = _array(value, _FLOAT32, ours.axes, (ours.horizon, most))
-    largest = np.abs(inputs).max(axis=1).tolist()  # NaN if the row has one
+    largest = np.abs(inputs).max(axis=1).tolist()  # NaN if the row contains one
     if not all(map(math.isfinite, largest)):
         raise ProtocolError(Drop.NOT_FINITE)
     for most, bound in zip(largest, ours.u_max, strict=True):
@@ -384,7 +384,7 @@ def knots_in(value: object, ours: Terms) -> NDArray[np.float32]:
 
 
 def ahead_max(terms: Terms) -> int:
-    """Largest delay bound d [steps]: d inputs fit in a horizon beside its plan; 1 or more."""
+    """Largest delay bound d with which d inputs and a plan fit in a horizon [steps]; at least 1."""
     return max(1, min(INPUTS_MAX // terms.axes - terms.horizon, terms.age_max))
 
 
@@ -408,7 +408,7 @@ U64 = range(2**64)
 _CLOCK = range(2**63)
 _STAMP = range(STAMPS)
 _NUMBER = range(NUMBERS)
-# Negative if the server's clock was set and its clock map lags: the step is then before the
+# Negative if the server's clock was set and its clock map lags: then the step is before that of the
 # observation.
 _AGE = range(-(2**15), 2**32)
 _SPACING = range(1, 2**16)
@@ -433,7 +433,7 @@ _TYPES: dict[int, tuple[type[Any], tuple[Check, ...]]] = {
 }
 """Message of each type number (from 1) and the check of each of its fields on the wire."""
 _ROOMS = {9: "skytether.shared.wire.path_proof", 10: "skytether.shared.wire.lead"}
-"""Modules of rooms that add the message of a type number, imported with the first such message."""
+"""Modules with optional messages, by type number, imported with the first such message."""
 
 _OBSERVATION = 3
 """Type number of the message that a server receives most."""
@@ -450,7 +450,7 @@ _QUICK = msgspec.msgpack.Decoder(tuple[int, int, *map(_kind, _FIELDS)])  # type:
 """Decoder of an observation that checks types and ranges at once. A packet that it refuses is
 decoded again field by field to find the reason."""
 _MADE = [(i, check) for i, check in enumerate(_FIELDS) if callable(check)]
-"""Converters of those fields of an observation that are bytes, by the index of the field."""
+"""Converters of the fields of an observation that are sent as bytes, by field index."""
 # 0x90 + n is msgpack's header of an array of n < 16 elements.
 _QUICK_START = bytes([0x90 | (2 + len(_FIELDS)), VERSION, _OBSERVATION])
 
@@ -458,11 +458,11 @@ _NUMBERS = {message: number for number, (message, _) in _TYPES.items()}
 
 
 def add(number: int, message: type[Any], checks: tuple[Check, ...]) -> None:
-    """Add the message of a room, and the check of each of its fields on the wire."""
+    """Add a message of an optional package, and the check of each of its fields."""
     _TYPES[number], _NUMBERS[message] = (message, checks), number
 
 
-# One packer for all messages: packb makes one for each, and takes three times as long.
+# One packer for all messages: packb makes one per message, and takes three times as long.
 _PACKER = msgpack.Packer(default=np.ndarray.tobytes)
 
 
@@ -471,8 +471,8 @@ def _observation_fields(sent: Observation) -> list[object]:
     number, silence, unsaved = rest
     numbers = state.ravel().tolist() + u.tolist()
     return [
-        # Steps are sent as differences, mode and flags as one number: usually a byte each instead
-        # of up to five.
+        # Steps are sent as differences, mode and flags as one number: usually one byte each, not up
+        # to five.
         VERSION,
         _OBSERVATION,
         vehicle,
@@ -493,7 +493,7 @@ def _observation(fields: Iterable[Any]) -> Observation:
     vehicle, session, step, flown, delay, backward_us, heard, does, motion, number, silence = fields
     since = step - flown
     in_force = NO_HORIZON if delay is None else since - delay
-    # Differences may lead below step 0 even if each of them is within its range.
+    # The sum of differences may be below step 0 even if each is within its range.
     if since < 0 or (delay is not None and in_force < 0):
         raise ProtocolError(Drop.FIELD)
     unsaved, does = divmod(does, _DOES)
@@ -544,7 +544,7 @@ def encode_horizon(
     number: int,
     silence: int,
 ) -> bytes:
-    """Datagram of a `Horizon` whose arrays are bytes already, for a server that sends many."""
+    """Datagram of a `Horizon` whose arrays are already bytes, for a server that sends many."""
     fields = (vehicle, session, step, server_us, age, inputs, feedback, number, silence)
     payload: bytes = _PACKER.pack((VERSION, _NUMBERS[Horizon], *fields))
     assert len(payload) <= PAYLOAD_BYTES_MAX
@@ -552,8 +552,8 @@ def encode_horizon(
 
 
 def kind_of(payload: bytes) -> int | None:
-    """Type number of a message, from its first bytes; None for bytes that no message of this
-    protocol begins with.
+    """Type number of a message, from its first bytes; None if no message of this protocol begins
+    with these bytes.
 
     Array header, version and type must be in msgpack's shortest form, so that the bytes are
     unambiguous.
@@ -585,11 +585,11 @@ def unpacked(payload: bytes) -> tuple[Any, ...]:
     Raises:
         ProtocolError: the bytes are not one msgpack array of two elements or more.
     """
-    # First of all checks: nothing is parsed of a packet that is too long.
+    # The first check: a packet that is too long is not parsed at all.
     if len(payload) > PAYLOAD_BYTES_MAX:
         raise ProtocolError(Drop.TOO_LONG)
     try:
-        # No message has a map or an extension, so none is ever built from received bytes.
+        # Messages contain no maps and no extensions, so these are never built from received bytes.
         fields = msgpack.unpackb(payload, use_list=False, max_map_len=0, max_ext_len=0)
     except (ValueError, msgpack.UnpackException) as error:
         raise ProtocolError(Drop.NOT_MSGPACK) from error
@@ -613,7 +613,7 @@ def checked(fields: tuple[Any, ...], terms: Terms) -> Message:
 
 
 def _is_of_a_room(number: int) -> bool:
-    """Whether an installed room has a message of this number, which is loaded then."""
+    """Load the optional message of this type number; False if no installed package has one."""
     if module := _ROOMS.pop(number, ""):
         with suppress(ModuleNotFoundError):
             import_module(module)
@@ -621,6 +621,6 @@ def _is_of_a_room(number: int) -> bool:
 
 
 def preload() -> None:
-    """Load the messages of rooms now, so that no stranger's packet makes a process import them."""
+    """Load all optional messages now, so that no received packet causes an import."""
     for number in tuple(_ROOMS):
         _is_of_a_room(number)

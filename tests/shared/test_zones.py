@@ -141,7 +141,7 @@ def test_nobody_is_above_a_zone_that_reaches_to_the_sky() -> None:
     ("text", "said"),
     [
         ("bix(0, 1, 0, 1)", "did you mean box"),
-        ("box(1, 0, 0, 1)", "from less to more"),
+        ("box(1, 0, 0, 1)", "each pair ascending"),
         ("box(0, 1, 0, nan)", "box(x0, x1, y0, y1, heights…)"),
         ("box(0, 1)", "box(x0, x1, y0, y1, heights…)"),
         ("polygon(0, 0, 1, 1)", "at least 3 points"),
@@ -218,7 +218,7 @@ def shape(geometry_type: str, coordinates: Any, **properties: Any) -> str:
         (geojson([polygon(SQUARE)], origin=[50, 110]), "up to 85 degrees north"),
         (geojson([polygon(SQUARE)], origin=[10, 50]), "at most 100000 m from the origin"),
         (geojson([polygon([[0, 0], [0, 89], [1, 89]])], origin=[0, 84]), "longitude and latitude"),
-        (geojson([polygon(SQUARE)], crs={"type": "name"}), "no crs, for RFC 7946 has degrees"),
+        (geojson([polygon(SQUARE)], crs={"type": "name"}), "no crs: RFC 7946 uses degrees"),
         (geojson([{"geometry": None}]), "a Point with radius_m, not a None"),
         (geojson([polygon([[0, 0], [1, 1]])]), "feature 1', expected at least 3 corners"),
         (geojson([{"properties": {}}]), "feature 1', expected a feature with a geometry"),
