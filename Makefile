@@ -46,8 +46,9 @@ $(FLY): $(UV) locks/fly.lock pyproject.toml
 	$(INSTALL) --no-deps --no-build-isolation --editable .
 	touch $@
 
-$(STAMP): $(FLY) locks/dev.lock
+$(STAMP): $(FLY) locks/dev.lock locks/openpi.lock
 	$(INSTALL) --require-hashes -r locks/dev.lock
+	$(INSTALL) --require-hashes --no-deps -r locks/openpi.lock
 	touch $@
 
 demo: $(FLY)  ## fly the demonstration for three minutes, with a page to play with

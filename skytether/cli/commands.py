@@ -32,6 +32,10 @@ COMMANDS_IN_GROUPS = {
             "a bad network between two; `netem run` PROGRAM: in it",
             "skytether.netem.__main__:emulate",
         ),
+        "policy serve|join": (
+            "a policy on another machine than its robot, unchanged",
+            "skytether.policy.command:policy",
+        ),
         "probe HOST:PORT": (
             "delay and loss of a real path, each way",
             "skytether.cli.probe:probe",

@@ -17,7 +17,7 @@ from skytether.shared.base import extras
 
 with extras.named():
     from skytether.gym.networked import NOTHING_SENT, ORACLE, Networked, NetworkedVector
-    from skytether.gym.players import Chunk, Clocked, Freshest, Held, Newest, Player, Queue
+    from skytether.policy.players import Chunk, Clocked, Freshest, Held, Newest, Player, Queue
 
 __all__ = [
     "NOTHING_SENT",

@@ -25,13 +25,13 @@ from gymnasium.utils import RecordConstructorArgs
 from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
 from gymnasium.vector.utils import concatenate, create_empty_array, iterate
 
-from skytether.gym.players import Chunk, Clocked, Player, Row
 from skytether.gym.remote import PART_BYTES, ROWS_MAX, Network, Remote
 from skytether.gym.spaces import Space, idle_of, no_rows, observed, size_of, to_action, to_rows
 from skytether.netem.fate import Fates
 from skytether.netem.impairments.direction import Impairments, impairments
 from skytether.netem.impairments.draws import SLOT_NS
 from skytether.netem.link import QUEUE_BYTES_MAX
+from skytether.policy.players import Chunk, Clocked, Player, Row
 from skytether.shared.base.chance import stream
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.base.units import seconds_to_ns

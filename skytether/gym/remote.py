@@ -18,10 +18,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from skytether.gym.players import Chunk, Held, Player, Row
 from skytether.netem.fate import Fates
 from skytether.netem.impairments.direction import Impairments
 from skytether.netem.link import QUEUE_BYTES_MAX, Lane, Link
+from skytether.policy.players import Chunk, Held, Player, Row
 from skytether.server.schemes.delay_bound import DelayBound, add_sample, delay_bound
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.base.kernel import kernel

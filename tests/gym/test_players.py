@@ -5,7 +5,7 @@ from copy import copy
 import numpy as np
 import pytest
 
-from skytether.gym.players import HELD_MAX, Clocked, Freshest, Held, Newest, Player, Queue
+from skytether.policy.players import HELD_MAX, Clocked, Freshest, Held, Newest, Player, Queue
 from skytether.shared.base.errors import ConfigError
 
 

@@ -53,7 +53,7 @@ if TYPE_CHECKING:
     from skytether.shell.driving.memory import MemoryFile
     from skytether.shell.driving.program import Program
 
-    AnyLine: TypeAlias = Line | Node | Program | Listen
+    AnyLine: TypeAlias = Line | Node | Program | Listen | Callable[..., "OpenLine"]
 
 LINES = {"Line": "stream", "Listen": "connections", "Node": "graph", "Program": "program"}
 """Module of `shell.driving` that opens a line, by the line's class."""
@@ -86,8 +86,9 @@ class OpenLine(Protocol):
     datagrams that arrive together, `refused` with the reason why a sent datagram cannot arrive.
     """
 
-    address: Address | None
-    """Address for incoming connections; None without any."""
+    @property
+    def address(self) -> Address | None:
+        """Address for incoming connections; None without any."""
 
     def send(self, payload: bytes, peer: Address) -> bool:
         """Send bytes to a peer; False if they cannot be sent now."""
@@ -126,7 +127,7 @@ class Shell:
         control: control socket for changes of keys in flight.
         feed: socket that sends rows and events to readers.
         line: connection to an autopilot, a robot, a program's packets or relayed clients, which
-            becomes socket 1.
+            becomes socket 1; or a function `open_line(hear, refused)` that opens one.
         paths: paths to the endpoint's peers, by socket number. If there are several, a path that is
             unusable now is opened later.
         is_patient: whether to start if the name of a path's peer cannot be resolved yet; the lookup
@@ -223,8 +224,12 @@ class Shell:
 
     def _add(self, line: "AnyLine") -> None:
         if not isinstance(line, Line) or line.kind in ("tcp", "serial"):
-            opens = import_module(f"skytether.shell.driving.{LINES[type(line).__name__]}")
-            self._line = opened = opens.open_line(line, self._hear_line, self._hear_refusal)
+            if callable(line):
+                opened = line(self._hear_line, self._hear_refusal)
+            else:
+                opens = import_module(f"skytether.shell.driving.{LINES[type(line).__name__]}")
+                opened = opens.open_line(line, self._hear_line, self._hear_refusal)
+            self._line = opened
             if opened.address:
                 self.addresses[0] = opened.address
         elif line.kind == "udp":

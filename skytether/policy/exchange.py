@@ -1,0 +1,222 @@
+"""Exchange of messages between two ends of a session, each message as datagrams with parity.
+
+What was not sent yet of a message is dropped when a newer one of its stream is to be sent. Each
+end reports what has come of each message, so that the other learns rate, loss and round trip.
+"""
+
+from collections import OrderedDict, deque
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+from skytether.policy import parts
+from skytether.policy.messages import STAMPS, PartMessage, Seen, encode
+from skytether.policy.pace import RATE_MAX, Pace
+from skytether.policy.parts import Part, Reassembly
+from skytether.shared.base.units import HEADER_BYTES, MICROSECOND_NS, MILLISECOND_NS
+from skytether.shared.wire.drop import Drop, ProtocolError
+
+QUIET_NS = 25 * MILLISECOND_NS
+"""Time without a further part after which a message is reported as it is."""
+REMEMBERED_MAX = 64
+"""Number of newest messages whose reports are understood."""
+PART_HEAD_BYTES = 40
+"""Bytes of a datagram beside its part, seal included [B]."""
+
+
+@dataclass(slots=True)
+class _Sent:
+    """Message as far as it was sent."""
+
+    began_ns: int
+    parts: int = 0
+    bytes: int = 0
+    was_limited: bool = False
+    """Whether a part had to wait."""
+
+
+@dataclass(slots=True)
+class _Coming:
+    """Message as far as it has come."""
+
+    number: int
+    expected: int
+    first_ns: int
+    last_ns: int = 0
+    sent_us: int = 0
+    came: int = 0
+    bytes: int = 0
+
+
+class Arrived(NamedTuple):
+    stream: int
+    number: int
+    message: bytes
+    repaired: int
+
+
+class Exchange:
+    """One end of a session.
+
+    Args:
+        rate_max: bound of the rate at which it sends [B/s].
+    """
+
+    def __init__(self, session: int, rate_max: float = RATE_MAX) -> None:
+        self.session = session
+        self.pace = Pace(rate_max)
+        self._queue: dict[int, deque[Part]] = {}
+        """Parts that wait, by stream."""
+        self._replies: deque[bytes] = deque(maxlen=REMEMBERED_MAX)
+        """Reports that wait."""
+        self._sent: OrderedDict[tuple[int, int], _Sent] = OrderedDict()
+        self._numbers: dict[int, int] = {}
+        self._coming: dict[int, _Coming] = {}
+        self._whole: dict[int, Reassembly] = {}
+        self._delay_us = 0
+        """Newest delay by both ends' clocks [µs]."""
+        self.sent = self.sent_bytes = self.dropped = self.came = self.repaired = 0
+
+    def send(self, stream: int, message: bytes, *, now_ns: int, is_urgent: bool = False) -> None:
+        """Send a message, in place of what is left of the one before.
+
+        Args:
+            is_urgent: whether as much parity is sent as message, which then arrives whole if any
+                half of it does.
+        """
+        number = self._numbers[stream] = self._numbers.get(stream, -1) + 1
+        loss = self.pace.loss
+
+        def parity(count: int) -> int:
+            return max(parts.parity_for(count, loss), count if is_urgent else 0)
+
+        made = parts.split(message, stream, number, parity)
+        self.dropped += len(self._queue.get(stream, ()))
+        self._queue[stream] = deque(made)
+        self._sent[stream, number] = _Sent(now_ns)
+        while len(self._sent) > REMEMBERED_MAX:
+            self._sent.popitem(last=False)
+
+    def due_ns(self) -> int | None:
+        """Time of the next datagram to be sent [ns]; None if nothing waits."""
+        due = [each.last_ns + QUIET_NS for each in self._coming.values()]
+        if self._replies:
+            due.append(0)
+        if any(self._queue.values()):
+            due.append(self.pace.due_ns())
+        return min(due, default=None)
+
+    def outbox(self, *, now_ns: int) -> list[bytes]:
+        """Datagrams that are due, without a seal."""
+        for stream, coming in list(self._coming.items()):
+            if now_ns >= coming.last_ns + QUIET_NS:
+                self._report(stream, now_ns)
+        out = list(self._replies)
+        self._replies.clear()
+        while now_ns >= self.pace.due_ns():
+            waiting = [stream for stream, each in self._queue.items() if each]
+            if not waiting:
+                break
+            stream = waiting[-1]  # that of few and small messages last: metadata is sent first
+            part = self._queue[stream].popleft()
+            sent_us = now_ns // MICROSECOND_NS % STAMPS
+            out.append(encode(PartMessage(self.session, *part[:-1], sent_us, part.data)))
+            size = len(part.data) + PART_HEAD_BYTES + HEADER_BYTES
+            self.pace.sent(size, now_ns)
+            self.sent += 1
+            self.sent_bytes += size
+            if noted := self._sent.get((stream, part.number)):
+                noted.parts += 1
+                noted.bytes += size
+        for stream, queued in self._queue.items():
+            if queued and (noted := self._sent.get((stream, queued[0].number))):
+                noted.was_limited = True
+        return out
+
+    def accept(self, message: PartMessage, *, now_ns: int) -> Arrived | None:
+        """Accept a part; the message that it makes whole, if it does.
+
+        Raises:
+            ProtocolError: see `parts.Reassembly.accept`.
+        """
+        stream, part = message.stream, message.part
+        whole = self._whole.setdefault(stream, Reassembly())
+        coming = self._coming.get(stream)
+        if coming and part.number > coming.number:
+            self._report(stream, now_ns)
+            coming = None
+        arrived = None
+        try:
+            arrived = whole.accept(part)
+        except ProtocolError as error:
+            is_spare = coming and part.number == coming.number and error.reason is not Drop.FIELD
+            if not is_spare:  # else a copy, or parity of a message that is whole
+                raise
+        if coming is None:
+            count, _ = parts.block_parts(part.size, part.blocks)
+            expected = part.blocks * (count + part.parity)
+            coming = self._coming[stream] = _Coming(part.number, expected, now_ns)
+        if part.number == coming.number:
+            self._count(coming, message, now_ns)
+            if coming.came == coming.expected:
+                self._report(stream, now_ns)
+        if arrived is None:
+            return None
+        self.repaired += arrived.repaired
+        return Arrived(stream, *arrived)
+
+    def _count(self, coming: _Coming, message: PartMessage, now_ns: int) -> None:
+        self.came += 1
+        coming.came += 1
+        coming.bytes += len(message.data) + PART_HEAD_BYTES + HEADER_BYTES
+        coming.last_ns, coming.sent_us = now_ns, message.sent_us
+
+    def _report(self, stream: int, now_ns: int) -> None:
+        coming = self._coming.pop(stream)
+        last_us = coming.last_ns // MICROSECOND_NS
+        seen = Seen(
+            self.session,
+            stream,
+            coming.number,
+            min(coming.came, 2**16 - 1),
+            min(coming.bytes, 2**32 - 1),
+            (last_us - coming.sent_us) % STAMPS,
+            min((coming.last_ns - coming.first_ns) // MICROSECOND_NS, STAMPS - 1),
+            coming.sent_us,
+            min((now_ns - coming.last_ns) // MICROSECOND_NS, STAMPS - 1),
+        )
+        self._replies.append(encode(seen))
+
+    def learn(self, seen: Seen, *, now_ns: int) -> None:
+        """Learn from the other end's report of a message."""
+        sent = self._sent.pop((seen.stream, seen.number), None)
+        if sent is None or not sent.parts:
+            return
+        round_trip_us = (now_ns // MICROSECOND_NS - seen.sent_us - seen.held_us) % STAMPS
+        self.pace.round_trip_ns = round_trip_us * MICROSECOND_NS
+        # Both ends' clocks differ by any time, so the delay is counted on from the one before.
+        change_us = (seen.delay_us - self._delay_us + STAMPS // 2) % STAMPS - STAMPS // 2
+        self._delay_us += change_us
+        self.pace.heard(
+            sent.parts,
+            seen.came,
+            seen.bytes,
+            self._delay_us * MICROSECOND_NS,
+            seen.spread_us * MICROSECOND_NS,
+            was_limited=sent.was_limited,
+            now_ns=now_ns,
+        )
+
+    def figures(self) -> dict[str, Any]:
+        round_trip_ns = self.pace.round_trip_ns
+        return {
+            "sent": self.sent,
+            "sent_bytes": self.sent_bytes,
+            "replaced": self.dropped,
+            "came": self.came,
+            "repaired": self.repaired,
+            "given_up": sum(each.given_up for each in self._whole.values()),
+            "loss": round(self.pace.loss, 4),
+            "rate_bytes_per_s": int(self.pace.rate),
+            "queue_s": self.pace.queue_ns / 1e9,
+            "round_trip_s": None if round_trip_ns is None else round_trip_ns / 1e9,
+        }

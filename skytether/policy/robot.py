@@ -1,0 +1,461 @@
+"""The robot's end: answers each call of its program by the deadline, whatever the network does.
+
+The program speaks through the line (socket 1): openpi's websocket protocol, or `Robot.infer`. A
+call is an observation. It is answered as soon as its own chunk has come; at the deadline with the
+newest chunk that has rows for now, cut to now; then with what holds the robot, for at most
+`hold_ns`; then with an error, so that the robot's own stop acts. The first call of a program is
+answered when the first chunk has come, within `begin_ns`: the robot has not moved yet.
+
+What the line hears and sends begins with one of `Said`.
+"""
+
+from collections import Counter, deque
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from enum import Enum
+from statistics import median
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from skytether.client.link import ClientLink
+from skytether.policy import events, values
+from skytether.policy.exchange import Exchange
+from skytether.policy.messages import (
+    CHUNK,
+    METADATA,
+    OBSERVATION,
+    Hello,
+    Seen,
+    Welcome,
+    decode,
+    encode,
+)
+from skytether.policy.pace import RATE_MAX
+from skytether.policy.players import Clocked, Player
+from skytether.policy.schedule import Actions, Kind, Schedule
+from skytether.policy.values import ValueRefused
+from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
+from skytether.shared.endpoints.endpoint import Address, Datagram, Endpoint, by_name
+from skytether.shared.events.flight import address_text
+from skytether.shared.telemetry.record import Recorder
+from skytether.shared.wire.drop import Drop, ProtocolError
+from skytether.shared.wire.protocol import Refusal
+
+LINE = 1
+"""Socket of the line."""
+SILENCE_NS = 3 * SECOND_NS
+"""Time without a packet after which the robot says HELLO again."""
+ALIVE_NS = SECOND_NS
+"""Time after which something is sent, so that the server knows that the robot is there."""
+STEP_NS_FIRST = 50 * MILLISECOND_NS
+"""Length of a step before it is measured."""
+MEASURED, DELAYS = 9, 64
+"""Number of newest intervals and delays that are measured."""
+ROWS_SENT = 64
+"""Largest number of coming rows that are sent with an observation."""
+CALL_COLUMNS = np.dtype(
+    [
+        ("time_ns", "<i8"),  # time of the answer
+        ("robot", "<u2"),
+        ("call", "<u4"),  # number of the call
+        ("kind", "u1"),  # 0 fresh, 1 rest, 2 hold, 3 error
+        ("waited_ns", "<i8"),  # time from the call to the answer
+        ("chunk_age_ns", "<i8"),  # age of the observation that the answer was made from, -1: none
+        ("left", "<i4"),  # rows of the answer that the policy has made
+    ]
+)
+KINDS = (Kind.FRESH, Kind.REST, Kind.HOLD, Kind.ERROR)
+
+
+class Said(bytes, Enum):
+    """First byte of what a line hears and sends."""
+
+    OPENED = b"+"
+    CLOSED = b"-"
+    """The rest is the reason, or empty."""
+    MESSAGE = b"m"
+    ERROR = b"e"
+    """The rest is a text."""
+
+
+@dataclass(frozen=True)
+class RobotOptions:
+    actions: Actions
+    deadline_ns: int
+    hold_ns: int = SECOND_NS
+    """Longest time for which a robot without rows is held."""
+    begin_ns: int = 60 * SECOND_NS
+    """Longest time for the first answer."""
+    key: str = "actions"
+    """Key of the actions in the policy's reply."""
+    step_ns: int | None = None
+    """Length of a step; None: measured, as the time from an answer to the next call."""
+    rows: int = 1
+    """Number of rows that the program plays of each answer, from which the step is measured."""
+    plays_on: bool = False
+    """Whether the robot plays on while its program waits for an answer."""
+    spare_rows: int | None = None
+    """An observation is sent only if fewer rows than these will be left when its chunk comes; None
+    sends each."""
+    rate_max: float = RATE_MAX
+    """Bound of the rate at which it sends [B/s]."""
+    player: Callable[[], Player] = Clocked
+
+
+@dataclass(slots=True)
+class _Call:
+    peer: Address
+    number: int
+    began_ns: int
+    is_first: bool
+    is_sent: bool
+
+
+class _Asked(NamedTuple):
+    """Observation that was sent."""
+
+    began_ns: int
+    connection: int
+
+
+@dataclass(slots=True)
+class _Program:
+    """The robot's program, from its connection on."""
+
+    peer: Address
+    number: int
+    schedule: Schedule
+    newest: int = -1
+    """Number of the observation that the newest chunk was made from."""
+    made_ns: int = -1
+    """Time of that observation [ns]."""
+    answered_ns: int | None = None
+    intervals_ns: deque[int] = field(default_factory=lambda: deque(maxlen=MEASURED))
+    """Newest times from an answer to the next call."""
+    has_metadata: bool = False
+
+
+class RobotEnd(Endpoint):
+    """Robot's end of a session with a policy server.
+
+    Args:
+        robot: number of the robot, unique among those of the server.
+        servers: the server's address on each path, by socket; socket 1 is the line.
+        link: see `client.link`.
+        boot_id: random number of this run.
+        compress: changes an observation into what is sent of it, see `images.Compressor`.
+        recorder: of CALL_COLUMNS, a row for each answer.
+    """
+
+    def __init__(
+        self,
+        robot: int,
+        servers: dict[int, Address],
+        link: ClientLink,
+        options: RobotOptions,
+        *,
+        boot_id: int,
+        compress: Callable[[Any], Any] = lambda observation: observation,
+        recorder: Recorder | None = None,
+    ) -> None:
+        super().__init__()
+        self._robot, self._servers, self._link = robot, dict(servers), link
+        self._options, self._boot_id, self._compress = options, boot_id, compress
+        self._recorder = recorder
+        self._exchange: Exchange | None = None
+        self._hello_ns: int | None = 0
+        """Time of the next HELLO; None while there is a session."""
+        self._heard_ns = self._sent_ns = 0
+        self._metadata: bytes | None = None
+        self._wants_rows = False
+        """Whether the policy wants to know which rows are coming."""
+        self._program: _Program | None = None
+        self._call: _Call | None = None
+        self._asked: dict[int, _Asked] = {}
+        """Observations that were sent, by number."""
+        self._calls = self._connections = 0
+        self._generation = 0
+        """Newest chunk that was accepted."""
+        self._delays_ns: deque[int] = deque(maxlen=DELAYS)
+        """Newest times from an observation to its chunk."""
+        self._counts = Counter[Kind]()
+        self._drops = Counter[Drop]()
+        self._refused = 0
+        self._late_ns = 0
+        """Longest time by which an answer came after its deadline."""
+        self._is_holding = False
+
+    # -- datagrams -----------------------------------------------------------------------------
+
+    def receive(self, datagram: Datagram, *, now_ns: int) -> None:
+        if datagram.socket == LINE:
+            self._hear_program(datagram.payload, datagram.peer, now_ns)
+        else:
+            try:
+                self._hear_server(datagram, now_ns)
+            except ProtocolError as error:
+                self._drops[error.reason] += 1
+        self._send(now_ns)
+
+    def _hear_server(self, datagram: Datagram, now_ns: int) -> None:
+        if datagram.peer not in self._servers.values():
+            raise ProtocolError(Drop.ELSEWHERE)
+        opened = self._link.open(datagram.payload, now_ns=now_ns)
+        if opened is None:
+            return
+        message = decode(opened)
+        if isinstance(message, Welcome):
+            self._welcome(message, datagram.peer, now_ns)
+            return
+        exchange = self._exchange
+        if isinstance(message, Hello) or exchange is None or message.session != exchange.session:
+            raise ProtocolError(Drop.UNKNOWN_SESSION)
+        self._heard_ns = now_ns
+        if isinstance(message, Seen):
+            if message.came:
+                exchange.learn(message, now_ns=now_ns)
+        elif arrived := exchange.accept(message, now_ns=now_ns):
+            if arrived.stream == METADATA:
+                self._learn_metadata(arrived.message)
+            elif arrived.stream == CHUNK:
+                self._accept(arrived.message, now_ns)
+
+    def _welcome(self, welcome: Welcome, peer: Address, now_ns: int) -> None:
+        if welcome.robot != self._robot or welcome.boot_id != self._boot_id:
+            raise ProtocolError(Drop.FOR_ANOTHER_LIFE)
+        if welcome.refusal:
+            reason = str(Refusal(welcome.refusal))
+            self._events.append(events.JoinRefused(robot=self._robot, reason=reason))
+            return
+        self._link.adopt(now_ns=now_ns)
+        self._heard_ns, self._hello_ns = now_ns, None
+        if self._exchange and self._exchange.session == welcome.session:
+            return
+        self._exchange = Exchange(welcome.session, self._options.rate_max)
+        self._asked.clear()
+        self._events.append(events.PolicyJoined(robot=self._robot, peer=address_text(*peer)))
+        self._say_alive()
+
+    def _say_alive(self) -> None:
+        """Say that the robot is there, and whether it has the policy's metadata."""
+        assert self._exchange
+        has = int(self._metadata is not None)
+        self._post(encode(Seen(self._exchange.session, METADATA, has, 0, 0, 0, 0, 0, 0)))
+
+    def _learn_metadata(self, message: bytes) -> None:
+        try:
+            self._wants_rows, metadata = values.unpack(message)
+        except (ValueRefused, TypeError, ValueError):
+            raise ProtocolError(Drop.FIELD) from None
+        if not isinstance(metadata, bytes):
+            raise ProtocolError(Drop.FIELD)
+        self._metadata = metadata
+        self._greet()
+
+    def _post(self, payload: bytes) -> None:
+        sealed = self._link.seal(payload)
+        for socket, server in self._servers.items():
+            self.send(sealed, server, socket)
+
+    def _send(self, now_ns: int) -> None:
+        """Send what is due."""
+        if self._hello_ns is not None and now_ns >= self._hello_ns:
+            self._hello_ns = now_ns + self._link.hello_ns
+            hello = self._link.hello(encode(Hello(self._robot, self._boot_id)), now_ns=now_ns)
+            for socket, server in self._servers.items():
+                self.send(hello, server, socket)
+        for answer in self._link.outbox():
+            for socket, server in self._servers.items():
+                self.send(answer, server, socket)
+        if self._exchange is None:
+            return
+        posted = self._exchange.outbox(now_ns=now_ns)
+        for payload in posted:
+            self._post(payload)
+        if posted:
+            self._sent_ns = now_ns
+        elif now_ns - self._sent_ns >= ALIVE_NS:
+            self._sent_ns = now_ns
+            self._say_alive()
+
+    # -- the program ---------------------------------------------------------------------------
+
+    def _hear_program(self, said: bytes, peer: Address, now_ns: int) -> None:
+        match said[:1]:
+            case Said.OPENED:
+                options = self._options
+                step_ns = options.step_ns or STEP_NS_FIRST
+                player = options.player()
+                schedule = Schedule(player, options.actions, options.key, step_ns, now_ns)
+                self._connections += 1
+                self._program = _Program(peer, self._connections, schedule)
+                self._call = None
+                self._events.append(events.ProgramConnected(robot=self._robot))
+                self._greet()
+            case Said.CLOSED if self._program and self._program.peer == peer:
+                self._program = self._call = None
+                self._events.append(events.ProgramGone(robot=self._robot))
+            case Said.MESSAGE if self._program and self._program.peer == peer:
+                self._hear_call(self._program, said[1:], now_ns)
+
+    def _greet(self) -> None:
+        """Give the program the policy's metadata, by which its connection is complete."""
+        program = self._program
+        if program and self._metadata is not None and not program.has_metadata:
+            program.has_metadata = True
+            self.send(Said.MESSAGE.value + self._metadata, program.peer, LINE)
+
+    def _hear_call(self, program: _Program, data: bytes, now_ns: int) -> None:
+        options, schedule = self._options, program.schedule
+        if program.answered_ns is not None:
+            program.intervals_ns.append(now_ns - program.answered_ns)
+            if options.step_ns is None:
+                measured = int(median(program.intervals_ns) / options.rows)
+                schedule.set_step(max(measured, MILLISECOND_NS), now_ns=now_ns)
+        number = schedule.number(now_ns=now_ns)
+        schedule.stands = not options.plays_on
+        self._calls += 1
+        call = _Call(program.peer, self._calls, now_ns, program.newest < 0, is_sent=False)
+        self._call = call
+        if not self._is_needed(schedule, now_ns):
+            self._answer(Kind.REST, now_ns)
+            return
+        try:
+            seen = values.pack(self._compress(values.unpack(data)))
+            coming = None
+            if self._wants_rows:
+                coming = schedule.coming(ROWS_SENT, now_ns=now_ns)
+            left, delay = schedule.left(now_ns=now_ns), self._delay_steps(schedule)
+            content = [call.number, number, self._generation, left, delay, coming, seen]
+            message = values.pack(content)
+            if len(message) > values.BYTES_MAX:
+                raise ValueRefused(f"got {len(message)} B, expected at most {values.BYTES_MAX}")
+        except ValueRefused as error:
+            self._refused += 1
+            refused = events.ObservationRefused(robot=self._robot, reason=str(error))
+            self._events.append(refused)
+            self._answer(Kind.ERROR, now_ns, f"the observation is refused: {error}")
+            return
+        if self._exchange:
+            self._exchange.send(OBSERVATION, message, now_ns=now_ns)
+            self._asked[call.number] = _Asked(now_ns, program.number)
+            while len(self._asked) > DELAYS:
+                del self._asked[next(iter(self._asked))]
+            call.is_sent = True
+
+    def _delay_steps(self, schedule: Schedule) -> int:
+        """Steps within which a chunk comes, after its observation, by the newest delays."""
+        longest_ns = max(self._delays_ns, default=0)
+        return -(-longest_ns // schedule.step_ns)
+
+    def _is_needed(self, schedule: Schedule, now_ns: int) -> bool:
+        spare = self._options.spare_rows
+        if spare is None or not self._delays_ns:
+            return True
+        return schedule.left(now_ns=now_ns) < spare + self._delay_steps(schedule)
+
+    def _accept(self, message: bytes, now_ns: int) -> None:
+        """Accept a chunk."""
+        try:
+            generation, call_number, first, reply, error = values.unpack(message)
+            if not all(type(each) is int for each in (generation, call_number, first)):
+                raise ProtocolError(Drop.FIELD)
+            content = None if error else values.unpack(reply)
+        except (ValueRefused, TypeError, ValueError):
+            raise ProtocolError(Drop.FIELD) from None
+        asked, program = self._asked.get(call_number), self._program
+        if asked is None or program is None or asked.connection != program.number:
+            raise ProtocolError(Drop.FOR_ANOTHER_LIFE)
+        call = self._call
+        if error:
+            self._events.append(events.PolicyFailed(robot=self._robot, reason=str(error)[:200]))
+            return
+        self._delays_ns.append(now_ns - asked.began_ns)
+        try:
+            program.schedule.accept(generation, first, content, now_ns=now_ns)
+        except ValueRefused as refused:
+            self._events.append(events.PolicyFailed(robot=self._robot, reason=str(refused)))
+            return
+        if self._is_holding and program.schedule.since_ns is None:
+            self._is_holding = False
+        self._generation = max(self._generation, generation)
+        if call_number > program.newest:
+            program.newest, program.made_ns = call_number, asked.began_ns
+        if call and (call.number == call_number or call.is_first):
+            self._answer(Kind.FRESH, now_ns)
+
+    def _answer(self, kind: Kind, now_ns: int, error: str = "") -> None:
+        """Answer the call."""
+        program, call = self._program, self._call
+        assert program
+        assert call
+        self._call = None
+        schedule = program.schedule
+        answer = schedule.answer(kind, now_ns=now_ns)
+        kind, left = (Kind.ERROR, 0) if error else (answer.kind, answer.left)
+        since_ns = schedule.since_ns
+        if kind is Kind.HOLD and not error:
+            held_ns = now_ns - (since_ns if since_ns is not None else now_ns)
+            if answer.reply is None or held_ns > self._options.hold_ns:
+                kind = Kind.ERROR
+                error = f"no action from the policy for {held_ns / SECOND_NS:.2f} s"
+            if not self._is_holding:
+                self._is_holding = True
+                self._events.append(events.Holding(robot=self._robot))
+        schedule.stands = False
+        program.answered_ns = now_ns
+        waited_ns = now_ns - call.began_ns
+        self._counts[kind] += 1
+        if not call.is_first:
+            self._late_ns = max(self._late_ns, waited_ns - self._options.deadline_ns)
+        if self._recorder:
+            age_ns = now_ns - program.made_ns if program.newest >= 0 else -1
+            row = (now_ns, self._robot, call.number, KINDS.index(kind), waited_ns, age_ns, left)
+            self._recorder.append_row(*row)
+        if error:
+            self.send(Said.ERROR.value + error.encode(), call.peer, LINE)
+        else:
+            self.send(Said.MESSAGE.value + values.pack(answer.reply), call.peer, LINE)
+
+    # -- time ----------------------------------------------------------------------------------
+
+    def next_wake_ns(self) -> int | None:
+        due = [self._heard_ns + SILENCE_NS, self._sent_ns + ALIVE_NS]
+        if self._hello_ns is not None:
+            due = [self._hello_ns]
+        if self._exchange and (sends_ns := self._exchange.due_ns()) is not None:
+            due.append(sends_ns)
+        if self._call:
+            due.append(self._answer_by_ns(self._call))
+        return min(due)
+
+    def _answer_by_ns(self, call: _Call) -> int:
+        options = self._options
+        return call.began_ns + (options.begin_ns if call.is_first else options.deadline_ns)
+
+    def wake(self, *, now_ns: int) -> None:
+        call = self._call
+        if call and now_ns >= self._answer_by_ns(call):
+            self._answer(Kind.REST, now_ns)
+        if self._hello_ns is None:
+            silence_ns = now_ns - self._heard_ns
+            if silence_ns >= SILENCE_NS:
+                silent = events.PolicySilent(robot=self._robot, silence_s=silence_ns / SECOND_NS)
+                self._events.append(silent)
+                self._hello_ns = now_ns
+            elif self._link.wants_hello(now_ns):
+                self._hello_ns = now_ns
+        self._send(now_ns)
+
+    def figures(self) -> dict[str, Any]:
+        exchange, program = self._exchange, self._program
+        return {
+            "calls": self._calls,
+            "answers": by_name({kind: self._counts[kind] for kind in KINDS}),
+            "late_s_max": max(self._late_ns, 0) / SECOND_NS,
+            "observations_refused": self._refused,
+            "delay_s": max(self._delays_ns, default=0) / SECOND_NS,
+            "step_s": program.schedule.step_ns / SECOND_NS if program else None,
+            "dropped": by_name(self._drops),
+        } | ({"link": exchange.figures()} if exchange else {})

@@ -1,0 +1,358 @@
+"""The policy's end: observations of robots in, chunks of actions out.
+
+The policy speaks through the line (socket 1): openpi's websocket protocol, with a connection for
+each robot, or a function. While it thinks, a newer observation of the same robot takes the place of
+one that waits. An error, or a connection that was lost, reaches the robot as an error, and its rows
+play on.
+"""
+
+from collections import Counter, OrderedDict
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+from skytether.policy import events, values
+from skytether.policy.exchange import Exchange
+from skytether.policy.messages import (
+    CHUNK,
+    METADATA,
+    OBSERVATION,
+    Hello,
+    PartMessage,
+    Welcome,
+    decode,
+    encode,
+)
+from skytether.policy.pace import RATE_MAX
+from skytether.policy.robot import LINE, Said
+from skytether.policy.values import ValueRefused
+from skytether.server.gate import Gate, GateCall, ReplyPath
+from skytether.shared.base.units import SECOND_NS
+from skytether.shared.endpoints.endpoint import Address, Datagram, Endpoint, by_name
+from skytether.shared.events.flight import address_text
+from skytether.shared.wire.drop import Drop, ProtocolError
+from skytether.shared.wire.protocol import Refusal
+
+ROBOTS_MAX = 64
+"""Largest number of robots at once."""
+SILENCE_NS = 10 * SECOND_NS
+"""Time after which a silent robot's session ends."""
+PATH_NS = 3 * SECOND_NS
+"""Time without a packet from an address after which nothing is sent there."""
+PATHS_MAX = 4
+AGAIN_NS = SECOND_NS
+"""Time after which a connection to the policy that was lost is opened again."""
+POLICY = "policy"
+"""Peer of the line: `(POLICY, robot)`."""
+
+
+class _Job(NamedTuple):
+    """Observation that the policy is asked for an answer to."""
+
+    call: int
+    first: int
+    is_urgent: bool
+    """Whether the robot has no more rows than come before the chunk does."""
+    observation: bytes
+
+
+@dataclass(slots=True)
+class _Robot:
+    session: int
+    boot_id: int
+    reply: ReplyPath
+    exchange: Exchange
+    heard_ns: int
+    paths: "OrderedDict[tuple[int, Address], int]" = field(default_factory=OrderedDict)
+    """Time of the newest packet [ns] of each socket and address, newest last."""
+    generation: int = 0
+    waiting: _Job | None = None
+    thinking: _Job | None = None
+    asked_ns: int = 0
+    is_open: bool = False
+    """Whether the connection to the policy is open."""
+    opens_ns: int = 0
+    """Time at which it is opened next, if it is not."""
+    is_opening: bool = False
+    has_metadata: bool = False
+
+
+class PolicyEnd(Endpoint):
+    """Policy's end of the sessions of several robots.
+
+    Args:
+        gate: see `server.gate`.
+        boot_id: random number of this run.
+        draw: returns an unpredictable number of 32 bits, for sessions.
+        patience_ns: longest time that the policy may think; then its connection is opened anew.
+        gives_rows: whether an observation gets the keys `delay_steps`, `coming` and `committed`:
+            the rows that the robot plays from the observation's step on, as far as it has them, and
+            those of them that it plays before a chunk can come.
+        rate_max: bound of the rate at which a robot is sent to [B/s].
+        unpacked: what makes images of what `images.Compressor` made.
+    """
+
+    def __init__(
+        self,
+        gate: Gate,
+        *,
+        boot_id: int,
+        draw: Callable[[], int],
+        patience_ns: int = 30 * SECOND_NS,
+        gives_rows: bool = False,
+        rate_max: float = RATE_MAX,
+        unpacked: Callable[[dict[Any, Any]], Any] | None = None,
+    ) -> None:
+        super().__init__()
+        self._gate, self._boot_id, self._draw = gate, boot_id, draw
+        self._patience_ns, self._gives_rows, self._rate_max = patience_ns, gives_rows, rate_max
+        self._unpacked = unpacked
+        self._robots: dict[int, _Robot] = {}
+        self._metadata: bytes | None = None
+        self._drops = Counter[Drop]()
+        self._counts = Counter[str]()
+
+    # -- datagrams -----------------------------------------------------------------------------
+
+    def receive(self, datagram: Datagram, *, now_ns: int) -> None:
+        if datagram.socket == LINE:
+            self._hear_policy(datagram.payload, datagram.peer[1], now_ns)
+        else:
+            try:
+                self._hear_robot(datagram, now_ns)
+            except ProtocolError as error:
+                self._drops[error.reason] += 1
+            for answer in self._gate.outbox():
+                self._out.append(answer)
+        self._send(now_ns)
+
+    def _hear_robot(self, datagram: Datagram, now_ns: int) -> None:
+        call = self._gate.open(datagram, now_ns=now_ns)
+        if call is None:
+            return
+        message = decode(call.payload)
+        if isinstance(message, Hello):
+            self._welcome(message, call, datagram, now_ns)
+            return
+        if isinstance(message, Welcome):
+            raise ProtocolError(Drop.NOT_FOR_A_SERVER)
+        number = self._number(message.session, call)
+        robot = self._robots[number]
+        at = datagram.socket, datagram.peer
+        if call.vehicle is None and at not in robot.paths:
+            raise ProtocolError(Drop.ELSEWHERE)
+        robot.heard_ns = now_ns
+        if call.vehicle is not None:
+            robot.reply = call.line
+        robot.paths[at] = now_ns
+        robot.paths.move_to_end(at)
+        while len(robot.paths) > PATHS_MAX:
+            robot.paths.popitem(last=False)
+        if isinstance(message, PartMessage):
+            if message.stream != OBSERVATION:
+                raise ProtocolError(Drop.FIELD)
+            if arrived := robot.exchange.accept(message, now_ns=now_ns):
+                self._observe(number, robot, arrived.message, now_ns)
+            return
+        if message.came:
+            robot.exchange.learn(message, now_ns=now_ns)
+        else:  # the robot says that it is there, and whether it has the metadata; so is the server
+            robot.has_metadata = message.number > 0
+            self.send(call.line.seal(call.payload), datagram.peer, datagram.socket)
+            self._give_metadata(robot, now_ns)
+
+    def _number(self, session: int, call: GateCall) -> int:
+        """Number of the robot of a session.
+
+        Raises:
+            ProtocolError: there is no such session, or it is another robot's.
+        """
+        if call.vehicle is not None:
+            robot = self._robots.get(call.vehicle)
+            if robot and robot.session == session:
+                return call.vehicle
+        else:
+            for number, each in self._robots.items():
+                if each.session == session:
+                    return number
+        raise ProtocolError(Drop.UNKNOWN_SESSION)
+
+    def _welcome(self, hello: Hello, call: GateCall, datagram: Datagram, now_ns: int) -> None:
+        if call.vehicle is not None and hello.robot != call.vehicle:
+            raise ProtocolError(Drop.OF_ANOTHER_VEHICLE)
+        number, at = hello.robot, (datagram.socket, datagram.peer)
+        before = self._robots.get(number)
+        refusal = Refusal.ACCEPTED
+        if before is None and len(self._robots) >= ROBOTS_MAX:
+            refusal = Refusal.FULL
+        elif before and call.vehicle is None and at not in before.paths:
+            # Without keys anybody may say that number; the robot that is there keeps it.
+            is_same = hello.boot_id == before.boot_id
+            refusal = Refusal.ACCEPTED if is_same else Refusal.TAKEN
+        session = 0
+        if refusal is Refusal.ACCEPTED:
+            if before is None or before.boot_id != hello.boot_id:
+                self._begin(number, hello.boot_id, call, now_ns)
+            robot = self._robots[number]
+            robot.reply, robot.heard_ns, session = call.line, now_ns, robot.session
+            if call.vehicle is None:
+                robot.paths[at] = now_ns
+                while len(robot.paths) > PATHS_MAX:
+                    robot.paths.popitem(last=False)
+        welcome = Welcome(number, session, hello.boot_id, self._boot_id, refusal)
+        self.send(call.line.seal(encode(welcome)), datagram.peer, datagram.socket)
+        if session:
+            self._gate.admit(call, now_ns=now_ns)
+            if before is None or before.boot_id != hello.boot_id:
+                peer = address_text(*datagram.peer)
+                self._events.append(events.RobotJoined(robot=number, peer=peer))
+
+    def _begin(self, number: int, boot_id: int, call: GateCall, now_ns: int) -> None:
+        session = 0
+        taken = {each.session for each in self._robots.values()}
+        while session == 0 or session in taken:
+            session = self._draw()
+        before = self._robots.get(number)
+        robot = _Robot(session, boot_id, call.line, Exchange(session, self._rate_max), now_ns)
+        if before:  # its connection to the policy is a new one, too: an episode begins
+            self._close(number)
+        self._robots[number] = robot
+        self._open(number, robot)
+
+    # -- the policy ----------------------------------------------------------------------------
+
+    def _open(self, number: int, robot: _Robot) -> None:
+        robot.is_opening = True
+        self.send(Said.OPENED.value, (POLICY, number), LINE)
+
+    def _close(self, number: int) -> None:
+        self.send(Said.CLOSED.value, (POLICY, number), LINE)
+
+    def _hear_policy(self, said: bytes, number: int, now_ns: int) -> None:
+        robot = self._robots.get(number)
+        if robot is None:
+            return
+        match said[:1]:
+            case Said.OPENED:
+                robot.is_open, robot.is_opening = True, False
+                self._metadata = said[1:]
+                self._events.append(events.UpstreamFound(robot=number))
+                self._give_metadata(robot, now_ns)
+            case Said.CLOSED:
+                self._lose(number, robot, said[1:].decode(errors="replace"), now_ns)
+                return
+            case Said.MESSAGE:
+                self._counts["answers"] += 1
+                self._finish(robot, said[1:], "", now_ns)
+            case Said.ERROR:
+                reason = said[1:].decode(errors="replace").strip() or "unknown"
+                self._counts["errors"] += 1
+                last = reason.splitlines()[-1][:200]
+                self._events.append(events.PolicyFailed(robot=number, reason=last))
+                self._finish(robot, b"", last, now_ns)
+        self._ask(number, robot, now_ns)
+
+    def _lose(self, number: int, robot: _Robot, reason: str, now_ns: int) -> None:
+        if robot.is_open or not robot.opens_ns:
+            lost = events.UpstreamLost(robot=number, reason=reason[:200] or "closed")
+            self._events.append(lost)
+        robot.is_open = robot.is_opening = False
+        robot.opens_ns = now_ns + AGAIN_NS
+        self._finish(robot, b"", f"the policy's connection was lost: {reason[:100]}", now_ns)
+
+    def _finish(self, robot: _Robot, reply: bytes, error: str, now_ns: int) -> None:
+        """Send the answer to the observation that the policy was asked about."""
+        job, robot.thinking = robot.thinking, None
+        if job is None:
+            return
+        robot.generation += 1
+        content = [robot.generation, job.call, job.first, reply, error]
+        message = values.pack(content)
+        if len(message) > values.BYTES_MAX:
+            error = f"the policy's reply has {len(message)} B"
+            message = values.pack([*content[:3], b"", error])
+        robot.exchange.send(CHUNK, message, now_ns=now_ns, is_urgent=job.is_urgent)
+
+    def _give_metadata(self, robot: _Robot, now_ns: int) -> None:
+        if self._metadata is not None and not robot.has_metadata and robot.paths:
+            robot.has_metadata = True
+            content = values.pack([self._gives_rows, self._metadata])
+            robot.exchange.send(METADATA, content, now_ns=now_ns)
+
+    def _observe(self, number: int, robot: _Robot, message: bytes, now_ns: int) -> None:
+        try:
+            call, first, _, left, delay, coming, seen = values.unpack(message)
+            if not all(type(each) is int for each in (call, first, left, delay)):
+                raise ProtocolError(Drop.FIELD)
+            observation = values.unpack(seen, self._unpacked)
+            if self._gives_rows and isinstance(observation, dict):
+                observation["delay_steps"] = delay
+                if coming is not None:
+                    observation |= {"coming": coming, "committed": coming[:delay]}
+            content = values.pack(observation)
+        except (ValueRefused, TypeError, ValueError):
+            raise ProtocolError(Drop.FIELD) from None
+        self._counts["observations"] += 1
+        self._counts["replaced"] += robot.waiting is not None
+        robot.waiting = _Job(call, first, left <= delay, content)
+        self._ask(number, robot, now_ns)
+
+    def _ask(self, number: int, robot: _Robot, now_ns: int) -> None:
+        """Ask the policy about the newest observation, if it is free."""
+        if robot.waiting and robot.is_open and robot.thinking is None:
+            robot.thinking, robot.waiting = robot.waiting, None
+            robot.asked_ns = now_ns
+            said = Said.MESSAGE.value + robot.thinking.observation
+            self.send(said, (POLICY, number), LINE)
+
+    # -- time ----------------------------------------------------------------------------------
+
+    def next_wake_ns(self) -> int | None:
+        due = []
+        for robot in self._robots.values():
+            due.append(robot.heard_ns + SILENCE_NS)
+            if robot.thinking:
+                due.append(robot.asked_ns + self._patience_ns)
+            if not (robot.is_open or robot.is_opening):
+                due.append(robot.opens_ns)
+            if (sends_ns := robot.exchange.due_ns()) is not None:
+                due.append(sends_ns)
+        return min(due, default=None)
+
+    def wake(self, *, now_ns: int) -> None:
+        for number, robot in list(self._robots.items()):
+            silence_ns = now_ns - robot.heard_ns
+            if silence_ns >= SILENCE_NS:
+                silence_s = silence_ns / SECOND_NS
+                self._events.append(events.RobotSilent(robot=number, silence_s=silence_s))
+                self._close(number)
+                del self._robots[number]
+                continue
+            if robot.thinking and now_ns - robot.asked_ns >= self._patience_ns:
+                self._close(number)
+                waited_s = self._patience_ns / SECOND_NS
+                self._lose(number, robot, f"no answer in {waited_s:g} s", now_ns)
+            if not (robot.is_open or robot.is_opening) and now_ns >= robot.opens_ns:
+                self._open(number, robot)
+        self._send(now_ns)
+
+    def _send(self, now_ns: int) -> None:
+        for robot in self._robots.values():
+            for payload in robot.exchange.outbox(now_ns=now_ns):
+                sealed = robot.reply.seal(payload)
+                for (socket, peer), heard_ns in robot.paths.items():
+                    if heard_ns >= now_ns - PATH_NS:
+                        self.send(sealed, peer, socket)
+
+    def figures(self) -> dict[str, Any]:
+        return {
+            "robots": len(self._robots),
+            "observations": self._counts["observations"],
+            "observations_replaced": self._counts["replaced"],
+            "answers": self._counts["answers"],
+            "errors": self._counts["errors"],
+            "dropped": by_name(self._drops),
+            "by_robot": {
+                str(number): robot.exchange.figures() for number, robot in self._robots.items()
+            },
+        }

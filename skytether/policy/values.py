@@ -1,0 +1,97 @@
+"""Observations and actions as bytes, as openpi sends them: msgpack with numpy arrays.
+
+An array is a map with the keys `__ndarray__`, `data`, `dtype` and `shape` as bytes, a numpy number
+one with `__npgeneric__`, `data` and `dtype`. Only arrays of numbers and booleans are accepted:
+nothing is unpickled, and no array is larger than its bytes.
+"""
+
+import re
+from collections.abc import Callable
+from math import prod
+from typing import Any
+
+import msgpack
+import numpy as np
+from numpy.typing import NDArray
+
+ARRAY, GENERIC = b"__ndarray__", b"__npgeneric__"
+BYTES_MAX = 4_000_000
+"""Largest size of a value [B]: 20 MB of raw images would take seconds at 10 Mbit/s."""
+AXES_MAX = 8
+_DTYPE = re.compile(r"[<>|=]?[biuf][1248]|[<>|=]?f16")
+
+
+class ValueRefused(ValueError):
+    """Bytes that are no value, or one that is too large; the message says why, in one line."""
+
+
+def pack(value: Any) -> bytes:
+    """Value as bytes.
+
+    Raises:
+        ValueRefused: it has something else than numbers, texts, bytes, lists, maps and arrays.
+    """
+    try:
+        packed: bytes = msgpack.packb(value, default=_described)
+    except (TypeError, ValueError, OverflowError, RecursionError) as error:
+        raise ValueRefused(str(error)) from None
+    return packed
+
+
+def unpack(data: bytes, hook: Callable[[dict[Any, Any]], Any] | None = None) -> Any:
+    """Value of bytes; arrays are views of the bytes, and cannot be written.
+
+    Args:
+        hook: called with each map that is no array, and returns what takes its place.
+
+    Raises:
+        ValueRefused: the bytes are no value.
+    """
+    if len(data) > BYTES_MAX:
+        raise ValueRefused(f"got {len(data)} B, expected at most {BYTES_MAX}")
+
+    def made(table: dict[Any, Any]) -> Any:
+        if ARRAY in table:
+            return _array(table)
+        if GENERIC in table:
+            return _dtype(table.get(b"dtype")).type(table.get(b"data"))
+        return hook(table) if hook else table
+
+    try:
+        return msgpack.unpackb(data, object_hook=made)
+    except ValueRefused:
+        raise
+    except (ValueError, TypeError, OverflowError, RecursionError, msgpack.UnpackException) as error:
+        raise ValueRefused(f"no msgpack with arrays: {error}") from None
+
+
+def _described(value: Any) -> Any:
+    if isinstance(value, np.ndarray | np.generic) and value.dtype.kind not in "biuf":
+        raise ValueRefused(f"got an array of {value.dtype}, expected numbers")
+    if isinstance(value, np.ndarray):
+        return {
+            ARRAY: True,
+            b"data": value.tobytes(),
+            b"dtype": value.dtype.str,
+            b"shape": value.shape,
+        }
+    if isinstance(value, np.generic):
+        return {GENERIC: True, b"data": value.item(), b"dtype": value.dtype.str}
+    raise ValueRefused(f"got a {type(value).__name__}, expected numbers, text, lists, maps, arrays")
+
+
+def _dtype(given: Any) -> "np.dtype[Any]":
+    if not isinstance(given, str) or not _DTYPE.fullmatch(given):
+        raise ValueRefused(f"got an array of {given!r:.40}, expected numbers")
+    return np.dtype(given)
+
+
+def _array(table: dict[Any, Any]) -> NDArray[Any]:
+    dtype, data, shape = _dtype(table.get(b"dtype")), table.get(b"data"), table.get(b"shape")
+    if not isinstance(data, bytes) or not isinstance(shape, list) or len(shape) > AXES_MAX:
+        raise ValueRefused("got an array without data or shape")
+    if not all(type(each) is int and each >= 0 for each in shape):
+        raise ValueRefused(f"got an array of shape {shape!r:.40}")
+    if prod(shape) * dtype.itemsize != len(data):
+        raise ValueRefused(f"got {len(data)} B for an array of shape {shape!r:.40} of {dtype}")
+    return np.ndarray(shape, dtype, data)
