@@ -48,6 +48,8 @@ SILENCE_NS = 3 * SECOND_NS
 """Time without a packet after which the robot says HELLO again."""
 ALIVE_NS = SECOND_NS
 """Time after which something is sent, so that the server knows that the robot is there."""
+AGAIN_NS = SECOND_NS
+"""Time after which the first observation is sent again."""
 STEP_NS_FIRST = 50 * MILLISECOND_NS
 """Length of a step before it is measured."""
 MEASURED, DELAYS = 9, 64
@@ -57,12 +59,12 @@ ROWS_SENT = 64
 CALL_COLUMNS = np.dtype(
     [
         ("time_ns", "<i8"),  # time of the answer
-        ("robot", "<u2"),
-        ("call", "<u4"),  # number of the call
+        ("robot", "<i8"),
+        ("call", "<i8"),  # number of the call
         ("kind", "u1"),  # 0 fresh, 1 rest, 2 hold, 3 error
         ("waited_ns", "<i8"),  # time from the call to the answer
         ("chunk_age_ns", "<i8"),  # age of the observation that the answer was made from, -1: none
-        ("left", "<i4"),  # rows of the answer that the policy has made
+        ("left", "<i8"),  # rows of the answer that the policy has made
     ]
 )
 KINDS = (Kind.FRESH, Kind.REST, Kind.HOLD, Kind.ERROR)
@@ -109,7 +111,10 @@ class _Call:
     number: int
     began_ns: int
     is_first: bool
-    is_sent: bool
+    message: bytes
+    """Observation as it is sent; empty if it is not."""
+    again_ns: int
+    """Time at which it is sent again, if no answer has ever come."""
 
 
 class _Asked(NamedTuple):
@@ -164,6 +169,8 @@ class RobotEnd(Endpoint):
         self._options, self._boot_id, self._compress = options, boot_id, compress
         self._recorder = recorder
         self._exchange: Exchange | None = None
+        self._session = (0, 0)
+        """Number of the session, and of the server's run."""
         self._hello_ns: int | None = 0
         """Time of the next HELLO; None while there is a session."""
         self._heard_ns = self._sent_ns = 0
@@ -175,8 +182,6 @@ class RobotEnd(Endpoint):
         self._asked: dict[int, _Asked] = {}
         """Observations that were sent, by number."""
         self._calls = self._connections = 0
-        self._generation = 0
-        """Newest chunk that was accepted."""
         self._delays_ns: deque[int] = deque(maxlen=DELAYS)
         """Newest times from an observation to its chunk."""
         self._counts = Counter[Kind]()
@@ -230,10 +235,11 @@ class RobotEnd(Endpoint):
             return
         self._link.adopt(now_ns=now_ns)
         self._heard_ns, self._hello_ns = now_ns, None
-        if self._exchange and self._exchange.session == welcome.session:
+        session = welcome.session, welcome.server_boot_id
+        if self._session == session:
             return
+        self._session = session
         self._exchange = Exchange(welcome.session, self._options.rate_max)
-        self._asked.clear()
         self._events.append(events.PolicyJoined(robot=self._robot, peer=address_text(*peer)))
         self._say_alive()
 
@@ -316,7 +322,8 @@ class RobotEnd(Endpoint):
         number = schedule.number(now_ns=now_ns)
         schedule.stands = not options.plays_on
         self._calls += 1
-        call = _Call(program.peer, self._calls, now_ns, program.newest < 0, is_sent=False)
+        again_ns = now_ns + AGAIN_NS
+        call = _Call(program.peer, self._calls, now_ns, program.newest < 0, b"", again_ns)
         self._call = call
         if not self._is_needed(schedule, now_ns):
             self._answer(Kind.REST, now_ns)
@@ -327,7 +334,7 @@ class RobotEnd(Endpoint):
             if self._wants_rows:
                 coming = schedule.coming(ROWS_SENT, now_ns=now_ns)
             left, delay = schedule.left(now_ns=now_ns), self._delay_steps(schedule)
-            content = [call.number, number, self._generation, left, delay, coming, seen]
+            content = [call.number, number, left, delay, coming, seen]
             message = values.pack(content)
             if len(message) > values.BYTES_MAX:
                 raise ValueRefused(f"got {len(message)} B, expected at most {values.BYTES_MAX}")
@@ -337,12 +344,12 @@ class RobotEnd(Endpoint):
             self._events.append(refused)
             self._answer(Kind.ERROR, now_ns, f"the observation is refused: {error}")
             return
+        self._asked[call.number] = _Asked(now_ns, program.number)
+        while len(self._asked) > DELAYS:
+            del self._asked[next(iter(self._asked))]
+        call.message = message
         if self._exchange:
             self._exchange.send(OBSERVATION, message, now_ns=now_ns)
-            self._asked[call.number] = _Asked(now_ns, program.number)
-            while len(self._asked) > DELAYS:
-                del self._asked[next(iter(self._asked))]
-            call.is_sent = True
 
     def _delay_steps(self, schedule: Schedule) -> int:
         """Steps within which a chunk comes, after its observation, by the newest delays."""
@@ -358,8 +365,8 @@ class RobotEnd(Endpoint):
     def _accept(self, message: bytes, now_ns: int) -> None:
         """Accept a chunk."""
         try:
-            generation, call_number, first, reply, error = values.unpack(message)
-            if not all(type(each) is int for each in (generation, call_number, first)):
+            call_number, first, reply, error = values.unpack(message)
+            if type(call_number) is not int or type(first) is not int:
                 raise ProtocolError(Drop.FIELD)
             content = None if error else values.unpack(reply)
         except (ValueRefused, TypeError, ValueError):
@@ -373,13 +380,12 @@ class RobotEnd(Endpoint):
             return
         self._delays_ns.append(now_ns - asked.began_ns)
         try:
-            program.schedule.accept(generation, first, content, now_ns=now_ns)
+            program.schedule.accept(call_number, first, content, now_ns=now_ns)
         except ValueRefused as refused:
             self._events.append(events.PolicyFailed(robot=self._robot, reason=str(refused)))
             return
         if self._is_holding and program.schedule.since_ns is None:
             self._is_holding = False
-        self._generation = max(self._generation, generation)
         if call_number > program.newest:
             program.newest, program.made_ns = call_number, asked.began_ns
         if call and (call.number == call_number or call.is_first):
@@ -428,6 +434,8 @@ class RobotEnd(Endpoint):
             due.append(sends_ns)
         if self._call:
             due.append(self._answer_by_ns(self._call))
+            if self._call.is_first and self._call.message:
+                due.append(self._call.again_ns)
         return min(due)
 
     def _answer_by_ns(self, call: _Call) -> int:
@@ -438,6 +446,11 @@ class RobotEnd(Endpoint):
         call = self._call
         if call and now_ns >= self._answer_by_ns(call):
             self._answer(Kind.REST, now_ns)
+        elif call and call.is_first and call.message and now_ns >= call.again_ns:
+            # The robot waits for its first answer, and no other observation follows.
+            call.again_ns = now_ns + AGAIN_NS
+            if self._exchange:
+                self._exchange.send(OBSERVATION, call.message, now_ns=now_ns)
         if self._hello_ns is None:
             silence_ns = now_ns - self._heard_ns
             if silence_ns >= SILENCE_NS:

@@ -61,6 +61,8 @@ class Schedule:
         self._end = 0
         """First step without a row."""
         self._reply: Any = None
+        self._newest = -1
+        """Call that the reply is an answer to."""
         self._first = 0
         self.stands = False
         """Whether the robot stands still now, although rows are left."""
@@ -91,10 +93,11 @@ class Schedule:
         """The player's number of the present step, from which a chunk counts its rows."""
         return self._player.number(self.advance(now_ns=now_ns))
 
-    def accept(self, generation: int, first: int, reply: Any, *, now_ns: int) -> None:
+    def accept(self, call: int, first: int, reply: Any, *, now_ns: int) -> None:
         """Accept a chunk.
 
         Args:
+            call: number of the call that it answers; that of a newer one is higher.
             first: number of the step of its observation, see `number`.
 
         Raises:
@@ -102,11 +105,13 @@ class Schedule:
         """
         rows = rows_of(reply, self._key).astype(np.float64)
         step = self.advance(now_ns=now_ns)
-        last = self._player.last
-        if last is not None and last.shape != rows.shape[1:]:
-            raise ValueRefused(f"got actions of shape {rows.shape[1:]}, expected {last.shape}")
-        self._player.accept(Held(generation, first, rows), step)
-        self._reply, self._first = reply, first
+        if self._reply is not None:
+            before = rows_of(self._reply, self._key).shape[1:]
+            if before != rows.shape[1:]:
+                raise ValueRefused(f"{self._key}: got rows of {rows.shape[1:]}, expected {before}")
+        self._player.accept(Held(call, first, rows), step)
+        if call > self._newest:
+            self._newest, self._reply, self._first = call, reply, first
         left = len(self._coming(step, ROWS_MAX + HELD_MAX)[0])
         self._end = step + left
         if left:

@@ -65,9 +65,10 @@ class _Robot:
     heard_ns: int
     paths: "OrderedDict[tuple[int, Address], int]" = field(default_factory=OrderedDict)
     """Time of the newest packet [ns] of each socket and address, newest last."""
-    generation: int = 0
     waiting: _Job | None = None
     thinking: _Job | None = None
+    answered: tuple[int, bytes] = (-1, b"")
+    """Newest call that was answered, and the chunk."""
     asked_ns: int = 0
     is_open: bool = False
     """Whether the connection to the policy is open."""
@@ -265,12 +266,11 @@ class PolicyEnd(Endpoint):
         job, robot.thinking = robot.thinking, None
         if job is None:
             return
-        robot.generation += 1
-        content = [robot.generation, job.call, job.first, reply, error]
-        message = values.pack(content)
+        message = values.pack([job.call, job.first, reply, error])
         if len(message) > values.BYTES_MAX:
             error = f"the policy's reply has {len(message)} B"
-            message = values.pack([*content[:3], b"", error])
+            message = values.pack([job.call, job.first, b"", error])
+        robot.answered = job.call, message
         robot.exchange.send(CHUNK, message, now_ns=now_ns, is_urgent=job.is_urgent)
 
     def _give_metadata(self, robot: _Robot, now_ns: int) -> None:
@@ -281,9 +281,14 @@ class PolicyEnd(Endpoint):
 
     def _observe(self, number: int, robot: _Robot, message: bytes, now_ns: int) -> None:
         try:
-            call, first, _, left, delay, coming, seen = values.unpack(message)
+            call, first, left, delay, coming, seen = values.unpack(message)
             if not all(type(each) is int for each in (call, first, left, delay)):
                 raise ProtocolError(Drop.FIELD)
+            if any(job and job.call == call for job in (robot.thinking, robot.waiting)):
+                return  # sent again
+            if call == robot.answered[0]:
+                robot.exchange.send(CHUNK, robot.answered[1], now_ns=now_ns, is_urgent=True)
+                return
             observation = values.unpack(seen, self._unpacked)
             if self._gives_rows and isinstance(observation, dict):
                 observation["delay_steps"] = delay

@@ -1,4 +1,4 @@
-"""`gym.players`: the row that a robot plays at each step."""
+"""`policy.players`: the row that a robot plays at each step."""
 
 from copy import copy
 

@@ -54,6 +54,7 @@ class Lab:
         unpacked: Callable[[dict[Any, Any]], Any] | None = None,
         gives_rows: bool = False,
         boot_id: int = 7,
+        server_boot_id: int = 9,
     ) -> None:
         self.options = options or RobotOptions("absolute", 150 * MS, step_ns=20 * MS)
         self.robot = RobotEnd(
@@ -62,7 +63,7 @@ class Lab:
         sessions = count(100)
         self.server = PolicyEnd(
             gate or PlainGate(),
-            boot_id=9,
+            boot_id=server_boot_id,
             draw=lambda: next(sessions),
             gives_rows=gives_rows,
             unpacked=unpacked,
@@ -149,7 +150,7 @@ class Lab:
     def connect(self) -> Any:
         """The program's connection; returns the policy's metadata."""
         self.program(Said.OPENED.value)
-        self.run(self.now_ns + 10 * SECOND_NS, lambda: bool(self.answers))
+        self.run(self.now_ns + 60 * SECOND_NS, lambda: bool(self.answers))
         return values.unpack(self.answers[-1][1][1:])
 
     def infer(self, observation: Any, wait_ns: int = 70 * SECOND_NS) -> Any:

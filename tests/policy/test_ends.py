@@ -1,0 +1,349 @@
+"""Both ends of a policy in virtual time: each call is answered by its deadline."""
+
+from contextlib import suppress
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from policy_lab import MS, PROGRAM, ROBOT, SERVER, Lab, ramp
+from skytether.client.secure import SecureLink
+from skytether.policy import values
+from skytether.policy.images import Compressor, unpacked
+from skytether.policy.players import Freshest, Queue
+from skytether.policy.robot import LINE, RobotOptions, Said
+from skytether.server.secure import SecureGate
+from skytether.shared.base.units import SECOND_NS
+from skytether.shared.endpoints.endpoint import Datagram
+from skytether.shared.wire.keys import SECRET_BYTES, Keyring, VehicleKey
+
+OPTIONS = RobotOptions("absolute", 150 * MS, step_ns=20 * MS)
+
+
+def state(position: float) -> dict[str, Any]:
+    return {"state": np.array([position])}
+
+
+def first_row(reply: Any) -> float:
+    return float(reply["actions"][0, 0])
+
+
+def test_without_a_network_the_answer_is_the_policys_own() -> None:
+    lab = Lab(ramp)
+    assert lab.connect() == {"name": "scripted"}
+    for position in (0.0, 5.0, 7.0):
+        reply = lab.infer(state(position))
+        assert reply["actions"].dtype == np.float32
+        assert np.array_equal(reply["actions"], ramp(state(position))["actions"])
+        assert reply["time"] == 3
+        lab.sleep(100 * MS)
+
+
+@settings(deadline=None, max_examples=30)
+@given(
+    st.integers(0, 400),
+    st.sampled_from([0, 5, 20, 60]),
+    st.integers(0, 300),
+    st.lists(st.booleans(), min_size=8, max_size=8),
+    st.integers(1, 99),
+)
+def test_every_call_is_answered_by_its_deadline(
+    delay_ms: int, loss: int, thinking_ms: int, cuts: list[bool], seed: int
+) -> None:
+    way = f"gamma({delay_ms}ms, {delay_ms + 30}ms, 30ms) & loss({loss}%)"
+    lab = Lab(ramp, up=way, down=way, thinking_ns=thinking_ms * MS, seed=seed, options=OPTIONS)
+    lab.connect()
+    for answers, cut in enumerate(cuts):
+        lab.cut = cut and answers > 0
+        before, began_ns = len(lab.answers), lab.now_ns
+        with suppress(RuntimeError):
+            lab.infer(state(1.0))
+        limit_ns = OPTIONS.deadline_ns if answers else OPTIONS.begin_ns
+        assert lab.answers[-1][0] - began_ns <= limit_ns
+        assert len(lab.answers) == before + 1
+        lab.sleep(60 * MS)
+
+
+def test_a_late_answer_is_cut_to_now_and_the_robot_goes_on_without_a_jump() -> None:
+    """250 ms there and back, and 100 ms of actions from each answer: rows go on one by one."""
+    lab = Lab(ramp, up="constant(125ms)", down="constant(125ms)", options=OPTIONS)
+    lab.connect()
+    position, played = 0.0, list[float]()
+    for _ in range(20):
+        rows = lab.infer(state(position))["actions"][:5, 0].tolist()
+        played += rows
+        position = rows[-1] + 1.0
+        lab.sleep(100 * MS)
+    assert np.diff(played).max() <= 1.0
+    assert np.diff(played).min() >= 0.0
+    assert played[-1] > 60.0
+    kinds = lab.robot.figures()["answers"]
+    assert kinds["rest"] > 10
+
+
+@pytest.mark.parametrize("actions", ["absolute", "delta"])
+def test_without_rows_the_robot_is_held_then_gets_an_error_and_begins_where_it_is(
+    actions: Any,
+) -> None:
+    options = RobotOptions(actions, 150 * MS, hold_ns=SECOND_NS, step_ns=20 * MS)
+    lab = Lab(ramp, options=options)
+    lab.connect()
+    assert first_row(lab.infer(state(1.0))) == 1.0
+    lab.sleep(100 * MS)
+    lab.cut = True
+    rest = lab.infer(state(6.0))["actions"][:, 0].tolist()
+    held = 10.0 if actions == "absolute" else 0.0
+    assert rest == [6.0, 7.0, 8.0, 9.0, 10.0] + [held] * 5
+    lab.sleep(100 * MS)
+    for _ in range(3):
+        assert lab.infer(state(11.0))["actions"][:, 0].tolist() == [held] * 10
+        lab.sleep(100 * MS)
+    lab.sleep(SECOND_NS)
+    with pytest.raises(RuntimeError, match="no action from the policy for"):
+        lab.infer(state(11.0))
+    lab.cut = False
+    lab.sleep(4 * SECOND_NS)
+    reply = lab.infer(state(11.0))
+    assert reply["actions"][:, 0].tolist() == ramp(state(11.0))["actions"][:, 0].tolist()
+
+
+def test_a_chunk_from_before_an_outage_is_not_played_after_it() -> None:
+    lab = Lab(ramp, thinking_ns=3 * SECOND_NS, options=OPTIONS)
+    lab.connect()
+    lab.infer(state(0.0))
+    for _ in range(15):
+        try:
+            row = first_row(lab.infer(state(50.0)))
+        except RuntimeError:
+            row = 0.0
+        lab.sleep(100 * MS)
+    # Its observation was of the place where the robot stands, so its rows begin there.
+    assert row in (0.0, 9.0) or row >= 50.0
+
+
+def test_an_error_of_the_policy_leaves_the_rest_then_an_error() -> None:
+    def fails(observation: Any) -> Any:
+        if observation["state"][0] > 0:
+            raise RuntimeError("CUDA out of memory")
+        return ramp(observation)
+
+    lab = Lab(fails, options=OPTIONS)
+    lab.connect()
+    lab.infer(state(0.0))
+    lab.sleep(100 * MS)
+    assert first_row(lab.infer(state(5.0))) == 5.0  # of the chunk before
+    assert any("CUDA out of memory" in str(event) for event in lab.robot.events())
+
+
+@pytest.mark.parametrize(
+    "reply",
+    [
+        {},
+        {"actions": np.zeros((0, 2))},
+        {"actions": np.array([[np.nan]])},
+        {"actions": np.zeros((2000, 1))},
+        {"actions": "run"},
+        [1, 2],
+    ],
+)
+def test_a_reply_without_rows_is_none(reply: Any) -> None:
+    lab = Lab(lambda _: reply, options=RobotOptions("absolute", 150 * MS, begin_ns=SECOND_NS))
+    lab.connect()
+    with pytest.raises(RuntimeError):
+        lab.infer(state(0.0))
+
+
+def test_rows_of_another_shape_than_before_are_refused() -> None:
+    lab = Lab(lambda seen: {"actions": np.zeros((5, 2 + int(seen["state"][0])))}, options=OPTIONS)
+    lab.connect()
+    lab.infer(state(0.0))
+    assert lab.infer(state(1.0))["actions"].shape == (5, 2)
+
+
+def test_while_the_policy_thinks_a_newer_observation_replaces_one_that_waits() -> None:
+    lab = Lab(ramp, thinking_ns=900 * MS, options=OPTIONS)
+    lab.connect()
+    for position in range(8):
+        with suppress(RuntimeError):
+            lab.infer(state(float(position)))
+        lab.sleep(50 * MS)
+    lab.sleep(2 * SECOND_NS)
+    assert lab.server.figures()["observations_replaced"] >= 2
+    assert [int(each["state"][0]) for each in lab.asked][-1] == 7
+
+
+def test_observations_that_are_not_needed_are_not_sent() -> None:
+    def flown(spare: int | None) -> tuple[int, dict[str, int]]:
+        options = RobotOptions("absolute", 150 * MS, step_ns=20 * MS, spare_rows=spare)
+        lab = Lab(ramp, up="constant(20ms)", down="constant(20ms)", options=options)
+        lab.connect()
+        position = 0.0
+        for _ in range(60):
+            position = first_row(lab.infer(state(position))) + 1.0
+            lab.sleep(20 * MS)
+        return lab.server.figures()["observations"], lab.robot.figures()["answers"]
+
+    every, _ = flown(None)
+    some, answers = flown(2)
+    assert every == 60
+    assert some < 20
+    assert answers["hold"] == answers["error"] == 0
+
+
+@pytest.mark.parametrize("player", [lambda: Queue("average"), Freshest])
+def test_other_rules_of_merging_play_every_row_once(player: Any) -> None:
+    options = RobotOptions("absolute", 150 * MS, step_ns=20 * MS, player=player)
+    lab = Lab(ramp, up="constant(50ms)", down="constant(50ms)", options=options)
+    lab.connect()
+    position, played = 0.0, list[float]()
+    for _ in range(10):
+        rows = lab.infer(state(position))["actions"][:5, 0].tolist()
+        played += rows
+        position = rows[-1] + 1.0
+        lab.sleep(100 * MS)
+    assert np.allclose(np.diff(played), 1.0)
+
+
+def test_the_policy_is_given_the_rows_that_the_robot_will_play() -> None:
+    lab = Lab(ramp, up="constant(60ms)", down="constant(60ms)", options=OPTIONS, gives_rows=True)
+    lab.connect()
+    lab.infer(state(0.0))
+    lab.sleep(40 * MS)
+    lab.infer(state(2.0))
+    seen = lab.asked[-1]
+    assert seen["delay_steps"] == 6
+    assert seen["coming"][:, 0].tolist() == [2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 9.0]
+    assert seen["committed"][:, 0].tolist() == [2.0, 3.0, 4.0, 5.0, 6.0, 7.0]
+
+
+def test_images_and_their_bytes() -> None:
+    lab = Lab(ramp, options=OPTIONS, compress=Compressor(64), unpacked=unpacked)
+    lab.connect()
+    image = np.zeros((240, 320, 3), np.uint8)
+    lab.infer(state(0.0) | {"camera": image})
+    assert lab.asked[-1]["camera"].shape == (64, 64, 3)
+
+
+def test_an_observation_that_is_too_large_is_an_error_by_name() -> None:
+    lab = Lab(ramp, options=OPTIONS)
+    lab.connect()
+    lab.infer(state(0.0))
+    with pytest.raises(RuntimeError, match="5000"):
+        lab.infer({"state": np.zeros(1), "camera": np.zeros(5_000_000, np.uint8)})
+    assert first_row(lab.infer(state(0.0))) == 0.0
+
+
+def test_the_step_is_measured_by_the_time_between_calls() -> None:
+    options = RobotOptions("absolute", 150 * MS, rows=5)
+    lab = Lab(ramp, options=options)
+    lab.connect()
+    for _ in range(12):
+        lab.infer(state(0.0))
+        lab.sleep(100 * MS)
+    assert lab.robot.figures()["step_s"] == pytest.approx(0.02)
+
+
+def test_a_new_program_plays_nothing_of_the_one_before() -> None:
+    lab = Lab(ramp, options=OPTIONS)
+    lab.connect()
+    lab.infer(state(100.0))
+    lab.cut = True
+    lab.program(Said.CLOSED.value)
+    lab.program(Said.OPENED.value, ("program", 2))
+    lab.program(Said.MESSAGE.value + values.pack(state(0.0)), ("program", 2))
+    lab.run(lab.now_ns + 61 * SECOND_NS)
+    assert lab.answers[-1][1][:1] == Said.ERROR
+
+
+def test_a_lost_connection_to_the_policy_is_opened_again() -> None:
+    lab = Lab(ramp, options=OPTIONS)
+    lab.connect()
+    lab.infer(state(0.0))
+    lab.hear(Said.CLOSED.value + b"gone", ("policy", 1))
+    lab.sleep(2 * SECOND_NS)
+    assert first_row(lab.infer(state(3.0))) == 3.0
+
+
+def test_a_server_that_was_restarted_is_found_again() -> None:
+    lab = Lab(ramp, options=OPTIONS)
+    lab.connect()
+    lab.infer(state(0.0))
+    lab.server = Lab(ramp, server_boot_id=10).server
+    lab.sleep(5 * SECOND_NS)
+    assert first_row(lab.infer(state(3.0))) == 3.0
+
+
+# -- keys --------------------------------------------------------------------------------------
+
+
+def entropy() -> Any:
+    return np.random.default_rng(3).bytes
+
+
+def keyed(seed: int = 1) -> VehicleKey:
+    return VehicleKey.of(1, 0, np.random.default_rng(seed).bytes(SECRET_BYTES))
+
+
+def secured(key: VehicleKey | None = None, **options: Any) -> Lab:
+    link = SecureLink(key or keyed(), entropy=entropy())
+    gate = SecureGate(Keyring("test", {(1, 0): keyed()}), entropy=entropy())
+    return Lab(ramp, link=link, gate=gate, options=OPTIONS, **options)
+
+
+def test_with_keys_nothing_is_readable_and_replays_change_nothing() -> None:
+    lab = secured(up="constant(20ms)", down="constant(20ms)")
+    lab.connect()
+    for position in range(5):
+        assert (
+            first_row(lab.infer({"state": np.array([float(position)]), "prompt": "secret!"}))
+            == position
+        )
+        lab.sleep(100 * MS)
+    assert not any(b"secret!" in payload for _, payload in lab.wire)
+    before, answers = lab.server.figures()["observations"], len(lab.answers)
+    for peer, payload in list(lab.wire):
+        if peer == SERVER:
+            lab.server.receive(Datagram(payload, ("203.0.113.9", 9), 0), now_ns=lab.now_ns)
+        else:
+            lab.robot.receive(Datagram(payload, SERVER, 0), now_ns=lab.now_ns)
+    assert lab.server.figures()["observations"] == before
+    assert len(lab.answers) == answers
+    assert first_row(lab.infer(state(9.0))) == 9.0
+
+
+def test_another_key_gets_no_session() -> None:
+    lab = secured(keyed(2))
+    lab.program(Said.OPENED.value)
+    lab.sleep(5 * SECOND_NS)
+    assert not lab.answers
+    assert lab.server.figures()["robots"] == 0
+
+
+@settings(deadline=None, max_examples=60)
+@given(st.lists(st.binary(max_size=60) | st.binary(max_size=20).map(lambda b: b"\x9b\x01\x14" + b)))
+def test_hostile_datagrams_change_nothing(payloads: list[bytes]) -> None:
+    lab = Lab(ramp, options=OPTIONS)
+    lab.connect()
+    lab.infer(state(0.0))
+    for payload in payloads:
+        lab.server.receive(Datagram(payload, ROBOT, 0), now_ns=lab.now_ns)
+        lab.server.receive(Datagram(payload, ("203.0.113.9", 9), 0), now_ns=lab.now_ns)
+        lab.robot.receive(Datagram(payload, SERVER, 0), now_ns=lab.now_ns)
+        lab.robot.receive(Datagram(payload, PROGRAM, LINE), now_ns=lab.now_ns)
+    lab.run(lab.now_ns)
+    lab.sleep(200 * MS)
+    assert first_row(lab.infer(state(2.0))) == 2.0
+
+
+def test_without_keys_a_second_robot_with_the_same_number_is_refused() -> None:
+    lab = Lab(ramp, options=OPTIONS)
+    lab.connect()
+    other = Lab(ramp, options=OPTIONS, boot_id=8).robot
+    other.wake(now_ns=lab.now_ns)
+    for payload, _, _ in other.outbox():
+        lab.server.receive(Datagram(payload, ("203.0.113.9", 9), 0), now_ns=lab.now_ns)
+    answer = lab.server.outbox()[-1]
+    other.receive(Datagram(answer.payload, SERVER, 0), now_ns=lab.now_ns)
+    assert "taken" in str(other.events()[-1])

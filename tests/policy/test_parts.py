@@ -1,0 +1,175 @@
+"""`policy.parts`, `policy.exchange` and `policy.pace`: messages as datagrams, and back."""
+
+from random import Random
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from skytether.policy import parts
+from skytether.policy.exchange import Exchange
+from skytether.policy.messages import OBSERVATION, PartMessage, Seen, decode, encode
+from skytether.policy.parts import HELD_MAX, Part, Reassembly
+from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
+from skytether.shared.wire.drop import Drop, ProtocolError
+from skytether.shared.wire.protocol import PAYLOAD_BYTES_MAX
+
+MS = MILLISECOND_NS
+SIZES = st.integers(1, 6000) | st.sampled_from([1120, 1121, 215_040, 215_041, 500_000])
+
+
+def cut(message: bytes, number: int = 0, parity: int = 3) -> list[Part]:
+    return parts.split(message, OBSERVATION, number, lambda _: parity)
+
+
+def put(whole: Reassembly, each: Part) -> bytes | None:
+    arrived = whole.accept(each)
+    return arrived.message if arrived else None
+
+
+@given(SIZES, st.integers(0, 5), st.randoms(use_true_random=False))
+def test_any_k_parts_of_each_block_are_enough(size: int, parity: int, random: Random) -> None:
+    message = random.randbytes(size)
+    made = cut(message, parity=parity)
+    lost = {
+        (block, place)
+        for block in range(made[0].blocks)
+        for place in random.sample(sorted(p.place for p in made if p.block == block), parity)
+    }
+    left = [each for each in made if (each.block, each.place) not in lost]
+    random.shuffle(left)
+    whole = Reassembly()
+    came = [put(whole, each) for each in left]
+    assert came[-1] == message
+    assert came[:-1] == [None] * (len(left) - 1)
+
+
+def test_with_one_part_less_nothing_arrives() -> None:
+    whole = Reassembly()
+    made = cut(bytes(5000))
+    count, _ = parts.block_parts(5000, 1)
+    assert [put(whole, each) for each in made[: count - 1]] == [None] * (count - 1)
+
+
+def test_a_newer_message_replaces_older_ones() -> None:
+    whole, old, new = Reassembly(), cut(bytes(3000), 4), cut(b"\1" * 3000, 5)
+    whole.accept(old[0])
+    assert [put(whole, each) for each in new[:3]][-1] == b"\1" * 3000
+    assert whole.given_up == 1
+    with pytest.raises(ProtocolError, match=str(Drop.OVERTAKEN)):
+        whole.accept(old[1])
+
+
+def test_of_many_messages_that_are_not_whole_the_newest_are_held() -> None:
+    whole = Reassembly()
+    for number in range(50):
+        whole.accept(cut(bytes(3000), number)[0])
+    assert whole.given_up == 50 - HELD_MAX
+    with pytest.raises(ProtocolError):
+        whole.accept(cut(bytes(3000), 3)[1])
+
+
+@given(
+    st.builds(
+        Part,
+        st.integers(0, 2),
+        st.integers(0, 3),
+        st.integers(0, 10_000_000),
+        st.integers(0, 255),
+        st.integers(0, 64),
+        st.integers(0, 255),
+        st.integers(0, 255),
+        st.binary(min_size=1, max_size=1120),
+    )
+)
+def test_a_part_that_cannot_be_takes_no_memory(part: Part) -> None:
+    whole = Reassembly()
+    try:
+        whole.accept(part)
+    except ProtocolError:
+        assert not whole._partial
+
+
+def test_parts_that_disagree_are_refused() -> None:
+    whole = Reassembly()
+    whole.accept(cut(bytes(3000), 1)[0])
+    with pytest.raises(ProtocolError, match=str(Drop.FIELD)):
+        whole.accept(cut(bytes(3000), 1, parity=9)[1])
+    with pytest.raises(ProtocolError, match=str(Drop.COPY)):
+        whole.accept(cut(bytes(3000), 1)[0])
+
+
+def test_parity_follows_the_loss() -> None:
+    """The figures of a Reed-Solomon code with 18 parts, by the binomial distribution."""
+    assert [parts.parity_for(18, loss) for loss in (0.0, 0.01, 0.05, 0.1)] == [0, 2, 4, 7]
+
+
+@given(st.binary(max_size=80))
+def test_a_datagram_is_a_message_or_refused(payload: bytes) -> None:
+    try:
+        decode(payload)
+    except ProtocolError:
+        return
+    assert encode(decode(payload))
+
+
+def test_every_datagram_is_below_the_limit() -> None:
+    ends = Exchange(2**32 - 1), Exchange(2**32 - 1)
+    ends[0].send(OBSERVATION, bytes(100_000), now_ns=0)
+    sent = pump(ends, lambda _: True, 5 * SECOND_NS)
+    assert max(map(len, sent)) <= PAYLOAD_BYTES_MAX - 32  # of which a channel's seal takes 32 B
+
+
+def pump(
+    ends: tuple[Exchange, Exchange], passes: object, until_ns: int, delay_ns: int = 20 * MS
+) -> list[bytes]:
+    """Let two ends exchange what they have; returns the datagrams."""
+    now_ns, sent = 0, []
+    under_way: list[tuple[int, int, bytes]] = []
+    while now_ns < until_ns:
+        for number, end in enumerate(ends):
+            for payload in end.outbox(now_ns=now_ns):
+                sent.append(payload)
+                if passes(payload):  # type: ignore[operator]
+                    under_way.append((now_ns + delay_ns, 1 - number, payload))
+        due = [each.due_ns() for each in ends] + [each[0] for each in under_way]
+        times = [each for each in due if each is not None]
+        if not times:
+            break
+        now_ns = max(min(times), now_ns + 1)
+        for each in [each for each in under_way if each[0] <= now_ns]:
+            under_way.remove(each)
+            message, end = decode(each[2]), ends[each[1]]
+            if isinstance(message, PartMessage):
+                end.accept(message, now_ns=now_ns)
+            elif isinstance(message, Seen):
+                end.learn(message, now_ns=now_ns)
+    return sent
+
+
+def test_the_sender_learns_round_trip_and_loss() -> None:
+    ends, random = (Exchange(1), Exchange(1)), Random(5)
+
+    def passes(payload: bytes) -> bool:
+        return not isinstance(decode(payload), PartMessage) or random.random() > 0.2
+
+    for _ in range(60):
+        ends[0].send(OBSERVATION, bytes(20_000), now_ns=0)
+        pump(ends, passes, SECOND_NS)
+        ends[0].pace._free_ns = 0
+    assert ends[0].pace.loss == pytest.approx(0.2, abs=0.1)
+    assert ends[0].pace.round_trip_ns == pytest.approx(40 * MS, rel=0.01)
+    assert ends[1].repaired
+
+
+def test_what_is_left_of_a_message_is_replaced_by_a_newer_one() -> None:
+    end = Exchange(1, rate_max=20_000.0)
+    end.send(OBSERVATION, bytes(100_000), now_ns=0)
+    first = end.outbox(now_ns=0)
+    assert 0 < len(first) < 10  # the rest waits for the rate
+    end.send(OBSERVATION, bytes(10), now_ns=0)
+    assert end.dropped > 80
+    later = end.outbox(now_ns=SECOND_NS)
+    assert {
+        message.number for message in map(decode, later) if isinstance(message, PartMessage)
+    } == {1}

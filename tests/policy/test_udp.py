@@ -1,0 +1,200 @@
+"""A policy over real UDP: openpi's own client unchanged, both commands, and both ends in Python."""
+
+import asyncio
+import json
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from openpi_client import msgpack_numpy
+from openpi_client.websocket_client_policy import WebsocketClientPolicy
+from websockets.asyncio.server import ServerConnection, serve
+from websockets.exceptions import ConnectionClosed
+
+from helpers import SKYTETHER, refused
+from policy_lab import ramp
+from skytether.__main__ import main
+from skytether.policy import PolicyError, Robot
+from skytether.shared.base.errors import ConfigError
+from skytether.shared.telemetry.parts import parse
+
+
+class PolicyServer:
+    """Server with openpi's protocol: metadata first, then a reply for each observation."""
+
+    def __init__(self) -> None:
+        self.thinking_s = 0.0
+        self.seen: list[Any] = []
+        started = threading.Event()
+
+        async def handle(connection: ServerConnection) -> None:
+            packer = msgpack_numpy.Packer()
+            await connection.send(packer.pack({"name": "ramp"}))
+            try:
+                async for message in connection:
+                    self.seen.append(msgpack_numpy.unpackb(message))
+                    await asyncio.sleep(self.thinking_s)
+                    if "fail" in self.seen[-1]:
+                        await connection.send("Traceback:\nRuntimeError: no memory")
+                    else:
+                        await connection.send(packer.pack(ramp(self.seen[-1])))
+            except ConnectionClosed:
+                pass
+
+        async def run() -> None:
+            self._loop, self._end = asyncio.get_running_loop(), asyncio.Event()
+            async with serve(handle, "127.0.0.1", 0, compression=None, max_size=None) as server:
+                self.port = next(iter(server.sockets)).getsockname()[1]
+                started.set()
+                await self._end.wait()
+
+        self._thread = threading.Thread(target=lambda: asyncio.run(run()), daemon=True)
+        self._thread.start()
+        started.wait()
+
+    def close(self) -> None:
+        self._loop.call_soon_threadsafe(self._end.set)
+        self._thread.join()
+
+
+@pytest.fixture
+def policy() -> Iterator[PolicyServer]:
+    server = PolicyServer()
+    yield server
+    server.close()
+
+
+@contextmanager
+def process(*line: str) -> Iterator[str]:
+    """A process; the address that it says it is listening on."""
+    with subprocess.Popen(line, stdout=subprocess.PIPE, text=True) as running:
+        try:
+            assert running.stdout
+            for said in running.stdout:
+                if "listening on" in said:
+                    break
+            threading.Thread(target=running.stdout.read, daemon=True).start()
+            yield said.partition("listening on ")[2].partition(",")[0]
+        finally:
+            running.terminate()
+            running.wait()
+
+
+def command(*argv: str) -> AbstractContextManager[str]:
+    return process(*SKYTETHER, *argv)
+
+
+def served(policy: PolicyServer, *flags: str) -> AbstractContextManager[str]:
+    upstream = f"ws://127.0.0.1:{policy.port}"
+    return command("policy", "serve", "--upstream", upstream, "--bind", "127.0.0.1:0", *flags)
+
+
+def joined(server: str, *flags: str) -> AbstractContextManager[str]:
+    line = ("--listen", "127.0.0.1:0", "--actions", "absolute", "--rows", "5", *flags)
+    return command("policy", "join", server, *line)
+
+
+def calls(client: WebsocketClientPolicy, count: int, period_s: float = 0.1) -> Sequence[float]:
+    """Rows of the calls of a program that plays five rows of each answer."""
+    position, rows = 0.0, list[float]()
+    for _ in range(count):
+        reply = client.infer({"state": np.array([position]), "prompt": "go on"})
+        rows += reply["actions"][:5, 0].tolist()
+        position = rows[-1] + 1.0
+        time.sleep(period_s)
+    return rows
+
+
+@pytest.mark.realtime
+def test_openpis_own_client_flies_through_both_commands(
+    policy: PolicyServer, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """With keys, a bad network between, and a policy that answers with an error at the end."""
+    keys = ["--keys", str(tmp_path / "keys")]
+    assert main(["keygen", keys[1]]) == 0
+    capsys.readouterr()
+    bad = ("--to-server", "constant(30ms) & loss(10%)", "--to-client", "constant(30ms) & loss(10%)")
+    files = [f"--json={tmp_path / 'join.json'}", f"--record={tmp_path / 'calls.rows'}"]
+    with (
+        served(policy, *keys) as server,
+        command("netem", "--bind", "127.0.0.1:0", "--server", server, *bad) as netem,
+        joined(netem, *keys, "--deadline", "2s", *files) as robot,
+    ):
+        client = WebsocketClientPolicy(f"ws://{robot}")
+        assert client.get_server_metadata() == {"name": "ramp"}
+        assert np.diff(calls(client, 15)).tolist() == [1.0] * 74
+        with pytest.raises(RuntimeError, match="the observation is refused"):
+            client.infer({"state": np.zeros(1), "image": np.zeros(5_000_000, np.uint8)})
+        client._ws.close()
+    counted = json.loads((tmp_path / "join.json").read_text())
+    assert counted["answers"] == {"fresh": 15, "rest": 0, "hold": 0, "error": 1}
+    rows = parse((tmp_path / "calls.rows").read_bytes())
+    assert rows["kind"].tolist() == [0] * 15 + [3]
+    assert policy.seen[0]["prompt"] == "go on"
+
+
+@pytest.mark.realtime
+def test_a_robot_in_python_with_a_policy_in_python(tmp_path: Path) -> None:
+    script = tmp_path / "serves.py"
+    script.write_text(
+        "import sys\n"
+        "import numpy as np\n"
+        "from skytether import policy\n"
+        "def infer(seen):\n"
+        "    if seen['state'][0] < 0:\n"
+        "        raise RuntimeError('below zero')\n"
+        "    return seen['state'][0] + np.arange(10.0)[:, None]\n"
+        "print('listening on 127.0.0.1:47910, soon', flush=True)\n"
+        "policy.serve(infer, bind='127.0.0.1:47910', metadata={'rows': 10})\n"
+    )
+    with (
+        process(sys.executable, "-P", str(script)) as server,
+        Robot(server, actions="absolute", deadline=1.0, hold=0.2, step=0.01) as robot,
+    ):
+        position = 0.0
+        for _ in range(20):
+            row = float(robot.infer({"state": np.array([position])})["actions"][0, 0])
+            assert row == position
+            position += 1.0
+            time.sleep(0.01)
+        assert robot.metadata == {"rows": 10}
+        assert robot.figures()["answers"]["fresh"] == 20
+        time.sleep(0.5)
+        with pytest.raises(PolicyError, match="no action from the policy"):
+            robot.infer({"state": np.array([-1.0])})
+
+
+@pytest.mark.parametrize(
+    ("argv", "says"),
+    [
+        ([], "expected serve or join"),
+        (["fly"], "expected serve or join"),
+        (["join", "127.0.0.1:1"], "--actions: got nothing, expected absolute or delta"),
+        (["join", "--actions", "delta"], "expected either HOST:PORT or --path"),
+        (["join", "192.0.2.1:1", "--actions", "delta"], "--keys"),
+        (["join", "127.0.0.1:1", "--actions", "delta", "--deadline", "soon"], "--deadline"),
+        (["join", "127.0.0.1:1", "--actions", "delta", "--rate", "4"], "4mbit"),
+        (["join", "127.0.0.1:1", "--actions", "delta", "--when", "never"], "needed(2)"),
+        (["join", "127.0.0.1:1", "--actions", "delta", "--rows", "0"], "1 to 1024"),
+        (["serve", "--upstream", "http://127.0.0.1"], "ws://HOST:PORT"),
+        (["serve", "--bind", "0.0.0.0:1"], "--keys"),
+    ],
+)
+def test_what_is_wrong_is_named(
+    argv: list[str], says: str, capfd: pytest.CaptureFixture[str]
+) -> None:
+    assert says in refused(["policy", *argv], capfd)
+
+
+def test_other_machines_need_keys_in_python_too() -> None:
+    with pytest.raises(ConfigError, match="expected keys=FILE"):
+        Robot("192.0.2.1:47010", actions="delta")
+    with pytest.raises(ConfigError, match="absolute"):
+        Robot("127.0.0.1:47010", actions="up")  # type: ignore[arg-type]

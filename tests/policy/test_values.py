@@ -1,0 +1,119 @@
+"""`policy.values` and `policy.images`: openpi's bytes, bounds, and images on their way."""
+
+from contextlib import suppress
+
+import msgpack
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as arrays
+from openpi_client import image_tools, msgpack_numpy
+
+from skytether.policy import values
+from skytether.policy.images import Compressor, unpacked
+from skytether.policy.values import ValueRefused
+
+KINDS = st.sampled_from(["<f4", "<f8", "|u1", "<i8", "|b1", ">i2"]).map(np.dtype)
+LEAVES = (
+    st.integers(-(2**63), 2**64 - 1)
+    | st.floats(allow_nan=False)
+    | st.text(max_size=5)
+    | st.binary(max_size=5)
+    | st.none()
+    | KINDS.flatmap(lambda kind: arrays.arrays(kind, arrays.array_shapes(max_dims=3, max_side=4)))
+)
+TREES = st.recursive(
+    LEAVES,
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(), inner, max_size=3),
+)
+
+
+def same(one: object, other: object) -> bool:
+    if isinstance(one, dict) and isinstance(other, dict):
+        return one.keys() == other.keys() and all(same(one[key], other[key]) for key in one)
+    if isinstance(one, list) and isinstance(other, list):
+        return len(one) == len(other) and all(map(same, one, other))
+    if isinstance(one, np.ndarray) and isinstance(other, np.ndarray):
+        return one.dtype == other.dtype and np.array_equal(
+            one, other, equal_nan=one.dtype.kind == "f"
+        )
+    return type(one) is type(other) and one == other
+
+
+@given(TREES)
+def test_a_value_is_what_openpis_own_client_would_send(tree: object) -> None:
+    packed = values.pack(tree)
+    assert packed == msgpack_numpy.packb(tree)
+    assert same(values.unpack(packed), tree)
+
+
+@given(st.binary(max_size=200))
+def test_bytes_are_a_value_or_refused(data: bytes) -> None:
+    with suppress(ValueRefused):
+        values.pack(values.unpack(data))
+
+
+ARRAY = {b"__ndarray__": True, b"data": bytes(8), b"dtype": "<f8", b"shape": [1]}
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {b"dtype": "|O"},
+        {b"dtype": "<U2"},
+        {b"dtype": 3},
+        {b"shape": [2]},
+        {b"shape": [-1]},
+        {b"shape": [10**9, 10**9, 0]},
+        {b"shape": [1] * 9},
+        {b"shape": 1},
+        {b"data": "text"},
+    ],
+)
+def test_an_array_is_of_numbers_and_no_larger_than_its_bytes(change: dict[bytes, object]) -> None:
+    assert values.unpack(msgpack.packb(ARRAY)) == np.zeros(1)
+    with pytest.raises(ValueRefused):
+        values.unpack(msgpack.packb(ARRAY | change))
+
+
+@pytest.mark.parametrize("value", [object(), {1, 2}, np.array([object()]), 2**70, float])
+def test_what_is_no_value_is_refused_before_it_is_sent(value: object) -> None:
+    with pytest.raises(ValueRefused):
+        values.pack(value)
+
+
+def test_nested_too_deep_is_refused() -> None:
+    with pytest.raises(ValueRefused):
+        values.unpack(b"\x91" * 100_000 + b"\xc0")
+
+
+def picture(height: int, width: int) -> np.ndarray:
+    rows, columns = np.mgrid[:height, :width]
+    shades = (rows * 255 // height, columns * 255 // width, (rows + columns) % 256)
+    return np.stack(shades, axis=2).astype(np.uint8)
+
+
+@pytest.mark.parametrize("first", [False, True])
+def test_images_are_resized_as_openpi_does_and_arrive_in_their_axes(*, first: bool) -> None:
+    image = picture(120, 160)
+    given_ = image.transpose(2, 0, 1) if first else image
+    sent = values.pack(Compressor(64)({"images": {"wrist": given_}, "state": np.zeros(3)}))
+    came = values.unpack(sent, unpacked)["images"]["wrist"]
+    assert came.shape == ((3, 64, 64) if first else (64, 64, 3))
+    expected = image_tools.resize_with_pad(image, 64, 64).astype(int)
+    difference = (came.transpose(1, 2, 0) if first else came).astype(int) - expected
+    assert np.abs(difference).mean() < 4.0
+    assert len(sent) < 64 * 64 * 3 / 2
+
+
+def test_a_raw_image_and_what_is_no_image_are_unchanged() -> None:
+    observation = {"a": picture(40, 40), "mask": np.zeros((40, 40, 2), np.uint8), "n": 3}
+    came = values.unpack(values.pack(Compressor(raw=["a"])(observation)), unpacked)
+    assert same(came, observation)
+
+
+@pytest.mark.parametrize("jpeg", [b"", b"no image", 3, b"\xff\xd8\xff" + bytes(50)])
+def test_an_image_that_is_none_is_refused(jpeg: object) -> None:
+    with pytest.raises(ValueRefused):
+        values.unpack(msgpack.packb({b"__jpeg__": jpeg}), unpacked)
