@@ -157,6 +157,7 @@ def serve(argv: Sequence[str]) -> None:
     if why := web.check_url(options.upstream):
         raise _wrong("--upstream", options.upstream, f"ws://HOST:PORT or wss://HOST:PORT ({why})")
     binds = [command.address("--bind", each) for each in options.bind or ("127.0.0.1:47010",)]
+    command.claim_output("--json", options.json)
     gate = inside.gate_of(options.keys)
     for bind in binds:
         command.check_sealed(bind, secure=gate.secure or options.insecure)
@@ -196,6 +197,8 @@ def join(argv: Sequence[str]) -> None:
     ):
         if not least <= value <= most:
             raise _wrong(flag, value, f"{least} to {most}")
+    for option in ("json", "record"):
+        command.claim_output(f"--{option}", getattr(options, option))
     link = inside.link_of(options.keys, options.robot)
     for path in paths:
         command.check_sealed(path.peer, secure=link.secure or options.insecure)

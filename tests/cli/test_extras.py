@@ -19,7 +19,7 @@ from skytether.shared.base.extras import MODULES
 
 ALL = (
     *("server", "mavlink", "ros2", "page", "plot", "record", "pandas", "parquet", "cluster"),
-    *("gym", "lab", "ulog"),
+    *("gym", "lab", "ulog", "policy"),
 )
 LAB = (
     *("sweep", "margins", "identify", "reproduce"),
@@ -35,6 +35,7 @@ NEEDS: dict[str, tuple[str, ...]] = {
     "duel": ("server", "page"),
     "page": ("page",),
     "ros2": ("ros2",),
+    "policy": ("policy",),
     "replay": ("page", "record"),
     "export": ("record",),
     "join": ("record",),

@@ -54,6 +54,8 @@ LINES = {
     "probe --json": "probe 127.0.0.1:9 --keys KEYS --duration 1 OUT",
     "probe --figure": "probe 127.0.0.1:9 --keys KEYS --duration 1 OUT.png",
     "probe --record": "probe 127.0.0.1:9 --keys KEYS --duration 1 OUT",
+    "policy --json": "policy join 127.0.0.1:9 --actions delta --keys KEYS OUT",
+    "policy --record": "policy join 127.0.0.1:9 --actions delta --keys KEYS OUT",
     "server --json": "server demo --keys KEYS OUT",
     "server --record": "server SCENARIO OUT",
     "netem --json": "netem SCENARIO OUT",

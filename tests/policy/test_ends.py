@@ -8,18 +8,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from policy_lab import MS, PROGRAM, ROBOT, SERVER, Lab, ramp
+from policy_lab import MS, OPTIONS, Lab, ramp
 from skytether.client.secure import SecureLink
 from skytether.policy import values
 from skytether.policy.images import Compressor, unpacked
 from skytether.policy.players import Freshest, Queue
 from skytether.policy.robot import LINE, RobotOptions, Said
+from skytether.policy.virtual import PROGRAM, ROBOT, SERVER, NoActionError
 from skytether.server.secure import SecureGate
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.endpoints.endpoint import Datagram
 from skytether.shared.wire.keys import SECRET_BYTES, Keyring, VehicleKey
-
-OPTIONS = RobotOptions("absolute", 150 * MS, step_ns=20 * MS)
 
 
 def state(position: float) -> dict[str, Any]:
@@ -38,7 +37,7 @@ def test_without_a_network_the_answer_is_the_policys_own() -> None:
         assert reply["actions"].dtype == np.float32
         assert np.array_equal(reply["actions"], ramp(state(position))["actions"])
         assert reply["time"] == 3
-        lab.sleep(100 * MS)
+        lab.sleep(0.1)
 
 
 @settings(deadline=None, max_examples=30)
@@ -53,29 +52,29 @@ def test_every_call_is_answered_by_its_deadline(
     delay_ms: int, loss: int, thinking_ms: int, cuts: list[bool], seed: int
 ) -> None:
     way = f"gamma({delay_ms}ms, {delay_ms + 30}ms, 30ms) & loss({loss}%)"
-    lab = Lab(ramp, up=way, down=way, thinking_ns=thinking_ms * MS, seed=seed, options=OPTIONS)
+    lab = Lab(ramp, OPTIONS, to_policy=way, to_robot=way, thinking=thinking_ms / 1e3, seed=seed)
     lab.connect()
     for answers, cut in enumerate(cuts):
-        lab.cut = cut and answers > 0
+        lab.is_cut = cut and answers > 0
         before, began_ns = len(lab.answers), lab.now_ns
-        with suppress(RuntimeError):
+        with suppress(NoActionError):
             lab.infer(state(1.0))
         limit_ns = OPTIONS.deadline_ns if answers else OPTIONS.begin_ns
         assert lab.answers[-1][0] - began_ns <= limit_ns
         assert len(lab.answers) == before + 1
-        lab.sleep(60 * MS)
+        lab.sleep(0.06)
 
 
 def test_a_late_answer_is_cut_to_now_and_the_robot_goes_on_without_a_jump() -> None:
     """250 ms there and back, and 100 ms of actions from each answer: rows go on one by one."""
-    lab = Lab(ramp, up="constant(125ms)", down="constant(125ms)", options=OPTIONS)
+    lab = Lab(ramp, to_policy="constant(125ms)", to_robot="constant(125ms)")
     lab.connect()
     position, played = 0.0, list[float]()
     for _ in range(20):
         rows = lab.infer(state(position))["actions"][:5, 0].tolist()
         played += rows
         position = rows[-1] + 1.0
-        lab.sleep(100 * MS)
+        lab.sleep(0.1)
     assert np.diff(played).max() <= 1.0
     assert np.diff(played).min() >= 0.0
     assert played[-1] > 60.0
@@ -88,29 +87,29 @@ def test_without_rows_the_robot_is_held_then_gets_an_error_and_begins_where_it_i
     actions: Any,
 ) -> None:
     options = RobotOptions(actions, 150 * MS, hold_ns=SECOND_NS, step_ns=20 * MS)
-    lab = Lab(ramp, options=options)
+    lab = Lab(ramp, options)
     lab.connect()
     assert first_row(lab.infer(state(1.0))) == 1.0
-    lab.sleep(100 * MS)
-    lab.cut = True
+    lab.sleep(0.1)
+    lab.is_cut = True
     rest = lab.infer(state(6.0))["actions"][:, 0].tolist()
     held = 10.0 if actions == "absolute" else 0.0
     assert rest == [6.0, 7.0, 8.0, 9.0, 10.0] + [held] * 5
-    lab.sleep(100 * MS)
+    lab.sleep(0.1)
     for _ in range(3):
         assert lab.infer(state(11.0))["actions"][:, 0].tolist() == [held] * 10
-        lab.sleep(100 * MS)
-    lab.sleep(SECOND_NS)
-    with pytest.raises(RuntimeError, match="no action from the policy for"):
+        lab.sleep(0.1)
+    lab.sleep(1)
+    with pytest.raises(NoActionError, match="no action from the policy for"):
         lab.infer(state(11.0))
-    lab.cut = False
-    lab.sleep(4 * SECOND_NS)
+    lab.is_cut = False
+    lab.sleep(4)
     reply = lab.infer(state(11.0))
     assert reply["actions"][:, 0].tolist() == ramp(state(11.0))["actions"][:, 0].tolist()
 
 
 def test_a_chunk_from_before_an_outage_is_not_played_after_it() -> None:
-    lab = Lab(ramp, thinking_ns=3 * SECOND_NS, options=OPTIONS)
+    lab = Lab(ramp, thinking=3.0)
     lab.connect()
     lab.infer(state(0.0))
     for _ in range(15):
@@ -118,7 +117,7 @@ def test_a_chunk_from_before_an_outage_is_not_played_after_it() -> None:
             row = first_row(lab.infer(state(50.0)))
         except RuntimeError:
             row = 0.0
-        lab.sleep(100 * MS)
+        lab.sleep(0.1)
     # Its observation was of the place where the robot stands, so its rows begin there.
     assert row in (0.0, 9.0) or row >= 50.0
 
@@ -129,10 +128,10 @@ def test_an_error_of_the_policy_leaves_the_rest_then_an_error() -> None:
             raise RuntimeError("CUDA out of memory")
         return ramp(observation)
 
-    lab = Lab(fails, options=OPTIONS)
+    lab = Lab(fails)
     lab.connect()
     lab.infer(state(0.0))
-    lab.sleep(100 * MS)
+    lab.sleep(0.1)
     assert first_row(lab.infer(state(5.0))) == 5.0  # of the chunk before
     assert any("CUDA out of memory" in str(event) for event in lab.robot.events())
 
@@ -149,27 +148,27 @@ def test_an_error_of_the_policy_leaves_the_rest_then_an_error() -> None:
     ],
 )
 def test_a_reply_without_rows_is_none(reply: Any) -> None:
-    lab = Lab(lambda _: reply, options=RobotOptions("absolute", 150 * MS, begin_ns=SECOND_NS))
+    lab = Lab(lambda _: reply, RobotOptions("absolute", 150 * MS, begin_ns=SECOND_NS))
     lab.connect()
-    with pytest.raises(RuntimeError):
+    with pytest.raises(NoActionError):
         lab.infer(state(0.0))
 
 
 def test_rows_of_another_shape_than_before_are_refused() -> None:
-    lab = Lab(lambda seen: {"actions": np.zeros((5, 2 + int(seen["state"][0])))}, options=OPTIONS)
+    lab = Lab(lambda seen: {"actions": np.zeros((5, 2 + int(seen["state"][0])))})
     lab.connect()
     lab.infer(state(0.0))
     assert lab.infer(state(1.0))["actions"].shape == (5, 2)
 
 
 def test_while_the_policy_thinks_a_newer_observation_replaces_one_that_waits() -> None:
-    lab = Lab(ramp, thinking_ns=900 * MS, options=OPTIONS)
+    lab = Lab(ramp, thinking=0.9)
     lab.connect()
     for position in range(8):
-        with suppress(RuntimeError):
+        with suppress(NoActionError):
             lab.infer(state(float(position)))
-        lab.sleep(50 * MS)
-    lab.sleep(2 * SECOND_NS)
+        lab.sleep(0.05)
+    lab.sleep(2)
     assert lab.server.figures()["observations_replaced"] >= 2
     assert [int(each["state"][0]) for each in lab.asked][-1] == 7
 
@@ -177,12 +176,12 @@ def test_while_the_policy_thinks_a_newer_observation_replaces_one_that_waits() -
 def test_observations_that_are_not_needed_are_not_sent() -> None:
     def flown(spare: int | None) -> tuple[int, dict[str, int]]:
         options = RobotOptions("absolute", 150 * MS, step_ns=20 * MS, spare_rows=spare)
-        lab = Lab(ramp, up="constant(20ms)", down="constant(20ms)", options=options)
+        lab = Lab(ramp, to_policy="constant(20ms)", to_robot="constant(20ms)", options=options)
         lab.connect()
         position = 0.0
         for _ in range(60):
             position = first_row(lab.infer(state(position))) + 1.0
-            lab.sleep(20 * MS)
+            lab.sleep(0.02)
         return lab.server.figures()["observations"], lab.robot.figures()["answers"]
 
     every, _ = flown(None)
@@ -195,22 +194,22 @@ def test_observations_that_are_not_needed_are_not_sent() -> None:
 @pytest.mark.parametrize("player", [lambda: Queue("average"), Freshest])
 def test_other_rules_of_merging_play_every_row_once(player: Any) -> None:
     options = RobotOptions("absolute", 150 * MS, step_ns=20 * MS, player=player)
-    lab = Lab(ramp, up="constant(50ms)", down="constant(50ms)", options=options)
+    lab = Lab(ramp, to_policy="constant(50ms)", to_robot="constant(50ms)", options=options)
     lab.connect()
     position, played = 0.0, list[float]()
     for _ in range(10):
         rows = lab.infer(state(position))["actions"][:5, 0].tolist()
         played += rows
         position = rows[-1] + 1.0
-        lab.sleep(100 * MS)
+        lab.sleep(0.1)
     assert np.allclose(np.diff(played), 1.0)
 
 
 def test_the_policy_is_given_the_rows_that_the_robot_will_play() -> None:
-    lab = Lab(ramp, up="constant(60ms)", down="constant(60ms)", options=OPTIONS, gives_rows=True)
+    lab = Lab(ramp, to_policy="constant(60ms)", to_robot="constant(60ms)", gives_rows=True)
     lab.connect()
     lab.infer(state(0.0))
-    lab.sleep(40 * MS)
+    lab.sleep(0.04)
     lab.infer(state(2.0))
     seen = lab.asked[-1]
     assert seen["delay_steps"] == 6
@@ -219,7 +218,7 @@ def test_the_policy_is_given_the_rows_that_the_robot_will_play() -> None:
 
 
 def test_images_and_their_bytes() -> None:
-    lab = Lab(ramp, options=OPTIONS, compress=Compressor(64), unpacked=unpacked)
+    lab = Lab(ramp, compress=Compressor(64), unpacked=unpacked)
     lab.connect()
     image = np.zeros((240, 320, 3), np.uint8)
     lab.infer(state(0.0) | {"camera": image})
@@ -227,51 +226,51 @@ def test_images_and_their_bytes() -> None:
 
 
 def test_an_observation_that_is_too_large_is_an_error_by_name() -> None:
-    lab = Lab(ramp, options=OPTIONS)
+    lab = Lab(ramp)
     lab.connect()
     lab.infer(state(0.0))
-    with pytest.raises(RuntimeError, match="5000"):
+    with pytest.raises(NoActionError, match="5000"):
         lab.infer({"state": np.zeros(1), "camera": np.zeros(5_000_000, np.uint8)})
     assert first_row(lab.infer(state(0.0))) == 0.0
 
 
 def test_the_step_is_measured_by_the_time_between_calls() -> None:
     options = RobotOptions("absolute", 150 * MS, rows=5)
-    lab = Lab(ramp, options=options)
+    lab = Lab(ramp, options)
     lab.connect()
     for _ in range(12):
         lab.infer(state(0.0))
-        lab.sleep(100 * MS)
+        lab.sleep(0.1)
     assert lab.robot.figures()["step_s"] == pytest.approx(0.02)
 
 
 def test_a_new_program_plays_nothing_of_the_one_before() -> None:
-    lab = Lab(ramp, options=OPTIONS)
+    lab = Lab(ramp)
     lab.connect()
     lab.infer(state(100.0))
-    lab.cut = True
-    lab.program(Said.CLOSED.value)
-    lab.program(Said.OPENED.value, ("program", 2))
-    lab.program(Said.MESSAGE.value + values.pack(state(0.0)), ("program", 2))
+    lab.is_cut = True
+    lab.say(Said.CLOSED.value)
+    lab.say(Said.OPENED.value, ("program", 2))
+    lab.say(Said.MESSAGE.value + values.pack(state(0.0)), ("program", 2))
     lab.run(lab.now_ns + 61 * SECOND_NS)
     assert lab.answers[-1][1][:1] == Said.ERROR
 
 
 def test_a_lost_connection_to_the_policy_is_opened_again() -> None:
-    lab = Lab(ramp, options=OPTIONS)
+    lab = Lab(ramp)
     lab.connect()
     lab.infer(state(0.0))
-    lab.hear(Said.CLOSED.value + b"gone", ("policy", 1))
-    lab.sleep(2 * SECOND_NS)
+    lab.policy_says(Said.CLOSED.value + b"gone", ("policy", 1))
+    lab.sleep(2)
     assert first_row(lab.infer(state(3.0))) == 3.0
 
 
 def test_a_server_that_was_restarted_is_found_again() -> None:
-    lab = Lab(ramp, options=OPTIONS)
+    lab = Lab(ramp)
     lab.connect()
     lab.infer(state(0.0))
-    lab.server = Lab(ramp, server_boot_id=10).server
-    lab.sleep(5 * SECOND_NS)
+    lab.server = Lab(boot_ids=(1, 10)).server
+    lab.sleep(5)
     assert first_row(lab.infer(state(3.0))) == 3.0
 
 
@@ -289,18 +288,18 @@ def keyed(seed: int = 1) -> VehicleKey:
 def secured(key: VehicleKey | None = None, **options: Any) -> Lab:
     link = SecureLink(key or keyed(), entropy=entropy())
     gate = SecureGate(Keyring("test", {(1, 0): keyed()}), entropy=entropy())
-    return Lab(ramp, link=link, gate=gate, options=OPTIONS, **options)
+    return Lab(link=link, gate=gate, **options)
 
 
 def test_with_keys_nothing_is_readable_and_replays_change_nothing() -> None:
-    lab = secured(up="constant(20ms)", down="constant(20ms)")
+    lab = secured(to_policy="constant(20ms)", to_robot="constant(20ms)")
     lab.connect()
     for position in range(5):
         assert (
             first_row(lab.infer({"state": np.array([float(position)]), "prompt": "secret!"}))
             == position
         )
-        lab.sleep(100 * MS)
+        lab.sleep(0.1)
     assert not any(b"secret!" in payload for _, payload in lab.wire)
     before, answers = lab.server.figures()["observations"], len(lab.answers)
     for peer, payload in list(lab.wire):
@@ -315,8 +314,8 @@ def test_with_keys_nothing_is_readable_and_replays_change_nothing() -> None:
 
 def test_another_key_gets_no_session() -> None:
     lab = secured(keyed(2))
-    lab.program(Said.OPENED.value)
-    lab.sleep(5 * SECOND_NS)
+    lab.say(Said.OPENED.value)
+    lab.sleep(5)
     assert not lab.answers
     assert lab.server.figures()["robots"] == 0
 
@@ -324,23 +323,23 @@ def test_another_key_gets_no_session() -> None:
 @settings(deadline=None, max_examples=60)
 @given(st.lists(st.binary(max_size=60) | st.binary(max_size=20).map(lambda b: b"\x9b\x01\x14" + b)))
 def test_hostile_datagrams_change_nothing(payloads: list[bytes]) -> None:
-    lab = Lab(ramp, options=OPTIONS)
+    lab = Lab(ramp)
     lab.connect()
     lab.infer(state(0.0))
     for payload in payloads:
         lab.server.receive(Datagram(payload, ROBOT, 0), now_ns=lab.now_ns)
         lab.server.receive(Datagram(payload, ("203.0.113.9", 9), 0), now_ns=lab.now_ns)
         lab.robot.receive(Datagram(payload, SERVER, 0), now_ns=lab.now_ns)
-        lab.robot.receive(Datagram(payload, PROGRAM, LINE), now_ns=lab.now_ns)
+        lab.say(Said.MESSAGE.value + payload)
     lab.run(lab.now_ns)
-    lab.sleep(200 * MS)
+    lab.sleep(0.2)
     assert first_row(lab.infer(state(2.0))) == 2.0
 
 
 def test_without_keys_a_second_robot_with_the_same_number_is_refused() -> None:
-    lab = Lab(ramp, options=OPTIONS)
+    lab = Lab(ramp)
     lab.connect()
-    other = Lab(ramp, options=OPTIONS, boot_id=8).robot
+    other = Lab(ramp, boot_ids=(8, 2)).robot
     other.wake(now_ns=lab.now_ns)
     for payload, _, _ in other.outbox():
         lab.server.receive(Datagram(payload, ("203.0.113.9", 9), 0), now_ns=lab.now_ns)

@@ -46,7 +46,7 @@ COMMANDS = [line for document in DOCUMENTS for block in blocks(document) for lin
 
 ELSEWHERE = {
     *("autopilot", "compare", "duel", "explain", "export", "keygen", "page", "probe", "replay"),
-    *("report", "reproduce", "set"),
+    *("policy", "report", "reproduce", "set"),
     *("client", "netem", "server"),
 }
 """Commands with tests of their own; `test_a_documented_flight_flies` runs all others."""

@@ -77,6 +77,7 @@ ROOMS: dict[str, tuple[str, str]] = {
     "the page": ("view/page view/browser", "page folder"),
     "recordings": ("view/recordings", "report a.mcap"),
     "the probe": ("probe", "probe localhost:1"),
+    "policies far away": ("policy", "policy join localhost:1 --actions delta"),
     "the laboratory": ("lab", "sweep demo"),
     "the laboratory's engine": ("lab/engine", "sweep demo"),
     "the laboratory's pages": ("lab/pages", "reproduce"),
