@@ -3,8 +3,9 @@
 The program speaks through the line (socket 1): openpi's websocket protocol, or `Robot.infer`. A
 call is an observation. It is answered as soon as its own chunk has come; at the deadline with the
 newest chunk that has rows for now, cut to now; then with what holds the robot, for at most
-`hold_ns`; then with an error, so that the robot's own stop acts. The first call of a program is
-answered when the first chunk has come, within `begin_ns`: the robot has not moved yet.
+`hold_ns`; then with an error, so that the robot's own stop acts. While chunks take longer than the
+deadline, waiting gains nothing: a call is answered at once if rows are left. The first call of a
+program is answered when the first chunk has come, within `begin_ns`: the robot has not moved yet.
 
 What the line hears and sends begins with one of `Said`.
 """
@@ -182,6 +183,9 @@ class RobotEnd(Endpoint):
         self._asked: dict[int, _Asked] = {}
         """Observations that were sent, by number."""
         self._calls = self._connections = 0
+        self._waits = True
+        """Whether the newest chunk came within the deadline, so that it is worth waiting for the
+        next."""
         self._delays_ns: deque[int] = deque(maxlen=DELAYS)
         """Newest times from an observation to its chunk."""
         self._counts = Counter[Kind]()
@@ -350,6 +354,11 @@ class RobotEnd(Endpoint):
         call.message = message
         if self._exchange:
             self._exchange.send(OBSERVATION, message, now_ns=now_ns)
+        before = self._asked.get(call.number - 1)
+        if before and program.newest < call.number - 1:  # its chunk has not come yet
+            self._waits &= now_ns - before.began_ns <= options.deadline_ns
+        if not (self._waits or call.is_first) and schedule.left(now_ns=now_ns):
+            self._answer(Kind.REST, now_ns)
 
     def _delay_steps(self, schedule: Schedule) -> int:
         """Steps within which a chunk comes, after its observation, by the newest delays."""
@@ -379,6 +388,7 @@ class RobotEnd(Endpoint):
             self._events.append(events.PolicyFailed(robot=self._robot, reason=str(error)[:200]))
             return
         self._delays_ns.append(now_ns - asked.began_ns)
+        self._waits = self._delays_ns[-1] <= self._options.deadline_ns
         try:
             program.schedule.accept(call_number, first, content, now_ns=now_ns)
         except ValueRefused as refused:

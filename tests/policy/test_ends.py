@@ -13,8 +13,8 @@ from skytether.client.secure import SecureLink
 from skytether.policy import values
 from skytether.policy.images import Compressor, unpacked
 from skytether.policy.players import Freshest, Queue
-from skytether.policy.robot import LINE, RobotOptions, Said
-from skytether.policy.virtual import PROGRAM, ROBOT, SERVER, NoActionError
+from skytether.policy.robot import RobotOptions, Said
+from skytether.policy.virtual import ROBOT, SERVER, NoActionError
 from skytether.server.secure import SecureGate
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.endpoints.endpoint import Datagram
