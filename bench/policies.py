@@ -26,7 +26,7 @@ from openpi_client.websocket_client_policy import WebsocketClientPolicy
 from websockets.asyncio.server import ServerConnection, serve
 from websockets.exceptions import ConnectionClosed
 
-from bench.harness import CONSOLE, TextTable
+from bench.harness import TextTable
 from skytether.shared.base import files
 
 STEP_S, ROWS, PLAYED = 0.05, 20, 2
@@ -244,7 +244,7 @@ def measure(counts: PoliciesCounts, cells: Sequence[Cell] = CELLS) -> dict[str, 
         for system in SYSTEMS
     ]
     with ThreadPoolExecutor(counts.together) as pool:
-        flown = list(pool.map(lambda run: fly(*run, counts.seconds), runs))
+        flown = list(pool.map(lambda run: fly(run[0], run[1], run[2], counts.seconds), runs))
     rows = [
         {"system": system, "cell": cell.name, "seed": seed} | figures
         for (system, cell, seed), figures in zip(runs, flown, strict=True)
@@ -288,8 +288,7 @@ def main() -> None:
     quick = "--quick" in sys.argv[1:]
     result = measure(QUICK if quick else FULL)
     for title, table in tables(result).items():
-        CONSOLE.print(title)
-        CONSOLE.print(table.rich())
+        table.show(title)
     if not quick:
         out = Path(__file__).with_name("policies.json")
         files.write(out, json.dumps(result, indent=1).encode())
