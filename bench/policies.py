@@ -1,8 +1,10 @@
-"""A policy far from its robot over real UDP and TCP: openpi's client alone, and behind `policy`.
+"""A policy far from its robot: openpi's client alone, and behind `skytether policy`.
 
-The robot is a pendulum that moves on while its program waits; the policy swings it up. Both drive
-the same program with openpi's own client. Alone it speaks TCP through netem's relay, where a piece
-that is lost is sent again after 200 ms; with `policy join` and `policy serve` it is UDP.
+The robot is a pendulum that moves on while its program waits; the policy swings it up. Over real
+sockets, openpi's own client alone speaks TCP through netem's relay, where a piece that is lost is
+sent again after 200 ms; with `policy join` and `policy serve` there is UDP. In virtual time the
+same two ends run over the same networks, beside a call that waits for all datagrams of its message
+and each way's retransmissions.
 """
 
 import asyncio
@@ -14,11 +16,11 @@ import tempfile
 import threading
 import time
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, Protocol
 
 import numpy as np
 from openpi_client import msgpack_numpy
@@ -27,13 +29,25 @@ from websockets.asyncio.server import ServerConnection, serve
 from websockets.exceptions import ConnectionClosed
 
 from bench.harness import TextTable
+from skytether.netem.fate import Fates
+from skytether.netem.impairments.direction import impairments
+from skytether.netem.impairments.draws import SLOT_NS
+from skytether.policy import values
+from skytether.policy.images import Compressor, unpacked
+from skytether.policy.robot import RobotOptions
+from skytether.policy.virtual import Emulated
 from skytether.shared.base import files
+from skytether.shared.base.units import SECOND_NS, seconds_to_ns
 
 STEP_S, ROWS, PLAYED = 0.05, 20, 2
 """Step of the pendulum [s], rows of a chunk, and rows that the program plays of each."""
 DEADLINE_S = 0.1
 TORQUE_MAX, GRAVITY = 2.0, 10.0
 SKYTETHER = (sys.executable, "-P", "-m", "skytether")
+UPRIGHT = 0.5
+"""Cost of a step below which the pendulum is upright."""
+RETRY_S = 0.2
+"""Linux's smallest retransmission time-out [s]."""
 System = Literal["openpi alone", "policy"]
 SYSTEMS: tuple[System, ...] = ("openpi alone", "policy")
 
@@ -48,6 +62,8 @@ class Cell:
     """Whether an observation has two images of 224²."""
 
 
+RATES = {"4 Mbit/s, two cameras, 86 ms": 500_000.0}
+"""Rate of a cell with one [B/s]: a fate has none."""
 CELLS = (
     Cell("no network", "none"),
     *(
@@ -62,35 +78,39 @@ CELLS = (
 
 @dataclass(frozen=True)
 class PoliciesCounts:
-    runs: int = 5
+    virtual: int = 50
+    """Runs of each cell in virtual time."""
+    real: int = 5
+    """Runs of each cell over real sockets."""
     seconds: float = 10.0
-    together: int = 3
+    together: int = 2
     """Number of runs at once."""
 
 
-FULL, QUICK = PoliciesCounts(), PoliciesCounts(runs=1, seconds=3.0)
+FULL, QUICK = PoliciesCounts(), PoliciesCounts(virtual=2, real=1, seconds=3.0)
 
 
 class Pendulum:
     """Gymnasium's Pendulum, which moves on by the clock."""
 
-    def __init__(self, seed: int) -> None:
+    def __init__(self, seed: int, now_s: float) -> None:
         rng = np.random.default_rng(seed)
         self.angle, self.speed = math.pi + 0.2 * rng.standard_normal(), 0.1 * rng.standard_normal()
         self.torque = 0.0
         self.costs: list[float] = []
-        self._began_s = time.monotonic()
+        self._began_s = now_s
 
-    def pass_time(self) -> None:
+    @property
+    def next_s(self) -> float:
+        """Time of its next step [s]."""
+        return self._began_s + len(self.costs) * STEP_S
+
+    def pass_time(self, now_s: float) -> None:
         """Step until now, with the present torque."""
-        while self._began_s + len(self.costs) * STEP_S < time.monotonic():
+        while self.next_s < now_s:
             cost = _folded(self.angle) ** 2 + 0.1 * self.speed**2 + 0.001 * self.torque**2
             self.costs.append(cost)
             self.angle, self.speed = stepped(self.angle, self.speed, self.torque)
-
-    def sleep_until_step(self) -> None:
-        time.sleep(max(0.0, self._began_s + len(self.costs) * STEP_S - time.monotonic()))
-        self.pass_time()
 
 
 def stepped(angle: float, speed: float, torque: float) -> tuple[float, float]:
@@ -187,7 +207,7 @@ def fly(system: System, cell: Cell, seed: int, seconds: float) -> dict[str, floa
                 join = ("policy", "join", through, "--listen", anywhere, "--actions", "absolute")
                 more = ("--step", f"{STEP_S}s", "--plays-on", "--deadline", f"{DEADLINE_S}s")
                 at = ends.enter_context(process(*join, *more))
-            figures = program(f"ws://{at}", cell, seed, seconds)
+            figures = program(Real(f"ws://{at}"), cell, seed, seconds)
         counts = json.loads(counted.read_text())
     sent = sum(
         counts[way]["bytes"] for way in ("to_server", "to_client") if isinstance(counts[way], dict)
@@ -195,93 +215,196 @@ def fly(system: System, cell: Cell, seed: int, seconds: float) -> dict[str, floa
     return figures | {"kbit_per_s": 8e-3 * sent / seconds}
 
 
-def program(url: str, cell: Cell, seed: int, seconds: float) -> dict[str, float]:
-    """The robot's program: openpi's client, and the pendulum."""
-    client = WebsocketClientPolicy(url)
+class World(Protocol):
+    """Clock and policy of a program."""
+
+    def now_s(self) -> float: ...
+
+    def sleep_until(self, at_s: float) -> None: ...
+
+    def infer(self, observation: dict[str, Any]) -> Any:
+        """Reply of the policy; raises RuntimeError if there is none."""
+
+
+class Real:
+    """The machine's clock, and openpi's client."""
+
+    def __init__(self, url: str) -> None:
+        self._client = WebsocketClientPolicy(url)
+        self.infer = self._client.infer
+        self.now_s = time.monotonic
+
+    def sleep_until(self, at_s: float) -> None:
+        time.sleep(max(0.0, at_s - time.monotonic()))
+
+
+class Virtual:
+    """Both ends of `policy` in virtual time."""
+
+    def __init__(self, cell: Cell, seed: int) -> None:
+        options = RobotOptions(
+            "absolute",
+            seconds_to_ns(DEADLINE_S),
+            step_ns=seconds_to_ns(STEP_S),
+            plays_on=True,
+        )
+        self._ends = Emulated(
+            swing_up,
+            options,
+            to_policy=cell.network,
+            to_robot=cell.network,
+            thinking=cell.thinking_s,
+            seed=seed,
+            compress=Compressor(),
+            unpacked=unpacked,
+        )
+        self._ends.connect()
+        self.infer = self._ends.infer
+
+    def now_s(self) -> float:
+        return self._ends.now_ns / SECOND_NS
+
+    def sleep_until(self, at_s: float) -> None:
+        self._ends.run(seconds_to_ns(at_s))
+
+
+class Blocking:
+    """A call over TCP that waits for the whole answer, in virtual time: each message is datagrams,
+    and one that is lost is sent again after RETRY_S.
+    """
+
+    def __init__(self, cell: Cell, seed: int) -> None:
+        self._thinking_s, self._now_s = cell.thinking_s, 0.0
+        ways = (impairments(cell.network, ()) for _ in range(2))
+        self._fates = [Fates(way, seed, name, 0) for way, name in zip(ways, "ud", strict=True)]
+        self._rate = RATES.get(cell.name)
+
+    def now_s(self) -> float:
+        return self._now_s
+
+    def sleep_until(self, at_s: float) -> None:
+        self._now_s = max(self._now_s, at_s)
+
+    def _arrives_s(self, fates: Fates, size: int, at_s: float) -> float:
+        """Time at which the last datagram of a message arrives [s]."""
+        last_s = at_s
+        for rank in range(-(-size // 1448)):
+            sent_s, tries = at_s, 0
+            if self._rate:
+                at_s = sent_s = at_s + min(size, 1448) / self._rate
+            while (fate := fates.at(seconds_to_ns(sent_s) // SLOT_NS, rank + 1000 * tries)).lost:
+                sent_s, tries = sent_s + RETRY_S, tries + 1
+            last_s = max(last_s, sent_s + fate.delay_ns / SECOND_NS)
+        return last_s
+
+    def infer(self, observation: dict[str, Any]) -> Any:
+        up, down = self._fates
+        reply = swing_up(observation)
+        asked_s = self._arrives_s(up, len(values.pack(observation)), self._now_s)
+        answered_s = asked_s + self._thinking_s
+        self._now_s = self._arrives_s(down, len(values.pack(reply)), answered_s)
+        return reply
+
+
+def program(world: World, cell: Cell, seed: int, seconds: float) -> dict[str, float]:
+    """The robot's program and the pendulum; figures of the run."""
     images = {}
     if cell.camera:
         shade = np.add.outer(np.arange(224), np.arange(224)).astype(np.uint8)
         images = {f"image_{i}": np.stack([shade, shade.T, shade + i * 80], axis=2) for i in (1, 2)}
-    client.infer({"state": np.array([math.pi, 0.0]), **images})
-    robot, waits, freezes, failed = Pendulum(seed), list[float](), list[float](), 0
-    until_s = time.monotonic() + seconds
-    fresh_s = time.monotonic()
-    while time.monotonic() < until_s:
-        robot.pass_time()
-        asked_s = time.monotonic()
+    world.infer({"state": np.array([math.pi, 0.0]), **images})
+    robot, waits, failed = Pendulum(seed, world.now_s()), list[float](), 0
+    until_s = world.now_s() + seconds
+    while world.now_s() < until_s:
+        robot.pass_time(world.now_s())
+        asked_s = world.now_s()
         try:
-            rows = client.infer({"state": np.array([robot.angle, robot.speed]), **images})[
-                "actions"
-            ]
+            state = np.array([robot.angle, robot.speed])
+            rows = world.infer({"state": state, **images})["actions"]
         except RuntimeError:  # the robot's own stop
             failed += 1
             rows = np.zeros((1, 1))
-        waits.append(time.monotonic() - asked_s)
-        robot.pass_time()
-        freezes.append(time.monotonic() - fresh_s)
+        waits.append(world.now_s() - asked_s)
+        robot.pass_time(world.now_s())
         for row in rows[:PLAYED]:
             robot.torque = float(row[0])
-            robot.sleep_until_step()
-        fresh_s = time.monotonic()
-    late = sum(wait > DEADLINE_S + 0.005 for wait in waits)
+            world.sleep_until(robot.next_s)
+            robot.pass_time(world.now_s() + 1e-9)
+    half = robot.costs[len(robot.costs) // 2 :]
     return {
         "cost": float(np.mean(robot.costs)),
-        "upright": float(np.mean(np.array(robot.costs[len(robot.costs) // 2 :]) < 0.5)),
+        "upright": float(np.mean(np.array(half) < UPRIGHT)),
         "calls": len(waits),
-        "late": late,
+        "late": sum(wait > DEADLINE_S + 0.005 for wait in waits),
         "wait_ms_p50": 1e3 * float(np.median(waits)),
         "wait_ms_max": 1e3 * max(waits),
-        "freeze_ms_max": 1e3 * max(freezes),
         "errors": failed,
     }
 
 
+def fly_virtual(run: tuple[str, Cell, int, float]) -> dict[str, float]:
+    system, cell, seed, seconds = run
+    world: World = Virtual(cell, seed) if system == "policy" else Blocking(cell, seed)
+    return program(world, cell, seed, seconds)
+
+
 def measure(counts: PoliciesCounts, cells: Sequence[Cell] = CELLS) -> dict[str, Any]:
-    runs = [
-        (system, cell, seed)
-        for seed in range(1, counts.runs + 1)
-        for cell in cells
-        for system in SYSTEMS
-    ]
-    with ThreadPoolExecutor(counts.together) as pool:
-        flown = list(pool.map(lambda run: fly(run[0], run[1], run[2], counts.seconds), runs))
-    rows = [
-        {"system": system, "cell": cell.name, "seed": seed} | figures
-        for (system, cell, seed), figures in zip(runs, flown, strict=True)
-    ]
-    return {"counts": asdict(counts), "runs": rows}
+    def runs(count: int) -> list[tuple[System, Cell, int, float]]:
+        seeds = range(1, count + 1)
+        return [
+            (system, cell, seed, counts.seconds)
+            for seed in seeds
+            for cell in cells
+            for system in SYSTEMS
+        ]
+
+    def rows(flown: Sequence[tuple[System, Cell, int, float]], figures: Any) -> list[Any]:
+        each = zip(flown, figures, strict=True)
+        return [
+            {"system": run[0], "cell": run[1].name, "seed": run[2]} | found for run, found in each
+        ]
+
+    virtual, real = runs(counts.virtual), runs(counts.real)
+    with ProcessPoolExecutor(counts.together) as processes:
+        found = list(processes.map(fly_virtual, virtual, chunksize=4))
+    with ThreadPoolExecutor(counts.together) as threads:
+        measured = list(threads.map(lambda run: fly(*run), real))
+    return {
+        "counts": asdict(counts),
+        "virtual": rows(virtual, found),
+        "real": rows(real, measured),
+    }
 
 
 def tables(result: dict[str, Any]) -> dict[str, TextTable]:
-    cells = list(dict.fromkeys(run["cell"] for run in result["runs"]))
+    titles = {"virtual": "in virtual time", "real": "over real UDP and TCP"}
+    return {titles[kind]: _table(result[kind]) for kind in titles}
+
+
+def _table(runs: Sequence[dict[str, Any]]) -> TextTable:
     rows = []
-    for cell in cells:
-        row = [cell]
+    for cell in dict.fromkeys(run["cell"] for run in runs):
+        row = [str(cell)]
         for system in SYSTEMS:
-            runs = [run for run in result["runs"] if (run["system"], run["cell"]) == (system, cell)]
-            mean = {
-                name: float(np.mean([run[name] for run in runs]))
-                for name in ("cost", "upright", "kbit_per_s", "wait_ms_p50")
-            }
-            late, calls = (sum(run[name] for run in runs) for name in ("late", "calls"))
-            freeze = max(run["freeze_ms_max"] for run in runs)
+            own = [run for run in runs if (run["system"], run["cell"]) == (system, cell)]
+            costs = [run["cost"] for run in own]
+            spread = 1.96 * float(np.std(costs, ddof=1)) / math.sqrt(len(own)) if own[1:] else 0.0
+            upright = 100 * float(np.mean([run["upright"] for run in own]))
+            late, calls, errors = (
+                sum(run[key] for run in own) for key in ("late", "calls", "errors")
+            )
             row += [
-                f"{mean['cost']:.2f}",
-                f"{100 * mean['upright']:.0f} %",
+                f"{np.mean(costs):.2f} ± {spread:.2f}",
+                f"{upright:.0f} %",
                 f"{late} of {calls}",
-                f"{freeze:.0f}",
-                f"{mean['kbit_per_s']:.0f}",
+                f"{max(run['wait_ms_max'] for run in own):.0f}",
+                f"{errors}",
             ]
         rows.append(row)
-    head = (
-        "cost",
-        "upright",
-        f"later than {1e3 * DEADLINE_S:.0f} ms",
-        "longest wait [ms]",
-        "kbit/s",
+    head = ("cost", "upright", "late", "longest wait [ms]", "errors")
+    return TextTable(
+        ["network", *(f"{each}, {system}" for system in SYSTEMS for each in head)], rows
     )
-    headings = ["network", *(f"{each}, {system}" for system in SYSTEMS for each in head)]
-    return {"policies": TextTable(headings, rows)}
 
 
 def main() -> None:
