@@ -143,7 +143,7 @@ def fly(argv: Sequence[str]) -> None:
         scenario = running.scenario
         flying = [vehicles.make(scenario, number) for number in numbers]
         memory = stack.enter_context(_memory(options, flying, keyring))
-        before = _before(memory, scenario, numbers[0], running.warnings) if memory else None
+        make = _saving(memory, scenario, numbers[0], running.warnings) if memory else Client
         if kernel := sys.modules.get("skytether.shared.base.kernel"):  # a simulation with kernels
             from skytether.shared.base import machine_code
 
@@ -159,7 +159,7 @@ def fly(argv: Sequence[str]) -> None:
         if len(paths) > 1 or standby:
             several, sockets = _several(paths, standby, scenario, partial(link, numbers[0]))
         clients = [
-            Client(
+            make(
                 scenario,
                 flies,
                 server=several or paths[0].peer,
@@ -167,8 +167,6 @@ def fly(argv: Sequence[str]) -> None:
                 boot_id=secrets.randbits(64),
                 link=None if several else link(number),
                 recorder=running.recorder,
-                keeps=memory is not None,
-                before=before,
             )
             for number, flies in zip(numbers, flying, strict=True)
         ]
@@ -298,20 +296,21 @@ def _memory(
         yield memory
 
 
-def _before(
+def _saving(
     memory: "MemoryFile", scenario: Scenario, number: int, warnings: list[Event]
-) -> "SavedState | None":
-    """State saved by an earlier run. A warning for the log is added to `warnings`."""
+) -> Callable[..., Client]:
+    """Makes a client that goes on from the state saved by an earlier run, and saves its own.
+
+    A warning for the log is added to `warnings`.
+    """
     room = load("skytether.client.memory", "vehicle.memory")
+    before: SavedState | None = None
     try:
-        saved = memory.read()
-        if saved is None:
-            return None
-        before: SavedState = room.recall(*saved, time.monotonic_ns(), scenario.terms())
+        if saved := memory.read():
+            before = room.recall(*saved, time.monotonic_ns(), scenario.terms())
+            warnings.append(Recalled(vehicle=number, goes_on=before.boot_id is not None))
     except ValueError as error:
         warnings.append(NotRecalled(vehicle=number, reason=str(error)))
         # The vehicle may have been armed before: only an operator may arm it again.
-        forgotten: SavedState = room.SavedState(frame=VehicleMemory(armed=True))
-        return forgotten
-    warnings.append(Recalled(vehicle=number, goes_on=before.boot_id is not None))
-    return before
+        before = room.SavedState(frame=VehicleMemory(armed=True))
+    return partial(room.SavingClient, before=before)

@@ -1,8 +1,7 @@
 """A client with one server, which its vehicle follows, and without saved state.
 
 Other modules replace its parts: `client.standby` with a standby server, `client.several` with
-several addresses, and `client.memory`, with which the next run of a client continues in the middle
-of a flight.
+several addresses. `client.memory` has a client whose next run continues in the middle of a flight.
 """
 
 from collections.abc import Callable, Sequence
@@ -33,41 +32,15 @@ class MotionInForce(NamedTuple):
 
 
 class Fresh:
-    """A client that saves nothing: its vehicle begins on the ground."""
+    """What an earlier run has saved: nothing, so that the vehicle begins on the ground."""
 
     heard_ns = 0
     began_ns: int | None = None
     motion: Any = None
 
-    def __init__(self, boot_id: int) -> None:
-        self.before: Any = self
-        """State saved by an earlier run; here this object, which stands for no saved state."""
-        self.boot_id = boot_id
-
     def servers(self, parts: "Parts") -> "OneServer":
         """Servers of a client that reaches one, and knows of no other from an earlier run."""
         return OneServer(parts.failsafe)
-
-    @property
-    def unsaved(self) -> bool:
-        """Whether saving the present state has failed, so that the next run lacks it."""
-        return False
-
-    @property
-    def is_stale(self) -> bool:
-        """Whether the saved state is older than the present state."""
-        return False
-
-    def keep(self, state: Callable[[], dict[str, Any]], *, now_ns: int) -> bytes | None:
-        """State to be saved, as bytes; None if the state has not changed."""
-        return None
-
-    def may_tell(self, state: Callable[[], dict[str, Any]], *, now_ns: int) -> bool:
-        """Whether messages may be sent before the state is saved."""
-        return True
-
-    def kept(self, *, nothing: bool) -> None:
-        """Note that the bytes returned last were written, or that the file was removed."""
 
 
 class Role:
@@ -125,6 +98,8 @@ class OneServer:
         self.failsafe = failsafe
         self.sessions: list[Any] = []
         """Session with each server; the caller appends the sessions."""
+        self.may_tell: Callable[[int], bool] = lambda _: True
+        """Whether messages may be sent at a time [ns]; not before the state is saved, if it is."""
 
     @property
     def followed(self) -> Any:
@@ -165,8 +140,6 @@ class Parts(NamedTuple):
     """State saved by the previous run: `memory.SavedState`, or `Fresh`."""
     motion: Callable[[], MotionInForce | None]
     """Returns the motion in force of a mission; None on the ground, or without one."""
-    may_tell: Callable[[int], bool]
-    """Saves the state if needed; returns whether packets may be sent at a time [ns]."""
     out: list[Datagram]
     events: Events
     """List to which events for the operator are appended."""

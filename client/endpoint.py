@@ -10,7 +10,7 @@ from collections import Counter
 from collections.abc import Sequence
 from functools import cached_property
 from operator import attrgetter
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from skytether.client.alone import Fresh, Parts, Reach
 from skytether.client.connections import connect
@@ -45,9 +45,6 @@ from skytether.shared.telemetry.record import Reason, Recorder
 from skytether.shared.wire.drop import Drop, ProtocolError
 from skytether.shared.wire.protocol import CLOSES, Close, Mode, stamp_us
 
-if TYPE_CHECKING:
-    from skytether.client.memory import SavedState
-
 ORDERS = keys_of(InFlight.ARMED) | {*DECISIONS}
 """Keys of an operator's orders to any vehicle, see `orders`."""
 VEHICLE_SOCKET = 1
@@ -69,9 +66,11 @@ class Client(Endpoint):
         vehicle: number of the vehicle, unique among the vehicles of the server.
         boot_id: number unique to this run of the client.
         link: link to the server at an address; None: without keys.
-        keeps: whether the state needed after a restart of the client is saved, see `client.memory`.
-        before: state saved by the previous run of the client; None if there was none.
+        before: state saved by the previous run of the client, see `client.memory`; None: nothing.
     """
+
+    _unsaved = False
+    """Whether the next run would not go on from the present state, although it should."""
 
     def __init__(
         self,
@@ -83,22 +82,15 @@ class Client(Endpoint):
         boot_id: int,
         link: ClientLink | None = None,
         recorder: Recorder | None = None,
-        keeps: bool = False,
-        before: "SavedState | None" = None,
+        before: Any = None,
     ) -> None:
         super().__init__()
         terms = scenario.terms()
-        self.keeps = keeps or before is not None
-        self._memory = Fresh(boot_id)
-        if self.keeps:
-            module = load("skytether.client.memory", "a saved state")
-            self._memory = module.Saving(module.ClientMemory(terms, boot_id, before))
+        self._before = before or Fresh()
         self._keeps_apart, self._axes = scenario.keeps_apart, terms.axes
         self.vehicle = vehicle
         self._timeout_ns = seconds_to_ns(scenario.link.timeout_s)
         self._flies, self._port = flies, flies.port
-        if before is not None:
-            flies.recall(before.frame)
         self._failsafe = Failsafe(
             HOLD if terms.exhausted == "hold" else TRANSITIONS,
             armed=scenario.armed,
@@ -112,11 +104,10 @@ class Client(Endpoint):
             scenario=scenario,
             terms=terms,
             vehicle=vehicle,
-            boot_id=self._memory.boot_id,
+            boot_id=boot_id,
             failsafe=self._failsafe,
-            before=self._memory.before,
+            before=self._before,
             motion=self._pilot.motion_in_force,
-            may_tell=self._may_tell,
             out=self._out,
             events=self._events,
         )
@@ -211,7 +202,7 @@ class Client(Endpoint):
         The flight of an earlier run continues at once, before there is a session: the vehicle
         follows the motion that was in force, or hovers.
         """
-        before, flies = self._memory.before, self._flies
+        before, flies = self._before, self._flies
         if self._session.number is not None:
             if not flies.take_off(now_ns=now_ns):
                 return
@@ -234,28 +225,6 @@ class Client(Endpoint):
             session.heard_ns = before.heard_ns
         self._failsafe.resume(cause, heard_ns=before.heard_ns, now_ns=now_ns)
         self._note_transitions(now_ns)
-
-    # -- saved state -------------------------------------------------------------------------
-
-    def _to_keep(self) -> dict[str, Any]:
-        """Fields of `memory.SavedState`; on the ground only those that change on the ground."""
-        pilot, always = self._pilot, {"frame": self._flies.frame} | self._servers.to_keep()
-        if pilot.next_ns is None:
-            return always
-        return always | {
-            "began_ns": pilot.began_ns,
-            "heard_ns": self._failsafe.heard_ns or pilot.began_ns,
-            "motion": self._pilot.motion_in_force(),
-        }
-
-    def keep(self, *, now_ns: int) -> bytes | None:
-        return self._memory.keep(self._to_keep, now_ns=now_ns)
-
-    def _may_tell(self, now_ns: int) -> bool:
-        return self._memory.may_tell(self._to_keep, now_ns=now_ns)
-
-    def kept(self, *, nothing: bool = False) -> None:
-        self._memory.kept(nothing=nothing)
 
     def next_wake_ns(self) -> int | None:
         pilot, due_ns = self._pilot, None
@@ -281,7 +250,7 @@ class Client(Endpoint):
             port_ns = self._port.next_wake_ns()
             if port_ns is not None and port_ns <= now_ns:
                 self._port.wake(now_ns=now_ns)
-        if self._pilot.next_ns is None and self._memory.before.began_ns is not None:
+        if self._pilot.next_ns is None and self._before.began_ns is not None:
             self._begin(now_ns)
         due_ns = self._due_ns()
         if due_ns is not None and due_ns <= now_ns:
@@ -324,13 +293,11 @@ class Client(Endpoint):
         if pilot.step >= pilot.steps:
             self._flies.land()
             self._log.report_end(now_ns)
-        # Nothing is sent before the state is saved or saving has failed: otherwise the server would
-        # not know which motion the next run flies.
-        if self.keeps:
-            may_tell = self._may_tell(now_ns)
-            self.waits_for_disk = self._memory.is_stale
-            if not may_tell:
-                return
+        self._report(now_ns)
+
+    def _report(self, now_ns: int) -> None:
+        """Send the servers what is due after a step."""
+        pilot = self._pilot
         self._servers.follow(step=pilot.flown, on_ground=False, now_ns=now_ns)
         for session in self._sessions:
             observation = None
@@ -341,7 +308,7 @@ class Client(Endpoint):
             elif session.is_observation_due(pilot.flown):
                 observation = pilot.observe(session)
             if observation is not None:
-                if self._memory.unsaved:
+                if self._unsaved:
                     observation = observation._replace(unsaved=1)
                 session.send(observation, now_ns=now_ns)
                 self._tell_time(session, now_ns)

@@ -10,27 +10,28 @@ saves, outside the process:
     the number of the leadership          plans of an earlier leadership are not flown
     whether the vehicle was armed         starting a process must not arm it
 
-A client opens no file: `Client.keep` returns the state's bytes when they have changed,
-`shell.driving.memory` writes them and confirms by `Client.kept`. **Nothing is sent to a server
-before the state is saved**: otherwise the next run might fly a motion that the server no longer
-expects. If it cannot be saved, because a disk is full, read-only or stuck, the client continues
-after `WAIT_NS`, and each observation says so: the servers then treat a restart of the client as one
-without saved state.
+A client opens no file: `SavingClient.keep` returns the state's bytes when they have changed,
+`shell.driving.memory` writes them and confirms by `SavingClient.kept`. **Nothing is sent to a
+server before the state is saved**: otherwise the next run might fly a motion that the server no
+longer expects. If it cannot be saved, because a disk is full, read-only or stuck, the client
+continues after `WAIT_NS`, and each observation says so: the servers then treat a restart of the
+client as one without saved state.
 """
 
-from collections.abc import Callable
 from typing import Annotated, Any, Self
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from skytether.client.alone import Fresh, OneServer, Parts
+from skytether.client.alone import OneServer, Parts
+from skytether.client.endpoint import Client
 from skytether.client.standby.leadership import NUMBER_MAX
-from skytether.client.vehicle import VehicleMemory
+from skytether.client.vehicle import Vehicle, VehicleMemory
 from skytether.shared.base.units import MILLISECOND_NS
 from skytether.shared.law.terms import Terms
 from skytether.shared.scenario.registry import load
+from skytether.shared.scenario.schema import Scenario
 from skytether.shared.wire.protocol import KNOTS_MAX
 
 TIME_MAX_NS = 2**62
@@ -205,37 +206,64 @@ class ClientMemory:
         return self.unsaved or self._saved is None
 
 
-class Saving(Fresh):
-    """A client that saves its state, see `Fresh`."""
+class SavingClient(Client):
+    """Client that saves its state, and continues the flight of an earlier run.
 
-    def __init__(self, memory: ClientMemory) -> None:
-        super().__init__(memory.boot_id)
-        self._memory, self.before = memory, memory.before
+    Args:
+        before: state saved by the previous run; None if there was none.
+        others: further arguments of `Client`.
+    """
 
-    def keep(self, state: Callable[[], dict[str, Any]], *, now_ns: int) -> bytes | None:
-        return self._memory.keep(self._state(state()), now_ns=now_ns)
+    keeps = True
 
-    def may_tell(self, state: Callable[[], dict[str, Any]], *, now_ns: int) -> bool:
-        return self._memory.may_tell(self._state(state()), now_ns=now_ns)
+    def __init__(
+        self,
+        scenario: Scenario,
+        flies: Vehicle,
+        *,
+        boot_id: int,
+        before: SavedState | None = None,
+        **others: Any,
+    ) -> None:
+        if before is not None:
+            flies.recall(before.frame)
+        memory = ClientMemory(scenario.terms(), boot_id, before)
+        super().__init__(scenario, flies, boot_id=memory.boot_id, before=memory.before, **others)
+        self._memory = memory
+        self._servers.may_tell = self._may_tell
 
-    def kept(self, *, nothing: bool) -> None:
+    def keep(self, *, now_ns: int) -> bytes | None:
+        return self._memory.keep(self._state(), now_ns=now_ns)
+
+    def kept(self, *, nothing: bool = False) -> None:
         self._memory.kept(nothing=nothing)
 
-    @property
-    def unsaved(self) -> bool:
-        return self._memory.unsaved
+    def _may_tell(self, now_ns: int) -> bool:
+        may_tell = self._memory.may_tell(self._state(), now_ns=now_ns)
+        self._unsaved = self._memory.unsaved
+        return may_tell
 
-    @property
-    def is_stale(self) -> bool:
-        return self._memory.is_stale
+    def _report(self, now_ns: int) -> None:
+        # Nothing is sent before the state is saved, or the disk has failed: otherwise the server
+        # would not know which motion the next run flies.
+        may_tell = self._may_tell(now_ns)
+        self.waits_for_disk = self._memory.is_stale
+        if may_tell:
+            super()._report(now_ns)
 
-    def _state(self, values: dict[str, Any]) -> SavedState:
+    def _state(self) -> SavedState:
         """State to save; on the ground the flight of the previous run may still continue."""
-        if "began_ns" not in values:
-            return msgspec.structs.replace(self._memory.before, **values)
-        if motion := values["motion"]:
-            values["motion"] = FlownMotion(**motion._asdict())
-        return SavedState(boot_id=self.boot_id, **values)
+        pilot, always = self._pilot, {"frame": self._flies.frame} | self._servers.to_keep()
+        if pilot.next_ns is None:
+            return msgspec.structs.replace(self._memory.before, **always)
+        motion = pilot.motion_in_force()
+        return SavedState(
+            boot_id=self._memory.boot_id,
+            began_ns=pilot.began_ns,
+            heard_ns=self._failsafe.heard_ns or pilot.began_ns,
+            motion=motion and FlownMotion(**motion._asdict()),
+            **always,
+        )
 
 
 def _is_same(one: SavedState, other: SavedState) -> bool:

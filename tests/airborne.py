@@ -13,7 +13,7 @@ from skytether.autopilot.faults import parse as parse_fault
 from skytether.autopilot.flavours import FlavourName, FlightMode
 from skytether.client import vehicles
 from skytether.client.endpoint import Client
-from skytether.client.memory import SavedState, recall
+from skytether.client.memory import SavedState, SavingClient, recall
 from skytether.mavlink.codec import Codec, Message
 from skytether.netem.proxy import Proxy
 from skytether.server.endpoint import Server
@@ -199,14 +199,13 @@ class Air:
         self.world.add("server", server, clock=Clock(OFFSET_NS))
 
     def _client(self, life: int, before: SavedState | None) -> Client:
-        client = Client(
+        client = SavingClient(
             self.scenario,
             self.flies,
             server=("netem", 0),
             vehicle=1,
             boot_id=2**60 + life,
             recorder=self._recorder,
-            keeps=True,
             before=before,
         )
         self._running = Running(client, self.scenario)

@@ -18,7 +18,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from skytether.client import vehicles
 from skytether.client.endpoint import Client
-from skytether.client.memory import SavedState, recall
+from skytether.client.memory import SavedState, SavingClient, recall
 from skytether.netem.proxy import Proxy
 from skytether.ros2 import graph, messages
 from skytether.ros2.graph import Node
@@ -254,14 +254,13 @@ class Ground:
 
     def _client(self, life: int, before: SavedState | None) -> Client:
         self.flies = vehicles.make(self.scenario, 1)
-        return Client(
+        return SavingClient(
             self.scenario,
             self.flies,
             server=("netem", 0),
             vehicle=1,
             boot_id=2**60 + life,
             recorder=self._recorder,
-            keeps=True,
             before=before,
         )
 

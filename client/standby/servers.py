@@ -79,7 +79,7 @@ class Servers(OneServer):
         self._lead_states = [LeadState() for _ in range(count)]
         self._count, self._vehicle, self._events = count, parts.vehicle, parts.events
         self._dt_ns, self._timeout_ns = parts.terms.dt_ns, timeout_ns
-        self._motion, self._may_tell = parts.motion, parts.may_tell
+        self._motion = parts.motion
         self._reported = number
         """Number of the leadership that was last reported."""
         self._differing: dict[int, tuple[Difference, ...]] = {}
@@ -141,7 +141,7 @@ class Servers(OneServer):
         self._report_limits()
         # Sent only once the number is saved: the next run of the client must not follow an earlier
         # leadership than the servers.
-        if self._may_tell(now_ns):
+        if self.may_tell(now_ns):
             self._tell(lead.doubts(heard_ns, now_ns), heard_ns[lead.leader], step, now_ns)
 
     def name(self, server: int, *, now_ns: int) -> None:

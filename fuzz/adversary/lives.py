@@ -5,7 +5,7 @@ then drifts with the wind; one whose client has ended in order holds its place, 
 autopilot. Keys set by the operator survive a restart of the server.
 """
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
 from types import MappingProxyType
@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from skytether.client.endpoint import Client
-from skytether.client.memory import recall
+from skytether.client.memory import SavingClient, recall
 from skytether.client.several import Several
 from skytether.client.simulated.plant import FirstOrderPlant
 from skytether.client.simulated.sensor import Sensor
@@ -166,18 +166,18 @@ class Lives:
         return server
 
     def _client(self, number: int, runs: int, kept: Saved | None = None) -> Client:
-        before, steps = None, MemoryRecorder(client_columns(self.scenario.model.axes))
-        if kept is not None:
-            before = recall(*kept, CLOCK.local(self.world.now_ns), self.scenario.terms())
-        client = Client(
+        make: Callable[..., Client] = Client
+        if self._keeps(number):
+            now_ns, terms = CLOCK.local(self.world.now_ns), self.scenario.terms()
+            make = partial(SavingClient, before=recall(*kept, now_ns, terms) if kept else None)
+        steps = MemoryRecorder(client_columns(self.scenario.model.axes))
+        client = make(
             self.scenario,
             self.bodies[number],
             server=Several([NETWORK], standby=self._standby),
             vehicle=number,
             boot_id=number * 1000 + runs,
             recorder=steps,
-            keeps=self._keeps(number),
-            before=before,
         )
         self._lives[number].append(Life(client, steps))
         return client

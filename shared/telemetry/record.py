@@ -238,18 +238,18 @@ class MemoryRecorder(Recorder):
 
     def __init__(self, columns: np.dtype[np.void]) -> None:
         super().__init__(columns)
-        self._kept = io.BytesIO()
-        self.follow(self._kept)
+        self._written = io.BytesIO()
+        self.follow(self._written)
 
     @property
     def count(self) -> int:
         """Number of rows so far."""
-        return self._kept.tell() // self.columns.itemsize
+        return self._written.tell() // self.columns.itemsize
 
     def rows(self, first: int = 0) -> Rows:
         """Rows so far, from number `first` on; a negative number counts from the end."""
-        kept = self._kept.getbuffer()[first * self.columns.itemsize :]
-        return np.frombuffer(bytes(kept), self.columns)
+        written = self._written.getbuffer()[first * self.columns.itemsize :]
+        return np.frombuffer(bytes(written), self.columns)
 
 
 def _row(columns: np.dtype[np.void]) -> Struct:

@@ -315,8 +315,11 @@ def fly_runs(
         else:
             run_of[host].hear(time_ns, host, event)
 
-    make_world = load("skytether.sim.world", "actions").World if actions else Hosts
-    world: Hosts = make_world(on_event)
+    world = Hosts(on_event)
+    if (
+        actions or own_server or beside or servers is not ALONE
+    ):  # which may stop hosts, or save a state
+        world = load("skytether.sim.world", "actions").World(on_event)
     entropy = stream(scenario.seed, "entropy").bytes
     each = [msgspec.structs.replace(scenario, seed=seed) for seed in seeds]
     error_ns = seconds_to_ns(scenario.simulation.time_error_s)

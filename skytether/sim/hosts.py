@@ -4,7 +4,7 @@ A datagram takes no time between endpoints; delays come from netem, which is an 
 host has its own clock, with offset and drift. A host may need computing time when it is woken: its
 datagrams leave at the end of that time, and only then can it be woken again. It receives datagrams
 meanwhile, so computing for one peer does not delay the datagrams of another. A `sim.world.World`
-can stop hosts, too.
+can stop hosts, too, and saves the state of their endpoints.
 
 Time is integer nanoseconds, and events of one instant happen in a fixed order. So equal inputs give
 equal outcomes on every machine, and hosts that exchange no datagrams do not affect each other.
@@ -61,8 +61,6 @@ class Host:
     """Time of the world at which the host is to be woken, or None."""
     due_ns: int | None = None
     """Time on the host's clock from which `armed_ns` was computed; None to compute it again."""
-    memory: tuple[bytes, int] | None = None
-    """Newest state that an endpoint of the host saved, and its time [ns; host's clock]."""
 
 
 ACTION, ARRIVAL = -1, 0
@@ -205,11 +203,6 @@ class Hosts:
     def _after(self, host: Host, leaves_ns: int) -> None:
         """Send the datagrams that a host has queued, report its events, and set its next wake."""
         endpoint = host.endpoint
-        if endpoint.keeps:
-            now_ns = host.clock.local(self.now_ns)
-            if (content := endpoint.keep(now_ns=now_ns)) is not None:
-                host.memory = content, now_ns
-                endpoint.kept()
         out, events = endpoint.pending
         if out:
             for payload, (name, socket), source in endpoint.outbox():

@@ -6,10 +6,12 @@ agenda and its order.
 """
 
 from collections import deque
+from collections.abc import Callable
 from heapq import heapify
 
 from skytether.shared.endpoints.endpoint import Datagram, Endpoint
-from skytether.sim.hosts import Clock, Hosts
+from skytether.shared.events.flight import Event
+from skytether.sim.hosts import Clock, Host, Hosts
 
 FROZEN_MAX = 6_500
 """Largest number of datagrams queued for a frozen host: a socket's buffer holds as many of 600 B.
@@ -61,6 +63,11 @@ class World(Hosts):
             and the event, before `on_finished` of that host.
     """
 
+    def __init__(self, on_event: Callable[[int, str, Event], None] = lambda *_: None) -> None:
+        super().__init__(on_event)
+        self._memories: dict[str, tuple[bytes, int]] = {}
+        """State that an endpoint of each host saved last, and when [ns; host's clock]."""
+
     def endpoint(self, name: str) -> Endpoint:
         """Endpoint of a host, also while it is down or frozen."""
         endpoint = self._hosts[name].endpoint
@@ -90,7 +97,7 @@ class World(Hosts):
 
     def memory(self, name: str) -> tuple[bytes, int] | None:
         """Newest state that an endpoint of a host saved, and its time [ns; host's clock]."""
-        return self._hosts[name].memory
+        return self._memories.get(name)
 
     def freeze(self, name: str) -> None:
         """Freeze a host: datagrams are queued for it, up to a bound.
@@ -139,3 +146,11 @@ class World(Hosts):
     def rearm(self, name: str) -> None:
         """Recompute a host's next wake after an action has changed its state."""
         self._arm(self._hosts[name])
+
+    def _after(self, host: Host, leaves_ns: int) -> None:
+        if host.endpoint.keeps:
+            now_ns = host.clock.local(self.now_ns)
+            if (content := host.endpoint.keep(now_ns=now_ns)) is not None:
+                self._memories[host.name] = content, now_ns
+                host.endpoint.kept()
+        super()._after(host, leaves_ns)

@@ -7,8 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from helpers import packaged
-from skytether.client.endpoint import Client
-from skytether.client.memory import SavedState, recall
+from skytether.client.memory import SavedState, SavingClient, recall
 from skytether.client.several import STANDBY_SOCKETS, Several
 from skytether.client.simulated.vehicle import SimulatedVehicle, simulated
 from skytether.client.standby.leadership import ASK_SHARE, NUMBER_MAX, Leadership
@@ -93,13 +92,12 @@ class Vehicle:
     ) -> None:
         self.scenario, self.now_ns = scenario, SECOND_NS
         self.saves, self.writes = True, False
-        self.client = Client(
+        self.client = SavingClient(
             scenario,
             flies or simulated(scenario, 1),
             server=Several([SERVERS[0]], standby=[SERVERS[1]]) if has_standby else SERVERS[0],
             vehicle=4,
             boot_id=99,
-            keeps=True,
             before=before,
         )
         self.sent: list[tuple[int, Message]] = []
