@@ -1,10 +1,18 @@
-"""Log events of a vehicle on the ground: the reason why it cannot fly yet, and the silence of its
-server.
+"""Log events of a vehicle on the ground: the reason why it cannot fly yet, that no server answers,
+and the silence of its server.
 """
 
+from skytether.client.session import ServerSession
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.endpoints.endpoint import Address, Events
-from skytether.shared.events.flight import AutopilotWaits, ServerHeard, ServerSilent, Welcomed
+from skytether.shared.events.ground import (
+    AutopilotWaits,
+    NoAnswer,
+    ServerHeard,
+    ServerSilent,
+    Unanswered,
+    Welcomed,
+)
 
 WAITED_NS = 2 * SECOND_NS
 """Delay before the log gives the reason why the vehicle cannot fly."""
@@ -13,6 +21,26 @@ SILENT_NS = 3 * SECOND_NS
 
 The server answers two HELLOs a second. Of eight, one gets through even if the network loses a fifth
 of the packets each way."""
+
+
+def unanswered(session: ServerSession, left_ns: int) -> Unanswered:
+    """Event for a session that its server has not opened yet, `left_ns` before it is given up."""
+    (host, port), others = session.address, session.route.others
+    left_s = left_ns / SECOND_NS
+    return Unanswered(vehicle=session.vehicle, host=host, port=port, others=others, left_s=left_s)
+
+
+def no_answer(session: ServerSession, waited_ns: int) -> NoAnswer:
+    """Event for a session that is given up."""
+    host, port = session.address
+    return NoAnswer(
+        vehicle=session.vehicle,
+        host=host,
+        port=port,
+        others=session.route.others,
+        waited_s=waited_ns / SECOND_NS,
+        secure=session.link.secure,
+    )
 
 
 class GroundReports:

@@ -6,7 +6,7 @@ The client echoes the time stamp of every packet of the session, from which the 
 delays. `client.failsafe` decides how packets and silence change the vehicle's mode.
 """
 
-from typing import Literal
+from typing import Any, Literal
 
 from skytether.client.alone import Role
 from skytether.client.link import AGAIN_NS, ClientLink
@@ -14,16 +14,11 @@ from skytether.client.route import Route
 from skytether.client.server_clock import ServerClock
 from skytether.shared.base.units import SECOND_NS, seconds_to_ns
 from skytether.shared.endpoints.endpoint import Address, Events
-from skytether.shared.events.flight import (
-    Failure,
-    NoAnswer,
-    NoSession,
-    SessionRefused,
-    Unanswered,
-)
+from skytether.shared.events.flight import Failure, NoSession, SessionRefused
 from skytether.shared.law.heartbeat import NUMBERS, RARE_TIMES, Hearing
 from skytether.shared.law.terms import Terms
 from skytether.shared.scenario.catalogue import differences
+from skytether.shared.scenario.registry import load
 from skytether.shared.telemetry.record import Reason
 from skytether.shared.wire.drop import Drop, ProtocolError
 from skytether.shared.wire.framing import split
@@ -325,40 +320,21 @@ class ServerSession:
         if self._began_ns is None:
             self._began_ns = now_ns
         waited_ns = now_ns - self._began_ns
-        if waited_ns <= self._connect_ns:
-            self._say_unanswered(self._connect_ns - waited_ns, waited_ns)
-            return True
-        self._give_up(waited_ns / SECOND_NS)
-        return False
-
-    def _say_unanswered(self, left_ns: int, waited_ns: int) -> None:
-        """Report once, after a while, that the server has not answered."""
-        if self._is_unanswered or self._refusal is not None or waited_ns < UNANSWERED_NS:
-            return
-        self._is_unanswered = True
-        (host, port), others = self.address, self.route.others
-        left_s = left_ns / SECOND_NS
-        self._events.append(
-            Unanswered(vehicle=self.vehicle, host=host, port=port, others=others, left_s=left_s)
-        )
-
-    def _give_up(self, waited_s: float) -> None:
-        """Fail because no session was ever opened; a refusal has been reported already."""
-        if self._refusal is not None:
-            self.failure = self._refusal
-            return
-        host, port = self.address
-        self._fail(
-            NoAnswer(
-                vehicle=self.vehicle,
-                host=host,
-                port=port,
-                others=self.route.others,
-                waited_s=waited_s,
-                secure=self.link.secure,
-            )
-        )
+        if waited_ns > self._connect_ns:
+            if self._refusal is None:
+                self._fail(_ground().no_answer(self, waited_ns))
+            else:
+                self.failure = self._refusal  # it has been reported already
+            return False
+        if not self._is_unanswered and self._refusal is None and waited_ns >= UNANSWERED_NS:
+            self._is_unanswered = True
+            self._events.append(_ground().unanswered(self, self._connect_ns - waited_ns))
+        return True
 
     def _fail(self, failure: Failure) -> None:
         self.failure = failure
         self._events.append(failure)
+
+
+def _ground() -> Any:
+    return load("skytether.client.ground", "a server that does not answer")

@@ -161,7 +161,7 @@ def _work(
         options,
         server_columns(axes, control.scheme),
         number=number,
-        secure=gate.secure,
+        secure=bool(keyring),
         warnings=command.flight_warnings(options.config),
     ) as running:
         endpoint = Server(

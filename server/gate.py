@@ -30,9 +30,6 @@ class GateCall(NamedTuple):
 class Gate(Protocol):
     """Converts datagrams of vehicles to messages."""
 
-    secure: bool
-    """Whether messages returned by `open` are authenticated."""
-
     def open(self, datagram: Datagram, *, now_ns: int) -> GateCall | None:
         """Message in a datagram; None if it was part of a handshake.
 
@@ -53,8 +50,6 @@ class Gate(Protocol):
 
 
 class PlainGate:
-    secure = False
-
     def open(self, datagram: Datagram, *, now_ns: int) -> GateCall:  # noqa: ARG002 - interface of `Gate`
         return GateCall(datagram.payload, None, _PLAIN_REPLY, moves=True)
 

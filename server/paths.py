@@ -307,6 +307,10 @@ class RoutesOverPaths(Routes):
         self.at |= dict.fromkeys(paths.places, session)
 
 
+make = RoutesOverPaths
+"""See `server.routes.Routes.of_several`."""
+
+
 def _paths(session: Session) -> ServerPaths | None:
     """Paths of a session; None with a single address."""
     return session.route if isinstance(session.route, ServerPaths) else None

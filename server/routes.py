@@ -39,7 +39,7 @@ class Routes:
             spread: `link.spread`.
             timeout_ns: time without a packet after which a vehicle considers the link lost [ns].
         """
-        routes: Routes = load(ROOM, "paths").RoutesOverPaths(entropy, spread, timeout_ns)
+        routes: Routes = load(ROOM, "paths").make(entropy, spread, timeout_ns)
         return routes
 
     def is_copy(self, datagram: Datagram, now_ns: int) -> bool:

@@ -168,8 +168,6 @@ class _Answer:
 class SecureGate:
     """Gate that accepts only vehicles of the keyring; `entropy` returns unpredictable bytes."""
 
-    secure = True
-
     def __init__(self, keyring: Keyring, *, entropy: Callable[[int], bytes]) -> None:
         self._keyring = keyring
         self.entropy = entropy

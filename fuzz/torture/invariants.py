@@ -95,7 +95,6 @@ class Gatekeeper:
 
     def __init__(self, gate: Gate, life: int, up: Ledger, down: Ledger) -> None:
         self.gate = gate
-        self.secure = gate.secure
         self._life = life
         self._up, self._down = up, down
 

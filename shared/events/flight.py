@@ -4,10 +4,10 @@ An endpoint returns its events (`Endpoint.events`); a driver passes them to a lo
 virtual time, or the command that started the process. `str(event)` is a sentence for the operator.
 For programs an event is a JSON object whose key `type` is the name of the class.
 
-This module has the events of all flights. Those of autopilots are in `aboard`, of several paths in
-`path_events`, of a standby server in `standby_events`, of processes in `process_events`, of
-missions in `shared.missions.events`. `shared.telemetry.every_event` decodes them all, and imports
-each of these modules.
+This module has the events of all flights. Those of a vehicle on the ground are in `ground`, of
+autopilots in `aboard`, of several paths in `paths`, of a standby server in `standby`, of processes
+in `processes`, of missions in `shared.missions.events`. `shared.telemetry.every_event` decodes them
+all, and imports each of these modules.
 """
 
 from typing import Any, Literal, dataclass_transform
@@ -249,56 +249,6 @@ class NoSession(PeerEvent, Failure):
             "taken": "another client flies under this number; see --id",
         }[self.reason]
         return f"vehicle {self.vehicle} is refused by {self.peer}: {why}"
-
-
-class UnansweredEvent(PeerEvent):
-    others: tuple[str, ...] = ()
-    """Addresses of the server's other paths, which have not answered either."""
-
-    @property
-    def everywhere(self) -> str:
-        return ", ".join((self.peer, *self.others))
-
-
-class NoAnswer(UnansweredEvent, Failure, kw_only=True):
-    waited_s: float
-    secure: bool = False
-    """Whether the vehicle has a key; it then ignores answers without this key."""
-
-    def __str__(self) -> str:
-        key, and_key = (" with this key", ", with this key") if self.secure else ("", "")
-        no_answer = f"no answer{key} from {self.everywhere} in {self.waited_s:.0f} s"
-        return f"vehicle {self.vehicle}: {no_answer}: is a server running there{and_key}?"
-
-
-class Unanswered(UnansweredEvent, kw_only=True):
-    sentence = (
-        "vehicle {vehicle}: no answer from {everywhere} yet, asking for another {left_s:.0f} s"
-    )
-    left_s: float
-
-
-class Welcomed(PeerEvent):
-    sentence = "vehicle {vehicle}: session open with the server at {peer}"
-
-
-class AutopilotWaits(VehicleEvent):
-    sentence = "vehicle {vehicle} waits for {waits_for}"
-    waits_for: str
-
-
-class ServerSilent(VehicleEvent):
-    """Packets of the server no longer arrive at a vehicle on the ground."""
-
-    sentence = "vehicle {vehicle}: the server has been silent for {silent_s:.1f} s"
-    silent_s: float
-
-
-class ServerHeard(VehicleEvent):
-    """Packets of the server arrive again at a vehicle on the ground."""
-
-    sentence = "vehicle {vehicle}: its server answers again, after {silent_s:.1f} s"
-    silent_s: float
 
 
 class Flying(VehicleEvent):

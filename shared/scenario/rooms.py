@@ -64,6 +64,7 @@ TEXTS: Mapping[str, PluginTable] = MappingProxyType(
 """Keys whose value is a text with arguments, and the table of the entries it may name."""
 EVENTS = (
     f"{SHARED}events.aboard",
+    f"{SHARED}events.ground",
     f"{SHARED}events.paths",
     f"{SHARED}events.standby",
     f"{SHARED}missions.events",

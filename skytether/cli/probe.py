@@ -158,7 +158,7 @@ def _listen(options: ProbeOptions, bind: Address) -> None:
         from skytether.server.secure import SecureGate
 
         gate = SecureGate(keys.load(options.keys), entropy=secrets.token_bytes)
-    command.check_sealed(bind, secure=gate.secure or options.insecure)
+    command.check_sealed(bind, secure=bool(options.keys) or options.insecure)
     listener = Listener(gate, secrets.token_bytes(SECRET_BYTES))
     try:
         shell = driver.Shell(listener, bind)

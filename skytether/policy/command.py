@@ -160,7 +160,7 @@ def serve(argv: Sequence[str]) -> None:
     command.claim_output("--json", options.json)
     gate = inside.gate_of(options.keys)
     for bind in binds:
-        command.check_sealed(bind, secure=gate.secure or options.insecure)
+        command.check_sealed(bind, secure=bool(options.keys) or options.insecure)
     end = inside.policy_end(
         gate,
         patience_ns=_time_ns("--patience", options.patience),

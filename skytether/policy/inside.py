@@ -146,7 +146,7 @@ def serve(
         AddressError: the address cannot be bound.
     """
     at, gate = _address("bind", bind), gate_of(keys)
-    _check_sealed("bind", at, secure=gate.secure or insecure)
+    _check_sealed("bind", at, secure=bool(keys) or insecure)
     line = partial(_FunctionLine, infer, {} if metadata is None else metadata)
     end = policy_end(gate, gives_rows=gives_rows)
     run([Shell(end, at, line=lambda hear, _: line(hear))], on_event=on_event)

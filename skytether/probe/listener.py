@@ -112,12 +112,12 @@ class Listener(Endpoint):
             self.send(packet, datagram.peer)
             self._gate.admit(call, now_ns=now_ns)
         elif isinstance(message, Probe):
-            session = self._session(message.session, datagram.peer, now_ns)
+            session = self._session(message.session, call, datagram.peer, now_ns)
             self._probe(session, message, call, datagram, now_ns)
         else:
             raise ProtocolError(Drop.NOT_FOR_A_SERVER)
 
-    def _session(self, name: bytes, peer: Address, now_ns: int) -> ProbeSession:
+    def _session(self, name: bytes, call: GateCall, peer: Address, now_ns: int) -> ProbeSession:
         """Measurement of a session, begun if it is new.
 
         Raises:
@@ -125,7 +125,7 @@ class Listener(Endpoint):
                 open.
         """
         session = self._sessions.get(name)
-        if session is None or not self._gate.secure:
+        if session is None or call.vehicle is None:
             nonce, cookie = name[:NONCE_BYTES], name[NONCE_BYTES:]
             if not hmac.compare_digest(cookie, self._cookie(nonce, peer)):
                 raise ProtocolError(Drop.UNKNOWN_SESSION)
@@ -186,7 +186,7 @@ class Listener(Endpoint):
         first = session.logged - len(log)
         arrivals = tuple(islice(log, _ARRIVALS_MAX))
         answer = ProbeAnswer(name, held.number, now_ns, first, session.logged, arrivals)
-        size = held.size - (OVERHEAD_BYTES if self._gate.secure else 0)
+        size = held.size - (0 if held.call.vehicle is None else OVERHEAD_BYTES)
         packet = line.seal(encode(answer, size))
         if len(packet) <= held.size:  # a probe that is too short gets no answer
             self.send(packet, held.peer)

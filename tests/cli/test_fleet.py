@@ -22,7 +22,7 @@ from skytether.server.endpoint import Server
 from skytether.shared.base.chance import stream
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.endpoints.endpoint import VEHICLES_SHOWN_MAX, Address, Datagram
-from skytether.shared.events.flight import NoAnswer
+from skytether.shared.events.ground import NoAnswer
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.drops import drops

@@ -21,12 +21,7 @@ from skytether.shared.events.aboard import (
     PositionsDropped,
     TextsOmitted,
 )
-from skytether.shared.events.flight import (
-    AutopilotWaits,
-    ServerHeard,
-    ServerSilent,
-    Welcomed,
-)
+from skytether.shared.events.ground import AutopilotWaits, ServerHeard, ServerSilent, Welcomed
 from skytether.shared.telemetry.record import Reason
 
 

@@ -13,15 +13,8 @@ from skytether.client.several import PATH_SOCKETS, Several
 from skytether.client.simulated.vehicle import SimulatedVehicle, simulated
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.endpoints.endpoint import Address, Datagram
-from skytether.shared.events.flight import (
-    Finished,
-    Flying,
-    ModeChanged,
-    NoAnswer,
-    NoSession,
-    SessionRefused,
-    Unanswered,
-)
+from skytether.shared.events.flight import Finished, Flying, ModeChanged, NoSession, SessionRefused
+from skytether.shared.events.ground import NoAnswer, Unanswered
 from skytether.shared.law.terms import Difference
 from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import Reason

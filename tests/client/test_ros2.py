@@ -25,7 +25,7 @@ from skytether.shared.base.errors import ConfigError
 from skytether.shared.base.extras import ExtraMissing
 from skytether.shared.endpoints.endpoint import Datagram
 from skytether.shared.events.aboard import OdometryDropped, SecondPublisher
-from skytether.shared.events.flight import AutopilotWaits
+from skytether.shared.events.ground import AutopilotWaits
 from skytether.shared.wire.protocol import Mode
 from skytether.sim.hosts import Clock
 from skytether.sim.world import World

@@ -19,7 +19,8 @@ import skytether
 from helpers import PATIENCE_S
 from skytether import ConfigError, check, fly, fly_batch, load, sweep
 from skytether.cli import processes
-from skytether.shared.events.flight import NoAnswer, ReferenceTooFast
+from skytether.shared.events.flight import ReferenceTooFast
+from skytether.shared.events.ground import NoAnswer
 from skytether.shared.telemetry.summary import Summary, summarise
 from skytether.shared.wire.protocol import (
     Hello,

@@ -12,7 +12,8 @@ from helpers import packaged
 from skytether.server.planning.desired import Desired
 from skytether.shared.base import chance
 from skytether.shared.base.units import MILLISECOND_NS
-from skytether.shared.events.flight import NoAnswer, SessionEnded
+from skytether.shared.events.flight import SessionEnded
+from skytether.shared.events.ground import NoAnswer
 from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import Record
 from skytether.shared.wire.protocol import Heartbeat, encode

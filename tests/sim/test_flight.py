@@ -12,14 +12,8 @@ import skytether.sim.flight
 from helpers import packaged
 from skytether.server import reception
 from skytether.shared.base.units import SECOND_NS
-from skytether.shared.events.flight import (
-    Finished,
-    FlowOpened,
-    Flying,
-    ModeChanged,
-    NoAnswer,
-    SessionOpened,
-)
+from skytether.shared.events.flight import Finished, FlowOpened, Flying, ModeChanged, SessionOpened
+from skytether.shared.events.ground import NoAnswer
 from skytether.shared.law.model import Array
 from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import DOWNLINK, UPLINK, Reason, Record, client_columns

@@ -21,11 +21,10 @@ from skytether.shared.events.flight import (
     ModeChanged,
     NotFlown,
     RecordIncomplete,
-    ServerHeard,
-    ServerSilent,
     StateLeapt,
     SteppedLate,
 )
+from skytether.shared.events.ground import ServerHeard, ServerSilent
 from skytether.shared.events.paths import PathDied, PathHealed
 from skytether.shared.events.processes import (
     HostFound,
