@@ -189,7 +189,7 @@ class RobotEnd(Endpoint):
         self._delays_ns: deque[int] = deque(maxlen=DELAYS)
         """Newest times from an observation to its chunk."""
         self._counts = Counter[Kind]()
-        self._drops = Counter[Drop]()
+        self._drops = Counter[str]()
         self._refused = 0
         self._late_ns = 0
         """Longest time by which an answer came after its deadline."""

@@ -110,7 +110,7 @@ class PolicyEnd(Endpoint):
         self._unpacked = unpacked
         self._robots: dict[int, _Robot] = {}
         self._metadata: bytes | None = None
-        self._drops = Counter[Drop]()
+        self._drops = Counter[str]()
         self._counts = Counter[str]()
 
     # -- datagrams -----------------------------------------------------------------------------
