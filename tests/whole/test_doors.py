@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from skytether.shared.scenario import registry, rooms
+from skytether.shared.scenario import registry, rooms, schemes
 from skytether.shared.scenario.registry import PluginTable
 
 ROOT = Path(__file__).parents[2]
@@ -29,6 +29,7 @@ TABLES = {
     for name, each in vars(module).items()
     if isinstance(each, PluginTable)
 }
+assert schemes.SCHEMES is registry.SCHEMES  # the module that fills the table is imported
 DOORS = [(table, name) for table in PAGES for name in TABLES[table]]
 
 
