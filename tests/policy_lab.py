@@ -5,10 +5,13 @@ from typing import Any
 
 import numpy as np
 
+from skytether.client.secure import SecureLink
 from skytether.policy.robot import RobotOptions
 from skytether.policy.virtual import Emulated
+from skytether.server.secure import SecureGate
 from skytether.shared.base.units import MILLISECOND_NS
-from skytether.shared.endpoints.endpoint import Address
+from skytether.shared.endpoints.endpoint import Address, Datagram, Endpoint
+from skytether.shared.wire.keys import SECRET_BYTES, Keyring, VehicleKey
 
 MS = MILLISECOND_NS
 OPTIONS = RobotOptions("absolute", 150 * MS, step_ns=20 * MS)
@@ -18,6 +21,26 @@ def ramp(observation: Any) -> dict[str, Any]:
     """Ten rows that go on from the position in the observation by 1 a row."""
     at = float(observation["state"][0])
     return {"actions": at + np.arange(10, dtype=np.float32)[:, None], "time": 3}
+
+
+def state(position: float) -> dict[str, Any]:
+    return {"state": np.array([position])}
+
+
+def first_row(reply: Any) -> float:
+    return float(reply["actions"][0, 0])
+
+
+def entropy() -> Any:
+    return np.random.default_rng(3).bytes
+
+
+def keyed(seed: int = 1) -> VehicleKey:
+    return VehicleKey.of(1, 0, np.random.default_rng(seed).bytes(SECRET_BYTES))
+
+
+def secured_gate() -> SecureGate:
+    return SecureGate(Keyring("test", {(1, 0): keyed()}), entropy=entropy())
 
 
 class Lab(Emulated):
@@ -35,3 +58,46 @@ class Lab(Emulated):
 
         super().__init__(asked, options, metadata={"name": "scripted"}, **others)
         self.on_datagram = lambda each: self.wire.append((each.peer, each.payload))
+
+
+def secured(key: VehicleKey | None = None, **options: Any) -> Lab:
+    return Lab(link=SecureLink(key or keyed(), entropy=entropy()), gate=secured_gate(), **options)
+
+
+class Around:
+    """An end whose process may freeze, with a clock and an address of its own."""
+
+    def __init__(self, end: Endpoint) -> None:
+        self.end = end
+        self.until_ns = 0
+        """Time until which nothing is done; datagrams wait in the sockets."""
+        self.shift_ns = 0
+        """Its clock minus that of the others [ns]."""
+        self.seen_as: Callable[[Datagram], Datagram] = lambda datagram: datagram
+        """What it hears a datagram as."""
+        self.leaves: Callable[[Datagram], bool] = lambda _: True
+        self._waiting: list[Datagram] = []
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.end, name)
+
+    def receive(self, datagram: Datagram, *, now_ns: int) -> None:
+        self._waiting.append(self.seen_as(datagram))
+        if now_ns >= self.until_ns:
+            self._flush(now_ns)
+
+    def next_wake_ns(self) -> int | None:
+        wake_ns = self.end.next_wake_ns()
+        return wake_ns if wake_ns is None else max(wake_ns - self.shift_ns, self.until_ns)
+
+    def wake(self, *, now_ns: int) -> None:
+        self._flush(now_ns)
+        self.end.wake(now_ns=now_ns + self.shift_ns)
+
+    def _flush(self, now_ns: int) -> None:
+        waiting, self._waiting = self._waiting, []
+        for datagram in waiting:
+            self.end.receive(datagram, now_ns=now_ns + self.shift_ns)
+
+    def outbox(self) -> Any:
+        return [each for each in self.end.outbox() if self.leaves(each)]

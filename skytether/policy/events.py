@@ -65,6 +65,11 @@ class UpstreamFound(RobotEvent):
     sentence = "robot {robot}: connected to the policy"
 
 
+class ChunkRefused(RobotEvent):
+    sentence = "robot {robot}: a chunk is not played: {reason}"
+    reason: str
+
+
 class PolicyFailed(RobotEvent):
     sentence = "robot {robot}: the policy answered with an error: {reason}"
     reason: str

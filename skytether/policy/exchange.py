@@ -5,7 +5,7 @@ end reports what has come of each message, so that the other learns rate, loss a
 """
 
 from collections import OrderedDict, deque
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 from skytether.policy import parts
@@ -43,8 +43,9 @@ class _Coming:
     first_ns: int
     last_ns: int = 0
     sent_us: int = 0
-    came: int = 0
     bytes: int = 0
+    places: set[tuple[int, int]] = field(default_factory=set)
+    """Block and place of each part that has come."""
 
 
 class Arrived(NamedTuple):
@@ -96,6 +97,10 @@ class Exchange:
         while len(self._sent) > REMEMBERED_MAX:
             self._sent.popitem(last=False)
 
+    def is_sending(self, stream: int) -> bool:
+        """Whether parts of a message wait."""
+        return bool(self._queue.get(stream))
+
     def due_ns(self) -> int | None:
         """Time of the next datagram to be sent [ns]; None if nothing waits."""
         due = [each.last_ns + QUIET_NS for each in self._coming.values()]
@@ -113,10 +118,10 @@ class Exchange:
         out = list(self._replies)
         self._replies.clear()
         while now_ns >= self.pace.due_ns():
-            waiting = [stream for stream, each in self._queue.items() if each]
+            waiting = list(filter(self.is_sending, self._queue))
             if not waiting:
                 break
-            stream = waiting[-1]  # that of few and small messages last: metadata is sent first
+            stream = max(waiting)  # metadata first
             part = self._queue[stream].popleft()
             sent_us = now_ns // MICROSECOND_NS % STAMPS
             out.append(encode(PartMessage(self.session, *part[:-1], sent_us, part.data)))
@@ -157,7 +162,7 @@ class Exchange:
             coming = self._coming[stream] = _Coming(part.number, expected, now_ns)
         if part.number == coming.number:
             self._count(coming, message, now_ns)
-            if coming.came == coming.expected:
+            if len(coming.places) == coming.expected:
                 self._report(stream, now_ns)
         if arrived is None:
             return None
@@ -165,8 +170,11 @@ class Exchange:
         return Arrived(stream, *arrived)
 
     def _count(self, coming: _Coming, message: PartMessage, now_ns: int) -> None:
+        place = message.block, message.place
+        if place in coming.places:
+            return  # it came over another path before
+        coming.places.add(place)
         self.came += 1
-        coming.came += 1
         coming.bytes += len(message.data) + PART_HEAD_BYTES + HEADER_BYTES
         coming.last_ns, coming.sent_us = now_ns, message.sent_us
 
@@ -177,7 +185,7 @@ class Exchange:
             self.session,
             stream,
             coming.number,
-            min(coming.came, 2**16 - 1),
+            len(coming.places),
             min(coming.bytes, 2**32 - 1),
             (last_us - coming.sent_us) % STAMPS,
             min((coming.last_ns - coming.first_ns) // MICROSECOND_NS, STAMPS - 1),
@@ -192,7 +200,6 @@ class Exchange:
         if sent is None or not sent.parts:
             return
         round_trip_us = (now_ns // MICROSECOND_NS - seen.sent_us - seen.held_us) % STAMPS
-        self.pace.round_trip_ns = round_trip_us * MICROSECOND_NS
         # Both ends' clocks differ by any time, so the delay is counted on from the one before.
         change_us = (seen.delay_us - self._delay_us + STAMPS // 2) % STAMPS - STAMPS // 2
         self._delay_us += change_us
@@ -201,6 +208,7 @@ class Exchange:
             seen.came,
             seen.bytes,
             self._delay_us * MICROSECOND_NS,
+            round_trip_us * MICROSECOND_NS,
             seen.spread_us * MICROSECOND_NS,
             was_limited=sent.was_limited,
             now_ns=now_ns,

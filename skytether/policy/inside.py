@@ -89,14 +89,19 @@ class _FunctionLine:
     def __init__(self, infer: Callable[[Any], Any], metadata: Any, hear: Hear) -> None:
         self._infer, self._hear = infer, hear
         self._metadata = values.pack(metadata)
-        self._asked: queue.SimpleQueue[tuple[bytes, Address]] = queue.SimpleQueue()
+        self._asked: dict[Address, bytes] = {}
+        """Observation of each connection; a closed one has none, however long the function took."""
+        self._order: queue.SimpleQueue[Address] = queue.SimpleQueue()
 
     def send(self, payload: bytes, peer: Address) -> bool:
         if payload[:1] == Said.OPENED:
             said = Said.OPENED.value + self._metadata
             asyncio.get_running_loop().call_soon(self._hear, Datagram(said, peer, LINE))
         elif payload[:1] == Said.MESSAGE:
-            self._asked.put((payload[1:], peer))
+            self._asked[peer] = payload[1:]
+            self._order.put(peer)
+        else:
+            self._asked.pop(peer, None)
         return True
 
     async def run(self) -> None:
@@ -106,7 +111,10 @@ class _FunctionLine:
 
     def _work(self, loop: asyncio.AbstractEventLoop) -> None:
         while True:
-            observation, peer = self._asked.get()
+            peer = self._order.get()
+            observation = self._asked.pop(peer, None)
+            if observation is None:
+                continue
             try:
                 reply = self._infer(values.unpack(observation))
                 if isinstance(reply, np.ndarray):

@@ -54,7 +54,7 @@ class PartMessage(NamedTuple):
 
     session: U32
     stream: Stream
-    number: U32
+    number: U63
     size: U32
     blocks: U8
     parity: Annotated[int, Meta(ge=0, le=PARITY_MAX)]
@@ -75,7 +75,7 @@ class Seen(NamedTuple):
 
     session: U32
     stream: Stream
-    number: U32
+    number: U63
     came: U16
     """Number of its parts that came."""
     bytes: U32

@@ -40,10 +40,10 @@ class Pace:
         """Bytes that may be sent in a second [B/s]."""
         self.loss = LOSS_FIRST
         """Share of the parts that are lost."""
-        self.queue_ns = 0
-        """Newest delay minus the least [ns]."""
         self.round_trip_ns: int | None = None
         """Newest round trip, without the time at the other end [ns]."""
+        self.queue_ns = 0
+        """Newest delay minus the least [ns]."""
         self._least: deque[tuple[int, int]] = deque()
         """Times and delays [ns] of which each is the least since; the first is the least of all."""
         self._lowered_ns = -LOWERED_EVERY_NS
@@ -63,6 +63,7 @@ class Pace:
         came: int,
         size: int,
         delay_ns: int,
+        round_trip_ns: int,
         spread_ns: int,
         *,
         was_limited: bool,
@@ -74,12 +75,16 @@ class Pace:
             sent, came: number of parts of a message that were sent, and that came.
             size: bytes of those that came.
             delay_ns: delay of the last, up to a constant [ns].
+            round_trip_ns: round trip of the last, which is no shorter than any queue on it [ns].
             spread_ns: time from the first to the last at the receiver [ns].
             was_limited: whether the message took as long as the rate allows.
         """
+        self.round_trip_ns = round_trip_ns
         share = max(0.0, 1.0 - came / sent)
         self.loss += (GAIN_UP if share > self.loss else GAIN_DOWN) * (share - self.loss)
         self.loss = min(self.loss, LOSS_MAX)
+        if self._least and delay_ns - self._least[0][1] > round_trip_ns:
+            self._least.clear()  # no queue is that long: a clock has jumped
         while self._least and self._least[-1][1] >= delay_ns:
             self._least.pop()
         self._least.append((now_ns, delay_ns))

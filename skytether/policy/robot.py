@@ -53,6 +53,8 @@ AGAIN_NS = SECOND_NS
 """Time after which the first observation is sent again."""
 STEP_NS_FIRST = 50 * MILLISECOND_NS
 """Length of a step before it is measured."""
+STEP_NS_LEAST, STEP_NS_MOST = MILLISECOND_NS, SECOND_NS
+"""Bounds of what is measured: a program that pauses for a minute plays no row for a minute."""
 MEASURED, DELAYS = 9, 64
 """Number of newest intervals and delays that are measured."""
 ROWS_SENT = 64
@@ -122,6 +124,10 @@ class _Asked(NamedTuple):
     """Observation that was sent."""
 
     began_ns: int
+    first: int
+    """Number of the first row of its chunk."""
+    stood_ns: float
+    """Time for which the robot had stood still until then [ns]."""
     connection: int
 
 
@@ -297,7 +303,8 @@ class RobotEnd(Endpoint):
                 options = self._options
                 step_ns = options.step_ns or STEP_NS_FIRST
                 player = options.player()
-                schedule = Schedule(player, options.actions, options.key, step_ns, now_ns)
+                late_ns = options.hold_ns + options.deadline_ns
+                schedule = Schedule(player, options.actions, options.key, step_ns, late_ns, now_ns)
                 self._connections += 1
                 self._program = _Program(peer, self._connections, schedule)
                 self._call = None
@@ -318,37 +325,41 @@ class RobotEnd(Endpoint):
 
     def _hear_call(self, program: _Program, data: bytes, now_ns: int) -> None:
         options, schedule = self._options, program.schedule
+        if self._call:  # the program does not wait for its answers; each gets its own
+            self._answer(Kind.REST, now_ns)
         if program.answered_ns is not None:
             program.intervals_ns.append(now_ns - program.answered_ns)
             if options.step_ns is None:
                 measured = int(median(program.intervals_ns) / options.rows)
-                schedule.set_step(max(measured, MILLISECOND_NS), now_ns=now_ns)
-        number = schedule.number(now_ns=now_ns)
-        schedule.stands = not options.plays_on
+                schedule.step_ns = min(max(measured, STEP_NS_LEAST), STEP_NS_MOST)
         self._calls += 1
-        again_ns = now_ns + AGAIN_NS
-        call = _Call(program.peer, self._calls, now_ns, program.newest < 0, b"", again_ns)
+        is_first, again_ns = program.newest < 0, now_ns + AGAIN_NS
+        call = _Call(program.peer, self._calls, now_ns, is_first, b"", again_ns)
         self._call = call
+        if not options.plays_on:
+            schedule.stand(now_ns=now_ns)
+        number = schedule.number(now_ns=now_ns)
         if not self._is_needed(schedule, now_ns):
             self._answer(Kind.REST, now_ns)
             return
         try:
-            seen = values.pack(self._compress(values.unpack(data)))
+            observation = values.unpack(data, most=values.MADE_BYTES_MAX)
+            seen = values.pack(self._compress(observation))
             coming = None
             if self._wants_rows:
                 coming = schedule.coming(ROWS_SENT, now_ns=now_ns)
             left, delay = schedule.left(now_ns=now_ns), self._delay_steps(schedule)
-            content = [call.number, number, left, delay, coming, seen]
+            content = [call.number, left, delay, coming, seen]
             message = values.pack(content)
             if len(message) > values.BYTES_MAX:
                 raise ValueRefused(f"got {len(message)} B, expected at most {values.BYTES_MAX}")
-        except ValueRefused as error:
+        except (ValueError, RecursionError) as error:  # ValueError: an image that cannot be resized
             self._refused += 1
             refused = events.ObservationRefused(robot=self._robot, reason=str(error))
             self._events.append(refused)
             self._answer(Kind.ERROR, now_ns, f"the observation is refused: {error}")
             return
-        self._asked[call.number] = _Asked(now_ns, program.number)
+        self._asked[call.number] = _Asked(now_ns, number, schedule.stood_ns, program.number)
         while len(self._asked) > DELAYS:
             del self._asked[next(iter(self._asked))]
         call.message = message
@@ -367,15 +378,14 @@ class RobotEnd(Endpoint):
 
     def _is_needed(self, schedule: Schedule, now_ns: int) -> bool:
         spare = self._options.spare_rows
-        if spare is None or not self._delays_ns:
-            return True
-        return schedule.left(now_ns=now_ns) < spare + self._delay_steps(schedule)
+        left = schedule.left(now_ns=now_ns)
+        return spare is None or not left or left < spare + self._delay_steps(schedule)
 
     def _accept(self, message: bytes, now_ns: int) -> None:
         """Accept a chunk."""
         try:
-            call_number, first, reply, error = values.unpack(message)
-            if type(call_number) is not int or type(first) is not int:
+            call_number, reply, error = values.unpack(message)
+            if type(call_number) is not int:
                 raise ProtocolError(Drop.FIELD)
             content = None if error else values.unpack(reply)
         except (ValueRefused, TypeError, ValueError):
@@ -387,15 +397,15 @@ class RobotEnd(Endpoint):
         if error:
             self._events.append(events.PolicyFailed(robot=self._robot, reason=str(error)[:200]))
             return
-        self._delays_ns.append(now_ns - asked.began_ns)
-        self._waits = self._delays_ns[-1] <= self._options.deadline_ns
+        schedule, delay_ns = program.schedule, now_ns - asked.began_ns
+        self._waits = delay_ns <= self._options.deadline_ns
         try:
-            program.schedule.accept(call_number, first, content, now_ns=now_ns)
+            stood_ns = asked.stood_ns
+            schedule.accept(call_number, asked.first, stood_ns, content, now_ns=now_ns)
         except ValueRefused as refused:
-            self._events.append(events.PolicyFailed(robot=self._robot, reason=str(refused)))
+            self._events.append(events.ChunkRefused(robot=self._robot, reason=str(refused)))
             return
-        if self._is_holding and program.schedule.since_ns is None:
-            self._is_holding = False
+        self._delays_ns.append(delay_ns)
         if call_number > program.newest:
             program.newest, program.made_ns = call_number, asked.began_ns
         if call and (call.number == call_number or call.is_first):
@@ -408,18 +418,26 @@ class RobotEnd(Endpoint):
         assert call
         self._call = None
         schedule = program.schedule
-        answer = schedule.answer(kind, now_ns=now_ns)
-        kind, left = (Kind.ERROR, 0) if error else (answer.kind, answer.left)
-        since_ns = schedule.since_ns
+        schedule.go(now_ns=now_ns)
+        since_ns = now_ns if schedule.since_ns is None else schedule.since_ns
+        held_s = (now_ns - since_ns) / SECOND_NS
+        message, left = b"", 0
+        if not error:
+            try:
+                kind, reply, left = schedule.answer(kind, now_ns=now_ns)
+                message = values.pack(reply)
+            except (ValueRefused, RecursionError) as refused:  # nested too deep
+                error = f"the policy's reply cannot be sent: {refused}"
         if kind is Kind.HOLD and not error:
-            held_ns = now_ns - (since_ns if since_ns is not None else now_ns)
-            if answer.reply is None or held_ns > self._options.hold_ns:
-                kind = Kind.ERROR
-                error = f"no action from the policy for {held_ns / SECOND_NS:.2f} s"
+            if reply is None or now_ns - since_ns > self._options.hold_ns:
+                error = f"no action from the policy for {held_s:.2f} s"
             if not self._is_holding:
                 self._is_holding = True
                 self._events.append(events.Holding(robot=self._robot))
-        schedule.stands = False
+        elif self._is_holding and not error:
+            self._is_holding = False
+            self._events.append(events.PlaysAgain(robot=self._robot, after_s=held_s))
+        kind = Kind.ERROR if error else kind
         program.answered_ns = now_ns
         waited_ns = now_ns - call.began_ns
         self._counts[kind] += 1
@@ -432,7 +450,7 @@ class RobotEnd(Endpoint):
         if error:
             self.send(Said.ERROR.value + error.encode(), call.peer, LINE)
         else:
-            self.send(Said.MESSAGE.value + values.pack(answer.reply), call.peer, LINE)
+            self.send(Said.MESSAGE.value + message, call.peer, LINE)
 
     # -- time ----------------------------------------------------------------------------------
 

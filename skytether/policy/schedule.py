@@ -1,9 +1,10 @@
 """Rows of actions that a robot holds, and the answer to its program at any time.
 
 Rows are played by the clock, `step_ns` each. While the robot stands still, so does the count of its
-steps: when rows have run out, and, with a program that waits for each answer, until it has come.
-The first row of a chunk that was made from an observation at that place is then the next one, and
-nothing is left out or played late.
+steps: when the rows that its program was given have run out, and, with a program that waits for
+each answer, until it has come. The first row of a chunk that was made from an observation at that
+place is then the next one, and nothing is left out. The robot has not moved since, but all about it
+may have: a chunk is forgotten when its rows would be played more than `late_ns` after their time.
 """
 
 from copy import copy
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 
 from skytether.policy.players import HELD_MAX, Held, Player, Row
 from skytether.policy.values import ValueRefused
+from skytether.shared.base.units import SECOND_NS
 
 ROWS_MAX = 1024
 """Largest number of rows of a chunk."""
@@ -49,59 +51,97 @@ class Schedule:
         actions: see `Actions`.
         key: key of the actions in the policy's reply.
         step_ns: length of a step [ns].
+        late_ns: longest time by which a row is played later than it was planned for [ns].
         began_ns: time of step 0.
     """
 
     def __init__(
-        self, player: Player, actions: Actions, key: str, step_ns: int, began_ns: int
+        self,
+        player: Player,
+        actions: Actions,
+        key: str,
+        step_ns: int,
+        late_ns: int,
+        began_ns: int,
     ) -> None:
         self._player, self._actions, self._key = player, actions, key
-        self._step_ns, self._at_ns = step_ns, began_ns
+        self._late_ns = late_ns
+        self.step_ns, self._at_ns = step_ns, began_ns
         self._count = 0.0
         self._end = 0
         """First step without a row."""
+        self._given = 0
+        """The same of the rows that the program has: it plays its answer, whatever comes later."""
         self._reply: Any = None
         self._newest = -1
         """Call that the reply is an answer to."""
         self._first = 0
-        self.stands = False
-        """Whether the robot stands still now, although rows are left."""
+        self._stands = False
+        """Whether the robot stands still now, although rows may be left."""
+        self.stood_ns = 0.0
+        """Time for which it has stood still so far [ns]."""
+        self._made: dict[int, float] = {}
+        """The same when the observation of each chunk was made, by its call [ns]."""
         self.since_ns: int | None = began_ns
-        """Time since which no row has been left [ns]; None while rows are left."""
+        """Time since which the program has had no row [ns]; None while it has."""
 
-    def set_step(self, step_ns: int, *, now_ns: int) -> None:
-        self.advance(now_ns=now_ns)
-        self._step_ns = step_ns
+    def stand(self, *, now_ns: int) -> None:
+        """Stand still until `go`: the program waits for an answer. It calls between two rows, so
+        the count becomes a whole number.
+        """
+        self.advance(now_ns=now_ns, whole=True)
+        self._stands = True
 
-    @property
-    def step_ns(self) -> int:
-        return self._step_ns
+    def go(self, *, now_ns: int) -> None:
+        """Play on, as far as the program is given an answer."""
+        self._given = self.advance(now_ns=now_ns)
+        self._stands = False
 
-    def advance(self, *, now_ns: int) -> int:
+    def advance(self, *, now_ns: int, whole: bool = False) -> int:
         """Play the rows until now; returns the number of the present step."""
-        before = int(self._count)
-        passed = 0.0 if self.stands else (now_ns - self._at_ns) / self._step_ns
-        ends_ns = self._at_ns + int((self._end - self._count) * self._step_ns)
-        self._at_ns, self._count = now_ns, max(min(self._count + passed, self._end), self._count)
-        for step in range(before, int(self._count)):
+        before_ns, least = self._at_ns, self._count
+        count = least + (0.0 if self._stands else (now_ns - before_ns) / self.step_ns)
+        if whole:
+            count, least = round(count), int(least)
+        count = max(min(count, self._given), least)
+        for step in range(int(self._count), int(count)):
             self._player.row(step)
-        if self._count >= self._end and self.since_ns is None:
-            self.since_ns = ends_ns
-        return int(self._count)
+        if count >= self._given and self.since_ns is None:
+            ended_ns = before_ns + int((self._given - self._count) * self.step_ns)
+            self.since_ns = min(ended_ns, now_ns)
+        self.stood_ns += now_ns - before_ns - (count - self._count) * self.step_ns
+        self._at_ns, self._count = now_ns, count
+        if any(self._is_late(stood_ns) for stood_ns in self._made.values()):
+            self._forget()
+        return int(count)
+
+    def _is_late(self, stood_ns: float) -> bool:
+        return self.stood_ns - stood_ns > self._late_ns
+
+    def _forget(self) -> None:
+        """Forget chunks that are late, and what is known of those that are played."""
+        held = self._player.held
+        held = tuple(each for each in held if not self._is_late(self._made[each.generation]))
+        self._player.held = held
+        self._made = {each.generation: self._made[each.generation] for each in held}
+        step = int(self._count)
+        self._end = step + len(self._coming(step, ROWS_MAX + HELD_MAX)[0])
 
     def number(self, *, now_ns: int) -> int:
         """The player's number of the present step, from which a chunk counts its rows."""
         return self._player.number(self.advance(now_ns=now_ns))
 
-    def accept(self, call: int, first: int, reply: Any, *, now_ns: int) -> None:
+    def accept(self, call: int, first: int, stood_ns: float, reply: Any, *, now_ns: int) -> None:
         """Accept a chunk.
 
         Args:
             call: number of the call that it answers; that of a newer one is higher.
             first: number of the step of its observation, see `number`.
+            stood_ns: `stood_ns` at that time.
 
         Raises:
-            ValueRefused: the reply has no rows of actions, or other ones than those before.
+            ValueRefused: the reply has no rows of actions, or other ones than those before, or it
+                is too late for them.
         """
         rows = rows_of(reply, self._key).astype(np.float64)
         step = self.advance(now_ns=now_ns)
@@ -109,13 +149,17 @@ class Schedule:
             before = rows_of(self._reply, self._key).shape[1:]
             if before != rows.shape[1:]:
                 raise ValueRefused(f"{self._key}: got rows of {rows.shape[1:]}, expected {before}")
+        if self._reply is None:
+            stood_ns = self.stood_ns  # the robot has not moved yet, however long it has waited
+        elif self._is_late(stood_ns):
+            late_s = (self.stood_ns - stood_ns) / SECOND_NS
+            why = f"the robot has stood still since its observation for {late_s:.1f} s"
+            raise ValueRefused(f"{why}, longer than deadline and hold")
+        self._made[call] = stood_ns
         self._player.accept(Held(call, first, rows), step)
         if call > self._newest:
             self._newest, self._reply, self._first = call, reply, first
-        left = len(self._coming(step, ROWS_MAX + HELD_MAX)[0])
-        self._end = step + left
-        if left:
-            self.since_ns = None
+        self._forget()
 
     def left(self, *, now_ns: int) -> int:
         """Number of rows that are left."""
@@ -142,9 +186,13 @@ class Schedule:
         step = self.advance(now_ns=now_ns)
         made = rows_of(self._reply, self._key)
         rows, last = self._coming(step, len(made))
-        if not rows:
+        if rows:
+            self._given, self.since_ns = step + len(rows), None
+        else:
             kind = Kind.HOLD
-        assert last is not None
+            self.since_ns = now_ns if self.since_ns is None else self.since_ns
+        if last is None:
+            return Answer(kind, None, 0)
         fill = last if self._actions == "absolute" else np.zeros_like(last)
         every = np.stack([*rows, *[fill] * (len(made) - len(rows))]).astype(made.dtype, copy=False)
         cut = min(max(self._player.number(step) - self._first, 0), len(made) - 1)

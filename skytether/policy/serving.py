@@ -43,14 +43,14 @@ PATHS_MAX = 4
 AGAIN_NS = SECOND_NS
 """Time after which a connection to the policy that was lost is opened again."""
 POLICY = "policy"
-"""Peer of the line: `(POLICY, robot)`."""
+"""Peer of the line: `(POLICY, connection)`; a number is never used again, so that an answer that
+comes after its connection's end is nobody's."""
 
 
 class _Job(NamedTuple):
     """Observation that the policy is asked for an answer to."""
 
     call: int
-    first: int
     is_urgent: bool
     """Whether the robot has no more rows than come before the chunk does."""
     observation: bytes
@@ -70,8 +70,10 @@ class _Robot:
     answered: tuple[int, bytes] = (-1, b"")
     """Newest call that was answered, and the chunk."""
     asked_ns: int = 0
+    """Time at which the policy was asked, or its connection opened [ns]."""
     is_open: bool = False
     """Whether the connection to the policy is open."""
+    connection: int = 0
     opens_ns: int = 0
     """Time at which it is opened next, if it is not."""
     is_opening: bool = False
@@ -109,6 +111,9 @@ class PolicyEnd(Endpoint):
         self._patience_ns, self._gives_rows, self._rate_max = patience_ns, gives_rows, rate_max
         self._unpacked = unpacked
         self._robots: dict[int, _Robot] = {}
+        self._by_connection: dict[int, int] = {}
+        """Number of the robot of each connection to the policy."""
+        self._connections = 0
         self._metadata: bytes | None = None
         self._drops = Counter[str]()
         self._counts = Counter[str]()
@@ -153,7 +158,7 @@ class PolicyEnd(Endpoint):
             if message.stream != OBSERVATION:
                 raise ProtocolError(Drop.FIELD)
             if arrived := robot.exchange.accept(message, now_ns=now_ns):
-                self._observe(number, robot, arrived.message, now_ns)
+                self._observe(robot, arrived.message, now_ns)
             return
         if message.came:
             robot.exchange.learn(message, now_ns=now_ns)
@@ -188,8 +193,8 @@ class PolicyEnd(Endpoint):
             refusal = Refusal.FULL
         elif before and call.vehicle is None and at not in before.paths:
             # Without keys anybody may say that number; the robot that is there keeps it.
-            is_same = hello.boot_id == before.boot_id
-            refusal = Refusal.ACCEPTED if is_same else Refusal.TAKEN
+            is_there = now_ns - before.heard_ns < PATH_NS and hello.boot_id != before.boot_id
+            refusal = Refusal.TAKEN if is_there else Refusal.ACCEPTED
         session = 0
         if refusal is Refusal.ACCEPTED:
             if before is None or before.boot_id != hello.boot_id:
@@ -216,23 +221,27 @@ class PolicyEnd(Endpoint):
         before = self._robots.get(number)
         robot = _Robot(session, boot_id, call.line, Exchange(session, self._rate_max), now_ns)
         if before:  # its connection to the policy is a new one, too: an episode begins
-            self._close(number)
+            self._close(before)
         self._robots[number] = robot
-        self._open(number, robot)
+        self._open(number, robot, now_ns)
 
     # -- the policy ----------------------------------------------------------------------------
 
-    def _open(self, number: int, robot: _Robot) -> None:
-        robot.is_opening = True
-        self.send(Said.OPENED.value, (POLICY, number), LINE)
+    def _open(self, number: int, robot: _Robot, now_ns: int) -> None:
+        self._connections += 1
+        robot.is_opening, robot.asked_ns, robot.connection = True, now_ns, self._connections
+        self._by_connection[robot.connection] = number
+        self.send(Said.OPENED.value, (POLICY, robot.connection), LINE)
 
-    def _close(self, number: int) -> None:
-        self.send(Said.CLOSED.value, (POLICY, number), LINE)
+    def _close(self, robot: _Robot) -> None:
+        self._by_connection.pop(robot.connection, None)
+        self.send(Said.CLOSED.value, (POLICY, robot.connection), LINE)
 
-    def _hear_policy(self, said: bytes, number: int, now_ns: int) -> None:
-        robot = self._robots.get(number)
-        if robot is None:
+    def _hear_policy(self, said: bytes, connection: int, now_ns: int) -> None:
+        number = self._by_connection.get(connection)
+        if number is None:
             return
+        robot = self._robots[number]
         match said[:1]:
             case Said.OPENED:
                 robot.is_open, robot.is_opening = True, False
@@ -241,6 +250,10 @@ class PolicyEnd(Endpoint):
                 self._give_metadata(robot, now_ns)
             case Said.CLOSED:
                 self._lose(number, robot, said[1:].decode(errors="replace"), now_ns)
+                return
+            case _ if robot.thinking is None:
+                # Else the next observation would get this answer, and each further one that before.
+                self._lose(number, robot, "it answers what it was not asked", now_ns)
                 return
             case Said.MESSAGE:
                 self._counts["answers"] += 1
@@ -251,12 +264,13 @@ class PolicyEnd(Endpoint):
                 last = reason.splitlines()[-1][:200]
                 self._events.append(events.PolicyFailed(robot=number, reason=last))
                 self._finish(robot, b"", last, now_ns)
-        self._ask(number, robot, now_ns)
+        self._ask(robot, now_ns)
 
     def _lose(self, number: int, robot: _Robot, reason: str, now_ns: int) -> None:
         if robot.is_open or not robot.opens_ns:
             lost = events.UpstreamLost(robot=number, reason=reason[:200] or "closed")
             self._events.append(lost)
+        self._close(robot)
         robot.is_open = robot.is_opening = False
         robot.opens_ns = now_ns + AGAIN_NS
         self._finish(robot, b"", f"the policy's connection was lost: {reason[:100]}", now_ns)
@@ -266,23 +280,24 @@ class PolicyEnd(Endpoint):
         job, robot.thinking = robot.thinking, None
         if job is None:
             return
-        message = values.pack([job.call, job.first, reply, error])
+        message = values.pack([job.call, reply, error])
         if len(message) > values.BYTES_MAX:
             error = f"the policy's reply has {len(message)} B"
-            message = values.pack([job.call, job.first, b"", error])
-        robot.answered = job.call, message
+            message = values.pack([job.call, b"", error])
+        if not error:  # else the robot may ask again
+            robot.answered = job.call, message
         robot.exchange.send(CHUNK, message, now_ns=now_ns, is_urgent=job.is_urgent)
 
     def _give_metadata(self, robot: _Robot, now_ns: int) -> None:
-        if self._metadata is not None and not robot.has_metadata and robot.paths:
-            robot.has_metadata = True
+        is_due = not (robot.has_metadata or robot.exchange.is_sending(METADATA))
+        if self._metadata is not None and is_due:
             content = values.pack([self._gives_rows, self._metadata])
             robot.exchange.send(METADATA, content, now_ns=now_ns)
 
-    def _observe(self, number: int, robot: _Robot, message: bytes, now_ns: int) -> None:
+    def _observe(self, robot: _Robot, message: bytes, now_ns: int) -> None:
         try:
-            call, first, left, delay, coming, seen = values.unpack(message)
-            if not all(type(each) is int for each in (call, first, left, delay)):
+            call, left, delay, coming, seen = values.unpack(message)
+            if not all(type(each) is int for each in (call, left, delay)):
                 raise ProtocolError(Drop.FIELD)
             if any(job and job.call == call for job in (robot.thinking, robot.waiting)):
                 return  # sent again
@@ -299,16 +314,16 @@ class PolicyEnd(Endpoint):
             raise ProtocolError(Drop.FIELD) from None
         self._counts["observations"] += 1
         self._counts["replaced"] += robot.waiting is not None
-        robot.waiting = _Job(call, first, left <= delay, content)
-        self._ask(number, robot, now_ns)
+        robot.waiting = _Job(call, left <= delay, content)
+        self._ask(robot, now_ns)
 
-    def _ask(self, number: int, robot: _Robot, now_ns: int) -> None:
+    def _ask(self, robot: _Robot, now_ns: int) -> None:
         """Ask the policy about the newest observation, if it is free."""
         if robot.waiting and robot.is_open and robot.thinking is None:
             robot.thinking, robot.waiting = robot.waiting, None
             robot.asked_ns = now_ns
             said = Said.MESSAGE.value + robot.thinking.observation
-            self.send(said, (POLICY, number), LINE)
+            self.send(said, (POLICY, robot.connection), LINE)
 
     # -- time ----------------------------------------------------------------------------------
 
@@ -316,7 +331,7 @@ class PolicyEnd(Endpoint):
         due = []
         for robot in self._robots.values():
             due.append(robot.heard_ns + SILENCE_NS)
-            if robot.thinking:
+            if robot.thinking or robot.is_opening:
                 due.append(robot.asked_ns + self._patience_ns)
             if not (robot.is_open or robot.is_opening):
                 due.append(robot.opens_ns)
@@ -330,15 +345,15 @@ class PolicyEnd(Endpoint):
             if silence_ns >= SILENCE_NS:
                 silence_s = silence_ns / SECOND_NS
                 self._events.append(events.RobotSilent(robot=number, silence_s=silence_s))
-                self._close(number)
+                self._close(robot)
                 del self._robots[number]
                 continue
-            if robot.thinking and now_ns - robot.asked_ns >= self._patience_ns:
-                self._close(number)
+            is_asked = robot.thinking or robot.is_opening
+            if is_asked and now_ns - robot.asked_ns >= self._patience_ns:
                 waited_s = self._patience_ns / SECOND_NS
                 self._lose(number, robot, f"no answer in {waited_s:g} s", now_ns)
             if not (robot.is_open or robot.is_opening) and now_ns >= robot.opens_ns:
-                self._open(number, robot)
+                self._open(number, robot, now_ns)
         self._send(now_ns)
 
     def _send(self, now_ns: int) -> None:

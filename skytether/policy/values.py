@@ -16,7 +16,9 @@ from numpy.typing import NDArray
 
 ARRAY, GENERIC = b"__ndarray__", b"__npgeneric__"
 BYTES_MAX = 4_000_000
-"""Largest size of a value [B]: 20 MB of raw images would take seconds at 10 Mbit/s."""
+"""Largest size of a value that is sent [B]: 20 MB of raw images would take seconds at 10 Mbit/s."""
+MADE_BYTES_MAX = 64_000_000
+"""Largest size of a value before it is compressed, and of its images after it [B]."""
 AXES_MAX = 8
 _DTYPE = re.compile(r"[<>|=]?[biuf][1248]|[<>|=]?f16")
 
@@ -38,17 +40,20 @@ def pack(value: Any) -> bytes:
     return packed
 
 
-def unpack(data: bytes, hook: Callable[[dict[Any, Any]], Any] | None = None) -> Any:
+def unpack(
+    data: bytes, hook: Callable[[dict[Any, Any]], Any] | None = None, most: int = BYTES_MAX
+) -> Any:
     """Value of bytes; arrays are views of the bytes, and cannot be written.
 
     Args:
         hook: called with each map that is no array, and returns what takes its place.
+        most: largest number of bytes.
 
     Raises:
         ValueRefused: the bytes are no value.
     """
-    if len(data) > BYTES_MAX:
-        raise ValueRefused(f"got {len(data)} B, expected at most {BYTES_MAX}")
+    if len(data) > most:
+        raise ValueRefused(f"got {len(data)} B, expected at most {most}")
 
     def made(table: dict[Any, Any]) -> Any:
         if ARRAY in table:

@@ -13,19 +13,22 @@ from contextlib import suppress
 from itertools import count
 
 from websockets.asyncio.client import connect
+from websockets.asyncio.connection import Connection
 from websockets.asyncio.server import ServerConnection, serve
 from websockets.exceptions import ConnectionClosed, InvalidURI, WebSocketException
 from websockets.http11 import Request, Response
 
 from skytether.policy.robot import LINE, Said
+from skytether.policy.values import MADE_BYTES_MAX
 from skytether.shared.endpoints.endpoint import Address, Datagram
 from skytether.shared.events.flight import address_text
 from skytether.shell.host.udp import AddressError, from_kernel, to_kernel
 
-BYTES_MAX = 64_000_000
-"""Largest message of a websocket [B]: a larger observation is refused by name before it is sent."""
+ANSWERS_MAX = 16
+"""Number of answers that may wait until a program reads them; then its connection is closed."""
 PROGRAM = "program"
 Hear = Callable[[Datagram], None]
+Messages = asyncio.Queue[bytes | str]
 
 
 class ProgramLine:
@@ -37,8 +40,8 @@ class ProgramLine:
 
     def __init__(self, bind: Address, hear: Hear) -> None:
         self._hear = hear
-        self._connections: dict[int, ServerConnection] = {}
-        self._sending = set[asyncio.Task[None]]()
+        self._connections: dict[int, tuple[ServerConnection, Messages]] = {}
+        self._closing = set[asyncio.Task[None]]()
         self._numbers = count(1)
         host, port = bind
         try:
@@ -50,23 +53,28 @@ class ProgramLine:
         self.address: Address = from_kernel(self._socket.getsockname())
 
     def send(self, payload: bytes, peer: Address) -> bool:
-        connection = self._connections.get(peer[1])
-        if connection is None:
+        if peer[1] not in self._connections:
+            return False
+        connection, answers = self._connections[peer[1]]
+        if answers.full():
+            self._close(connection, "the answers are not read")
             return False
         said = payload[1:]
-        task = asyncio.get_running_loop().create_task(
-            _send(connection, said.decode() if payload[:1] == Said.ERROR else said)
-        )
-        self._sending.add(task)
-        task.add_done_callback(self._sending.discard)
+        answers.put_nowait(said.decode() if payload[:1] == Said.ERROR else said)
         return True
+
+    def _close(self, connection: ServerConnection, reason: str) -> None:
+        """Close a connection, without waiting for its program, which may be frozen."""
+        task = asyncio.get_running_loop().create_task(connection.close(reason=reason))
+        self._closing.add(task)
+        task.add_done_callback(self._closing.discard)
 
     async def run(self) -> None:
         async with serve(
             self._serve,
             sock=self._socket,
             compression=None,
-            max_size=BYTES_MAX,
+            max_size=2 * MADE_BYTES_MAX,
             process_request=_health,
         ):
             await asyncio.get_running_loop().create_future()
@@ -74,17 +82,19 @@ class ProgramLine:
     async def _serve(self, connection: ServerConnection) -> None:
         number = next(self._numbers)
         peer = PROGRAM, number
-        before = list(self._connections.values())
-        self._connections[number] = connection
+        for each, _ in self._connections.values():
+            self._close(each, "another program has connected")
+        answers = Messages(ANSWERS_MAX)
+        self._connections[number] = connection, answers
         self._hear(Datagram(Said.OPENED.value, peer, LINE))
+        writer = asyncio.get_running_loop().create_task(_write(connection, answers))
         try:
-            for each in before:
-                await each.close(reason="another program has connected")
             with suppress(ConnectionClosed):
                 async for message in connection:
-                    if isinstance(message, bytes):
-                        self._hear(Datagram(Said.MESSAGE.value + message, peer, LINE))
+                    said = message.encode() if isinstance(message, str) else message
+                    self._hear(Datagram(Said.MESSAGE.value + said, peer, LINE))
         finally:
+            writer.cancel()
             del self._connections[number]
             self._hear(Datagram(Said.CLOSED.value, peer, LINE))
 
@@ -102,14 +112,14 @@ class PolicyLine:
     def __init__(self, url: str, api_key: str, hear: Hear) -> None:
         self._url, self._hear = url, hear
         self._headers = {"Authorization": f"Api-Key {api_key}"} if api_key else None
-        self._waiting: dict[Address, asyncio.Queue[bytes]] = {}
+        self._waiting: dict[Address, Messages] = {}
+        """Observations for each connection, of which `PolicyEnd` sends one at a time."""
         self._tasks: dict[Address, asyncio.Task[None]] = {}
 
     def send(self, payload: bytes, peer: Address) -> bool:
         match payload[:1]:
             case Said.OPENED:
-                self._end(peer)
-                self._waiting[peer] = asyncio.Queue()
+                self._waiting[peer] = Messages()
                 self._tasks[peer] = asyncio.get_running_loop().create_task(self._speak(peer))
             case Said.CLOSED:
                 self._end(peer)
@@ -133,20 +143,26 @@ class PolicyLine:
         waiting, reason = self._waiting[peer], ""
         try:
             async with connect(
-                self._url, compression=None, max_size=BYTES_MAX, additional_headers=self._headers
+                self._url,
+                compression=None,
+                max_size=2 * MADE_BYTES_MAX,
+                additional_headers=self._headers,
+                ping_interval=None,  # openpi's server answers no ping while its policy thinks
             ) as connection:
                 metadata = await connection.recv()
                 if isinstance(metadata, str):
                     raise TypeError("it sends text where openpi sends its metadata")
                 self._hear(Datagram(Said.OPENED.value + metadata, peer, LINE))
-                while True:
-                    await connection.send(await waiting.get())
-                    reply = await connection.recv()
-                    if isinstance(reply, str):
-                        said = Said.ERROR.value + reply.encode()
-                    else:
-                        said = Said.MESSAGE.value + reply
-                    self._hear(Datagram(said, peer, LINE))
+                writer = asyncio.get_running_loop().create_task(_write(connection, waiting))
+                try:
+                    async for reply in connection:
+                        if isinstance(reply, str):
+                            said = Said.ERROR.value + reply.encode()
+                        else:
+                            said = Said.MESSAGE.value + reply
+                        self._hear(Datagram(said, peer, LINE))
+                finally:
+                    writer.cancel()
         except (OSError, WebSocketException, TypeError) as error:
             reason = str(error) or type(error).__name__
         self._hear(Datagram(Said.CLOSED.value + reason.encode(), peer, LINE))
@@ -163,9 +179,11 @@ def check_url(url: str) -> str:
     return ""
 
 
-async def _send(connection: ServerConnection, message: bytes | str) -> None:
+async def _write(connection: Connection, messages: Messages) -> None:
+    """Send what is put into a queue, until the connection is closed."""
     with suppress(ConnectionClosed):
-        await connection.send(message)
+        while True:
+            await connection.send(await messages.get())
 
 
 def _health(connection: ServerConnection, request: Request) -> Response | None:

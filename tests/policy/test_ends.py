@@ -8,25 +8,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from policy_lab import MS, OPTIONS, Lab, ramp
-from skytether.client.secure import SecureLink
+from policy_lab import MS, OPTIONS, Lab, first_row, keyed, ramp, secured, state
 from skytether.policy import values
 from skytether.policy.images import Compressor, unpacked
 from skytether.policy.players import Freshest, Queue
 from skytether.policy.robot import RobotOptions, Said
 from skytether.policy.virtual import ROBOT, SERVER, NoActionError
-from skytether.server.secure import SecureGate
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.endpoints.endpoint import Datagram
-from skytether.shared.wire.keys import SECRET_BYTES, Keyring, VehicleKey
-
-
-def state(position: float) -> dict[str, Any]:
-    return {"state": np.array([position])}
-
-
-def first_row(reply: Any) -> float:
-    return float(reply["actions"][0, 0])
 
 
 def test_without_a_network_the_answer_is_the_policys_own() -> None:
@@ -275,20 +264,6 @@ def test_a_server_that_was_restarted_is_found_again() -> None:
 
 
 # -- keys --------------------------------------------------------------------------------------
-
-
-def entropy() -> Any:
-    return np.random.default_rng(3).bytes
-
-
-def keyed(seed: int = 1) -> VehicleKey:
-    return VehicleKey.of(1, 0, np.random.default_rng(seed).bytes(SECRET_BYTES))
-
-
-def secured(key: VehicleKey | None = None, **options: Any) -> Lab:
-    link = SecureLink(key or keyed(), entropy=entropy())
-    gate = SecureGate(Keyring("test", {(1, 0): keyed()}), entropy=entropy())
-    return Lab(link=link, gate=gate, **options)
 
 
 def test_with_keys_nothing_is_readable_and_replays_change_nothing() -> None:
