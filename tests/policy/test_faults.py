@@ -1,0 +1,411 @@
+"""Faults, and what the robot got each time; docs/policy.md has the table."""
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from policy_lab import (
+    MS,
+    OPTIONS,
+    Around,
+    Lab,
+    first_row,
+    keyed,
+    ramp,
+    secured,
+    secured_gate,
+    state,
+)
+from skytether.client.secure import SecureLink
+from skytether.policy import values
+from skytether.policy.exchange import Exchange
+from skytether.policy.images import Compressor, unpacked
+from skytether.policy.messages import METADATA, OBSERVATION, PartMessage, decode
+from skytether.policy.robot import RobotEnd, RobotOptions, Said
+from skytether.policy.serving import PolicyEnd
+from skytether.policy.virtual import ROBOT, SERVER, NoActionError
+from skytether.server.gate import PlainGate
+from skytether.shared.base.units import MICROSECOND_NS, SECOND_NS
+from skytether.shared.endpoints.endpoint import Datagram
+
+KEYS = pytest.mark.parametrize("made", [Lab, secured], ids=["plain", "keys"])
+FAR = {"to_policy": "constant(20ms)", "to_robot": "constant(20ms)"}
+
+
+def fly(lab: Lab, calls: int, position: float = 0.0) -> tuple[list[float | None], float]:
+    """First rows of the answers to a program that plays five rows of each, None for an error, and
+    where it is then; each is answered by its deadline.
+    """
+    got = list[float | None]()
+    for _ in range(calls):
+        began_ns = lab.now_ns
+        try:
+            rows = lab.infer(state(position))["actions"][:5, 0].tolist()
+            position = rows[-1] + 1.0
+            got.append(rows[0])
+        except NoActionError:
+            got.append(None)
+        assert lab.now_ns - began_ns <= OPTIONS.deadline_ns
+        lab.sleep(0.1)
+    return got, position
+
+
+def flying(made: Any = Lab, **options: Any) -> tuple[Lab, float]:
+    lab = made(**(FAR | options))
+    lab.connect()
+    lab.infer(state(0.0))
+    lab.sleep(0.1)
+    _, position = fly(lab, 3, 5.0)
+    return lab, position
+
+
+def shares(lab: Lab) -> dict[str, int]:
+    answers: dict[str, int] = lab.robot.figures()["answers"]
+    return answers
+
+
+# -- processes ---------------------------------------------------------------------------------
+
+
+@KEYS
+def test_a_policys_end_that_was_killed_and_restarted(made: Any) -> None:
+    """Rows left, then hold, then errors, until the robot has found the new one after 3 to 4 s."""
+    lab, position = flying(made)
+    gate = PlainGate() if made is Lab else secured_gate()
+    lab.server = PolicyEnd(gate, boot_id=77, draw=lambda: 99)
+    got, position = fly(lab, 40, position)
+    assert got[:3] == [20.0, 24.0, 24.0]
+    assert got.index(None) * (OPTIONS.deadline_ns + 100 * MS) >= OPTIONS.hold_ns
+    assert None not in got[24:]
+    got, _ = fly(lab, 3, 100.0)
+    assert got == [100.0, 105.0, 110.0]
+
+
+@pytest.mark.parametrize(("made", "after_s"), [(Lab, 5), (secured, 2)], ids=["plain", "keys"])
+def test_a_robots_end_that_was_killed_and_restarted(made: Any, after_s: float) -> None:
+    """Its program connects anew, and waits for its first answer. Without keys the robot's number
+    belongs to the old address until it has been silent for 3 s.
+    """
+    lab, _ = flying(made)
+    link = (
+        lab.robot._link
+        if made is Lab
+        else SecureLink(keyed(), entropy=np.random.default_rng(8).bytes)
+    )
+    lab.robot = RobotEnd(1, {0: SERVER}, link, OPTIONS, boot_id=55)
+    moved = Around(lab.server)
+    moved.seen_as = lambda each: each if each.socket else each._replace(peer=("192.0.2.2", 5001))
+    moved.leaves = lambda each: each.peer != ROBOT
+    lab.server = moved  # type: ignore[assignment]
+    began_ns, before = lab.now_ns, len(lab.answers)
+    lab.say(Said.OPENED.value)
+    lab.run(lab.now_ns + 60 * SECOND_NS, lambda: len(lab.answers) > before)
+    assert first_row(lab.infer(state(7.0))) == 7.0
+    assert lab.now_ns - began_ns < after_s * SECOND_NS
+
+
+@pytest.mark.parametrize(("made", "after_s"), [(Lab, 5), (secured, 0)], ids=["plain", "keys"])
+def test_an_address_that_changes(made: Any, after_s: float) -> None:
+    """With keys nothing is lost; without, the robot says hello again after 3 s of silence."""
+    lab, position = flying(made)
+    moved = Around(lab.server)
+    moved.seen_as = lambda each: each if each.socket else each._replace(peer=("198.51.100.7", 9))
+    moved.leaves = lambda each: each.peer != ROBOT
+    lab.server = moved  # type: ignore[assignment]
+    got, _ = fly(lab, 5 + int(after_s * 4), position)
+    if after_s:
+        assert None in got
+        assert first_row(lab.infer(state(70.0))) == 70.0
+    else:
+        assert got == [20.0, 25.0, 30.0, 35.0, 40.0]
+
+
+@pytest.mark.parametrize("frozen", ["robot", "server"])
+def test_a_process_that_was_frozen(frozen: str) -> None:
+    """No row from before is played: the program gets hold or an error, then fresh chunks."""
+    lab, position = flying()
+    end = Around(getattr(lab, frozen))
+    setattr(lab, frozen, end)
+    lab.say(Said.MESSAGE.value + values.pack(state(position)))
+    before, end.until_ns = len(lab.answers), lab.now_ns + 5 * SECOND_NS
+    lab.run(end.until_ns, lambda: len(lab.answers) > before)
+    lab.run(end.until_ns + SECOND_NS)
+    assert len(lab.answers) == before + 1
+    lab.sleep(4)
+    got, _ = fly(lab, 3, 100.0)
+    assert got[-1] == 110.0 or got[-1] == 105.0
+    assert not {20.0, 25.0} & set(got)
+
+
+# -- the policy --------------------------------------------------------------------------------
+
+
+def test_a_policy_that_hangs() -> None:
+    """Rows left, hold, errors; after its patience the server connects anew, and all is well."""
+    lab, position = flying()
+    lab.thinking_ns = None
+    got, _ = fly(lab, 110, position)
+    assert got[0] == 20.0
+    assert set(got[10:]) == {None}
+    lab.thinking_ns = 0
+    lab.sleep(5)
+    assert first_row(lab.infer(state(50.0))) == 50.0
+
+
+def test_an_answer_that_comes_after_its_connection_was_given_up_is_nobodys() -> None:
+    lab, position = flying()
+    lab.thinking_ns = 31_120 * MS  # 100 ms after it is connected anew
+    lab.infer(state(-900.0))
+    lab.thinking_ns = 500 * MS
+    got, _ = fly(lab, 150, position)
+    assert all(each is None or each >= 0.0 for each in got)
+    assert got[-1] is not None
+    assert got[-1] > position
+
+
+def test_a_policy_that_answers_twice_is_connected_anew() -> None:
+    """Else each observation would get the answer to the one before."""
+    lab, position = flying()
+    lab.policy_says(Said.MESSAGE.value + values.pack(ramp(state(-900.0))), ("policy", 1))
+    got, position = fly(lab, 12, position)
+    assert all(each is None or each >= 20.0 for each in got)
+    assert first_row(lab.infer(state(position))) == position
+
+
+def test_a_policy_that_raises_at_the_first_call_is_asked_again() -> None:
+    fails = [True, True, False]
+
+    def policy(observation: Any) -> Any:
+        if fails.pop(0):
+            raise RuntimeError("no memory")
+        return ramp(observation)
+
+    lab = Lab(policy)
+    lab.connect()
+    assert first_row(lab.infer(state(3.0))) == 3.0
+    assert lab.now_ns < 4 * SECOND_NS
+
+
+def test_metadata_that_never_comes_is_asked_for_anew() -> None:
+    lab = Lab(ramp)
+    asked = lab._ask
+    lab._ask = lambda *_: None  # type: ignore[method-assign]
+    lab.say(Said.OPENED.value)
+    lab.sleep(20)
+    lab._ask = asked  # type: ignore[method-assign]
+    lab.sleep(15)
+    assert lab.answers
+    assert first_row(lab.infer(state(3.0))) == 3.0
+
+
+def test_rows_of_another_shape_are_not_played() -> None:
+    """Rows left of the chunk before, then hold, then an error; the log says why."""
+    lab = Lab(lambda seen: {"actions": np.zeros((10, 2 if seen["state"][0] < 20 else 3))}, **FAR)
+    lab.connect()
+    lab.infer(state(0.0))
+    lab.sleep(0.1)
+    assert lab.infer(state(20.0))["actions"].shape == (10, 2)
+    lab.sleep(2)
+    with pytest.raises(NoActionError):
+        lab.infer(state(20.0))
+    assert any("got rows of (3,), expected (2,)" in str(each) for each in lab.robot.events())
+
+
+@pytest.mark.parametrize("depth", [100, 600, 2000])
+def test_a_reply_that_is_nested_deep_is_an_error_at_most(depth: int) -> None:
+    lab = Lab(ramp, replace(OPTIONS, begin_ns=SECOND_NS), thinking=None)
+    lab.connect()
+    lab.say(Said.MESSAGE.value + values.pack(state(0.0)))
+    lab.sleep(0.1)
+    actions = values.pack("actions") + values.pack(np.zeros((3, 1)))
+    nested = values.pack("nested") + b"\x81\xa1a" * depth + b"\xc0"
+    lab.policy_says(Said.MESSAGE.value + b"\x82" + actions + nested, ("policy", 1))
+    lab.sleep(2)
+    assert len(lab.answers) == 2
+
+
+# -- observations ------------------------------------------------------------------------------
+
+
+def test_a_camera_that_stops() -> None:
+    """Its image is missing from the observation; the policy decides, and the rest goes on."""
+    lab = Lab(ramp, compress=Compressor(64), unpacked=unpacked, **FAR)
+    lab.connect()
+    image = np.zeros((240, 320, 3), np.uint8)
+    for position, cameras in enumerate([{"wrist": image, "top": image}, {"wrist": image}, {}] * 3):
+        assert first_row(lab.infer(state(position) | cameras)) == position
+        assert lab.asked[-1].keys() == {"state", *cameras}
+        lab.sleep(0.1)
+
+
+def test_observations_of_20_mb() -> None:
+    """Images of any size are resized first; what is still too large is an error that says so."""
+    lab = Lab(ramp, compress=Compressor(224), unpacked=unpacked, **FAR)
+    lab.connect()
+    image = np.zeros((1700, 1960, 3), np.uint8)
+    lab.infer(state(0.0) | {"wrist": image, "top": image})
+    assert lab.asked[-1]["top"].shape == (224, 224, 3)
+    with pytest.raises(NoActionError, match="expected at most 4000000"):
+        lab.infer(state(0.0) | {"cloud": np.zeros(20_000_000, np.uint8)})
+    got, _ = fly(lab, 2, 5.0)
+    assert got == [5.0, 10.0]
+
+
+def test_an_observation_that_is_nested_deep_is_an_error_at_once() -> None:
+    lab = Lab(ramp, compress=Compressor(32), unpacked=unpacked)
+    lab.connect()
+    lab.infer(state(0.0))
+    lab.say(Said.MESSAGE.value + b"\x81\xa1a" * 900 + b"\xc0")
+    lab.run(lab.now_ns)
+    assert lab.answers[-1][1].startswith(Said.ERROR.value + b"the observation is refused")
+
+
+# -- programs ----------------------------------------------------------------------------------
+
+
+def test_a_program_that_does_not_wait_for_its_answers_gets_each_in_order() -> None:
+    lab, position = flying()
+    before = len(lab.answers)
+    for _ in range(5):
+        lab.say(Said.MESSAGE.value + values.pack(state(position)))
+    lab.sleep(0.2)
+    assert len(lab.answers) == before + 5
+
+
+def test_of_two_programs_the_newest_is_the_robots() -> None:
+    lab, _ = flying()
+    other = ("program", 2)
+    lab.say(Said.OPENED.value, other)
+    lab.say(Said.MESSAGE.value + values.pack(state(0.0)))  # of the first: not heard
+    before = len(lab.answers)
+    lab.sleep(1)
+    assert len(lab.answers) == before + 1  # the metadata for the second
+    lab.say(Said.MESSAGE.value + values.pack(state(300.0)), other)
+    lab.sleep(0.2)
+    assert first_row(values.unpack(lab.answers[-1][1][1:])) == 300.0
+    lab.say(Said.CLOSED.value)  # the first has gone: nothing changes
+    lab.say(Said.MESSAGE.value + values.pack(state(310.0)), other)
+    lab.sleep(0.2)
+    assert first_row(values.unpack(lab.answers[-1][1][1:])) == 310.0
+
+
+def test_a_program_that_pauses_plays_nothing_old_and_its_pause_is_no_step() -> None:
+    lab, position = flying(options=RobotOptions("absolute", 150 * MS, rows=5))
+    lab.is_cut = True
+    lab.sleep(60)
+    assert fly(lab, 1, position)[0] in ([24.0], [None])
+    assert lab.robot.figures()["step_s"] <= 1.0
+
+
+# -- the network -------------------------------------------------------------------------------
+
+
+@KEYS
+def test_ten_thousand_hostile_datagrams(made: Any) -> None:
+    """From strangers, and in the name of each end's address: nothing changes."""
+    lab, position = flying(made)
+    rng = np.random.default_rng(6)
+    recorded = [payload for _, payload in lab.wire]
+    for count in range(10_000):
+        payload = bytearray(recorded[count % len(recorded)])
+        for at in rng.integers(len(payload), size=3):
+            payload[at] = rng.integers(256)
+        if made is Lab:  # without keys whoever knows the session may write in it
+            payload[3:8] = b"\xce" + rng.bytes(4)
+        lab.server.receive(Datagram(bytes(payload), ("203.0.113.9", 9)), now_ns=lab.now_ns)
+        lab.robot.receive(Datagram(bytes(payload), SERVER), now_ns=lab.now_ns)
+        lab.robot.receive(Datagram(bytes(payload), ("203.0.113.9", 9)), now_ns=lab.now_ns)
+    got, _ = fly(lab, 4, position)
+    assert got == [20.0, 25.0, 30.0, 35.0]
+
+
+def test_clocks_that_differ_and_jump() -> None:
+    """Only round trips and own steps count, whatever the other end's clock says."""
+    lab, position = flying(options=OPTIONS)
+    server = Around(lab.server)
+    lab.server = server  # type: ignore[assignment]
+    rate = lab.robot.figures()["link"]["rate_bytes_per_s"]
+    for hours in (3, 900, 901):
+        server.shift_ns = hours * 3600 * SECOND_NS
+        # A clock that jumps by more than 10 s is silence for a server: the session begins anew.
+        lab.sleep(6)
+        got, position = fly(lab, 20, position)
+        assert None not in got[1:]
+        assert got[-1] == position - 5.0
+    assert lab.robot.figures()["link"]["rate_bytes_per_s"] >= rate
+
+
+@pytest.mark.parametrize("sent_us", [2**32 - 50_000, 2**32 - 1])
+def test_stamps_that_wrap_and_messages_beyond_2_32(sent_us: int) -> None:
+    ends = Exchange(1), Exchange(1)
+    ends[0]._numbers[OBSERVATION] = 2**32 - 3
+    now_ns = sent_us * MICROSECOND_NS
+    for count in range(5):
+        ends[0].send(OBSERVATION, bytes(3000), now_ns=now_ns)
+        whole = None
+        for payload in ends[0].outbox(now_ns=now_ns):
+            message = decode(payload)
+            assert isinstance(message, PartMessage)
+            whole = ends[1].accept(message, now_ns=now_ns + 20 * MS) or whole
+        assert whole
+        assert whole.number == 2**32 - 2 + count
+        for payload in ends[1].outbox(now_ns=now_ns + 20 * MS):
+            ends[0].learn(decode(payload), now_ns=now_ns + 40 * MS)  # type: ignore[arg-type]
+        assert ends[0].pace.round_trip_ns == 40 * MS
+        assert ends[0].pace.queue_ns == 0
+        now_ns += 100 * MS
+
+
+def test_of_several_paths_one_is_dead() -> None:
+    lab = Lab(ramp, **FAR)
+    lab.robot = RobotEnd(1, {0: SERVER, 2: ("192.0.2.9", 1)}, lab.robot._link, OPTIONS, boot_id=1)
+    one = Around(lab.robot)
+    one.leaves = lambda each: each.socket != 2
+    lab.robot = one  # type: ignore[assignment]
+    lab.connect()
+    got, _ = fly(lab, 5) if lab.infer(state(0.0)) else ([], 0)
+    assert None not in got
+
+
+def test_a_deadline_below_the_networks_jitter() -> None:
+    """Each call is answered by then, and rows go on one by one while there are any."""
+    way = "gamma(60ms, 90ms, 30ms)"
+    options = RobotOptions("absolute", 20 * MS, step_ns=20 * MS, rows=5)
+    lab = Lab(ramp, options, to_policy=way, to_robot=way)
+    lab.connect()
+    position, rows = 0.0, list[float]()
+    for call in range(30):
+        began_ns = lab.now_ns
+        rows += lab.infer(state(position))["actions"][:5, 0].tolist()
+        assert call == 0 or lab.now_ns - began_ns <= 20 * MS
+        position = rows[-1] + 1.0
+        lab.sleep(0.1)
+    assert set(np.diff(rows)) <= {0.0, 1.0}
+    assert rows[-1] > 75.0
+
+
+def test_needed_observations_in_an_outage() -> None:
+    lab, position = flying(options=replace(OPTIONS, spare_rows=2))
+    lab.is_cut = True
+    got, position = fly(lab, 20, position)
+    assert None in got
+    lab.is_cut = False
+    lab.sleep(4)
+    got, _ = fly(lab, 6, position)
+    assert got[-1] is not None
+    assert got[-1] > position
+
+
+def test_under_a_low_rate_metadata_arrives_and_calls_go_on() -> None:
+    """A metadata message that takes longer than the robot's next question is sent on, not again."""
+    end = Exchange(1, rate_max=12_500.0)
+    end.send(METADATA, bytes(50_000), now_ns=0)
+    streams = list[int]()
+    for now_ns in range(0, 6 * SECOND_NS, 10 * MS):
+        end.send(OBSERVATION, bytes(2000), now_ns=now_ns)
+        sent = [decode(each) for each in end.outbox(now_ns=now_ns)]
+        streams += [each.stream for each in sent if isinstance(each, PartMessage)]
+    assert streams.count(METADATA) >= 45
+    assert streams[-1] == OBSERVATION
