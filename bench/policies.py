@@ -33,7 +33,7 @@ from skytether.netem.fate import Fates
 from skytether.netem.impairments.direction import impairments
 from skytether.netem.impairments.draws import SLOT_NS
 from skytether.policy import values
-from skytether.policy.images import Compressor, unpacked
+from skytether.policy.images import Compressor, Unpacker
 from skytether.policy.robot import RobotOptions
 from skytether.policy.virtual import Emulated
 from skytether.shared.base import files
@@ -256,7 +256,7 @@ class Virtual:
             thinking=cell.thinking_s,
             seed=seed,
             compress=Compressor(),
-            unpacked=unpacked,
+            unpacker=Unpacker,
         )
         self._ends.connect()
         self.infer = self._ends.infer

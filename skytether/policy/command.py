@@ -108,7 +108,7 @@ class JoinOptions(EndOptions):
     """Number of rows that the program plays of each answer: `action_horizon` of openpi's
     ActionChunkBroker, or 1 without one."""
     plays_on: bool = False
-    """Whether the robot goes on to play rows while its program waits for an answer."""
+    """Whether the robot goes on to play rows while its program waits for an answer; needs --step."""
     when: str = "always"
     """Which observations are sent: always, or needed(N): those for which fewer than N rows will be
     left when the answer comes."""
@@ -232,6 +232,8 @@ def _robot_options(options: JoinOptions) -> RobotOptions:
         if not found:
             raise _wrong("--when", options.when, "always or needed(N), as in needed(2)")
         spare = int(found[1])
+    if options.plays_on and options.step is None:
+        raise _wrong("--plays-on", "no --step", "one: it cannot be measured then")
     return RobotOptions(
         options.actions,
         _time_ns("--deadline", options.deadline),

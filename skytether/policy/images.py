@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageOps
 
-from skytether.policy.values import ValueRefused
+from skytether.policy.values import MADE_BYTES_MAX, ValueRefused
 
 SIDE_MIN, SIDE_MAX = 32, 4096
 JPEG, FIRST = b"__jpeg__", b"channels_first"
@@ -49,7 +49,7 @@ class Compressor:
         """Bytes of the newest image of each key as it was sent."""
 
     def __call__(self, observation: Any) -> Any:
-        """The observation, with each image in place as `unpacked` expects it."""
+        """The observation, with each image in place as `Unpacker` expects it."""
         return _mapped(observation, "", self._sent)
 
     def _sent(self, key: str, value: Any) -> Any:
@@ -70,22 +70,31 @@ class Compressor:
         return {JPEG: file.getvalue(), FIRST: first}
 
 
-def unpacked(table: dict[Any, Any]) -> Any:
-    """Image of a map that `Compressor` made; any other map as it is.
+class Unpacker:
+    """Images of one observation as they were."""
 
-    Raises:
-        ValueRefused: it is no image, or one that is too large.
-    """
-    if JPEG not in table:
-        return table
-    try:
-        with Image.open(io.BytesIO(table[JPEG]), formats=("JPEG",)) as image:
-            if max(image.size) > SIDE_MAX:  # checked before memory is taken for it
-                raise ValueRefused(f"got an image of {image.size}, expected at most {SIDE_MAX} px")
-            array = np.asarray(image.convert("RGB"))
-    except (OSError, TypeError, SyntaxError, Image.DecompressionBombError) as error:
-        raise ValueRefused(f"no image: {error}") from None
-    return np.ascontiguousarray(array.transpose(2, 0, 1)) if table.get(FIRST) else array
+    def __init__(self) -> None:
+        self._left = MADE_BYTES_MAX
+        """Bytes that further images may take."""
+
+    def __call__(self, table: dict[Any, Any]) -> Any:
+        """Image of a map that `Compressor` made; any other map as it is.
+
+        Raises:
+            ValueRefused: it is no image, or all of the observation's are too large.
+        """
+        if JPEG not in table:
+            return table
+        try:
+            with Image.open(io.BytesIO(table[JPEG]), formats=("JPEG",)) as image:
+                width, height = image.size
+                self._left -= 3 * width * height
+                if self._left < 0:  # checked before memory is taken for it
+                    raise ValueRefused(f"got images of more than {MADE_BYTES_MAX} B")
+                array = np.asarray(image.convert("RGB"))
+        except (OSError, TypeError, SyntaxError, Image.DecompressionBombError) as error:
+            raise ValueRefused(f"no image: {error}") from None
+        return np.ascontiguousarray(array.transpose(2, 0, 1)) if table.get(FIRST) else array
 
 
 def _mapped(value: Any, key: str, change: Callable[[str, Any], Any]) -> Any:

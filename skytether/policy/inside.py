@@ -16,7 +16,7 @@ import numpy as np
 
 from skytether.client.link import ClientLink, PlainLink
 from skytether.policy import values
-from skytether.policy.images import QUALITY, Compressor, unpacked
+from skytether.policy.images import QUALITY, Compressor, Unpacker
 from skytether.policy.robot import LINE, RobotEnd, RobotOptions, Said
 from skytether.policy.schedule import Actions
 from skytether.policy.serving import PolicyEnd
@@ -61,7 +61,7 @@ def policy_end(gate: Gate, **options: Any) -> PolicyEnd:
         gate,
         boot_id=secrets.randbits(63),
         draw=lambda: secrets.randbits(32),
-        unpacked=unpacked,
+        unpacker=Unpacker,
         **options,
     )
 

@@ -95,7 +95,8 @@ class RobotOptions:
     key: str = "actions"
     """Key of the actions in the policy's reply."""
     step_ns: int | None = None
-    """Length of a step; None: measured, as the time from an answer to the next call."""
+    """Length of a step; None: measured, as the time from an answer to the next call, in which a
+    robot that `plays_on` does not play just its rows."""
     rows: int = 1
     """Number of rows that the program plays of each answer, from which the step is measured."""
     plays_on: bool = False

@@ -92,7 +92,7 @@ class PolicyEnd(Endpoint):
             the rows that the robot plays from the observation's step on, as far as it has them, and
             those of them that it plays before a chunk can come.
         rate_max: bound of the rate at which a robot is sent to [B/s].
-        unpacked: what makes images of what `images.Compressor` made.
+        unpacker: makes what makes an observation's images of those of `images.Compressor`.
     """
 
     def __init__(
@@ -104,12 +104,12 @@ class PolicyEnd(Endpoint):
         patience_ns: int = 30 * SECOND_NS,
         gives_rows: bool = False,
         rate_max: float = RATE_MAX,
-        unpacked: Callable[[dict[Any, Any]], Any] | None = None,
+        unpacker: Callable[[], Callable[[dict[Any, Any]], Any]] | None = None,
     ) -> None:
         super().__init__()
         self._gate, self._boot_id, self._draw = gate, boot_id, draw
         self._patience_ns, self._gives_rows, self._rate_max = patience_ns, gives_rows, rate_max
-        self._unpacked = unpacked
+        self._unpacker = unpacker
         self._robots: dict[int, _Robot] = {}
         self._by_connection: dict[int, int] = {}
         """Number of the robot of each connection to the policy."""
@@ -304,7 +304,7 @@ class PolicyEnd(Endpoint):
             if call == robot.answered[0]:
                 robot.exchange.send(CHUNK, robot.answered[1], now_ns=now_ns, is_urgent=True)
                 return
-            observation = values.unpack(seen, self._unpacked)
+            observation = values.unpack(seen, self._unpacker and self._unpacker())
             if self._gives_rows and isinstance(observation, dict):
                 observation["delay_steps"] = delay
                 if coming is not None:

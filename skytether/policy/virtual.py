@@ -51,7 +51,7 @@ class Emulated:
         seed: seed of the network.
         metadata: what the policy says when it is connected.
         link, gate: of both ends, with keys or without.
-        compress, unpacked: see `images`.
+        compress, unpacker: see `images`.
         gives_rows: see `PolicyEnd`.
 
     Raises:
@@ -71,7 +71,7 @@ class Emulated:
         link: ClientLink | None = None,
         gate: Gate | None = None,
         compress: Callable[[Any], Any] = lambda observation: observation,
-        unpacked: Callable[[dict[Any, Any]], Any] | None = None,
+        unpacker: Callable[[], Callable[[dict[Any, Any]], Any]] | None = None,
         gives_rows: bool = False,
         boot_ids: tuple[int, int] = (1, 2),
     ) -> None:
@@ -91,7 +91,7 @@ class Emulated:
             boot_id=boot_ids[1],
             draw=lambda: next(sessions),
             gives_rows=gives_rows,
-            unpacked=unpacked,
+            unpacker=unpacker,
         )
         self.now_ns = 0
         self.answers: list[tuple[int, bytes]] = []

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from policy_lab import MS, OPTIONS, Lab, first_row, keyed, ramp, secured, state
 from skytether.policy import values
-from skytether.policy.images import Compressor, unpacked
+from skytether.policy.images import Compressor, Unpacker
 from skytether.policy.players import Freshest, Queue
 from skytether.policy.robot import RobotOptions, Said
 from skytether.policy.virtual import ROBOT, SERVER, NoActionError
@@ -207,7 +207,7 @@ def test_the_policy_is_given_the_rows_that_the_robot_will_play() -> None:
 
 
 def test_images_and_their_bytes() -> None:
-    lab = Lab(ramp, compress=Compressor(64), unpacked=unpacked)
+    lab = Lab(ramp, compress=Compressor(64), unpacker=Unpacker)
     lab.connect()
     image = np.zeros((240, 320, 3), np.uint8)
     lab.infer(state(0.0) | {"camera": image})

@@ -21,7 +21,7 @@ from policy_lab import (
 from skytether.client.secure import SecureLink
 from skytether.policy import values
 from skytether.policy.exchange import Exchange
-from skytether.policy.images import Compressor, unpacked
+from skytether.policy.images import Compressor, Unpacker
 from skytether.policy.messages import METADATA, OBSERVATION, PartMessage, decode
 from skytether.policy.robot import RobotEnd, RobotOptions, Said
 from skytether.policy.serving import PolicyEnd
@@ -231,7 +231,7 @@ def test_a_reply_that_is_nested_deep_is_an_error_at_most(depth: int) -> None:
 
 def test_a_camera_that_stops() -> None:
     """Its image is missing from the observation; the policy decides, and the rest goes on."""
-    lab = Lab(ramp, compress=Compressor(64), unpacked=unpacked, **FAR)
+    lab = Lab(ramp, compress=Compressor(64), unpacker=Unpacker, **FAR)
     lab.connect()
     image = np.zeros((240, 320, 3), np.uint8)
     for position, cameras in enumerate([{"wrist": image, "top": image}, {"wrist": image}, {}] * 3):
@@ -242,7 +242,7 @@ def test_a_camera_that_stops() -> None:
 
 def test_observations_of_20_mb() -> None:
     """Images of any size are resized first; what is still too large is an error that says so."""
-    lab = Lab(ramp, compress=Compressor(224), unpacked=unpacked, **FAR)
+    lab = Lab(ramp, compress=Compressor(224), unpacker=Unpacker, **FAR)
     lab.connect()
     image = np.zeros((1700, 1960, 3), np.uint8)
     lab.infer(state(0.0) | {"wrist": image, "top": image})
@@ -254,7 +254,7 @@ def test_observations_of_20_mb() -> None:
 
 
 def test_an_observation_that_is_nested_deep_is_an_error_at_once() -> None:
-    lab = Lab(ramp, compress=Compressor(32), unpacked=unpacked)
+    lab = Lab(ramp, compress=Compressor(32), unpacker=Unpacker)
     lab.connect()
     lab.infer(state(0.0))
     lab.say(Said.MESSAGE.value + b"\x81\xa1a" * 900 + b"\xc0")

@@ -1,5 +1,6 @@
 """`policy.values` and `policy.images`: openpi's bytes, bounds, and images on their way."""
 
+import io
 from contextlib import suppress
 
 import msgpack
@@ -9,9 +10,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 from openpi_client import image_tools, msgpack_numpy
+from PIL import Image
 
 from skytether.policy import values
-from skytether.policy.images import Compressor, unpacked
+from skytether.policy.images import Compressor, Unpacker
 from skytether.policy.values import ValueRefused
 
 KINDS = st.sampled_from(["<f4", "<f8", "|u1", "<i8", "|b1", ">i2"]).map(np.dtype)
@@ -99,7 +101,7 @@ def test_images_are_resized_as_openpi_does_and_arrive_in_their_axes(*, first: bo
     image = picture(120, 160)
     given_ = image.transpose(2, 0, 1) if first else image
     sent = values.pack(Compressor(64)({"images": {"wrist": given_}, "state": np.zeros(3)}))
-    came = values.unpack(sent, unpacked)["images"]["wrist"]
+    came = values.unpack(sent, Unpacker())["images"]["wrist"]
     assert came.shape == ((3, 64, 64) if first else (64, 64, 3))
     expected = image_tools.resize_with_pad(image, 64, 64).astype(int)
     difference = (came.transpose(1, 2, 0) if first else came).astype(int) - expected
@@ -109,11 +111,20 @@ def test_images_are_resized_as_openpi_does_and_arrive_in_their_axes(*, first: bo
 
 def test_a_raw_image_and_what_is_no_image_are_unchanged() -> None:
     observation = {"a": picture(40, 40), "mask": np.zeros((40, 40, 2), np.uint8), "n": 3}
-    came = values.unpack(values.pack(Compressor(raw=["a"])(observation)), unpacked)
+    came = values.unpack(values.pack(Compressor(raw=["a"])(observation)), Unpacker())
     assert same(came, observation)
 
 
 @pytest.mark.parametrize("jpeg", [b"", b"no image", 3, b"\xff\xd8\xff" + bytes(50)])
 def test_an_image_that_is_none_is_refused(jpeg: object) -> None:
     with pytest.raises(ValueRefused):
-        values.unpack(msgpack.packb({b"__jpeg__": jpeg}), unpacked)
+        values.unpack(msgpack.packb({b"__jpeg__": jpeg}), Unpacker())
+
+
+def test_images_that_take_too_much_memory_are_refused_before_it_is_taken() -> None:
+    file = io.BytesIO()
+    Image.new("L", (4096, 4096)).save(file, "JPEG", quality=1)
+    assert file.tell() < 300_000
+    images = msgpack.packb([{b"__jpeg__": file.getvalue()}] * 2)
+    with pytest.raises(ValueRefused, match="more than"):
+        values.unpack(images, Unpacker())
