@@ -87,6 +87,8 @@ class Around:
             self._flush(now_ns)
 
     def next_wake_ns(self) -> int | None:
+        if self._waiting:
+            return self.until_ns
         wake_ns = self.end.next_wake_ns()
         return wake_ns if wake_ns is None else max(wake_ns - self.shift_ns, self.until_ns)
 

@@ -2,6 +2,7 @@
 
 import re
 import secrets
+import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
@@ -11,7 +12,7 @@ from typing import Annotated, Any, Literal
 
 import msgspec
 
-from skytether.policy import inside, web
+from skytether.policy import inside, metrics, web
 from skytether.policy.images import QUALITY, Compressor
 from skytether.policy.pace import RATE_MAX
 from skytether.policy.players import Clocked, Freshest, Player, Queue
@@ -27,7 +28,8 @@ from skytether.shell.driving.driver import Shell, run
 from skytether.shell.host.paths import NetworkPath
 from skytether.shell.host.udp import AddressError
 from skytether.shell.processes.log import Log, LogFormat
-from skytether.shell.processes.process import recorded
+from skytether.shell.processes.metrics import Metric
+from skytether.shell.processes.process import recorded, serving
 
 PLAYERS: dict[str, Callable[[], Player]] = {
     "clock": Clocked,
@@ -63,6 +65,8 @@ class EndOptions:
     measured."""
     log: LogFormat = "text"
     """Format in which each event is printed: a sentence, or a line of JSON for a program."""
+    metrics: str | None = None
+    """HTTP address for Prometheus metrics and /healthz, HOST:PORT."""
     json: Path | None = None
     """File for the counters at the end, as JSON."""
 
@@ -108,7 +112,8 @@ class JoinOptions(EndOptions):
     """Number of rows that the program plays of each answer: `action_horizon` of openpi's
     ActionChunkBroker, or 1 without one."""
     plays_on: bool = False
-    """Whether the robot goes on to play rows while its program waits for an answer; needs --step."""
+    """Whether the robot goes on to play rows while its program waits for an answer. Needs --step.
+    """
     when: str = "always"
     """Which observations are sent: always, or needed(N): those for which fewer than N rows will be
     left when the answer comes."""
@@ -170,7 +175,7 @@ def serve(argv: Sequence[str]) -> None:
     bound: list[Any] = list(binds)
     line = partial(web.PolicyLine, options.upstream, options.api_key)
     shell = _shell(end, bound, line=lambda hear, _: line(hear))
-    _drive("policy serve", end, shell, options, "robots")
+    _drive("policy serve", end.figures, shell, options, "robots", metrics.SERVE)
 
 
 def join(argv: Sequence[str]) -> None:
@@ -208,20 +213,25 @@ def join(argv: Sequence[str]) -> None:
         recorder = None
         if options.record:
             recorder = stack.enter_context(recorded(options.record, CALL_COLUMNS)).recorder
+        compress = Compressor(options.resize, options.quality, options.raw)
         end = RobotEnd(
             options.robot,
             {number: path.peer for number, path in numbered.items()},
             link,
             _robot_options(options),
             boot_id=secrets.randbits(63),
-            compress=Compressor(options.resize, options.quality, options.raw),
+            compress=compress,
             recorder=recorder,
         )
         listen = partial(web.ProgramLine, command.address("--listen", options.listen))
         shell = _shell(
             end, None, paths=numbered, is_patient=True, line=lambda hear, _: listen(hear)
         )
-        _drive("policy join", end, shell, options, "the robot's program")
+
+        def figures() -> dict[str, Any]:
+            return end.figures() | {"image_bytes": compress.bytes}
+
+        _drive("policy join", figures, shell, options, "the robot's program", metrics.JOIN)
 
 
 def _robot_options(options: JoinOptions) -> RobotOptions:
@@ -256,23 +266,38 @@ def _shell(end: Endpoint, bind: list[Any] | None, **options: Any) -> Shell:
         raise CommandError(str(error)) from None
 
 
-def _drive(name: str, end: Endpoint, shell: Shell, options: EndOptions, waiting_for: str) -> None:
-    with closing(Log(name, options.log, lambda _: None)) as out:
+def _drive(
+    name: str,
+    figures: Callable[[], dict[str, Any]],
+    shell: Shell,
+    options: EndOptions,
+    waiting_for: str,
+    table: Sequence[Metric],
+) -> None:
+    with (
+        closing(Log(name, options.log, lambda _: None)) as out,
+        serving(options.metrics, name, "", 0.0, table) as served,
+    ):
 
         def start() -> None:
             host, port = shell.address
             out.say(Listening(host=host, port=port, waiting_for=waiting_for))
 
         def counted() -> Counted:
-            figures = end.figures() | {"kernel_drops": shell.kernel_drops()}
-            return Counted(figures=figures | {"send_errors": shell.send_errors})
+            of_process = {"kernel_drops": shell.kernel_drops(), "send_errors": shell.send_errors}
+            return Counted(figures=figures() | of_process | {"cpu_s": time.process_time()})
+
+        def each_second() -> None:
+            out.each_second()
+            if served:
+                served.take(counted().figures)
 
         run(
             [shell],
             on_start=start,
             on_event=out.hear,
             on_usr1=lambda: out.say(counted()),
-            on_second=out.each_second,
+            on_second=each_second,
         )
         last = counted()
         out.say(last)

@@ -46,10 +46,11 @@ class Compressor:
     ) -> None:
         self._side, self._quality, self._raw = side, quality, frozenset(raw)
         self.bytes: dict[str, int] = {}
-        """Bytes of the newest image of each key as it was sent."""
+        """Bytes of each image of the newest observation, as it is sent, by its key."""
 
     def __call__(self, observation: Any) -> Any:
         """The observation, with each image in place as `Unpacker` expects it."""
+        self.bytes = {}
         return _mapped(observation, "", self._sent)
 
     def _sent(self, key: str, value: Any) -> Any:

@@ -201,6 +201,8 @@ class RobotEnd(Endpoint):
         self._late_ns = 0
         """Longest time by which an answer came after its deadline."""
         self._is_holding = False
+        self._age_ns, self._left = -1, 0
+        """Age of the newest answer's observation [ns], -1: none, and its rows by the policy."""
 
     # -- datagrams -----------------------------------------------------------------------------
 
@@ -444,8 +446,9 @@ class RobotEnd(Endpoint):
         self._counts[kind] += 1
         if not call.is_first:
             self._late_ns = max(self._late_ns, waited_ns - self._options.deadline_ns)
+        age_ns = now_ns - program.made_ns if program.newest >= 0 else -1
+        self._age_ns, self._left = age_ns, left
         if self._recorder:
-            age_ns = now_ns - program.made_ns if program.newest >= 0 else -1
             row = (now_ns, self._robot, call.number, KINDS.index(kind), waited_ns, age_ns, left)
             self._recorder.append_row(*row)
         if error:
@@ -499,5 +502,7 @@ class RobotEnd(Endpoint):
             "observations_refused": self._refused,
             "delay_s": max(self._delays_ns, default=0) / SECOND_NS,
             "step_s": program.schedule.step_ns / SECOND_NS if program else None,
+            "chunk_age_s": None if self._age_ns < 0 else self._age_ns / SECOND_NS,
+            "rows_left": self._left,
             "dropped": by_name(self._drops),
         } | ({"link": exchange.figures()} if exchange else {})

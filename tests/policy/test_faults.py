@@ -19,7 +19,7 @@ from policy_lab import (
     state,
 )
 from skytether.client.secure import SecureLink
-from skytether.policy import values
+from skytether.policy import metrics, values
 from skytether.policy.exchange import Exchange
 from skytether.policy.images import Compressor, Unpacker
 from skytether.policy.messages import METADATA, OBSERVATION, PartMessage, decode
@@ -29,6 +29,7 @@ from skytether.policy.virtual import ROBOT, SERVER, NoActionError
 from skytether.server.gate import PlainGate
 from skytether.shared.base.units import MICROSECOND_NS, SECOND_NS
 from skytether.shared.endpoints.endpoint import Datagram
+from skytether.shell.processes.metrics import families
 
 KEYS = pytest.mark.parametrize("made", [Lab, secured], ids=["plain", "keys"])
 FAR = {"to_policy": "constant(20ms)", "to_robot": "constant(20ms)"}
@@ -409,3 +410,21 @@ def test_under_a_low_rate_metadata_arrives_and_calls_go_on() -> None:
         streams += [each.stream for each in sent if isinstance(each, PartMessage)]
     assert streams.count(METADATA) >= 45
     assert streams[-1] == OBSERVATION
+
+
+# -- what is counted ---------------------------------------------------------------------------
+
+
+def test_every_figure_is_a_metric() -> None:
+    lab, _ = flying()
+    lab.server.receive(Datagram(b"x", ROBOT), now_ns=lab.now_ns)
+    lab.robot.receive(Datagram(b"x", SERVER), now_ns=lab.now_ns)
+    of_process = {"cpu_s": 1.0, "kernel_drops": 0, "send_errors": 0}
+    for end, own, more in (
+        (lab.robot, metrics.JOIN, {"image_bytes": {"wrist": 900}}),
+        (lab.server, metrics.SERVE, {}),
+    ):
+        exposed, unknown = families("policy", end.figures() | of_process | more, own)
+        assert not unknown
+        names = {each.name for each in exposed}
+        assert {each.exposed().name for each in own} <= names

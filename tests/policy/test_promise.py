@@ -3,15 +3,19 @@ out or played twice while there is no gap, and nothing old is played after one.
 """
 
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from policy_lab import MS, Around, Lab
+from policy_lab import MS, Around, Lab, ramp, secured, secured_gate, state
 from skytether.policy import values
+from skytether.policy.players import Clocked, Freshest, Queue
 from skytether.policy.robot import RobotOptions, Said
+from skytether.policy.serving import PolicyEnd
+from skytether.server.gate import PlainGate
 from skytether.shared.base.units import SECOND_NS
 
 ROWS, PLAYED, STEP_NS = 10, 5, 20 * MS
@@ -103,3 +107,94 @@ def test_the_promise(
         lab.run(lab.now_ns + played_ns - played_ns // 2)
         step += min(PLAYED, len(rows))
         assert len(lab.answers) == call + 1
+
+
+DOES = st.sampled_from(["raises", "hangs", "thinks", "closes", "twice", "nonsense"])
+DOES |= st.sampled_from(
+    ["call", "call", "call", "calls", "reconnect", "cut", "mend", "server", "robot", "frozen"]
+)
+
+
+@settings(deadline=None, max_examples=100)
+@given(
+    st.lists(st.tuples(DOES, st.integers(0, 400)), min_size=5, max_size=30),
+    st.sampled_from([OPTIONS, replace(OPTIONS, plays_on=True), replace(OPTIONS, step_ns=None)]),
+    st.sampled_from([None, 0, 3]),
+    st.sampled_from([Clocked, Freshest, partial(Queue, "average")]),
+    st.sampled_from([Lab, secured]),
+    st.integers(1, 99),
+)
+def test_whatever_happens_each_call_gets_one_answer_by_its_deadline(
+    does: list[tuple[str, int]],
+    options: RobotOptions,
+    spare: int | None,
+    player: Any,
+    made: Any,
+    seed: int,
+) -> None:
+    way = "gamma(20ms, 60ms, 30ms) & loss(10%)"
+    options = replace(options, spare_rows=spare, player=player, begin_ns=2 * SECOND_NS)
+    lab = made(options=options, to_policy=way, to_robot=way, seed=seed)
+    world, program = World(lab, seed), ("program", 1)
+    lab.say(Said.OPENED.value, program)
+    lab.sleep(2)
+    for number, (what, wait_ms) in enumerate(does, start=2):
+        if what == "reconnect":
+            program = "program", number
+            lab.say(Said.OPENED.value, program)
+        calls = {"call": 1, "calls": 2}.get(what, 0)
+        if not calls:
+            world.do(what)
+        before, began_ns = len(lab.answers), lab.now_ns
+        for _ in range(calls):
+            lab.say(Said.MESSAGE.value + values.pack(state(float(number))), program)
+        assert lab.robot._program
+        is_first = lab.robot._program.newest < 0
+        longest_ns = options.begin_ns if is_first else options.deadline_ns
+        limit_ns = max(began_ns, world.until_ns) + longest_ns + 1
+        lab.run(limit_ns if calls else began_ns)
+        answers = [each for each in lab.answers[before:] if not is_metadata(each[1])]
+        assert len(answers) == calls
+        lab.sleep(wait_ms / 1e3)
+
+
+def is_metadata(said: bytes) -> bool:
+    return b"scripted" in said
+
+
+class World:
+    """What happens around a robot's end."""
+
+    def __init__(self, lab: Lab, seed: int) -> None:
+        self._lab, self._rng = lab, np.random.default_rng(seed)
+        self.until_ns = 0
+
+    def _draw(self) -> int:
+        return int(self._rng.integers(2**32))
+
+    def do(self, what: str) -> None:
+        lab = self._lab
+        connection = "policy", lab.server._connections
+        match what:
+            case "cut" | "mend":
+                lab.is_cut = what == "cut"
+            case "server":
+                gate = secured_gate() if lab.server._gate.secure else PlainGate()
+                lab.server = PolicyEnd(gate, boot_id=int(self._rng.integers(99)), draw=self._draw)
+            case "robot" | "frozen":
+                name = "robot" if what == "robot" else "server"
+                end: Any = getattr(lab, name)
+                end = end if isinstance(end, Around) else Around(end)
+                end.until_ns = lab.now_ns + int(self._rng.integers(3000)) * MS
+                setattr(lab, name, end)
+                self.until_ns = lab.robot.until_ns if name == "robot" else self.until_ns
+            case "raises":
+                lab.policy_says(Said.ERROR.value + b"no memory", connection)
+            case "hangs" | "thinks":
+                lab.thinking_ns = None if what == "hangs" else int(self._rng.integers(2000)) * MS
+            case "closes":
+                lab.policy_says(Said.CLOSED.value, connection)
+            case "twice":
+                lab.policy_says(Said.MESSAGE.value + values.pack(ramp(state(0.0))), connection)
+            case "nonsense":
+                lab.policy_says(Said.MESSAGE.value + self._rng.bytes(30), connection)

@@ -2,6 +2,7 @@
 
 import asyncio
 import json
+import socket
 import subprocess
 import sys
 import threading
@@ -10,6 +11,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import Any
+from urllib.request import urlopen
 
 import numpy as np
 import pytest
@@ -120,18 +122,22 @@ def test_openpis_own_client_flies_through_both_commands(
     keys = ["--keys", str(tmp_path / "keys")]
     assert main(["keygen", keys[1]]) == 0
     capsys.readouterr()
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        metrics = f"127.0.0.1:{free.getsockname()[1]}"
     bad = ("--to-server", "constant(30ms) & loss(10%)", "--to-client", "constant(30ms) & loss(10%)")
     files = [f"--json={tmp_path / 'join.json'}", f"--record={tmp_path / 'calls.rows'}"]
     with (
         served(policy, *keys) as server,
         command("netem", "--bind", "127.0.0.1:0", "--server", server, *bad) as netem,
-        joined(netem, *keys, "--deadline", "2s", *files) as robot,
+        joined(netem, *keys, "--deadline", "2s", "--metrics", metrics, *files) as robot,
     ):
         client = WebsocketClientPolicy(f"ws://{robot}")
         assert client.get_server_metadata() == {"name": "ramp"}
         assert np.diff(calls(client, 15)).tolist() == [1.0] * 74
         with pytest.raises(RuntimeError, match="the observation is refused"):
             client.infer({"state": np.zeros(1), "image": np.zeros(5_000_000, np.uint8)})
+        with urlopen(f"http://{metrics}/metrics", timeout=10) as answer:
+            assert b'skytether_policy_answers_total{kind="fresh"}' in answer.read()
         client._ws.close()
     counted = json.loads((tmp_path / "join.json").read_text())
     assert counted["answers"] == {"fresh": 15, "rest": 0, "hold": 0, "error": 1}

@@ -14,7 +14,7 @@ import os
 import socket
 import threading
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from socketserver import ThreadingMixIn
 from typing import Any
@@ -30,7 +30,7 @@ from prometheus_client.registry import Collector
 from skytether.shared.endpoints.endpoint import Address
 from skytether.shell.host.udp import from_kernel, look_up
 from skytether.shell.host.web import HEADERS, host_name, is_ours
-from skytether.shell.processes.metrics import OWN, families, trouble
+from skytether.shell.processes.metrics import OWN, Metric, families, trouble
 
 CONNECTIONS_MAX = 8
 """Largest number of connections at once; a new connection closes the oldest."""
@@ -56,12 +56,15 @@ class Collected(Collector):
     Args:
         process: server, netem or client; `server.N` is worker N of a server, `netem N` that of
             path N.
+        table: metrics of its figures, of a process that `metrics` does not have.
     """
 
-    def __init__(self, process: str, scenario: str, step_s: float) -> None:
+    def __init__(
+        self, process: str, scenario: str, step_s: float, table: Sequence[Metric] = ()
+    ) -> None:
         self._process = process
         self._kind = process.partition(" ")[0].partition(".")[0]
-        self._scenario, self._step_s = scenario, step_s
+        self._scenario, self._step_s, self._table = scenario, step_s, table
         # Replaced as a whole, so that threads see either the old or the new figures.
         self._snapshot: tuple[Mapping[str, Any], float] | None = None
 
@@ -78,7 +81,7 @@ class Collected(Collector):
         if self._snapshot is None:
             return
         figures, taken_s = self._snapshot
-        metrics, unknown = families(self._kind, figures)
+        metrics, unknown = families(self._kind, figures, self._table)
         age_s.add_sample(age_s.name, {}, time.monotonic() - taken_s)
         unmapped.add_sample(unmapped.name, {}, float(len(unknown)))
         yield from (age_s, unmapped, *metrics)

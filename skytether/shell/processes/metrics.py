@@ -4,7 +4,7 @@ Each figure of an endpoint (`Endpoint.figures`) is in a table or in LEFT_OUT; ot
 counted, and fail a test. Names follow Prometheus: base units, `_total` for counters.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from prometheus_client.metrics_core import Metric as Exposed
@@ -65,7 +65,7 @@ class Metric(NamedTuple):
             exposed.add_sample(name, labels, float(value) * self.scale)
 
 
-def _table(text: str) -> tuple[Metric, ...]:
+def table(text: str) -> tuple[Metric, ...]:
     """Metrics of a table of two lines each: figure, name and labels; below them the help."""
     lines = iter(text.strip().splitlines())
     metrics = []
@@ -88,7 +88,7 @@ def _paths(process: str) -> tuple[Metric, ...]:
     )
 
 
-_PATH = _table("""
+_PATH = table("""
 packets packets_total
     Packets that were sent on the path, copies included.
 bytes bytes_total
@@ -104,7 +104,7 @@ first first_copies_total
 copies later_copies_total
     Later copies of packets from the other end that the path brought.
 """)
-_SERVER = _table("""
+_SERVER = table("""
 vehicles server_vehicles
     Vehicles in session.
 degraded server_degraded
@@ -152,7 +152,7 @@ by_vehicle/{vehicle}/clock_bound_ms server_vehicle_clock_bound_seconds
 by_vehicle/{vehicle}/clock_m server_vehicle_clock_metres
     Uncertainty of the vehicle's position along its motion that follows from its clock's offset.
 """) + _paths("server")
-_NETEM = _table("""
+_NETEM = table("""
 flows netem_flows
     Clients whose packets are forwarded; of `netem run`, the flows that it knows.
 refused netem_refused_packets_total
@@ -194,7 +194,7 @@ refused netem_refused_packets_total
 {direction}/queueing_ms_p99 netem_queueing_seconds quantile=0.99
     Time that packets waited for a limited rate.
 """)
-_CLIENT = _table("""
+_CLIENT = table("""
 missed client_missed_steps_total
     Steps that were missed because the process was late.
 by_vehicle/{vehicle}/mode client_mode
@@ -248,7 +248,7 @@ by_vehicle/{vehicle}/autopilot/round_trip_ms autopilot_round_trip_seconds
 by_vehicle/{vehicle}/autopilot/drift_ppm autopilot_clock_drift_ppm
     Rate at which the client's clock runs faster than the autopilot's.
 """) + _paths("client")
-_PROCESS = _table("""
+_PROCESS = table("""
 cpu_s cpu_seconds_total
     CPU time of the process.
 kernel_drops kernel_dropped_datagrams_total
@@ -263,7 +263,7 @@ feed/refused feed_refused_readers_total
     Readers of the feed that were refused because the feed was full.
 """)
 TABLES = {"server": _PROCESS + _SERVER, "netem": _PROCESS + _NETEM, "client": _PROCESS + _CLIENT}
-OWN = _table("""
+OWN = table("""
 - info
     Name of the process and of its scenario, as labels; the value is always 1.
 - step_seconds
@@ -295,17 +295,21 @@ LEFT_OUT = {
 """Figures that are deliberately not exported."""
 
 
-def families(process: str, figures: Mapping[str, Any]) -> tuple[list[Exposed], list[str]]:
+def families(
+    process: str, figures: Mapping[str, Any], own: Sequence[Metric] = ()
+) -> tuple[list[Exposed], list[str]]:
     """Convert figures to metrics; also returns the paths of figures in no table.
 
     Args:
         process: server, netem or client; other processes have only common metrics.
         figures: from `Endpoint.figures`, and those that the process adds.
+        own: metrics of a process that TABLES lacks.
     """
+    possible = (*_PROCESS, *own) if own else TABLES.get(process, _PROCESS)
     metrics: dict[str, Exposed] = {}
     unknown = []
     for path, value in flat(figures):
-        for metric in TABLES.get(process, _PROCESS):
+        for metric in possible:
             labels = matched(metric.figure, path)
             if labels is not None:
                 if metric.name not in metrics:
@@ -314,7 +318,7 @@ def families(process: str, figures: Mapping[str, Any]) -> tuple[list[Exposed], l
                 break
         else:
             left_out = LEFT_OUT.get(process, ())
-            if process in TABLES and all(matched(each, path) is None for each in left_out):
+            if (own or process in TABLES) and all(matched(each, path) is None for each in left_out):
                 unknown.append("/".join(path))
     return list(metrics.values()), unknown
 

@@ -171,7 +171,8 @@ class Process:
         if feed:
             feed.open(opened(self.name, options.scenario, running, feed))
         with ExitStack() as stack:
-            served = stack.enter_context(_served(self.name, options))
+            about = self.name, options.scenario, options.config.control.dt
+            served = stack.enter_context(serving(options.metrics, *about))
             try:
                 heeds = stack.enter_context(_controlled(options.control, running, journal))
                 shell = Shell(
@@ -334,17 +335,16 @@ def _followed(recorder: Recorder, feed: "Feed", part: str, columns: np.dtype[np.
 
 
 @contextmanager
-def _served(process: str, options: ProcessOptions) -> Iterator["Metrics | None"]:
-    """Serve metrics over HTTP during the block; None without an address."""
-    if options.metrics is None:
+def serving(at: str | None, *about: Any) -> Iterator["Metrics | None"]:
+    """Serve metrics, `exporter.Collected(*about)`, during the block; None without an address."""
+    if at is None:
         yield None
         return
-    address = command.address("--metrics", options.metrics)
+    address = command.address("--metrics", at)
     from skytether.shell.processes.exporter import Collected, Metrics, MetricsError
 
-    collected = Collected(process, options.scenario, options.config.control.dt)
     try:
-        metrics = Metrics(address, collected)
+        metrics = Metrics(address, Collected(*about))
     except MetricsError as error:
         at = address_text(*address)
         raise CommandError(f"--metrics: cannot listen at {at}: {error}", CONFIGURATION) from None
