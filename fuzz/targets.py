@@ -8,6 +8,7 @@ from types import MappingProxyType
 from fuzz.datagrams import SCENARIOS, Decoder, EndpointInFlight
 from fuzz.feeds import FeedTarget, PageTarget
 from fuzz.handshake import Holder, Strangers
+from fuzz.policies import RobotAndPolicy
 from fuzz.recordings import RecordingFile
 from fuzz.target import Target
 from fuzz.texts import ControlTarget, LogLines, NamedFiles, ScenarioFile
@@ -44,6 +45,7 @@ TARGETS: Mapping[str, Callable[[Path], Target]] = MappingProxyType(
         "files": NamedFiles,
         "feed": lambda _: FeedTarget(),
         "page": lambda _: PageTarget(),
+        "policy": lambda _: Both(RobotAndPolicy(), RobotAndPolicy(sealed=True)),
         "log": lambda _: LogLines(),
     }
 )

@@ -44,8 +44,10 @@ ABOUT = """usage: skytether policy serve|join ...
 A policy on another machine than its robot, over any network. `serve` runs beside
 the policy's server, `join` on the robot; openpi's client and server are as ever.
 
-    skytether policy serve --upstream ws://127.0.0.1:8000 --bind 0.0.0.0:47010 --keys FILE
-    skytether policy join gpu:47010 --listen 127.0.0.1:8000 --actions absolute --keys FILE
+    skytether policy serve --upstream ws://127.0.0.1:8000 --bind 0.0.0.0:47010
+        --keys FILE
+    skytether policy join gpu:47010 --listen 127.0.0.1:8000 --actions absolute
+        --keys FILE
 
 `skytether policy serve --help` and `skytether policy join --help` explain their options."""
 
@@ -146,8 +148,9 @@ def policy(argv: Sequence[str]) -> None:
         join(argv[1:])
     elif name in ("", "-h", "--help"):
         print(ABOUT)
-        if not name:
-            raise CommandError("policy: got nothing, expected serve or join", CONFIGURATION)
+        if name:
+            raise SystemExit(0)
+        raise CommandError("policy: got nothing, expected serve or join", CONFIGURATION)
     else:
         raise CommandError(f"policy: got {name!r}, expected serve or join", CONFIGURATION)
 

@@ -13,8 +13,7 @@ class PolicyJoined(RobotEvent):
 
 
 class RobotJoined(RobotEvent):
-    sentence = "robot {robot} at {peer} has joined"
-    peer: str
+    sentence = "robot {robot} has joined"
 
 
 class PolicySilent(RobotEvent):

@@ -29,7 +29,6 @@ from skytether.policy.values import ValueRefused
 from skytether.server.gate import Gate, GateCall, ReplyPath
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.endpoints.endpoint import Address, Datagram, Endpoint, by_name
-from skytether.shared.events.flight import address_text
 from skytether.shared.wire.drop import Drop, ProtocolError
 from skytether.shared.wire.protocol import Refusal
 
@@ -58,7 +57,6 @@ class _Job(NamedTuple):
 
 @dataclass(slots=True)
 class _Robot:
-    session: int
     boot_id: int
     reply: ReplyPath
     exchange: Exchange
@@ -78,6 +76,18 @@ class _Robot:
     """Time at which it is opened next, if it is not."""
     is_opening: bool = False
     has_metadata: bool = False
+
+    @property
+    def session(self) -> int:
+        return self.exchange.session
+
+    def hear(self, line: ReplyPath, datagram: Datagram, now_ns: int) -> None:
+        """Note from where a packet has come."""
+        at = datagram.socket, datagram.peer
+        self.reply, self.heard_ns, self.paths[at] = line, now_ns, now_ns
+        self.paths.move_to_end(at)
+        while len(self.paths) > PATHS_MAX:
+            self.paths.popitem(last=False)
 
 
 class PolicyEnd(Endpoint):
@@ -111,6 +121,8 @@ class PolicyEnd(Endpoint):
         self._patience_ns, self._gives_rows, self._rate_max = patience_ns, gives_rows, rate_max
         self._unpacker = unpacker
         self._robots: dict[int, _Robot] = {}
+        self._welcomed: dict[int, _Robot] = {}
+        """Robots of which nothing has come but a HELLO, which may be a repeat of an earlier run."""
         self._by_connection: dict[int, int] = {}
         """Number of the robot of each connection to the policy."""
         self._connections = 0
@@ -142,18 +154,11 @@ class PolicyEnd(Endpoint):
             return
         if isinstance(message, Welcome):
             raise ProtocolError(Drop.NOT_FOR_A_SERVER)
-        number = self._number(message.session, call)
+        number = self._number(message.session, call, now_ns)
         robot = self._robots[number]
-        at = datagram.socket, datagram.peer
-        if call.vehicle is None and at not in robot.paths:
+        if call.vehicle is None and (datagram.socket, datagram.peer) not in robot.paths:
             raise ProtocolError(Drop.ELSEWHERE)
-        robot.heard_ns = now_ns
-        if call.vehicle is not None:
-            robot.reply = call.line
-        robot.paths[at] = now_ns
-        robot.paths.move_to_end(at)
-        while len(robot.paths) > PATHS_MAX:
-            robot.paths.popitem(last=False)
+        robot.hear(call.line, datagram, now_ns)
         if isinstance(message, PartMessage):
             if message.stream != OBSERVATION:
                 raise ProtocolError(Drop.FIELD)
@@ -167,13 +172,16 @@ class PolicyEnd(Endpoint):
             self.send(call.line.seal(call.payload), datagram.peer, datagram.socket)
             self._give_metadata(robot, now_ns)
 
-    def _number(self, session: int, call: GateCall) -> int:
+    def _number(self, session: int, call: GateCall, now_ns: int) -> int:
         """Number of the robot of a session.
 
         Raises:
             ProtocolError: there is no such session, or it is another robot's.
         """
         if call.vehicle is not None:
+            welcomed = self._welcomed.get(call.vehicle)
+            if welcomed and welcomed.session == session:
+                self._begin(call.vehicle, now_ns)
             robot = self._robots.get(call.vehicle)
             if robot and robot.session == session:
                 return call.vehicle
@@ -186,44 +194,50 @@ class PolicyEnd(Endpoint):
     def _welcome(self, hello: Hello, call: GateCall, datagram: Datagram, now_ns: int) -> None:
         if call.vehicle is not None and hello.robot != call.vehicle:
             raise ProtocolError(Drop.OF_ANOTHER_VEHICLE)
-        number, at = hello.robot, (datagram.socket, datagram.peer)
-        before = self._robots.get(number)
+        number = hello.robot
+        present, session = self._robots.get(number), 0
         refusal = Refusal.ACCEPTED
-        if before is None and len(self._robots) >= ROBOTS_MAX:
+        if present is None and len(self._robots) >= ROBOTS_MAX:
             refusal = Refusal.FULL
-        elif before and call.vehicle is None and at not in before.paths:
+        elif present and call.vehicle is None and hello.boot_id != present.boot_id:
             # Without keys anybody may say that number; the robot that is there keeps it.
-            is_there = now_ns - before.heard_ns < PATH_NS and hello.boot_id != before.boot_id
-            refusal = Refusal.TAKEN if is_there else Refusal.ACCEPTED
-        session = 0
+            is_silent = now_ns - present.heard_ns >= PATH_NS
+            is_here = (datagram.socket, datagram.peer) in present.paths
+            refusal = Refusal.ACCEPTED if is_silent or is_here else Refusal.TAKEN
         if refusal is Refusal.ACCEPTED:
-            if before is None or before.boot_id != hello.boot_id:
-                self._begin(number, hello.boot_id, call, now_ns)
-            robot = self._robots[number]
-            robot.reply, robot.heard_ns, session = call.line, now_ns, robot.session
+            of_run = (present, self._welcomed.get(number))
+            robot = next((each for each in of_run if each and each.boot_id == hello.boot_id), None)
+            if robot is None:
+                exchange = Exchange(self._new_session(), self._rate_max)
+                robot = self._welcomed[number] = _Robot(hello.boot_id, call.line, exchange, now_ns)
+            session = robot.session
             if call.vehicle is None:
-                robot.paths[at] = now_ns
-                while len(robot.paths) > PATHS_MAX:
-                    robot.paths.popitem(last=False)
+                if robot is not present:
+                    self._begin(number, now_ns)
+                robot.hear(call.line, datagram, now_ns)
         welcome = Welcome(number, session, hello.boot_id, self._boot_id, refusal)
         self.send(call.line.seal(encode(welcome)), datagram.peer, datagram.socket)
         if session:
             self._gate.admit(call, now_ns=now_ns)
-            if before is None or before.boot_id != hello.boot_id:
-                peer = address_text(*datagram.peer)
-                self._events.append(events.RobotJoined(robot=number, peer=peer))
 
-    def _begin(self, number: int, boot_id: int, call: GateCall, now_ns: int) -> None:
-        session = 0
-        taken = {each.session for each in self._robots.values()}
-        while session == 0 or session in taken:
-            session = self._draw()
-        before = self._robots.get(number)
-        robot = _Robot(session, boot_id, call.line, Exchange(session, self._rate_max), now_ns)
-        if before:  # its connection to the policy is a new one, too: an episode begins
+    def _new_session(self) -> int:
+        robots = (*self._robots.values(), *self._welcomed.values())
+        taken = {0, *(each.session for each in robots)}
+        while (session := self._draw()) in taken:
+            pass
+        return session
+
+    def _begin(self, number: int, now_ns: int) -> None:
+        """Begin the session of a robot that was welcomed; it has a connection to the policy of its
+        own, for an episode begins.
+        """
+        before, robot = self._robots.get(number), self._welcomed.pop(number)
+        if before:
             self._close(before)
         self._robots[number] = robot
+        robot.heard_ns = now_ns
         self._open(number, robot, now_ns)
+        self._events.append(events.RobotJoined(robot=number))
 
     # -- the policy ----------------------------------------------------------------------------
 

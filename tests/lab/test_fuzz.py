@@ -38,6 +38,7 @@ COUNTS = {
     "files": 400,
     "feed": 2_000,
     "page": 120,
+    "policy": 600,
     "log": 2_000,
 }
 BY_AXES = pytest.mark.parametrize("scenario", SCENARIOS, ids=["2-D", "3-D", "splines"])

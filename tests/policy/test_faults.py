@@ -140,6 +140,23 @@ def test_a_process_that_was_frozen(frozen: str) -> None:
     assert not {20.0, 25.0} & set(got)
 
 
+def test_a_hello_of_an_earlier_run_ends_no_session() -> None:
+    """It was recorded when its run did not use the answer, so that the gate does not know it."""
+    lab, position = flying(secured)
+    link = SecureLink(keyed(), entropy=np.random.default_rng(9).bytes)
+    earlier = RobotEnd(1, {0: SERVER}, link, OPTIONS, boot_id=55)
+    earlier.wake(now_ns=lab.now_ns)
+    for _ in range(2):  # the answer to the first is a cookie
+        for each in earlier.outbox():
+            lab.server.receive(Datagram(each.payload, ("203.0.113.9", 9)), now_ns=lab.now_ns)
+        for each in lab.server.outbox():
+            if each.peer[0] == "203.0.113.9":
+                earlier.receive(Datagram(each.payload, SERVER), now_ns=lab.now_ns)
+    assert earlier._exchange is not None
+    got, _ = fly(lab, 3, position)
+    assert got == [20.0, 25.0, 30.0]
+
+
 # -- the policy --------------------------------------------------------------------------------
 
 
