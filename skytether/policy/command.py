@@ -41,15 +41,17 @@ RATES = {"kbit": 125.0, "mbit": 125e3, "gbit": 125e6}
 
 ABOUT = """usage: skytether policy serve|join ...
 
-A policy on another machine than its robot, over any network. `serve` runs beside
-the policy's server, `join` on the robot; openpi's client and server are as ever.
+A policy on another machine than its robot, over any network. `serve` runs
+beside the policy's server, `join` on the robot; openpi's client and server are
+as ever.
 
     skytether policy serve --upstream ws://127.0.0.1:8000 --bind 0.0.0.0:47010
         --keys FILE
     skytether policy join gpu:47010 --listen 127.0.0.1:8000 --actions absolute
         --keys FILE
 
-`skytether policy serve --help` and `skytether policy join --help` explain their options."""
+`skytether policy serve --help` and `skytether policy join --help` have their
+options."""
 
 
 @dataclass(frozen=True)
