@@ -3,7 +3,7 @@
 import re
 import secrets
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from functools import partial
@@ -36,7 +36,7 @@ PLAYERS: dict[str, Callable[[], Player]] = {
     "average": partial(Queue, "average"),
     "drtc": Freshest,
 }
-UNITS_NS = {"us": 1e3, "ms": 1e6, "s": 1e9}
+UNITS_NS = {"": 1e9, "us": 1e3, "ms": 1e6, "s": 1e9}
 RATES = {"kbit": 125.0, "mbit": 125e3, "gbit": 125e6}
 
 ABOUT = """usage: skytether policy serve|join ...
@@ -312,22 +312,24 @@ def _drive(
 
 def _time_ns(flag: str, text: str) -> int:
     """Time given to a flag [ns]; without a unit in seconds."""
-    found = re.fullmatch(r"(\d{1,6}(?:\.\d{1,9})?)(us|ms|s)?", text)
-    time_ns = round(float(found[1]) * UNITS_NS[found[2] or "s"]) if found else 0
-    if not 0 < time_ns <= 3600 * SECOND_NS:
-        raise _wrong(flag, text, "a time such as 150ms or 1.5s, at most an hour")
-    return time_ns
+    expected = "a time such as 150ms or 1.5s, at most an hour"
+    return round(_quantity(flag, text, UNITS_NS, 3600 * SECOND_NS, expected))
 
 
 def _rate(text: str | None) -> float:
     """Rate given to --rate [B/s]."""
-    if text is None:
-        return RATE_MAX
-    found = re.fullmatch(r"(\d{1,6}(?:\.\d{1,6})?)(kbit|mbit|gbit)", text)
-    rate = float(found[1]) * RATES[found[2]] if found else 0.0
-    if not 0 < rate <= RATE_MAX:
-        raise _wrong("--rate", text, "a rate such as 4mbit, at most 1gbit")
-    return rate
+    expected = "a rate such as 4mbit, at most 1gbit"
+    return RATE_MAX if text is None else _quantity("--rate", text, RATES, RATE_MAX, expected)
+
+
+def _quantity(
+    flag: str, text: str, units: Mapping[str, float], most: float, expected: str
+) -> float:
+    found = re.fullmatch(r"(\d{1,6}(?:\.\d{1,9})?)([a-z]*)", text)
+    value = float(found[1]) * units.get(found[2], 0.0) if found else 0.0
+    if not 0 < value <= most:
+        raise _wrong(flag, text, expected)
+    return value
 
 
 def _wrong(flag: str, got: object, expected: str) -> CommandError:

@@ -6,7 +6,7 @@ end reports what has come of each message, so that the other learns rate, loss a
 
 from collections import OrderedDict, deque
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import Any
 
 from skytether.policy import parts
 from skytether.policy.messages import STAMPS, PartMessage, Seen, encode
@@ -46,13 +46,6 @@ class _Coming:
     bytes: int = 0
     places: set[tuple[int, int]] = field(default_factory=set)
     """Block and place of each part that has come."""
-
-
-class Arrived(NamedTuple):
-    stream: int
-    number: int
-    message: bytes
-    repaired: int
 
 
 class Exchange:
@@ -137,7 +130,7 @@ class Exchange:
                 noted.was_limited = True
         return out
 
-    def accept(self, message: PartMessage, *, now_ns: int) -> Arrived | None:
+    def accept(self, message: PartMessage, *, now_ns: int) -> bytes | None:
         """Accept a part; the message that it makes whole, if it does.
 
         Raises:
@@ -167,7 +160,7 @@ class Exchange:
         if arrived is None:
             return None
         self.repaired += arrived.repaired
-        return Arrived(stream, *arrived)
+        return arrived.message
 
     def _count(self, coming: _Coming, message: PartMessage, now_ns: int) -> None:
         place = message.block, message.place

@@ -10,7 +10,6 @@ one is whole, those before it are given up, because a newer one replaces them.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from math import comb
 from typing import NamedTuple
 
@@ -25,10 +24,13 @@ and the seal of a channel [B]."""
 BLOCK_PARTS = 192
 PARITY_MAX = 64
 """Largest number of parts of parity of a block: with BLOCK_PARTS the 256 of the code."""
-BLOCKS_MAX = -(-BYTES_MAX // (PART_BYTES_MAX * BLOCK_PARTS))
 HELD_MAX = 4
 WHOLE_MIN = 0.995
 """Share of messages that are to arrive whole at the loss that is measured."""
+
+
+Form = tuple[int, int, int]
+"""Size of a message, its blocks and their parity."""
 
 
 class Part(NamedTuple):
@@ -82,45 +84,24 @@ def split(message: bytes, stream: int, number: int, parity: Callable[[int], int]
     ]
 
 
-@dataclass(slots=True)
-class _Partial:
-    form: tuple[int, int, int]
-    """Size, number of blocks and parity."""
-    blocks: list[dict[int, bytes]] = field(default_factory=list)
-    came: int = 0
-    """Number of parts that have come."""
-    repaired: int = 0
-    """Number of parts that came as parity alone."""
-
-
 class Whole(NamedTuple):
     """A message that is whole."""
 
-    number: int
     message: bytes
     repaired: int
     """Number of its parts that were lost, and made from parity."""
 
 
 class Reassembly:
-    """Messages of one stream from their parts.
+    """Messages of one stream from their parts."""
 
-    Args:
-        most: largest size of a message [B].
-    """
-
-    def __init__(self, most: int = BYTES_MAX) -> None:
-        self._most = most
-        self._partial: dict[int, _Partial] = {}
+    def __init__(self) -> None:
+        self._partial: dict[int, tuple[Form, list[dict[int, bytes]]]] = {}
+        """Messages that are not whole, by number: their parts, by block and place."""
         self.newest = -1
         """Number of the newest message that was whole."""
         self.given_up = 0
         """Number of messages of which parts came, and that a newer one has replaced."""
-
-    def came(self, number: int) -> int:
-        """Number of parts of a message that have come so far, of one that is held."""
-        held = self._partial.get(number)
-        return held.came if held else 0
 
     def accept(self, part: Part) -> Whole | None:
         """Accept a part; the message that it makes whole, if it does.
@@ -129,7 +110,7 @@ class Reassembly:
             ProtocolError: the part cannot be one of a message, is a copy, or a newer message is
                 whole already.
         """
-        _check(part, self._most)
+        _check(part)
         if part.number <= self.newest:
             raise ProtocolError(Drop.OVERTAKEN)
         held = self._partial.get(part.number)
@@ -141,26 +122,26 @@ class Reassembly:
                     raise ProtocolError(Drop.OVERTAKEN)
                 del self._partial[oldest]
                 self.given_up += 1
-            held = self._partial[part.number] = _Partial(form, [{} for _ in range(part.blocks)])
-        if held.form != form:
+            held = self._partial[part.number] = form, [{} for _ in range(part.blocks)]
+        if held[0] != form:
             raise ProtocolError(Drop.FIELD)
-        block = held.blocks[part.block]
+        blocks = held[1]
+        block = blocks[part.block]
         if part.place in block:
             raise ProtocolError(Drop.COPY)
-        held.came += 1
         count, _ = block_parts(part.size, part.blocks)
         if len(block) < count:
             block[part.place] = part.data
-        if any(len(each) < count for each in held.blocks):
+        if any(len(each) < count for each in blocks):
             return None
         self.newest = part.number
         older = [number for number in self._partial if number <= part.number]
         self.given_up += len(older) - 1
         for number in older:
             del self._partial[number]
-        repaired = sum(index >= count for each in held.blocks for index in each)
-        joined = b"".join(_joined(each, count, part.parity) for each in held.blocks)
-        return Whole(part.number, joined[: part.size], repaired)
+        repaired = sum(index >= count for each in blocks for index in each)
+        joined = b"".join(_joined(each, count, part.parity) for each in blocks)
+        return Whole(joined[: part.size], repaired)
 
 
 def _joined(block: dict[int, bytes], count: int, parity: int) -> bytes:
@@ -172,8 +153,8 @@ def _joined(block: dict[int, bytes], count: int, parity: int) -> bytes:
     return b"".join(zfec.Decoder(count, count + parity).decode([block[i] for i in order], order))
 
 
-def _check(part: Part, most: int) -> None:
-    if not 0 < part.size <= most or part.blocks != blocks_of(part.size):
+def _check(part: Part) -> None:
+    if not 0 < part.size <= BYTES_MAX or part.blocks != blocks_of(part.size):
         raise ProtocolError(Drop.FIELD)
     count, length = block_parts(part.size, part.blocks)
     if not (part.block < part.blocks and part.parity <= PARITY_MAX):

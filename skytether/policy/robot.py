@@ -111,7 +111,6 @@ class RobotOptions:
 
 @dataclass(slots=True)
 class _Call:
-    peer: Address
     number: int
     began_ns: int
     is_first: bool
@@ -234,10 +233,10 @@ class RobotEnd(Endpoint):
             if message.came:
                 exchange.learn(message, now_ns=now_ns)
         elif arrived := exchange.accept(message, now_ns=now_ns):
-            if arrived.stream == METADATA:
-                self._learn_metadata(arrived.message)
-            elif arrived.stream == CHUNK:
-                self._accept(arrived.message, now_ns)
+            if message.stream == METADATA:
+                self._learn_metadata(arrived)
+            elif message.stream == CHUNK:
+                self._accept(arrived, now_ns)
 
     def _welcome(self, welcome: Welcome, peer: Address, now_ns: int) -> None:
         if welcome.robot != self._robot or welcome.boot_id != self._boot_id:
@@ -273,20 +272,20 @@ class RobotEnd(Endpoint):
         self._greet()
 
     def _post(self, payload: bytes) -> None:
-        sealed = self._link.seal(payload)
+        self._send_on_all(self._link.seal(payload))
+
+    def _send_on_all(self, datagram: bytes) -> None:
         for socket, server in self._servers.items():
-            self.send(sealed, server, socket)
+            self.send(datagram, server, socket)
 
     def _send(self, now_ns: int) -> None:
         """Send what is due."""
         if self._hello_ns is not None and now_ns >= self._hello_ns:
             self._hello_ns = now_ns + self._link.hello_ns
-            hello = self._link.hello(encode(Hello(self._robot, self._boot_id)), now_ns=now_ns)
-            for socket, server in self._servers.items():
-                self.send(hello, server, socket)
+            hello = encode(Hello(self._robot, self._boot_id))
+            self._send_on_all(self._link.hello(hello, now_ns=now_ns))
         for answer in self._link.outbox():
-            for socket, server in self._servers.items():
-                self.send(answer, server, socket)
+            self._send_on_all(answer)
         if self._exchange is None:
             return
         posted = self._exchange.outbox(now_ns=now_ns)
@@ -337,7 +336,7 @@ class RobotEnd(Endpoint):
                 schedule.step_ns = min(max(measured, STEP_NS_LEAST), STEP_NS_MOST)
         self._calls += 1
         is_first, again_ns = program.newest < 0, now_ns + AGAIN_NS
-        call = _Call(program.peer, self._calls, now_ns, is_first, b"", again_ns)
+        call = _Call(self._calls, now_ns, is_first, b"", again_ns)
         self._call = call
         if not options.plays_on:
             schedule.stand(now_ns=now_ns)
@@ -452,9 +451,9 @@ class RobotEnd(Endpoint):
             row = (now_ns, self._robot, call.number, KINDS.index(kind), waited_ns, age_ns, left)
             self._recorder.append_row(*row)
         if error:
-            self.send(Said.ERROR.value + error.encode(), call.peer, LINE)
+            self.send(Said.ERROR.value + error.encode(), program.peer, LINE)
         else:
-            self.send(Said.MESSAGE.value + message, call.peer, LINE)
+            self.send(Said.MESSAGE.value + message, program.peer, LINE)
 
     # -- time ----------------------------------------------------------------------------------
 

@@ -163,7 +163,7 @@ class PolicyEnd(Endpoint):
             if message.stream != OBSERVATION:
                 raise ProtocolError(Drop.FIELD)
             if arrived := robot.exchange.accept(message, now_ns=now_ns):
-                self._observe(robot, arrived.message, now_ns)
+                self._observe(robot, arrived, now_ns)
             return
         if message.came:
             robot.exchange.learn(message, now_ns=now_ns)
