@@ -12,9 +12,8 @@ What the line hears and sends begins with one of `Said`.
 
 from collections import Counter, deque
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from enum import Enum
-from statistics import median
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -138,13 +137,13 @@ class _Program:
     peer: Address
     number: int
     schedule: Schedule
+    intervals_ns: deque[int]
+    """Newest times from an answer to the next call; the first is a guess."""
     newest: int = -1
     """Number of the observation that the newest chunk was made from."""
     made_ns: int = -1
     """Time of that observation [ns]."""
     answered_ns: int | None = None
-    intervals_ns: deque[int] = field(default_factory=lambda: deque(maxlen=MEASURED))
-    """Newest times from an answer to the next call."""
     has_metadata: bool = False
 
 
@@ -306,9 +305,13 @@ class RobotEnd(Endpoint):
                 step_ns = options.step_ns or STEP_NS_FIRST
                 player = options.player()
                 late_ns = options.hold_ns + options.deadline_ns
-                schedule = Schedule(player, options.actions, options.key, step_ns, late_ns, now_ns)
+                rows = None if options.step_ns else options.rows
+                schedule = Schedule(
+                    player, options.actions, options.key, step_ns, rows, late_ns, now_ns
+                )
                 self._connections += 1
-                self._program = _Program(peer, self._connections, schedule)
+                intervals_ns = deque([STEP_NS_FIRST * options.rows], MEASURED)
+                self._program = _Program(peer, self._connections, schedule, intervals_ns)
                 self._call = None
                 self._events.append(events.ProgramConnected(robot=self._robot))
                 self._greet()
@@ -329,11 +332,12 @@ class RobotEnd(Endpoint):
         options, schedule = self._options, program.schedule
         if self._call:  # the program does not wait for its answers; each gets its own
             self._answer(Kind.REST, now_ns)
-        if program.answered_ns is not None:
+        if program.answered_ns is not None and options.step_ns is None:
             program.intervals_ns.append(now_ns - program.answered_ns)
-            if options.step_ns is None:
-                measured = int(median(program.intervals_ns) / options.rows)
-                schedule.step_ns = min(max(measured, STEP_NS_LEAST), STEP_NS_MOST)
+            # The lower quartile: a program may pause more often than it calls without playing.
+            measured_ns = sorted(program.intervals_ns)[len(program.intervals_ns) // 4]
+            step_ns = measured_ns // options.rows
+            schedule.step_ns = min(max(step_ns, STEP_NS_LEAST), STEP_NS_MOST)
         self._calls += 1
         is_first, again_ns = program.newest < 0, now_ns + AGAIN_NS
         call = _Call(self._calls, now_ns, is_first, b"", again_ns)

@@ -51,6 +51,7 @@ class Schedule:
         actions: see `Actions`.
         key: key of the actions in the policy's reply.
         step_ns: length of a step [ns].
+        rows: number of rows that the program plays of each answer; None: as long as it takes.
         late_ns: longest time by which a row is played later than it was planned for [ns].
         began_ns: time of step 0.
     """
@@ -61,11 +62,12 @@ class Schedule:
         actions: Actions,
         key: str,
         step_ns: int,
+        rows: int | None,
         late_ns: int,
         began_ns: int,
     ) -> None:
         self._player, self._actions, self._key = player, actions, key
-        self._late_ns = late_ns
+        self._rows, self._late_ns = rows, late_ns
         self.step_ns, self._at_ns = step_ns, began_ns
         self._count = 0.0
         self._end = 0
@@ -89,7 +91,8 @@ class Schedule:
         """Stand still until `go`: the program waits for an answer. It calls between two rows, so
         the count becomes a whole number.
         """
-        self.advance(now_ns=now_ns, whole=True)
+        played = self._given if self._rows else round(self._by_clock(now_ns))
+        self._move(max(played, int(self._count)), now_ns)
         self._stands = True
 
     def go(self, *, now_ns: int) -> None:
@@ -97,13 +100,17 @@ class Schedule:
         self._given = self.advance(now_ns=now_ns)
         self._stands = False
 
-    def advance(self, *, now_ns: int, whole: bool = False) -> int:
+    def advance(self, *, now_ns: int) -> int:
         """Play the rows until now; returns the number of the present step."""
-        before_ns, least = self._at_ns, self._count
-        count = least + (0.0 if self._stands else (now_ns - before_ns) / self.step_ns)
-        if whole:
-            count, least = round(count), int(least)
-        count = max(min(count, self._given), least)
+        self._move(max(self._by_clock(now_ns), self._count), now_ns)
+        return int(self._count)
+
+    def _by_clock(self, now_ns: int) -> float:
+        passed_ns = 0 if self._stands else now_ns - self._at_ns
+        return min(self._count + passed_ns / self.step_ns, self._given)
+
+    def _move(self, count: float, now_ns: int) -> None:
+        before_ns = self._at_ns
         for step in range(int(self._count), int(count)):
             self._player.row(step)
         if count >= self._given and self.since_ns is None:
@@ -113,7 +120,6 @@ class Schedule:
         self._at_ns, self._count = now_ns, count
         if any(self._is_late(stood_ns) for stood_ns in self._made.values()):
             self._forget()
-        return int(count)
 
     def _is_late(self, stood_ns: float) -> bool:
         return self.stood_ns - stood_ns > self._late_ns
@@ -187,7 +193,7 @@ class Schedule:
         made = rows_of(self._reply, self._key)
         rows, last = self._coming(step, len(made))
         if rows:
-            self._given, self.since_ns = step + len(rows), None
+            self._given, self.since_ns = step + min(len(rows), self._rows or len(rows)), None
         else:
             kind = Kind.HOLD
             self.since_ns = now_ns if self.since_ns is None else self.since_ns

@@ -64,17 +64,25 @@ def wait_for(lab: Lab, answers: int) -> None:
     st.sampled_from([0, 0, 20, 60]),
     st.sampled_from([0.0, 0.02, 0.3, 2.0]),
     st.sampled_from([None, 0, 2]),
+    st.sampled_from([STEP_NS, None]),
     st.integers(1, 99),
 )
-@example([Move()] * 8, 0, 0, 0.0, 0, 1)
-@example([Move(-3), Move(3)] * 4, 125, 0, 0.0, None, 1)
-@example([Move(frozen_call_ms=5000)] * 4, 0, 0, 0.0, None, 1)
-@example([Move(is_cut=True)] * 20 + [Move()] * 8, 100, 0, 0.0, None, 1)
+@example([Move()] * 8, 0, 0, 0.0, 0, STEP_NS, 1)
+@example([Move(-3), Move(3)] * 4, 125, 0, 0.0, None, STEP_NS, 1)
+@example([Move(-30), Move(30)] * 4, 125, 0, 0.0, None, None, 1)
+@example([Move(frozen_call_ms=5000)] * 4, 0, 0, 0.0, None, STEP_NS, 1)
+@example([Move(is_cut=True)] * 20 + [Move()] * 8, 100, 0, 0.0, None, STEP_NS, 1)
 def test_the_promise(
-    moves: list[Move], delay_ms: int, loss: int, thinking: float, spare: int | None, seed: int
+    moves: list[Move],
+    delay_ms: int,
+    loss: int,
+    thinking: float,
+    spare: int | None,
+    step_ns: int | None,
+    seed: int,
 ) -> None:
     way = f"gamma({delay_ms}ms, {delay_ms + 30}ms, 30ms) & loss({loss}%)"
-    options = replace(OPTIONS, spare_rows=spare)
+    options = replace(OPTIONS, spare_rows=spare, step_ns=step_ns)
     lab = Lab(tagged, options, to_policy=way, to_robot=way, thinking=thinking, seed=seed)
     robot: Any = Around(lab.robot)
     lab.robot = robot
@@ -100,7 +108,7 @@ def test_the_promise(
         for row, (made_of, planned) in enumerate(rows):
             made_ns, made_at = asked[int(made_of)]
             plan_ns = made_ns + (int(planned) - made_at) * STEP_NS
-            assert answered_ns + row * STEP_NS - plan_ns <= LATE_NS or made_of == 1
+            assert answered_ns + row * STEP_NS - plan_ns <= LATE_NS or made_of == 1 or not step_ns
         played_ns = PLAYED * STEP_NS + move.jitter_ms * MS
         lab.run(lab.now_ns + played_ns // 2)
         robot.until_ns = max(robot.until_ns, lab.now_ns + move.frozen_ms * MS)
