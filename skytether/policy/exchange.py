@@ -1,7 +1,8 @@
 """Exchange of messages between two ends of a session, each message as datagrams with parity.
 
-What was not sent yet of a message is dropped when a newer one of its stream is to be sent. Each
-end reports what has come of each message, so that the other learns rate, loss and round trip.
+A message that has begun to leave is sent to its end, however slow the path is; of those that wait
+for it, a newer one replaces an older. Each end reports what has come of each message, so that the
+other learns rate, loss and round trip.
 """
 
 from collections import OrderedDict, deque
@@ -15,8 +16,9 @@ from skytether.policy.parts import Part, Reassembly
 from skytether.shared.base.units import HEADER_BYTES, MICROSECOND_NS, MILLISECOND_NS
 from skytether.shared.wire.drop import Drop, ProtocolError
 
-QUIET_NS = 25 * MILLISECOND_NS
-"""Time without a further part after which a message is reported as it is."""
+QUIET_NS = 300 * MILLISECOND_NS
+"""Time without a further part after which a message is reported as it is: longer than the time
+between two datagrams at the least rate."""
 REMEMBERED_MAX = 64
 """Number of newest messages whose reports are understood."""
 PART_HEAD_BYTES = 40
@@ -27,9 +29,7 @@ PART_HEAD_BYTES = 40
 class _Sent:
     """Message as far as it was sent."""
 
-    began_ns: int
     parts: int = 0
-    bytes: int = 0
     was_limited: bool = False
     """Whether a part had to wait."""
 
@@ -60,6 +60,8 @@ class Exchange:
         self.pace = Pace(rate_max)
         self._queue: dict[int, deque[Part]] = {}
         """Parts that wait, by stream."""
+        self._next: dict[int, tuple[bytes, bool]] = {}
+        """Message of each stream that waits for these, and whether it is urgent."""
         self._replies: deque[bytes] = deque(maxlen=REMEMBERED_MAX)
         """Reports that wait."""
         self._sent: OrderedDict[tuple[int, int], _Sent] = OrderedDict()
@@ -70,23 +72,28 @@ class Exchange:
         """Newest delay by both ends' clocks [µs]."""
         self.sent = self.sent_bytes = self.dropped = self.came = self.repaired = 0
 
-    def send(self, stream: int, message: bytes, *, now_ns: int, is_urgent: bool = False) -> None:
-        """Send a message, in place of what is left of the one before.
+    def send(self, stream: int, message: bytes, *, is_urgent: bool = False) -> None:
+        """Send a message, in place of one that waits.
 
         Args:
             is_urgent: whether as much parity is sent as message, which then arrives whole if any
                 half of it does.
         """
+        self.dropped += stream in self._next
+        self._next[stream] = message, is_urgent
+        if not self._queue.get(stream):
+            self._begin(stream)
+
+    def _begin(self, stream: int) -> None:
+        message, is_urgent = self._next.pop(stream)
         number = self._numbers[stream] = self._numbers.get(stream, -1) + 1
         loss = self.pace.loss
 
         def parity(count: int) -> int:
             return max(parts.parity_for(count, loss), count if is_urgent else 0)
 
-        made = parts.split(message, stream, number, parity)
-        self.dropped += len(self._queue.get(stream, ()))
-        self._queue[stream] = deque(made)
-        self._sent[stream, number] = _Sent(now_ns)
+        self._queue[stream] = deque(parts.split(message, stream, number, parity))
+        self._sent[stream, number] = _Sent()
         while len(self._sent) > REMEMBERED_MAX:
             self._sent.popitem(last=False)
 
@@ -124,7 +131,8 @@ class Exchange:
             self.sent_bytes += size
             if noted := self._sent.get((stream, part.number)):
                 noted.parts += 1
-                noted.bytes += size
+            if not self._queue[stream] and stream in self._next:
+                self._begin(stream)
         for stream, queued in self._queue.items():
             if queued and (noted := self._sent.get((stream, queued[0].number))):
                 noted.was_limited = True

@@ -13,8 +13,8 @@ sent policy_sent_parts_total
     Datagrams with parts of messages that were sent.
 sent_bytes policy_sent_bytes_total
     Bytes of these, with UDP's and IP's headers.
-replaced policy_replaced_parts_total
-    Parts that were not sent, because a newer message took their place.
+replaced policy_replaced_messages_total
+    Messages that were not sent, because a newer one took their place.
 came policy_received_parts_total
     Datagrams with parts of messages that came, copies left out.
 repaired policy_repaired_parts_total

@@ -97,6 +97,6 @@ class Pace:
                 lower = self.rate * LOWER
                 if came >= PARTS_MIN and spread_ns > 0:
                     lower = min(lower, LOWER * size / spread_ns * SECOND_NS)
-                self.rate = max(lower, RATE_MIN)
+                self.rate = max(lower, min(RATE_MIN, self._most))
         elif self.queue_ns < QUEUE_LOW_NS and was_limited:
             self.rate = min(self.rate * RISE, self._most)

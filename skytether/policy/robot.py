@@ -370,7 +370,7 @@ class RobotEnd(Endpoint):
             del self._asked[next(iter(self._asked))]
         call.message = message
         if self._exchange:
-            self._exchange.send(OBSERVATION, message, now_ns=now_ns)
+            self._exchange.send(OBSERVATION, message)
         before = self._asked.get(call.number - 1)
         if before and program.newest < call.number - 1:  # its chunk has not come yet
             self._waits &= now_ns - before.began_ns <= options.deadline_ns
@@ -485,7 +485,7 @@ class RobotEnd(Endpoint):
             # The robot waits for its first answer, and no other observation follows.
             call.again_ns = now_ns + AGAIN_NS
             if self._exchange:
-                self._exchange.send(OBSERVATION, call.message, now_ns=now_ns)
+                self._exchange.send(OBSERVATION, call.message)
         if self._hello_ns is None:
             silence_ns = now_ns - self._heard_ns
             if silence_ns >= SILENCE_NS:

@@ -170,7 +170,7 @@ class PolicyEnd(Endpoint):
         else:  # the robot says that it is there, and whether it has the metadata; so is the server
             robot.has_metadata = message.number > 0
             self.send(call.line.seal(call.payload), datagram.peer, datagram.socket)
-            self._give_metadata(robot, now_ns)
+            self._give_metadata(robot)
 
     def _number(self, session: int, call: GateCall, now_ns: int) -> int:
         """Number of the robot of a session.
@@ -261,7 +261,7 @@ class PolicyEnd(Endpoint):
                 robot.is_open, robot.is_opening = True, False
                 self._metadata = said[1:]
                 self._events.append(events.UpstreamFound(robot=number))
-                self._give_metadata(robot, now_ns)
+                self._give_metadata(robot)
             case Said.CLOSED:
                 self._lose(number, robot, said[1:].decode(errors="replace"), now_ns)
                 return
@@ -271,13 +271,13 @@ class PolicyEnd(Endpoint):
                 return
             case Said.MESSAGE:
                 self._counts["answers"] += 1
-                self._finish(robot, said[1:], "", now_ns)
+                self._finish(robot, said[1:], "")
             case Said.ERROR:
                 reason = said[1:].decode(errors="replace").strip() or "unknown"
                 self._counts["errors"] += 1
                 last = reason.splitlines()[-1][:200]
                 self._events.append(events.PolicyFailed(robot=number, reason=last))
-                self._finish(robot, b"", last, now_ns)
+                self._finish(robot, b"", last)
         self._ask(robot, now_ns)
 
     def _lose(self, number: int, robot: _Robot, reason: str, now_ns: int) -> None:
@@ -287,9 +287,9 @@ class PolicyEnd(Endpoint):
         self._close(robot)
         robot.is_open = robot.is_opening = False
         robot.opens_ns = now_ns + AGAIN_NS
-        self._finish(robot, b"", f"the policy's connection was lost: {reason[:100]}", now_ns)
+        self._finish(robot, b"", f"the policy's connection was lost: {reason[:100]}")
 
-    def _finish(self, robot: _Robot, reply: bytes, error: str, now_ns: int) -> None:
+    def _finish(self, robot: _Robot, reply: bytes, error: str) -> None:
         """Send the answer to the observation that the policy was asked about."""
         job, robot.thinking = robot.thinking, None
         if job is None:
@@ -300,13 +300,13 @@ class PolicyEnd(Endpoint):
             message = values.pack([job.call, b"", error])
         if not error:  # else the robot may ask again
             robot.answered = job.call, message
-        robot.exchange.send(CHUNK, message, now_ns=now_ns, is_urgent=job.is_urgent)
+        robot.exchange.send(CHUNK, message, is_urgent=job.is_urgent)
 
-    def _give_metadata(self, robot: _Robot, now_ns: int) -> None:
+    def _give_metadata(self, robot: _Robot) -> None:
         is_due = not (robot.has_metadata or robot.exchange.is_sending(METADATA))
         if self._metadata is not None and is_due:
             content = values.pack([self._gives_rows, self._metadata])
-            robot.exchange.send(METADATA, content, now_ns=now_ns)
+            robot.exchange.send(METADATA, content)
 
     def _observe(self, robot: _Robot, message: bytes, now_ns: int) -> None:
         try:
@@ -316,7 +316,7 @@ class PolicyEnd(Endpoint):
             if any(job and job.call == call for job in (robot.thinking, robot.waiting)):
                 return  # sent again
             if call == robot.answered[0]:
-                robot.exchange.send(CHUNK, robot.answered[1], now_ns=now_ns, is_urgent=True)
+                robot.exchange.send(CHUNK, robot.answered[1], is_urgent=True)
                 return
             observation = values.unpack(seen, self._unpacker and self._unpacker())
             if self._gives_rows and isinstance(observation, dict):

@@ -361,7 +361,7 @@ def test_stamps_that_wrap_and_messages_beyond_2_32(sent_us: int) -> None:
     ends[0]._numbers[OBSERVATION] = 2**32 - 3
     now_ns = sent_us * MICROSECOND_NS
     for _ in range(5):
-        ends[0].send(OBSERVATION, bytes(3000), now_ns=now_ns)
+        ends[0].send(OBSERVATION, bytes(3000))
         whole = None
         for payload in ends[0].outbox(now_ns=now_ns):
             message = decode(payload)
@@ -418,10 +418,10 @@ def test_needed_observations_in_an_outage() -> None:
 def test_under_a_low_rate_metadata_arrives_and_calls_go_on() -> None:
     """A metadata message that takes longer than the robot's next question is sent on, not again."""
     end = Exchange(1, rate_max=12_500.0)
-    end.send(METADATA, bytes(50_000), now_ns=0)
+    end.send(METADATA, bytes(50_000))
     streams = list[int]()
     for now_ns in range(0, 6 * SECOND_NS, 10 * MS):
-        end.send(OBSERVATION, bytes(2000), now_ns=now_ns)
+        end.send(OBSERVATION, bytes(2000))
         sent = [decode(each) for each in end.outbox(now_ns=now_ns)]
         streams += [each.stream for each in sent if isinstance(each, PartMessage)]
     assert streams.count(METADATA) >= 45

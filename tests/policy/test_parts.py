@@ -115,7 +115,7 @@ def test_a_datagram_is_a_message_or_refused(payload: bytes) -> None:
 
 def test_every_datagram_is_below_the_limit() -> None:
     ends = Exchange(2**32 - 1), Exchange(2**32 - 1)
-    ends[0].send(OBSERVATION, bytes(100_000), now_ns=0)
+    ends[0].send(OBSERVATION, bytes(100_000))
     sent = pump(ends, lambda _: True, 5 * SECOND_NS)
     assert max(map(len, sent)) <= PAYLOAD_BYTES_MAX - 32  # of which a channel's seal takes 32 B
 
@@ -154,7 +154,7 @@ def test_the_sender_learns_round_trip_and_loss() -> None:
         return not isinstance(decode(payload), PartMessage) or random.random() > 0.2
 
     for _ in range(60):
-        ends[0].send(OBSERVATION, bytes(20_000), now_ns=0)
+        ends[0].send(OBSERVATION, bytes(20_000))
         pump(ends, passes, SECOND_NS)
         ends[0].pace._free_ns = 0
     assert ends[0].pace.loss == pytest.approx(0.2, abs=0.1)
@@ -162,14 +162,31 @@ def test_the_sender_learns_round_trip_and_loss() -> None:
     assert ends[1].repaired
 
 
-def test_what_is_left_of_a_message_is_replaced_by_a_newer_one() -> None:
+def test_a_message_that_has_begun_is_sent_to_its_end_and_of_those_that_wait_the_newest() -> None:
     end = Exchange(1, rate_max=20_000.0)
-    end.send(OBSERVATION, bytes(100_000), now_ns=0)
+    for size in (30_000, 20, 10):
+        end.send(OBSERVATION, bytes(size))
     first = end.outbox(now_ns=0)
     assert 0 < len(first) < 10  # the rest waits for the rate
-    end.send(OBSERVATION, bytes(10), now_ns=0)
-    assert end.dropped > 80
-    later = end.outbox(now_ns=SECOND_NS)
-    assert {
-        message.number for message in map(decode, later) if isinstance(message, PartMessage)
-    } == {1}
+    assert end.dropped == 1
+    later = first + [
+        each for at in range(0, 3 * SECOND_NS, 10 * MS) for each in end.outbox(now_ns=at)
+    ]
+    sent = [message for message in map(decode, later) if isinstance(message, PartMessage)]
+    assert list(dict.fromkeys(message.size for message in sent)) == [30_000, 10]
+
+
+def test_under_a_low_rate_observations_go_on_and_no_loss_is_measured() -> None:
+    """A message takes longer than until the next one: each is whole, and the newest follows."""
+    ends, now_ns, whole = (Exchange(1, rate_max=12_500.0), Exchange(1)), 0, 0
+    for now_ns in range(0, 20 * SECOND_NS, 10 * MS):
+        if now_ns % (100 * MS) == 0:
+            ends[0].send(OBSERVATION, bytes(8000))
+        for end, other in (ends, ends[::-1]):
+            for message in map(decode, end.outbox(now_ns=now_ns)):
+                if isinstance(message, PartMessage):
+                    whole += other.accept(message, now_ns=now_ns + 50 * MS) is not None
+                elif isinstance(message, Seen):
+                    other.learn(message, now_ns=now_ns + 100 * MS)
+    assert whole >= 24
+    assert ends[0].pace.loss < 0.01
