@@ -14,7 +14,7 @@ import msgspec
 
 from skytether.policy import inside, metrics, web
 from skytether.policy.images import QUALITY, Compressor
-from skytether.policy.pace import RATE_MAX
+from skytether.policy.pace import RATE_MAX, RATE_MIN
 from skytether.policy.players import Clocked, Freshest, Player, Queue
 from skytether.policy.robot import CALL_COLUMNS, RobotEnd, RobotOptions
 from skytether.shared.base.units import SECOND_NS
@@ -313,21 +313,23 @@ def _drive(
 def _time_ns(flag: str, text: str) -> int:
     """Time given to a flag [ns]; without a unit in seconds."""
     expected = "a time such as 150ms or 1.5s, at most an hour"
-    return round(_quantity(flag, text, UNITS_NS, 3600 * SECOND_NS, expected))
+    return round(_quantity(flag, text, UNITS_NS, (1, 3600 * SECOND_NS), expected))
 
 
 def _rate(text: str | None) -> float:
     """Rate given to --rate [B/s]."""
-    expected = "a rate such as 4mbit, at most 1gbit"
-    return RATE_MAX if text is None else _quantity("--rate", text, RATES, RATE_MAX, expected)
+    if text is None:
+        return RATE_MAX
+    expected = "a rate such as 4mbit, 100kbit to 1gbit"
+    return _quantity("--rate", text, RATES, (RATE_MIN, RATE_MAX), expected)
 
 
 def _quantity(
-    flag: str, text: str, units: Mapping[str, float], most: float, expected: str
+    flag: str, text: str, units: Mapping[str, float], limits: tuple[float, float], expected: str
 ) -> float:
     found = re.fullmatch(r"(\d{1,6}(?:\.\d{1,9})?)([a-z]*)", text)
     value = float(found[1]) * units.get(found[2], 0.0) if found else 0.0
-    if not 0 < value <= most:
+    if not limits[0] <= value <= limits[1]:
         raise _wrong(flag, text, expected)
     return value
 

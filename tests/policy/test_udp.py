@@ -187,6 +187,7 @@ def test_a_robot_in_python_with_a_policy_in_python(tmp_path: Path) -> None:
         (["join", "192.0.2.1:1", "--actions", "delta"], "--keys"),
         (["join", "127.0.0.1:1", "--actions", "delta", "--deadline", "soon"], "--deadline"),
         (["join", "127.0.0.1:1", "--actions", "delta", "--rate", "4"], "4mbit"),
+        (["join", "127.0.0.1:1", "--actions", "delta", "--rate", "90kbit"], "100kbit"),
         (["join", "127.0.0.1:1", "--actions", "delta", "--when", "never"], "needed(2)"),
         (["join", "127.0.0.1:1", "--actions", "delta", "--rows", "0"], "1 to 1024"),
         (["join", "127.0.0.1:1", "--actions", "delta", "--plays-on"], "--step"),
