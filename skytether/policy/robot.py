@@ -54,8 +54,9 @@ STEP_NS_FIRST = 50 * MILLISECOND_NS
 """Length of a step before it is measured."""
 STEP_NS_LEAST, STEP_NS_MOST = MILLISECOND_NS, SECOND_NS
 """Bounds of what is measured: a program that pauses for a minute plays no row for a minute."""
-MEASURED, DELAYS = 9, 64
-"""Number of newest intervals and delays that are measured."""
+MEASURED, DELAYS, ASKED_MAX = 9, 64, 1024
+"""Number of newest intervals and delays that are measured, and of observations whose chunks are
+played."""
 ROWS_SENT = 64
 """Largest number of coming rows that are sent with an observation."""
 CALL_COLUMNS = np.dtype(
@@ -366,7 +367,7 @@ class RobotEnd(Endpoint):
             self._answer(Kind.ERROR, now_ns, f"the observation is refused: {error}")
             return
         self._asked[call.number] = _Asked(now_ns, number, schedule.stood_ns, program.number)
-        while len(self._asked) > DELAYS:
+        while len(self._asked) > ASKED_MAX:
             del self._asked[next(iter(self._asked))]
         call.message = message
         if self._exchange:

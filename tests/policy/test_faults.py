@@ -172,6 +172,22 @@ def test_a_policy_that_hangs() -> None:
     assert first_row(lab.infer(state(50.0))) == 50.0
 
 
+def test_a_policy_that_takes_as_long_as_many_calls() -> None:
+    """1.5 s for 4 s of rows, and a call each 20 ms: rows go on one by one."""
+
+    def policy(seen: Any) -> Any:
+        return {"actions": seen["state"][0] + np.arange(200.0)[:, None]}
+
+    lab = Lab(policy, replace(OPTIONS, step_ns=20 * MS), thinking=1.5, **FAR)
+    lab.connect()
+    position, got = 0.0, list[float]()
+    for _ in range(400):
+        got.append(first_row(lab.infer(state(position))))
+        position = got[-1] + 1.0
+        lab.sleep(0.02)
+    assert np.diff(got).tolist() == [1.0] * 399
+
+
 def test_an_answer_that_comes_after_its_connection_was_given_up_is_nobodys() -> None:
     lab, position = flying()
     lab.thinking_ns = 31_120 * MS  # 100 ms after it is connected anew
