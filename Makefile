@@ -48,7 +48,7 @@ $(FLY): $(UV) locks/fly.lock pyproject.toml
 
 $(STAMP): $(FLY) locks/dev.lock locks/openpi.lock
 	$(INSTALL) --require-hashes -r locks/dev.lock
-	$(INSTALL) --require-hashes --no-deps -r locks/openpi.lock
+	$(INSTALL) --require-hashes --no-deps -r locks/openpi.lock  # its own client, for tests: it asks for numpy below 2
 	touch $@
 
 demo: $(FLY)  ## fly the demonstration for three minutes, with a page to play with

@@ -68,6 +68,7 @@ EVENTS = (
     f"{SHARED}events.paths",
     f"{SHARED}events.standby",
     f"{SHARED}missions.events",
+    "skytether.policy.events",
 )
 """Modules with events of optional packages, see `shared.telemetry.every_event`."""
 

@@ -188,7 +188,8 @@ class World:
             case "cut" | "mend":
                 lab.is_cut = what == "cut"
             case "server":
-                gate = secured_gate() if lab.server._gate.secure else PlainGate()
+                is_plain = isinstance(lab.server._gate, PlainGate)
+                gate = PlainGate() if is_plain else secured_gate()
                 lab.server = PolicyEnd(gate, boot_id=int(self._rng.integers(99)), draw=self._draw)
             case "robot" | "frozen":
                 name = "robot" if what == "robot" else "server"
