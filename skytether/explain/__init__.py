@@ -1,4 +1,4 @@
-"""Explain: why a flight in virtual time braked, was far off, came too close, or sent too much.
+"""Explain: why a flight braked, was far off, came too close, or sent too much.
 
 A flight in virtual time is the same to the last bit each time, and the loss and delay of a packet
 follow from seed, direction, flow and time. So the same flight can be flown again without one
@@ -17,6 +17,7 @@ The modules, in the order of their use:
 | `flying` | `fly(case) -> CaseOutcome`, the only function that flies; can run in a worker process |
 | `moments` | what went wrong, beside the same flight over a perfect network |
 | `units` | what the network did: outages, packets lost or late; and wind, noise, a stall |
+| `doubles`, `doubled` | a recorded flight over UDP as a case, and what is its own in virtual time |
 | `smallest` | delta debugging: the smallest set of units that suffices |
 | `causes` | the cause, single packets that would have averted it, how long an outage must be |
 | `remedies` | other keys, over the same network and with other seeds |
@@ -33,9 +34,9 @@ set. A unit is *needed* if the moment does not occur when only this unit is remo
 No shares of blame are computed: if a vehicle brakes only because of two outages together, each of
 the two is needed.
 
-**Limits.** It explains one flight of a simulated vehicle in simulated wind. A remedy that helps in
-one flight may fail in others; `--seeds` flies others. Flights over real UDP cannot be flown again,
-but for missions the recording suffices to check the hypotheses.
+**Limits.** It explains one flight of a simulated vehicle in simulated wind, or the double of a
+recorded flight, if that is near. A remedy that helps in one flight may fail in others; `--seeds`
+flies others. Of missions over UDP the recording suffices to check the hypotheses.
 
 **Bounds.** Every figure comes from a flight; none is estimated. Every flight goes through `fly`.
 """

@@ -5,6 +5,7 @@ scenario that any user can fly.
 """
 
 from collections import defaultdict
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal, TypeAlias
 
@@ -12,6 +13,7 @@ import msgspec
 
 from skytether.netem.fate import Fates
 from skytether.netem.impairments.draws import SLOT_S
+from skytether.shared.law.model import Array
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.dotted import set_keys
 from skytether.shared.scenario.whole import Scenario
@@ -79,6 +81,25 @@ class DeliveredStretch:
     most_s: float
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Double:
+    """What a case has of the recorded flight that it is the double of; times are those in the
+    flight.
+    """
+
+    opens_s: float
+    """Time at which the vehicle asks for a session [s]."""
+    began_ns: int
+    """Time of step 0 [ns]."""
+    client_late_ns: Mapping[int, int]
+    server_late_ns: Mapping[int, int]
+    """How late an end was woken, by the time at which it should have been [ns]."""
+    states: Array
+    """Position [m] and velocity [m/s] at the start of each step; shape (steps, axes, 2)."""
+    inputs: Array
+    """Desired velocity from there on [m/s]; shape (steps, axes)."""
+
+
 @dataclass(frozen=True, slots=True)
 class FlightCase:
     """Flight to be flown: a scenario, and changes to it."""
@@ -91,6 +112,8 @@ class FlightCase:
     delivered: tuple[DeliveredStretch, ...] = ()
     until_s: float | None = None
     """Time of flight at which the flight may end [s]; None: at its regular end."""
+    double: Double | None = None
+    """Recorded flight of which it is the double; None for a flight in virtual time."""
 
     def fates(self, lane: Lane) -> Fates:
         """Losses and delays of the packets of a lane."""

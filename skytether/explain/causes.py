@@ -15,7 +15,7 @@ from skytether.explain.cases import Bad, FlightCase, Lane, Setting, Stall, Unit,
 from skytether.explain.flying import CaseOutcome, FlyAll
 from skytether.explain.moments import AFTER_S, Moment, comes_about, error_m, is_averted
 from skytether.explain.smallest import smallest
-from skytether.explain.units import Circumstances
+from skytether.explain.units import PUSH, Circumstances
 from skytether.shared.endpoints.directions import FLIGHT
 
 BEFORE_S = 8.0
@@ -41,6 +41,8 @@ class CausePart:
     """Whether the moment does not occur without this unit."""
     error_m: float
     """Largest error without this unit [m]."""
+    calm_m: float = np.nan
+    """The same without wind either, for the double of a real vehicle, whose wind is unknown [m]."""
     packets: int = 0
     """Number of packets that the unit lost or delayed."""
     plans: int = 0
@@ -133,7 +135,7 @@ def _part(unit: Unit, flown: CaseOutcome) -> CausePart:
     began_s, which = flown.began_s[unit.lane], _met(unit, flown)
     plans = int(flown.packets.is_plan[which].sum())
     times = began_s + unit.first * 1e-3, began_s + unit.end * 1e-3
-    return CausePart(unit, *times, False, np.nan, len(which), plans)
+    return CausePart(unit, *times, False, np.nan, packets=len(which), plans=plans)
 
 
 def _met(unit: Bad, flown: CaseOutcome) -> list[int]:
@@ -152,13 +154,15 @@ def needed(
     parts, others = found.parts, _groups(found, here)
     cases = [here.without(part.unit) for part in parts]
     cases += [here.without(*group) for group in others.values()]
-    as_flown, *outcomes = fly_all([here.case, *cases])
+    calm = [here.without(part.unit, PUSH) for part in parts if PUSH in here.units]
+    as_flown, *outcomes = fly_all([here.case, *cases, *calm])
     errors = [error_m(moment, each) for each in outcomes]
+    calm_m = errors[len(cases) :] or [np.nan] * len(parts)
     checked = tuple(
-        replace(part, is_needed=not comes_about(moment, each), error_m=error)
-        for part, each, error in zip(parts, outcomes, errors, strict=False)
+        replace(part, is_needed=not comes_about(moment, each), error_m=error, calm_m=least)
+        for part, each, error, least in zip(parts, outcomes, errors, calm_m, strict=False)
     )
-    differ = [error - error_m(moment, as_flown) for error in errors[len(parts) :]]
+    differ = [error - error_m(moment, as_flown) for error in errors[len(parts) : len(cases)]]
     innocent = tuple(zip(others, differ, strict=True))
     return replace(found, parts=checked, innocent=innocent), outcomes[: len(parts)]
 

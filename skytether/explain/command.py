@@ -1,4 +1,4 @@
-"""`skytether explain`: why a flight in virtual time went as it did."""
+"""`skytether explain`: why a flight went as it did."""
 
 import time
 from collections.abc import Sequence
@@ -9,10 +9,10 @@ from typing import Annotated
 import numpy as np
 
 from skytether.cli import recordings
-from skytether.explain import mission, picture
+from skytether.explain import doubles, mission, picture
 from skytether.explain.cases import FlightCase
 from skytether.explain.explanation import FIRST, STEPS, Explanation, check_same, explain
-from skytether.explain.flying import CaseOutcome, fly
+from skytether.explain.flying import CaseOutcome, Track, fly
 from skytether.explain.hypotheses import hypotheses
 from skytether.figures import flights as figures
 from skytether.lab.commands.pool import Flags, Interrupted, PoolFlags, crew
@@ -39,7 +39,7 @@ class ExplainOptions:
 
     scenario: ScenarioName = "demo"
     """A scenario's name (`skytether list scenarios`), a .toml file, or a recording (.mcap) of a
-    flight in virtual time."""
+    flight in virtual time or over UDP."""
     at: Annotated[float | None, Argument(metavar="T")] = None
     """Time of flight of the moment to explain [s]; by default the gravest moment."""
     seeds: Annotated[int, Argument(metavar="N")] = 0
@@ -77,6 +77,11 @@ def explain_flight(argv: Sequence[str]) -> None:
             _judge(options, found)
             return
         name, case, recorded = _recorded(found)
+        if isinstance(recorded, Track) and options.seeds:
+            message = (
+                f"--seeds: got {options.seeds} with a flight over UDP, whose network is recorded"
+            )
+            raise CommandError(message, command.CONFIGURATION)
     else:
         options = command.parse(ExplainOptions(), argv, "skytether explain", explain_flight.__doc__)
         vehicles = _vehicles(options)
@@ -120,18 +125,17 @@ def _judge(options: ExplainOptions, recorded: Recorded) -> None:
     print("A flight over UDP cannot be flown again: what caused what is not said.")
 
 
-def _recorded(recorded: Recorded) -> tuple[str, FlightCase, str]:
-    """Name, case and hash of a recorded flight.
+def _recorded(recorded: Recorded) -> tuple[str, FlightCase, str | Track]:
+    """Name and case of a recorded flight; its hash, or the flight if the case is its double.
 
     Raises:
         CommandError: the flight cannot be flown again.
     """
     path, client = recorded.path, recorded.parts.get("client")
-    if recorded.about.began:
-        expected = "expected one in virtual time, which can be flown again"
-        raise CommandError(f"{path}: got a flight over UDP, {expected}", command.CONFIGURATION)
     if client is None:
         raise CommandError(f"{path}: no step was flown", command.CONFIGURATION)
+    if recorded.about.began:
+        return recorded.about.scenario, *doubles.double(recorded)
     case = FlightCase(
         recorded.scenario,
         vehicles=len(np.unique(client["vehicle"])),
@@ -140,8 +144,11 @@ def _recorded(recorded: Recorded) -> tuple[str, FlightCase, str]:
     return recorded.about.scenario, case, trace_hash(client)
 
 
-def _explain(options: ExplainOptions, name: str, case: FlightCase, recorded: str) -> None:
+def _explain(options: ExplainOptions, name: str, case: FlightCase, recorded: str | Track) -> None:
     """Explain a flight, and show the explanation even if it is incomplete.
+
+    Args:
+        recorded: see `_recorded`; empty: the flight is not recorded.
 
     Raises:
         CommandError: interrupted, or a file cannot be written.
@@ -158,10 +165,19 @@ def _explain(options: ExplainOptions, name: str, case: FlightCase, recorded: str
             return outcomes
 
         step = FIRST
-        steps = explain(case, name, fly_all, at_s=options.at, seeds=options.seeds, at_once=at_once)
+        steps = explain(
+            case,
+            name,
+            fly_all,
+            at_s=options.at,
+            seeds=options.seeds,
+            at_once=at_once,
+            recorded=recorded if isinstance(recorded, Track) else None,
+        )
         try:
             for step, known in steps:
-                check_same(known.flown, recorded or known.flown.trace, options.scenario)
+                if isinstance(recorded, str):
+                    check_same(known.flown, recorded or known.flown.trace, options.scenario)
                 flyers.advance(1, step)
                 if options.json is not None:  # at once, for programs that show the progress
                     command.write(options.json, known.to_json(step))

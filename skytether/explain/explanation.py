@@ -8,7 +8,8 @@ import msgspec
 from skytether.explain import causes, mission, remedies, units, words
 from skytether.explain.cases import FlightCase
 from skytether.explain.causes import Cause, Rescues
-from skytether.explain.flying import CaseOutcome, FlyAll, fly
+from skytether.explain.doubles import Nearness, nearness
+from skytether.explain.flying import CaseOutcome, FlyAll, Track, fly
 from skytether.explain.moments import WEIGHTS, Moment, moments, worst
 from skytether.explain.remedies import Remedy
 from skytether.shared.base.errors import ConfigError
@@ -40,11 +41,15 @@ class Explanation:
     rescues: Rescues | None = None
     remedies: tuple[Remedy, ...] | None = None
     """Flights with other keys; the first is the explained flight."""
+    nearness: Nearness | None = None
+    """Distance of the double of a recorded flight from it; None for a flight in virtual time."""
     curves: tuple[tuple[str, CaseOutcome], ...] = ()
     """Flights drawn for comparison: without a part of the cause, and with a remedy."""
 
     def __str__(self) -> str:
         said = words.text(self.moments, self.moment, self.cause, self.rescues, self.remedies)
+        if self.nearness is not None:
+            said = f"A double of the flight, {self.nearness}:\n{said}"
         of_mission = mission.text(self.flown.hypotheses, self.flown.waits)
         return f"{said}\n\n{of_mission}" if of_mission else said
 
@@ -52,7 +57,7 @@ class Explanation:
         """The explanation so far, as JSON: fields without flights, figures of a mission, text, and
         name of the next step, which is empty at the end.
         """
-        names = "name", "seed", "moments", "moment", "cause", "rescues", "remedies"
+        names = "name", "seed", "moments", "moment", "nearness", "cause", "rescues", "remedies"
         fields = {name: getattr(self, name) for name in names}
         fields |= {name: getattr(self.flown, name) for name in ("hypotheses", "waits")}
         return msgspec.json.encode({**fields, "text": str(self), "next": following})
@@ -66,6 +71,7 @@ def explain(
     at_s: float | None = None,
     seeds: int = 0,
     at_once: int = 1,
+    recorded: Track | None = None,
 ) -> Iterator[tuple[str, Explanation]]:
     """Yield the explanation of a flight after each step, and the name of the next step.
 
@@ -74,14 +80,16 @@ def explain(
         at_s: time of flight of the moment to explain [s]; None: the gravest moment.
         seeds: number of flights of each remedy with other seeds.
         at_once: number of flights that `fly_all` flies side by side.
+        recorded: the flight that the case is the double of.
 
     Raises:
-        ConfigError: there is no moment at that time.
+        ConfigError: there is no moment at that time, or the double is too far from the recording.
     """
     flown, perfect = fly_all([case, units.perfect(case)])
     found = tuple(moments(flown, perfect, case.scenario))
     moment = _chosen(found, at_s)
-    known = Explanation(name, case.scenario.seed, found, moment, flown)
+    near = nearness(flown, recorded, moment, case.scenario.settled_s) if recorded else None
+    known = Explanation(name, case.scenario.seed, found, moment, flown, nearness=near)
     if moment is None:
         yield "", known
         return

@@ -10,6 +10,7 @@ from typing import TypeAlias
 
 import numpy as np
 
+from skytether.explain import doubled
 from skytether.explain.cases import FlightCase, Lane, Stall
 from skytether.explain.hypotheses import Hypothesis, hypotheses
 from skytether.explain.server_ticks import are_plans
@@ -36,6 +37,8 @@ class Track:
     """Time of flight at step 0 [s]."""
     step_s: Array
     """Time since step 0 [s]."""
+    position_m: Array
+    """Position [m]; shape (n, axes)."""
     error_m: Array
     """Distance from the reference [m]; 0 on a mission, which has goals and no reference."""
     mode: Indices
@@ -100,6 +103,8 @@ def fly(case: FlightCase) -> CaseOutcome:
 
     until_s, reasons = case.until_s, list[Reason]()
     actions = [action for stall in case.stalls for action in _actions(stall, case)]
+    if case.double is not None:
+        actions += doubled.actions(case.double, scenario)
     if scenario.keeps_apart:
         actions += _questions(scenario, reasons)
     record = flight.fly(
@@ -149,7 +154,7 @@ def outcome(scenario: Scenario, record: Record, reasons: Sequence[Reason] = ()) 
         if (rows["mode"] == Mode.TRACK).any():
             flown.append(rows)
             began_s.append(began)
-            tracks.append(_track(scenario, rows, record.server, vehicle, began))
+            tracks.append(track(scenario, rows, record.server, vehicle, began))
     dt_s, scale = scenario.control.dt, scenario.mission.height_scale if scenario.keeps_apart else 1
     times_s, nearest_m = separations(flown, began_s, dt_s, scale)
     return CaseOutcome(
@@ -170,7 +175,8 @@ def outcome(scenario: Scenario, record: Record, reasons: Sequence[Reason] = ()) 
     )
 
 
-def _track(scenario: Scenario, rows: Rows, server: Rows, vehicle: int, began_s: float) -> Track:
+def track(scenario: Scenario, rows: Rows, server: Rows, vehicle: int, began_s: float) -> Track:
+    """Track of a vehicle from its rows, and from the server's."""
     flown = rows[np.argmax(rows["mode"] == Mode.TRACK) :]
     if scenario.keeps_apart:  # on a mission the reference is the next goal, which is far away
         error_m = np.zeros(len(flown))
@@ -178,7 +184,7 @@ def _track(scenario: Scenario, rows: Rows, server: Rows, vehicle: int, began_s: 
         error_m = np.linalg.norm(position_error(scenario, flown, server), axis=1)
     step_s = flown["step"] * scenario.control.dt
     modes, reasons = flown["mode"].astype(np.int64), flown["reason"].astype(np.int64)
-    return Track(vehicle, began_s, step_s, error_m, modes, reasons)
+    return Track(vehicle, began_s, step_s, flown["state"][..., 0], error_m, modes, reasons)
 
 
 def _lanes_began_ns(record: Record) -> dict[Lane, int]:

@@ -102,6 +102,8 @@ def _largest_m(outcome: CaseOutcome, scenario: Scenario) -> float:
 def possible(found: Cause, case: FlightCase) -> Iterator[tuple[str, Keys]]:
     """Names and keys of remedies that the scenario can be flown with."""
     for name, keys in _listed([part.unit for part in found.parts], case.scenario):
+        if case.double and any(key == "network.paths" for key, _ in keys):
+            continue  # a second network is not recorded
         try:
             changed = replace(case, keys=keys).flown()
         except ConfigError:

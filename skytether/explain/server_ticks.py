@@ -36,7 +36,7 @@ def flows(record: Record) -> dict[int, int]:
 
 def begin_ns(record: Record, dt_ns: int) -> int | None:
     """Time at which the packets of tick 0 leave, in virtual time [ns]: chosen so that most plans
-    coincide with a packet. None if no plan does.
+    coincide with a packet, to a millisecond where ticks come late. None if no plan does.
     """
     own, server = flows(record), record.server
     sent, times = server[server["event"]], Counter[int]()
@@ -45,7 +45,11 @@ def begin_ns(record: Record, dt_ns: int) -> int | None:
         left_ns = uplink["arrived_ns"][uplink["flow"] == flow][:PACKETS]
         since_ns = left_ns[:, None] - tick[sent["vehicle"] == vehicle][:PLANS] * dt_ns
         times.update(since_ns.ravel().tolist())
-    return max(times, key=times.__getitem__) if times else None
+    near = Counter[int]()
+    for time_ns, count in times.items():
+        near[time_ns // MILLISECOND_NS] += count
+    most = max(near, key=near.__getitem__, default=0)
+    return max(times, key=lambda each: (each // MILLISECOND_NS == most, times[each]), default=None)
 
 
 def are_plans(record: Record, packets: Rows, dt_ns: int) -> Flags:
@@ -61,5 +65,5 @@ def are_plans(record: Record, packets: Rows, dt_ns: int) -> Flags:
     sent = zip(packets["flow"].tolist(), at.tolist(), strict=True)
     is_at: Flags = np.array([(own.get(flow, 0), tick) in plans for flow, tick in sent], dtype=bool)
     is_up = packets["direction"] == UPLINK
-    result: Flags = is_at & is_up & (off_ns < MILLISECOND_NS)
+    result: Flags = is_at & is_up & (off_ns < dt_ns // 4)
     return result

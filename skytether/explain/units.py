@@ -63,6 +63,9 @@ SETTINGS: Sequence[tuple[str, Keys]] = (
     ("the server's computing time", (("simulation.compute_s", 0.001),)),
 )
 """Properties of vehicle, wind and server, and values of keys that remove them."""
+DOUBLED = "doubled(1)"
+"""Kind of the vehicle in place of a real one, see `doubled`."""
+PUSH = Setting("wind and errors of the model", (("vehicle.kind", "doubled(0)"),))
 
 
 def perfect(case: FlightCase) -> FlightCase:
@@ -159,6 +162,8 @@ def circumstances(
         window.append(stretch)
         bad += _bad(case, flown, stretch, usual_s[lane[:2]])
     settings = [Setting(*each) for each in SETTINGS if _is_there(case.scenario, each[1])]
+    if case.scenario.vehicle.kind == DOUBLED:
+        settings.append(PUSH)
     delays = [UsualDelay(direction) for direction in (1, 0)] if with_delay else []
     return Circumstances(case, (*settings, *delays, *case.stalls, *bad), tuple(window), usual_s)
 

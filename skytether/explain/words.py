@@ -148,7 +148,11 @@ def _without(parts: Sequence[CausePart], moment: Moment) -> str:
         return ""
     if len(parts) > 1:
         return f"{needed} of {len(parts)} needed by itself"
-    off = _off(parts[0].error_m) if moment.kind in ("brake", "error") else ""
+    part = parts[0]
+    off = _off(part.error_m) if moment.kind in ("brake", "error") else ""
+    if off and not math.isnan(part.calm_m):
+        least, most = sorted((part.calm_m, part.error_m))
+        off = f" ({least:.2f} to {most:.2f} m, without and with the push)"
     return f"without: {'does not' if needed else 'all the same'}{off}"
 
 

@@ -253,7 +253,8 @@ class Flight:
                     events.append(FlightEvent(time_ns, process, frame.event))
                 case Figures():
                     figures[process] = frame.figures
-        parts: dict[str, Any] = {**_no_rows(recorded.scenario), **recorded.parts}
+        parts: dict[str, Any] = _no_rows(recorded.scenario)
+        parts |= {part: rows for part, rows in recorded.parts.items() if part in PARTS}
         parts["netem"]["arrived_ns"] -= recorded.begin_ns
         log_events = [each.event for each in events]
         record = Record(

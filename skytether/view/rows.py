@@ -15,6 +15,7 @@ from skytether.shared.base.units import SECOND_NS
 from skytether.shared.endpoints.directions import FLIGHT, Directions
 from skytether.shared.law.model import Array
 from skytether.shared.scenario.whole import Scenario
+from skytether.shared.telemetry import ends
 from skytether.shared.telemetry.record import (
     DOWNLINK,
     PACKET_COLUMNS,
@@ -37,9 +38,15 @@ WORDS: Mapping[str, Mapping[int, str]] = {
     "reason": {reason: str(reason) for reason in Reason},
     "compared": {figure: str(figure) for figure in Compared},
     "direction": {UPLINK: FLIGHT[0], DOWNLINK: FLIGHT[1]},
+    "end": {end: str(end) for end in ends.End},
+    "happened": {what: str(what) for what in ends.Happened},
 }
 FLOWN_S_MAX = 2 * 86_400.0
 """Latest accepted time of a step [s]; a scenario lasts for a day at most."""
+TIMES = "arrived_ns", "time_ns", "due_ns"
+"""Columns with times on a process's clock."""
+TIME_NS_MAX = 2**62
+"""Largest accepted time on such a clock [ns]."""
 DELAY_NS_MAX = 86_400 * SECOND_NS
 """Longest delay of a packet that is accepted [ns]."""
 NUMBER_MAX = 1e100
@@ -134,6 +141,8 @@ def check_columns(part: str, columns: np.dtype[np.void], scenario: Scenario) -> 
             expected = plan_columns(axes, 1)
         case "netem":
             expected = PACKET_COLUMNS
+        case ends.PART:
+            expected = ends.COLUMNS
         case _:
             raise ValueError(f"no flight has a part {part[:20]!r}")
     plain(columns)
@@ -157,12 +166,12 @@ def check_values(part: str, rows: Rows, scenario: Scenario) -> None:
         "begins": int(FLOWN_S_MAX / scenario.control.dt),
         "path": PATHS_MAX - 1,
         "delay_ns": DELAY_NS_MAX,
-        "arrived_ns": 2**62,
+        **dict.fromkeys(TIMES, TIME_NS_MAX),
         "age_ns": 2**62,
         "solve_ns": 2**62,
         **{name: len(words) - 1 for name, words in WORDS.items()},
     }
-    least = {"age_ns": -1, "solve_ns": -1, "arrived_ns": -(2**62)}
+    least = {"age_ns": -1, "solve_ns": -1, **dict.fromkeys(TIMES, -TIME_NS_MAX)}
     for name in (rows.dtype.names or ()) if len(rows) else ():
         values = rows[name]
         if values.dtype.kind == "f":

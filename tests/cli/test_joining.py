@@ -14,7 +14,8 @@ from skytether.cli.join import join
 from skytether.cli.report import report
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.whole import Scenario
-from skytether.shared.telemetry.feed import Frame, Rows
+from skytether.shared.telemetry import ends, feed
+from skytether.shared.telemetry.feed import Frame, Opened, Rows
 from skytether.shared.telemetry.record import PACKET_COLUMNS, Record
 from skytether.shared.telemetry.summary import summarise
 from skytether.shell.commandline import command
@@ -74,6 +75,30 @@ def test_three_recordings_become_the_flight(flown: Record, tmp_path: Path) -> No
         assert joined.parts[part].tobytes() == getattr(flown, part).tobytes()
     times_ns = [time_ns for time_ns, *_ in joined.frames]
     assert times_ns == sorted(times_ns)
+
+
+def test_packets_at_the_ends_get_the_times_of_the_client(flown: Record, tmp_path: Path) -> None:
+    paths = [recorded_by(process, tmp_path, flown) for process in OFFSETS_NS]
+    about, columns = read(paths[1]).about, {ends.PART: ends.COLUMNS}
+    rows = np.array([(0, 0, 0, 0, 0, 0, 70, 50)], ends.COLUMNS)
+    opened = Opened(
+        process="server",
+        name="demo",
+        scenario=reading.to_toml(SCENARIO).decode(),
+        parts=feed.described(columns),
+        wall_ns=0,
+        time_ns=0,
+    )
+    with (tmp_path / "ends.mcap").open("wb") as file:
+        recording = Recording(file, SCENARIO, about)
+        recording.add("server", opened)
+        recording.add("server", Rows(part=ends.PART, time_ns=70, rows=rows.tobytes()))
+        recording.finish(None)
+    assert together([paths[0], tmp_path / "ends.mcap"], tmp_path / "flight.mcap") == 0
+    joined = read(tmp_path / "flight.mcap")
+    (row,) = joined.parts[ends.PART]
+    late_ns = about.offset_ns - joined.about.offset_ns
+    assert (row["time_ns"], row["due_ns"]) == (70 + late_ns, 50 + late_ns)
 
 
 def test_each_process_says_what_is_its_own(flown: Record, tmp_path: Path) -> None:
@@ -142,7 +167,7 @@ def test_a_flight_by_hand_is_recorded_and_joined(
     assert together(list(files.values()), out) == 0
     assert command.main(report, [str(out), "--html", str(tmp_path / "page.html")], "it") == 0
     parts, summary = read(out).parts, read(out).summary
-    assert set(parts) == {"client", "server", "plan", "netem"}
+    assert set(parts) == {"client", "server", "plan", "netem", ends.PART}
     # On a busy machine the vehicle may miss steps, but no recorded row may be missing.
     last = parts["client"][-1]
     assert last["step"] + 1 == len(parts["client"]) + last["missed"]

@@ -124,6 +124,17 @@ class Process:
         """Recorder of a further part of the record, for the feed only; None without a feed."""
         return _followed(Recorder(columns), self.feed, part, columns) if self.feed else None
 
+    def _watched(self, endpoint: Endpoint, line: int | None) -> Endpoint:
+        """The endpoint, with the packets at this end recorded in the feed, if there is one."""
+        if self.feed is None or self.secure is None:
+            return endpoint
+        from skytether.shared.telemetry import ends  # loaded with the feed
+        from skytether.shell.driving.ends import Watched
+
+        end = ends.End.CLIENT if self.name == "client" else ends.End.SERVER
+        recorder = _followed(Recorder(ends.COLUMNS), self.feed, ends.PART, ends.COLUMNS)
+        return Watched(endpoint, end, recorder, line)
+
     def _log(self, *, to_stderr: bool) -> Log:
         beside: Callable[[Event], None] = self.feed.say if self.feed else lambda _: None
         return Log(self.name, self.options.log, beside, to_stderr=to_stderr)
@@ -166,6 +177,7 @@ class Process:
                 to stderr, and the final counters only to the feed and the file.
         """
         options, feed, journal = self.options, self.feed, self.journal
+        endpoint = self._watched(endpoint, None if line is None else 1)  # socket 1 is the line
         clocks = [_clock(endpoint)] if options.config.link.time_of_day == "host" else []
         running = self._running(endpoint)
         if feed:

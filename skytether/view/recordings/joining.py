@@ -22,6 +22,7 @@ from skytether.shared.scenario.dotted import flat, set_keys
 from skytether.shared.scenario.owners import InFlight, Owner
 from skytether.shared.scenario.reading import check, to_table
 from skytether.shared.scenario.whole import Scenario
+from skytether.shared.telemetry import ends
 from skytether.shared.telemetry.feed import Frame, Rows
 from skytether.shared.telemetry.record import Rows as Table
 from skytether.view.recordings.recorded import Recorded, summary_of
@@ -29,6 +30,9 @@ from skytether.view.recordings.recording import Recording
 
 OWNERS = {"client": Owner.VEHICLE, "server": Owner.SERVER, "netem": Owner.NETEM}
 """Owner of keys by part of the record: a key's value is taken from the recording with that part."""
+
+TIMES = {"netem": ["arrived_ns"], ends.PART: ["time_ns", "due_ns"]}
+"""Columns with times on the process's clock."""
 
 
 def join(recordings: Sequence[Recorded], file: BinaryIO) -> None:
@@ -94,9 +98,10 @@ def _moved(
     late_ns = recorded.about.offset_ns - offset_ns
     for _, process, frame in recorded.frames:
         moved = msgspec.structs.replace(frame, time_ns=frame.time_ns + late_ns)
-        if isinstance(moved, Rows) and moved.part == "netem":
-            rows = np.frombuffer(moved.rows, recorded.parts["netem"].dtype).copy()
-            rows["arrived_ns"] += late_ns
+        if isinstance(moved, Rows) and (times := TIMES.get(moved.part)):
+            rows = np.frombuffer(moved.rows, recorded.parts[moved.part].dtype).copy()
+            for name in times:
+                rows[name] += late_ns
             moved = msgspec.structs.replace(moved, rows=rows.tobytes())
         yield named[process], moved
 

@@ -1,0 +1,170 @@
+"""What is a double's own in virtual time: when its ends are woken, its network and its vehicle.
+
+The impairment `doubled` has what happened to each packet. The vehicle `doubled` is a model in place
+of a real vehicle, pushed as that was:
+
+    x(k+1) = A x(k) + B u(k) + share · (x_r(k+1) - A x_r(k) - B u_r(k))
+
+x_r and u_r are the states and inputs of the recorded flight. With its inputs and all of the push it
+flies as recorded; without the push, as the model does in calm air.
+"""
+
+from collections.abc import Callable, Iterator, Mapping
+from functools import partial
+from typing import Annotated, Any
+
+import numpy as np
+from msgspec import Meta
+
+from skytether.client.memory import ClientMemory, Saving
+from skytether.client.simulated.plant import FirstOrderPlant
+from skytether.client.simulated.sensor import Sensor
+from skytether.client.simulated.vehicle import SimulatedVehicle
+from skytether.client.simulated.weather import Weather
+from skytether.explain.cases import Double
+from skytether.netem.impairments.draws import SLOT_S, Draws, Fate
+from skytether.netem.impairments.impairment import impairment
+from skytether.netem.impairments.traces import Trace
+from skytether.shared.base.chance import stream
+from skytether.shared.base.units import seconds_to_ns
+from skytether.shared.endpoints.endpoint import Datagram, Endpoint
+from skytether.shared.endpoints.steady import Steady
+from skytether.shared.law.model import Array
+from skytether.shared.scenario.registry import VEHICLES, File
+from skytether.shared.scenario.schema import Scenario
+from skytether.sim.flight import BOOT_ID, MIDNIGHT_NS, SERVER
+from skytether.sim.world import World
+
+FLOWN: list[Double] = []
+"""The recorded flight of the next vehicle: a scenario has no arrays."""
+
+
+def actions(double: Double, scenario: Scenario) -> Iterator[tuple[float, Callable[[World], None]]]:
+    """What makes a flight in virtual time a double, with the times in it [s]."""
+    FLOWN[:] = [double]
+    client = f"client {scenario.seed}.1"
+    if scenario.vehicle.kind.startswith("doubled") and scenario.vehicle.memory != "none":
+        yield 0.0, partial(_save, host=client, memory=ClientMemory(scenario.terms(), BOOT_ID, None))
+    for host, late_ns in ((client, double.client_late_ns), (SERVER[0], double.server_late_ns)):
+        yield 0.0, partial(_wake_late, host=host, double=double, late_ns=late_ns)
+    yield 0.0, partial(World.freeze, name=client)
+    yield double.opens_s, partial(World.thaw, name=client)
+
+
+def _save(world: World, host: str, memory: ClientMemory) -> None:
+    """Let a client save its state, as that of a real vehicle does: it sends nothing before."""
+    client: Any = world.endpoint(host)
+    client.keeps, client._memory = True, Saving(memory)
+
+
+def _wake_late(world: World, host: str, double: Double, late_ns: Mapping[int, int]) -> None:
+    world.restart(host, Late(world.endpoint(host), MIDNIGHT_NS + double.began_ns, late_ns))
+
+
+class Late(Steady):
+    """Endpoint that is woken late, as its process was; where that is not known, as it usually was.
+
+    Args:
+        began_ns: time of step 0 on its clock.
+        late_ns: see `Double`.
+    """
+
+    def __init__(self, inner: Endpoint, began_ns: int, late_ns: Mapping[int, int]) -> None:
+        super().__init__(inner)
+        self._began_ns, self._late_ns = began_ns, late_ns
+        self._usual_ns = int(np.median([*late_ns.values()])) if late_ns else 0
+
+    def next_wake_ns(self) -> int | None:
+        due_ns = super().next_wake_ns()
+        if due_ns is None or due_ns < MIDNIGHT_NS:  # at once
+            return due_ns
+        return due_ns + self._late_ns.get(due_ns - MIDNIGHT_NS, self._usual_ns)
+
+    def keep(self, *, now_ns: int) -> bytes | None:
+        """The disk is too slow for what begins with step 0 to be saved before it."""
+        return super().keep(now_ns=now_ns) if abs(now_ns - self._began_ns) > 1 else None
+
+
+@impairment(name="doubled")
+class DoubledPath(Trace):
+    """Delays and loses packets as those of a recorded flight, each by its slot and rank."""
+
+    def __init__(self, file: File) -> None:
+        super().__init__(file, "once")
+        rows = [map(float, line.split(",")) for line in file.content.decode().split()[1:]]
+        self._fates = {
+            (round(time_s / SLOT_S), rank): (seconds_to_ns(delay_s), bool(is_lost))
+            for time_s, delay_s, is_lost, rank in rows
+        }
+
+    def __call__(self, fate: Fate, draws: Draws) -> None:
+        """Apply the fate of the packet sent then; between packets as `trace`."""
+        if (known := self._fates.get((fate.slot, fate.rank))) is None:
+            super().__call__(fate, draws)
+            return
+        fate.delay_ns += known[0]
+        fate.lost |= known[1]
+
+
+class PushedPlant(FirstOrderPlant):
+    """Plant in calm air that begins where the recorded vehicle did."""
+
+    def __init__(self, scenario: Scenario, flown: Double, share: float) -> None:
+        super().__init__(scenario, Weather(scenario, stream(scenario.seed, "calm")))
+        model = FirstOrderPlant(scenario, self.weather)
+        self._pushes: list[Array] = []
+        for state, after, command in zip(
+            flown.states, flown.states[1:], flown.inputs, strict=False
+        ):
+            model.x = state.copy()
+            model.advance(command)
+            self._pushes.append(share * (after - model.x))
+        self._steps = 0
+        self.x = flown.states[0].copy()
+
+    def advance(self, command: Array) -> None:
+        super().advance(command)
+        if self._steps < len(self._pushes):
+            self.x += self._pushes[self._steps]
+        self._steps += 1
+
+
+class Ground(Endpoint):
+    """Port of a vehicle that is in the air at a given time of its clock."""
+
+    def __init__(self, up_ns: int) -> None:
+        super().__init__()
+        self._up_ns = up_ns
+        self.is_up = False
+
+    def receive(self, datagram: Datagram, *, now_ns: int) -> None:
+        """Nothing is received."""
+
+    def wake(self, *, now_ns: int) -> None:
+        self.is_up |= now_ns > self._up_ns
+
+    def next_wake_ns(self) -> int | None:
+        return None if self.is_up else self._up_ns
+
+
+class Doubled(SimulatedVehicle):
+    """A real vehicle's double: it takes off when that had taken off."""
+
+    drifts = True
+    port: Ground
+
+    def take_off(self, *, now_ns: int) -> bool:  # noqa: ARG002
+        return self.port.is_up
+
+
+@VEHICLES
+def doubled(
+    scenario: Scenario,
+    number: int,  # noqa: ARG001
+    share: Annotated[float, Meta(ge=0, le=1)] = 1.0,
+) -> Doubled:
+    """The model of a real vehicle, with a share of what pushed that in a recorded flight."""
+    sensor, (flown,) = Sensor(scenario, stream(scenario.seed, "sensor")), FLOWN
+    made = Doubled(scenario.dt_ns, PushedPlant(scenario, flown, share), sensor)
+    made.port = Ground(MIDNIGHT_NS + flown.began_ns - 1)
+    return made

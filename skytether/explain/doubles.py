@@ -1,0 +1,302 @@
+"""Doubles: a flight over UDP, flown again in virtual time with what its packets met.
+
+    rows of both ends → when they were woken, fates of packets (`doubled`) → a `FlightCase`
+
+The double has the scenario, the seed and the session's opening of the recording. Both ends are
+woken as late as they were, and packets are lost or delayed as those sent at the same time were: one
+between two recorded ones is lost if the nearer was, and has a delay between theirs. So each packet
+is handled before the tick before which it was; `in_force` and `observed_step` follow from that.
+
+**A real vehicle** is replaced by the model that flew with it, pushed at each step by what that left
+unexplained (`doubled`). What it would have done with other inputs is less certain: the wind
+elsewhere, and errors of the model.
+"""
+
+from collections import Counter, defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal
+
+import msgspec
+import numpy as np
+
+from skytether.explain.cases import Double, FlightCase, Stall
+from skytether.explain.flying import CaseOutcome, Track, track
+from skytether.explain.moments import AROUND_S, Moment
+from skytether.explain.units import DOUBLED, SETTINGS
+from skytether.netem.impairments.draws import SLOT_NS, SLOT_S
+from skytether.shared.base.errors import ConfigError
+from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
+from skytether.shared.events.flight import Flying
+from skytether.shared.law.model import Array, Indices
+from skytether.shared.scenario import reading
+from skytether.shared.scenario.dotted import set_keys
+from skytether.shared.scenario.registry import File
+from skytether.shared.scenario.whole import Scenario, WithFiles
+from skytether.shared.telemetry.ends import COLUMNS, PART, End, Happened
+from skytether.shared.telemetry.record import Rows
+from skytether.shared.telemetry.summary import WORSE
+from skytether.sim.flight import MIDNIGHT_NS
+
+if TYPE_CHECKING:  # it needs the library of MCAP
+    from skytether.view.recordings.recorded import Recorded
+
+NEAR_M = 0.1
+"""Largest distance of a double from its recording, up to the moment, with which it explains [m]."""
+NOWHERE = 2**16 - 1
+"""Path of packets of others."""
+SENT = Happened.SENT
+ENDS: tuple[Literal["client", "server"], ...] = ("client", "server")
+ASIDE_NS = 5 * MILLISECOND_NS
+"""Time after a stall within which packets that came meanwhile are handled [ns]."""
+SIMULATED = "simulated", "quadrotor"
+"""Kinds of vehicles that fly the same again, from their seed."""
+
+
+@dataclass(frozen=True, slots=True)
+class Nearness:
+    """Largest distances of a double from its recording, at equal steps, once settled [m]."""
+
+    until_m: float
+    """Up to the beginning of the moment; of a flight without one, in the whole flight."""
+    whole_m: float
+
+    def __str__(self) -> str:
+        until, whole = f"{self.until_m:.3f} m", f"{self.whole_m:.3f} m"
+        before = f"{until} until then, " if until != whole else ""
+        return f"at most {before}{whole} from it in the whole flight"
+
+
+def double(recorded: "Recorded") -> tuple[FlightCase, Track]:
+    """The case that is the double of a recorded flight, and that flight itself.
+
+    Raises:
+        ConfigError: the recording does not have what a double needs.
+    """
+    scenario, dt_ns, rows = recorded.scenario, recorded.scenario.dt_ns, recorded.parts["client"]
+    client, server = ends = _ends(recorded)
+    began_ns = _began_ns(recorded, client)
+    # Time in the flight, as that of events, plus less than a step: so the server's ticks are due.
+    tick_ns = int(_of(server, Happened.WOKEN)["due_ns"][-1])
+    zero_ns = recorded.begin_ns - (recorded.begin_ns - tick_ns - MIDNIGHT_NS) % dt_ns
+    compute_ns = _compute_ns(server)
+    late_ns, stalls, stood_ns = [], list[Stall](), []
+    for name, each in zip(ENDS, ends, strict=True):
+        late = _late_ns(each)
+        late_ns.append({at - zero_ns: by for at, by in late.items() if by < dt_ns})
+        stood_ns.append([(at, by) for at, by in late.items() if by >= dt_ns and at > began_ns])
+        stalls += [
+            Stall(name, (at - zero_ns) / SECOND_NS, by / SECOND_NS) for at, by in stood_ns[-1]
+        ]
+    opens_ns, fates = [], list[File]()
+    for path in range(len(scenario.paths)):
+        asked = (client["happened"] == SENT) & (client["peer"] == path)
+        opens_ns.append(int(client["time_ns"][_causes(client)[np.argmax(asked)]]))
+        way = path, opens_ns[-1]
+        fates.append(_fates("up", server, client, *way, compute_ns, stood_ns[0]))
+        fates.append(_fates("down", client, server, *way, 0, stood_ns[1]))
+    clocks = dict.fromkeys(("simulation.clock_offset_s", "simulation.clock_drift_ppm"), 0.0)
+    keys: dict[str, Any] = {"simulation.compute_s": compute_ns / SECOND_NS, **clocks}
+    if scenario.vehicle.kind not in SIMULATED:
+        keys |= {key: value for _, changes in SETTINGS[:-1] for key, value in changes}
+        keys["vehicle.kind"] = DOUBLED
+    # Just before step 0, whose lateness has this time, the vehicle is in the air.
+    late_ns[0][began_ns - zero_ns - 1] = 1
+    opens_s, (states, inputs) = (opens_ns[0] - zero_ns) / SECOND_NS, _steps(rows)
+    flown = Double(opens_s, began_ns - zero_ns, late_ns[0], late_ns[1], states, inputs)
+    case = FlightCase(_with_fates(scenario, fates, keys), stalls=tuple(stalls), double=flown)
+    began_s = (began_ns - zero_ns) / SECOND_NS
+    return case, track(scenario, rows, recorded.parts["server"], 1, began_s)
+
+
+def _ends(recorded: "Recorded") -> tuple[Rows, Rows]:
+    """Rows of the client's end and of the server's, whose peers are numbers of paths."""
+    parts = recorded.parts
+    rows = parts.get(PART, np.empty(0, COLUMNS))
+    client, server = (rows[rows["end"] == end] for end in (End.CLIENT, End.SERVER))
+    vehicles = np.unique(parts["client"]["vehicle"]).tolist()
+    for is_met, expected in (
+        (vehicles == [1], f"vehicle 1 alone; got {vehicles}"),
+        ("server" in parts and len(client) and len(server), "the packets at both ends"),
+    ):
+        if not is_met:
+            raise ConfigError(f"{recorded.path}: it cannot be flown again, expected {expected}")
+    return client, _on_paths(client, server)
+
+
+def _on_paths(client: Rows, server: Rows) -> Rows:
+    """The server's rows with the client's numbers of paths for its own, by the packets sent once;
+    the client numbers its paths in the order in which it uses them first.
+    """
+    both = Counter[tuple[int, int]]()
+    for sender, receiver in ((client, server), (server, client)):
+        sent, received = _of(sender, SENT), _of(receiver, Happened.RECEIVED)
+        packets, first, counts = np.unique(sent["packet"], return_index=True, return_counts=True)
+        once = dict(
+            zip(
+                packets[counts == 1].tolist(),
+                sent["peer"][first[counts == 1]].tolist(),
+                strict=True,
+            )
+        )
+        for packet, peer in received[["packet", "peer"]].tolist():
+            if packet in once:
+                both[(once[packet], peer) if sender is client else (peer, once[packet])] += 1
+    paths = {peer: path for (path, peer), _ in reversed(both.most_common())}
+    server = server.copy()
+    server["peer"] = [paths.get(peer, NOWHERE) for peer in server["peer"].tolist()]
+    return server
+
+
+def _of(rows: Rows, happened: Happened) -> Rows:
+    return rows[rows["happened"] == happened]
+
+
+def _began_ns(recorded: "Recorded", client: Rows) -> int:
+    """Time of step 0: of the wakes near the event, the one that most others follow by steps."""
+    times_ns = (at_ns for at_ns, _, event in recorded.events() if isinstance(event, Flying))
+    flying_ns, dt_ns = recorded.begin_ns + next(times_ns, 0), recorded.scenario.dt_ns
+    due_ns = _of(client, Happened.WOKEN)["due_ns"]
+    near = due_ns[np.abs(due_ns - flying_ns) < dt_ns].tolist()
+    if not near:
+        message = "it cannot be flown again, its first step is not recorded"
+        raise ConfigError(f"{recorded.path}: {message}")
+    steps = [int(((due_ns - each) % dt_ns == 0).sum()) for each in near]
+    return int(near[int(np.argmax(steps))])
+
+
+def _causes(rows: Rows) -> Indices:
+    """Number of the row to which each answers: itself, unless something was sent."""
+    is_sent = rows["happened"] == SENT
+    return np.maximum.accumulate(np.where(is_sent, 0, np.arange(len(rows))))
+
+
+def _arrivals(sender: Rows, receiver: Rows) -> dict[int, int]:
+    """Number of the receiver's row for each of the sender's rows of a packet that arrived."""
+    sent, found = defaultdict[tuple[int, int], list[int]](list), dict[int, int]()
+    for number in np.flatnonzero(sender["happened"] == SENT).tolist():
+        sent[_packet(sender[number])].append(number)
+    for number in np.flatnonzero(receiver["happened"] == Happened.RECEIVED).tolist():
+        equal = sent[_packet(receiver[number])]
+        # Of equal packets, such as those that ask for a session, the newest before it.
+        before = sum(sender["time_ns"][each] <= receiver["time_ns"][number] for each in equal)
+        if equal:
+            found[equal.pop(max(0, before - 1))] = number
+    return found
+
+
+def _packet(row: np.void) -> tuple[int, int]:
+    """Path and hash of a packet, of which a copy may go over each path."""
+    return int(row["peer"]), int(row["packet"])
+
+
+def _compute_ns(server: Rows) -> int:
+    """Median time from a tick to what it sends [ns]."""
+    cause = _causes(server)
+    is_it = (server["happened"] == SENT) & (server["happened"][cause] == Happened.WOKEN)
+    passed_ns = (server["time_ns"] - server["time_ns"][cause])[is_it]
+    return int(np.median(passed_ns)) if len(passed_ns) else 0
+
+
+def _late_ns(rows: Rows) -> dict[int, int]:
+    """How late an end was woken, by the time at which it should have been [ns]."""
+    woken = _of(rows, Happened.WOKEN)
+    late_ns = woken["time_ns"] - woken["due_ns"]
+    return dict(zip(woken["due_ns"].tolist(), late_ns.tolist(), strict=True))
+
+
+def _fates(
+    way: str,
+    sender: Rows,
+    receiver: Rows,
+    path: int,
+    opens_ns: int,
+    compute_ns: int,
+    stood_ns: Sequence[tuple[int, int]],
+) -> File:
+    """File of what happened to the packets of a path and direction, for `doubled`.
+
+    Args:
+        opens_ns: time at which the path's first packet is sent, from which the file counts.
+        compute_ns: time after which what a tick sends leaves.
+        stood_ns: times at which the receiver stood still, and for how long.
+    """
+    cause, came = _causes(sender), _arrivals(sender, receiver)
+    is_tick = sender["happened"][cause] == Happened.WOKEN
+    sent_ns = sender["time_ns"][cause] + np.where(is_tick, compute_ns, 0)
+    took_ns = {n: max(0, int(receiver["time_ns"][to] - sent_ns[n])) for n, to in came.items()}
+    usual_ns = int(np.median([*took_ns.values()] or [0]))
+    for number, to in came.items():
+        came_ns = int(receiver["time_ns"][to])
+        if any(0 < came_ns - at_ns <= for_ns + ASIDE_NS for at_ns, for_ns in stood_ns):
+            took_ns[number] = min(usual_ns, took_ns[number])
+    slots, lines = Counter[int](), list[str]()
+    for number in np.flatnonzero((sender["happened"] == SENT) & (sender["peer"] == path)).tolist():
+        slot, is_lost = int(sent_ns[number] - opens_ns) // SLOT_NS, number not in came
+        delay_s = took_ns.get(number, usual_ns) / SECOND_NS
+        lines.append(f"{slot * SLOT_S:.3f},{delay_s:.9f},{is_lost:d},{slots[slot]}")
+        slots[slot] += 1
+    first = [] if slots[0] else [f"0.000,{usual_ns / SECOND_NS:.9f},0,0"]
+    text = "\n".join(["time_s,delay_s,lost,rank", *first, *lines, ""])
+    return File(f"recorded-{way}link-{path + 1}.csv", text.encode())
+
+
+def _with_fates(scenario: Scenario, fates: Sequence[File], keys: Mapping[str, Any]) -> Scenario:
+    """Scenario with changed keys, whose paths have the fates in files: up and down of each."""
+    texts = [f"doubled({each.name})" for each in fates]
+    network = scenario.network
+    paths = tuple(
+        msgspec.structs.replace(each, uplink=up, downlink=down)
+        for each, up, down in zip(network.paths, texts[::2], texts[1::2], strict=False)
+    )
+    up, down = texts[:2]
+    network = msgspec.structs.replace(network, uplink=up, downlink=down, paths=paths)
+    fields = {name: getattr(scenario, name) for name in Scenario.__struct_fields__}
+    named = WithFiles(**{**fields, "network": network}, contents=(*scenario.files, *fates))
+    table = reading.to_table(named)
+    set_keys(dict(keys), table)
+    return reading.check(table, checked=named)
+
+
+def _steps(client: Rows) -> tuple[Array, Array]:
+    """States and inputs of all steps; of missed ones those between, and the input before them."""
+    step, states = client["step"], client["state"]
+    steps = np.arange(int(step[-1]) + 1)
+    columns = [np.interp(steps, step, each) for each in states.reshape(len(states), -1).T]
+    before = np.searchsorted(step, steps, side="right") - 1
+    through = np.stack(columns, -1).reshape(-1, *states.shape[1:])
+    return through, client["input"][np.maximum(before, 0)]
+
+
+def nearness(
+    flown: CaseOutcome, recorded: Track, moment: Moment | None, settled_s: float
+) -> Nearness:
+    """How near a double is to its recording.
+
+    Args:
+        settled_s: time since step 0 from which on it counts [s].
+
+    Raises:
+        ConfigError: too far to explain it.
+    """
+    if not flown.tracks:
+        raise ConfigError("its double does not fly")
+    own = flown.tracks[0]
+    at_s, mine, its = np.intersect1d(own.step_s, recorded.step_s, return_indices=True)
+    mine, its = mine[at_s >= settled_s], its[at_s >= settled_s]
+    distance_m = np.linalg.norm(own.position_m[mine] - recorded.position_m[its], axis=1)
+    time_s = own.time_s[mine]
+    until = time_s <= (moment.start_s if moment else np.inf)
+    near = Nearness(*(float(each.max(initial=0.0)) for each in (distance_m[until], distance_m)))
+    if near.until_m > NEAR_M:
+        departs_s = time_s[np.argmax(distance_m > NEAR_M)]
+        raise ConfigError(
+            f"its double is {near.until_m:.2f} m away before the moment, expected at most "
+            f"{NEAR_M} m: it departs at {departs_s:.2f} s, by something that is not recorded, such "
+            "as a key that was changed, or a process that was restarted"
+        )
+    around = np.abs(recorded.time_s - moment.start_s) <= AROUND_S if moment else np.array([])
+    if moment and moment.kind == "brake" and not np.isin(recorded.mode[around], WORSE).any():
+        says = f"its double {moment.says} at {moment.start_s:.2f} s"
+        raise ConfigError(f"{says}, which the recorded flight did not")
+    return near
