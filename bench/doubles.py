@@ -37,7 +37,7 @@ from skytether.shell.commandline import command
 from skytether.view.recordings.joining import join
 from skytether.view.recordings.recorded import read
 
-PLAIN, PAPER = "constant(0.05)", "paper(0.4, 0.02, 2.0)"
+PLAIN, FAIR, PAPER = "constant(0.05)", "uniform(0.05, 0.15) & loss(0.1)", "paper(0.4, 0.02, 2.0)"
 
 
 @dataclass(frozen=True)
@@ -57,8 +57,12 @@ class Problem:
     """Autopilot; None for a simulated vehicle."""
 
 
-def _network(uplink: str, downlink: str | None = None) -> dict[str, str]:
-    return {"network.uplink": uplink, "network.downlink": downlink or uplink.partition(" & ")[0]}
+def _path(uplink: str, downlink: str = "") -> dict[str, str]:
+    return {"uplink": uplink, "downlink": downlink or uplink.partition(" & ")[0]}
+
+
+def _network(uplink: str, downlink: str = "") -> dict[str, str]:
+    return {f"network.{way}": text for way, text in _path(uplink, downlink).items()}
 
 
 FIELD: Mapping[str, Any] = {
@@ -80,9 +84,9 @@ PROBLEMS = (
     ),
     Problem("downlink out for 5 s", "downlink", _network(PLAIN, f"{PLAIN} & outage(7, 5)")),
     Problem(
-        "downlink out for 5 s, paper's network",
-        "downlink",
-        _network(PAPER, f"{PAPER} & outage(7, 5)"),
+        "both uplinks of two paths out for 3 s",
+        "uplink",
+        {"network.paths": [_path(f"{FAIR} & outage(8, 3)", FAIR)] * 2},
     ),
     Problem("server stopped for 2.5 s", "server", _network(PLAIN), ("server", 7.0, 2.5)),
     Problem("client stopped for 1 s", "client", _network(PLAIN), ("client", 7.0, 1.0)),
@@ -144,7 +148,6 @@ def record(problem: Problem, folder: Path) -> Path:
     table = reading.to_table(reading.load(base))
     set_keys({"duration": 14.0, "settle": 3.0, "seed": 7, **problem.keys}, table)
     with ExitStack() as stack:
-        autopilot = None
         scenario = folder / "scenario.toml"
         if problem.flavour:
             files.write(scenario, reading.to_toml(reading.check(table, "bench")))
@@ -162,10 +165,13 @@ def record(problem: Problem, folder: Path) -> Path:
         parts: list[Path] = []
         server = start("server", "", "--bind", f"{HOST}:0")
         at = address_text(*server.address)
-        netem = start("netem", "", "--bind", f"{HOST}:0", "--server", at)
+        netems = [
+            start("netem", f" {n}", "--bind", f"{HOST}:0", "--server", at, "--path", str(n))
+            for n in range(1, len(reading.check(table, "bench").paths) + 1)
+        ]
+        paths = [f"--path={HOST}={address_text(*each.address)}" for each in netems]
         unsafe = ["--set-parameters"] if problem.flavour else []
-        path = "--server", address_text(*netem.address)
-        client = start("client", "", *path, "--new-flight", *unsafe)
+        client = start("client", "", *paths, "--new-flight", *unsafe)
         client.wait_for(Flying)
         if problem.stopped:
             name, at_s, for_s = problem.stopped
@@ -176,7 +182,7 @@ def record(problem: Problem, folder: Path) -> Path:
             server.kill()
             server = start("server", " again", "--bind", at)
         client.process.wait(120.0)
-        for each in (server, netem):
+        for each in (server, *netems):
             each.stop()
         whole = folder / "flight.mcap"
         with files.replacing(whole) as file:
@@ -243,7 +249,7 @@ def table(all_found: Sequence[Found]) -> TextTable:
     rows = [
         [
             each.name,
-            f"{each.until_m:.4f}, {each.whole_m:.4f}" if not each.refused else "-",
+            "-" if each.refused else f"{each.until_m:.1g}, {each.whole_m:.1g}",
             each.moment or "-",
             "; ".join(each.cause) or ("refused" if each.refused else "the scenario itself"),
             "yes" if each.agrees else "no",
