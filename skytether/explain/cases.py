@@ -69,7 +69,17 @@ class Stall:
     for_s: float
 
 
-Unit: TypeAlias = Bad | UsualDelay | Setting | Stall
+@dataclass(frozen=True, slots=True)
+class Command:
+    """Key that a person changes in flight."""
+
+    at_s: float
+    """Time of flight [s]."""
+    key: str
+    value: Any
+
+
+Unit: TypeAlias = Bad | UsualDelay | Setting | Stall | Command
 """Unit that can be removed from a flight."""
 
 
@@ -108,6 +118,7 @@ class FlightCase:
     vehicles: int = 1
     secure: bool = False
     stalls: tuple[Stall, ...] = ()
+    commands: tuple[Command, ...] = ()
     keys: Keys = ()
     delivered: tuple[DeliveredStretch, ...] = ()
     until_s: float | None = None

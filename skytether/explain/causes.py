@@ -11,7 +11,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from skytether.explain import units
-from skytether.explain.cases import Bad, FlightCase, Lane, Setting, Stall, Unit, UsualDelay
+from skytether.explain.cases import (
+    Bad,
+    Command,
+    FlightCase,
+    Lane,
+    Setting,
+    Stall,
+    Unit,
+    UsualDelay,
+)
 from skytether.explain.flying import CaseOutcome, FlyAll
 from skytether.explain.moments import AFTER_S, Moment, comes_about, error_m, is_averted
 from skytether.explain.smallest import smallest
@@ -128,6 +137,8 @@ def cause(
 
 
 def _part(unit: Unit, flown: CaseOutcome) -> CausePart:
+    if isinstance(unit, Command):
+        return CausePart(unit, unit.at_s, unit.at_s, False, np.nan)
     if isinstance(unit, Stall):
         return CausePart(unit, unit.at_s, unit.at_s + unit.for_s, False, np.nan)
     if not isinstance(unit, Bad):
@@ -201,6 +212,8 @@ def named(unit: Unit) -> str:
             return unit.name
         case UsualDelay():
             return f"usual delay of the {FLIGHT[unit.direction]}"
+        case Command():
+            return f"change of {unit.key} to {unit.value}"
         case Stall():
             return f"stall of the {unit.process}"
         case Bad():

@@ -20,14 +20,14 @@ from typing import TYPE_CHECKING, Any, Literal
 import msgspec
 import numpy as np
 
-from skytether.explain.cases import Double, FlightCase, Stall
+from skytether.explain.cases import Command, Double, FlightCase, Stall
 from skytether.explain.flying import CaseOutcome, Track, track
 from skytether.explain.moments import AROUND_S, Moment
 from skytether.explain.units import DOUBLED, SETTINGS
 from skytether.netem.impairments.draws import SLOT_NS, SLOT_S
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
-from skytether.shared.events.flight import Flying
+from skytether.shared.events.flight import Changed, Flying
 from skytether.shared.law.model import Array, Indices
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.dotted import set_keys
@@ -104,7 +104,17 @@ def double(recorded: "Recorded") -> tuple[FlightCase, Track]:
     late_ns[0][began_ns - zero_ns - 1] = 1
     opens_s, (states, inputs) = (opens_ns[0] - zero_ns) / SECOND_NS, _steps(rows)
     flown = Double(opens_s, began_ns - zero_ns, late_ns[0], late_ns[1], states, inputs)
-    case = FlightCase(_with_fates(scenario, fates, keys), stalls=tuple(stalls), double=flown)
+    commands = tuple(
+        Command(
+            (recorded.begin_ns + at_ns - zero_ns) / SECOND_NS,
+            event.key,
+            msgspec.json.decode(event.after),
+        )
+        for at_ns, process, event in recorded.events()
+        if isinstance(event, Changed) and not process.startswith("netem")
+    )
+    fated = _with_fates(scenario, fates, keys)
+    case = FlightCase(fated, stalls=tuple(stalls), commands=commands, double=flown)
     began_s = (began_ns - zero_ns) / SECOND_NS
     return case, track(scenario, rows, recorded.parts["server"], 1, began_s)
 
@@ -293,7 +303,7 @@ def nearness(
         raise ConfigError(
             f"its double is {near.until_m:.2f} m away before the moment, expected at most "
             f"{NEAR_M} m: it departs at {departs_s:.2f} s, by something that is not recorded, such "
-            "as a key that was changed, or a process that was restarted"
+            "as a pilot, or a process that was restarted"
         )
     around = np.abs(recorded.time_s - moment.start_s) <= AROUND_S if moment else np.array([])
     if moment and moment.kind == "brake" and not np.isin(recorded.mode[around], WORSE).any():

@@ -111,6 +111,7 @@ def fly(case: FlightCase) -> CaseOutcome:
         scenario,
         vehicles=case.vehicles,
         secure=case.secure,
+        changes=[(each.at_s, {each.key: each.value}) for each in case.commands],
         actions=actions,
         on_second=on_second,
         stopped=None if until_s is None else lambda: reached_s >= until_s,

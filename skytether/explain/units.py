@@ -81,6 +81,7 @@ def perfect(case: FlightCase) -> FlightCase:
         scenario=msgspec.structs.replace(case.scenario, network=network),
         keys=tuple(key for keys in settings for key in keys),
         stalls=(),
+        commands=(),
     )
 
 
@@ -129,8 +130,14 @@ class Circumstances:
 
     def _with(self, delivered: Sequence[DeliveredStretch], taken: Collection[Unit]) -> FlightCase:
         keys = [key for each in taken if isinstance(each, Setting) for key in each.keys]
-        stalls = tuple(each for each in self.case.stalls if each not in taken)
-        return replace(self.case, delivered=tuple(delivered), keys=tuple(keys), stalls=stalls)
+        own = self.case
+        return replace(
+            own,
+            delivered=tuple(delivered),
+            keys=tuple(keys),
+            stalls=tuple(each for each in own.stalls if each not in taken),
+            commands=tuple(each for each in own.commands if each not in taken),
+        )
 
 
 def _between(stretch: Stretch, bad: Collection[Bad]) -> Iterator[Stretch]:
@@ -165,7 +172,8 @@ def circumstances(
     if case.scenario.vehicle.kind == DOUBLED:
         settings.append(PUSH)
     delays = [UsualDelay(direction) for direction in (1, 0)] if with_delay else []
-    return Circumstances(case, (*settings, *delays, *case.stalls, *bad), tuple(window), usual_s)
+    found = *settings, *delays, *case.stalls, *case.commands, *bad
+    return Circumstances(case, found, tuple(window), usual_s)
 
 
 def _order(lane: Lane) -> tuple[int, int, int]:

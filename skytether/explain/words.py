@@ -125,7 +125,8 @@ def _row(parts: Sequence[CausePart], moment: Moment) -> list[str]:
     """Cells of a row: where, when, what was lost, how much is enough, and the flight without it."""
     first, last = parts[0], parts[-1]
     unit, plans = first.unit, sum(part.plans for part in parts)
-    when = f"{first.start_s:.1f} to {first.end_s:.1f} s" if first.end_s else ""
+    times = dict.fromkeys(f"{each:.1f}" for each in (first.start_s, first.end_s))
+    when = f"{' to '.join(times)} s" if first.end_s else ""
     if not isinstance(unit, Bad):
         return [named(unit), when, "", "", _without(parts, moment)]
     verb, packets = "late" if unit.is_late else "lost", first.packets

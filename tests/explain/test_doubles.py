@@ -13,7 +13,7 @@ import pytest
 from helpers import SKYTETHER, ran
 from skytether.client.simulated.vehicle import SimulatedVehicle
 from skytether.explain import doubles
-from skytether.explain.cases import Bad, FlightCase, Stall
+from skytether.explain.cases import Bad, Command, FlightCase, Stall
 from skytether.explain.explanation import Explanation, explain
 from skytether.explain.flying import CaseOutcome, fly
 from skytether.shared.base.errors import ConfigError
@@ -38,12 +38,16 @@ def scenario_of(**keys: Any) -> Scenario:
 
 
 def recorded(
-    scenario: Scenario, *actions: tuple[float, Callable[[World], None]], kind: str = ""
+    scenario: Scenario,
+    *actions: tuple[float, Callable[[World], None]],
+    kind: str = "",
+    **changed: Any,
 ) -> Any:
     """Recording of a flight in virtual time, as processes would make it.
 
     Args:
         kind: kind of the vehicle in the recording; by default that of the scenario.
+        changed: keys changed 7 s into the flight.
     """
     ends = MemoryRecorder(COLUMNS)
     worlds: list[World] = []
@@ -60,7 +64,9 @@ def recorded(
     def begin(world: World) -> None:
         world.thaw(f"client {scenario.seed}.1")
 
-    flown = flight.fly(scenario, actions=[(0.0, watch), (0.321, begin), *actions])
+    own = [(0.0, watch), (0.321, begin), *actions]
+    changes = [(7.0, changed)] if changed else []
+    flown = flight.fly(scenario, actions=own, changes=changes)
     vehicle = msgspec.structs.replace(scenario.vehicle, kind=kind or scenario.vehicle.kind)
     parts = {"client": flown.client, "server": flown.server, PART: ends.rows()}
     return SimpleNamespace(
@@ -126,6 +132,17 @@ def test_a_process_that_stood_still_is_a_unit_of_its_double() -> None:
     assert known.nearness.until_m < 1e-9
     assert known.cause is not None
     assert [type(part.unit) for part in known.cause.parts] == [Stall]
+
+
+def test_what_a_person_changed_in_flight_is_a_unit_of_its_double() -> None:
+    gust = {"vehicle.steady_wind_mps": [4.0, 0.0]}
+    case, track = doubles.double(recorded(scenario_of(), **gust))
+    known = explained(case, track)
+    assert known.nearness is not None
+    assert known.nearness.whole_m < 1e-9
+    assert known.cause is not None
+    (part,) = known.cause.parts
+    assert part.unit == Command(pytest.approx(7.0, abs=0.05), *gust.popitem())
 
 
 def test_a_real_vehicle_is_doubled_by_its_model_and_what_pushed_it(
