@@ -41,7 +41,7 @@ def replay(argv: Sequence[str]) -> None:
         closing(Explainer(options.file, brakes(recorded))) as explainer,
     ):
         added = [player.controls]
-        if not recorded.about.began:  # only virtual flights can be flown again
+        if recorded.can_be_explained:
             added.append(explainer.controls)
 
         def more(gui: GuiApi) -> Callable[[], None]:

@@ -42,6 +42,8 @@ class ExplainOptions:
     flight in virtual time or over UDP."""
     at: Annotated[float | None, Argument(metavar="T")] = None
     """Time of flight of the moment to explain [s]; by default the gravest moment."""
+    vehicle: Annotated[int | None, Argument(metavar="N")] = None
+    """Number of the vehicle whose moment is to be explained; by default any."""
     seeds: Annotated[int, Argument(metavar="N")] = 0
     """Number of flights of each remedy with other seeds, which count up from the scenario's."""
     vehicles: Annotated[int | None, Argument(metavar="N")] = None
@@ -108,7 +110,7 @@ def _judge(options: ExplainOptions, recorded: Recorded) -> None:
     Raises:
         CommandError: a part of the record is missing, or an option needs more flights.
     """
-    for name in ("at", "seeds", "json", "figure"):
+    for name in ("at", "vehicle", "seeds", "json", "figure"):
         if getattr(options, name) != getattr(ExplainOptions, name):
             message = f"--{name}: got it with a flight over UDP, which cannot be flown again"
             raise CommandError(message, command.CONFIGURATION)
@@ -170,6 +172,7 @@ def _explain(options: ExplainOptions, name: str, case: FlightCase, recorded: str
             name,
             fly_all,
             at_s=options.at,
+            vehicle=options.vehicle,
             seeds=options.seeds,
             at_once=at_once,
             recorded=recorded if isinstance(recorded, Track) else None,

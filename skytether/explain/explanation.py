@@ -69,6 +69,7 @@ def explain(
     fly_all: FlyAll,
     *,
     at_s: float | None = None,
+    vehicle: int | None = None,
     seeds: int = 0,
     at_once: int = 1,
     recorded: Track | None = None,
@@ -78,6 +79,7 @@ def explain(
     Args:
         name: name of the scenario.
         at_s: time of flight of the moment to explain [s]; None: the gravest moment.
+        vehicle: vehicle of the moment to explain; None: any.
         seeds: number of flights of each remedy with other seeds.
         at_once: number of flights that `fly_all` flies side by side.
         recorded: the flight that the case is the double of.
@@ -87,7 +89,7 @@ def explain(
     """
     flown, perfect = fly_all([case, units.perfect(case)])
     found = tuple(moments(flown, perfect, case.scenario))
-    moment = _chosen(found, at_s)
+    moment = _chosen(found, at_s, vehicle)
     near = nearness(flown, recorded, moment, case.scenario.settled_s) if recorded else None
     known = Explanation(name, case.scenario.seed, found, moment, flown, nearness=near)
     if moment is None:
@@ -116,8 +118,18 @@ def explain(
         yield "other seeds", (known := replace(known, remedies=tuple(tried)))
 
 
-def _chosen(found: Sequence[Moment], at_s: float | None) -> Moment | None:
-    """Choose the moment to explain; raises ConfigError if there is none at the requested time."""
+def _chosen(
+    found: Sequence[Moment], at_s: float | None, vehicle: int | None = None
+) -> Moment | None:
+    """Choose the moment to explain; raises ConfigError if there is none at the requested time, or
+    of the requested vehicle.
+    """
+    if vehicle is not None:
+        vehicles = dict.fromkeys(str(each.vehicle) for each in found)
+        found = [each for each in found if each.vehicle == vehicle]
+        if not found:
+            expected = f"one of {', '.join(vehicles)}" if vehicles else "none"
+            raise ConfigError(f"vehicle: got {vehicle}, expected {expected}")
     if at_s is None:
         return worst(found) if found else None
 

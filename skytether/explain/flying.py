@@ -6,18 +6,19 @@ A case and its outcome can be sent to another process and back.
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
 from skytether.explain import doubled
 from skytether.explain.cases import FlightCase, Lane, Stall
 from skytether.explain.hypotheses import Hypothesis, hypotheses
-from skytether.explain.server_ticks import are_plans
+from skytether.explain.server_ticks import are_plans, flows
 from skytether.explain.waits import Reason, Wait, waits
 from skytether.netem.impairments.draws import SLOT_NS
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.events.flight import Failure, FlowOpened, Flying
+from skytether.shared.events.paths import PathDied
 from skytether.shared.law.model import Array, Flags, Indices
 from skytether.shared.law.motion import SPACING
 from skytether.shared.scenario.whole import Scenario
@@ -26,6 +27,10 @@ from skytether.shared.telemetry.summary import position_error, separations
 from skytether.shared.wire.protocol import Mode
 from skytether.sim import flight
 from skytether.sim.world import World
+
+JUST_NS, BEFORE_NS = SECOND_NS // 5, 2 * SECOND_NS
+"""Least and largest age of packets by which it is judged whether a path was dead [ns]: those that
+were sent just before may be under way."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,6 +69,19 @@ class Packets:
     is_plan: Flags
 
 
+class Death(NamedTuple):
+    """Time at which an end took a path for dead."""
+
+    time_s: float
+    """Time of flight [s]."""
+    vehicle: int
+    path: int
+    direction: int
+    """UPLINK, which the server judges by reports, or DOWNLINK, which the vehicle hears."""
+    arrived: float
+    """Share of the packets sent over it shortly before that arrived."""
+
+
 @dataclass(frozen=True, slots=True)
 class CaseOutcome:
     """Result of flying a case."""
@@ -79,6 +97,7 @@ class CaseOutcome:
     """Reason why a vehicle could not fly; empty if all flew."""
     failed_s: float
     """Time of flight of the failure [s]; 0 if there was none."""
+    deaths: tuple[Death, ...]
     packets_per_s: float
     trace: str
     """Hash of the vehicles' rows, see `trace_hash`."""
@@ -169,6 +188,7 @@ def outcome(scenario: Scenario, record: Record, reasons: Sequence[Reason] = ()) 
             (each.time_ns / SECOND_NS for each in record.events if isinstance(each.event, Failure)),
             0.0,
         ),
+        tuple(_deaths(record)),
         len(record.netem) / max(1.0, float(np.ptp(record.netem["arrived_ns"])) / SECOND_NS),
         trace_hash(record.client),
         hypotheses(record, scenario) if scenario.keeps_apart else (),
@@ -186,6 +206,21 @@ def track(scenario: Scenario, rows: Rows, server: Rows, vehicle: int, began_s: f
     step_s = flown["step"] * scenario.control.dt
     modes, reasons = flown["mode"].astype(np.int64), flown["reason"].astype(np.int64)
     return Track(vehicle, began_s, step_s, flown["state"][..., 0], error_m, modes, reasons)
+
+
+def _deaths(record: Record) -> Iterator[Death]:
+    flow, packets = {vehicle: flow for flow, vehicle in flows(record).items()}, record.netem
+    for each in record.events:
+        if not isinstance(each.event, PathDied):
+            continue
+        way = UPLINK if each.process == "server" else DOWNLINK
+        since_ns = each.time_ns - packets["arrived_ns"]
+        is_own = (packets["direction"] == way) & (packets["path"] == each.event.path)
+        is_own &= packets["flow"] == flow.get(each.event.vehicle, 0)
+        lost = packets["lost"][is_own & (since_ns > JUST_NS) & (since_ns < BEFORE_NS)]
+        if len(lost):
+            at, arrived = (each.event.vehicle, each.event.path, way), 1.0 - float(lost.mean())
+            yield Death(each.time_ns / SECOND_NS, *at, arrived)
 
 
 def _lanes_began_ns(record: Record) -> dict[Lane, int]:

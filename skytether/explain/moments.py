@@ -5,6 +5,7 @@
     error        its distance from the reference is far above that of the perfect flight
     separation   two vehicles of a mission came as close as they may, or closer
     packets      the server sends far more packets in a second than in the perfect flight
+    path         a path was taken for dead although most of its packets arrived
 
 The perfect flight has the same reference and wind, every packet arrives at once, and nothing else
 is wrong (`units.perfect`). A comparison with the flight's own median would hide a flight that is
@@ -18,9 +19,10 @@ from typing import Literal
 import numpy as np
 
 from skytether.explain.flying import CaseOutcome, Track
+from skytether.shared.endpoints.directions import FLIGHT
 from skytether.shared.law.model import Array, Flags
 from skytether.shared.scenario.whole import Scenario
-from skytether.shared.telemetry.record import Reason
+from skytether.shared.telemetry.record import DOWNLINK, Reason
 from skytether.shared.telemetry.summary import STOPPED, WORSE
 from skytether.shared.wire.protocol import Mode
 
@@ -39,10 +41,12 @@ NEAR = 1.05
 WASTED_TIMES, WASTED_PER_S = 3.0, 10.0
 """Packets are wasted above this multiple of the perfect flight's rate, and this excess [1/s]."""
 
+ALIVE = 0.5
+"""Share of its packets that arrived above which a path was not dead."""
 WARM_S = 5.0
 """Time of flight before which many plans are normal, because vehicles have just started [s]."""
 
-Kind = Literal["failure", "brake", "error", "separation", "packets"]
+Kind = Literal["failure", "brake", "error", "separation", "packets", "path"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,7 +80,7 @@ def moments(flown: CaseOutcome, perfect: CaseOutcome, scenario: Scenario) -> lis
         for track in flown.tracks
         for moment in _of_vehicle(track, usual.get(track.vehicle), scenario)
     ]
-    found += [*_too_near(flown, perfect, scenario), *_wasted(flown, perfect)]
+    found += [*_too_near(flown, perfect, scenario), *_wasted(flown, perfect), *_alive(flown)]
     at_s = flown.failed_s
     # A flight that ends while the vehicle brakes is explained by the brake.
     if flown.failure and not any(each.end_s >= at_s - AROUND_S for each in found):
@@ -93,27 +97,36 @@ def worst(found: Sequence[Moment]) -> Moment:
     return max(found, key=weight)
 
 
-WEIGHTS: Mapping[Kind, int] = {"failure": 3, "separation": 2, "brake": 2, "error": 1, "packets": 0}
+WEIGHTS: Mapping[Kind, int] = {
+    "failure": 3,
+    "separation": 2,
+    "brake": 2,
+    "error": 1,
+    "packets": 0,
+    "path": 0,
+}
 
 
 def measured(moment: Moment, outcome: CaseOutcome) -> float:
     """Size of a moment in another flight; from `moment.level` on, it occurs there."""
+    around = moment.start_s - AROUND_S, moment.end_s + AROUND_S
     match moment.kind:
         case "failure":
-            return float(bool(outcome.failure))
+            size = float(bool(outcome.failure))
         case "brake":
-            track = _track(outcome, moment.vehicle)
-            if track is None:  # the vehicle never flew
-                return 1.0
-            near = _within(track.time_s, moment.start_s - AROUND_S, moment.end_s + AROUND_S)
-            return float(np.isin(track.mode[near], WORSE).sum())
+            track, size = _track(outcome, moment.vehicle), 1.0
+            if track is not None:  # else the vehicle never flew
+                size = float(np.isin(track.mode[_within(track.time_s, *around)], WORSE).sum())
         case "error":
-            return error_m(moment, outcome)
+            size = error_m(moment, outcome)
         case "separation":
-            near = _within(outcome.separation_s, moment.start_s - AROUND_S, moment.end_s + AROUND_S)
-            return -_least(outcome.separation_m[near])
+            size = -_least(outcome.separation_m[_within(outcome.separation_s, *around)])
         case "packets":
-            return _rate(outcome, moment.start_s - AROUND_S, moment.end_s + AROUND_S)
+            size = _rate(outcome, *around)
+        case "path":
+            found = [each for each in _alive(outcome) if each.vehicle == moment.vehicle]
+            size = float(sum(around[0] <= each.start_s <= around[1] for each in found))
+    return size
 
 
 def comes_about(moment: Moment, outcome: CaseOutcome) -> bool:
@@ -209,6 +222,16 @@ def _wasted(flown: CaseOutcome, perfect: CaseOutcome) -> Iterator[Moment]:
         times, levels = (float(start_s), float(end_s)), _levels(float(most), usual)
         says = f"the server sent {most} plans in a second"
         yield Moment("packets", 0, *times, says, float(most), usual, *levels)
+
+
+def _alive(flown: CaseOutcome) -> Iterator[Moment]:
+    for each in flown.deaths:
+        if each.arrived > ALIVE:
+            who = f"vehicle {each.vehicle}" if each.direction == DOWNLINK else "the server"
+            way = f"{FLIGHT[each.direction]} {each.path + 1}"
+            says = f"{who} took {way} for dead ({each.arrived:.0%} arrived)"
+            at = each.time_s, each.time_s
+            yield Moment("path", each.vehicle, *at, says, each.arrived, 0.0, 1.0, 0.0)
 
 
 def _sent_s(outcome: CaseOutcome) -> Array:

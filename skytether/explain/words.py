@@ -46,7 +46,7 @@ def _when(moment: Moment) -> str:
 
 
 def _subject(moment: Moment) -> str:
-    if moment.kind in ("failure", "packets"):
+    if moment.kind in ("failure", "packets", "path"):
         return ""
     return f"vehicle {moment.vehicle} " if moment.vehicle else "two vehicles "
 

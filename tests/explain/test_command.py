@@ -6,11 +6,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
 import msgspec
+import numpy as np
 import pytest
 
 from elements import Gui
 from helpers import SKYTETHER, ran, until
 from skytether.__main__ import main
+from skytether.shared.telemetry import ends
 from skytether.view.browser.explaining import Explainer
 from skytether.view.recordings.outcome import brakes
 from skytether.view.recordings.recorded import read
@@ -106,11 +108,15 @@ def test_a_report_has_the_command_for_each_brake_and_the_explanation_if_asked(
     assert "Why: one outage" not in plain.read_text()
 
 
-def test_a_report_of_a_flight_over_udp_has_no_such_command(recording: Path) -> None:
+def test_a_report_of_a_flight_over_udp_has_it_if_it_has_the_packets(
+    recording: Path,
+) -> None:
     flown = read(recording)
     over_udp = replace(flown, about=msgspec.structs.replace(flown.about, began="2026-01-01T12:00"))
     assert "skytether explain" in page(flown, [])
     assert "skytether explain" not in page(over_udp, [])
+    with_packets = replace(over_udp, parts={**flown.parts, ends.PART: np.empty(0, ends.COLUMNS)})
+    assert "skytether explain" in page(with_packets, [])
 
 
 @pytest.mark.parametrize(

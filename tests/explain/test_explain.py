@@ -45,6 +45,19 @@ def two_links() -> Explanation:
     return skytether.fly("demo-two-links", seed=9314).explain()
 
 
+def test_a_path_that_was_taken_for_dead_is_a_moment() -> None:
+    (first, second) = (each for each in two_links().moments if each.kind == "path")
+    assert first.says == "vehicle 1 took downlink 1 for dead (100% arrived)"
+    assert second.says.startswith("the server took uplink 1 for dead")
+    at = second.start_s
+    known = up_to("what is needed", flight("demo-two-links", 9314), at)
+    assert known.cause is not None
+    (part,) = known.cause.parts
+    assert isinstance(part.unit, Bad)
+    assert part.unit.lane == (1, DOWNLINK, 0)
+    assert part.start_s < at < part.end_s + 0.1
+
+
 def test_two_outages_at_once_are_the_cause_and_each_is_needed() -> None:
     known = two_links()
     assert known.cause
@@ -221,6 +234,10 @@ def test_of_two_moments_at_once_the_one_that_begins_then_is_meant() -> None:
     assert _chosen([first, second], 12.11) is second
     assert _chosen([first, second], 10.4) is first
     assert _chosen([first, second], 18.0) is second
+    other = replace(first, vehicle=2)
+    assert _chosen([first, other, second], 10.4, 2) is other
+    with pytest.raises(ConfigError, match="vehicle: got 3, expected one of 1, 2"):
+        _chosen([first, other], None, 3)
 
 
 def test_a_flight_that_is_always_bad_does_not_hide_itself() -> None:
@@ -232,8 +249,10 @@ def test_a_flight_that_is_always_bad_does_not_hide_itself() -> None:
 
 
 def test_a_time_without_a_moment_is_refused_with_those_there_are() -> None:
-    with pytest.raises(ConfigError, match=r"at: got 30, expected one of 12\.1, at which"):
-        explained(flight("demo-two-links", 9314), "demo", at_s=30.0)
+    with pytest.raises(
+        ConfigError, match=r"at: got 25, expected one of 10\.0, 12\.1, 29\.6, at which"
+    ):
+        explained(flight("demo-two-links", 9314), "demo", at_s=25.0)
     with pytest.raises(ConfigError, match="nothing went wrong in this flight"):
         explained(flight("demo", 1), "demo", at_s=30.0)
 

@@ -23,7 +23,7 @@ from skytether.shared.events.processes import Counted
 from skytether.shared.law.model import Indices
 from skytether.shared.scenario.reading import check
 from skytether.shared.scenario.whole import Scenario
-from skytether.shared.telemetry import drops, feed
+from skytether.shared.telemetry import drops, ends, feed
 from skytether.shared.telemetry.feed import Figures, Frame, Opened, Rows, Said, columns_of
 from skytether.shared.telemetry.record import Rows as Table
 from skytether.shared.telemetry.summary import Summary, summarise
@@ -67,6 +67,11 @@ class Recorded:
             for _, process, frame in self.frames
             if isinstance(frame, Figures)
         }
+
+    @property
+    def can_be_explained(self) -> bool:
+        """Whether its flight can be flown again, if over UDP by the packets at both ends."""
+        return not self.about.began or (ends.PART in self.parts and not self.scenario.keeps_apart)
 
     @property
     def ways(self) -> Directions:

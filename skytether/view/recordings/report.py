@@ -185,7 +185,9 @@ def _first(outcome: Outcome) -> list[Table]:
 
 
 def _why(recorded: Recorded, outcome: Outcome, explanation: str) -> list[Part]:
-    """The explanation, and a command that explains each brake event; none for flights over UDP."""
+    """The explanation, and a command that explains each brake event; none if it cannot be
+    flown again.
+    """
     parts: list[Part] = []
     if explanation:
         parts.append(Folded("Why", text=explanation, is_open=True))
@@ -194,7 +196,7 @@ def _why(recorded: Recorded, outcome: Outcome, explanation: str) -> list[Part]:
         [f"{at_s + outcome.time_s(0):.1f}", text, f"{explain} {at_s:.2f}"]
         for at_s, text in brakes(recorded)
     ]
-    if rows and not recorded.about.began:
+    if rows and recorded.can_be_explained:
         says = (
             "Each command flies the flight again, until the smallest set of losses is found. Times "
             f"of an explanation begin {-outcome.time_s(0):.1f} s before the first step."
