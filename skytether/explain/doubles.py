@@ -114,7 +114,8 @@ def double(recorded: "Recorded") -> tuple[FlightCase, Track]:
         if isinstance(event, Changed) and not process.startswith("netem")
     )
     fated = _with_fates(scenario, fates, keys)
-    case = FlightCase(fated, stalls=tuple(stalls), commands=commands, double=flown)
+    secure = recorded.about.secure
+    case = FlightCase(fated, 1, secure, tuple(stalls), commands, double=flown)
     began_s = (began_ns - zero_ns) / SECOND_NS
     return case, track(scenario, rows, recorded.parts["server"], 1, began_s)
 
@@ -125,8 +126,10 @@ def _ends(recorded: "Recorded") -> tuple[Rows, Rows]:
     rows = parts.get(PART, np.empty(0, COLUMNS))
     client, server = (rows[rows["end"] == end] for end in (End.CLIENT, End.SERVER))
     vehicles = np.unique(parts["client"]["vehicle"]).tolist()
+    servers = {process for _, process, _ in recorded.frames if process.startswith("server")}
     for is_met, expected in (
         (vehicles == [1], f"vehicle 1 alone; got {vehicles}"),
+        (len(servers) == 1, f"one run of one server; got {len(servers)}"),
         ("server" in parts and len(client) and len(server), "the packets at both ends"),
     ):
         if not is_met:
@@ -303,7 +306,7 @@ def nearness(
         raise ConfigError(
             f"its double is {near.until_m:.2f} m away before the moment, expected at most "
             f"{NEAR_M} m: it departs at {departs_s:.2f} s, by something that is not recorded, such "
-            "as a pilot, or a process that was restarted"
+            "as what a pilot did, or another process"
         )
     around = np.abs(recorded.time_s - moment.start_s) <= AROUND_S if moment else np.array([])
     if moment and moment.kind == "brake" and not np.isin(recorded.mode[around], WORSE).any():

@@ -74,6 +74,8 @@ def recorded(
         scenario=msgspec.structs.replace(scenario, vehicle=vehicle),
         parts=parts,
         begin_ns=flight.MIDNIGHT_NS,
+        about=SimpleNamespace(secure=False),
+        frames=[(0, "server", None)],
         events=lambda: iter(flown.events),
     )
 
@@ -173,16 +175,15 @@ def test_a_brake_that_the_recording_lacks_is_refused() -> None:
     [
         (PART, "expected the packets at both ends"),
         ("client", "expected vehicle 1 alone"),
+        ("server 2", "expected one run of one server; got 2"),
     ],
 )
 def test_what_a_double_needs(part: str, said: str) -> None:
     found = recorded(scenario_of(duration=4.0))
-    rows = found.parts[part].copy()
-    if part == "client":
-        rows["vehicle"][-1] = 2
-    else:
-        rows = rows[:0]
-    found.parts[part] = rows
+    found.frames.append((0, part, None))
+    if part in found.parts:
+        found.parts[part] = found.parts[part].copy()[: None if part == "client" else 0]
+    found.parts["client"]["vehicle"][-1] += part == "client"
     with pytest.raises(ConfigError, match=said):
         doubles.double(found)
 
