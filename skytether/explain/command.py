@@ -65,7 +65,8 @@ def explain_flight(argv: Sequence[str]) -> None:
     whether a single packet would have averted it, how long an outage must be, and what other keys
     would change, over the same network and, with --seeds, with other seeds.
 
-    It explains this flight of a simulated vehicle, or the double of a recorded one. Ctrl-C prints the explanation so far.
+    It explains this flight of a simulated vehicle, or the double of a recorded one. Ctrl-C prints
+    the explanation so far.
     """
     if argv and argv[0].endswith(RECORDING):
         options = read(ExplainOptions(), argv, "skytether explain", explain_flight.__doc__)
