@@ -101,6 +101,8 @@ class Double:
     """Time at which the vehicle asks for a session [s]."""
     began_ns: int
     """Time of step 0 [ns]."""
+    sends_first: bool
+    """Whether the client sent anything at step 0."""
     client_late_ns: Mapping[int, int]
     server_late_ns: Mapping[int, int]
     """How late an end was woken, by the time at which it should have been [ns]."""

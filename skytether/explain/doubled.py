@@ -16,7 +16,6 @@ from typing import Annotated, Any
 import numpy as np
 from msgspec import Meta
 
-from skytether.client.memory import ClientMemory, Saving
 from skytether.client.simulated.plant import FirstOrderPlant
 from skytether.client.simulated.sensor import Sensor
 from skytether.client.simulated.vehicle import SimulatedVehicle
@@ -32,7 +31,7 @@ from skytether.shared.endpoints.steady import Steady
 from skytether.shared.law.model import Array
 from skytether.shared.scenario.registry import VEHICLES, File
 from skytether.shared.scenario.schema import Scenario
-from skytether.sim.flight import BOOT_ID, MIDNIGHT_NS, SERVER
+from skytether.sim.flight import MIDNIGHT_NS, SERVER
 from skytether.sim.world import World
 
 FLOWN: list[Double] = []
@@ -43,35 +42,41 @@ def actions(double: Double, scenario: Scenario) -> Iterator[tuple[float, Callabl
     """What makes a flight in virtual time a double, with the times in it [s]."""
     FLOWN[:] = [double]
     client = f"client {scenario.seed}.1"
-    if scenario.vehicle.kind.startswith("doubled") and scenario.vehicle.memory != "none":
-        yield 0.0, partial(_save, host=client, memory=ClientMemory(scenario.terms(), BOOT_ID, None))
+    if not double.sends_first:
+        yield 0.0, partial(_keep_silent, host=client)
     for host, late_ns in ((client, double.client_late_ns), (SERVER[0], double.server_late_ns)):
-        yield 0.0, partial(_wake_late, host=host, double=double, late_ns=late_ns)
+        yield 0.0, partial(_wake_late, host=host, late_ns=late_ns)
     yield 0.0, partial(World.freeze, name=client)
     yield double.opens_s, partial(World.thaw, name=client)
 
 
-def _save(world: World, host: str, memory: ClientMemory) -> None:
-    """Let a client save its state, as that of a real vehicle does: it sends nothing before."""
+def _keep_silent(world: World, host: str) -> None:
+    """Let a client send nothing at step 0, as one does that first saves that it has begun (see
+    `client.memory`).
+    """
     client: Any = world.endpoint(host)
-    client.keeps, client._memory = True, Saving(memory)
+    report = client._report
+
+    def first(now_ns: int) -> None:  # noqa: ARG001
+        client._report = report
+
+    client._report = first
 
 
-def _wake_late(world: World, host: str, double: Double, late_ns: Mapping[int, int]) -> None:
-    world.restart(host, Late(world.endpoint(host), MIDNIGHT_NS + double.began_ns, late_ns))
+def _wake_late(world: World, host: str, late_ns: Mapping[int, int]) -> None:
+    world.restart(host, Late(world.endpoint(host), late_ns))
 
 
 class Late(Steady):
     """Endpoint that is woken late, as its process was; where that is not known, as it usually was.
 
     Args:
-        began_ns: time of step 0 on its clock.
         late_ns: see `Double`.
     """
 
-    def __init__(self, inner: Endpoint, began_ns: int, late_ns: Mapping[int, int]) -> None:
+    def __init__(self, inner: Endpoint, late_ns: Mapping[int, int]) -> None:
         super().__init__(inner)
-        self._began_ns, self._late_ns = began_ns, late_ns
+        self._late_ns = late_ns
         self._usual_ns = int(np.median([*late_ns.values()])) if late_ns else 0
 
     def next_wake_ns(self) -> int | None:
@@ -79,10 +84,6 @@ class Late(Steady):
         if due_ns is None or due_ns < MIDNIGHT_NS:  # at once
             return due_ns
         return due_ns + self._late_ns.get(due_ns - MIDNIGHT_NS, self._usual_ns)
-
-    def keep(self, *, now_ns: int) -> bytes | None:
-        """The disk is too slow for what begins with step 0 to be saved before it."""
-        return super().keep(now_ns=now_ns) if abs(now_ns - self._began_ns) > 1 else None
 
 
 @impairment(name="doubled")

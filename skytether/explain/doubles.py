@@ -103,7 +103,8 @@ def double(recorded: "Recorded") -> tuple[FlightCase, Track]:
     # Just before step 0, whose lateness has this time, the vehicle is in the air.
     late_ns[0][began_ns - zero_ns - 1] = 1
     opens_s, (states, inputs) = (opens_ns[0] - zero_ns) / SECOND_NS, _steps(rows)
-    flown = Double(opens_s, began_ns - zero_ns, late_ns[0], late_ns[1], states, inputs)
+    sends = bool((client["due_ns"][_causes(client)[client["happened"] == SENT]] == began_ns).any())
+    flown = Double(opens_s, began_ns - zero_ns, sends, late_ns[0], late_ns[1], states, inputs)
     commands = tuple(
         Command(
             (recorded.begin_ns + at_ns - zero_ns) / SECOND_NS,

@@ -32,7 +32,7 @@ OUT = {"network.uplink": "paper(0.1, 0.02, 2.0) & loss(0.1) & outage(8, 2.5) & o
 def scenario_of(**keys: Any) -> Scenario:
     table = reading.to_table(reading.load("demo"))
     network = {"network.downlink": "paper(0.1, 0.02, 2.0) & loss(0.1)"}
-    short = {"seed": 5, "duration": 13.0, "settle": 3.0, "vehicle.memory": "none"}
+    short = {"seed": 5, "duration": 13.0, "settle": 3.0}
     set_keys({**network, **short, **keys}, table)
     return reading.check(table, "a test")
 
