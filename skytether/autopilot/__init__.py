@@ -8,7 +8,7 @@
 
 `skytether autopilot` runs it, for tests and for users without an autopilot. Its response to
 velocities, lost set-points, refused commands and landings was measured on both autopilots in
-simulation; behaviour that Skytether does not depend on is left out. Nothing is registered. The
-package imports `skytether.mavlink`, `quadrotor` and `shared`; only `__main__` imports the shell.
-The client never imports the package.
+simulation; behaviour that Skytether does not depend on is left out. The package imports
+`skytether.mavlink`, `quadrotor` and `shared`; only `__main__` imports the shell. The client never
+imports the package.
 """

@@ -54,18 +54,18 @@ class ArduPilot(PilotedVehicle):
         return ""
 
     def mode_number(self, main: int, sub: int) -> int:  # noqa: ARG002
-        """Number of the mode, which is the command's main mode."""
+        """Number of a mode in a heartbeat: the main mode of the command."""
         return main
 
     def takes_setpoints(self) -> bool:
         return self.mode is FlightMode.GUIDED
 
     def altitude_of(self, altitude: float) -> float | None:
-        """Return the commanded altitude, which is above home."""
+        """Altitude above home [m]: the commanded one, which counts from home already."""
         return altitude
 
     def enter_takeoff(self) -> bool:
-        """Enter GUIDED, which climbs by itself."""
+        """Enter GUIDED, in which the vehicle climbs."""
         return self.mode is FlightMode.GUIDED
 
     def limits(self) -> OwnSpeeds:

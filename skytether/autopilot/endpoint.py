@@ -244,7 +244,7 @@ class Autopilot(Endpoint):
             self.send(peer.codec.encode(message), peer.address)
 
     def _tell(self, peer: Peer, number: int) -> bool:
-        """Send a peer the message of a type; returns whether the autopilot has this type."""
+        """Send a peer a telemetry message by its id; returns whether there is such a message."""
         make = STREAMS.get(number)
         message = make(self._telemetry) if make else None
         if message is not None:

@@ -42,7 +42,7 @@ class ScriptedFault(NamedTuple):
     name: str
     from_ns: int
     until_ns: int | None
-    """Time at which the fault ends; None for a fault that does not end."""
+    """Time after arming at which the fault ends [ns]; None for a fault that does not end."""
 
 
 def parse(text: str) -> ScriptedFault:
@@ -54,13 +54,13 @@ def parse(text: str) -> ScriptedFault:
     number = r"(\d+(?:\.\d+)?)"
     match = re.fullmatch(rf"(\w+)@{number}(?:-{number})?", text)
     if match is None:
-        expected = "expected NAME@SECONDS, or NAME@SECONDS-SECONDS, after arming"
+        expected = "expected NAME@SECONDS or NAME@SECONDS-SECONDS, counted from arming"
         raise ConfigError(f"--fault: got {text!r}, {expected}")
     name, begin, end = match.groups()
     if name not in NAMES:
         raise ConfigError(f"--fault: got {name!r}; {hint(name, NAMES)}")
     if end is not None and (name not in LASTING or float(end) <= float(begin)):
-        expected = f"expected a later end, and one of {', '.join(LASTING)} alone"
+        expected = f"expected an end after the beginning; only {', '.join(LASTING)} can have one"
         raise ConfigError(f"--fault: got {text!r}, {expected}")
     return ScriptedFault(
         name, seconds_to_ns(float(begin)), None if end is None else seconds_to_ns(float(end))

@@ -47,7 +47,7 @@ class SimulatedFlavour:
     frame: str
     """Airframe of the autopilot's own simulator, or the nearest one in FRAMES."""
     ready_s: float
-    """Time from the start until arming is allowed, because filters must settle first."""
+    """Time from the start until arming is allowed [s], because filters must settle first."""
     words_for_stations: bool
     """Whether status texts are sent only to ground stations, as by PX4."""
     fixed_heartbeats: bool
@@ -57,11 +57,11 @@ class SimulatedFlavour:
     forwards: bool
     """Whether the autopilot forwards each peer's heartbeats to the other peers."""
     spool_s: float
-    """Time from the take-off command until the vehicle climbs."""
+    """Time from the take-off command until the vehicle climbs [s]."""
     wander_mps: float
-    """Standard deviation of the velocity estimate's error along each axis."""
+    """Standard deviation of the velocity estimate's error along each axis [m/s]."""
     blind_s: float
-    """Time after the last GPS fix at which the estimate counts as lost and the vehicle lands."""
+    """Time from the last GPS fix until the estimate counts as lost and the vehicle lands [s]."""
     home: tuple[float, float, float]
     """Latitude [°], longitude [°] and altitude above the sea [m] of the start."""
     modes: dict[int, tuple[str, FlightMode]]

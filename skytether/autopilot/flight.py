@@ -102,7 +102,7 @@ class PilotedVehicle(ABC):
     """
 
     low = 0.15
-    """Charge of the battery below which the low-battery failsafe acts."""
+    """Charge, from 0 to 1, below which the low-battery failsafe acts."""
 
     def __init__(
         self,
@@ -131,13 +131,13 @@ class PilotedVehicle(ABC):
         self._pulled, self._pull = np.zeros(3), np.zeros(3)
         """Errors of the position [m] and velocity estimates [m/s] caused by the receiver."""
         self._blind_ns: int | None = None
-        """Time of the last fix; None while the receiver has a fix."""
+        """Time of the last fix [ns]; None while the receiver has a fix."""
         self._past: deque[tuple[Array, Array]] = deque(maxlen=FIX_TICKS)
         """True positions [m] and velocities [m/s] at the newest ticks."""
         self.said: list[tuple[Severity, str]] = []
         self.now_ns = 0
         self.station_ns: int | None = None
-        """Time of the station's newest heartbeat; None, and no failsafe, before the first."""
+        """Time of the ground station's newest heartbeat [ns]; None, and no failsafe, before one."""
         self._ready_ns = seconds_to_ns(ready_s)
         self._setpoint: CompanionSetpoint | None = None
         self._climb: float | None = None
@@ -408,7 +408,7 @@ class PilotedVehicle(ABC):
         return self._toward(setpoint.position, setpoint.velocity)
 
     def _staying(self) -> Vector:
-        """Velocity that brakes, then holds the position at which the vehicle came to rest."""
+        """Velocity command that brakes, then holds the position at which the vehicle stopped."""
         if self._held is None:
             if hypot(*self.velocity()) > STILL_MPS:
                 return REST
@@ -499,13 +499,13 @@ class PilotedVehicle(ABC):
         return (x, y, z), (north, east, up)
 
     def quadrotor_wants(self) -> Vector:
-        """Position that the control loops track [m]: the true one or that of the shaped motion."""
+        """Position that the control loops track [m], see `Quadrotor.wanted_position`."""
         x, y, z = self.quadrotor.wanted_position().tolist()
         return x, y, z
 
 
 def _approach(distance: float, p: float, acceleration: float) -> float:
-    """Speed towards a target: proportional to a small distance, or to the root of a large one."""
+    """Speed towards a target [m/s]: proportional to the distance, or to its root if it is large."""
     near = acceleration / (p * p)
     if distance <= near:
         return p * distance

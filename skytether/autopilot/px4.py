@@ -105,7 +105,7 @@ class PX4(PilotedVehicle):
         return True
 
     def altitude_of(self, altitude: float) -> float | None:
-        """Altitude above home, from a commanded altitude above the sea, or from none."""
+        """Altitude above home [m], from one above the sea; if that is NaN, MIS_TAKEOFF_ALT."""
         if isfinite(altitude):
             return altitude - self.flavour.home[2]
         return self.parameters["MIS_TAKEOFF_ALT"]

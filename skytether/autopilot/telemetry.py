@@ -22,7 +22,7 @@ SENSORS = int(
 )
 """Sensors whose health SYS_STATUS reports."""
 KNOWS_ALL, KNOWS_ATTITUDE = 831, 167
-"""Flags of an estimate with a position, and without, as sent by ArduPilot and PX4."""
+"""Status flags of an estimate with a position, and without, as sent by ArduPilot and PX4."""
 UNKNOWN_MV = 65535
 """Voltage sent for a missing cell [mV]."""
 CURRENT_MODE_EXTRA = 193

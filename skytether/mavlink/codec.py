@@ -33,9 +33,9 @@ class Codec:
         self._stream = stream
         self._rest = bytearray()
         self.garbage_bytes = 0
-        """Number of bytes so far that belong to no frame."""
+        """Number of bytes received so far that belong to no frame."""
         self.unknown = 0
-        """Number of frames so far of types that the dialect lacks."""
+        """Number of frames received so far of types that the dialect lacks."""
 
     def encode(self, message: Message) -> bytes:
         """Frame of a message, with the next sequence number."""
@@ -76,7 +76,7 @@ class Codec:
 
 
 def _length(data: bytearray, at: int) -> int:
-    """Length of the frame that begins at `at`; 0 if none does.
+    """Length of the frame that begins at index `at` [B]; 0 if none does.
 
     A truncated header counts as the longest frame.
     """

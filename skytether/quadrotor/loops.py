@@ -39,7 +39,7 @@ class Gains(NamedTuple):
     i: float
     """Gain from the integral of the horizontal velocity error to acceleration [1/s²]."""
     d: float
-    """Gain of the measured acceleration, which is subtracted from the command."""
+    """Gain of the measured horizontal acceleration, which is subtracted from the command."""
     p_up: float
     """Gain from vertical velocity error to acceleration [1/s]."""
     i_up: float

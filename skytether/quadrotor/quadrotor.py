@@ -113,7 +113,7 @@ class Quadrotor:
         return UP * self._quad.x[3:6]
 
     def wanted_position(self) -> Array:
-        """Position that its loops track [m]; shape (3,).
+        """Position of the shaped motion, which the control loops track [m]; shape (3,).
 
         Without a position loop (`Gains.catch_up` 0) it is the true position.
         """

@@ -57,12 +57,13 @@ class Node:
     publishes: Topic
     subscribes: Topic
     alternatives: tuple[Topic, ...] = ()
-    """The published topic with alternative types; if any, the first message determines the type."""
+    """The published topic with alternative types; if there are any, the first message to publish
+    determines the type."""
 
     @property
     def forms(self) -> tuple[Topic, ...]:
-        """The published topic, once for each possible type. The address of a message to publish
-        contains an index of this list.
+        """The published topic, once for each type that it may have. The address of a message to
+        publish contains an index of this list.
         """
         return self.publishes, *self.alternatives
 
@@ -94,7 +95,7 @@ class Entity(NamedTuple):
     """Publisher or subscriber of a node."""
 
     kind: str
-    """PUBLISHER or SUBSCRIBER."""
+    """Kind of the entity: PUBLISHER or SUBSCRIBER."""
     node: str
     """Name of the node, with its namespace."""
     topic: str
@@ -102,7 +103,7 @@ class Entity(NamedTuple):
     type_hash: str
 
     def takes(self, topic: Topic) -> bool:
-        """Whether the entity has the type and the type hash of a topic."""
+        """Whether the entity has the message type and the type hash of a topic."""
         return (self.dds_kind, self.type_hash) == (topic.dds_kind, topic.type_hash)
 
     def __str__(self) -> str:
