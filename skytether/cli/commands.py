@@ -7,7 +7,7 @@ between them, delays, reorders and loses their packets."""
 COMMANDS_IN_GROUPS = {
     "Flying": {
         "fly [SCENARIO]": (
-            "one flight, with everything it needs: start here",
+            "one flight, with all processes that it needs: start here",
             "skytether.cli.fly:fly",
         ),
         "fleet [SCENARIO]": (
@@ -19,7 +19,7 @@ COMMANDS_IN_GROUPS = {
             "skytether.cli.duel:duel",
         ),
         "set PATH KEY=VALUE": (
-            "change keys in flight, at a process with --control",
+            "change keys in flight, of a process with --control",
             "skytether.cli.set:set_keys",
         ),
         "ros2 FOLDER": (
@@ -29,15 +29,15 @@ COMMANDS_IN_GROUPS = {
     },
     "Any program's network": {
         "netem [SCENARIO]": (
-            "a bad network between two; `netem run` PROGRAM: in it",
+            "a bad network between two programs; `netem run`: for one",
             "skytether.netem.__main__:emulate",
         ),
         "policy serve|join": (
-            "a policy on another machine than its robot, unchanged",
+            "an unchanged policy on another machine than its robot",
             "skytether.policy.command:policy",
         ),
         "probe HOST:PORT": (
-            "delay and loss of a real path, each way",
+            "delay and loss of a real path, in each direction",
             "skytether.cli.probe:probe",
         ),
     },
@@ -59,7 +59,7 @@ COMMANDS_IN_GROUPS = {
             "skytether.cli.export:export",
         ),
         "join FILE...": (
-            "recordings of server, netem and client, as one",
+            "recordings of server, netem and client merged into one",
             "skytether.cli.join:join",
         ),
     },
@@ -73,7 +73,7 @@ COMMANDS_IN_GROUPS = {
             "skytether.lab.commands.compare:compare",
         ),
         "reproduce": (
-            "the paper's table and figures, and more, as a report",
+            "a report with the paper's table and figures, and more",
             "skytether.lab.commands.reproduce:reproduce",
         ),
         "calibrate [SCENARIO]": (
@@ -81,7 +81,7 @@ COMMANDS_IN_GROUPS = {
             "skytether.lab.commands.calibrate:calibrate",
         ),
         "margins [SCENARIO]": (
-            "whether its loop is stable, and with which vehicles",
+            "whether a scenario's loop is stable, for which vehicles",
             "skytether.lab.commands.margins:margins",
         ),
         "identify KIND": (
@@ -107,11 +107,11 @@ COMMANDS_IN_GROUPS = {
     },
     "Names and completion": {
         "list KIND": (
-            "schemes, triggers, scenarios … that can be named",
+            "names of schemes, triggers, scenarios and so on",
             "skytether.cli.names:list_names",
         ),
         "completion SHELL": (
-            "names and options at the Tab key: bash, zsh or fish",
+            "Tab completion of names and options: bash, zsh, fish",
             "skytether.cli.completion:complete",
         ),
     },

@@ -72,7 +72,7 @@ def duel(argv: Sequence[str]) -> None:
 
 
 def together(options: DuelOptions) -> list[Scenario]:
-    """The scenarios, with the same network, duration and seed."""
+    """Scenarios of a duel, all with network, duration and seed of the first."""
     if len(options.scenarios) < 2:
         message = f"got {len(options.scenarios)} scenario, expected two or more"
         raise CommandError(message, command.CONFIGURATION)

@@ -79,7 +79,7 @@ def _traffic(options: ExportOptions, recorded: Recorded) -> None:
             _write(options.traces / f"{name}.csv", trace.encode())
     if options.pcap:
         counted = recorded.figures.get("netem", {})
-        header_bytes = counted.get("header_bytes", HEADER_BYTES)  # recorded by `netem run`
+        header_bytes = counted.get("header_bytes", HEADER_BYTES)  # only `netem run` records it
         _write(options.pcap, traffic.pcap(packets, header_bytes=header_bytes))
 
 

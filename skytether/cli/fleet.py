@@ -38,11 +38,11 @@ from skytether.shell.commandline.command import CommandError, ScenarioName, Scen
 from skytether.sim import flight as sim
 
 VEHICLES = 20
-"""Suffixes of files with timed points."""
+"""Number of vehicles of a fleet without a mission, unless --vehicles is given."""
 AFTER_S = 30.0
 """Time flown after the last goal of a mission's table [s]."""
 STAGES = ("receive", "open", "decode", "observe", "estimate", "plan", "trigger", "encode", "send")
-"""Stages of the server's work in order; `record`, the cost of recording, is left out."""
+"""Stages of the server's work in a tick, in order, without that of recording."""
 
 
 @dataclass(frozen=True)
@@ -50,11 +50,11 @@ class FleetOptions(ScenarioOptions):
     scenario: ScenarioName = "fleet"
     """A scenario's name (`skytether list scenarios`) or a .toml file; every vehicle flies it."""
     mission: Annotated[str | None, Argument(metavar="NAME|FILE")] = None
-    """Mission in place of a scenario: swap, sphere, rings, corridor, warehouse, or a file of timed
+    """Mission instead of a scenario: swap, sphere, rings, corridor, warehouse, or a file of timed
     goals: CSV with the columns vehicle, t, x, y (and z), or a .plan of QGroundControl."""
     show: Annotated[Path | None, Argument(metavar="FILE")] = None
-    """Show in place of a scenario: timed paths in a CSV file, or a folder or zip with one file for
-    each vehicle, as written by Skybrush, Crazyswarm or MAVSDK."""
+    """Drone show instead of a scenario: timed paths in a CSV file, or a folder or zip with one file
+    for each vehicle, as written by Skybrush, Crazyswarm or MAVSDK."""
     vehicles: Annotated[int | None, Argument(metavar="N")] = None
     """Number of vehicles; by default 20, or as many as the mission has."""
     workers: Annotated[int, Argument(metavar="N")] = 1
@@ -86,12 +86,12 @@ class FleetSummary(msgspec.Struct, frozen=True, kw_only=True):
     steps: int
     secure: bool
     server_steps: int
-    """Steps that the server planned."""
+    """Number of steps for which the server planned, all vehicles together."""
     event_ratio: float
     uplink_above: int | None
     """Plans sent because the trigger's figure was above its threshold; in virtual time only."""
     uplink_due: int | None
-    """Plans sent below the threshold, see `SentBy`; in virtual time only."""
+    """Plans sent as a heartbeat, by a schedule, or as the first one; in virtual time only."""
     rmse_xy: tuple[float, float, float] | None
     """Smallest, median and largest RMSE of the vehicles [m]."""
     separation_m: float | None
@@ -99,7 +99,7 @@ class FleetSummary(msgspec.Struct, frozen=True, kw_only=True):
     least_separation_m: float | None
     """Smallest distance between two vehicles of a mission [m]."""
     left_tube: int | None
-    """Observations outside `mission.tube_m`; the separation is guaranteed only if there is none."""
+    """Observations outside a tube (`mission.tube_m`); only without any is the separation proven."""
     uplink_packets_per_s: float
     """Packets from the server into the network [1/s]."""
     downlink_packets_per_s: float
@@ -111,7 +111,7 @@ class FleetSummary(msgspec.Struct, frozen=True, kw_only=True):
     drops: dict[str, dict[str, int]]
     """Packets that server, netem and vehicles dropped, by reason, see `Summary.drops`."""
     plugin_errors: dict[str, int]
-    """See `Summary.plugin_errors`."""
+    """Number of errors in the code of plug-ins, by kind, see `Summary.plugin_errors`."""
     tick_ms_p50: float
     """Median duration of a server's tick, all vehicles together, in the slowest worker [ms]."""
     tick_ms_p99: float
@@ -123,17 +123,17 @@ class FleetSummary(msgspec.Struct, frozen=True, kw_only=True):
     client_late_ms_max: float
     """Longest delay with which a vehicle's step began [ms]."""
     machine_missed: int | None
-    """Steps missed in the same time by a thread that only sleeps: the machine's share."""
+    """Steps missed by a thread that only sleeps meanwhile: those missed because of the machine."""
     machine_late_ms_max: float | None
     """Longest delay with which the sleeping thread woke [ms]."""
     server_cpu_us: dict[str, float]
-    """CPU time of the server per vehicle and step [µs]: `total`; by stage, wall-clock time."""
+    """Time of the server per vehicle and step [µs]: CPU time `total`, wall-clock time by stage."""
     client_cpu_us: float | None
     """CPU time of the vehicles' process per vehicle and step [µs]."""
     netem_cpu_us: float | None
     """CPU time of netem per packet [µs]."""
     vehicle_steps_per_core_s: float | None
-    """Vehicle steps flown per second of CPU time of all parts; in virtual time only."""
+    """Vehicle steps flown per second of CPU time of all parts [1/s]; in virtual time only."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -291,8 +291,8 @@ class Lateness:
 
 @contextmanager
 def metronome(dt_s: float) -> Iterator[Lateness]:
-    """Run a thread that sleeps from step to step during the block; steps that it misses are the
-    machine's fault.
+    """Run a thread that only sleeps, from step to step of `dt_s`, during the block; the steps that
+    it misses were missed because of the machine.
     """
     late, over = Lateness(), threading.Event()
 

@@ -52,9 +52,9 @@ PRINTED = (
 PRINTED_OF_ROOMS = ("LeaderChanged",)
 """Names of further printed events, whose packages need not be installed."""
 POLL_S = 0.2
-"""Interval at which Ctrl-C is checked while the page stays open."""
+"""Interval at which Ctrl-C is checked while the page stays open [s]."""
 Flown = tuple[Scenario, "Future[Record]"]
-"""Scenario that another process flies, and its flight."""
+"""Scenario of --beside, and the record of its flight once another process has flown it."""
 ON_THE_GROUND = {str(mode) for mode in (Mode.INIT, Mode.SYNC, Mode.READY)}
 """Modes before the first plan is flown; their changes are not printed."""
 
@@ -129,9 +129,8 @@ def fly(argv: Sequence[str]) -> None:
     if not options.virtual:
         for warning in command.flight_warnings(scenario):
             page_process.say(warning)
-    vehicles.make(
-        scenario, 0
-    )  # compiles the vehicle's kernels; fails here if the vehicle cannot be made
+    # Compiles the vehicle's kernels, and fails before any process starts if there is no vehicle.
+    vehicles.make(scenario, 0)
     at = options.page or os.environ.get(page_process.VARIABLE, HOST_PORT)
     page = None if options.virtual or options.no_page else at
     with page_process.paged(page, options.control) as sockets:

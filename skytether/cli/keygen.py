@@ -91,7 +91,7 @@ def make(
 
 
 def _number(present: keys.Keyring, vehicle: int, asked: int | None) -> int:
-    """Number of a vehicle's new key."""
+    """Number of a vehicle's new key: `asked`, by default the next after those present."""
     numbers = present.numbers(vehicle)
     what = f"{present.name}: vehicle {vehicle}"
     if len(numbers) == KEYS_MAX:

@@ -14,7 +14,7 @@ from skytether.shell.processes.log import line_of
 from skytether.shell.processes.workers import die_with_parent
 
 STOP_S = 5.0
-"""Longest time for the page to end after SIGTERM."""
+"""Longest time for the page to end after SIGTERM [s]."""
 VARIABLE = "SKYTETHER_PAGE"
 """Environment variable with HOST:PORT of the page, or `none`."""
 NONE = "none"

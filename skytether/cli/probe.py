@@ -342,7 +342,7 @@ def _check(options: ProbeOptions, paths: int) -> None:
 
 
 def _trace_name(way: str, path: int) -> str:
-    """Name of the trace of a path's direction, as in `skytether export`; paths count from 0."""
+    """File name of a trace, as in `skytether export`, for a direction `way`; paths count from 0."""
     return f"{way}-path-{path + 1}.csv" if path else f"{way}.csv"
 
 
@@ -408,11 +408,11 @@ def _tell_accuracy(outcome: ProbeOutcome, of_path: str) -> None:
     print(of_path + (_of_log(path) if path.log else _of_clocks(path)))
     if path.log and not path.uplink.bursts and (missing := _missing(outcome.delays["uplink"])):
         print(
-            f"The file has no row for {missing} packets between even ones {path.every_s:.3g} s "
-            "apart. If they were lost, give each a row with its time and no delay."
+            f"Packets were sent every {path.every_s:.3g} s, but the file has no row for {missing} "
+            "of them. If they were lost, give each a row with its time and no delay."
         )
     if path.unreported:
-        print(f"{path.unreported} packets are left out: forgotten by the other end.")
+        print(f"{path.unreported} packets are left out: the other end lost their arrival times.")
 
 
 def _flights(options: ProbeOptions, outcomes: Sequence[ProbeOutcome]) -> Sequence[str]:
@@ -492,7 +492,7 @@ def _figures(way: DirectionFigures) -> dict[str, str]:
 
 
 def _models(ways: dict[str, DirectionFigures]) -> "Table":
-    """Best models of both directions, each with its distance from the best in BIC."""
+    """Best models of both directions, each with its BIC minus that of the best model."""
     from rich.table import Table
     from rich.text import Text
 

@@ -57,7 +57,7 @@ GRACE_S = 30.0
 ASKED_S, STOP_S = 3.0, 5.0
 """Longest time for a process to end after the first SIGTERM, and after the second [s]."""
 POLL_S = 0.2
-"""Interval at which Ctrl-C is checked."""
+"""Interval at which Ctrl-C is checked [s]."""
 LINES_MAX = 20
 """Number of a process's last lines that are kept, to be printed if it fails."""
 
@@ -312,7 +312,7 @@ def run(
 
 
 def flown(scenario: Scenario, fly: Callable[[Scenario, Path], list[Shortfall]]) -> Record:
-    """Record of a flight by `run`, given its other arguments as in `partial(run, workers=2)`."""
+    """Fly with `fly`, such as `partial(run, workers=2)`, and return the record of the flight."""
     with temporary.folder() as parts:
         return record_of(parts, scenario, fly(scenario, parts))
 

@@ -28,7 +28,7 @@ from skytether.view.recordings.recording import About, Recording
 FLUSH_S = 0.25
 """Interval at which new frames are written [s]; a killed process loses at most this much."""
 PATIENCE_S = 3.0
-"""Longest time to wait at the end for the rest of the feeds."""
+"""Longest time to wait at the end for the rest of the feeds [s]."""
 
 
 def check(path: Path, flag: str = "--record") -> None:

@@ -41,7 +41,7 @@ from skytether.shell.processes.log import Log
 from skytether.view.rows import check_columns, planned
 
 REPEAT_S = 1.0
-"""Interval at which the newest paths are published again, for tools that started later."""
+"""Interval at which the newest paths are published again [s], for tools that started later."""
 GOALS, POINT, VELOCITY = "mission.goals", "reference.points_m", "reference.velocity_mps"
 
 
