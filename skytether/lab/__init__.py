@@ -7,7 +7,6 @@
 
 Each package imports only from those above it in this list; `pages` does not import `identify`.
 `import skytether` and the benchmarks use `engine`, too. Only `commands` has processes, clocks and
-sockets, and needs the extra `lab`. The laboratory registers nothing: `skytether.cli.commands` names
-its commands. It may import every package but `gym` and `library`; in the wheel only `library`
-imports it.
+sockets, and needs the extra `lab`. The commands are listed in `skytether.cli.commands`. The
+laboratory may import every package but `gym` and `library`; in the wheel only `library` imports it.
 """

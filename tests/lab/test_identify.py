@@ -129,7 +129,7 @@ def test_what_is_no_first_order_is_said_to_be_none() -> None:
 
 def test_what_noise_hides_is_said_to_be_unknown() -> None:
     best = found(answered(Numbers(1.0, 0.4, 0.2), np.random.default_rng(3), noise=1.0, count=4))
-    assert "cannot be told" in verdict(best)
+    assert "it is unclear whether" in verdict(best)
 
 
 def test_a_model_of_another_vehicle_is_off_by_as_much_as_the_vehicles_differ() -> None:

@@ -43,7 +43,7 @@ class CalibrateOptions:
     changes weights and plant; rmse changes the keys of scheme and trigger, and the weights except
     the position's, as only ratios matter."""
     runs: int = 10
-    """Number of flights of each point, with table1 of each column of each point; seeds count up
+    """Number of flights of each point (with table1: for each column of the table); seeds count up
     from --seed."""
     generations: int = 40
     """Number of generations; a search in OUT continues up to this number."""

@@ -91,7 +91,7 @@ def size(options: CompareOptions) -> ComparisonSize:
 def run(
     options: CompareOptions, scale: ComparisonSize, call: CommandCall
 ) -> tuple[list[ComparedCase], Drawn, int]:
-    """Fly all cases and write the report; returns results, report and number of new flights."""
+    """Fly all cases and write the report; returns results, report and number of flights flown."""
     plans = [Plan(case, options.weights, scale) for case in scale.cases]
     command.claim_folder("--out", options.out, report_folder.PAGE)
     runs = sum(_scout(options, plans, number) for number in range(1 + scale.rounds))
@@ -110,7 +110,7 @@ def run(
 
 
 def _scout(options: CompareOptions, plans: Sequence[Plan], number: int) -> int:
-    """Fly the scouting flights of a round: first all points, in later rounds points near budgets.
+    """Fly the scouting flights of a round: all points in round 0, later ones near a budget.
 
     Returns the number of flights flown by this call.
     """
@@ -127,7 +127,7 @@ def _scout(options: CompareOptions, plans: Sequence[Plan], number: int) -> int:
 
 
 def _beside(flyers: Crew, plan: Plan, folder: Path) -> Baselines:
-    """Baselines of a case; empty for a case with its own weights."""
+    """Baselines of a case; empty for a case that is flown with the weights of another case."""
     if plan.case.weights:
         return Baselines()
     work, no_work = Work(plan), lambda _: 0.0

@@ -300,11 +300,11 @@ def _show_models(flown: SizeFlown) -> None:
             row += [f"{found.misfit.rms:.1%}", f"{found.misfit.largest:.1%}"]
         rows.append(row)
     title = "first order with dead time, 95 % intervals"
-    tables.show(title, (*heading, "left over, rms", "largest"), rows)
+    tables.show(title, (*heading, "residual, RMS", "largest"), rows)
 
 
 def _costs(flown: Sequence[SizeFlown]) -> list[dict[str, float]]:
-    """Largest errors, for the requested size of step, of models identified at each size."""
+    """Table of the largest errors at the requested size of step, of models from each size."""
     measured = [axis.responses for axis in flown[0].axes]
 
     def off(model: Fit | None, axis: int) -> float:

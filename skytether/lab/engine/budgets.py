@@ -86,7 +86,7 @@ class FlownContender:
 
 
 def flying(contender: Contender, case: Case, tuned: Scenario) -> list[FlownContender]:
-    """Points of a contender: each reporting policy at all thresholds, in rising order."""
+    """Points of a contender: for each reporting policy all thresholds, in rising order."""
     keys, key = differences(tuned, case.plant), contender.threshold
     keys = {path: value for path, value in keys.items() if path not in case.keys}
     keys |= contender.keys
@@ -156,7 +156,7 @@ class Plan:
         for contender in scale.who(case):
             self.points += flying(contender, case, tuned(contender, case, weights))
         self.runs = -(-scale.runs // 2) if case.weights else scale.runs
-        """Number of flights of each chosen point; half as many in a case with its own weights."""
+        """Number of flights of each chosen point; half as many with the weights of another case."""
         self._scenario = scale.scenario(case)
         self._scouting = scale.scouts, replace(self._scenario, seed=SEARCH_SEED)
         self._scouted: list[Scouted] = []
@@ -175,7 +175,7 @@ class Plan:
         return self._sweep(self._scenario, list(each.values()), self.runs)
 
     def scouted(self, points: Sequence[FlownContender], sweep: Sweep, done: Results) -> None:
-        """Store the results of the sweep that `scouts` returned for the same points."""
+        """Store the results of scouting flights: of the sweep by `scouts` for the same points."""
         for cell, point in enumerate(points):
             runs = sweep.of_cell(done, cell)
             packets, effort = (

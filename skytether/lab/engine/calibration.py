@@ -112,11 +112,11 @@ WEIGHTS = (
     Free("control.input_weight", 1e-4, 1e4),
     Free("control.change_weight", 1e-4, 1e4),
 )
-"""Weights that the search varies; the position's is fixed, because only ratios matter."""
+"""Weights that a search varies; that of the position is fixed, because only ratios matter."""
 REGULATOR = (WEIGHTS[0], *WEIGHTS[3:])
-"""Weights that determine a trajectory, and the regulator along it."""
+"""Weights that a trajectory scheme uses: for planning, and for the regulator aboard."""
 SPLINE_KEYS = (Free("control.spline_error_m", 1e-3, 1e-1),)
-"""Key of a trajectory scheme, if the server knows the reference in advance."""
+"""Key that a search also varies if a trajectory scheme knows the reference in advance."""
 TRIGGER_KEYS: Mapping[str, Sequence[Free]] = {
     "state_gap": (
         Free("control.trigger.state_gap.epsilon", 1e-4, 1e8),

@@ -95,10 +95,9 @@ class ContenderRuns:
 class ComparedCase:
     case: Case
     bought: Mapping[tuple[str, float], ContenderRuns]
-    """Runs of the point chosen for each contender and budget, by contender's name and budget [1/s].
-    """
+    """Runs of each contender's best point within each budget, by its name and the budget [1/s]."""
     tuned: Sequence[FlownContender] = ()
-    """Each contender's point at the threshold from the search."""
+    """Each contender at the threshold that the search for weights found."""
     floor: Sequence[Floor] = ()
 
     @property
@@ -109,7 +108,7 @@ class ComparedCase:
         return [found[name] for name in dict.fromkeys([*first, *found])]
 
     def curve(self, contender: str) -> list[ContenderRuns]:
-        """Chosen points of a contender, by rising budget, without repetitions."""
+        """Runs of a contender's chosen points by rising budget; a point of several budgets once."""
         points = (self.bought.get((contender, budget)) for budget in SOUGHT)
         return list({id(each): each for each in points if each is not None}.values())
 
@@ -165,7 +164,7 @@ class Judged:
     ratio: tuple[float, float, float] | None
     """Ratio of the two mean RMSE xy, with its interval; None if too few flights succeeded."""
     sparse: bool
-    """Whether our contender sends no more than the claim allows."""
+    """Whether our contender sends no more packets than the claim allows."""
 
     @property
     def medians(self) -> float | None:

@@ -60,7 +60,7 @@ class Contender:
 
     @property
     def factors(self) -> Sequence[float]:
-        """Factors for the threshold from the search; each gives a point of a curve."""
+        """Factors for the threshold that the search found, one for each point of a curve."""
         if not self.threshold:
             return ()
         return PERIODS if self.threshold == "trigger.periodic" else NEAR

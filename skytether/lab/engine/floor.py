@@ -172,7 +172,7 @@ class Baselines:
 
 
 class Work:
-    """Flights for the baselines of a case."""
+    """Flights for the baselines of a case, and their settings."""
 
     def __init__(self, plan: Plan) -> None:
         scenario, aboard = plan.tuned(BESIDE), plan.tuned(REGULATED)

@@ -130,7 +130,7 @@ LIMITS: dict[str, tuple[str, float, float]] = {
     "dead time, more [s]": ("dead_time_s", 0.0, 2.0),
     "delay each way, more [s]": ("delay_s", 0.0, 2.0),
 }
-"""Quantities whose limit is searched for: field of `Differing`, first value and last value."""
+"""Quantities whose limit is searched for: field of `Differing`, first and last value tried."""
 
 
 class Margin(msgspec.Struct, frozen=True, kw_only=True):
@@ -143,7 +143,7 @@ class Margin(msgspec.Struct, frozen=True, kw_only=True):
     rms_m: tuple[float, ...] | None
     """RMS deviation of the position on each axis [m]; None if unstable."""
     rms_ci95_m: tuple[float, ...] | None
-    """Half-width of the 95 % interval of `rms_m`; None if unstable, or for a single seed."""
+    """Half-width of the 95 % interval of `rms_m` [m]; None if unstable, or for a single seed."""
     rms_input_mps: tuple[float, ...] | None
     """RMS input on each axis [m/s]; None if unstable."""
     saturated: float | None

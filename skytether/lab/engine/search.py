@@ -84,7 +84,7 @@ def put(scenario: Scenario, values: Mapping[Free, float]) -> Scenario:
 
 
 def plain(table: Any) -> Any:
-    """Scenario, or a table of one, as mutable dictionaries and lists."""
+    """Scenario, or one of its tables, as dictionaries and lists that can be changed."""
     if isinstance(table, Scenario):
         table = reading.to_table(table)
     if isinstance(table, Mapping):
@@ -108,7 +108,7 @@ class Optimiser:
         low, high = np.log([key.low for key in free]), np.log([key.high for key in free])
         self._low, self._range = low, high - low
         start_point = (np.log([key.of(plain(start)) for key in free]) - low) / self._range
-        # numpy's global generator could be used by other code
+        # A generator of its own: other code may use numpy's global one.
         rng = np.random.default_rng(seed)
         options = {
             "bounds": [0, 1],
@@ -121,7 +121,7 @@ class Optimiser:
         self._points: list[Any] = []
 
     def ask(self) -> list[Scenario]:
-        """Next generation; the first one begins with the starting point."""
+        """Scenarios of the next generation; the very first one is the start of the search."""
         first = self._search.countiter == 0
         self._points = self._search.ask()
         if first:
@@ -153,7 +153,7 @@ class Objective(Protocol):
         """Name and settings of the objective, as plain values."""
 
     def free(self) -> Sequence[Free]:
-        """Default free keys."""
+        """Keys that are searched unless the user names others."""
 
     def fly(self, scenario: Scenario, seeds: Sequence[int]) -> Values:
         """Figures of a point; called in a worker."""

@@ -106,7 +106,7 @@ class Study:
         return Sweep(SCENARIO, self.scenario, [self.axis, METHODS], self.runs)
 
     def second(self, flown: "CellSummaries") -> Sweep:
-        """Sweep of periodic sending, at the rate of the event trigger in the first sweep."""
+        """Sweep of periodic sending at the event trigger's rate in the first sweep."""
         changes = tuple(
             {**keys, **periodic(period(flown[value, EVENT]))} for value, keys in self.axis.points()
         )

@@ -29,7 +29,7 @@ from skytether.sim.batch import fly_batch
 CHUNK = 25
 """Number of runs in a task; the last task of a cell may have fewer."""
 FORM = "KEY=START:STOP:COUNT or KEY=VALUE,VALUE,..."
-"""Form of a grid on the command line."""
+"""Form of a grid on the command line, as error messages show it."""
 SEED_MAX = 2**32 - 1
 
 

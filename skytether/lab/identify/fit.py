@@ -272,4 +272,4 @@ def verdict(found: Fit) -> str:
     if off.certain > GOOD:
         return f"first order with dead time will not do: it is off by {where}"
     advice = "because the steps differ too much: fly in calm air, or with more --repeats"
-    return f"it cannot be told whether first order with dead time will do ({where}), {advice}"
+    return f"it is unclear whether first order with dead time will do ({where}), {advice}"

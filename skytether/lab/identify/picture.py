@@ -33,7 +33,7 @@ def drawn(axes: Sequence[AxisOutcome]) -> "Figure":
         for each in (above, below):
             each.grid(alpha=0.3)
     grid[0, 0].set_ylabel("share of the step")
-    grid[1, 0].set_ylabel("left over [%]")
+    grid[1, 0].set_ylabel("residual [%]")
     if any(axis.fit for axis in axes):
         first = next(n for n, axis in enumerate(axes) if axis.fit)
         grid[0, first].legend(loc="lower right", fontsize=8)

@@ -123,7 +123,7 @@ class Experiment:
         self._now_ns, self._state = now_ns, state
         if self._script is None:
             self._home = [p for p, _ in state]
-            # fixes the home position of the fence
+            # The fence takes the position of its first call as home.
             self._fence.limited([0.0] * len(state), state, self._u_max)
             self._script = self._flown()
         wanted = next(self._script, None)

@@ -44,8 +44,7 @@ def draw(results: Sequence[ComparedCase]) -> Drawn:
         )
     else:
         verdict = (
-            f"{sum(asked)} of the {len(asked)} claimed ratios hold with the whole of their 95 % "
-            "interval."
+            f"{sum(asked)} of the {len(asked)} claimed ratios hold over their whole 95 % interval."
         )
     tables = [
         budgets_table(results),
@@ -255,7 +254,7 @@ def weights_table(results: Sequence[ComparedCase]) -> Table:
 
 
 def _weights(value: Any) -> str:
-    """Text of a number, or of several with commas; empty for None."""
+    """Text of a weight, or of several with commas; empty for None."""
     parts = () if value is None else np.atleast_1d(value)
     return ", ".join(f"{part:.4g}" for part in parts)
 

@@ -126,11 +126,11 @@ def traffic_table(columns: Mapping[str, MethodFlights]) -> Table:
         for name in TRAFFIC
     ]
     says = (
-        f"All that entered the network in a flight. The paper's “10 times” counts packets on the "
-        f"uplink alone: there the trigger sends {share[0]:.1%} of what every step takes; of all "
+        "All packets that entered the network in a flight. The paper's “10 times” counts those on "
+        f"the uplink alone: there the trigger sends {share[0]:.1%} of what every step takes; of all "
         f"packets, both ways, {share[4]:.1%}, and {share[5]:.1%} of all bytes. Of the plans, those "
         "“above” were sent because the trigger's figure exceeded its threshold, the others because "
-        "a sign of life, a first plan or the schedule was due."
+        "a heartbeat, a first plan or the schedule was due."
     )
 
     def cell(name: str, row: Row) -> str:
@@ -142,7 +142,7 @@ def traffic_table(columns: Mapping[str, MethodFlights]) -> Table:
 
 
 SENT_BY = ("uplink_above", "uplink_due")
-"""Plans sent, by cause, see `shared.telemetry.sent.SentBy`."""
+"""Figures of plans sent, by cause, see `shared.telemetry.sent.SentBy`."""
 REAL = {
     "column": ("column", ""),
     "UDP": ("rmse_xy_udp", ".4f"),
