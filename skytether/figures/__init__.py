@@ -4,6 +4,6 @@
     page, tables            an HTML page that opens offline, its tables, and CSV
     colours                 colours of modes and states, shared with the live page
 
-Nothing is registered. The package imports `shared`, `netem.impairments` and the results of
-`probe`. Pictures need the extra `plot`.
+The package imports `shared`, `netem.impairments` and the results of `probe`. Pictures need the
+extra `plot`.
 """

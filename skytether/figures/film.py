@@ -20,13 +20,13 @@ if TYPE_CHECKING:
 
 SUFFIX = ".gif"
 RATE_HZ = 12
-"""Frames per second of the film."""
+"""Frames per second of the film [Hz]."""
 SPEED = 4.0
 """Seconds of the flight per second of the film."""
 FRAMES_MAX = 600
 """Largest number of frames; a longer flight is shown faster."""
 TRAIL_S = 2.0
-"""Duration of the flown path that is drawn behind each vehicle."""
+"""Duration of the flown path that is drawn behind each vehicle [s]."""
 COLOURS = 64
 
 
@@ -98,7 +98,7 @@ def _frames(
     if nearest is not None:
         times_s, nearest_m = separations or (np.zeros(0), np.zeros(0))
         asked_m = scenario.mission.separation_m
-        nearest.axhline(asked_m, color="tab:red", linestyle="--", label=f"asked for: {asked_m:g} m")
+        nearest.axhline(asked_m, color="tab:red", linestyle="--", label=f"required: {asked_m:g} m")
         (line,) = nearest.plot([], [], "k-", linewidth=0.8, label="nearest two vehicles")
         nearest.set_xlim(0.0, float(np.ptp(times_s)))
         # Large distances at the start and the end would compress the scale.

@@ -29,12 +29,12 @@ class Table:
     bold: Collection[tuple[int, int]] = ()
     """Rows and columns of cells in bold type."""
     own: Collection[int] = ()
-    """Rows of the reader's own contenders."""
+    """Rows of the user's own contenders."""
     is_grouped: bool = True
 
     @property
     def groups(self) -> dict[str, list[int]]:
-        """Rows grouped by the first column if a value repeats; otherwise one unnamed group."""
+        """Rows by their value in the first column if one repeats; otherwise one unnamed group."""
         groups: dict[str, list[int]] = {}
         for at, (first, *_) in enumerate(self.rows):
             groups.setdefault(first if self.is_grouped else "", []).append(at)

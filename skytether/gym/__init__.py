@@ -5,10 +5,10 @@
     env = Networked(gymnasium.make("Pendulum-v1"), uplink="constant(50ms) & loss(10%)")
 
     networked  `Networked`, and `NetworkedVector` for many robots; `remote` has the network
-    players    rules by which the robot plays chunks of actions that arrive late
     spaces     actions as rows, and the size of observations, for any of Gymnasium's spaces
     flights    Skytether's own flights, in which the agent is the trigger
 
+`skytether.policy.players` has the rules by which a robot chooses actions from chunks.
 Importing `flights` registers `skytether/Target-v0` with Gymnasium. The package imports `sim`,
 `netem`, `server` and `shared`; nothing imports it. It needs the extra `gym`.
 """

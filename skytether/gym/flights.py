@@ -46,7 +46,7 @@ _SPACE = Box(-1e9, 1e9, (len(OBSERVED),), np.float32)
 
 
 class Decided(Trigger):
-    """Trigger with a threshold for each vehicle, which an agent sets.
+    """Trigger whose threshold an agent sets, separately for each vehicle.
 
     Args:
         vehicle: number of the vehicle in each row; shape (capacity,).

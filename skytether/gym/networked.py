@@ -2,9 +2,9 @@
 
 Robot and environment are at one end, the agent at the other. Time is virtual: step k of the
 environment begins k · `step_s` after the episode's start, and nothing sleeps. At each step a robot
-receives the packets that have arrived, plays the step's action, and reports the next observation. A
-call of `step` is one answer of the agent: it is sent after the agent's thinking time, and the call
-simulates that time, at least one step.
+receives the packets that have arrived, executes the step's action, and reports the next
+observation. A call of `step` is one answer of the agent: it is sent after the agent's thinking
+time, and the call simulates that time, at least one step.
 
 With `thinking = "measured"` the thinking time is the real time between two calls. No other clock is
 read here.
@@ -51,8 +51,9 @@ Answer = Any
 """An action; actions for successive steps, the first for the step of the newest observation, as
 arrays with one more axis in front; a `Chunk` of actions; or None to send nothing."""
 Exhausted = Literal["hold", "zero"] | Callable[[Any, Any], Any]
-"""Rule after the last received action: repeat it ("hold"), play `idle` ("zero"), or call a function
-that returns an action from the robot's observation and last action (None before the first)."""
+"""Rule after the last received action: repeat it ("hold"), execute `idle` ("zero"), or call a
+function that returns an action from the robot's observation and last action (None before the
+first)."""
 Compress = Callable[[Any], bytes | int]
 """Function that returns an observation's compressed bytes, or their number."""
 
@@ -73,8 +74,8 @@ class Options(TypedDict, total=False):
     """Seed of the network. `reset(seed=…)` restarts the network's random numbers from both seeds; a
     `reset` without seed goes on to the next episode's random numbers."""
     exhausted: Exhausted
-    """What the robot plays after the last received action: "hold" (that action), "zero" (`idle`),
-    or a function."""
+    """What the robot executes after the last received action: "hold" (that action), "zero"
+    (`idle`), or a function."""
     idle: Any
     """Action before the first one has arrived, and for "zero"; by default zeros, or the nearest
     action in the action space."""
@@ -95,13 +96,13 @@ class Options(TypedDict, total=False):
 
 
 ORACLE: Options = {"uplink": "none", "downlink": "none", "thinking": 0.0, "price": 0.0}
-"""Options for an upper bound of a policy's return: no network."""
+"""Options for an upper bound of a policy's return: no delay, no loss, no price."""
 NOTHING_SENT: Options = {"uplink": "loss(1)", "price": 0.0}
 """Options for a lower bound of a policy's return: no answer arrives."""
 
 
 class _Far:
-    """Common part of `Networked` and `NetworkedVector`: an agent and `count` remote robots."""
+    """Common part of `Networked` and `NetworkedVector`: an agent, and `count` remote robots."""
 
     def __init__(
         self,
@@ -206,7 +207,7 @@ class _Far:
         rows = to_rows(self.space, given, "action")
         if len(rows) > ROWS_MAX:
             raise ValueError(f"action: got {len(rows)} rows, expected at most {ROWS_MAX}")
-        rows.setflags(write=False)  # the robot plays these rows without a copy
+        rows.setflags(write=False)  # the robot uses these rows without a copy
         return Chunk(rows, first, thought_ns)
 
     def thought_ns(self, *, is_nothing: bool) -> int:
@@ -218,7 +219,7 @@ class _Far:
         return self._thoughts.at(self.begun().now_ns // SLOT_NS).delay_ns
 
     def played(self) -> list[Any]:
-        """Action of each robot at the present step."""
+        """Action that each robot executes at the present step."""
         rows = self.begun().rows()
         return [
             to_action(self.space, self._rule(i) if row is None else self._row(row))
@@ -266,7 +267,7 @@ class _Far:
         return _whole("compress", size, 0, QUEUE_BYTES_MAX)
 
     def returns(self) -> None:
-        """Record the time at which the agent gets control."""
+        """Record when `step` or `reset` returns: the thinking time is measured from then on."""
         if self.thinking is None:
             self._returned_ns = self._clock_ns()
 
@@ -410,7 +411,7 @@ class NetworkedVector(_VectorWrapper):
         return list(iterate(self.observation_space, observations))
 
     def _infos(self) -> dict[str, Any]:
-        """Entries of `info` for all robots, as arrays with one row per robot."""
+        """Entries of `info["network"]` for all robots, as arrays with one row per robot."""
         each = [self._far.begun().info(index) for index in range(self.num_envs)]
         return {name: np.array([one[name] for one in each]) for name in each[0]}
 

@@ -59,7 +59,7 @@ class ObservationReport(NamedTuple):
 
     step: int
     number: int
-    """Number that the player gives to the step; default of `Chunk.first`."""
+    """Number of the step by the robot's player; default of `Chunk.first` of an answer."""
     acknowledged: int
     """Newest generation of chunks that the robot held; 0 for none."""
     since: int
@@ -98,7 +98,7 @@ class Robot:
     acknowledged: int = 0
     since: int = 0
     exhausted: int = 0
-    """Number of steps at which rows had run out."""
+    """Number of steps at which the robot had no row of actions left."""
 
 
 @kernel
@@ -113,9 +113,9 @@ class Remote:
     Args:
         make_player: called for each robot and episode.
         step_ns: length of a step of the environment [ns].
-        none: no rows of actions; shape (0, *row).
+        none: empty array of rows of actions; shape (0, *row).
         shown: number of rows in `coming` and `committed`.
-        fill: returns the row that a robot plays after rows have run out, from its last row (None
+        fill: returns the row that a robot executes after rows have run out, from its last (None
             before the first); None if the agent cannot know it.
     """
 
@@ -135,8 +135,8 @@ class Remote:
         self.downlink = Link(DOWNLINK, QUEUE_BYTES_MAX, None, network.downlink)
         self._bound = delay_bound(count, step_ns / SECOND_NS, DELAY_STEPS_MAX, None)
         self._leaving: list[tuple[int, int, Message, int]] = []
-        """Answers whose thinking time has not ended: time of sending [ns], robot, message, size. A
-        call of `step` adds at most one per robot, and normally lasts until they are sent."""
+        """Answers whose thinking time has not ended: time of sending [ns], robot, message, size. At
+        most one per robot in a call of `step`, which normally lasts until they are sent."""
         self._robots: list[Robot] = []
         self.step = 0
         self._flows = 0
@@ -183,7 +183,7 @@ class Remote:
         return 1 if size <= mtu else -(-size // (mtu - PART_BYTES))
 
     def rows(self) -> list[Row | None]:
-        """Row of each robot for the present step; None where rows have run out."""
+        """Row of actions of each robot for the present step; None for a robot without rows left."""
         self._hear_agents()
         played = [robot.player.row(self.step) for robot in self._robots]
         for robot, row in zip(self._robots, played, strict=True):
@@ -191,11 +191,11 @@ class Remote:
         return played
 
     def last(self, index: int) -> Row | None:
-        """Row that a robot repeats when rows have run out."""
+        """Row of actions that a robot repeats when it has none left."""
         return self._robots[index].player.last
 
     def advance(self, observations: Sequence[Any], sizes: Sequence[int]) -> None:
-        """Advance to the next step; `observations` are the robots' there, of `sizes` [B]."""
+        """Advance to the next step, with each robot's observation there and its size [B]."""
         self.step += 1
         self._hear_agents()
         for index, (robot, observation, size) in enumerate(
@@ -296,7 +296,7 @@ class Remote:
         return padded
 
     def _coming(self, robot: Robot, delay_steps: int) -> tuple[int, NDArray[Any], int, int]:
-        """Predict from the agent's knowledge the rows that a robot plays from the observation's
+        """Predict from the agent's knowledge the rows that a robot executes from the observation's
         step on, at most `shown`: from the newest report, and the answers under way, each expected
         to arrive `delay_steps` after its observation.
 

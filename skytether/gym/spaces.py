@@ -90,7 +90,7 @@ def to_rows(space: Space, given: Any, name: str) -> NDArray[Any]:
 
 
 def _given(space: Space, given: Any, name: str) -> list[tuple[str, Space, Any]]:
-    """Name, space and value of each part of an action or observation."""
+    """Name, space and value of each part of an action or observation of a Dict or Tuple space."""
     parts = _parts(space)
     fields = getattr(getattr(given, "dtype", None), "names", None)
     if isinstance(space, Tuple) and isinstance(given, tuple | list):

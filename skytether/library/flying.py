@@ -157,7 +157,7 @@ def named(scenario: Given, keys: Mapping[str, Any]) -> tuple[str, Scenario]:
 
 def prepare(*scenarios: Scenario) -> None:
     """Compile the kernels that these scenarios call, or without scenarios those of all schemes,
-    with a note on stderr. Kernels that this machine has are not compiled again.
+    with a note on stderr. Kernels that are on disk already are not compiled again.
     """
     import skytether.sim.flight  # noqa: F401 - its kernels are those of every flight
     from skytether.server.schemes import loading
