@@ -57,14 +57,14 @@ class Clocks:
     """Listener's clock relative to the prober's."""
 
     offset_s: float
-    """Offset at the first probe, assuming equal least delays in both directions."""
+    """Offset at the first probe [s], assuming equal least delays in both directions."""
     drift: float
     """Rate by which the listener's clock runs faster; 0 if no drift is significant."""
     drift_doubt: float
     least_sum_s: float
-    """Sum of the two least delays."""
+    """Sum of the two directions' least delays [s]."""
     doubt_s: float
-    """Largest error of one-way delays: half of `least_sum_s`, minus known fixed times."""
+    """Largest error of one-way delays [s]: half of `least_sum_s`, minus known fixed times."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,7 +72,7 @@ class BottleneckRate:
     """Rate of a path's bottleneck, in one direction."""
 
     bytes_per_s: float
-    """Rate, including headers of IP and UDP."""
+    """Rate, including headers of IP and UDP [B/s]."""
     low: float
     high: float
     """Bounds of the 95 % interval [B/s]."""
@@ -84,9 +84,9 @@ class Delays:
     """Packets of one direction that were sent alone, not in a train, in order of sending."""
 
     time_s: Array
-    """Time of sending on the prober's clock, from the first probe; shape (n,)."""
+    """Time of sending on the prober's clock, from the first probe [s]; shape (n,)."""
     delay_s: Array
-    """One-way delay; NaN for a lost packet; shape (n,)."""
+    """One-way delay [s]; NaN for a lost packet; shape (n,)."""
     rate: BottleneckRate | None
     """Rate of the bottleneck; None if trains give no finite rate."""
 
@@ -99,7 +99,7 @@ class Delays:
 
 
 def delays(measured: MeasuredPath) -> tuple[Clocks, Delays, Delays]:
-    """Clocks, and delays of the downlink and of the uplink.
+    """Relation of the two clocks, and delays of the downlink and of the uplink.
 
     Raises:
         ValueError: fewer than two packets arrived in a direction.
@@ -163,7 +163,7 @@ def _drift(x_down: Array, y_down: Array, x_up: Array, y_up: Array) -> tuple[floa
     mean = float(np.mean(x_down)), float(np.mean(x_up))
 
     def height(slope: float) -> float:
-        """Mean height of both lines, a concave function of the slope."""
+        """Sum of both lines' mean heights, each just below its points; concave in the slope."""
         below = float(np.min(down[1] - slope * (down[0] - mean[0])))
         return below + float(np.min(up[1] + slope * (up[0] - mean[1])))
 
@@ -230,7 +230,7 @@ def highest(function: Callable[[float], float], low: float, high: float, steps: 
 
 
 def autocorrelation(time_s: Array, values: Array, lags: int = LAGS) -> tuple[Array, Array]:
-    """Mean time between packets by lag, and the correlation of their values.
+    """Mean time between packets by lag [s], and the correlation of their values.
 
     Pairs with a gap between them, such as those around a train, are left out.
 
@@ -317,7 +317,7 @@ def rate(way: Way, delay_s: Array, size: int) -> BottleneckRate | None:
 
     Args:
         delay_s: delays of all packets, with any constant offset; delays of lost packets are
-            ignored; shape (n,).
+            ignored [s]; shape (n,).
         size: UDP payload of each packet [B].
     """
     trains = []
@@ -347,7 +347,7 @@ Trains = list[tuple[Array, Array]]
 
 
 def _slope(trains: Trains) -> tuple[float, float]:
-    """Common slope of lines through all trains, each with its own intercept; standard error."""
+    """Common slope of lines through all trains, each with an intercept, and its standard error."""
     centred = [(x - x.mean(), y - y.mean()) for x, y in trains]
     sxx = sum(float(x @ x) for x, _ in centred)
     slope = sum(float(x @ y) for x, y in centred) / sxx

@@ -94,7 +94,7 @@ def _normal(delay_s: Array) -> Found:
 
 
 def _with_least(delay_s: Array, name: str) -> Found:
-    """Gamma or lognormal distribution above a least delay, for which a grid of values is tried."""
+    """Fit a gamma or lognormal distribution above a least delay, from a grid of least delays."""
     first, span = float(delay_s.min()), float(np.mean(delay_s) - delay_s.min())
     law = _gamma if name == "gamma" else _lognormal
     below = np.minimum(np.geomspace(RESOLUTION_S, 30.0 * span, LEASTS), first)
@@ -131,7 +131,7 @@ def _gamma(delay_s: Array, least_s: float) -> tuple[float, float, float]:
 
 
 def _paper(delay_s: Array) -> Found | None:
-    """Least delay plus a Poisson number of slots, with a normal error; None without slots."""
+    """Fit a least delay plus a Poisson number of slots, with a normal error; None without slots."""
     first, span = float(delay_s.min()), float(delay_s.max() - delay_s.min())
     if span < 20.0 * RESOLUTION_S:
         return None
@@ -187,7 +187,8 @@ def fit_losses(time_s: Array, lost: Flags) -> list[FittedImpairment]:
 
     The channel of `gilbert_elliott` is redrawn at random moments, bad with probability `share`, and
     loses every packet while it is bad. Its state is not redrawn between two packets with
-    probability exp(-Δt / cell), and a bad period lasts cell / (1 - share) on average.
+    probability exp(-Δt / cell), `cell` being the mean time from one redraw to the next. A bad
+    period lasts cell / (1 - share) on average.
 
     Args:
         time_s: times of sending, in the order of sending; shape (n,).
@@ -219,12 +220,12 @@ def fit_losses(time_s: Array, lost: Flags) -> list[FittedImpairment]:
 
 
 def _at_share(likelihood: Callable[[float, float], float], share: float, cell: float) -> float:
-    """Log-likelihood as a function of the share; `cell` is the logarithm of the cell length."""
+    """Log-likelihood of a share; `cell` is the logarithm of the redraw time."""
     return likelihood(share, exp(cell))
 
 
 def _at_cell(likelihood: Callable[[float, float], float], cell_s: float, share: float) -> float:
-    """Log-likelihood as a function of the cell length at a share."""
+    """Log-likelihood of a redraw time `cell_s` [s] at a given share."""
     return likelihood(share, cell_s)
 
 

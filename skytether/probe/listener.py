@@ -62,7 +62,7 @@ class ProbeSession:
     """Measurement by one prober."""
 
     heard_ns: int
-    """Time of the newest probe."""
+    """Time of the newest probe [ns]."""
     host: str
     logged: int = 0
     log: deque[tuple[int, int]] = field(default_factory=lambda: deque(maxlen=HISTORY_MAX))
@@ -70,7 +70,7 @@ class ProbeSession:
     train: list[HeldPacket] = field(default_factory=list)
     """Received packets of a train, answered once the rest has arrived."""
     train_ns: int = 0
-    """Time of the newest packet in `train`."""
+    """Time of the newest packet in `train` [ns]."""
 
 
 class Listener(Endpoint):
@@ -118,7 +118,7 @@ class Listener(Endpoint):
             raise ProtocolError(Drop.NOT_FOR_A_SERVER)
 
     def _session(self, name: bytes, call: GateCall, peer: Address, now_ns: int) -> ProbeSession:
-        """Measurement of a session, begun if it is new.
+        """Measurement with the session id `name`, begun if it is new.
 
         Raises:
             ProtocolError: the session id is wrong for this sender, or SESSIONS_MAX sessions are
@@ -141,7 +141,7 @@ class Listener(Endpoint):
         return session
 
     def _gives_way(self, peer: Address, now_ns: int) -> bytes | None:
-        """Session to end in favour of a sender's new session; None if none may be ended.
+        """Id of the session to end so that a new sender can begin one; None if none may be ended.
 
         A host with many sessions cannot block others: for a host with fewer sessions, the oldest
         session of the host with the most is ended.
@@ -193,7 +193,7 @@ class Listener(Endpoint):
             self._answered += 1
 
     def wake(self, *, now_ns: int) -> None:
-        """Answer incomplete trains after a time limit."""
+        """Answer incomplete trains HOLD_NS after their newest packet."""
         for name, session in self._sessions.items():
             if session.train and now_ns >= session.train_ns + HOLD_NS:
                 self._release(session, name, now_ns)

@@ -53,14 +53,14 @@ class CommonOutages(msgspec.Struct, frozen=True, kw_only=True):
     """Outages of each path, and common outages of all paths."""
 
     threshold_s: float
-    """Time T without an answer after which a path counts as out."""
+    """Time T without an answer after which a path counts as out [s]."""
     seconds: float
-    """Time covered by probes of all paths."""
+    """Time covered by probes of all paths [s]."""
     paths: list[OutageFigures]
     common: OutageFigures
     """Outages of all paths at once."""
     product: float
-    """Product of the paths' shares."""
+    """Product of the paths' shares: the common share if the paths are independent."""
 
 
 def compare(paths: Sequence[RoundTrips]) -> CommonOutages:
@@ -87,8 +87,8 @@ def compare(paths: Sequence[RoundTrips]) -> CommonOutages:
 
 
 def common_time(paths: Sequence[RoundTrips]) -> Sequence[tuple[float, float]]:
-    """Beginning and end of the common time of all measurements, for each path since its first probe
-    [s].
+    """Beginning and end [s] of the time that all measurements share, counted from the first probe
+    of each path.
     """
     begin_s = max(float(path.sent_s[0]) for path in paths)
     end_s = min(float(path.sent_s[-1]) for path in paths)
@@ -101,7 +101,7 @@ def _figures(out: Intervals, covered: Intervals) -> OutageFigures:
 
 
 def outages(path: RoundTrips, threshold_s: float) -> tuple[Intervals, Intervals]:
-    """Outages of one path, and the times covered by its probes."""
+    """Outages of one path, and the times covered by its probes [s]; shapes (n, 2)."""
     sent_s, most_s = path.sent_s, SPARSE * path.every_s
     ends_s = np.minimum(np.append(sent_s[1:], np.inf), sent_s + most_s)
     failed = ~(path.trip_s <= threshold_s)  # NaN, no answer, counts as failed

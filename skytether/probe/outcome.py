@@ -17,9 +17,10 @@ from skytether.shared.law.model import Array
 from skytether.shared.telemetry.record import DOWNLINK, PACKET_COLUMNS, UPLINK, Rows
 
 TEXT_CORRELATION_MIN = 0.5
-"""Shortest correlation time written in the text, in times between two packets."""
+"""Shortest correlation time that the text states, as a multiple of the time between packets."""
 ORDERED_SHARE = 0.01
-"""Predicted share of reordered packets above which a path without reordering is called ordered."""
+"""A path counts as ordered if no packet was reordered, but with independent delays more than this
+share would have been."""
 
 
 class ModelFigures(msgspec.Struct, frozen=True):
@@ -41,26 +42,26 @@ class DirectionFigures(msgspec.Struct, frozen=True, kw_only=True):
     """Bounds of the 95 % interval of the loss."""
     bursts: int
     burst_packets: float
-    """Mean length of a run [packets]."""
+    """Mean length of a run of lost packets [packets]."""
     reordered: float
     """Share of packets that arrived after one sent later."""
     mean_s: float
     sd_s: float
     quantiles_s: dict[str, float]
-    """Quantiles of the delay, by probability."""
+    """Quantiles of the delay [s], by probability."""
     correlation: list[tuple[float, float]]
     """For each lag, time between two packets [s] and correlation of their delays."""
     correlation_s: float
-    """Time in which the correlation falls to 1/e; 0 without significant correlation."""
+    """Time in which the correlation falls to 1/e [s]; 0 without significant correlation."""
     rate_bytes_per_s: float | None
-    """Rate of the bottleneck, with headers; None if trains give no finite rate."""
+    """Rate of the bottleneck, with headers [B/s]; None if trains give no finite rate."""
     rate_low: float | None
     rate_high: float | None
     """Bounds of the 95 % interval of the rate [B/s]."""
     trains: int
-    """Number of trains with enough received packets."""
+    """Number of trains of which enough packets arrived to estimate the rate."""
     train_wait_s: float
-    """Time for which the last packet of a train waits in the bottleneck's queue."""
+    """Time for which the last packet of a train waits in the bottleneck's queue [s]."""
     delay_models: list[ModelFigures]
     """Models of the delay, without the transmission time at the rate, the best first."""
     loss_models: list[ModelFigures]
@@ -81,16 +82,16 @@ class PathFigures(msgspec.Struct, frozen=True, kw_only=True):
     """UDP payload of a packet [B]; 0 if a log does not contain it."""
     every_s: float
     offset_s: float
-    """Offset of the listener's clock at the first probe."""
+    """Offset of the listener's clock at the first probe [s]."""
     offset_doubt_s: float
-    """Largest error of the offset, and of one-way delays (opposite in both directions)."""
+    """Largest error of the offset, and of one-way delays (opposite in both directions) [s]."""
     drift_ppm: float
-    """Drift of the listener's clock; 0 if none is significant."""
+    """Drift of the listener's clock [10⁻⁶]; 0 if none is significant."""
     drift_doubt_ppm: float
     round_trip_mean_s: float
-    """Mean round-trip time, which is independent of the clocks' offset."""
+    """Mean round-trip time [s], which is independent of the clocks' offset."""
     round_trip_least_s: float
-    """Sum of both directions' least delays."""
+    """Sum of both directions' least delays [s]."""
     unreported: int
     """Number of arrivals that the listener dropped before reporting them."""
     uplink: DirectionFigures

@@ -49,7 +49,7 @@ TRAIN_EVERY_NS, TRAIN_EVERY_SLOTS = 10 * SECOND_NS, 10 * TRAIN
 HELLO_BYTES = 64
 """Size of a HELLO without keys, longer than its WELCOME [B]."""
 PATIENCE_NS = 10 * SECOND_NS
-"""Longest wait for the first answer."""
+"""Longest wait for the first answer [ns]."""
 POLL_NS = 100 * MILLISECOND_NS
 LAST_MIN_NS, LAST_MAX_NS = 1 * SECOND_NS, 60 * SECOND_NS
 """Bounds of the wait for the last answers, which is twice the longest round-trip time [ns]."""
@@ -65,9 +65,9 @@ class Way:
     """
 
     sent_ns: Longs
-    """Time of sending, on the sender's clock; shape (n,)."""
+    """Time of sending, on the sender's clock [ns]; shape (n,)."""
     came_ns: Longs
-    """Time of arrival, on the receiver's clock; 0 for a lost packet; shape (n,)."""
+    """Time of arrival, on the receiver's clock [ns]; 0 for a lost packet; shape (n,)."""
     came: Flags
     train: Longs
     """Number of each packet's train, -1 for a packet sent alone; shape (n,)."""
@@ -94,7 +94,7 @@ class Prober(Endpoint):
         listener: address of the other end.
         nonce: NONCE_BYTES, different for each measurement.
         probes: number of grid points, at most PROBES_MAX.
-        period_ns: time between two grid points.
+        period_ns: time between two grid points [ns].
         size: UDP payload of a probe, BYTES_MIN to PAYLOAD_BYTES_MAX [B].
     """
 
@@ -118,14 +118,14 @@ class Prober(Endpoint):
         self._session = b""
         self._hello = encode(ProbeHello(nonce), 0 if link.secure else HELLO_BYTES)
         self._due_ns: int | None = 0
-        """Time of the next wake; 0 before the first."""
+        """Time of the next wake [ns]; 0 before the first."""
         self._hello_ns = 0
         self._began_ns: int | None = None
         self._zero_ns = 0
         self._slot = 0
         """Grid point of the next probe."""
         self._over_ns: int | None = None
-        """Time at which the last probe was sent; None before."""
+        """Time at which the last probe was sent [ns]; None before."""
         self._longest_ns = 0
         self.refused = False
         """Whether the listener has refused, because SESSIONS_MAX measurements are open."""
@@ -257,7 +257,7 @@ class Prober(Endpoint):
         self._train.append(number)
 
     def _poll(self, now_ns: int, over_ns: int) -> None:
-        """Request arrivals until all are known, or until a time limit."""
+        """Request arrivals until all are known, or until LAST_MAX_NS after the last probe."""
         waited_ns = now_ns - over_ns
         least_ns = min(max(LAST_MIN_NS, 2 * self._longest_ns), LAST_MAX_NS)
         if waited_ns >= LAST_MAX_NS or (waited_ns >= least_ns and self._logged >= self._total):
@@ -287,7 +287,7 @@ class Prober(Endpoint):
 
     @property
     def probed_s(self) -> float:
-        """Length of the measurement so far."""
+        """Length of the measurement so far [s]."""
         return self._slot * self._period_ns / SECOND_NS
 
     def figures(self) -> dict[str, Any]:
@@ -299,7 +299,7 @@ class Prober(Endpoint):
         }
 
     def measured(self) -> MeasuredPath:
-        """Packets so far.
+        """Packets of both directions so far.
 
         If the measurement was ended early, packets that may still be under way are left out:
         packets after the newest one that is known to be received or lost.
@@ -320,7 +320,8 @@ class Prober(Endpoint):
         downlink = self.measured().downlink
         number, answered = np.array(self._logged_number), np.array(self._answer_number)
         at = np.flatnonzero(answered < len(number))
-        at = at[number[answered[at]] >= 0][::-1]  # of several answers, keep the first: written last
+        # Reversed, so that of several answers to a probe the first is written last, and stays.
+        at = at[number[answered[at]] >= 0][::-1]
         probe = number[answered[at]]
         trip_s = np.full(len(self._sent_ns), np.nan)
         came_ns, sent_ns = np.array(self._answer_came_ns)[at], np.array(self._sent_ns)[probe]

@@ -70,11 +70,11 @@ class ProbeAnswer(NamedTuple):
     number: int
     """Number of the answered arrival, from 0; or NO_NUMBER."""
     sent_ns: int
-    """Time of sending, on the listener's clock."""
+    """Time of sending, on the listener's clock [ns]."""
     first: int
     """Number of the first reported arrival."""
     logged: int
-    """Number of arrivals so far."""
+    """Number of arrivals at the listener so far."""
     arrivals: tuple[tuple[int, int], ...]
     """Reported arrivals: number of the PROBE and the listener's time [ns]."""
 
