@@ -18,11 +18,11 @@ from skytether.shared.events.flight import address_text
 from skytether.shell.host.udp import AddressError, from_kernel, to_kernel
 
 HELD_MAX = 200
-"""Number of pieces of an end under way, above which it is not read. Even with the data of one more
-read, all connections together stay below the bounds of a link's queue."""
+"""Number of pieces from an end that are under way, above which it is not read. Even with the data
+of one more read, all connections together stay below the bounds of a link's queue."""
 READ_BYTES = 32 * PIECE_BYTES
 BREAKS_OFF = struct.pack("ii", 1, 0)
-"""Value of SO_LINGER with which closing a socket sends a reset."""
+"""Value of SO_LINGER (on, 0 s) with which closing a socket sends a reset."""
 
 Hear = Callable[[bytes, Address], None]
 
@@ -36,7 +36,7 @@ class SocketHalf:
         self._source, self._target = source, target
         self._peer, self._hear = peer, hear
         self.pieces: asyncio.Queue[bytes] = asyncio.Queue()
-        """Pieces that the endpoint has relayed."""
+        """Pieces of data that the endpoint has relayed and that are to be written to the target."""
         self._held, self._has_capacity = 0, asyncio.Event()
         self._has_capacity.set()
         self._has_ended = False
@@ -98,7 +98,7 @@ class Connections:
         self.address: Address = from_kernel(self._socket.getsockname())
 
     def send(self, payload: bytes, peer: Address) -> bool:
-        if way := self._ways.get(peer):  # otherwise the connection was reset meanwhile
+        if way := self._ways.get(peer):  # unless the connection was reset meanwhile
             way.pieces.put_nowait(payload)
         return True
 
@@ -168,4 +168,4 @@ class Connections:
 
 
 open_line = Connections
-"""See `shell.driving.driver.OpenLine`."""
+"""Function that listens for clients of a `Listen`, see `shell.driving.driver.OpenLine`."""

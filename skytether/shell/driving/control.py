@@ -30,11 +30,11 @@ PROCESSES = ("server", "server 2", *NETEMS, "client")
 """Names of the processes, and of their sockets in a flight's folder."""
 
 REST_S = 0.01
-"""Shortest pause after a request."""
+"""Shortest pause after a request [s]."""
 RESTS = 20
 """Pause after a request, as a multiple of its duration: requests take at most 1/21 of the time."""
 PATIENCE_S = 5.0
-"""Longest time to wait for an answer."""
+"""Longest time to wait for an answer [s]."""
 ANSWER_BYTES_MAX = 65_536
 
 
@@ -62,7 +62,7 @@ class Control:
         self._after: Callable[[], None] = lambda: None
 
     def begin(self, loop: asyncio.AbstractEventLoop, after: Callable[[], None]) -> None:
-        """Answer requests from now on; calls `after` after each request."""
+        """Answer requests from now on; `after` is called after each request."""
         self._loop, self._after = loop, after
         self._listen()
 

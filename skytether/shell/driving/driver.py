@@ -56,7 +56,7 @@ if TYPE_CHECKING:
     AnyLine: TypeAlias = Line | Node | Program | Listen | Callable[..., "OpenLine"]
 
 LINES = {"Line": "stream", "Listen": "connections", "Node": "graph", "Program": "program"}
-"""Module of `shell.driving` that opens a line, by the line's class."""
+"""Module of `shell.driving` that opens a connection beside UDP, by the class that describes it."""
 BURST_MAX = BATCH_MAX
 """Largest number of datagrams read from one socket before timers and other sockets have their
 turn."""
@@ -68,9 +68,9 @@ BATCHES_MAX = 4
 """Largest number of batches read from one socket before timers and other sockets have their
 turn."""
 SOCKET = itemgetter(2)
-"""Socket number of a datagram."""
+"""Function that returns the socket number of a datagram."""
 CAME = itemgetter(0)
-"""Arrival time, from a pair of time and datagram."""
+"""Function that returns the arrival time, from a pair of arrival time and datagram."""
 DATAGRAM_BYTES_MAX = 65535
 RESOLVE_EVERY_S = 2.0
 """Interval at which names are looked up again [s]: a restarted host may have a new address."""
@@ -218,7 +218,7 @@ class Shell:
         self._sockets.clear()
 
     def _names_at(self, number: int) -> Names:
-        """Names of the peers of a socket."""
+        """Names and numeric addresses of the peers of a socket."""
         path = self._paths.get(number)
         return path.names if path else self._names
 
@@ -312,7 +312,7 @@ class Shell:
                     size, sender = receive(buffer)
                     peer = name(from_kernel(sender))
                 except BlockingIOError:
-                    is_refused |= count == 0  # the socket was readable, so an error was pending
+                    is_refused |= count == 0  # readable without a datagram: an error was pending
                     break
                 except OSError:  # ICMP: the peer's port was closed when an earlier packet arrived
                     is_refused = True
@@ -346,7 +346,7 @@ class Shell:
             self._crowd(number, now_ns)
 
     def _crowd(self, number: int, now_ns: int) -> None:
-        """From now on read a socket in batches, if the system has a call for it."""
+        """From now on read a socket in batches, if the system has `recvmmsg`."""
         sock = self._sockets[number]
         batch = self._batch(sock)
         if batch is None or self._slices is None:
@@ -363,8 +363,8 @@ class Shell:
             self._after()
 
     def _read_slice(self) -> None:
-        """Read the datagrams at crowded sockets since the last slice, at most BATCHES_MAX calls
-        each.
+        """Read what has arrived at the sockets that are read in batches, with at most BATCHES_MAX
+        calls each.
 
         Handling many datagrams in a row takes half the time of waking the process for each, when
         caches are cold. The kernel's timestamps give their arrival times.
@@ -463,13 +463,13 @@ class Shell:
             self._after()
 
     def leave(self) -> int:
-        """Ask the endpoint to end; returns the latest time at which to end it by force [ns]."""
+        """Ask the endpoint to end; returns the time at which to end it if it has not [ns]."""
         latest_ns = self.endpoint.leave(now_ns=time.monotonic_ns())
         self._after()
         return latest_ns
 
     def changed(self) -> None:
-        """Process the effects of a change; to be called by the code that changed the endpoint."""
+        """Send the datagrams and report the events that a change of the endpoint caused."""
         self._heard_ns = time.monotonic_ns()
         self._after()
 

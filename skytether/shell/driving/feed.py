@@ -43,21 +43,21 @@ ROWS_BYTES_MAX = 256 * 1024
 SEND_BYTES_MAX = 64 * 1024
 """Largest number of bytes sent to a reader in one turn of the loop."""
 GATHER_S = 0.01
-"""Time for which frames are collected before they are sent."""
+"""Time for which frames are collected before they are sent [s]."""
 REST_S = 0.02
 """Pause between two accepted readers [s], which bounds the cost of reconnecting in a loop."""
 PATIENCE_S = 0.5
-"""Longest time to wait at the end until readers have received everything."""
+"""Longest time to wait at the end until readers have received everything [s]."""
 
 READ_BYTES = 256 * 1024
 AGAIN_S = 1.0
-"""Time between two attempts to connect to a process, or two searches for new feeds."""
+"""Time between two attempts to connect to a process, or two searches for new feeds [s]."""
 FOLLOWED_MAX = 128
 """Largest number of feeds that a subscriber follows."""
 
 
 class _Part:
-    """Rows of one part of the record that are not in a frame yet."""
+    """Rows of one part of the record that were written, but are not in a frame yet."""
 
     def __init__(self, name: str) -> None:
         self.name = name
@@ -127,7 +127,7 @@ class Feed:
 
     @property
     def parts(self) -> dict[str, str]:
-        """Parts of the record, in the form of `Opened`."""
+        """Parts of the record with their columns, as `Opened` contains them."""
         return described(self._columns)
 
     def open(self, opened: Callable[[], Opened]) -> None:

@@ -51,7 +51,7 @@ class GraphSession:
         self._publisher: Any = None
         self._queue: deque[tuple[str, bytes]] = deque(maxlen=QUEUE_MAX)
         self._is_called = False
-        """Whether a call of the event loop for the queue is pending."""
+        """Whether the event loop is scheduled to empty the queue."""
 
     async def run(self) -> None:
         self._loop = asyncio.get_running_loop()
@@ -63,7 +63,7 @@ class GraphSession:
             self._session.close()
 
     def _declare(self) -> list[Any]:
-        """Subscribers and tokens, which end when they are garbage-collected."""
+        """Declare the subscribers and tokens; they end when the returned objects are freed."""
         zenoh, node, session = self._zenoh, self._node, self._session
         out, into, zid = node.publishes, node.subscribes, str(session.zid())
         liveliness, (alive, publisher, subscriber) = session.liveliness(), node.tokens(zid)
@@ -83,7 +83,7 @@ class GraphSession:
         remote = zenoh.Locality.REMOTE
         return [
             session.declare_subscriber(into.key(node.domain), put(into.name)),
-            # Any type, but not our own messages: a message is from another commander.
+            # Commands by others, of any type: they show that somebody else steers the robot.
             session.declare_subscriber(
                 f"{node.domain}/{out.name.strip('/')}/*/*", put(out.name), allowed_origin=remote
             ),
@@ -143,5 +143,5 @@ class GraphSession:
 
 
 def open_line(node: Node, hear: Callable[[Datagram], None], _: object) -> GraphSession:
-    """See `shell.driving.driver.OpenLine`."""
+    """Open the Zenoh session of a node, see `shell.driving.driver.OpenLine`."""
     return GraphSession(node, hear)

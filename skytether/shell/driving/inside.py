@@ -149,7 +149,7 @@ def _configure(mtu: int) -> None:
         )
         with suppress(subprocess.CalledProcessError):  # a kernel without IPv6
             _ip(f"addr add {ADDRESS6}/64 dev netem nodad", "route add ::/0 dev netem")
-    # File capabilities, with which `ping` or a web server do the same, have no effect here.
+    # Allow ping and ports below 1024: file capabilities, which allow them elsewhere, fail here.
     group = os.getegid()
     for name, value in (
         ("ping_group_range", f"{group} {group}"),
@@ -197,7 +197,7 @@ def _mount() -> None:
         if str(real.parent) in RESOLVERS:  # a private folder since the mount above
             real.write_text(text)
         return
-    if text == before:  # inside another `run`, whose deleted file cannot be mounted over
+    if text == before:  # inside another `netem run`; its deleted file cannot be mounted over
         return
     with tempfile.NamedTemporaryFile("w") as file:  # the file is deleted, its mount remains
         file.write(text)
@@ -219,7 +219,7 @@ def _run(command: Sequence[str], mask: Iterable[int]) -> None:
 
 
 def _wait(control: socket.socket, program: int) -> None:
-    """Wait for the program and all processes that it leaves behind, and report both ends."""
+    """Wait for the program, then for all processes that it left running; report each end."""
     woken, wake = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
     signal.set_wakeup_fd(wake)
     signal.signal(signal.SIGCHLD, lambda *_: None)

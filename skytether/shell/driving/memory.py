@@ -34,7 +34,7 @@ BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
 DISK_FAILED = {EROFS, EIO}
 """Errors of a failed disk; a full disk counts as usable, because the lock file fits."""
 AGAIN_S = 1.0
-"""Time after which a failed write is repeated."""
+"""Time after which a failed write is repeated [s]."""
 
 
 class MemoryRefused(ValueError):
@@ -94,11 +94,11 @@ class MemoryFile:
         self._ends = False
         self._thread: threading.Thread | None = None
         self._failure = self._reported = ""
-        """Reason why the newest content was not written, and the newest reported reason."""
+        """Reason why the newest content was not written, and reason reported last, or ""."""
         self._is_removed = False
         """Whether the file was removed, because it could not be written."""
         self._kept_nothing = False
-        """Whether the endpoint's newest information is that no state is saved."""
+        """Whether the endpoint was last informed that no state is saved."""
 
     @property
     def path(self) -> Path:
@@ -107,8 +107,9 @@ class MemoryFile:
     def read(self) -> tuple[bytes, int | None] | None:
         """Content saved by the previous run, and the time of writing; None without a file.
 
-        The time is of the monotonic clock [ns]; None if the host was rebooted since. The content is
-        written again, as a test: a file that cannot be replaced may be older than the flight.
+        The time is that of the host's monotonic clock [ns]; None if the host was rebooted since.
+        The content is written again, as a test: a file that cannot be replaced may be older than
+        the flight.
 
         Raises:
             MemoryRefused: the file must not be used.

@@ -19,7 +19,7 @@ HANGING_MAX = 64
 
 Call = Callable[[], Any]
 Calls = SimpleQueue[tuple[int, int, Call]]
-"""Calls for a thread: each with its planner and the number of its tick."""
+"""Calls for a thread: number of the planner, number of the tick, and the call."""
 
 
 class Planners:
@@ -32,11 +32,11 @@ class Planners:
         self._busy: dict[int, Calls] = {}
         """Queues of busy threads, by number of the planner that runs there."""
         self._answers: SimpleQueue[tuple[int, int, Any]] = SimpleQueue()
-        """Number of planner, number of tick, and the planner's result or exception."""
+        """Answers of threads: number of planner, number of tick, and its result or exception."""
         self._tick = 0
 
     def __call__(self, calls: Sequence[tuple[int, Call]]) -> list[Any]:
-        """See `server.planning.scheme.Planning`."""
+        """Call planners; returns plans or exceptions, see `server.planning.scheme.Planning`."""
         self._tick += 1
         until_s = time.monotonic() + self._limit_s
         while not self._answers.empty():  # drop plans of planners that took too long

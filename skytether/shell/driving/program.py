@@ -53,7 +53,7 @@ FRAME_BYTES_MAX = 65_536
 WAITING_MAX = 16_384
 """Largest number of packets waiting for slirp4netns; further packets are send errors."""
 PATIENCE_S = 30.0
-"""Longest time for slirp4netns to start."""
+"""Longest time for slirp4netns to start [s]."""
 GRACE_S = 1.0
 """Time from SIGHUP until the program is killed, after netem's parent has ended [s]."""
 FLUSH_S = 1.0
@@ -358,5 +358,5 @@ class ProgramLine:
 
 
 def open_line(program: Program, hear: Callable[..., None], _: object) -> ProgramLine:
-    """See `shell.driving.driver.OpenLine`."""
+    """Connect to a program's network, see `shell.driving.driver.OpenLine`."""
     return ProgramLine(program, hear)

@@ -19,7 +19,7 @@ TOGETHER_BYTES = 256 * 1024
 PAUSE_S = 0.02
 """Time for which rows are collected before a write [s]; a killed process loses these rows."""
 PATIENCE_S = 3.0
-"""Longest time to wait at the end until all rows are written."""
+"""Longest time to wait at the end until all rows are written [s]."""
 
 SLOW = "the disk is too slow"
 
@@ -42,7 +42,7 @@ class RecordFile:
         self._is_reported = False
 
     def news(self) -> RecordIncomplete | None:
-        """Event about lost rows: once, after the first was lost; otherwise None."""
+        """Event that reports lost rows, once, after the first loss; otherwise None."""
         reason = self._reason()
         if reason is None or self._is_reported:
             return None

@@ -121,5 +121,5 @@ def prepare(port: int, baud: int) -> None:
 
 
 def open_line(line: Line, hear: Callable[[Datagram], None], _: object) -> ByteStream:
-    """See `shell.driving.driver.OpenLine`."""
+    """Open a byte stream to an autopilot, see `shell.driving.driver.OpenLine`."""
     return ByteStream(line, hear)

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 LOCK = "compiling.lock"
 POLL_S = 0.1
-"""Time between two attempts to get the lock."""
+"""Time between two attempts to get the lock [s]."""
 
 
 @contextmanager
@@ -69,7 +69,7 @@ PROGRESS_BYTES = 200
 
 
 def tell(folder: Path | None, text: str) -> None:
-    """Write a text for `progress` to a flight's folder, if any; an empty text removes it."""
+    """Write the text that `progress` reads to a flight's folder, if any; empty: remove the file."""
     if folder is None:
         return
     with suppress(OSError):
@@ -118,7 +118,7 @@ def _next(kernels: "deque[Missing]") -> "Missing | None":
 
 
 def _have_compiled(kernels: "deque[Missing]", on_done: Callable[[], None]) -> None:
-    """Let another process compile kernels from a queue, until the queue is empty."""
+    """Start a process, and let it compile kernels from a queue until the queue is empty."""
     with subprocess.Popen(
         [sys.executable, "-P", "-m", __name__],
         stdin=subprocess.PIPE,

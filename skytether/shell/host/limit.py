@@ -48,7 +48,7 @@ class Limit:
 
         Args:
             kinds: kinds of events; empty for all.
-            now_ns: None ends every second.
+            now_ns: time now; None also returns the counts of the present second.
         """
         events = []
         for kind in kinds or tuple(self._seconds):

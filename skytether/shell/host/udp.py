@@ -33,7 +33,7 @@ SPARE_FILES = 48
 """Number of open files that a process may need beside its sockets, for feed and metrics."""
 
 FIND_S = 2.0
-"""Longest wait for a name's address at the start of a process with `is_patient` [s]."""
+"""Longest wait for DNS at the start [s]; then the process starts without the address."""
 
 _SO_BINDTODEVICE = 25
 _SO_SNDBUFFORCE, _SO_RCVBUFFORCE, _SO_MEMINFO, _MEMINFO_DROPS = 32, 33, 55, 8
@@ -324,11 +324,11 @@ class Names:
         return self._numbers.get(peer, peer)
 
     def name(self, number: Address) -> Address:
-        """Peer's address as the user gave it, from a numeric address."""
+        """Address of a peer as the user gave it, from its numeric address."""
         return self._by_number.get(number, number)
 
     def heard(self, raw: RawAddress) -> Address:
-        """Peer's address as the user gave it, from an address in the kernel's form.
+        """Address of a peer as the user gave it, from its address in the kernel's form.
 
         Raises:
             OSError: the interface of its scope does not exist.
@@ -337,7 +337,7 @@ class Names:
         if peer is None:
             number = from_kernel(unpack_address(raw))
             peer = self.name(number)
-            # An interface may have another index after it was unplugged.
+            # Not cached with a scope: the interface may have another index once plugged in again.
             if "%" not in number[0]:
                 if len(self._heard) >= ADDRESSES_MAX:
                     self._heard.clear()
@@ -345,7 +345,7 @@ class Names:
         return peer
 
     def heard_all(self, raws: Sequence[RawAddress]) -> list[Address]:
-        """Peers' addresses as the user gave them, from addresses in the kernel's form; raises the
+        """Addresses of peers as the user gave them, from addresses in the kernel's form; raises the
         errors of `heard`.
         """
         peers = list(map(self._heard.get, raws))

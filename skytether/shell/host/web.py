@@ -9,12 +9,12 @@ import ipaddress
 from urllib.parse import urlsplit
 
 HOST_PORT = "127.0.0.1:8080"
-"""Address of a page, unless another is requested."""
+"""Default address of the page."""
 HEADERS = {
     "Content-Security-Policy": "frame-ancestors 'none'",
     "X-Frame-Options": "DENY",
 }
-"""Headers of every answer: a website must not show it in a frame and catch clicks."""
+"""Headers of every answer, so that no website can show it in a frame and catch clicks."""
 
 
 def host_name(host: str) -> str:

@@ -9,7 +9,7 @@ from typing import IO, Any
 
 
 class Writer:
-    """Writer of a file, in its own thread; drops pieces when more than `room` bytes wait.
+    """Writer of a file, in its own thread; drops pieces when more than `capacity` bytes wait.
 
     The thread starts at once, so a process that forks must create writers in its children. A
     blocked thread does not keep the process from ending. A killed process loses pieces not yet
@@ -17,7 +17,7 @@ class Writer:
 
     Args:
         file: unbuffered file to write to; or the error from opening it.
-        room: largest number of bytes waiting to be written.
+        capacity: largest number of bytes waiting to be written.
         together: largest number of bytes in one write of several pieces; a piece is never split.
         pause_s: time for which pieces are collected before they are written [s].
     """
@@ -29,10 +29,10 @@ class Writer:
         self._capacity = capacity
         self._together = together
         self._pause_s = pause_s
-        # One thread changes each counter; the caller's changes `offered` and `refused`.
+        # Each counter is changed by one thread: `offered` and `refused` by the caller's.
         self.offered = 0
         self.refused = 0
-        """Bytes that were dropped because too many were waiting."""
+        """Number of bytes that were dropped because too many were waiting."""
         self.written = 0
         self._handled = 0
         self._pieces: SimpleQueue[bytes] = SimpleQueue()

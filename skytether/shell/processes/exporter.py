@@ -35,12 +35,12 @@ from skytether.shell.processes.metrics import OWN, Metric, families, trouble
 CONNECTIONS_MAX = 8
 """Largest number of connections at once; a new connection closes the oldest."""
 PATIENCE_S = 5.0
-"""Longest time from connecting to the end of the answer."""
+"""Longest time from connecting to the end of the answer [s]."""
 REQUEST_BYTES_MAX = 8192
 POLL_S = 0.1
-"""Interval at which connections that take too long are closed."""
+"""Interval at which connections that take too long are closed [s]."""
 REST_S = 0.02
-"""Pause between two accepted connections."""
+"""Pause between two accepted connections [s]."""
 FRESH_S = 3.0
 """Age above which figures count as stale, and the process as stuck [s]."""
 BY_NAME = b"Host: expected a number, localhost, a name without a dot or that of --metrics\n"

@@ -27,14 +27,14 @@ TOGETHER_BYTES = 4096
 """Largest number of bytes in one write: PIPE_BUF, up to which a write to a pipe is atomic, also
 with several writers."""
 PATIENCE_S = 0.5
-"""Longest time to wait at the end until all lines are written."""
+"""Longest time to wait at the end until all lines are written [s]."""
 
 LogFormat = Literal["text", "json"]
 
 
 class LogLine(msgspec.Struct, frozen=True, kw_only=True):
     process: str
-    """Server, netem or client; `server.N` is worker N of a server, `netem N` that of path N."""
+    """Name: server, netem or client; `server.N` is worker N of a server, `netem N` path N's."""
     time_ns: int
     """Time of the event [ns; CLOCK_MONOTONIC]."""
     event: EveryEvent
@@ -93,7 +93,7 @@ class Log:
                 self._unread += 1
 
     def note(self, event: Event) -> None:
-        """Log an event without printing it."""
+        """Pass an event to `beside` alone, without printing it."""
         self._beside(event)
 
     def each_second(self, *, last: bool = False) -> None:

@@ -100,9 +100,9 @@ failure failure_ratio
 delay_ms acknowledgement_seconds
     Shortest recent time from sending on the path to the acknowledgement.
 first first_copies_total
-    Packets from the other end of which the path brought the first copy.
+    Packets from the other end whose first copy came over the path.
 copies later_copies_total
-    Later copies of packets from the other end that the path brought.
+    Further copies of packets from the other end that came over the path.
 """)
 _SERVER = table("""
 vehicles server_vehicles

@@ -18,7 +18,7 @@ from skytether.shell.commandline import plugins
 from skytether.shell.host import temporary
 
 PATIENCE_S = 30.0
-"""Longest time for a recorder to complete its file."""
+"""Longest time for a recorder to complete its file [s]."""
 
 
 class RecorderOrder(msgspec.Struct, frozen=True, kw_only=True):
