@@ -1,1 +1,1 @@
-"""Virtual time: the endpoints that fly over UDP, on a clock that jumps from event to event."""
+"""Virtual time: the same endpoints as over UDP, on a clock that jumps from event to event."""

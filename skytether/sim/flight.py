@@ -83,11 +83,11 @@ class Alone:
     """Servers of a flight: one; `standby.WithStandby` has a second one that takes over."""
 
     def networks(self, scenario: Scenario) -> list[tuple[Address, Scenario]]:
-        """Server and scenario of each network of a vehicle."""
+        """Address of the server behind each network of a vehicle, and the network's scenario."""
         return [(SERVER, each) for each in scenario.networks]
 
     def reach(self, addresses: list[Address], link: Callable[..., ClientLink | None]) -> Reach:
-        """How a vehicle reaches its servers, behind the addresses of its networks."""
+        """Connection of a vehicle to its servers, through the netems at `addresses`."""
         if len(addresses) == 1:
             return Reach(addresses[0], link())
         several = load("skytether.client.several", "several paths")
@@ -95,7 +95,7 @@ class Alone:
         return reach
 
     def others(self, seed: int, started: Callable[..., Server]) -> dict[str, Endpoint]:  # noqa: ARG002
-        """Further servers, by their hosts."""
+        """Further servers of the flight, by host name; `started` makes one."""
         return {}
 
 
@@ -167,7 +167,7 @@ class Run:
     Args:
         scenario: scenario to fly, with the run's seed.
         server_rows: returns the number of rows that the server has recorded so far.
-        server_figures: returns the server's figures so far for the datagrams of hosts.
+        server_figures: returns the server's figures so far about the datagrams of these hosts.
         number: number of the run, from 0; its vehicles are numbered after those of earlier runs.
         vehicles: number of vehicles.
         ends: makes the ends of links.
@@ -234,7 +234,7 @@ class Run:
             self.flown[host] = client, scenario
         self.flying = vehicles
         self._ends: tuple[int | None, int | None] = None, None
-        """Numbers of rows of the server and of netem when the last vehicle finished."""
+        """Numbers of rows that server and netem had recorded when the last vehicle finished."""
         self._figures: dict[str, Any] | None = None
         """Figures of each process when the last vehicle finished."""
 
@@ -302,7 +302,7 @@ def fly_runs(
 
     Args:
         make_server: makes the server of all runs.
-        figures_of: the server's figures for the datagrams of some hosts.
+        figures_of: returns the server's figures about the datagrams of some hosts.
     """
 
     def on_event(time_ns: int, host: str, event: Event) -> None:
@@ -393,7 +393,7 @@ def fly_runs(
 
 
 def _tell_time(world: Hosts, hosts: Mapping[str, Endpoint], error_ns: int) -> None:
-    """Give each host a time of day that is wrong by ±`error_ns`, alternately; no effect if 0."""
+    """Give the hosts a time of day, wrong by +`error_ns` and -`error_ns` in turn; none if 0."""
     for number, (host, each) in enumerate(hosts.items() if error_ns else ()):
         wrong_ns = error_ns if number % 2 else -error_ns
         world.act(host, partial(each.learn_time, world.now_ns + wrong_ns, error_ns))

@@ -54,13 +54,13 @@ class Host:
     """Rank among hosts that are woken at one instant: 1, 2, … in the order of `Hosts.add`."""
     compute_ns: int
     busy_until_ns: int
-    """Time of the world until which the host computes; it cannot be woken before."""
+    """Time of the world until which the host computes [ns]; it cannot be woken before."""
     on_finished: Callable[[], None] | None
     """Callback for the end of the endpoint; None once called."""
     armed_ns: int | None = None
-    """Time of the world at which the host is to be woken, or None."""
+    """Time of the world at which the host is to be woken [ns]; None for never."""
     due_ns: int | None = None
-    """Time on the host's clock from which `armed_ns` was computed; None to compute it again."""
+    """Time on the host's clock from which `armed_ns` was computed [ns]; None: compute it again."""
 
 
 ACTION, ARRIVAL = -1, 0
@@ -97,7 +97,7 @@ class Hosts:
         """
         self._scheduled = 0
         self._look_ns = 0
-        """Time before which `run` does not check its condition."""
+        """Time of the world before which `run` does not check its condition again [ns]."""
         self._arriving: deque[tuple[Host, Datagram]] = deque()
         """Datagrams that arrive at the present time, in the order in which they were sent."""
 
@@ -115,7 +115,7 @@ class Hosts:
 
         Args:
             name: unique name of the host.
-            start_ns: time of the world before which the host is not woken.
+            start_ns: time of the world before which the host is not woken [ns].
             compute_ns: computing time of each wake [ns].
             on_finished: called once, when the endpoint has finished.
         """
@@ -127,7 +127,7 @@ class Hosts:
         return (name, 0)
 
     def at(self, time_ns: int, action: Callable[[], None]) -> None:
-        """Schedule an action for a time of the world, which must not be in the past."""
+        """Schedule an action for a time of the world [ns], which must not be in the past."""
         assert time_ns >= self.now_ns
         self._scheduled += 1
         heappush(self._agenda, (time_ns, ACTION, self._scheduled, None, action))
@@ -147,8 +147,9 @@ class Hosts:
         """Run the world until a condition holds, or until a time.
 
         Args:
-            every_ns: least time between two checks of the condition, which is also checked when an
-                endpoint finishes.
+            limit_ns: time of the world at which the run ends at the latest [ns].
+            every_ns: least time between two checks of the condition [ns], which is also checked
+                when an endpoint finishes.
         """
         agenda, arriving = self._agenda, self._arriving
         self._look_ns = self.now_ns

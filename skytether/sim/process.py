@@ -27,7 +27,7 @@ class VirtualProcess(Generic[Run]):
         self.endpoint, self.runs, self.is_up = make(0), 1, True
 
     def start(self, world: World, *args: Any) -> None:
-        """Start the next run; it replaces a run that is up."""
+        """Start the next run; if a run is up, it is replaced."""
         self.endpoint = self._make(self.runs, *args)
         self.runs, self.is_up = self.runs + 1, True
         world.restart(self.host, self.endpoint)
@@ -37,13 +37,13 @@ class VirtualProcess(Generic[Run]):
         world.stop(self.host)
 
     def close(self, world: World) -> None:
-        """End a run that is up at once, with its last datagrams, as a second SIGTERM does."""
+        """End the run at once if it is up, after its last datagrams, as a second SIGTERM does."""
         if self.is_up:
             world.act(self.host, self.endpoint.close)
         self.kill(world)
 
     def end(self, world: World, look_ns: int, ended: Callable[[], None] = lambda: None) -> None:
-        """Let a run that is up end in order, as SIGTERM does.
+        """Let the run end in order if it is up, as SIGTERM does.
 
         Args:
             look_ns: time between two checks whether it has finished [ns].

@@ -19,7 +19,7 @@ FROZEN_MAX = 6_500
 
 
 def changed(clock: Clock, time_ns: int, *, step_ns: int = 0, drift_ppb: int | None = None) -> Clock:
-    """Clock after a step of `step_ns` or a change of rate at `time_ns`, a time of the world.
+    """Clock after a step of `step_ns` or a change of rate at `time_ns`, a time of the world [ns].
 
     With `drift_ppb` None the rate stays the same.
     """
@@ -52,7 +52,7 @@ class _Still(Endpoint):
         """Do nothing: the stand-in never asks to be woken."""
 
     def next_wake_ns(self) -> None:
-        """None: the stand-in is never woken."""
+        """Return None: the stand-in is never woken."""
 
 
 class World(Hosts):
