@@ -16,7 +16,7 @@ from skytether.shared.telemetry.record import Record, Rows
 Timed = tuple[int, str, Frame]
 """Time [ns], process name and frame."""
 PROCESSES = {"client": "client", "server": "server", "plan": "server", "netem": "netem"}
-"""Process that records each part of the record."""
+"""Name of the process that records each part, by the part's name."""
 
 
 def of_flight(scenario: Scenario, name: str, flight: Record) -> Iterator[Timed]:

@@ -32,7 +32,7 @@ from skytether.shared.wire.protocol import Mode
 
 AXES = "xyz"
 SHORT = {"inputs": "input"}
-"""Names of columns of velocities that are replaced in plain columns."""
+"""Names of columns of velocities that are shortened in plain columns, and the short names."""
 WORDS: Mapping[str, Mapping[int, str]] = {
     "mode": {mode: str(mode) for mode in Mode},
     "reason": {reason: str(reason) for reason in Reason},

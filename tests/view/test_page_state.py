@@ -711,7 +711,7 @@ PATHS_SHOWN = [
     ["round trip [ms]", "99", "–"],
     ["lost up, down [%]", "2, 10", "5, 5"],
     ["packets up, down", "40, 38", "7, 12"],
-    ["came first up, down", "31, 33", "4, 0"],
+    ["first copies up, down", "31, 33", "4, 0"],
 ]
 
 
@@ -741,7 +741,7 @@ def test_what_one_end_does_not_tell_of_a_path_is_a_dash(told: Any) -> None:
     shown = cells(shown_of(with_paths(PATHS | {"server": told}), 1, brief().now_ns))
     row = {name: values for name, *values in shown}
     assert row["packets up, down"][:2] == ["–, 38", "–, 12"]
-    assert row["came first up, down"][:2] == ["31, –", "4, –"]
+    assert row["first copies up, down"][:2] == ["31, –", "4, –"]
     assert len(row["state"]) <= 4
 
 

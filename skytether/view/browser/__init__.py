@@ -8,7 +8,7 @@
     access  rules for who may watch and who may change a flight
     guard   limits of connections, messages and their rate
 
-Nothing is registered; `skytether fly`, `page`, `replay` and `duel` start it. The package imports
-`view.page`, `view.frames`, `shell` and `shared`, never `view.recordings`, and runs `skytether
-explain` as a process. It needs the extra `page`.
+`skytether fly`, `page`, `replay` and `duel` start the server. The package imports `view.page`,
+`view.frames`, `shell` and `shared`, never `view.recordings`, and runs `skytether explain` as a
+process. It needs the extra `page`.
 """

@@ -16,7 +16,7 @@ from skytether.shell.host.web import host_name, is_ours, numeric
 
 
 class TurnedAway(Enum):
-    """Reason why a browser is refused, or why its message is dropped."""
+    """Reason for refusing a browser, or for dropping its message."""
 
     ORIGIN = "a website of another origin tried to connect"
     HOST = "a browser used a name as address; expected a number, localhost, or the token"

@@ -30,7 +30,7 @@ POLL_S = 0.2
 BUTTONS_MAX = 12
 """Largest number of brake events with a button."""
 FIRST = "what went wrong"
-"""Step of the explanation shown before the process has written any."""
+"""Text shown as the step in progress before the process has named one."""
 GRAVEST = "What went wrong?"
 """Label of the button of a flight without brake events."""
 HINT = "Flies the same flight again, without its losses, until the cause is found"
@@ -42,7 +42,7 @@ class Findings:
 
     text: str = ""
     next: str = "another explanation"
-    """Step in progress; empty if the explanation is complete."""
+    """Step in progress, in words; empty if the explanation is complete."""
     refused: str = ""
     """Reason why there is no explanation; empty otherwise."""
 

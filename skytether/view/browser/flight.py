@@ -20,7 +20,8 @@ from skytether.view.page.changes import Mark, mark, together
 from skytether.view.page.state import LIVE_POINT, State
 
 FINAL = {*DECISIONS, "armed"}
-"""Keys whose changes cannot be undone: single decisions, and `armed`, which may end a flight."""
+"""Keys whose changes the page cannot undo: decisions (`DECISIONS`), and `armed`, which may end
+a flight."""
 
 
 class PageFlight:
@@ -40,11 +41,11 @@ class PageFlight:
         self.answer = ""
         self.refused = False
         self.asked: frozenset[str] = frozenset()
-        """Keys of the newest answered request."""
+        """Keys that the newest answered request named."""
         self._opened_ns: dict[str, int] = {}
         """Start time of each process on its clock [ns]; a new start time means a new process."""
         self._before: dict[str, dict[str, Any]] = {}
-        """Values to restore when a cut link is restored, by netem."""
+        """Values from before the link was cut, by netem; `heal` restores them."""
         self.operator = Operator(folder, self._answered) if folder else None
 
     def take(self, process: str, frame: Frame) -> None:
@@ -73,7 +74,7 @@ class PageFlight:
     @property
     def waits(self) -> str:
         """Text that says what a flight waits for before it begins."""
-        return progress(self._folder) or f"{self.title} No process of the flight is heard yet."
+        return progress(self._folder) or f"{self.title} No process of the flight has sent data yet."
 
     # -- changes -----------------------------------------------------------------------------
 
@@ -106,7 +107,7 @@ class PageFlight:
 
     @property
     def undo_cuts(self) -> bool:
-        """Whether undoing the newest change cuts the link."""
+        """Whether `undo` would make a netem lose every packet."""
         return any(mark(event) is Mark.HEALED for event in self.undoable.values())
 
     def undo(self) -> None:

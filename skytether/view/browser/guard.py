@@ -45,11 +45,11 @@ MESSAGE_BYTES_MAX = 64 * 1024
 PIECES_MAX = 64
 FRAMES_MAX = 1024
 UNREAD_BYTES = 128 * 1024
-"""Size of the kernel's send buffer of a connection [B]; the kernel doubles this value."""
+"""Requested size of the kernel's send buffer of a connection [B]; the kernel doubles it."""
 RATE_HZ = 200.0
-"""Messages per second that are read from one browser; dragging a slider sends 60."""
+"""Messages per second that are read from one browser [Hz]; dragging a slider sends 60."""
 BURST_S = 2.0
-"""Longest burst of an idle browser, in seconds at the full rate [s]."""
+"""Size of the largest burst of messages, as the time that they take at RATE_HZ [s]."""
 MESSAGES = frozenset(
     {
         "GuiUpdateMessage",
@@ -62,7 +62,7 @@ MESSAGES = frozenset(
 )
 """Types of viser messages that elements of the page send."""
 VALUE = "value"
-"""The only attribute of an element that a browser may set."""
+"""Name of the only attribute of an element that a browser may set."""
 PROTOCOL = f"viser-v{viser.__version__}"
 DRESS = Path(__file__).with_name("dress.html")
 """Style and script that this module adds to viser's page."""
@@ -218,7 +218,7 @@ class _Connection(sockets.ServerConnection):
         super().__init__(*protocol, **limits)
         self._guard = guard
         self._due_s = 0.0
-        """Time at which the messages so far would end if sent at RATE_HZ [s]."""
+        """Time at which the last message so far would come if all came at RATE_HZ [s]."""
         self._is_cut = False
         """Whether this guard has ended the connection."""
 

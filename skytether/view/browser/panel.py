@@ -248,7 +248,7 @@ class _Note:
         self._own = ""
 
     def asks(self, keys: Iterable[str]) -> None:
-        """From now on show refusals of these keys."""
+        """Show refusals of these keys from now on."""
         self._keys, self._own = frozenset(keys), ""
 
     def refuse(self, why: str) -> None:
@@ -523,7 +523,7 @@ class Controls:
             flight.cut(netems)
 
     def _cut_alone(self, netem: str) -> None:
-        """Cut a path; ask first if it is the last one that carries packets."""
+        """Cut the path of a netem; ask first if it is the last one that carries packets."""
         cut = partial(self._cut_all, (netem,))
         if any({*each.netems} <= {netem, *each.cuts} for each in self._flights):
             self._question.ask("Cut the last path?", "Yes, cut it", cut)
@@ -553,7 +553,7 @@ class Controls:
             flight.ask(flight.client(self._vehicle()), values)
 
     def _ask(self, knob: Knob, number: float) -> Collection[str]:
-        """Request a number; returns the requested keys."""
+        """Request a number for a slider; returns the keys that are to change."""
         keys: set[str] = set()
         for flight in self._flights:
             for process in flight.processes(knob.process):
@@ -665,7 +665,7 @@ class _Mission:
             self._guide(place)
 
     def _guide(self, place: NDArray[Any]) -> None:
-        """Set the chosen vehicle's goal [m; shape (axes,) at least]."""
+        """Set the chosen vehicle's goal [m]; shape (axes,), further elements are ignored."""
         values = self._flight.of_role("server")
         goals = parse_goals(values.get(GUIDED, ""), self._axes)
         goals[self._vehicle()] = np.round(place[: self._axes], 2)
@@ -740,7 +740,7 @@ class _Handle:
 
 
 class _Lead:
-    """Control of a target, which the user can drag, or place by a click."""
+    """Control of a `live` reference: a target that the user can drag, or place by a click."""
 
     def __init__(self, client: viser.ClientHandle, flights: Sequence[PageFlight]) -> None:
         self._flights = flights

@@ -18,7 +18,7 @@ from skytether.view.page.network import SPAN_S
 from skytether.view.page.state import State
 
 TICK_S = 0.04
-"""Time between two batches of frames."""
+"""Time between two batches of frames [s]."""
 SPEEDS = ("0.25", "0.5", "1", "2", "4", "8", "16")
 Placed = tuple[int, int, str, Frame]
 """Time of a frame since the first frame of its flight [ns], index of the flight, name of the
@@ -52,7 +52,7 @@ class Player:
         self.speed = 1.0
         self.plays = True
         self._wanted_ns: int | None = None
-        """Time that the user has requested; None once it is shown."""
+        """Time that the user has requested, since the first frame [ns]; None once it is shown."""
         self.seek(0)
         self._closed = threading.Event()
         self._thread = threading.Thread(target=self._work, daemon=True)

@@ -22,7 +22,7 @@ from skytether.view.browser.panel import More
 
 TOKEN_BYTES = 16
 POLL_S = 0.1
-"""Interval at which Ctrl-C is checked."""
+"""Interval at which Ctrl-C is checked [s]."""
 PORTS, PORTS_TRIED = 65536, 100
 """Number of existing ports, and number of ports tried, from the requested one on."""
 ANYWHERE = ("0.0.0.0", "::")

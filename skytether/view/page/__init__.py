@@ -7,6 +7,6 @@
     controls  numbers that can be changed in flight, as sliders
     changes   descriptions of changes in flight
 
-Nothing is registered. The package imports `view.rows`, `figures` and `shared`, and no module of it
-has a socket, a thread or a clock. Scene and plots need the extra `page`.
+The package imports `view.rows`, `figures` and `shared`, and no module of it has a socket, a thread
+or a clock. Scene and plots need the extra `page`.
 """

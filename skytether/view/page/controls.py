@@ -208,7 +208,7 @@ THRESHOLDS = (
     _argument(
         "Threshold: deviation",
         "m",
-        "Distance from the plan above which one is sent",
+        "Distance from the old plan above which a new one is sent",
         "deviation",
         0,
         1,

@@ -11,7 +11,7 @@ from skytether.shared.telemetry.record import DOWNLINK, UPLINK
 from skytether.shared.telemetry.record import Rows as Table
 
 SPAN_S = 60.0
-"""Length of the stored history."""
+"""Length of the stored history [s]."""
 BIN_NS = 250 * MILLISECOND_NS
 BINS = int(SPAN_S * SECOND_NS) // BIN_NS
 DELAY_BIN_NS = 20 * MILLISECOND_NS

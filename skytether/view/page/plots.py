@@ -26,7 +26,7 @@ SPARE = 6
 HEIGHT, BANDS_HEIGHT, AXIS = 115, 75, 35
 """Heights of a plot and a plot of bands without horizontal axis, and of the axis [pixels]."""
 BAND_MODE, BAND_LINK, BAND_ENDS = 2.0, 1.0, (0.0, 3.0)
-"""Vertical positions of the bands of `STATE`, and its vertical range."""
+"""Vertical positions of the bands for mode and link in `STATE`, and its vertical range."""
 GREY = "#868e96"
 UP, DOWN = "#12b886", "#e64980"
 """Colours of the two directions, in plots of one flight or of data that all flights share."""
@@ -64,7 +64,7 @@ class PlotLine:
     label: str
     values: Values
     rgb: str = ""
-    """Colour; the flight's colour if empty, or if several flights have this line."""
+    """Colour; empty, or if several flights have this line: the flight's colour."""
     dash: tuple[int, ...] = ()
     width: float = 1.5
     once: bool = False
@@ -83,7 +83,7 @@ class Plot:
     equal: bool = False
     """Whether the vertical range is as wide as in all other plots with `equal`."""
     bands: bool = False
-    """Whether the values are only names of bands, so that the vertical axis has no numbers."""
+    """Whether the values are places of named bands, so that the vertical axis has no numbers."""
 
     @property
     def timed(self) -> bool:
@@ -107,7 +107,7 @@ def _seconds(look: Look) -> Array:
 
 def _rates(direction: int) -> Values:
     def values(look: Look) -> Array:
-        """Packets in each second, from the last second before the flight; NaN before."""
+        """Packets in each second, from 1 s before the flight on; NaN for earlier seconds."""
         rates = look.state.network.rates(direction, look.now_ns)
         return np.where(_seconds(look) > -1.0, rates, np.nan)
 
@@ -116,7 +116,7 @@ def _rates(direction: int) -> Values:
 
 def _delays(direction: int) -> Values:
     def values(look: Look) -> Array:
-        """Mean delays on the grid; NaN in seconds in which no packet arrived."""
+        """Mean delays at the times of the curves [s]; NaN in seconds in which no packet arrived."""
         grid_s, seconds = look.curves.time_s, _seconds(look)
         delays_s = look.state.network.delays_s(direction, look.now_ns)
         is_finite = ~np.isnan(delays_s)
@@ -151,7 +151,7 @@ def _deadline_ms(look: Look) -> Array:
 
 
 def _compared(look: Look) -> Array:
-    """Compared figure, limited to SEEN thresholds so that the threshold stays visible."""
+    """Figure that the trigger compares, cut off at SEEN thresholds to keep these visible."""
     most = np.where(look.curves.threshold > 0, SEEN * look.curves.threshold, np.inf)
     return np.where(np.isnan(most), look.curves.figure, np.minimum(look.curves.figure, most))
 

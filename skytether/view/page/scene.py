@@ -35,7 +35,7 @@ TRAIL_POINTS = 240
 """Largest number of points of a vehicle's trail."""
 TRAIL_POINTS_ALL = 2000
 ROUND_S = 600.0
-"""Longest part of the desired trajectory that is drawn."""
+"""Longest part of the desired trajectory that is drawn [s]."""
 SHADE = 0.45
 """Brightness of vehicles, as a share of the flight's colour: the scene's lights brighten them."""
 SIZE = 0.05
@@ -53,7 +53,7 @@ def in_space(points: Array) -> NDArray[np.float32]:
 
 
 def segments(points: Array, *, dashed: bool = False) -> NDArray[np.float32]:
-    """Line through points, as its segments; segments with NaN are left out; shape (n, 2, 3)."""
+    """Line through points, as segments, without those that contain NaN; shape (n, 2, 3)."""
     placed = in_space(points)
     pieces = np.stack([placed[:-1], placed[1:]], axis=1)
     pieces = pieces[~np.isnan(pieces).any(axis=(1, 2))]

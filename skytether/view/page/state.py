@@ -66,16 +66,16 @@ AT_ONCE_S = 2.0
 LIVE_POINT = "reference.points_m"
 """Key that changes many times a second while a target is dragged; its changes are not logged."""
 LOSS_S = 10.0
-"""Time over which loss is measured."""
+"""Time over which loss is measured [s]."""
 LOSS_HIGH = 0.3
 """Loss above which a link is called degraded."""
 TRAJECTORY_BYTES = 32
-"""Size without encryption between a heartbeat's and the shortest trajectory's [B]."""
+"""Smallest unencrypted packet that counts as a trajectory [B]; heartbeats are smaller."""
 
 NO_SESSION = "there is no session yet"
-ONLY_SERVER = "only the server tells of this vehicle"
+ONLY_SERVER = "only the server has sent data of this vehicle"
 VALUES = ("position", "reference", "figure", "threshold", "age_s", "solve_ms", "mode")
-"""Columns of a vehicle's ring that are NaN where unknown."""
+"""Columns of a vehicle's ring buffer; a value is NaN where it is unknown."""
 ROUNDING = 1e-6
 """Rounding tolerance of times, relative to the length of a slot."""
 
@@ -274,9 +274,9 @@ class VehicleTrack:
         return self._along(self._plans[-1])
 
     def motions(self) -> list[Array]:
-        """Positions along each plan that the vehicle may fly, see `ahead`.
+        """Positions along each plan that the vehicle may fly [m], each as in `ahead`.
 
-        On a mission: the plan in force and those that may still be accepted.
+        On a mission: the plan in force and those that the vehicle may still accept.
         """
         if not self._scenario.is_mission or self.row is None:
             return [self.ahead()]
@@ -332,14 +332,14 @@ class VehicleTrack:
         return self._at_slots(np.arange(recent.min(), recent.max() + 1) if len(recent) else recent)
 
     def _at_slots(self, slots: NDArray[np.int64]) -> NDArray[np.void]:
-        """Slots by number; an empty slot for one that is not kept."""
+        """Slots of the ring buffer, by number; an empty slot for one that is no longer kept."""
         rows = self._ring[slots % self._slots]
         rows[(rows["slot"] != slots) | (slots < 0)] = self._empty
         return rows
 
 
 def group(figures: dict[str, Any], *names: str) -> dict[str, Any]:
-    """Group of figures within others; empty if missing."""
+    """Group of figures within nested groups; empty if missing."""
     for name in names:
         value = figures.get(name)
         figures = value if isinstance(value, dict) else {}
@@ -397,7 +397,7 @@ class State:
         self.marks: deque[tuple[float, Mark]] = deque(maxlen=SAID_MAX)
         """Newest changes, oldest first, with their times of flight [s]."""
         self.changed: dict[tuple[str, str], Changed] = {}
-        """Newest change, by process and key; has several keys if they were changed at once."""
+        """Newest change, by process and key; several entries if it was merged from several."""
         self.newest_ns = 0
         self.begin_ns: int | None = None
         """Start of the flight's step 0 [ns]; None before any step."""
@@ -526,7 +526,7 @@ class State:
         self.said.append(Heard(time_s, text, count))
 
     def _change(self, process: str, event: Changed, time_s: float) -> None:
-        """Record a change; it may be merged with the newest one, also of the other direction."""
+        """Record a change, or merge it with the newest: same key, or uplink with downlink."""
         if event.key == ZONED:
             self._zones = msgspec.json.decode(event.after)
         marked, before = mark(event), self.changed.get((process, event.key))
@@ -537,7 +537,8 @@ class State:
             and time_s - self.said[-1].time_s < AT_ONCE_S
             and all(key == event.key or {key, event.key} <= {*WAYS} for _, key in self.changed)
             and marked is self.marks[-1][1]
-            and (before is None or before.before != event.after)  # otherwise it undoes the change
+            # A change back to the value before the newest change is a change of its own.
+            and (before is None or before.before != event.after)
         ):
             self.said.pop()
             if before:
@@ -569,7 +570,7 @@ class State:
         return {way: name.replace("_", " ") for way, name in enumerate(self.ways)}
 
     def time_s(self, time_ns: int) -> float:
-        """Time of flight [s] at a time [ns], 0 before the flight; without one, running time."""
+        """Time of flight [s] at a time [ns], 0 before it; for netem alone, its running time."""
         begin_ns = self.begin_ns
         if begin_ns is None and not self.flies:
             begin_ns = min((each.opened.time_ns for each in self._processes.values()), default=None)
@@ -600,7 +601,7 @@ class State:
             return Zones()
 
     def waits(self, number: int) -> str:
-        """Reason why a vehicle of a mission waits; empty if it does not."""
+        """Reason, by the server, why a vehicle of a mission waits; empty if it does not."""
         reason = self.of_vehicle("server", number).get("waits", "")
         return reason if isinstance(reason, str) else ""
 
@@ -678,12 +679,12 @@ class State:
 
     @property
     def every_step(self) -> float:
-        """Packet rate if every vehicle received a packet at every step [1/s]."""
+        """Packet rate of one direction if each vehicle had a packet at every step [1/s]."""
         return max(1, len(self.vehicles)) / self.scenario.control.dt
 
     @property
     def _silence_ns(self) -> dict[int, int]:
-        """Silence after which a direction counts as cut [ns]."""
+        """Time without a packet after which a direction counts as cut [ns], by direction."""
         link = self.scenario.link
         return {UPLINK: seconds_to_ns(link.timeout_s), DOWNLINK: link.patience_ns}
 
@@ -705,7 +706,7 @@ class State:
         return np.select([~is_flown, cut, degraded], ["", RED, AMBER], GREEN)
 
     def link(self, number: int, now_ns: int) -> Word:
-        """Text for the state of a vehicle's link."""
+        """State of a vehicle's link for display: word, explanation and colour."""
         track = self.vehicles.get(number)
         if track is None or track.row is None or track.mode is Mode.INIT:
             is_seen = track is not None and track.server and not track.client

@@ -38,7 +38,7 @@ PATH = (
     "round trip [ms]",
     "lost up, down [%]",
     "packets up, down",
-    "came first up, down",
+    "first copies up, down",
 )
 """Names of the rows that are shown for each path."""
 

@@ -9,8 +9,7 @@
     outcome    sentences about what happened
     report     an HTML page with figures
 
-Nothing is registered: `skytether fly --record`, `replay`, `report`, `export` and `join`, and
-`Flight` of `import skytether`, import what they need. The package imports `view.rows`,
-`view.frames`, `figures` and `shared`. Files need the extra `record`, reports `plot`, and Parquet
-`parquet`.
+`skytether fly --record`, `replay`, `report`, `export` and `join`, and `Flight` of `import
+skytether`, import what they need. The package imports `view.rows`, `view.frames`, `figures` and
+`shared`. Files need the extra `record`, reports `plot`, and Parquet `parquet`.
 """

@@ -58,13 +58,13 @@ SHOWN = (
 """Events of failures and takeovers."""
 GROUND = {str(mode) for mode in (Mode.INIT, Mode.SYNC, Mode.READY)}
 WITHIN_S = 2.0
-"""Time within which the same event of several vehicles is shown once."""
+"""Time within which the same event of several vehicles is shown once [s]."""
 AT_ONCE_S = 0.1
-"""Time within which brake events count as one: `explain --at` cannot distinguish them."""
+"""Time within which brake events count as one [s]: `explain --at` cannot distinguish them."""
 BRIEF_S = 1.0
-"""Length of a path's outage below which it is not shown."""
+"""Length of a path's outage below which it is not shown [s]."""
 VEHICLES_MAX = 64
-"""Largest number of vehicles that have a row, and distances to each other."""
+"""Largest number of vehicles that get a row in the table, and whose distances are computed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,17 +78,17 @@ class Ended:
     error_max_m: float | None
     braked_s: float
     nearest_m: float | None
-    """Smallest distance to another vehicle on the mission [m]."""
+    """Smallest distance to another vehicle during the mission [m]."""
     nearest: int | None
     """Number of the other vehicle at that distance."""
 
 
 class Outcome:
-    """Outcome of a flight, by its recording.
+    """Outcome of a flight, from its recording.
 
     Args:
         recorded: recording with at least one flown step.
-        epoch_ns: time of step 0 of the first vehicle since the first frame [ns].
+        epoch_ns: time of the first vehicle's step 0, counted from the first frame [ns].
     """
 
     def __init__(self, recorded: Recorded, epoch_ns: int) -> None:
@@ -98,7 +98,7 @@ class Outcome:
         self.numbers: list[int] = np.unique(client["vehicle"]).tolist()
         self.rows: dict[int, Rows] = {}
         self.began_s: dict[int, float] = {}
-        """Time of step 0 of each vehicle, on the first one's clock [s]."""
+        """Time of each vehicle's step 0 since that of the first vehicle [s]."""
         for number in self.numbers[:VEHICLES_MAX]:
             at = np.flatnonzero(client["vehicle"] == number)
             self.rows[number] = client[at]
@@ -120,7 +120,7 @@ class Outcome:
             yield mode, began_s + float(first) * self._dt_s, began_s + float(last) * self._dt_s
 
     def apart(self) -> tuple[Array, Array]:
-        """Times [s], and the distance between the nearest two vehicles on the mission [m]."""
+        """Times [s], and the distance between the nearest two vehicles of the mission [m]."""
         return nearest(list(self._tracks.values()), self._dt_s)
 
     @cached_property

@@ -33,7 +33,7 @@ from skytether.view.recordings.recording import BEGUN, FEED, About, Begun
 from skytether.view.rows import check_columns, check_values
 
 SPAN_NS_MAX = 40 * 86_400 * SECOND_NS
-"""Longest time from the first frame of a recording to its last."""
+"""Longest time from the first frame of a recording to its last [ns]."""
 TIME_NS_MAX = 2**62
 """Largest time of a frame, and largest offset of a clock [ns]."""
 

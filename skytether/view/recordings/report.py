@@ -133,8 +133,8 @@ def page(recorded: Recorded, figures: Sequence[tuple[str, str]], explanation: st
                 f"Figures{whose}",
                 [table, path(flown), *([timeline(flown)] if fleet > 1 else [])],
             ),
-            Folded("All that was said", [happened]),
-            Folded("The scenario, whole", text=to_toml(scenario).decode()),
+            Folded("All events", [happened]),
+            Folded("The whole scenario", text=to_toml(scenario).decode()),
             Facts("How it was made", facts),
         ],
     )
@@ -148,7 +148,7 @@ def _verdict(summary: Summary) -> str:
 
 
 def _first(outcome: Outcome) -> list[Table]:
-    """First tables of the page: vehicles, and failures and takeovers."""
+    """First tables of the page: the vehicles, and the failures and takeovers."""
     found = []
     if len(outcome.ended) > 1:
         is_mission = outcome.scenario.is_mission
@@ -167,7 +167,7 @@ def _first(outcome: Outcome) -> list[Table]:
                 near = f"{as_text(each.nearest_m, '.3f')} ({each.nearest})" if each.nearest else "–"
                 row += [near]
             rows.append(row)
-        says = "Off: from where it should have been at its last step."
+        says = "Off: distance from the desired position at the last step."
         if len(outcome.numbers) > len(rows):
             says += f" The first {len(rows)} of {len(outcome.numbers)}."
         found.append(Table("vehicles", "Vehicles", says, "", heading, rows))
@@ -185,7 +185,7 @@ def _first(outcome: Outcome) -> list[Table]:
 
 
 def _why(recorded: Recorded, outcome: Outcome, explanation: str) -> list[Part]:
-    """The explanation, and a command that explains each brake event; none if it cannot be
+    """Explanation, and a command that explains each brake event; empty if the flight cannot be
     flown again.
     """
     parts: list[Part] = []
