@@ -35,7 +35,7 @@ class FlightMode(Enum):
 
 @dataclass(frozen=True)
 class SimulatedFlavour:
-    """Constants of one simulated autopilot."""
+    """Constants, modes and parameters of one simulated autopilot."""
 
     title: str
     version: tuple[int, int, int]

@@ -82,7 +82,7 @@ class ProbeOptions:
     duration: float = 60.0
     """Length of the measurement [s]."""
     rate: float = 20.0
-    """Packets per second, each way."""
+    """Number of packets per second in each direction."""
     bytes: int = 400
     """UDP payload of each packet [B]."""
     keys: Path | None = None
@@ -448,7 +448,7 @@ def _of_log(path: PathFigures) -> str:
         return "Clocks: unknown. The file has the delays of one direction, which are used for both."
     return (
         f"The round trip takes at least {1e3 * path.round_trip_least_s:.2f} ms and "
-        f"{1e3 * path.round_trip_mean_s:.2f} ms in the mean. Half of it is assumed each way, and "
+        f"{1e3 * path.round_trip_mean_s:.2f} ms on average. Half of it is assumed each way, and "
         "all losses both ways: the file does not say which way a packet was slow or lost. So one "
         "way may be up to twice as slow, and the losses of a round trip are counted twice."
     )
@@ -462,7 +462,7 @@ def _of_clocks(path: PathFigures) -> str:
         drift = f"the other end's gains {path.drift_ppm:+.1f} ± {doubt}"
     return (
         f"Clocks: {drift}. The round trip takes at least {1e3 * path.round_trip_least_s:.2f} ms "
-        f"and {1e3 * path.round_trip_mean_s:.2f} ms in the mean, whatever the clocks; half of the "
+        f"and {1e3 * path.round_trip_mean_s:.2f} ms on average, whatever the clocks; half of the "
         f"least is taken for each way, so one-way delays may be wrong by up to "
         f"{1e3 * path.offset_doubt_s:.2f} ms, one way too long and the other too short."
     )

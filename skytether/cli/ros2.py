@@ -50,7 +50,7 @@ class Ros2Options:
     folder: Annotated[Path, Argument(positional=True, metavar="FOLDER")]
     """Folder of the flight, with the feed and the control socket of its server."""
     address: str = "tcp:127.0.0.1:7447"
-    """tcp:HOST:PORT of a Zenoh router."""
+    """Address of a Zenoh router, tcp:HOST:PORT."""
     domain: int = 0
     """Domain id of the ROS tools (ROS_DOMAIN_ID)."""
     frame: str = "map"
@@ -93,7 +93,7 @@ class Bridge:
         self._options, self._line, self._out = options, line, out
         self._scenario = Scenario()
         self._columns: np.dtype[np.void] | None = None
-        """Columns of plans; None without plans."""
+        """Columns of the feed's rows of plans; None if the server records no plans."""
         self._nodes: dict[int, tuple[Node, GraphSession]] = {}
         """Nodes by the numbers of their vehicles, at most VEHICLES_SHOWN_MAX."""
         self._paths: dict[int, Sequence[Vector]] = {}

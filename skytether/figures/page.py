@@ -63,7 +63,7 @@ class Folded:
     title: str
     parts: Sequence["Part"] = ()
     text: str = ""
-    """Preformatted text before the parts."""
+    """Preformatted text, shown before the parts."""
     is_open: bool = False
 
 

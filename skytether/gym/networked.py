@@ -84,7 +84,7 @@ class Options(TypedDict, total=False):
     step_s: float | None
     """Length of a step [s]; None: 1 / `render_fps` of the environment."""
     clock_ns: Callable[[], int]
-    """Clock for "measured" [ns]."""
+    """Function that returns the time, for `thinking` "measured" [ns]."""
     mtu: int
     """Largest UDP payload of a datagram [B], without 28 B of headers. A longer observation or
     answer is sent in several datagrams, and has arrived when all of them have."""
@@ -394,7 +394,7 @@ class NetworkedVector(_VectorWrapper):
         return (_batch(self.single_observation_space, seen), reward, terminated, truncated, info)
 
     def _answers(self, actions: Any) -> list[Answer]:
-        """One answer for each robot."""
+        """Split the argument of `step` into one answer for each robot."""
         space = self.single_action_space
         if isinstance(actions, dict) or (isinstance(space, Tuple) and isinstance(actions, tuple)):
             answers = list(iterate(self.action_space, actions))

@@ -55,7 +55,7 @@ class Network(NamedTuple):
 
 
 class ObservationReport(NamedTuple):
-    """Observation at the agent's end."""
+    """Observation of a robot, as its agent receives it."""
 
     step: int
     number: int
@@ -86,7 +86,7 @@ class Part(bytes):
 class Robot:
     player: Player
     report: ObservationReport
-    """Newest report at the agent's end."""
+    """Newest report that the agent has received."""
     uplink: Lane
     downlink: Lane
     sent: OrderedDict[int, tuple[int, Held]]
@@ -178,7 +178,7 @@ class Remote:
         return count
 
     def _datagrams(self, size: int) -> int:
-        """Number of datagrams of a message."""
+        """Number of datagrams for a message of a size [B]."""
         mtu = self._network.mtu
         return 1 if size <= mtu else -(-size // (mtu - PART_BYTES))
 
@@ -225,11 +225,11 @@ class Remote:
             raise ConfigError(lane.fates.fault.splitlines()[-1])
 
     def _arrived(self, link: Link) -> list[tuple[int, Any]]:
-        """Robot and content of each message whose last datagram arrives."""
+        """Robot and content of each message whose last missing datagram has arrived by now."""
         found = []
         for part, (_, index), _ in link.release(now_ns=self.now_ns):
             if not isinstance(part, Part):
-                continue  # a bit was flipped
+                continue  # a copy with a flipped bit, see `Part`
             message = part.message
             message.missing.discard(part.number)
             if not message.missing and message.session == self._robots[index].session:
@@ -251,7 +251,7 @@ class Remote:
         for index, report in self._arrived(self.downlink):
             robot = self._robots[index]
             if report.step <= robot.report.step:
-                continue  # overtaken
+                continue  # overtaken by a newer report
             robot.report = report
             made = robot.sent.get(report.acknowledged)
             _forget_before(robot.sent, report.acknowledged + 1)

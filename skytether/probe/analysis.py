@@ -54,7 +54,7 @@ QUANTILES = (0.0, 0.05, 0.25, 0.5, 0.75, 0.95, 0.99, 0.999, 1.0)
 
 @dataclass(frozen=True, slots=True)
 class Clocks:
-    """Listener's clock relative to the prober's."""
+    """Offset and drift of the listener's clock, relative to the prober's."""
 
     offset_s: float
     """Offset at the first probe [s], assuming equal least delays in both directions."""

@@ -34,7 +34,7 @@ BURST_MIN, BURST_MAX_S = 0.1, 3600.0
 
 @dataclass(frozen=True, slots=True)
 class FittedImpairment:
-    """Impairment with fitted arguments."""
+    """Impairment of a scenario, with arguments fitted to a measurement."""
 
     name: str
     numbers: tuple[float, ...]

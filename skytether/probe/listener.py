@@ -59,7 +59,7 @@ class HeldPacket:
 
 @dataclass(slots=True)
 class ProbeSession:
-    """Measurement by one prober."""
+    """State of the measurement by one prober."""
 
     heard_ns: int
     """Time of the newest probe [ns]."""

@@ -44,7 +44,7 @@ class RoundTrips:
 
 class OutageFigures(msgspec.Struct, frozen=True):
     share: float
-    """Share of the covered time."""
+    """Share of the covered time in which the path, or every path, was out."""
     count: int
     longest_s: float
 
@@ -58,7 +58,7 @@ class CommonOutages(msgspec.Struct, frozen=True, kw_only=True):
     """Time covered by probes of all paths [s]."""
     paths: list[OutageFigures]
     common: OutageFigures
-    """Outages of all paths at once."""
+    """Times at which all paths were out at once."""
     product: float
     """Product of the paths' shares: the common share if the paths are independent."""
 

@@ -123,7 +123,7 @@ class Prober(Endpoint):
         self._began_ns: int | None = None
         self._zero_ns = 0
         self._slot = 0
-        """Grid point of the next probe."""
+        """Number of the grid point at which the next probe is sent."""
         self._over_ns: int | None = None
         """Time at which the last probe was sent [ns]; None before."""
         self._longest_ns = 0

@@ -32,11 +32,11 @@ class Attitude(NamedTuple):
 
 class Battery(NamedTuple):
     charge: float
-    """Remaining charge, from 1 to 0."""
+    """Remaining charge of the battery, from 1 to 0."""
     voltage: float
-    """Voltage [V]."""
+    """Voltage of the battery [V]."""
     current: float
-    """Current [A]."""
+    """Current drawn from the battery [A]."""
 
 
 class Quadrotor:
@@ -105,11 +105,11 @@ class Quadrotor:
         fly(self.frame, self.gains, self._quad, self._air, drawn, target, self._ground, self.on)
 
     def position(self) -> Array:
-        """Position [m]; shape (3,)."""
+        """True position [m]; shape (3,)."""
         return UP * self._quad.x[:3]
 
     def velocity(self) -> Array:
-        """Velocity [m/s]; shape (3,)."""
+        """True velocity [m/s]; shape (3,)."""
         return UP * self._quad.x[3:6]
 
     def wanted_position(self) -> Array:

@@ -89,7 +89,7 @@ class SizeFlown:
 
 
 class IdentificationTold(msgspec.Struct, frozen=True):
-    """Content of identified.json."""
+    """Results for programs, the content of identified.json."""
 
     scenario: str
     kind: str

@@ -121,7 +121,7 @@ class Scouted:
     point: FlownContender
     rmse_xy_m: float
     packets_per_s: float
-    """Packets in both directions [1/s]."""
+    """Mean number of packets in both directions together [1/s]."""
     is_valid: bool
     """Whether the effort is within the limit of the case."""
 

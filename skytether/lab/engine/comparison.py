@@ -55,7 +55,7 @@ class Claim:
 
 
 OURS = "trajectory-expected"
-"""Contender of most claims."""
+"""Name of the contender that most claims are about."""
 CLAIMS = (
     Claim(OURS, "paper-every-step", 0.12, {"target": 0.95, "turns": 0.8}),
     Claim(OURS, "feedback-gap", 0.5),

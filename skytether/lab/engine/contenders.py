@@ -42,7 +42,7 @@ PERIODS = (0.1, 0.2, 0.5, 1, 2, 4, 8)
 @dataclass(frozen=True, slots=True)
 class Contender:
     name: str
-    """Identifier in tables, files and scenarios."""
+    """Name of the contender in tables, files and scenarios."""
     scheme: str
     trigger: str
     control: Mapping[str, Any]
@@ -161,7 +161,7 @@ ABOARD = Contender("aboard", "reference aboard", "no packets", {})
 class Case:
     name: str
     title: str
-    """Name in the report."""
+    """Name of the case in the report."""
     plant: str
     """Name of the scenario with the vehicle, reference and network of all contenders."""
     keys: Mapping[str, Any]

@@ -70,7 +70,7 @@ class Misfit(NamedTuple):
 
     rms: float
     largest: float
-    """Largest difference over time in the mean of all starting steps, or of all ending steps."""
+    """Largest difference in the mean over all starting steps, or over all ending steps."""
     at_s: float
     """Time of the largest difference, relative to the step [s]."""
     certain: float

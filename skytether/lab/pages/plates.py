@@ -204,11 +204,11 @@ def maps(flown: CellSummaries, here: ControlConfig) -> Plate:
             figure.colorbar(mesh, label=name)
     ranks = stats.spearmanr(rmse.ravel(), ratio.ravel()).statistic
     says = (
-        f"{len(flown)} cells; the cross is the paper's. More λ, more events: from "
-        f"{ratio[0].mean():.3f} at {decay[0]:g} to {ratio[-1].mean():.3f} at {decay[-1]:g} on "
-        f"average; more ε, fewer: from {ratio[:, 0].mean():.3f} to {ratio[:, -1].mean():.3f}. RMSE "
-        f"and event ratio have a rank correlation of {ranks:.2f}; the paper calls them inversely "
-        f"related."
+        f"{len(flown)} cells; the cross is the paper's. The event ratio rises with λ, on average "
+        f"from {ratio[0].mean():.3f} at {decay[0]:g} to {ratio[-1].mean():.3f} at {decay[-1]:g}, "
+        f"and falls with ε, from {ratio[:, 0].mean():.3f} to {ratio[:, -1].mean():.3f}. RMSE and "
+        f"event ratio have a rank correlation of {ranks:.2f}; the paper calls them inversely "
+        "related."
     )
     rows = [
         {"decay_rate": decay, "epsilon": epsilon} | by_name(DRAWN, partial(estimate, runs))

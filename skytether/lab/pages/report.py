@@ -45,7 +45,7 @@ class Real:
     scenario: Scenario
     flight: Record
     netem: Mapping[str, Any]
-    """Counters and lateness of netem."""
+    """Counters and lateness of netem in the flight."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,8 +129,8 @@ def traffic_table(columns: Mapping[str, MethodFlights]) -> Table:
         "All packets that entered the network in a flight. The paper's “10 times” counts those on "
         f"the uplink alone: there the trigger sends {share[0]:.1%} of what every step takes; of "
         f"all packets, both ways, {share[4]:.1%}, and {share[5]:.1%} of all bytes. Of the plans, "
-        "those “above” were sent because the trigger's figure exceeded its threshold, the others because "
-        "a heartbeat, a first plan or the schedule was due."
+        "those “above” were sent because the trigger's figure exceeded its threshold, the others "
+        "because a heartbeat, a first plan or the schedule was due."
     )
 
     def cell(name: str, row: Row) -> str:

@@ -76,7 +76,7 @@ RESOLVE_EVERY_S = 2.0
 """Interval at which names are looked up again [s]: a restarted host may have a new address."""
 CHECK_PATHS_EVERY_S = 1.0
 Numbers = dict[Address, Address]
-"""Numeric addresses by peers' names."""
+"""Numeric address of each peer, by its address as the user gave it."""
 
 
 class OpenLine(Protocol):

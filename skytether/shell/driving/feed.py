@@ -139,7 +139,7 @@ class Feed:
         self._listen()
 
     def take(self) -> None:
-        """Put newly written rows into frames."""
+        """Put rows that were recorded since the last call into frames."""
         for part in self._parts:
             if part.rows:
                 for frame in part.frames(time.monotonic_ns()):

@@ -115,7 +115,7 @@ class TakenUp(NamedTuple):
     """Scenario of a starting process, with values that were set in an earlier run."""
 
     journal: Journal
-    """Journal beside the control socket."""
+    """Journal in which values set from now on are stored."""
     scenario: Scenario
     news: list[Event]
 

@@ -171,7 +171,7 @@ class MemoryFile:
                 self._changed.notify()
 
     def news(self) -> NotKept | None:
-        """Event with the reason why the file cannot be written; None if it can, or if reported."""
+        """Event with the reason why the file cannot be written; None without a new reason."""
         failure, reported = self._failure, self._reported
         self._reported = failure
         if not failure or failure == reported:

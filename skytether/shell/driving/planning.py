@@ -28,9 +28,9 @@ class Planners:
     def __init__(self, limit_s: float) -> None:
         self._limit_s = limit_s
         self._idle: list[Calls] = []
-        """Queues of idle threads."""
+        """Queue of calls of each idle thread."""
         self._busy: dict[int, Calls] = {}
-        """Queues of busy threads, by number of the planner that runs there."""
+        """Queue of calls of each busy thread, by number of the planner that it runs."""
         self._answers: SimpleQueue[tuple[int, int, Any]] = SimpleQueue()
         """Answers of threads: number of planner, number of tick, and its result or exception."""
         self._tick = 0

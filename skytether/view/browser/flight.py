@@ -111,7 +111,7 @@ class PageFlight:
         return any(mark(event) is Mark.HEALED for event in self.undoable.values())
 
     def undo(self) -> None:
-        """Undo the newest change."""
+        """Request the values from before the newest change."""
         before: dict[str, dict[str, Any]] = {}
         for (process, key), event in self.undoable.items():
             before.setdefault(process, {})[key] = msgspec.json.decode(event.before)
@@ -141,7 +141,7 @@ class PageFlight:
 
     @property
     def cuts(self) -> list[str]:
-        """Netems that lose every packet."""
+        """Names of the netems that lose every packet."""
         return [each for each in self.netems if controls.is_cut(self.values[each])]
 
     def cut(self, netems: Collection[str] = NETEMS) -> None:

@@ -16,7 +16,7 @@ Values = Mapping[str, Any]
 Read = Callable[[Values], float | None]
 Write = Callable[[Values, float], dict[str, Any]]
 WAYS = ("network.uplink", "network.downlink")
-"""Keys of both network directions."""
+"""Keys of the impairments of both directions."""
 ALL_LOST = " & loss(1)"
 """Text appended to a direction's impairments to lose every packet."""
 LOST = ("loss(1)", "loss(1.0)")

@@ -79,7 +79,7 @@ class Plot:
     across: str = TIME
     log: bool = False
     crop: bool = False
-    """Whether trailing zeros are cropped."""
+    """Whether zeros at the end of the plot are left out, but for SPARE of them."""
     equal: bool = False
     """Whether the vertical range is as wide as in all other plots with `equal`."""
     bands: bool = False

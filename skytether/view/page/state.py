@@ -101,7 +101,7 @@ class Curves:
     figure: Array
     """Figure that the trigger compares; shape (n,)."""
     threshold: Array
-    """Threshold of the figure; shape (n,)."""
+    """Threshold with which the trigger compares the figure; shape (n,)."""
     age_s: Array
     """Age of the observation from which the input in force was computed [s]; shape (n,)."""
     solve_ms: Array
@@ -127,7 +127,7 @@ class Heard:
 
 
 class VehicleTrack:
-    """Last minute of one vehicle."""
+    """Steps of the last minute, newest rows and plans of one vehicle."""
 
     def __init__(self, number: int, scenario: Scenario) -> None:
         self.number = number

@@ -175,7 +175,7 @@ class Container:
                     yield topic, record.data
 
     def _unpacked(self) -> Iterator[McapRecord]:
-        """Channels and messages in all chunks."""
+        """Records of channels and messages in all chunks, in file order."""
         left_bytes = SPARE_BYTES + RATIO_MAX * self._size
         for record in self._chunks():
             size = record.uncompressed_size

@@ -55,7 +55,7 @@ SHOWN = (
     *(ClockContradicted, TimeUnknown, BegunAnew, Recalled, NotRecalled, NotFlown),
     *(Fault, Degraded, RecordIncomplete, Changed, ChangeRefused),
 )
-"""Events of failures and takeovers."""
+"""Types of events that the report shows as failures and takeovers."""
 GROUND = {str(mode) for mode in (Mode.INIT, Mode.SYNC, Mode.READY)}
 WITHIN_S = 2.0
 """Time within which the same event of several vehicles is shown once [s]."""
@@ -74,7 +74,7 @@ class Ended:
     vehicle: int
     mode: Mode
     off_m: float | None
-    """Distance from the desired position [m]."""
+    """Distance from the desired position at the end [m]."""
     error_max_m: float | None
     braked_s: float
     nearest_m: float | None
