@@ -96,7 +96,7 @@ class ArduPilot(PilotedVehicle):
         return system == self.parameters["SYSID_MYGCS"]
 
     def return_altitude(self, distance: float) -> float:
-        """Altitude of the flight home: RTL_ALT, or lower near home."""
+        """Altitude of the flight home [m]: RTL_ALT, or lower near home."""
         cone = self.parameters["RTL_CONE_SLOPE"] * distance
         return min(self.parameters["RTL_ALT"] / 100.0, max(cone, 2.0))
 

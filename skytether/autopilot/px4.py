@@ -142,7 +142,7 @@ class PX4(PilotedVehicle):
         return kind == dialect.MAV_TYPE_GCS
 
     def return_altitude(self, distance: float) -> float:
-        """Altitude of the flight home: RTL_RETURN_ALT, or lower near home."""
+        """Altitude of the flight home [m]: RTL_RETURN_ALT, or lower near home."""
         cone = distance * tan(radians(self.parameters["RTL_CONE_ANG"]))
         return min(self.parameters["RTL_RETURN_ALT"], cone)
 

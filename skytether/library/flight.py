@@ -309,7 +309,7 @@ def _no_rows(scenario: Scenario) -> dict[str, Table]:
 
 
 def _failure(events: list[FlightEvent]) -> Failure | None:
-    """Failure of the first vehicle that failed: its last such event."""
+    """Failure of the first vehicle, by number, whose last event is one; None without any."""
     last: dict[int, Event] = {
         each.event.vehicle: each.event
         for each in events

@@ -22,7 +22,7 @@ def chunks(severity: int, text: str, number: int) -> list[Message]:
     encoded = text.encode()
     parts = [encoded[at : at + CHUNK_BYTES] for at in range(0, len(encoded), CHUNK_BYTES)]
     if len(encoded) % CHUNK_BYTES == 0:
-        parts.append(b"")  # a chunk that is not full ends the text
+        parts.append(b"")  # an empty chunk: a text ends with a chunk that is not full
     text_id = number if len(parts) > 1 else 0
     return [
         dialect.MAVLink_statustext_message(severity, part, text_id, k)

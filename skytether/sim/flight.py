@@ -316,9 +316,8 @@ def fly_runs(
             run_of[host].hear(time_ns, host, event)
 
     world = Hosts(on_event)
-    if (
-        actions or own_server or beside or servers is not ALONE
-    ):  # which may stop hosts, or save a state
+    # Actions may stop hosts, and a host that is not plain may save its state: a `World` has both.
+    if actions or own_server or beside or servers is not ALONE:
         world = load("skytether.sim.world", "actions").World(on_event)
     entropy = stream(scenario.seed, "entropy").bytes
     each = [msgspec.structs.replace(scenario, seed=seed) for seed in seeds]

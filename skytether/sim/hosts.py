@@ -187,7 +187,7 @@ class Hosts:
             host.armed_ns = None
             return
         if due_ns == host.due_ns and host.armed_ns is not None:
-            return  # already set for this time
+            return  # the wake is already set for this time
         host.due_ns = due_ns
         time_ns = host.clock.world(due_ns)
         time_ns = max(time_ns, host.busy_until_ns)

@@ -137,7 +137,7 @@ class Margin(msgspec.Struct, frozen=True, kw_only=True):
     vehicle: str
     growth: float
     growth_ci95: float | None
-    """Half-width of the 95 % interval over seeds; None for a single seed."""
+    """Half-width of the growth's 95 % interval over seeds; None for a single seed."""
     stable: bool
     """Whether the upper end of the growth's interval is below 1."""
     rms_m: tuple[float, ...] | None

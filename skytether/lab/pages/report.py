@@ -245,7 +245,7 @@ def html(drawn: Drawn, scenario: Scenario, calls: Sequence[Mapping[str, Any]]) -
         "commit": call["commit"] or "none: not run from a checkout",
         "versions": ", ".join(map(" ".join, versions.items())),
         "duration": f"{sum(call['seconds'] for call in calls):.1f} s in {len(calls)} "
-        f"call{'s' * (len(calls) > 1)} that came to an end: {'; '.join(each)}",
+        f"call{'s' * (len(calls) > 1)} that were completed: {'; '.join(each)}",
     }
     shown = (drawn.tables, drawn.pictures)[:: -1 if drawn.figures_first else 1]
     parts = [*shown[0], *shown[1], Facts("How it was made", made)]

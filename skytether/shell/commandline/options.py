@@ -262,7 +262,7 @@ def _tell_tyro(options: type, undo: ExitStack) -> None:
         if dataclasses.is_dataclass(within):
             _tell_tyro(within, undo)
         words = [conf.arg(name=argument.name, metavar=argument.metavar)]
-        words += [conf.FlagCreatePairsOff] * (hint is bool)  # no --no-no-page
+        words += [conf.FlagCreatePairsOff] * (hint is bool)  # no flag --no-no-page
         words += [conf.Positional] * argument.positional
         words += [conf.UseAppendAction] * argument.append
         return Annotated[(hint, *words)]

@@ -383,7 +383,7 @@ class Shell:
                 if count < BURST_MAX:
                     break
             is_left |= count == BURST_MAX
-        came.sort(key=CAME)  # by arrival time
+        came.sort(key=CAME)  # in order of arrival over all sockets
         hear = self.endpoint.receive
         for came_ns, datagram in came:
             self._heard_ns = came_ns
@@ -392,7 +392,7 @@ class Shell:
             except Exception as error:  # report an exception, and go on with the next datagram
                 self._loop.call_exception_handler({"message": str(error), "exception": error})
         for number in nothing_came:
-            self._hear(number)  # the plain call shows whether there was an error
+            self._hear(number)  # a plain read, which reports an error if there was one
         if self._crowded and self._slices:
             self._slices.set(time.monotonic_ns() + (0 if is_left else self._patience_ns))
 

@@ -68,7 +68,7 @@ def handle(loop: "asyncio.AbstractEventLoop", number: int, action: Callable[[], 
     """Call a function in an event loop at a signal."""
     try:
         loop.add_signal_handler(number, action)
-    except NotImplementedError:  # Windows
+    except NotImplementedError:  # on Windows, whose loops handle no signals
         signal.signal(number, lambda *_: loop.call_soon_threadsafe(action))
 
 

@@ -286,7 +286,7 @@ LEFT_OUT = {
         "{direction}/queue_max",  # cumulative; Prometheus computes the maximum over any period
     ),
     "client": (
-        "vehicles",  # constant
+        "vehicles",  # the number of vehicles of a client never changes
         "by_vehicle/{vehicle}/missed",  # covered by the other metrics
         "by_vehicle/{vehicle}/began_s",  # a time on the client's own clock
         "by_vehicle/{vehicle}/autopilot/mode",  # the mode's number is exported instead

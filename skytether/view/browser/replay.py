@@ -60,11 +60,11 @@ class Player:
 
     @property
     def at_ns(self) -> int:
-        """Present time since the first frame [ns]."""
+        """Time that the playback has reached, since the first frame [ns]."""
         return self._at_ns
 
     def now_ns(self) -> int:
-        """Present time on the clock of the first flight [ns]."""
+        """Time that the playback has reached, on the clock of the first flight [ns]."""
         return self._begin_ns + self._at_ns
 
     def seek(self, at_ns: int) -> None:

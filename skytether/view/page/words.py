@@ -90,7 +90,7 @@ def status(state: State, vehicle: int, now_ns: int, title: str = "") -> str:
 
 
 def figures(state: State, vehicle: int, now_ns: int, title: str = "") -> str:
-    """All other figures of a vehicle; empty without a vehicle."""
+    """Figures of a vehicle that `status` does not show; empty without a vehicle."""
     track = state.vehicles.get(vehicle) if state.flies else None
     if track is None:
         return ""

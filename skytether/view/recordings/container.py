@@ -98,9 +98,9 @@ def reading(path: Path) -> Iterator[None]:
         yield
     except RecordingError:
         raise
-    except ConfigError as error:  # of another version, or the trajectory's file is missing here
+    except ConfigError as error:  # scenario of another version, or its file is missing here
         raise RecordingError(f"{path}: {error}") from None
-    except FeedError as error:  # the checksum of the chunk was right
+    except FeedError as error:  # the frame is invalid, though its chunk has the right checksum
         raise RecordingError(f"{path}: it is of another version, or damaged: {error}") from None
     except BROKEN as error:
         what = (str(error).splitlines() or [type(error).__name__])[0]
