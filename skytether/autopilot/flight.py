@@ -137,7 +137,7 @@ class PilotedVehicle(ABC):
         self.said: list[tuple[Severity, str]] = []
         self.now_ns = 0
         self.station_ns: int | None = None
-        """Time of the ground station's newest heartbeat [ns]; None before the first: no failsafe."""
+        """Time of the ground station's newest heartbeat [ns]; None before one: no failsafe."""
         self._ready_ns = seconds_to_ns(ready_s)
         self._setpoint: CompanionSetpoint | None = None
         self._climb: float | None = None
