@@ -29,7 +29,7 @@ COMMANDS_IN_GROUPS = {
     },
     "Any program's network": {
         "netem [SCENARIO]": (
-            "a bad network between two programs; `netem run`: for one",
+            "a bad network between two programs, or around one",
             "skytether.netem.__main__:emulate",
         ),
         "policy serve|join": (

@@ -62,7 +62,7 @@ def keygen(argv: Sequence[str]) -> None:
     named = f"vehicles {vehicles[0]} to {vehicles[-1]}" if many else f"vehicle {vehicles[0]}"
     print(f"{options.file}: wrote {len(vehicles)} key{'s' if many else ''}, of {named}.")
     print(f"Next: start the server with `--keys {options.file}`; give each vehicle a file of mode")
-    print("0600 with its own line alone, which nobody else may read, and start it with `--keys`.")
+    print("0600, which nobody else can read, with its own line alone; start it with `--keys`.")
 
 
 def make(

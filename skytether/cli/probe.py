@@ -329,7 +329,9 @@ def _check(options: ProbeOptions, paths: int) -> None:
         message = f"got {probes:.0f} packets, expected at most {PROBES_MAX}"
         raise CommandError(f"--duration and --rate: {message}", CONFIGURATION)
     if options.record and options.record.suffix == RECORDING:
-        message = f"got {options.record}, expected another suffix: one row per packet is no flight"
+        message = (
+            f"got {options.record}, expected another suffix: the file is no recording of a flight"
+        )
         raise CommandError(f"--record: {message}", CONFIGURATION)
     for flag in command.OUTPUTS:
         command.claim_output(f"--{flag}", getattr(options, flag))
@@ -459,7 +461,7 @@ def _of_clocks(path: PathFigures) -> str:
     doubt = f"{path.drift_doubt_ppm:.1f} ppm"
     drift = f"no significant drift (standard error {doubt})"
     if path.drift_ppm:
-        drift = f"the other end's gains {path.drift_ppm:+.1f} ± {doubt}"
+        drift = f"the other end's clock gains {path.drift_ppm:+.1f} ± {doubt}"
     return (
         f"Clocks: {drift}. The round trip takes at least {1e3 * path.round_trip_least_s:.2f} ms "
         f"and {1e3 * path.round_trip_mean_s:.2f} ms on average, whatever the clocks; half of the "

@@ -117,7 +117,7 @@ async def started(
         CommandError: the process ended, or did not listen in time.
     """
     if not system.FORKS:
-        flies = "this system flies in virtual time, as by `fly --virtual`"
+        flies = "this system can fly in virtual time, with `fly --virtual`"
         raise CommandError(f"flights over UDP need Linux or macOS; {flies}")
     process = await asyncio.create_subprocess_exec(
         sys.executable,

@@ -126,7 +126,7 @@ def fly_batch(scenario: Given, seeds: Iterable[int], /, **keys: Any) -> list[Fli
     """
     name, flown = named(scenario, keys)
     if not isinstance(seeds, Iterable) or isinstance(seeds, str):
-        raise TypeError(f"seeds: got {seeds!r}, expected several of them, as in range(100)")
+        raise TypeError(f"seeds: got {seeds!r}, expected several seeds, as in range(100)")
     each = [_checked(name, flown, {"seed": seed}) for seed in seeds]
     numbers = [run.seed for run in each]
     for number in numbers:

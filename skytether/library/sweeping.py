@@ -126,7 +126,7 @@ def _axis(key: str, values: Iterable[Any]) -> lab.GridAxis:
         TypeError: the values are not a list.
     """
     if key == "seed":
-        raise ConfigError("grid: got 'seed', expected another key: it counts the runs")
+        raise ConfigError("grid: got 'seed', expected another key: the seed counts the runs")
     if isinstance(values, str) or not isinstance(values, Iterable):
         raise TypeError(f"grid: {key}: got {values!r}, expected a list of values")
     plain = [msgspec.to_builtins(value, enc_hook=lambda each: each.tolist()) for value in values]

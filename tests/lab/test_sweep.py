@@ -84,7 +84,10 @@ FORM = "expected KEY=START:STOP:COUNT or KEY=VALUE,VALUE,..."
     ("text", "said"),
     [
         *((text, f"--grid: got {text!r}, {FORM}") for text in NO_GRIDS),
-        ("seed=1,2", "--grid: got 'seed', expected another key: it counts the runs of a cell"),
+        (
+            "seed=1,2",
+            "--grid: got 'seed', expected another key: the seed counts the runs of a cell",
+        ),
         (
             "control.input_weight=1,2,1.0",
             "--grid: control.input_weight: got 1 twice, expected values that differ",

@@ -436,7 +436,7 @@ REFUSALS: list[tuple[Callable[[], object], type[Exception], str]] = [
     (
         lambda: fly_batch("demo", 8),  # type: ignore[arg-type]
         TypeError,
-        "seeds: got 8, expected several of them, as in range(100)",
+        "seeds: got 8, expected several seeds, as in range(100)",
     ),
     (
         lambda: fly_batch("demo", [1, -1]),
@@ -471,7 +471,7 @@ REFUSALS: list[tuple[Callable[[], object], type[Exception], str]] = [
     (
         lambda: sweep("demo", {"seed": [1, 2]}),
         ConfigError,
-        "grid: got 'seed', expected another key: it counts the runs",
+        "grid: got 'seed', expected another key: the seed counts the runs",
     ),
     (
         lambda: sweep("demo", {"control.horizom": [1]}),

@@ -66,7 +66,7 @@ def compare(argv: Sequence[str]) -> None:
     command.check_count("--generations", options.generations, 10**6)
     options.pool.check()
     if options.tune and options.contender:
-        searches = "expected one of them: `skytether calibrate` searches weights of your own"
+        searches = "expected one of the two: `skytether calibrate` tunes your own contender"
         raise CommandError(f"--contender: got it with --tune, {searches}", command.CONFIGURATION)
     scale = size(options)
     with writing(options.out):

@@ -370,7 +370,7 @@ def _of_user(file: Path) -> Contender:
     for key in keys:
         if key == "control.dt" or not {key.partition(".")[0], text_key(key)} & {*SETTABLE}:
             expected = (
-                f"{', '.join(texts)}, or keys of {', '.join(SETTABLE)}: others are the case's"
+                f"{', '.join(texts)}, or keys of {', '.join(SETTABLE)}: the case sets all others"
             )
             raise ConfigError(f"{file}: got {key}, expected {expected}")
     if not keys:

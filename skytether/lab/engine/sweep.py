@@ -69,7 +69,9 @@ def parse_axis(text: str) -> GridAxis:
     except ValueError:
         raise wrong from None
     if key == "seed":
-        raise ConfigError("--grid: got 'seed', expected another key: it counts the runs of a cell")
+        raise ConfigError(
+            "--grid: got 'seed', expected another key: the seed counts the runs of a cell"
+        )
     if not values:
         raise wrong
     for value in values:

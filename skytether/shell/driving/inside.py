@@ -66,7 +66,7 @@ def main(argv: Sequence[str]) -> int:
         first = os.fork()
     except OSError as error:
         return _fail(
-            control, f"this process may make no namespaces ({error.strerror}){_how(error)}"
+            control, f"this process may not make namespaces ({error.strerror}){_how(error)}"
         )
     if first:
         control.close()

@@ -136,7 +136,7 @@ def _slirp(mtu: int, exposed: Sequence[Address]) -> Iterator[tuple[socket.socket
     found = shutil.which(SLIRP, path=os.environ.get("PATH", "") + ADMIN)
     if found is None:
         raise ProgramError(
-            f"{SLIRP} is missing, the way out of namespaces: install it (apt install {SLIRP}, "
+            f"{SLIRP} is missing, which connects namespaces to the network (apt install {SLIRP}, "
             f"dnf install {SLIRP})"
         )
     guard, guard_end = socket.socketpair()

@@ -127,7 +127,7 @@ class Explainer:
             for at_s, text in self._brakes:
                 gui.add_button(text, hint=HINT).on_click(partial(ask, at_s))
             if self._is_more:
-                gui.add_html(words.note(f"The first {BUTTONS_MAX}; others by the command."))
+                gui.add_html(words.note(f"The first {BUTTONS_MAX}; for others use the command."))
             html = gui.add_html("")
 
         def show() -> None:

@@ -260,4 +260,4 @@ def _fault(chunk: Chunk) -> str:
         is_of_this_size = packed(chunk.data) in {-1, size}
     except zstandard.ZstdError:
         is_of_this_size = False
-    return "" if is_of_this_size else "a chunk's content has another size than it says"
+    return "" if is_of_this_size else "a chunk's content has another size than stated"

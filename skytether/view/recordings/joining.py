@@ -113,5 +113,5 @@ def _parts(recordings: Sequence[Recorded]) -> dict[str, Table]:
             pieces.setdefault(part, []).append(rows)
     for part, tables in pieces.items():
         if len({table.dtype for table in tables}) > 1:
-            raise RecordingError(f"the part {part} has other columns in one of them")
+            raise RecordingError(f"the part {part} has different columns in the recordings")
     return {part: np.concatenate(tables) for part, tables in pieces.items()}

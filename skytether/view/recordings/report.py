@@ -243,7 +243,7 @@ def course(outcome: Outcome) -> Picture:
         says = "Modes of the vehicles."
         says += " Triangles: another server leads." * bool(leads)
         says += " Black: nothing came over the path." * bool(paths)
-        says += " Below: distance between the nearest two, and what is required." * is_apart
+        says += " Below: distance between the nearest two, and the required distance." * is_apart
         return Picture("course", "What happened", says, as_png(figure, 140))
 
 
