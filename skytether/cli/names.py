@@ -28,7 +28,7 @@ TABLES: Mapping[str, registry.PluginTable] = {
 @dataclass(frozen=True)
 class ListOptions:
     kind: Annotated[str, Argument(metavar="|".join(KINDS), positional=True)] = ""
-    """What to list; without it, this help."""
+    """Kind of names to list; without it, this help is printed."""
     plugin: command.Plugins = ()
 
 

@@ -93,7 +93,7 @@ class Child:
     def last_words(self) -> str:
         """Reason why the process ended: a signal, or the last line of its output."""
         code = self.process.returncode
-        if code is not None and code < 0:  # the last line is unrelated to the signal
+        if code is not None and code < 0:  # ended by a signal: its last line is not the reason
             return f"{self.name}: ended by a signal: {signal.strsignal(-code)}"
         if self.said:
             return self.said[-1]

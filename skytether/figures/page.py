@@ -79,7 +79,7 @@ def blank(width: float, height: float) -> "Figure":
 
 @contextmanager
 def lettered(width: float, height: float, size: float) -> "Iterator[Figure]":
-    """Empty figure of a size [inch]; inside the block, text has the size `size` [points]."""
+    """Yield an empty figure of a size [inch]; text drawn in the block has `size` points."""
     import matplotlib as mpl
 
     letters: Any = {"font.size": size, "axes.titlesize": size, "legend.fontsize": 8}

@@ -56,7 +56,7 @@ class Collected(Collector):
     Args:
         process: server, netem or client; `server.N` is worker N of a server, `netem N` that of
             path N.
-        table: metrics of its figures, of a process that `metrics` does not have.
+        table: metrics of the figures, for a process of which `metrics` has no table.
     """
 
     def __init__(

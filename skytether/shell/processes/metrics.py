@@ -303,7 +303,7 @@ def families(
     Args:
         process: server, netem or client; other processes have only common metrics.
         figures: from `Endpoint.figures`, and those that the process adds.
-        own: metrics of a process that TABLES lacks.
+        own: metrics of the figures, for a process that is not in TABLES.
     """
     possible = (*_PROCESS, *own) if own else TABLES.get(process, _PROCESS)
     metrics: dict[str, Exposed] = {}

@@ -348,7 +348,7 @@ def _followed(recorder: Recorder, feed: "Feed", part: str, columns: np.dtype[np.
 
 @contextmanager
 def serving(at: str | None, *about: Any) -> Iterator["Metrics | None"]:
-    """Serve metrics, `exporter.Collected(*about)`, during the block; None without an address."""
+    """Serve metrics at HOST:PORT during the block, of `Collected(*about)`; None without `at`."""
     if at is None:
         yield None
         return

@@ -648,7 +648,7 @@ class _Mission:
         @client.scene.on_click()
         def _(event: viser.SceneClickEvent) -> None:
             origin, direction = np.array(event.ray_origin), np.array(event.ray_direction)
-            if direction[2] * origin[2] < 0:  # otherwise the sky was clicked
+            if direction[2] * origin[2] < 0:  # else the click is above the horizon
                 at = (origin - direction * origin[2] / direction[2])[:2]
                 if self._clicks.value == GUIDES:
                     here = self._goal()
@@ -752,7 +752,7 @@ class _Lead:
         def _(event: viser.SceneClickEvent) -> None:
             origin, direction = np.array(event.ray_origin), np.array(event.ray_direction)
             height = self._handle.place[2] - origin[2]
-            if direction[2] * height > 0:  # otherwise the sky was clicked
+            if direction[2] * height > 0:  # else the click is above the horizon
                 place = origin + direction * height / direction[2]
                 self._handle.put(place)
                 self._handle.stay()
