@@ -26,7 +26,7 @@ FLOODED_BYTES = 16 * 1024 * 1024
 """Receive buffer of a socket that may be flooded [B]: half a second of 50 000 packets/s."""
 
 ADDRESSES_MAX = 4096
-"""Largest number of addresses of which the user's and the kernel's form are cached, with 360 B each;
+"""Largest number of addresses of which the user's and the kernel's form are cached, 360 B each;
 bounded, because a flood of HELLO packets may fill the cache."""
 
 SPARE_FILES = 48

@@ -94,7 +94,7 @@ packets packets_total
 bytes bytes_total
     UDP payload of the packets sent on the path.
 loss loss_ratio
-    Share of the packets on the path that are lost one by one.
+    Share of the packets on the path that are lost singly, not in outages.
 failure failure_ratio
     Probability that a packet sent now on the path does not arrive.
 delay_ms acknowledgement_seconds
