@@ -99,7 +99,7 @@ class FleetSummary(msgspec.Struct, frozen=True, kw_only=True):
     least_separation_m: float | None
     """Smallest distance between two vehicles of a mission [m]."""
     left_tube: int | None
-    """Observations outside a tube (`mission.tube_m`); only without any is the separation proven."""
+    """Observations outside a tube (`mission.tube_m`); the separation is proven only if it is 0."""
     uplink_packets_per_s: float
     """Packets from the server into the network [1/s]."""
     downlink_packets_per_s: float

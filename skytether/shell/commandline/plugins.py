@@ -161,7 +161,7 @@ def _mention_groups(folder: Path) -> bool:
 
 @contextmanager
 def _tables(where: str) -> Iterator[None]:
-    """Restore all tables if the block fails, and name the plug-in in the error."""
+    """Restore all tables of names if the block fails, and name the plug-in in the error."""
     before = [dict(table) for table in PLUGIN_TABLES]
     try:
         yield

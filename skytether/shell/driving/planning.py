@@ -81,6 +81,6 @@ class Planners:
                 answer = call()
             except Exception as error:
                 answer = error
-            except BaseException as error:  # a thread that ended would count as late from then on
+            except BaseException as error:  # keep the thread: once ended, it would count as hanging
                 answer = RuntimeError(f"got {type(error).__name__}: {error}")
             self._answers.put((planner, tick, answer))

@@ -304,7 +304,7 @@ def _unframed(_: sockets.ServerConnection, __: Request, response: Response) -> N
 
 
 def visitor(connection: sockets.ServerConnection) -> Visitor:
-    """Access data of a browser's request.
+    """Fields of a browser's request on which its access depends.
 
     Raises:
         LookupError: a header occurs twice in the request.

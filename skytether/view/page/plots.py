@@ -278,7 +278,7 @@ def of_link(names: Sequence[str] = ("up", "down")) -> tuple[Plot, ...]:
 
 
 def _ways(title: str, values: Callable[[Network, int, int], Array], scale: float = 1.0) -> Plot:
-    """Plot of a figure of both directions over the last seconds, scaled."""
+    """Plot of a figure of both directions over the last seconds, multiplied by `scale`."""
 
     def line(direction: int) -> Values:
         return lambda look: scale * values(look.state.network, direction, look.now_ns)

@@ -537,7 +537,7 @@ class State:
             and time_s - self.said[-1].time_s < AT_ONCE_S
             and all(key == event.key or {key, event.key} <= {*WAYS} for _, key in self.changed)
             and marked is self.marks[-1][1]
-            # A change back to the value before the newest change is a change of its own.
+            # A change that undoes the newest one is not merged with it.
             and (before is None or before.before != event.after)
         ):
             self.said.pop()
