@@ -357,7 +357,7 @@ def of_user(files: Sequence[Path]) -> list[Contender]:
     built_in = len(found)
     for file in files:
         if file.stem in found:
-            expected = f"expected another than {', '.join(found)}"
+            expected = f"expected another name than {', '.join(found)}"
             raise ConfigError(f"--contender: {file}: got the name {file.stem!r}, {expected}")
         found[file.stem] = _of_user(file)
     return list(found.values())[built_in:]

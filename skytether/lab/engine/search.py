@@ -121,7 +121,7 @@ class Optimiser:
         self._points: list[Any] = []
 
     def ask(self) -> list[Scenario]:
-        """Scenarios of the next generation; the very first one is the start of the search."""
+        """Scenarios of the next generation; the first one of all is the start of the search."""
         first = self._search.countiter == 0
         self._points = self._search.ask()
         if first:

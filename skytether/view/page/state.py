@@ -644,7 +644,7 @@ class State:
 
     @property
     def missing(self) -> tuple[str, ...]:
-        """Missing processes: roles without one, and clients of vehicles only a server reports."""
+        """Roles without a process, and clients of vehicles that only a server reports."""
         if not self.flies:
             return ()
         roles = {each.role for each in self._processes.values()}

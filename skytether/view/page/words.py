@@ -313,7 +313,7 @@ def explained(text: str, following: str, refused_: str, command: str) -> str:
             lines += f'<pre style="margin:0.2em 0;overflow-x:auto;font-size:0.85em">{table}</pre>'
         else:
             lines += "".join(f"<div>{escape(each) or '&nbsp;'}</div>" for each in some)
-    waits = note(f"Flying the flight again: {following} …") if following and not refused_ else ""
+    waits = note(f"Flying it again: {following} …") if following and not refused_ else ""
     return (
         f'<div class="skytether-explained"><div style="{_BODY}">{lines}</div>{waits}'
         f'{refused(refused_) if refused_ else ""}<div style="{_BODY};{_DIM}">'
