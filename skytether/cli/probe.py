@@ -410,8 +410,8 @@ def _tell_accuracy(outcome: ProbeOutcome, of_path: str) -> None:
     print(of_path + (_of_log(path) if path.log else _of_clocks(path)))
     if path.log and not path.uplink.bursts and (missing := _missing(outcome.delays["uplink"])):
         print(
-            f"Packets were sent every {path.every_s:.3g} s; the file has no row for {missing} packets. "
-            "If they were lost, give each a row with its time and no delay."
+            f"Packets were sent every {path.every_s:.3g} s; the file has no row for {missing} "
+            "packets. If they were lost, give each a row with its time and no delay."
         )
     if path.unreported:
         print(f"{path.unreported} packets are left out: the other end lost their arrival times.")
