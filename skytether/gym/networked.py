@@ -77,8 +77,8 @@ class Options(TypedDict, total=False):
     """What the robot executes after the last received action: "hold" (that action), "zero"
     (`idle`), or a function."""
     idle: Any
-    """Action before the first one has arrived, and for "zero"; by default zeros, or the nearest
-    action in the action space."""
+    """Action that the robot executes before the first one arrives, and with `exhausted` "zero"; by
+    default zeros, or the nearest action in the action space."""
     player: Callable[[], Player]
     """Function that makes a `Player`, the robot's rule for choosing actions, for each episode."""
     step_s: float | None

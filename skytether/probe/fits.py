@@ -151,7 +151,7 @@ def _paper(delay_s: Array) -> Found | None:
     good = np.flatnonzero(scores > max(0.9 * float(scores.max()), 0.8))
     if not len(good):
         return None
-    # A fraction of the slot has the same score: take the longest slot.
+    # A fraction of the true slot length scores as high: take the longest of the best ones.
     run = good[: int(np.argmax(np.diff(good, append=10**9) > 1)) + 1]
     peak = inverse[run[np.argmax(scores[run])]]
     step = inverse[1] - inverse[0]

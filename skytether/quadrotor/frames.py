@@ -1,9 +1,9 @@
 """Frames: physical parameters of quadrotors, with the source of each number.
 
 Rotor k turns with the speed ω_k [rad/s]; its thrust along the body's axis is k_T ω_k², its torque
-k_M ω_k². The drag of each rotor is ω_k diag(k_d, k_d, k_z) times its own airspeed, that of the body
-c |v| v. This is the model of rotorpy (Folk, Paulos, Kumar, "RotorPy: A Python-based Multirotor
-Simulator with Aerodynamics for Education and Research", 2023).
+k_M ω_k². The drag of each rotor is ω_k diag(k_d, k_d, k_z) times its own airspeed; the drag of the
+body is c |v| v. This is the model of rotorpy (Folk, Paulos, Kumar, "RotorPy: A Python-based
+Multirotor Simulator with Aerodynamics for Education and Research", 2023).
 """
 
 from typing import NamedTuple

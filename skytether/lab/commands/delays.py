@@ -22,7 +22,7 @@ EVERY_S = 0.002
 BYTES = 350
 """Size of a packet [B], about that of a horizon."""
 LAST_S = 1.0
-"""Time to wait for the last packets after the mean delay [s]."""
+"""Time to wait for the last packets, in addition to the mean delay [s]."""
 
 
 class _End(asyncio.DatagramProtocol):

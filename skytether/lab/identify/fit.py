@@ -215,7 +215,7 @@ def differences(response: StepResponse, numbers: Numbers) -> Array:
 
 
 def misfit(responses: Sequence[StepResponse], numbers: Numbers) -> Misfit:
-    """Residual of a model for responses, which need not be those of its fit."""
+    """Residual of a model for responses, also for others than those to which it was fitted."""
     shares = [differences(each, numbers) for each in responses]
     rms = float(np.sqrt(np.mean(np.concatenate(shares) ** 2)))
     worst = Misfit(rms, 0.0, 0.0, 0.0)

@@ -194,8 +194,8 @@ def real_table(measured: Reproduction) -> Table:
             }
         )
     says = (
-        f"{length_s:g} s over real UDP on loopback, three processes and netem, beside virtual "
-        f"time: the run of the same seed, and mean, least and most of {len(runs)} seeds. "
+        f"{length_s:g} s over real UDP on loopback, three processes and netem, compared "
+        f"with virtual time: same seed, and mean, least and most of {len(runs)} seeds. "
         f"{within_range} of {len(rows)} flights over UDP lie within the range of virtual time. The "
         f"phase between the server's ticks and the vehicle's steps is random in both, so equal "
         f"seeds do not give equal flights."

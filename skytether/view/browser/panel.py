@@ -548,7 +548,7 @@ class Controls:
             flight.ask(netem, values)
 
     def _chosen(self, values: dict[str, Any]) -> None:
-        """Request values from the client of the chosen vehicle."""
+        """Request that the client of the chosen vehicle changes keys to these values."""
         for flight in self._flights:
             flight.ask(flight.client(self._vehicle()), values)
 
