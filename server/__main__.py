@@ -115,7 +115,7 @@ def _ready(scenario: Scenario) -> None:
     are forked, so that they share the memory, and before the first tick, which has to be on time.
     """
     for room in (assignment.ROOM, routes.ROOM):
-        with suppress(ConfigError):  # messages of packages that are not installed are refused
+        with suppress(ConfigError):  # without the module its messages are refused
             load(room, "a message")
     others = loading.others(scenario)
     terminal.prepare(machine_code.missing(without=others))

@@ -46,7 +46,7 @@ class Decider(Protocol):
 
 
 class Assignment:
-    """Vehicles that a server plans for; a session is a `sessions.Session`."""
+    """Vehicles that a server plans for; each `session` is a `sessions.Session`."""
 
     def __init__(self, controller: Decider, limits: Any) -> None:
         self.controller, self.limits = controller, limits
@@ -83,9 +83,9 @@ class Assignment:
         raise ProtocolError(Drop.FIELD)
 
     def signed(self, session: Any, plan: bytes) -> bytes:
-        """Bytes of a plan as sent to a vehicle; here unchanged."""
+        """Encoded plan as sent to a vehicle; unchanged in this base class."""
         return plan
 
     def spread(self, sessions: Iterable[Any], now_ns: int) -> Iterable[Datagram]:
-        """Datagrams about the servers, due once a second; here none."""
+        """Datagrams about the servers, due once a second; none in this base class."""
         return ()

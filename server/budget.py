@@ -6,7 +6,7 @@ bytes, in this order:
 1. urgent packets: a plan that replaces a heartbeat, and the first plan of a vehicle. They are
    always granted, like heartbeats, at the expense of the others.
 2. vehicles without a packet for WAIT_S, longest wait first, so that none is neglected;
-3. all others by the figure that their trigger compares, per byte.
+3. all others, first those with the largest figure of the trigger per byte.
 
 It is a token bucket: b ← b + r Δt, within ± r BURST_S, minus the bytes sent, headers included;
 urgent packets may make it negative. So a window of T seconds has at most r (T + BURST_S) bytes of
@@ -26,11 +26,11 @@ from skytether.shared.endpoints.endpoint import Datagram
 from skytether.shared.law.model import Array, Flags, Indices
 
 BURST_S = 0.1
-"""Size of the token bucket, as a time at the rate r [s]."""
+"""Size of the token bucket, divided by the rate r [s]."""
 WAIT_S = 1.0
 """Time without a packet after which a vehicle takes precedence [s]."""
 NEVER = -2
-"""Tick of the latest request of a vehicle without a request: earlier than any tick."""
+"""Value of `_asked` for a vehicle without a refused request: earlier than any tick."""
 GUESS_BYTES = 100
 """Assumed size of a packet, with headers, until the first is sent [B]."""
 
@@ -102,7 +102,7 @@ class SharedBudget:
         return chosen
 
     def charge(self, row: int, packet: Sequence[Datagram], *, is_plan: bool) -> None:
-        """Subtract the bytes of a packet, on all its paths; `is_plan`: it is not a heartbeat."""
+        """Subtract the bytes of a packet with its copies; `is_plan`: False for a heartbeat."""
         # The network also carries headers of IP and UDP: 28 bytes, more than a whole heartbeat.
         size = sum(len(each.payload) + HEADER_BYTES for each in packet)
         self._spent += size

@@ -128,8 +128,8 @@ class Controller:
         shared = control.shared_bytes_per_s
         self._budget: SharedBudget | None = None
         self.charge: Callable[..., None] | None = None
-        """Called with the row and the datagrams of each packet, if all vehicles share a rate; see
-        `SharedBudget.charge`."""
+        """Function called with the row and the datagrams of each packet, `SharedBudget.charge`;
+        None unless all vehicles share a rate."""
         if shared:
             module = load("skytether.server.budget", "control.shared_bytes_per_s")
             self._budget = module.SharedBudget(shared, capacity)
@@ -278,7 +278,7 @@ class Controller:
         # Called after the budget: the scheme "committed" may replay only horizons that are sent.
         self.scheme.remember(rows, step, predicted, event)  # eq. (12)
         _note_sent(rows, step, event, self._sent_step)
-        if events == n:  # with one vehicle: all or none
+        if events == n:  # no vehicle has to be left out
             sent = self._all[:n]
             self._trigger.sent(rows, figures)
         elif events:
@@ -316,7 +316,7 @@ def _able(
     idle: I1,
     able: B1,
 ) -> int:
-    """Fill in `able`, and `idle` of vehicles with a new step; return how many are able."""
+    """Fill in `able`, and `idle` of vehicles with a new step; return the number of `able` ones."""
     count = 0
     for i in range(len(rows)):
         row, step = rows[i], steps[i]

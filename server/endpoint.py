@@ -37,8 +37,8 @@ from skytether.shared.wire.protocol import CLOSES, Close, Refusal, encode
 VEHICLES_MAX = 64
 """Default largest number of vehicles at once."""
 LATEST_NS = 2 * SECOND_NS
-"""Time after the end of all motions for which a server that was asked to end waits for the
-vehicles' observations of the end [ns]."""
+"""Time for which a server that was asked to end waits, after the last motion, for observations of
+the vehicles at rest [ns]."""
 TICK_EDGES_MS = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0)
 """Bin edges of the histogram of tick durations [ms]."""
 
@@ -129,7 +129,7 @@ class Server(Endpoint):
         self._dt_ns = terms.dt_ns
         self._ticked_ns = 0
         self._expire_ns = 0
-        """Time of the next search for silent vehicles."""
+        """Time of the next check for silent vehicles."""
 
     def receive(self, datagram: Datagram, *, now_ns: int) -> None:
         self._reception.hear(datagram, now_ns=now_ns)
@@ -156,7 +156,7 @@ class Server(Endpoint):
             self._grid.rest()
 
     def leave(self, *, now_ns: int) -> int:
-        """On a mission, wait until all vehicles rest, or follow another server."""
+        """See `Endpoint`; on a mission, wait until all vehicles rest or follow another server."""
         self._leaves = True
         steps = self.controller.scheme.leave()
         moving = tuple(each.vehicle for each in self.sessions if not self._rests(each))

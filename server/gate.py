@@ -38,8 +38,8 @@ class Gate(Protocol):
         """
 
     def repeated(self, datagram: Datagram) -> int | None:
-        """Number of the vehicle whose recent packet a replayed datagram repeats; None if it repeats
-        none.
+        """Number of the vehicle whose recent packet a datagram repeats; None if it repeats no such
+        packet.
         """
 
     def admit(self, call: GateCall, *, now_ns: int) -> None:

@@ -113,7 +113,7 @@ class ServerPaths:
         return None
 
     def question(self, vehicle: int, session: int, place: Place, path: int = 0) -> PathProof:
-        """Message whose proof the vehicle returns; without `path` the vehicle knows the path."""
+        """Request for a proof of the address `place`; `path` may be 0: the vehicle knows it."""
         return PathProof(vehicle, session, path, self._proof(place), self.prices)
 
     def _proof(self, place: Place) -> int:
@@ -168,7 +168,7 @@ class ServerPaths:
         return [*chain.from_iterable(self._to(path, datagram, now_ns) for path in on)]
 
     def _to(self, path: int, datagram: bytes, now_ns: int) -> list[Datagram]:
-        """A datagram to a path's newest address, and to its former one while that sends packets."""
+        """Datagrams to a path's newest address, and to the former one while it sends packets."""
         places = self._places[path]
         newest = next(reversed(places))
         return [

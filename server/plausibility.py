@@ -124,7 +124,7 @@ def _against(
         drift = int(abs(new.step - before.step) * dt * SECOND_NS) // DRIFT
         if min(trip, new.forward + new.backward) < -SLACK_NS - drift:
             verdict = CLOCK
-        elif new.step > before.step:  # the clocks are checked in any order
+        elif new.step > before.step:  # only the clocks can be checked in any order of steps
             back = new.in_force < before.in_force or new.since < before.since
             if new.in_force != NO_HORIZON and back:
                 verdict = HORIZON

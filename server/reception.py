@@ -66,8 +66,8 @@ IMPLAUSIBLE: dict[int, Drop] = {
 }
 
 CONTRADICTED = {
-    Contradiction.CLOCK: "a clock was set, or runs wrong: the offset is estimated again",
-    Contradiction.ASYMMETRY: "delays each way differ by more than link.asymmetry_s: it is ignored",
+    Contradiction.CLOCK: "a clock was set, or runs too fast or slow: its offset is estimated again",
+    Contradiction.ASYMMETRY: "delays both ways differ by more than link.asymmetry_s: it is ignored",
     Contradiction.TIME_OF_DAY: "the time of day of one end is wrong: it is no longer used",
 }
 """Contradictions of the clock estimate, in words for the operator."""
@@ -142,7 +142,7 @@ class Reception:
         except ProtocolError as error:
             dropped = error.reason
             self.dropped[dropped] += 1
-        except NotInstalledError:  # a package that the message needs
+        except NotInstalledError:  # the message needs a missing package
             dropped = Drop.NOT_FOR_A_SERVER
             self.dropped[dropped] += 1
         self._stopwatch.lap("observe")
@@ -293,7 +293,7 @@ class Reception:
         if verdict == ANEW:
             self._anew(row, None)
             session.hearing.begin()
-        # After the plausibility check: if the newest observation was wrong, this one is not old.
+        # Not before the plausibility check, which discards a newest observation that was wrong.
         self._refuse_overtaken(session, observation.step)
         session.doubted = False
         if report:

@@ -29,7 +29,7 @@ class Route(Protocol):
 
 
 class Routes:
-    """Routes to all vehicles of a server; a session is a `sessions.Session`."""
+    """Routes to all vehicles of a server; each `session` is a `sessions.Session`."""
 
     def of_several(self, entropy: Callable[[int], bytes], spread: str, timeout_ns: int) -> "Routes":
         """Routes to vehicles of which some have several paths.

@@ -37,7 +37,7 @@ from skytether.shared.wire.protocol import PAYLOAD_BYTES_MAX, Hello
 COOKIE_NS = 60 * SECOND_NS
 """Length of a cookie's period; each cookie is valid in its period and the next one [ns]."""
 HANDSHAKES = 5
-"""Number of handshake attempts of a vehicle per second, and of answers to repeats of an attempt."""
+"""Largest number of handshake attempts of a vehicle a second, and of answers to their repeats."""
 PENDING_MAX = 64
 """Largest number of pending channels of a vehicle, which uses the first RESPONSE that it receives.
 Round trips up to 12 s do not exceed this limit, even if an attacker replays the vehicle's HELLOs,
@@ -45,7 +45,7 @@ five a second."""
 COMPLETED_MAX = 16
 """Number of stored completed attempts of a vehicle; repeats of them are not answered."""
 OUT_MAX = 1024
-"""Number of the gate's answers waiting to be sent; the oldest are dropped."""
+"""Largest number of the gate's answers waiting to be sent; older ones are dropped."""
 
 
 class _Pending(NamedTuple):

@@ -51,7 +51,7 @@ class Session:
     line: ReplyPath
     """Encoder of packets to the vehicle."""
     hearing: Hearing
-    """Measures losses; has the longest silence that the server requests of the vehicle."""
+    """Measured losses, and the longest silence that the server requests of the vehicle."""
     row: int = -1
     """Row of the vehicle in every array; -1 until its first observation."""
     heard_ns: int = 0
@@ -61,7 +61,7 @@ class Session:
     doubted: bool = False
     """Whether the newest observation was rejected."""
     unsaved: bool = False
-    """Whether the client has reported that its state is unsaved, in its newest observation."""
+    """Whether the client's newest observation reports that its state is unsaved."""
     asked_ns: int = 0
     """Longest silence that the vehicle requests of the server [ns]; 0 for no bound."""
     sent: int = 0
@@ -70,7 +70,7 @@ class Session:
     """Address from which a recent packet arrived a second time: one of the two senders may forward
     copies, and the other is then the vehicle."""
     other_ns: int = 0
-    """Time of the newest repeat from `other` [ns]."""
+    """Time of the newest repeated packet from `other` [ns]."""
     socket: int = 0
     """Number of the server's socket that received the vehicle's newest packet."""
     route: Route | None = None
@@ -158,7 +158,7 @@ class Sessions:
         self.routes = Routes()
         """Routes to the vehicles; replaced once one of them has several paths."""
         self.assignment = assignment
-        """Chooses the vehicles that the server plans for."""
+        """Choice of the vehicles that the server plans for."""
         self.idle = np.zeros(capacity, dtype=np.int64)
         """`Idle` reason of the vehicle in each row, as last reported; shape (capacity,)."""
 

@@ -104,7 +104,7 @@ class Ticker:
         self._recorder, self._plan_recorder = recorder, plan_recorder
         self._records = recorder is not None or plan_recorder is not None
         self.durations = Histogram(TICK_BIN_NS)
-        """Duration of each tick, while the stopwatch runs."""
+        """Durations of ticks; empty if the stopwatch measures nothing."""
 
     def tick(self, tick_ns: int, now_ns: int) -> None:
         """Run the tick that was due at `tick_ns`: plan, send, and record."""

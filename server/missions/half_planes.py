@@ -142,7 +142,7 @@ def _half_planes(
 def _possible_way(
     other: Motion, step: float, least: float, most: float, dt_s: float, way: F2
 ) -> int:
-    """Fill in the corners of a polyline of possible positions [m]; returns their number."""
+    """Fill in a polyline of another vehicle's possible positions [m]; returns its corner count."""
     first, last = moving_shifts(other, step, step, least, most)
     slices = int(np.ceil((last - first) * SAMPLES / SPACING))
     for j in range(slices + 1):

@@ -11,8 +11,8 @@ from skytether.shared.wire.lead import Lead
 class LedVehicles:
     def __init__(self) -> None:
         self._numbers: dict[int, int | None] = {}
-        """Number of the leadership with which each row is led by this server; None if another
-        server leads it."""
+        """Number of the leadership under which this server leads each row's vehicle; None if
+        another server leads it."""
         self._alone: set[int] = set()
         """Rows of vehicles that have no other server."""
         self._awaited: dict[int, int] = {}
@@ -59,6 +59,6 @@ class LedVehicles:
         missing = (
             row for row, number in self._numbers.items() if number != newest or row in self._awaited
         )
-        # If a vehicle has only this server, another server never hears all vehicles, so it plans
-        # nothing: the other vehicles fly this server's motions, or hold their positions.
+        # If a vehicle has only this server, no other server receives packets of all vehicles or
+        # plans: the other vehicles fly this server's motions, or hold their positions.
         self.missing = None if self._alone else next(missing, None)

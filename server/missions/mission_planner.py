@@ -68,14 +68,14 @@ ARRIVED_M = 0.02
 ROUNDS = 5
 """Largest number of QPs per waypoint, each with further constraints."""
 STUCK = 0.3
-"""A plan is stuck if it covers less than this share of the distance to its waypoint (max. 2 m)."""
+"""Share of the distance to its waypoint (2 m at most) below which a plan counts as stuck."""
 TURN = 2.0 * np.pi * np.arange(32) / 32
 AROUND = np.stack([np.cos(TURN), np.sin(TURN)], axis=1)
 """Directions in which a vehicle at rest within a zone searches for a way out."""
 OUT_M, OUT_STEPS = 0.1, 500
 """Distance between candidate positions on the way out [m], and their number."""
 NEARER_M = 1e-3
-"""Largest approach to a zone by a vehicle that leaves it, a tolerance [m]."""
+"""Distance by which a vehicle that leaves a zone may come nearer: a tolerance [m]."""
 ZONE = "a zone"
 CLOCK_POINTS = 33
 """Number of possible steps of a vehicle that `clock_m` evaluates."""
@@ -207,10 +207,10 @@ class MissionPlanner(SplineScheme):
             self._zones, self.limits = zones(scenario), limits(scenario)
             self._waypoints.change_zones(self._zones)
             for vehicle in self._state.vehicles.values():
-                vehicle.goal = None  # closed positions and progress belong to the old zones
+                vehicle.goal = None  # resets closed positions and progress, made with the old zones
 
     def objection(self, scenario: Scenario, keys: frozenset[str]) -> str:
-        """Refuse a zone in the way of a vehicle."""
+        """See `Scheme`; refuses a zone in the way of a vehicle."""
         objection = self._objection(zones(scenario)) if keys & ZONES else ""
         return f"mission.zones: got {objection}; nothing was changed" if objection else ""
 
@@ -395,7 +395,7 @@ class MissionPlanner(SplineScheme):
         return bool(away_m < self._clearances.planned_apart_m)
 
     def _ask_to_yield(self, row: int, way: Array) -> bool:
-        """Let the first vehicle that rests at its goal in the way yield; False if none can."""
+        """Let the first vehicle at rest at its goal on the path `way` yield; False if none can."""
         keep_m = self._clearances.planned_apart_m
         rest_ends, homes = list[tuple[int, Array]](), list[int]()
         for other, each in self._state.vehicles.items():

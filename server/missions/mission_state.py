@@ -105,7 +105,7 @@ class MissionState:
         """Largest distance of a vehicle from its motion, and largest time after a motion's first
         knot at which it was accepted, each as a share of the value that the theorem assumes."""
         self.state = np.zeros((capacity, terms.axes, 2))
-        """Newest observed states; shape (capacity, axes, 2)."""
+        """Newest observed states [m, m/s]; shape (capacity, axes, 2)."""
         self.vehicles: dict[int, VehicleMotions] = {}
         self.number_of = number_of
         self._references = references
@@ -153,7 +153,7 @@ class MissionState:
         self.led_vehicles = LedVehicles()
 
     def forget(self, row: int) -> None:
-        """End a session; motions stay, since the vehicle continues on them."""
+        """End a session; its motions are kept, because the vehicle continues on them."""
         self.observed_step[row] = -1
         self.rows.heard[row] = False
         if row in self.vehicles:
@@ -282,8 +282,8 @@ class MissionState:
         if flies_on:
             self.foreign = row
         if flies_on or vehicle.is_foreign:
-            # Done once more after the end of the foreign motion: the vehicle rests at the end, not
-            # at an earlier observed position.
+            # Also once after the end of the foreign motion: the vehicle then rests at that end,
+            # not at a position observed earlier.
             vehicle.in_force = SentMotion(
                 vehicle.in_force.step, resting(k, observation.state[:, 0])
             )
@@ -411,7 +411,7 @@ class MissionState:
     def targets(self, row: int) -> Array:
         """Points of a show's path for the planned knots of a motion [m]; shape (N, axes).
 
-        A vehicle lags its motion by its dead time, so the motion is ahead of the path by that.
+        A vehicle lags its motion by its dead time, so the motion is that much ahead of the path.
         """
         steps = self.now + self.ahead(row) + self.kept_steps + SPACING * PLANNED
         places = [self._desired(row, steps * self._dt_s + dead_s) for dead_s in self._dead_time_s]

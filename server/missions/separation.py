@@ -31,7 +31,7 @@ from skytether.shared.law.motion import SAMPLES, SPACING, Motion
 NEARER_M = 1e-3
 """Distance by which motions that are already too near may approach: solver tolerance [m]."""
 PIECES_MAX = 10_000
-"""Largest number of pieces sampled for a pair; usual motions and clocks need hundreds."""
+"""Largest number of pieces sampled for a pair of motions; usually hundreds are needed."""
 
 
 class Pair(NamedTuple):
@@ -158,8 +158,8 @@ def _least_distance(pair: Pair, begin: int, limit: float, sides: F2) -> float:
             nearest = min(nearest, within)
             i += 1
             continue
-        # Per piece, the midpoints approach by at most the distance flown by both vehicles, and the
-        # sweep grows by at most a piece: in total less than twice this distance.
+        # Per piece, the midpoints approach by at most the distance flown by both vehicles, and
+        # `swept` grows by at most a piece: in total less than twice this distance.
         skipped = int(spare / (2.0 * fastest)) if fastest > 0.0 else pieces
         i = max(i + 1, min(i + skipped, pieces))
     return max(nearest, 0.0)

@@ -92,7 +92,7 @@ class VehicleMotions:
             self.copies = max(self.copies - 1, 1)
 
     def is_stuck(self, step: int, goal: Array, remaining_m: float) -> bool:
-        """Whether there was no progress for PATIENCE_STEPS; True at most once per such time."""
+        """Whether there was no progress for PATIENCE_STEPS; True at most once in that time."""
         if self.goal is None or (goal != self.goal).any():
             self.detour = None
             self.closed.clear()

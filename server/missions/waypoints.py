@@ -138,7 +138,7 @@ class Waypoints:
 
 
 def _octagon(name: str, at: Array, radius_m: float, seen_from: Array) -> Zone:
-    """Octagon around a circle; a side faces the position `at`, where a corner would be too near."""
+    """Octagon around a circle; a side faces `seen_from`, because a corner would be too near it."""
     half = np.pi / len(AROUND)
     x, y = seen_from[:2] - at[:2]
     c, s = np.cos(np.arctan2(y, x) + half), np.sin(np.arctan2(y, x) + half)

@@ -46,7 +46,7 @@ class Draft(NamedTuple):
 
 @inline
 def begin(memory: PlanMemory, ahead: int, plan: PlanFigures, row: int, k: int) -> None:
-    """Fill in the first step of a plan, and whether it is fresh."""
+    """Set a plan's steps, and `fresh`: no previous plan is usable."""
     last, start = memory.step[row], k + ahead
     plan.row, plan.step, plan.start, plan.gap = row, k, start, start - last
     plan.solved = True

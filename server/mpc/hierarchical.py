@@ -270,7 +270,7 @@ def _keep(batch: PlanBatch, simd: SimdBatch, indices: I1, tier: int, axis: int) 
 def _plan_some(
     batch: PlanBatch, memory: F3, indices: I1, which: int, work: RiccatiWorkspace
 ) -> int:
-    """Plan for vehicles of the block, by index, at once; returns the number of unsolved plans."""
+    """Plan at once for vehicles of the block, given by index; returns the number of failures."""
     mpc, draft, figures, compares = batch.mpc, batch.draft, batch.figures, batch.compares
     simd, settled, undone = simd_batch(memory), batch.settled[: len(indices)], 0
     for lane in range(len(indices)):
@@ -369,19 +369,19 @@ def _pose(batch: PlanBatch, rows: I1, steps: I1, left: I1, tier: int) -> None:
 
 
 def start_plans(batch: PlanBatch, rows: Indices, step: Indices) -> None:
-    """Fill in the start of plans made without a solver; the guess is the shifted previous plan."""
+    """Set the steps of plug-in plans, and `draft.guess`: the previous plans, shifted [m/s]."""
     _pose(batch, rows, step, np.arange(len(rows)), GENERATOR)
 
 
 def conclude_given(batch: PlanBatch, n: int) -> None:
-    """Compare plans made without a solver, and store them; each counts as the optimum."""
+    """Compare plug-in plans with the sent inputs, and store them; slope taken as 0."""
     batch.draft.gradient[:n] = 0.0
     _conclude_all(batch, np.arange(n), False)
 
 
 @kernel
 def _conclude_all(batch: PlanBatch, left: I1, sloping: bool) -> None:
-    """Fill in figures and store plans; `sloping`: `draft.gradient` is g, not the slope."""
+    """Fill in figures and store plans; `sloping`: `draft.gradient` has g, not yet the slope."""
     draft, simd = batch.draft, simd_batch(batch.alone)
     for i in left:
         which = FIRST if batch.figures[i].fresh else LATER

@@ -31,7 +31,7 @@ from skytether.shared.wire.protocol import FLOAT_MAX
 ERRORS, LATE, NOT_CALLED = "planner_errors", "planner_late", "planner_not_called"
 """Names of the counts of steps without a plan, by cause."""
 EXPECTED = {TimeoutError: LATE, Full: NOT_CALLED}
-"""Count to increase for each error of a planner that has not answered."""
+"""Name of the count to increase, by the exception of a planner that has not answered."""
 
 
 @dataclass(slots=True)
@@ -52,7 +52,6 @@ class PluginPlanners:
     """Planners of up to `capacity` vehicles.
 
     Args:
-        counts: counts of the scheme, to which ERRORS, LATE and NOT_CALLED are added.
         states: whether a planner may return states instead of inputs.
 
     Raises:

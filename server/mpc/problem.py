@@ -63,7 +63,7 @@ class MPC(NamedTuple):
 
 
 def make_mpc(terms: Terms, control: ControlConfig) -> MPC:
-    """Problem of a scenario.
+    """Constant part of a scenario's problem.
 
     Source: eqs. (5), (6), (9).
     """

@@ -35,7 +35,7 @@ from skytether.shared.law.heartbeat import SESSION_NS
 from skytether.shared.law.model import Array, Indices
 
 BUCKET_NS = SECOND_NS // 2
-"""Length of an interval of which the minima are stored [ns]."""
+"""Length of the intervals whose smallest F and G are stored [ns]."""
 BUCKETS = 40
 RECENT = 3
 """Number of newest intervals that count as recent when looking for a step of a clock. If they hold
@@ -274,7 +274,7 @@ def half_trip_ns(seen: Seen, row: int) -> int:
 
 @part
 def shortest_ns(seen: Seen, row: int) -> int:
-    """Shortest estimated delay of the newest ECHOES packets [ns]; negative if there are fewer."""
+    """Shortest estimated uplink delay of the newest ECHOES packets [ns]; negative if fewer came."""
     return least(seen.echoes[row]) - seen.vehicles[row]["adopted"]
 
 
@@ -311,7 +311,7 @@ def _bounds(seen: Seen, row: int, now: int, bounds: I1) -> None:
 
 @part
 def _narrow(seen: Seen, row: int, low: int, high: int, now: int) -> bool:
-    """Narrow the bounds by settings and time of day [ns]; reset them if contradictory (False)."""
+    """Narrow the bounds by settings and time of day [ns]; if contradictory, reset them: False."""
     vehicle = seen.vehicles[row]
     other_low, other_high = _by_others(seen, row, now)
     trip_low, trip_high = _by_delays(seen, row, now)
@@ -349,7 +349,7 @@ def _narrow_by_asymmetry(seen: Seen, row: int, asymmetry: int, now: int) -> int:
         samples += seen.samples[row, slot]
     if asymmetry == 0 or vehicle.uneven or vehicle.doubted or samples < STEP_SAMPLES:
         return NOTHING
-    # The minima are up to 20 s old.
+    # The clocks may have drifted since the minima, which are up to 20 s old.
     margin = asymmetry // 2 + BUCKETS * BUCKET_NS // DRIFT
     middle = (least(seen.minimum[row, 1]) - least(seen.minimum[row, 0])) // 2
     if _narrow(seen, row, middle - margin, middle + margin, now):
@@ -362,7 +362,7 @@ def _narrow_by_asymmetry(seen: Seen, row: int, asymmetry: int, now: int) -> int:
 def _bound(
     seen: Seen, row: int, forward: int, backward: int, heard: int, is_newest: bool, now: int
 ) -> int:
-    """Narrow the bounds by F and G [ns]."""
+    """Narrow the bounds of a clock offset by F and G [ns]; returns a `Contradiction`."""
     vehicle = seen.vehicles[row]
     low, high = _by_delays(seen, row, now)
     # An echoed packet arrived aboard after the previous observation was sent, which did not echo

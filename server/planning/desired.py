@@ -139,7 +139,7 @@ class Desired:
         return int(self._number[row])
 
     def move(self, position: Array | None, velocity: Array | None, now_ns: int) -> None:
-        """Move a live point, see `LivePoint.move`; default: from its present position."""
+        """Move a live point, see `LivePoint.move`; without a position it stays where it is."""
         if self._point:
             position = self._point.at(now_ns)[:, 0] if position is None else position
             self._point.move(position, velocity, now_ns)
@@ -164,7 +164,7 @@ class Desired:
         return self.states(rows, steps, np.zeros(len(rows), dtype=np.int64))[:, :, 0]
 
     def window(self, rows: Indices, steps: Indices, ahead: Indices) -> Window:
-        """Desired states from k + d on, valid until the next call; `ahead` has d in its first n."""
+        """Desired states from k + d on, valid until the next call; `ahead`: d of each vehicle."""
         if self._all:
             return self._find(rows, steps, ahead)
         visible = self._find(rows, steps, self._at_once)

@@ -185,7 +185,7 @@ exception of each: TimeoutError if it takes too long, `queue.Full` if too many h
 
 
 Tell = Callable[[str, str], None]
-"""Called at each error with the name of its count, and a text to report, which may be empty."""
+"""Function called at each error with the name of its count and a text to report, or empty."""
 
 
 class Fleet(NamedTuple):
@@ -200,7 +200,7 @@ class Fleet(NamedTuple):
     """Reference of each vehicle of a mission, by its number; None without a mission."""
     stopwatch: Stopwatch
     tell: Tell
-    """Called at each error of a plug-in in flight."""
+    """Function called at each error of a plug-in in flight."""
     planning: Planning | None = None
     """Function that calls planners of plug-ins; None: they are called one after the other."""
 
@@ -265,7 +265,7 @@ class Scheme(ABC):
 
     @abstractmethod
     def plan(self, rows: Indices, step: Indices, foresight: Foresight) -> None:
-        """Plan: fill in `figures`, `planned` and the `horizons` of the foresight."""
+        """Fill in the plans: `figures`, `planned` and the `horizons` of the foresight."""
 
     def remember(  # noqa: B027 - many schemes ignore what is sent
         self, rows: Indices, step: Indices, foresight: Foresight, event: Flags

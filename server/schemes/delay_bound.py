@@ -41,7 +41,7 @@ class DelayBound(NamedTuple):
 
 
 def delay_bound(capacity: int, dt_s: float, most: int, fixed_s: float | None) -> DelayBound:
-    """Delay bounds without any sample, at most `most`; `fixed_s` is None to estimate them."""
+    """Delay bounds before any sample, at most `most` [steps]; `fixed_s`: None to estimate them."""
     least = 1
     if fixed_s is not None:
         # Rounded up, because d has to cover the whole delay.

@@ -35,7 +35,7 @@ from skytether.shared.wire.protocol import (
 
 
 class GuardedScheme(Scheme):
-    """A plug-in's scheme, called for a whole block, or if that fails for each vehicle alone."""
+    """A plug-in's scheme, called for a whole block or, if that fails, for each vehicle alone."""
 
     def __init__(self, name: str, inner: Scheme, fleet: Fleet) -> None:
         super().__init__(fleet)

@@ -31,7 +31,7 @@ def foresee_losses(
     """Fill in `loss_probability`, `start_if_lost` and `inputs_if_lost` of vehicle i of a block.
 
     Args:
-        in_force: number of the horizon in force at its newest observation.
+        in_force: number of the horizon in force at the vehicle's newest observation.
         in_flight: numbers of the horizons in flight.
         schedule, track: scratch memory.
     """

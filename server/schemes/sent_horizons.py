@@ -50,7 +50,7 @@ class SentHorizon:
     length: int
     """Number of inputs that may be flown before they are too old."""
     speed: float
-    """Magnitude of the last flown input over all axes [m/s]."""
+    """Magnitude of the last input that may be flown, over all axes [m/s]."""
 
 
 class ReferenceState:

@@ -14,7 +14,7 @@ PLUGINS = f"{__package__}.plugins"
 
 
 def code_of(scenario: Scenario, *, apart: bool = True) -> SchemeCode:
-    """Code of the scheme, or of missions, for a scenario."""
+    """Code of a scenario's scheme; with `apart` that of missions, if the scenario is one."""
     if apart and scenario.keeps_apart:
         module = load(SCHEME_APART, "missions")
     else:

@@ -44,7 +44,7 @@ class StateGap(Trigger):
     def test(self, situation: Situation) -> Verdict:
         rows, figures = situation.rows, situation.figures
         step, gap, fresh = figures["step"], figures["state_gap"], figures["fresh"]
-        if fresh.any():  # V(k_0) = 0
+        if fresh.any():  # without a usable previous plan V is 0
             self._event_step[rows[fresh]], self._event_gap[rows[fresh]] = step[fresh], 0.0
         since = step - self._event_step[rows]
         # λ is per second, not per step (E5): per step, λ = 1.5 would decay within three steps.

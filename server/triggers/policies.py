@@ -15,7 +15,7 @@ from skytether.shared.telemetry.record import Compared
 
 @trigger
 def heartbeat(situation: Situation) -> Flags:
-    """Sends when a heartbeat is due, in its place: a plan at no additional packet."""
+    """Sends a plan in place of each heartbeat that is due, so without an additional packet."""
     return situation.heartbeat_due
 
 

@@ -171,7 +171,7 @@ class Trigger:
         """Forget the vehicle in this row."""
 
     def test(self, situation: Situation) -> Verdict:
-        """Decide for each vehicle."""
+        """Verdict on each vehicle."""
         raise NotImplementedError
 
     def sent(self, rows: Indices, figures: Figures) -> None:
