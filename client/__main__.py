@@ -299,7 +299,7 @@ def _memory(
 def _saving(
     memory: "MemoryFile", scenario: Scenario, number: int, warnings: list[Event]
 ) -> Callable[..., Client]:
-    """Makes a client that goes on from the state saved by an earlier run, and saves its own.
+    """Function that makes a client, which continues from an earlier run's state, and saves its own.
 
     A warning for the log is added to `warnings`.
     """

@@ -32,14 +32,14 @@ class MotionInForce(NamedTuple):
 
 
 class Fresh:
-    """What an earlier run has saved: nothing, so that the vehicle begins on the ground."""
+    """Replacement for `memory.SavedState` without a saved state: the flight begins anew."""
 
     heard_ns = 0
     began_ns: int | None = None
     motion: Any = None
 
     def servers(self, parts: "Parts") -> "OneServer":
-        """Servers of a client that reaches one, and knows of no other from an earlier run."""
+        """Servers of a client that has a single server and no saved state."""
         return OneServer(parts.failsafe)
 
 
@@ -53,17 +53,17 @@ class Role:
     is_followed = True
     """Whether the vehicle flies the plans of the server."""
     may_observe = True
-    """Whether the server may be sent observations."""
+    """Whether observations may be sent to the server."""
     decode: Callable[[bytes, Terms], Message] = staticmethod(decode)
-    """Decodes a message of the server, see `protocol.decode`."""
+    """Decoder of the server's messages, see `protocol.decode`."""
 
     def __init__(self, failsafe: Failsafe) -> None:
         self.heard: Callable[..., None] = failsafe.heard
-        """Notes a packet of the session."""
+        """Function that notes a packet of the session."""
         self.malformed: Callable[..., None] = failsafe.malformed
-        """Notes a malformed message that proves to be from the server."""
+        """Function that notes a malformed message that proves to be from the server."""
         self.meet: Callable[..., None] = failsafe.meet
-        """Passes a failsafe cause that concerns the server to the failsafe."""
+        """Function that passes a cause (`Reason`) that concerns the server to the failsafe."""
 
     def begin(self) -> None:
         """Note another session with the server."""
@@ -79,7 +79,7 @@ class Role:
         """Silence after which the server counts as lost [ns].
 
         Args:
-            timeout_ns: this silence for a server that the vehicle follows [ns].
+            timeout_ns: value for a server that the vehicle follows [ns].
         """
         return timeout_ns
 
@@ -92,14 +92,14 @@ class OneServer:
     """
 
     keys: frozenset[str] = frozenset()
-    """Keys with which an operator lets another server lead."""
+    """Keys by which an operator chooses the server that leads."""
 
     def __init__(self, failsafe: Failsafe) -> None:
         self.failsafe = failsafe
         self.sessions: list[Any] = []
         """Session with each server; the caller appends the sessions."""
         self.may_tell: Callable[[int], bool] = lambda _: True
-        """Whether messages may be sent at a time [ns]; not before the state is saved, if it is."""
+        """Whether messages may be sent at a time [ns]; replaced if the client saves its state."""
 
     @property
     def followed(self) -> Any:
@@ -114,14 +114,14 @@ class OneServer:
         """Choose the server that the vehicle follows; called at each step, also on the ground."""
 
     def objection(self, scenario: Scenario) -> str:
-        """Why an operator's order about `keys` is refused at present; empty if it is accepted."""
+        """Why an operator's change of `keys` is refused at present; empty if it is accepted."""
         return ""
 
     def obey(self, scenario: Scenario, *, now_ns: int) -> None:
-        """Act on an operator's order about `keys`."""
+        """Act on an operator's change of `keys`."""
 
     def to_keep(self) -> dict[str, Any]:
-        """Fields of `memory.SavedState`."""
+        """Values of the servers for fields of `memory.SavedState`."""
         return {}
 
     def figures(self) -> dict[str, Any]:
@@ -139,7 +139,7 @@ class Parts(NamedTuple):
     before: Any
     """State saved by the previous run: `memory.SavedState`, or `Fresh`."""
     motion: Callable[[], MotionInForce | None]
-    """Returns the motion in force of a mission; None on the ground, or without one."""
+    """Function that returns the motion of a mission in force; None on the ground or without one."""
     out: list[Datagram]
     events: Events
     """List to which events for the operator are appended."""

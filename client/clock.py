@@ -29,7 +29,7 @@ ASKED_MAX = 16
 ROUND_TRIP_MAX_NS = SECOND_NS
 """Longest round trip of an answer that is used, for an autopilot aboard."""
 SPREAD_NS = MILLISECOND_NS
-"""An answer is used if its round trip is at most 1.5 times the shortest, plus SPREAD_NS."""
+"""Part of the largest usable round trip, which is 1.5 times the shortest, plus SPREAD_NS."""
 DRIFT_SPAN_NS = 10 * SECOND_NS
 """Shortest time span of the answers from which the drift is fitted."""
 DRIFT_MAX = 0.02

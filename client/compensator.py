@@ -183,7 +183,7 @@ class Compensator:
             stage: stage of the horizon at the present step.
             length: number of its stages that may be flown.
         """
-        if self._brake and stage >= length:  # braking is not started again
+        if self._brake and stage >= length:  # it would only start the braking again
             return True
         if self._horizons is None or isinstance(horizon, Trajectory):
             return False

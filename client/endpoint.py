@@ -50,7 +50,7 @@ ORDERS = keys_of(InFlight.ARMED) | {*DECISIONS}
 VEHICLE_SOCKET = 1
 """Socket used by the vehicle's own port; the server's is 0."""
 LATEST_NS = SECOND_NS
-"""Longest time between the end of the motion and the end of a client asked to end [ns]."""
+"""Longest time for which a client that was asked to end continues after its motion [ns]."""
 TIME_NS, TIME_ERROR_MAX_US = 2 * SECOND_NS, 2**32 - 1
 """Interval between two reports of the time of day [ns], and the largest error that fits in one
 [µs]."""
@@ -70,7 +70,7 @@ class Client(Endpoint):
     """
 
     _unsaved = False
-    """Whether the next run would not go on from the present state, although it should."""
+    """Whether the client has failed to save its state; observations report it."""
 
     def __init__(
         self,
@@ -186,7 +186,7 @@ class Client(Endpoint):
             horizon = session.hear(datagram.payload, path=path, now_ns=now_ns)
             if self._pilot.next_ns is None:
                 self._begin(now_ns)
-            elif self._failsafe.mode is Mode.INIT:  # the earlier run's flight continues
+            elif self._failsafe.mode is Mode.INIT:  # an earlier run's flight gets a session
                 self._failsafe.meet(Reason.OPENED, now_ns=now_ns)
             elif horizon is not None:
                 self._pilot.offer(horizon, now_ns=now_ns)
@@ -296,7 +296,7 @@ class Client(Endpoint):
         self._report(now_ns)
 
     def _report(self, now_ns: int) -> None:
-        """Send the servers what is due after a step."""
+        """Send the messages that are due after a step to the servers."""
         pilot = self._pilot
         self._servers.follow(step=pilot.flown, on_ground=False, now_ns=now_ns)
         for session in self._sessions:

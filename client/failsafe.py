@@ -90,7 +90,7 @@ _FAULTS = {(mode, Reason.NOT_FINITE): Mode.FAULT for mode in Mode if mode is not
 _TO_BRAKE = (
     BROKEN | GROUNDING | {Reason.ENDED, Reason.LATE, Reason.STALLED, Reason.UNARMED, Reason.LEAPT}
 )
-# Without INIT, in which nothing is flown yet, and without LAND, RETURN and FAULT, which only an
+# From all modes but INIT, in which nothing is flown yet, and LAND, RETURN and FAULT, which only an
 # operator ends.
 _YIELDS = {
     (mode, cause): Mode.MANUAL
@@ -295,7 +295,7 @@ class Failsafe:
 
     def horizon_taken(self, *, now_ns: int) -> None:
         self._horizon_ns = now_ns
-        self.postponed = None  # a stall; the newer motion replaces the old one
+        self.postponed = None  # was None or STALLED, see `takes`: the newer motion is in time
         self.meet(Reason.HORIZON, now_ns=now_ns)
 
     def malformed(self, *, now_ns: int) -> None:
@@ -380,7 +380,7 @@ class Failsafe:
             self.meet(cause, now_ns=now_ns)
 
     def meet(self, cause: Reason, *, now_ns: int) -> None:
-        """Act on a cause: change mode and reason, as the table says.
+        """Act on a cause: change mode and reason by the transition table.
 
         The other vehicles of a mission avoid the motion in force and assume no other. So a faulty
         or missing packet does not end the motion: such a cause acts at the last knot, where the

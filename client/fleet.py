@@ -19,7 +19,7 @@ class ClientFleet(Endpoint):
         super().__init__()
         self._clients = clients
         self._apart_ns = apart_ns
-        """Time from one start to the next [ns]; 0 once the starts are scheduled."""
+        """Time from one client's start to the next [ns]; 0 once the starts are scheduled."""
         self.changeable = clients[0].changeable
         self._due_ns = [client.next_wake_ns() for client in clients]
         self._heap = [(due_ns, n) for n, due_ns in enumerate(self._due_ns) if due_ns is not None]

@@ -47,7 +47,7 @@ class Follower(Protocol):
         Args:
             stage: stage of the newest `input_at`.
             state: position [m] and velocity [m/s] of each axis; shape (axes, 2).
-            flown: input flown from there [m/s]; None for the input that follows from the state.
+            flown: input flown at that stage [m/s]; None: the input computed from the state.
         """
 
 

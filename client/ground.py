@@ -19,7 +19,7 @@ WAITED_NS = 2 * SECOND_NS
 SILENT_NS = 3 * SECOND_NS
 """Time beyond the time-out after which the server of a vehicle on the ground counts as silent.
 
-The server answers two HELLOs a second. Of eight, one gets through even if the network loses a fifth
+The server answers two HELLOs a second. One of eight is answered even if the network loses a fifth
 of the packets each way."""
 
 

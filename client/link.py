@@ -10,7 +10,7 @@ from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
 HELLO_NS = SECOND_NS
 """Time between two HELLOs in plaintext until the server first answers."""
 AGAIN_NS = 400 * MILLISECOND_NS
-"""Time between two HELLOs otherwise; a server allows at most five handshakes a second."""
+"""Time between two HELLOs later, or with keys; a server allows at most five a second."""
 
 
 class ClientLink(Protocol):

@@ -84,7 +84,7 @@ class SavedState(msgspec.Struct, frozen=True, kw_only=True):
     """Number of the leadership, see `client.standby.leadership`."""
 
     def servers(self, parts: Parts) -> OneServer:
-        """See `Fresh`: the server may know a leadership of a standby server that there was."""
+        """See `Fresh`; after a flight with a standby server, the server is told that it leads."""
         if not self.leadership:
             return OneServer(parts.failsafe)
         standby = load("skytether.client.standby.servers", "a standby server")
@@ -194,8 +194,8 @@ class ClientMemory:
         self._saved = self._handed[0] if self._handed and not nothing else None
 
     def may_tell(self, state: SavedState, *, now_ns: int) -> bool:
-        """Whether messages may be sent: this state is saved, or no other is, or saving it has
-        failed, which the messages then report (`unsaved`).
+        """Whether messages may be sent: this state is saved, no older state is saved, or saving
+        has failed, which the messages then report (`unsaved`).
         """
         if self._saved is not None and _is_same(state, self._saved):
             self._differs_ns, self.unsaved = None, False
@@ -252,7 +252,7 @@ class SavingClient(Client):
             super()._report(now_ns)
 
     def _state(self) -> SavedState:
-        """State to save; on the ground the flight of the previous run may still continue."""
+        """State to save; before the flight has begun, that of the previous run."""
         pilot, always = self._pilot, {"frame": self._flies.frame} | self._servers.to_keep()
         if pilot.next_ns is None:
             return msgspec.structs.replace(self._memory.before, **always)

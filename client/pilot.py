@@ -97,8 +97,8 @@ class Pilot:
         """Present step; measurements up to its start are included."""
         self._flown_ns = 0
         self._takes_from: int | None = None
-        """Step of the first observation that announced that horizons are accepted; None while none
-        are."""
+        """Step of the first observation that announced that horizons are accepted; None while
+        they are refused."""
         self._input = np.zeros(self._terms.axes)
         """Desired velocity flown now [m/s]; shape (axes,)."""
         self._speed = 0.0

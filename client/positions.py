@@ -31,12 +31,12 @@ SPEED_MAX = 1e3
 
 FAULTS = {
     "not_finite": "they are not finite",
-    "far": "they are further away, or faster, than can be",
+    "far": "they are impossibly far away or fast",
     "unsynchronised": "the autopilot's clock is not known",
-    "doubled": "they come twice",
+    "doubled": "they arrive twice",
     "impossible": "their stamps lie in the future",
     "old": f"they are older than {OLD_NS / SECOND_NS:g} s",
-    "late": "older ones come after newer ones",
+    "late": "older ones arrive after newer ones",
 }
 
 Vector = tuple[float, float, float]
@@ -99,9 +99,9 @@ class Positions:
         self.velocity: Vector = (0.0, 0.0, 0.0)
         """Newest velocity, in our axes [m/s]."""
         self.came_ns: int | None = None
-        """Arrival of the newest measurement that was used."""
+        """Arrival of the newest measurement that was used [ns]."""
         self.heard_ns: int | None = None
-        """Arrival of the newest measurement, used or dropped."""
+        """Arrival of the newest measurement, used or dropped [ns]."""
         self.taken = 0
         self.dropped: Counter[str] = Counter()
         self._fault = ""
@@ -142,8 +142,8 @@ class Positions:
         )
 
     def _watch(self, leaps: Leaps, measured: Measurement) -> None:
-        """After a leap of the position, displace the origin by the same vector: the vehicle has not
-        moved so far.
+        """After a leap of the position, displace the origin by the same vector: no vehicle can have
+        moved that far.
         """
         if leaps.leaps(measured, measured.numbers()) and leaps.off_m and self.is_flown:
             dx, dy, dz = leaps.off_m
@@ -204,7 +204,7 @@ class Positions:
             self._recalled = saved
 
     def _recall(self, saved: VehicleMemory, now_ns: int) -> None:
-        """Restore an origin if both clocks have advanced alike: a reboot resets the autopilot's
+        """Restore an origin if both clocks have advanced equally: a reboot resets the autopilot's
         clock to 0.
         """
         self._recalled = None

@@ -45,7 +45,7 @@ class ServerClock:
 
     def begin(self) -> None:
         """Begin again after a restart of the server, whose time stamps cannot be compared with
-        those of the run before.
+        those of the earlier run.
         """
         self.echo = NEVER
 

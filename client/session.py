@@ -47,7 +47,7 @@ REFUSED = {
 }
 """Drop reason of a WELCOME that refuses the vehicle, by the refusal."""
 DEAF = frozenset({Idle.OBSERVATION, Idle.DELAY})
-"""Reasons why one server cannot plan that do not apply to every server."""
+"""Reasons of a server not to plan although another server may be able to plan."""
 DEGRADED = "the server misses its deadlines"
 """Reason for the lack of newer horizons if the server reports that it is degraded."""
 
@@ -92,7 +92,7 @@ class ServerSession:
         self._connect_ns = seconds_to_ns(connect_s)
         self.link = link
         self.hearing = hearing
-        """Measures losses, and chooses the longest silence to allow the server."""
+        """Measured losses, from which the longest silence to allow the server is chosen."""
         self.silence_asked = hearing.silence
         """Longest silence that the server allows the vehicle [half steps]; 0 for no bound."""
         self.sent = 0
@@ -154,8 +154,8 @@ class ServerSession:
         if payload is None:
             for answer in self.link.outbox():
                 self.route.put(answer, path)
-            # The answer to a CHALLENGE contains the HELLO, so the next HELLO is delayed. It is not
-            # if an attacker caused the CHALLENGE by replaying an old HELLO.
+            # The answer to a CHALLENGE contains the HELLO, so the next HELLO is delayed, unless an
+            # attacker caused the CHALLENGE by replaying an old HELLO.
             if self._awaits_welcome:
                 self.hello_ns = now_ns + AGAIN_NS
             return None
@@ -238,7 +238,7 @@ class ServerSession:
         self._is_open = True
         self.link.adopt(now_ns=now_ns)
         self._heard(welcome.server_ns, now_ns)
-        self._awaits_welcome = True  # another HELLO may open a newer session
+        self._awaits_welcome = True  # a repeated HELLO may have opened a newer session
         if restarted:
             self.role.meet(Reason.RESTARTED, now_ns=now_ns)
 
@@ -314,8 +314,8 @@ class ServerSession:
         self._is_open, self.heard_ns, self.useful_ns = False, None, None
 
     def wait(self, *, now_ns: int) -> bool:
-        """Whether to continue waiting for the flight; fails after too long without a session."""
-        if self.number is not None:  # the vehicle is still on the ground
+        """Whether to wait on for the flight; sets `failure` after too long without a session."""
+        if self.number is not None:  # had a session, not yet in flight
             return True
         if self._began_ns is None:
             self._began_ns = now_ns
@@ -324,7 +324,7 @@ class ServerSession:
             if self._refusal is None:
                 self._fail(_ground().no_answer(self, waited_ns))
             else:
-                self.failure = self._refusal  # it has been reported already
+                self.failure = self._refusal  # reported by `_note_refusal`
             return False
         if not self._is_unanswered and self._refusal is None and waited_ns >= UNANSWERED_NS:
             self._is_unanswered = True

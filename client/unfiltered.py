@@ -9,7 +9,7 @@ from skytether.shared.law.model import Array
 
 
 class Newest:
-    """Replacement for a filter: it returns the newest measured value of each number."""
+    """Replacement for a filter: it returns the newest measured positions and velocities."""
 
     def __init__(self, axes: int) -> None:
         self._zero = np.zeros(axes)

@@ -179,7 +179,7 @@ class Autopilot:
         self.parts = Parts(setup, launch, streams)
 
     def hear(self, message: Message, *, now_ns: int) -> None:
-        """Process a message of the autopilot; an unsuitable autopilot's are ignored."""
+        """Process a message of the autopilot; those of an unsuitable one are ignored."""
         if self.parts is None:
             return
         condition, (setup, launch, streams) = self.condition, self.parts
@@ -228,7 +228,7 @@ class Autopilot:
         self._texts.tick(now_ns=now_ns)
         if self.parts is None:
             if now_ns - self._began_ns > self._patience_ns and not self._unfit:
-                why = "no heartbeat of an autopilot has come, see vehicle.address"
+                why = "no heartbeat of an autopilot has arrived, see vehicle.address"
                 self._give_up("not heard", why)
             return []
         setup, launch, streams = self.parts

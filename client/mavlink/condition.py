@@ -57,12 +57,10 @@ class Condition:
         self.home_up = 0.0
         """Altitude of home in the autopilot's local frame [m]."""
         self._is_bad: dict[str, bool] = {}
-        """Whether the estimate is bad, according to each message that reports it, by the type of
-        the message."""
+        """Whether the estimate is bad, by the type of the message that reports it."""
         self._astray_ns: int | None = None
         self._is_low: dict[str, bool] = {}
-        """Whether the battery is low, according to each message that reports it, by the type of the
-        message."""
+        """Whether the battery is low, by the type of the message that reports it."""
         self._low_ns: int | None = None
         self.receiver = Receiver()
         self.has_new_fix = False

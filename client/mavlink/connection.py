@@ -44,7 +44,7 @@ class Connection:
         self.target: tuple[int, int] | None = None
         """Numbers of the autopilot's system and component; None until its first heartbeat."""
         self.unmet: tuple[Address, tuple[int, int]] | None = None
-        """Address and numbers of an autopilot that has sent no heartbeat yet."""
+        """Address and numbers of a sender that may be the autopilot, before its first heartbeat."""
         self.codec = Codec(keys.system, keys.component, stream=line.kind in ("tcp", "serial"))
         self.counts: Counter[str] = Counter()
         """Number of messages `heard`, `foreign` and `for_others`, and of datagrams from

@@ -150,5 +150,5 @@ def unfit(heartbeat: Message) -> str:
     if heartbeat.autopilot not in FLAVOURS:
         return f"its autopilot is number {heartbeat.autopilot}, expected ArduPilot (3) or PX4 (12)"
     if heartbeat.type not in AIRBORNE:
-        return f"it is of MAV_TYPE {heartbeat.type}, expected one that hovers, as a quadrotor (2)"
+        return f"it is of MAV_TYPE {heartbeat.type}, expected one that hovers, e.g. a quadrotor (2)"
     return ""

@@ -43,7 +43,7 @@ class Hindrances:
         self._yields = False
         """Whether a second commander flies the vehicle, so that nothing is sent."""
         self._is_taken = False
-        """Whether somebody else flies the vehicle, or has landed it and not lifted it since."""
+        """Whether somebody else flies the vehicle, or has landed it and not taken off since."""
         self._was_disarmed = False
         """Whether the vehicle was disarmed since it flew, so that it is not flown again."""
         self._reported_ns: dict[Reason, int] = {}
@@ -88,7 +88,7 @@ class Hindrances:
         return self._silence(now_ns)
 
     def _rival(self, now_ns: int) -> Reason | None:
-        """Reason by the way in which a second commander was detected; None if there is none."""
+        """Reason for a second commander, by the kind of detection; None if none was detected."""
         event: VehicleEvent
         if self.rivals.are_there(now_ns=now_ns):
             system, component, content = self.rivals.newest

@@ -43,12 +43,12 @@ QUIET_NS = 3 * SECOND_NS
 SILENT_MAX_NS = 10 * SECOND_NS
 """Silence of the autopilot after which the client stops waiting for the end of a landing."""
 THERE_M = 0.3
-"""The climb is over within this distance of the take-off altitude."""
+"""Distance from the take-off altitude within which the climb is over [m]."""
 LIFTED_M = 1.0
 """Distance below the take-off altitude from which the autopilot may end the climb by itself: PX4
 ends it at NAV_MC_ALT_RAD, by default 0.8 m."""
 STILL_MPS = 0.3
-"""Vertical speed below which the climb is over."""
+"""Vertical speed below which the climb is over [m/s]."""
 SET_MODE = int(dialect.MAV_CMD_DO_SET_MODE)
 ARM = int(dialect.MAV_CMD_COMPONENT_ARM_DISARM)
 TAKE_OFF = int(dialect.MAV_CMD_NAV_TAKEOFF)
@@ -159,7 +159,7 @@ class Launch:
         return came_ns is not None and now_ns - came_ns <= FRESH_NS
 
     def _begin(self, may_arm: bool, now_ns: int) -> None:
-        """Begin the climb when possible; a vehicle in the air is flown from there."""
+        """Begin the climb when possible; fly a vehicle that is already in the air."""
         condition, flavour = self._condition, self._flavour
         mode, guided = flavour.mode_name(condition.mode), flavour.mode_name(flavour.guided)
         if self._silence(now_ns):
@@ -200,7 +200,7 @@ class Launch:
             self._events.append(OriginAwaited(vehicle=self._vehicle, place=place))
         elif now_ns - self._hovers_ns > self._patience_ns:
             waited = f"not flown in {self._patience_ns / SECOND_NS:g} s"
-            self._enter(Phase.FLYING, now_ns)  # the vehicle is under our control, and lands
+            self._enter(Phase.FLYING, now_ns)  # otherwise the vehicle would not be landed
             self._fail(waited, "its origin is unknown, see mavlink.origin", now_ns)
 
     def _ask_to_arm(self) -> None:
@@ -352,7 +352,7 @@ class Launch:
         return is_asked and self._flavour.steps[self._step] is LaunchStep.HOLD
 
     def _is_late_to_lift(self, now_ns: int) -> bool:
-        """Whether an accepted take-off has not led to its mode for too long."""
+        """Whether the mode of an accepted take-off command is overdue."""
         climbs = self.phase is Phase.CLIMBING and self._accepted
         if not climbs or self._flavour.steps[self._step] is not LaunchStep.CLIMB:
             return False
@@ -360,7 +360,7 @@ class Launch:
         return now_ns - self._since_ns > HEARTBEAT_MAX_NS
 
     def is_down(self, *, now_ns: int) -> bool:
-        """Whether the vehicle needs no more control, or is out of our control."""
+        """Whether the vehicle is on the ground, or no longer under the client's control."""
         condition = self._condition
         if self.phase is Phase.GROUND or not condition.armed:
             return True

@@ -43,10 +43,10 @@ NOTICED = (
 """Rows: share of the allowed deviation, time for which the deviation has to be larger, and largest
 command in the direction of motion for which the row applies [m/s]."""
 CALM_SHARE, QUIET_NS = 0.15, 500 * MILLISECOND_NS
-"""Share of the allowed deviation below which the deviation has to stay, and the time for which it
-has to, until the vehicle counts as obedient again."""
+"""Share of the allowed deviation below which the deviation has to stay for QUIET_NS, until the
+vehicle counts as obedient again."""
 AGAIN_NS = 60 * SECOND_NS
-"""Time after the end of one disobedience within which another one is final."""
+"""Time after the end of a disobedience within which a second one is final."""
 COMMANDS_MAX = 256
 
 

@@ -39,7 +39,7 @@ from heartbeats."""
 GUIDED_ITEM = (2, 3)
 """Values of `current` that mark a mission item as a goal or an altitude to fly to at once."""
 STICK = 50
-"""Smallest stick deflection that counts, of 1000, or of 500 µs."""
+"""Smallest stick deflection that counts: of at most 1000 units, or of at most 500 µs."""
 CENTRE_US = 1500
 UNUSED_US = (0, 65535)
 """Pulse widths of a channel that is not overridden [µs]."""

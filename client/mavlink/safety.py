@@ -60,7 +60,7 @@ def _timeout(value: float) -> bool:
 _STATION_ACTIONS = {
     0: "without our heartbeats it hovers for ever",
     1: "without our heartbeats it returns home and lands",
-    2: "without our heartbeats it goes on with a mission, or returns home and lands",
+    2: "without our heartbeats it continues a mission, or returns home and lands",
     3: "without our heartbeats it returns home the way it came, and lands",
     4: "without our heartbeats it returns home the way it came, or lands",
     5: "without our heartbeats it lands where it is",
@@ -101,10 +101,10 @@ def _fence_types(value: float) -> str:
 
 def _options(value: float) -> str:
     kinds = {
-        2: "a mission goes on without a ground station",
-        4: "GUIDED goes on without a remote control",
-        8: "a landing goes on, whatever fails",
-        16: "a pilot's modes go on without a ground station",
+        2: "a mission continues without a ground station",
+        4: "GUIDED continues without a remote control",
+        8: "a landing continues, whatever fails",
+        16: "a pilot's modes continue without a ground station",
     }
     held = [words for bit, words in kinds.items() if round(value) & bit]
     return "; ".join(held) or "every failsafe acts at once"
@@ -176,7 +176,7 @@ def ardupilot(system: int, returns_below_m: float | None = None) -> tuple[Rule, 
         *_ardupilot_returns(returns_below_m),
         Rule(
             ("GUID_TIMEOUT",),
-            lambda v: f"without setpoints for {v:g} s it brakes, and stands",
+            lambda v: f"without setpoints for {v:g} s it brakes and hovers",
             _timeout,
             f"{SILENCE_MIN_S:g} to {SILENCE_MAX_S:g} s: set 1",
             SILENCE_MAX_S,
@@ -278,7 +278,7 @@ def px4(returns_below_m: float | None = None) -> tuple[Rule, ...]:
         Rule(
             ("GF_ACTION",),
             _table(
-                {0: "beyond its fence it goes on", 1: "beyond its fence it only reports it"},
+                {0: "beyond its fence it continues", 1: "beyond its fence it only reports it"},
                 "beyond its fence it acts by itself",
             ),
         ),

@@ -116,7 +116,7 @@ class Setup:
             self._changed.append((name, before, value))
         self._values[name], self._kinds[name] = value, kind
         for rule in self._rules:
-            if name in rule.names:  # an autopilot uses one of the rule's names
+            if name in rule.names:  # the autopilot has the parameter under one name only
                 for other_name in rule.names:
                     self._tries.pop(other_name, None)
 

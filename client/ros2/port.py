@@ -83,7 +83,7 @@ class Port(Endpoint):
 
     @property
     def is_down(self) -> bool:
-        """Whether the client sends no commands to the robot, or no more."""
+        """Whether the client has sent no commands to the robot, or has stopped sending them."""
         return not self._commands or (
             self._silent_ns is not None and self.now_ns >= self._silent_ns
         )

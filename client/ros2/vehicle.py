@@ -33,7 +33,7 @@ class Ros2Vehicle(Vehicle):
         self.node = self._port.node
         self._positions = self._port.odometry.positions
         self._placed = 0
-        """Number of measurements when the origin was placed; the pilot needs a later one."""
+        """Number of measurements when the origin was placed; flight begins with a later one."""
 
     def fly(self, velocity: Array) -> None:
         x, y, *up = velocity.tolist()

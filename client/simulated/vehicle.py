@@ -42,7 +42,7 @@ class SimulatedVehicle(Vehicle):
         self._step = -1
         """Step at whose start the plant's state is valid; -1 before the flight."""
         self._state = plant.state()
-        """State at the start of the step."""
+        """State at the start of `_step` [m, m/s]; shape (axes, 2)."""
         self._velocity = np.zeros(len(self._state))
 
     def fly(self, velocity: Array) -> None:

@@ -73,7 +73,7 @@ class Leadership:
         if now_ns - last_ns < self._change_ns:
             return None
         newest = max(filter(self.may_lead, range(self._servers)), key=heard_ns.__getitem__)
-        # Only a server that was heard since the leader was doubted: both may be out of reach.
+        # Only a server heard since the leader was doubted: otherwise both may be out of reach.
         return newest if heard_ns[newest] >= last_ns + self._ask_ns else None
 
     def hand_over(self, server: int) -> None:

@@ -70,7 +70,7 @@ class Servers(OneServer):
 
     def __init__(self, count: int, parts: Parts) -> None:
         super().__init__(parts.failsafe)
-        number = getattr(parts.before, "leadership", 0)  # none without saved state
+        number = getattr(parts.before, "leadership", 0)  # `Fresh` has no leadership
         timeout_ns = seconds_to_ns(parts.scenario.link.timeout_s)
         # A vehicle without its former standby server informs the other server that it leads now.
         number += bool(number and count == 1)
@@ -90,7 +90,7 @@ class Servers(OneServer):
         lead, or leads a vehicle on the ground, sends rarely. None before the first wake."""
         self._was_on_ground = False
         self._silent_since_ns = NEVER_NS
-        """Begin of the leader's silence for which the failsafe's time-out was last restarted [ns];
+        """Start of the leader's silence for which the failsafe's time-out was last restarted [ns];
         one restart per silence."""
 
     @property
