@@ -73,7 +73,7 @@ class NetemOptions(ProcessOptions):
     """Relay TCP connections in place of UDP: latency, a rate and cuts, and no packet loss."""
     flows: Annotated[int | None, Argument(metavar="N")] = None
     """Largest number of clients at once; each needs a socket. By default 512, or as many as the
-    system allows. With --tcp, of connections: 1 to 128, the default."""
+    system allows. With --tcp: number of connections, 1 to 128, by default 128."""
 
 
 @dataclass(frozen=True)
@@ -181,7 +181,7 @@ def emulate_for(argv: Sequence[str]) -> None:
         try:
             passing = min(mtu, path_mtu)
             with program(argv[end + 1 :], mtu, path_mtu=passing, exposed=exposed) as run_:
-                signal.signal(signal.SIGINT, lambda *_: None)  # also during the shutdown
+                signal.signal(signal.SIGINT, lambda *_: None)  # ignored until this process ends
                 endpoint = Tunnel(running.scenario, mtu=passing, recorder=running.recorder)
                 running.drive(endpoint, bind=None, waiting_for="", line=run_, on_signal=run_.signal)
         except ProgramError as error:
@@ -280,7 +280,7 @@ def _flows(requested: int | None, most: int) -> int:
     command.check_sockets("--flows", flows)
     if requested is None and flows < usual:
         print(
-            f"netem: room for {flows} clients instead of {usual}: {system.files_max()} files may "
+            f"netem: at most {flows} clients instead of {usual}: {system.files_max()} files may "
             "be open here (ulimit -n)",
             file=sys.stderr,
         )

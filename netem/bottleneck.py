@@ -40,7 +40,7 @@ class Codel:
     """Controlled delay (RFC 8289): drops packets more and more often until queueing times fall."""
 
     above_ns: int = 0
-    """End of INTERVAL_NS since waits became too long [ns]; 0 while they are short."""
+    """Time from which packets are dropped if waits stay too long [ns]; 0 while they are short."""
     drop_ns: int = 0
     """Time of the next drop."""
     count: int = 0

@@ -49,13 +49,13 @@ class Lane:
     slot: int = -1
     """Time slot of the newest packet, counted from `began_ns`."""
     rank: int = 0
-    """Number of packets in the newest packet's slot before it."""
+    """Number of earlier packets in the slot of the newest packet."""
     taken: int = 0
     """Number of packets so far, lost packets included."""
     newest_out: int = -1
     """Highest number of a packet that has left, or -1."""
     latest_ns: int = 0
-    """Due time of the last packet [ns]."""
+    """Latest due time so far [ns], if packets stay in order."""
 
 
 class Entered(NamedTuple):
@@ -190,7 +190,7 @@ class Link:
         self.counts = Counts()
 
     def change(self, impairments: Impairments, *, now_ns: int) -> None:
-        """Change order and rate; packets at the bottleneck are queued again if they fit."""
+        """Use other impairments; with another rate, packets at the bottleneck queue again."""
         self._pass(now_ns)
         previous, self.impairments = self.impairments, impairments
         self._is_ordered = impairments.is_ordered
@@ -201,7 +201,7 @@ class Link:
             self._wait(waiting.item, now_ns)
 
     def accept(self, datagram: Datagram, lane: Lane, *, now_ns: int) -> bool:
-        """Accept a packet, addressed to its destination; True if a packet may be due now."""
+        """Accept a packet whose peer is its destination; True if a packet may be due now."""
         counts, number, size = self.counts, lane.taken, len(datagram.payload)
         slot = (now_ns - lane.began_ns) // SLOT_NS
         # Packets in the same slot differ by their rank; otherwise all would have the same fate.
@@ -394,7 +394,7 @@ def _bottleneck(impairments: Impairments) -> "Bottleneck[Entered] | None":
 
 
 def _flipped(payload: bytes, place: float) -> bytes:
-    """Payload with one bit flipped, at a share of its length below 1."""
+    """Payload with one bit flipped, at the share `place` of its length."""
     bit = int(place * 8 * len(payload))
     changed = bytearray(payload)
     changed[bit // 8] ^= 1 << bit % 8

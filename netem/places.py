@@ -33,7 +33,7 @@ IDLE_NS = 5 * SECOND_NS
 HOST_FLOWS = 64
 """Number of flows above which a host's flows are replaced before those of other hosts."""
 TRIALS = 8
-"""Hosts with more than HOST_FLOWS flows leave one place in TRIALS to new clients."""
+"""Inverse of the share of places that hosts with more than HOST_FLOWS flows leave to others."""
 
 
 @dataclass(slots=True)
@@ -50,7 +50,7 @@ class Flow:
     order: "Order"
     """Order that contains this flow: `Places._earned` or `Places.others`."""
     laps: int
-    """Number of addresses that sent the same first packet earlier, see `Proxy._laps`."""
+    """Number of earlier addresses with the same first packet (a loop): `Proxy._laps`."""
     asks: bool = False
     """Whether a packet of the client has arrived since the newest exchange."""
     exchanges: int = 0
@@ -104,7 +104,7 @@ class Places:
         self._trials = count // TRIALS
         """Number of places that hosts with more than HOST_FLOWS flows leave to others."""
         self._earned = Order()
-        """Flows that have earned their place, in the order of the newest time of earning it."""
+        """Flows that have earned their place, by the time at which they last earned it."""
         self.others = Order()
         """All other flows, by the time of their last packets."""
 

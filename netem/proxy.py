@@ -69,8 +69,8 @@ class Proxy(Emulator):
         self._is_unreachable = False
         """Whether packets to the server have failed since its last answer."""
         self._passed: OrderedDict[int, tuple[int, Address]] = OrderedDict()
-        """Number of laps and latest client of each of the newest packets, until the server answers;
-        by Python's hash of the packet (64 bits, with a secret key of the process)."""
+        """Result of `_laps` and latest client of each of the newest packets, by Python's hash of
+        the packet (64 bits, with a secret key of the process); empty once the server answers."""
         self.refused = 0
         """Number of packets from clients without a flow, or to a flow's socket but not from the
         server."""
@@ -148,7 +148,7 @@ class Proxy(Emulator):
     def _laps(self, datagram: Datagram) -> int:
         """Number of new addresses, one after another, from which the same packet has arrived.
 
-        If no server answers, netem itself has sent such a packet.
+        Many of them, before any answer of the server, mean that netem's own packets return to it.
         """
         passed = self._passed.get(hash(datagram.payload)) if not self._is_answered else None
         if passed is None:

@@ -30,14 +30,14 @@ from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Recorder
 
 TRY = 1 << 32
-"""Difference of the piece numbers used to draw one try of a piece and its next try."""
+"""Number added to that of a piece at each new try, so that the new try has its own random loss."""
 RETRY_NS = 200 * MILLISECOND_NS
 """Time after which a piece that a link would have lost is sent again [ns]: the smallest
 retransmission time-out of Linux."""
 
 
 class LosslessFates(Fates):
-    """Fates of the pieces of a stream: delays alone."""
+    """Fates of the pieces of a stream: delays only."""
 
     def at(self, slot: int, rank: int = 0) -> Fate:
         return replace(super().at(slot, rank), lost=False, copies=0, flipped=None)
@@ -107,7 +107,7 @@ class Relay(Emulator):
         self._events.append(FlowOpened(flow=up.flow, host=CLIENT, port=number))
 
     def _admit(self, source: Address, stream: HalfConnection, now_ns: int) -> None:
-        """Let the held pieces of a stream enter its link, up to one that must wait."""
+        """Let held pieces of a stream enter its link, until one of them has to wait."""
         self._holding.pop(source, None)
         while stream.held:
             if not stream.link.has_room(len(stream.held[0].payload)):
@@ -185,9 +185,9 @@ def objection(scenario: Scenario) -> str:
     """Why byte streams cannot pass the network of a scenario, in words; empty if they can."""
     for key, of in zip(KEYS, (scenario.uplink, scenario.downlink), strict=True):
         if names := _only_packets(of):
-            expected = "nothing that acts on packets alone, for TCP is relayed as a stream of bytes"
+            expected = "impairments that streams can have, because TCP is relayed as a stream"
             what = f"{key}: got {' and '.join(names)}, expected {expected}"
-            return f"{what}; under `skytether netem run` its packets pass"
+            return f"{what}; `skytether netem run` passes packets of TCP"
     return ""
 
 

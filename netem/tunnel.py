@@ -24,8 +24,8 @@ FLOWS_MAX = 16_384
 class Tunnel(Emulator):
     """Delays, reorders and loses packets between a program and the outside.
 
-    A datagram's peer is PROGRAM or OUTSIDE, and its payload a packet of IP. An empty payload is the
-    end: of the program, whose last packets are still sent; or of the outside, and of all.
+    A datagram's peer is PROGRAM or OUTSIDE, and its payload a packet of IP; an empty payload means
+    that the peer has ended. The tunnel ends with OUTSIDE, or after the program's last packets.
 
     Args:
         mtu: largest packet that passes [B]; the program gets an ICMP error for a longer one.
@@ -41,7 +41,7 @@ class Tunnel(Emulator):
         self._began_ns = 0
         """Time of the first packet, at which outages and traces begin, for all flows."""
         self._has_ended = self._is_cut = False
-        """Whether the program has ended, and whether the outside has."""
+        """Whether an empty payload has come from PROGRAM, and whether one from OUTSIDE."""
         self.refused = 0
         """Number of packets that were not IP packets."""
 

@@ -11,7 +11,7 @@ from skytether.shared.base.units import seconds_to_ns
 
 @impairment(name="gilbert_elliott")
 class GilbertElliott(Impairment):
-    """Loses packets while a channel is bad: for a share of the time, burst_s at a time (mean)."""
+    """Loses packets while a channel is bad: a share of the time, for burst_s on average."""
 
     kind = "loss"
 
@@ -36,7 +36,7 @@ class GilbertElliott(Impairment):
 
 @impairment(name="outage")
 class Outage(Impairment):
-    """Loses everything from at_s on for for_s seconds, and again every every_s (0: only once)."""
+    """Loses all packets for for_s seconds from at_s on, and again every every_s (0: only once)."""
 
     def __init__(self, at_s: Time, for_s: Time, every_s: Time = 0.0) -> None:
         if every_s and every_s <= for_s:
@@ -54,7 +54,7 @@ class Outage(Impairment):
 
 @impairment(name="outages")
 class Outages(Impairment):
-    """Loses everything for a random time, mean for_s, then nothing for one with mean every_s."""
+    """Loses all packets for a random time of mean for_s, then none for one of mean every_s."""
 
     def __init__(self, every_s: Annotated[float, Meta(ge=0.001, le=3600)], for_s: Time) -> None:
         self.loss = for_s / (every_s + for_s)
@@ -67,7 +67,7 @@ class Outages(Impairment):
 
 @impairment(name="delivered")
 class Delivered(Impairment):
-    """Delivers packets despite earlier impairments: flow, at_s, for_s, delay_s of each stretch."""
+    """Delivers a flow's packets within delay_s, from at_s on for for_s; four numbers a stretch."""
 
     def __init__(self, *stretches: Annotated[float, Meta(ge=0, le=86400)]) -> None:
         each = list(zip(*(iter(stretches),) * 4, strict=False))

@@ -52,7 +52,7 @@ class Queued(Impairment):
 
 @impairment(name="rate")
 class Rate(Queued):
-    """Limits the rate to bytes_per_s, IP and UDP headers included; other packets queue."""
+    """Limits the rate to bytes_per_s, IP and UDP headers included; excess packets queue."""
 
     def __init__(
         self,

@@ -162,7 +162,7 @@ def test_netem_takes_as_many_clients_as_files_may_be_open() -> None:
         assert "listening" in netem.stdout.readline()
         netem.terminate()
         _, said = netem.communicate(timeout=PATIENCE_S)
-    room = "netem: room for 16 clients instead of 512: 64 files may be open here (ulimit -n)\n"
+    room = "netem: at most 16 clients instead of 512: 64 files may be open here (ulimit -n)\n"
     assert (netem.returncode, said) == (0, room)
 
 
